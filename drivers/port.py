@@ -1,0 +1,60 @@
+"""The one protocol that every driver meets, on a real wire or in memory.
+
+A cycle goes `trigger` on every link (requests leave, nothing is awaited), then `collect` on every link (answers
+are taken until the deadline), then the control law, then `write` on every link (hands over, never waits). All
+links wait at the same time that way, and a slow or dead device costs the others nothing: `collect` returns at
+the deadline at the latest, with the quality of what did not come set to STALE.
+
+What `write` hands over acts at the devices with the next `trigger` (a SYNC, or the write half of the read-write
+transaction), so the latency from sample to torque is one period on every wire.
+"""
+
+from typing import Protocol
+
+from gateway.core.signals import Inputs, LinkHealth, Outputs
+
+
+class PrepareRefused(Exception):
+    """A device cannot be trusted with torque. `reasons` name device, what was found, and what to do."""
+
+    def __init__(self, reasons: list[str]) -> None:
+        super().__init__("; ".join(reasons))
+        self.reasons = reasons
+
+
+class Link(Protocol):
+    """One bus with its devices."""
+
+    name: str
+    health: LinkHealth
+
+    async def open(self) -> None:
+        """Open the transport. Sends nothing that changes a device. Raises OSError with what to do about it."""
+        ...
+
+    async def prepare(self) -> None:
+        """Configure the devices and prove their communication watchdogs: set, read back, within bound.
+
+        After it returns the link is active. Raises PrepareRefused with every reason, and stays silent then.
+        """
+        ...
+
+    def silence(self) -> None:
+        """Back to silent: from now on nothing is sent that changes a device."""
+        ...
+
+    def trigger(self, now_s: float) -> None:
+        """Start a cycle: latch and sample (SYNC), or send the read requests. A silent link only listens and reads."""
+        ...
+
+    async def collect(self, inputs: Inputs, deadline_s: float) -> None:
+        """Fill in what arrived by `deadline_s` (monotonic), mark what did not."""
+        ...
+
+    def write(self, outputs: Outputs) -> None:
+        """Hand over the commands of this cycle. A silent link ignores them. Never blocks."""
+        ...
+
+    async def close(self) -> None:
+        """Release the transport. Idempotent."""
+        ...

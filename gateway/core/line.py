@@ -1,0 +1,151 @@
+"""The line description: what `line.toml` may say. Strict, frozen, SI.
+
+Spans and rollers are numbered by their order in the file: span i lies between roller i-1 and roller i; roller 0 is
+the unwinder, which the line PLC drives at v0 and which is not listed. What single values must satisfy stands here;
+what several tables must satisfy together stands in `line_checks`.
+"""
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+Name = Annotated[str, Field(pattern=r"^[a-z0-9]([a-z0-9-]{0,30}[a-z0-9])?$")]
+Positive = Annotated[float, Field(gt=0.0)]
+NonNegative = Annotated[float, Field(ge=0.0)]
+Fraction = Annotated[float, Field(gt=0.0, lt=1.0)]
+
+
+class Strict(BaseModel):
+    """Unknown keys, NaN, infinity, and text or booleans in place of numbers are refused."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+
+
+class Parameter(Strict):
+    """A physical parameter: nominal value and how far the truth may lie from it, as a fraction either way."""
+
+    value: Positive
+    tolerance: Fraction
+
+
+class Control(Strict):
+    period_s: Annotated[float, Field(ge=0.001, le=0.1)] = 0.010
+    latency_s: Annotated[float, Field(ge=0.0, le=0.1)] = 0.010  #: from a sample to the torque it causes
+    cpu: Annotated[int, Field(ge=0)] | None = None  #: pin the loop to this processor; default: the last one
+    priority: Annotated[int, Field(ge=1, le=90)] = 60  #: SCHED_FIFO priority, where permitted
+
+
+class Limits(Strict):
+    """What must never be left. Changed only here, by an engineer."""
+
+    torque_nm: Positive  #: per drive, either direction
+    torque_rate_nm_per_s: Positive
+    tension_min_n: NonNegative
+    tension_max_n: Positive
+    speed_max_m_per_s: Positive
+    tension_step_max_n: NonNegative = 0.0  #: largest set-point change that may be made at once; larger ones are ramped
+    speed_step_max_m_per_s: NonNegative = 0.0
+    hold_periods: Annotated[int, Field(ge=1, le=10)] = 3  #: periods without a signal until STOP
+    watchdog_s: Annotated[float, Field(gt=0.0, le=0.2)] = 0.1  #: the drives take torque off after this silence
+    tensioning_time_s: Positive = 20.0  #: after `start`, every span must have reached the band within this time
+
+
+class Moves(Strict):
+    """How set-points move when nobody asks for a step."""
+
+    tension_rate_n_per_s: Positive = 20.0
+    speed_rate_m_per_s2: Positive = 0.05
+    stop_rate_m_per_s2: Positive = 0.1  #: the controlled stop
+    stop_time_s: Positive = 10.0  #: torque goes off after this time in STOP, whatever the speed
+    torque_off_rate_nm_per_s: Positive = 200.0  #: at the end of a stop
+
+
+class Web(Strict):
+    stiffness_n: Parameter  #: E A, modulus times cross-section
+    tension_before_n: NonNegative = 0.0  #: T_0, tension ahead of span 1, as far as it acts on the rollers
+    tension_after_n: NonNegative = 0.0  #: T_{n+1}, tension behind the last roller
+
+
+class Roller(Strict):
+    name: Name
+    radius_m: Parameter
+    inertia_kg_m2: Parameter
+    friction_nms_per_rad: Parameter
+
+
+class Span(Strict):
+    name: Name
+    length_m: Parameter
+    control: Literal["tension", "draw"] = "tension"  #: draw: no load cell, the roller keeps a speed ratio
+
+
+class CanopenBus(Strict):
+    name: Name
+    protocol: Literal["canopen"]
+    interface: Literal["udp_multicast", "virtual", "socketcan"]
+    channel: str
+    port: Annotated[int, Field(ge=1, le=65535)] | None = None  #: udp_multicast only
+    bitrate_bit_per_s: Literal[125_000, 250_000, 500_000, 800_000, 1_000_000] = 1_000_000
+
+
+class ModbusTcpBus(Strict):
+    name: Name
+    protocol: Literal["modbus-tcp"]
+    host: str
+    port: Annotated[int, Field(ge=1, le=65535)] = 502
+
+
+Bus = Annotated[CanopenBus | ModbusTcpBus, Field(discriminator="protocol")]
+
+
+class Device(Strict):
+    name: Name
+    bus: Name
+    map: Name  #: device type, a file of `drivers/maps`
+    address: Annotated[int, Field(ge=1, le=247)]  #: CANopen node (1 to 127) or Modbus unit (1 to 247)
+
+
+class Drive(Device):
+    roller: Annotated[int, Field(ge=1)]
+    rated_torque_nm: Positive
+
+
+class LoadCell(Device):
+    span: Annotated[int, Field(ge=1)]
+    channel: Annotated[int, Field(ge=1)] = 1
+    capacity_n: Positive  #: a reading beyond it is not believed
+
+
+class LinePlc(Device):
+    pass
+
+
+class Recipe(Strict):
+    """Set-points for a grade. Draw-controlled spans take theirs as the tension their speed ratio is computed from."""
+
+    name: Name
+    tension_n: list[Positive]
+    speed_m_per_s: NonNegative
+
+
+class Line(Strict):
+    format: Literal[1]
+    site: Name
+    line: Name
+    description: str = ""
+    control: Control = Control()
+    limits: Limits
+    moves: Moves = Moves()
+    web: Web
+    rollers: Annotated[list[Roller], Field(min_length=1, max_length=60)]
+    spans: Annotated[list[Span], Field(min_length=1, max_length=60)]
+    buses: Annotated[list[Bus], Field(min_length=1)]
+    drives: list[Drive]
+    load_cells: list[LoadCell]
+    plc: LinePlc
+    recipes: Annotated[list[Recipe], Field(min_length=1)]  #: the first is the one a line starts with
+
+    @property
+    def n(self) -> int:
+        """Number of spans, and of driven rollers."""
+        return len(self.spans)

@@ -1,0 +1,104 @@
+"""What processes say to each other: commands and their replies (JSON), events (JSON), telemetry (see `telemetry`)."""
+
+import json
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, TypeAdapter, ValidationError
+
+from gateway.core.line import Strict
+
+
+class Arm(Strict):
+    """SILENT or STOP to READY: prove limits, PLC and watchdogs; zero torque."""
+
+    command: Literal["arm"] = "arm"
+
+
+class Start(Strict):
+    """READY to RUN: tension the web, then run at the set speed. HOLD to RUN: back to the set speed."""
+
+    command: Literal["start"] = "start"
+
+
+class Hold(Strict):
+    """RUN to HOLD: ramp the speed to standstill, tension control stays on."""
+
+    command: Literal["hold"] = "hold"
+
+
+class Stop(Strict):
+    """Any state: controlled stop, then torque off. Never refused."""
+
+    command: Literal["stop"] = "stop"
+
+
+class SetTension(Strict):
+    """A tension set-point. Ramped at the line's rate, or made at once within `limits.tension_step_max_n`."""
+
+    command: Literal["set"] = "set"
+    span: Annotated[int, Field(ge=1)]
+    tension_n: float
+    step: bool = False
+
+
+class SetSpeed(Strict):
+    """The line speed set-point (unwinder). Ramped, or made at once within `limits.speed_step_max_m_per_s`."""
+
+    command: Literal["speed"] = "speed"
+    speed_m_per_s: float
+    step: bool = False
+
+
+class SelectRecipe(Strict):
+    """All set-points of a recipe of the line's file, ramped."""
+
+    command: Literal["recipe"] = "recipe"
+    name: str
+
+
+Command = Annotated[Arm | Start | Hold | Stop | SetTension | SetSpeed | SelectRecipe, Field(discriminator="command")]
+_command: TypeAdapter[Command] = TypeAdapter(Command)
+
+
+class Reply(Strict):
+    """What was done, or why not. A refusal has done nothing."""
+
+    ok: bool
+    state: str  #: the loop's state after the command
+    text: str  #: one sentence for a person, with what to do next where it was refused
+    reasons: list[str] = []  #: every reason of a refusal
+
+
+class Event(Strict):
+    """Something that happened once: a state change, a trip, a set-point. `data` holds the measured numbers."""
+
+    time_s: float  #: monotonic
+    kind: str
+    text: str
+    data: dict[str, Any] = {}
+
+
+class MalformedMessage(Exception):
+    """Bytes from outside that are no message; the text says why."""
+
+
+def _no_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    keys = [key for key, _ in pairs]
+    twice = {key for key in keys if keys.count(key) > 1}
+    if twice:
+        raise MalformedMessage(f"key given twice: {', '.join(sorted(twice))}")
+    return dict(pairs)
+
+
+def parse_command(payload: bytes) -> Command:
+    """A command from outside. Raises MalformedMessage with every reason."""
+    if len(payload) > 4096:
+        raise MalformedMessage(f"a command has at most 4096 bytes, this one {len(payload)}")
+    try:
+        document = json.loads(payload, object_pairs_hook=_no_duplicates)
+    except (ValueError, RecursionError) as error:
+        raise MalformedMessage(f"not JSON: {error}") from error
+    try:
+        return _command.validate_python(document)
+    except ValidationError as error:
+        raise MalformedMessage("; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())) from error

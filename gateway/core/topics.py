@@ -1,0 +1,21 @@
+"""The one table of what travels between processes: name, way, rate, and whether it is kept."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class Topic:
+    name: str
+    way: Literal["publish", "request"]
+    rate: str  #: at most
+    kept: bool  #: written to the historian
+
+
+LOOP_TELEMETRY = Topic("loop/telemetry", "publish", "once a period", kept=True)
+LOOP_EVENT = Topic("loop/event", "publish", "100/s", kept=True)
+LOOP_COMMAND = Topic("loop/command", "request", "100/s", kept=False)
+GATEWAY_COMMAND = Topic("gateway/command", "request", "100/s", kept=True)
+GATEWAY_STATUS = Topic("gateway/status", "request", "20/s", kept=False)
+
+TOPICS = (LOOP_TELEMETRY, LOOP_EVENT, LOOP_COMMAND, GATEWAY_COMMAND, GATEWAY_STATUS)
