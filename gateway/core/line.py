@@ -46,7 +46,7 @@ class Limits(Strict):
     tension_step_max_n: NonNegative = 0.0  #: largest set-point change that may be made at once; larger ones are ramped
     speed_step_max_m_per_s: NonNegative = 0.0
     hold_periods: Annotated[int, Field(ge=1, le=10)] = 3  #: periods without a signal until STOP
-    watchdog_s: Annotated[float, Field(gt=0.0, le=0.2)] = 0.1  #: the drives take torque off after this silence
+    watchdog_s: Annotated[float, Field(ge=0.01, le=0.2)] = 0.1  #: the drives take torque off after this silence
     tensioning_time_s: Positive = 20.0  #: after `start`, every span must have reached the band within this time
 
 
@@ -112,7 +112,7 @@ class Drive(Device):
 
 class LoadCell(Device):
     span: Annotated[int, Field(ge=1)]
-    channel: Annotated[int, Field(ge=1)] = 1
+    channel: Annotated[int, Field(ge=1, le=60)] = 1  #: of an amplifier with at most 60
     capacity_n: Positive  #: a reading beyond it is not believed
 
 
@@ -129,7 +129,7 @@ class Recipe(Strict):
 
 
 class Line(Strict):
-    format: Literal[1]
+    format: Annotated[int, Field(ge=1, le=1)]  #: not Literal: that takes `true` and 1.0 for 1
     site: Name
     line: Name
     description: str = ""

@@ -101,4 +101,5 @@ def parse_command(payload: bytes) -> Command:
     try:
         return _command.validate_python(document)
     except ValidationError as error:
-        raise MalformedMessage("; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())) from error
+        reasons = "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())
+        raise MalformedMessage(reasons) from error

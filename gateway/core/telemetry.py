@@ -33,6 +33,7 @@ class Frame:
     speed_setpoint_m_per_s: float
     state: int  #: LoopState
     saturated: bool  #: a torque or its rate is at its limit
+    held: int  #: periods in a row in which a signal was missing and the outputs were held
     tension_n: FloatArray
     tension_setpoint_n: FloatArray
     speed_m_per_s: FloatArray
@@ -56,7 +57,7 @@ def pack(frame: Frame) -> bytes:
         frame.speed_setpoint_m_per_s,
         frame.state,
         frame.saturated,
-        0,
+        min(frame.held, 0xFFFF),
     )
     floats = np.concatenate([getattr(frame, name) for name in FLOAT_FIELDS]).astype("<f4").tobytes()
     return header + floats + frame.tension_quality.tobytes() + frame.drive_state.tobytes()
@@ -66,14 +67,36 @@ def unpack(payload: bytes) -> Frame:
     """The frame in `payload`. Raises MalformedFrame for a wrong version or length."""
     if len(payload) < _HEADER.size:
         raise MalformedFrame(f"{len(payload)} bytes are shorter than a header")
-    version, n, sequence, time_s, lateness, cycle, missed, unwind, setpoint, state, saturated, _ = _HEADER.unpack_from(payload)
+    version, n, *scalars = _HEADER.unpack_from(payload)
+    sequence, time_s, lateness, cycle, missed, unwind, setpoint, state, saturated, held = scalars
     if version != VERSION:
         raise MalformedFrame(f"version {version}, this program reads {VERSION}")
     expected = _HEADER.size + n * (4 * len(FLOAT_FIELDS) + len(BYTE_FIELDS))
     if len(payload) != expected:
         raise MalformedFrame(f"{len(payload)} bytes, a frame of {n} spans has {expected}")
     floats = np.frombuffer(payload, "<f4", n * len(FLOAT_FIELDS), _HEADER.size).astype(np.float64).reshape(-1, n)
-    octets = np.frombuffer(payload, np.int8, n * len(BYTE_FIELDS), expected - n * len(BYTE_FIELDS)).reshape(-1, n)
+    octets: IntArray = np.frombuffer(payload, np.int8, n * len(BYTE_FIELDS), expected - n * len(BYTE_FIELDS))
     return Frame(
-        sequence, time_s, lateness, cycle, missed, unwind, setpoint, state, bool(saturated), *floats, *octets
+        sequence, time_s, lateness, cycle, missed, unwind, setpoint, state, bool(saturated), held, *floats, octets[:n], octets[n:]
     )
+
+
+def frame_dtype(n: int) -> np.dtype[np.void]:
+    """The same layout for numpy, so that many frames of `n` spans are read at once: `np.frombuffer(b"".join(...))`."""
+    header = (
+        ("version", "<u2"),
+        ("n", "<u2"),
+        ("sequence", "<u4"),
+        ("time_s", "<f8"),
+        ("lateness_s", "<f4"),
+        ("cycle_s", "<f4"),
+        ("missed", "<u4"),
+        ("unwind_speed_m_per_s", "<f4"),
+        ("speed_setpoint_m_per_s", "<f4"),
+        ("state", "u1"),
+        ("saturated", "u1"),
+        ("held", "<u2"),
+    )
+    floats = [(name, "<f4", (n,)) for name in FLOAT_FIELDS]
+    octets = [(name, "i1", (n,)) for name in BYTE_FIELDS]
+    return np.dtype([*header, *floats, *octets])

@@ -49,8 +49,8 @@ def nominal_model(line: Line) -> WebModel:
 def reference_speeds(model: WebModel, tension_n: FloatArray, unwind_speed_m_per_s: float) -> FloatArray:
     """Speeds v_1 .. v_n (m/s) that keep the tensions (N): the recursion of eq. reference_velocity."""
     upstream = np.concatenate(([model.tension_before_n], tension_n[:-1]))
-    ratios = (model.stiffness_n - upstream) / (model.stiffness_n - tension_n)
-    return unwind_speed_m_per_s * np.cumprod(ratios)
+    ratios: FloatArray = (model.stiffness_n - upstream) / (model.stiffness_n - tension_n)
+    return unwind_speed_m_per_s * np.cumprod(ratios, dtype=np.float64)
 
 
 def equilibrium_torque(model: WebModel, tension_n: FloatArray, speed_m_per_s: FloatArray) -> FloatArray:

@@ -1,6 +1,8 @@
 """The one way in which processes talk. Transports: in-process (tests, stepped time) and unix socket; Zenoh later."""
 
 from collections.abc import Awaitable, Callable
+from contextvars import ContextVar
+from dataclasses import dataclass
 from typing import Protocol
 
 from gateway.core.topics import Topic
@@ -13,6 +15,41 @@ MAX_PAYLOAD = 65536  #: bytes; longer messages are refused on both sides
 
 class Unreachable(Exception):
     """The other side is not there, or did not answer in time. The text says what to start."""
+
+
+class RemoteError(Unreachable):
+    """The other side is there, but its handler failed or there is none. The text is what it said."""
+
+
+@dataclass(frozen=True, slots=True)
+class Peer:
+    """Who is at the other end, as the kernel tells it; nothing the peer says of itself."""
+
+    uid: int
+    pid: int
+
+
+#: The asking peer, readable inside a request handler; None where the transport cannot tell (in-process).
+PEER: ContextVar[Peer | None] = ContextVar("peer", default=None)
+
+
+@dataclass(slots=True)
+class Counters:
+    """What a mailbox has lived through. Only ever counted up."""
+
+    dropped: int = 0  #: messages not handed over: nobody there, buffer full, too long
+    malformed: int = 0  #: datagrams received that are no envelope
+    late_answers: int = 0  #: answers to a request that had been given up
+    refused: int = 0  #: requests and connections turned away because there were too many at once
+    handler_errors: int = 0  #: exceptions out of handlers
+    connects: int = 0
+    last_error: str = ""
+
+
+def what_to_start(topic: Topic) -> str:
+    """The sentence for an unreachable topic; the first part of a topic's name is the process that serves it."""
+    process = topic.name.partition("/")[0]
+    return f"{process} not running: start it with `r2rgate {process} LINE.toml`"
 
 
 class Mailbox(Protocol):

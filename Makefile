@@ -1,0 +1,42 @@
+# r2rgate: everything from a fresh machine with Python >= 3.11 and make.
+SHELL := /bin/sh
+VENV  := .venv
+PY    := $(VENV)/bin/python
+RUN   := $(PY) -m gateway.cli
+export PYTHONDONTWRITEBYTECODE :=
+
+.DEFAULT_GOAL := help
+.PHONY: help setup run test check format bench bench-stepped clean
+
+help: ## this list
+	@echo "r2rgate: make TARGET"
+	@grep -E '^[a-z-]+:.*##' Makefile | sed -E 's/^([a-z-]+):.*## */  \1|/' | awk -F'|' '{printf "%-18s %s\n", $$1, $$2}'
+
+$(VENV)/.ready: requirements.lock pyproject.toml deploy/setup-venv.sh
+	@sh deploy/setup-venv.sh "$(VENV)"
+
+setup: $(VENV)/.ready ## the virtual environment in .venv, from requirements.lock
+
+run: setup ## set up, then the demonstration: simulated line, loop and gateway in real time (ARGS="--help")
+	@exec $(RUN) demo $(ARGS)
+
+test: setup ## set up, then all tests
+	@$(PY) -m pytest $(ARGS)
+
+check: setup ## lint, types, import contracts
+	@$(PY) -m ruff check .
+	@$(PY) -m ruff format --check .
+	@$(VENV)/bin/lint-imports --no-cache > out/lint-imports.txt 2>&1 || { cat out/lint-imports.txt; exit 1; }
+	@$(PY) -m basedpyright
+
+format: setup ## format the code
+	@$(PY) -m ruff format .
+	@$(PY) -m ruff check --fix .
+
+bench: bench-stepped ## every benchmark
+
+bench-stepped: setup ## both cases in stepped time: RMSE against the goals, speed against real time
+	@$(PY) -m tests.bench.stepped $(ARGS)
+
+clean: ## remove what was built (the environment stays)
+	rm -rf out build dist *.egg-info .pytest_cache .ruff_cache .hypothesis

@@ -1,0 +1,149 @@
+"""What the gateway knows of one drive on the bus. No I/O: frames and times come in, a DriveState comes out."""
+
+import struct
+
+from canopen.emcy import EmcyError
+
+from drivers.canopen.cia402 import DISABLE_VOLTAGE, PowerState, controlword, drive_state, power_state
+from drivers.canopen.configure import DriveSettings
+from drivers.canopen.pdo import DriveSample, MalformedPdo, PdoCodec
+from drivers.device_map import DriveMap
+from drivers.scaling import si_per_count
+from gateway.core.signals import DriveRequest, DriveState
+
+HEARTBEATS_ALLOWED = 1.5  #: producer times without a heartbeat until a drive counts as lost
+ANSWERS_ALLOWED = 3  #: SYNCs in a row without an answer until a drive counts as absent
+
+BOOT_UP, STOPPED, OPERATIONAL, PRE_OPERATIONAL = 0x00, 0x04, 0x05, 0x7F
+_NMT_NAMES = {STOPPED: "stopped", OPERATIONAL: "operational", PRE_OPERATIONAL: "pre-operational"}
+_EMCY = struct.Struct("<HB5s")
+
+
+class DriveNode:
+    """One drive. `distrust` is why it gets no torque until the next `prepare`, empty while there is no reason."""
+
+    def __init__(self, name: str, index: int, device: DriveMap, settings: DriveSettings, radius_m: float) -> None:
+        self.name = name
+        self.index = index  #: roller - 1
+        self.device = device
+        self.settings = settings
+        self.codec = PdoCodec(device, settings.rated_torque_nm, radius_m)
+        heartbeat = device.heartbeat
+        self.heartbeat_s = heartbeat.value * si_per_count(heartbeat.unit, 1.0)
+        self.nmt_state: int | None = None
+        self.heard_s: float | None = None
+        self.sample: DriveSample | None = None  #: the answer to the present SYNC
+        self.power: PowerState | None = None
+        self.safe_torque_off = False
+        self.follows_command = False
+        self.missed = 0  #: SYNCs in a row without an answer
+        self.emergency = ""
+        self.distrust = ""
+        self.boot_ups = 0
+        self.supervised = False  #: must stay operational
+        self._controlword = DISABLE_VOLTAGE
+        self._request = int(DriveRequest.OFF)
+
+    @property
+    def node(self) -> int:
+        return self.settings.node
+
+    # what arrives
+
+    def on_answer(self, data: bytes | bytearray) -> None:
+        """The TPDO of the present SYNC. Raises MalformedPdo for a second one or a wrong length."""
+        if self.sample is not None:
+            raise MalformedPdo("a second answer to one SYNC")
+        sample = self.codec.decode(data)
+        self.sample = sample
+        self.missed = 0
+        self.power = power_state(sample.statusword)
+        follows = self.device.follows_command
+        self.follows_command = follows is None or bool(sample.statusword >> follows.bit & 1) != follows.inverted
+        if sample.safe_torque_off is not None:
+            self.safe_torque_off = sample.safe_torque_off
+        elif self.power is not PowerState.SWITCH_ON_DISABLED:
+            self.safe_torque_off = False  # what was asked for is over
+        if self._request == DriveRequest.RESET_FAULT and drive_state(self.power) != DriveState.FAULT:
+            self.emergency = ""
+
+    def on_heartbeat(self, data: bytes | bytearray, now_s: float) -> None:
+        """A heartbeat or boot-up message. Raises ValueError for a wrong length."""
+        if len(data) != 1:
+            raise ValueError(f"a heartbeat has 1 byte, this one {len(data)}")
+        self.nmt_state = data[0] & 0x7F
+        self.heard_s = now_s
+        self.boot_ups += self.nmt_state == BOOT_UP
+        if self.supervised and self.nmt_state == BOOT_UP:
+            self.distrust = "restarted: its settings are lost, arm again"
+        elif self.supervised and self.nmt_state != OPERATIONAL:
+            self.distrust = f"left operational for {_NMT_NAMES.get(self.nmt_state, hex(self.nmt_state))}, arm again"
+
+    def on_emergency(self, data: bytes | bytearray) -> None:
+        """An EMCY message; code 00xxh takes the last one back. Raises ValueError for a wrong length."""
+        if len(data) != _EMCY.size:
+            raise ValueError(f"an EMCY has 8 bytes, this one {len(data)}")
+        code, register, rest = _EMCY.unpack(data)
+        text = EmcyError(code, register, rest, 0.0).get_desc()
+        self.emergency = f"EMCY {code:04X}h {text}".rstrip() + f", error register {register:02X}h" if code >> 8 else ""
+
+    # the cycle
+
+    def begin_sync(self) -> None:
+        self.sample = None
+
+    def end_sync(self) -> None:
+        if self.sample is None:
+            self.missed += 1
+
+    def heartbeat_lost(self, now_s: float) -> bool:
+        return self.heard_s is None or now_s - self.heard_s > HEARTBEATS_ALLOWED * self.heartbeat_s
+
+    def state(self, now_s: float) -> DriveState:
+        if self.heartbeat_lost(now_s) or self.missed >= ANSWERS_ALLOWED:
+            return DriveState.ABSENT
+        if self.distrust or self.emergency:
+            return DriveState.FAULT
+        if self.power is None:
+            return DriveState.OFF
+        if self.safe_torque_off and self.power is PowerState.SWITCH_ON_DISABLED:
+            return DriveState.STO
+        if self.power is PowerState.OPERATION_ENABLED and not self.follows_command:
+            return DriveState.READY  # no torque, whatever is commanded
+        return drive_state(self.power)
+
+    def command(self, request: int, torque_nm: float, state: DriveState) -> bytes:
+        """The RPDO towards `request`. A drive that is not trusted, or not heard, is told to take torque off.
+
+        Raises ValueError when the torque cannot be commanded; nothing may be sent then.
+        """
+        self._request = request
+        if self.distrust or self.power is None or state == DriveState.ABSENT:
+            self._controlword = DISABLE_VOLTAGE
+        elif state == DriveState.FAULT and request != DriveRequest.RESET_FAULT:
+            self._controlword = DISABLE_VOLTAGE  # an emergency counts before the statusword shows it
+        else:
+            self._controlword = controlword(self.power, request, self._controlword)
+        follows = state == DriveState.ENABLED and request == DriveRequest.ENABLE
+        payload = self.codec.encode(self._controlword, torque_nm)
+        return payload if follows else self.codec.encode(self._controlword, 0.0)
+
+    # prepare
+
+    def forget(self) -> None:
+        """Nothing that was true of the drive before counts any more, except that it was heard."""
+        self.supervised = False
+        self.sample = None
+        self.power = None
+        self.missed = 0
+        self.distrust = ""
+        self._controlword = DISABLE_VOLTAGE
+        self._request = int(DriveRequest.OFF)
+
+    def trouble(self, now_s: float) -> str:
+        """What is wrong with it, for a person; empty when nothing is."""
+        if self.heartbeat_lost(now_s):
+            return "no heartbeat"
+        if self.missed >= ANSWERS_ALLOWED:
+            return f"no answer to {self.missed} SYNCs in a row"
+        return self.distrust or self.emergency

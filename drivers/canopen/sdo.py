@@ -1,0 +1,77 @@
+"""Service data on one CAN bus: the canopen library's SDO client, fed from our own reader.
+
+The library waits in a worker thread, so a transfer never costs the loop time. It is given SDO frames only: if it
+saw PDOs it would keep their last values, and on interfaces that echo, its own commands.
+"""
+
+import asyncio
+from collections.abc import Callable
+
+import canopen
+from canopen.sdo.client import SdoClient
+
+SDO_TIMEOUT_S = 0.2
+_REQUEST = 0x600  #: COB-ID of node 0, client to server
+_RESPONSE = 0x580
+
+
+class SdoFailed(Exception):
+    """A transfer that did not take place: no answer, or an abort. The text names object and cause."""
+
+
+class SdoSilent(SdoFailed):
+    """No answer."""
+
+
+class _Client(SdoClient):
+    RESPONSE_TIMEOUT = SDO_TIMEOUT_S
+
+
+class _Network(canopen.Network):
+    """The library's network without its bus and its threads."""
+
+    def __init__(self, send: Callable[[int, bytes], bool]) -> None:
+        super().__init__()
+        self._send = send
+
+    def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:
+        self._send(can_id, bytes(data))
+
+
+class SdoBus:
+    """Raw uploads and downloads, one at a time on the bus."""
+
+    def __init__(self, send: Callable[[int, bytes], bool], nodes: list[int]) -> None:
+        self._network = _Network(send)
+        self._one_at_a_time = asyncio.Lock()
+        self._clients: dict[int, SdoClient] = {}
+        for node in nodes:
+            client = _Client(_REQUEST + node, _RESPONSE + node, canopen.ObjectDictionary())
+            client.network = self._network
+            self._network.subscribe(_RESPONSE + node, client.on_response)
+            self._clients[node] = client
+
+    def response_cob_ids(self) -> list[int]:
+        return [_RESPONSE + node for node in self._clients]
+
+    def on_frame(self, cob_id: int, data: bytes | bytearray, now_s: float) -> None:
+        """An SDO response. One that is not 8 bytes long is no SDO frame and is not passed on."""
+        if len(data) == 8:
+            self._network.notify(cob_id, bytearray(data), now_s)
+
+    async def upload(self, node: int, index: int, sub: int) -> bytes:
+        """The bytes of an object. Raises SdoFailed."""
+        return await self._run(node, index, sub, lambda client: client.upload(index, sub))
+
+    async def download(self, node: int, index: int, sub: int, data: bytes) -> None:
+        """Write an object. Raises SdoFailed."""
+        await self._run(node, index, sub, lambda client: client.download(index, sub, data))
+
+    async def _run(self, node: int, index: int, sub: int, transfer: Callable[[SdoClient], bytes | None]) -> bytes:
+        async with self._one_at_a_time:
+            try:
+                return await asyncio.to_thread(transfer, self._clients[node]) or b""
+            except canopen.SdoAbortedError as error:
+                raise SdoFailed(f"object {index:04X}h sub {sub}: the device aborted: {error}") from error
+            except canopen.SdoCommunicationError as error:
+                raise SdoSilent(f"object {index:04X}h sub {sub}: {error}") from error

@@ -1,0 +1,117 @@
+"""All devices of a line in memory: the driver port for stepped time, without wires, threads or waiting."""
+
+from math import isfinite
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gateway.core.line import Line
+from gateway.core.signals import Channel, DriveRequest, DriveState, FloatArray, Inputs, LinkHealth, Outputs, Quality
+
+BoolArray = NDArray[np.bool_]
+
+
+class MemorySample(Protocol):
+    """One reading of everything. Arrays have shape (n,)."""
+
+    @property
+    def tension_n(self) -> FloatArray: ...
+    @property
+    def speed_m_per_s(self) -> FloatArray: ...
+    @property
+    def torque_nm(self) -> FloatArray: ...
+    @property
+    def unwind_speed_m_per_s(self) -> float: ...
+    @property
+    def permissive(self) -> bool: ...
+    @property
+    def emergency_stop(self) -> bool: ...
+    @property
+    def running(self) -> bool: ...
+    @property
+    def enabled(self) -> BoolArray: ...
+
+
+class MemoryPlant(Protocol):
+    """The plant's side: it is read at a time and commanded at the same time, and keeps its own latency."""
+
+    def sample(self, now_s: float) -> MemorySample: ...
+    def apply(
+        self, torque_nm: FloatArray, enable: BoolArray, speed_request_m_per_s: float, run: bool, now_s: float
+    ) -> None: ...
+
+
+class MemoryLink:
+    """A `drivers.port.Link` that carries every device of `line`. Spans without a load cell stay MISSING."""
+
+    name = "memory"
+
+    def __init__(self, line: Line, plant: MemoryPlant) -> None:
+        self.health = LinkHealth()
+        self._plant = plant
+        self._active = False
+        self._now_s = 0.0
+        self._capacity_n = np.full(line.n, np.nan)  #: NaN where there is no load cell
+        for cell in line.load_cells:
+            self._capacity_n[cell.span - 1] = cell.capacity_n
+        self._absent = np.flatnonzero(np.isnan(self._capacity_n))
+        self._request = np.full(line.n, DriveRequest.OFF, dtype=np.int8)
+
+    async def open(self) -> None: ...
+
+    async def prepare(self) -> None:
+        self._active = True
+
+    def silence(self) -> None:
+        self._active = False
+
+    def trigger(self, now_s: float) -> None:
+        self._now_s = now_s
+
+    async def collect(self, inputs: Inputs, deadline_s: float) -> None:
+        """Read the plant at the time of `trigger`. Never suspends."""
+        now_s = self._now_s
+        sample = self._plant.sample(now_s)
+        tension_n = sample.tension_n
+        believed = np.abs(tension_n) <= self._capacity_n  # False for NaN
+        inputs.tension.time_s[believed] = now_s
+        inputs.tension.value[believed] = tension_n[believed]
+        inputs.tension.quality[:] = np.where(believed, Quality.GOOD, Quality.BAD)
+        inputs.tension.quality[self._absent] = Quality.MISSING
+        _put_all(inputs.speed, sample.speed_m_per_s, now_s)
+        _put_all(inputs.torque, sample.torque_nm, now_s)
+        inputs.unwind_speed.put(0, sample.unwind_speed_m_per_s, now_s)
+        off = np.where(self._request == DriveRequest.OFF, DriveState.OFF, DriveState.READY)
+        inputs.drive_state[:] = np.where(sample.enabled, DriveState.ENABLED, off)
+        plc = inputs.plc
+        plc.quality = Quality.GOOD
+        plc.time_s = now_s
+        plc.permissive = sample.permissive
+        plc.emergency_stop = sample.emergency_stop
+        plc.running = sample.running
+
+    def write(self, outputs: Outputs) -> None:
+        """Command the plant for the sample of this cycle. What is not finite is not passed on, and counted."""
+        if not self._active:
+            return
+        if not (isfinite(outputs.torque_nm.sum()) and isfinite(outputs.speed_request_m_per_s)):
+            self.health.malformed += 1
+            self.health.last_error = "a torque or the speed request is not finite; nothing was commanded"
+            return
+        self._request[:] = outputs.drive_request
+        enable = self._request == DriveRequest.ENABLE
+        self._plant.apply(outputs.torque_nm, enable, outputs.speed_request_m_per_s, outputs.run, self._now_s)
+
+    async def close(self) -> None:
+        self._active = False
+
+
+def _put_all(channel: Channel, value: FloatArray, now_s: float) -> None:
+    if isfinite(value.sum()):
+        channel.value[:] = value
+        channel.time_s[:] = now_s
+        channel.quality[:] = Quality.GOOD
+    else:
+        for k in range(len(value)):
+            channel.put(k, value[k], now_s)

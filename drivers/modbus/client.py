@@ -1,0 +1,112 @@
+"""The one file that knows pymodbus: a TCP connection on which answers are believed only when they fit the question.
+
+pymodbus takes answers of a wrong function, with too few or too many registers, without an error; here they are
+refused. It is not asked to repeat anything or to reconnect by itself: a late answer would pass for a fresh one, and
+when to reconnect is the link's decision.
+"""
+
+import asyncio
+import logging
+from collections.abc import Awaitable
+
+from pymodbus.client import AsyncModbusTcpClient
+from pymodbus.exceptions import ConnectionException, ModbusException
+from pymodbus.pdu import ModbusPDU
+
+CONNECT_TIMEOUT_S = 0.5
+
+# What goes wrong is counted and named in the link's health; it does not belong on the terminal as well.
+logging.getLogger("pymodbus").addHandler(logging.NullHandler())
+
+
+class ModbusFailed(Exception):
+    """No usable answer; the text says why."""
+
+
+class ModbusTimeout(ModbusFailed):
+    """No answer in time, or no connection."""
+
+
+class ModbusConnection:
+    """One TCP connection. Requests are answered in turn; `deadline_s` is on the event loop's clock."""
+
+    def __init__(self, host: str, port: int) -> None:
+        self.where = f"{host}:{port}"
+        self._host, self._port = host, port
+        self._client: AsyncModbusTcpClient | None = None
+
+    @property
+    def connected(self) -> bool:
+        return self._client is not None and self._client.connected
+
+    async def connect(self) -> bool:
+        """Try once, afresh: nothing of an earlier connection is left that could be mistaken for an answer."""
+        self.close()
+        self._client = AsyncModbusTcpClient(
+            self._host, port=self._port, timeout=CONNECT_TIMEOUT_S, retries=0, reconnect_delay=0
+        )
+        return await self._client.connect()
+
+    def close(self) -> None:
+        """Drop the connection. Idempotent."""
+        client, self._client = self._client, None
+        if client is not None:
+            client.close()
+
+    async def read(self, function: int, unit: int, address: int, count: int, deadline_s: float) -> list[int]:
+        """Function 3 or 4: `count` registers. Raises ModbusFailed."""
+        client = self._connection()
+        ask = client.read_input_registers if function == 4 else client.read_holding_registers
+        answer = await self._answer(ask(address, count=count, device_id=unit), function, deadline_s)
+        return _registers(answer, count)
+
+    async def write(self, unit: int, address: int, registers: list[int], deadline_s: float) -> None:
+        """Function 16. Raises ModbusFailed."""
+        request = self._connection().write_registers(address, registers, device_id=unit)
+        answer = await self._answer(request, 16, deadline_s)
+        if (answer.address, answer.count) != (address, len(registers)):
+            raise ModbusFailed(f"{len(registers)} registers written at {address}, {answer.count} confirmed")
+
+    async def read_write(
+        self, unit: int, address: int, count: int, write_address: int, registers: list[int], deadline_s: float
+    ) -> list[int]:
+        """Function 23: writes, then reads `count` registers, in one transaction. Raises ModbusFailed."""
+        request = self._connection().readwrite_registers(
+            read_address=address, read_count=count, write_address=write_address, values=registers, device_id=unit
+        )
+        return _registers(await self._answer(request, 23, deadline_s), count)
+
+    def _connection(self) -> AsyncModbusTcpClient:
+        if self._client is None or not self._client.connected:
+            raise ModbusTimeout("not connected")
+        return self._client
+
+    async def _answer(self, request: Awaitable[ModbusPDU], function: int, deadline_s: float) -> ModbusPDU:
+        try:
+            async with asyncio.timeout_at(deadline_s):
+                answer = await request
+        except TimeoutError as error:
+            self._drop_half_a_frame()
+            raise ModbusTimeout("no answer in time") from error
+        except ConnectionException as error:
+            self.close()
+            raise ModbusTimeout("connection lost") from error
+        except (ModbusException, OSError) as error:
+            self.close()
+            raise ModbusFailed(str(error)) from error
+        if answer.isError():
+            raise ModbusFailed(f"exception {answer.exception_code} to function {function}")
+        if answer.function_code != function:
+            raise ModbusFailed(f"answer of function {answer.function_code} to function {function}")
+        return answer
+
+    def _drop_half_a_frame(self) -> None:
+        """After half an answer the stream cannot be trusted any more; a merely late one is told by its number."""
+        if self._client is not None and self._client.ctx.recv_buffer:
+            self.close()
+
+
+def _registers(answer: ModbusPDU, count: int) -> list[int]:
+    if len(answer.registers) != count:
+        raise ModbusFailed(f"{len(answer.registers)} registers, asked for {count}")
+    return list(answer.registers)

@@ -1,0 +1,154 @@
+"""Load-cell amplifiers and the line PLC behind one Modbus TCP address, behind the driver port.
+
+A cycle's requests leave with `trigger`, one after the other on the one connection, and what has come by the deadline
+counts. A request that is still running at the next `trigger` is not doubled: that cycle's samples are lost, and
+counted. A lost connection is made again beside the cycle, with growing pauses.
+"""
+
+import asyncio
+
+from drivers.modbus.amplifier import Amplifier
+from drivers.modbus.client import ModbusConnection, ModbusFailed, ModbusTimeout
+from drivers.modbus.plc import Plc
+from drivers.port import PrepareRefused
+from gateway.core.signals import Inputs, LinkHealth, Outputs
+
+EXCHANGE_SHARE = 0.8  #: of a period; what has not come by then leaves room for the next request
+PREPARE_TIMEOUT_S = 0.5  #: per device
+FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.1, 2.0  #: between attempts to connect
+ANSWERS_ALLOWED = 3  #: cycles in a row without an answer until a device counts as absent
+
+Device = Amplifier | Plc
+
+
+class ModbusLink:
+    """A `drivers.port.Link` for the devices at one host and port."""
+
+    def __init__(self, name: str, host: str, port: int, devices: list[Device], period_s: float) -> None:
+        self.name = name
+        self.health = LinkHealth()
+        self._devices = devices
+        self._plcs = [device for device in devices if isinstance(device, Plc)]
+        self._connection = ModbusConnection(host, port)
+        self._period_s = period_s
+        self._task: asyncio.Task[None] | None = None
+        self._open_s: float | None = None  #: the cycle whose answers still count, by its time
+        self._sent_s = 0.0
+        self._connecting: asyncio.Task[None] | None = None
+        self._retry_s = float("-inf")
+        self._pause_s = FIRST_PAUSE_S
+
+    async def open(self) -> None:
+        """Connect. Raises OSError with what to do; the link may be used all the same, and goes on trying then."""
+        if not await self._connection.connect():
+            raise OSError(
+                f"bus {self.name}: no connection to {self._connection.where}; "
+                "check host and port, and that the device is switched on"
+            )
+
+    async def prepare(self) -> None:
+        """Check every device; set and prove the PLC's command watchdog. Raises PrepareRefused with every reason."""
+        self.silence()
+        await _cancel(self._connecting)
+        if not self._connection.connected and not await self._connection.connect():
+            raise PrepareRefused([f"{d.name}: no connection to {self._connection.where}" for d in self._devices])
+        reasons: list[str] = []
+        for device in self._devices:
+            deadline_s = asyncio.get_running_loop().time() + PREPARE_TIMEOUT_S
+            reasons += await device.prepare(self._connection, deadline_s)
+        if reasons:
+            raise PrepareRefused(reasons)
+        for plc in self._plcs:
+            plc.active = True
+
+    def silence(self) -> None:
+        """Nothing is written from now on; reading goes on."""
+        for plc in self._plcs:
+            plc.silence()
+
+    def trigger(self, now_s: float) -> None:
+        """Send the requests of this cycle."""
+        for device in self._devices:
+            device.answer = None
+        if self._task is not None and not self._task.done():
+            return
+        if not self._connection.connected:
+            self._reconnect(now_s)
+            return
+        self._sent_s = self._open_s = now_s
+        self._task = asyncio.create_task(self._exchange(now_s, now_s + EXCHANGE_SHARE * self._period_s))
+
+    async def _exchange(self, sent_s: float, deadline_s: float) -> None:
+        # Who did not answer last time is asked last, so that a dead unit costs the others nothing.
+        for device in sorted(self._devices, key=lambda device: device.missed):
+            try:
+                answer = await device.exchange(self._connection, deadline_s)
+                if self._open_s == sent_s:
+                    device.answer = answer
+                else:
+                    self._discard(f"{device.name}: an answer after its cycle")
+            except ModbusTimeout as error:
+                self.health.last_error = f"{device.name}: {error}"
+            except (ModbusFailed, ValueError) as error:
+                self._discard(f"{device.name}: {error}")
+
+    async def collect(self, inputs: Inputs, deadline_s: float) -> None:
+        """The answers that have come by `deadline_s`."""
+        if self._open_s is not None and self._task is not None and not self._task.done():
+            await asyncio.wait([self._task], timeout=max(0.0, deadline_s - asyncio.get_running_loop().time()))
+        self._open_s = None
+        absent: list[str] = []
+        for device in self._devices:
+            for trouble in device.fill(inputs, self._sent_s):
+                self.health.last_error = trouble
+            self.health.timeouts += device.missed > 0
+            if device.missed >= ANSWERS_ALLOWED:
+                absent.append(device.name)
+        self.health.absent = absent
+
+    def write(self, outputs: Outputs) -> None:
+        """What the next transaction with the PLC writes."""
+        for plc in self._plcs:
+            if plc.active:
+                try:
+                    plc.command(outputs)
+                except ValueError as error:
+                    self._discard(f"{plc.name}: {error}")
+
+    def _reconnect(self, now_s: float) -> None:
+        if now_s >= self._retry_s and (self._connecting is None or self._connecting.done()):
+            self._retry_s = now_s + self._pause_s
+            self._pause_s = min(2.0 * self._pause_s, LONGEST_PAUSE_S)
+            for plc in self._plcs:
+                plc.proven = False
+            self._connecting = asyncio.create_task(self._connect_again())
+
+    async def _connect_again(self) -> None:
+        if not await self._connection.connect():
+            self.health.last_error = f"no connection to {self._connection.where}"
+            return
+        self._pause_s = FIRST_PAUSE_S
+        self.health.reconnects += 1
+        for plc in self._plcs:
+            deadline_s = asyncio.get_running_loop().time() + PREPARE_TIMEOUT_S
+            if reasons := await plc.prove_again(self._connection, deadline_s):
+                self.health.last_error = reasons[0]
+
+    def _discard(self, reason: str) -> None:
+        self.health.malformed += 1
+        self.health.last_error = reason
+
+    async def close(self) -> None:
+        """Drop the connection. Idempotent."""
+        self.silence()
+        await _cancel(self._task)
+        await _cancel(self._connecting)
+        self._task = self._connecting = None
+        self._connection.close()
+        await asyncio.sleep(0)  # lets the transport release its socket
+
+
+async def _cancel(task: asyncio.Task[None] | None) -> None:
+    if task is not None:
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)

@@ -1,0 +1,82 @@
+"""Registers of a Modbus device to numbers and back, as its map says. No I/O.
+
+A block is read or written in one request. Each register goes high byte first; of a number in two registers the
+high word comes first or last, as the map says. Addresses in a map count from its `address_base`, on the wire from 0.
+"""
+
+import struct
+from collections.abc import Sequence
+from math import isfinite
+
+from drivers.device_map import BYTES, MAX_READ_REGISTERS
+
+_CODE = {"u16": "H", "i16": "h", "u32": "I", "i32": "i", "f32": "f"}
+
+Field = tuple[int, str]  #: address (from 0, as on the wire) and type
+
+
+class RegisterBlock:
+    """Numbers at fixed addresses, decoded and encoded together. Fields must not overlap; gaps are read, not used."""
+
+    def __init__(self, fields: Sequence[Field], word_order: str) -> None:
+        order = sorted(range(len(fields)), key=lambda k: fields[k][0])
+        self.address = fields[order[0]][0]
+        code = ">"
+        at = self.address
+        swapped: list[int] = []
+        for k in order:
+            address, kind = fields[k]
+            code += "xx" * (address - at) + _CODE[kind]
+            at = address + BYTES[kind] // 2
+            if BYTES[kind] == 4 and word_order == "low-first":
+                swapped.append(address - self.address)
+        self.count = at - self.address
+        self._fields = struct.Struct(code)
+        self._registers = struct.Struct(f">{self.count}H")
+        self._swapped = swapped
+        self._position = [order.index(k) for k in range(len(fields))]  #: of field k, in order of address
+
+    def decode(self, registers: Sequence[int]) -> list[float]:
+        """The numbers, in the order in which the fields were given. Raises ValueError for a wrong count."""
+        if len(registers) != self.count:
+            raise ValueError(f"{len(registers)} registers, asked for {self.count}")
+        try:
+            numbers = self._fields.unpack(self._registers.pack(*self._in_order(registers)))
+        except struct.error as error:
+            raise ValueError(f"no registers: {error}") from error
+        return [numbers[position] for position in self._position]
+
+    def encode(self, numbers: Sequence[float]) -> list[int]:
+        """The registers of numbers in the order of the fields.
+
+        Raises ValueError for a number that is not finite or does not fit its type.
+        """
+        if not all(isfinite(number) for number in numbers):
+            raise ValueError(f"{list(numbers)}: not finite")
+        ordered: list[float] = [0.0] * len(numbers)
+        for number, position in zip(numbers, self._position, strict=True):
+            ordered[position] = number
+        try:
+            packed = self._fields.pack(*ordered)
+        except (struct.error, OverflowError) as error:
+            raise ValueError(f"{list(numbers)}: {error}") from error
+        return self._in_order(self._registers.unpack(packed))
+
+    def _in_order(self, registers: Sequence[int]) -> list[int]:
+        words = list(registers)
+        for at in self._swapped:
+            words[at], words[at + 1] = words[at + 1], words[at]
+        return words
+
+
+def spans(fields: Sequence[Field]) -> list[list[int]]:
+    """The fields, by their place in `fields`, that fit into one read each; the fewest reads in order of address."""
+    groups: list[list[int]] = []
+    start = 0
+    for k in sorted(range(len(fields)), key=lambda k: fields[k][0]):
+        address, kind = fields[k]
+        if not groups or address + BYTES[kind] // 2 - start > MAX_READ_REGISTERS:
+            groups.append([])
+            start = address
+        groups[-1].append(k)
+    return groups

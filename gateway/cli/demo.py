@@ -1,0 +1,248 @@
+"""The demonstration: a simulated line, the gateway and the loop in their own processes, both cases in real time."""
+
+import asyncio
+import platform
+import shutil
+import sys
+import time
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from importlib.resources import as_file, files
+from pathlib import Path
+
+from rich.console import Console
+
+from gateway.cli.cases import CASES, CHANGE_AT_S, DURATION_S, Case
+from gateway.cli.children import ChildFailed, Children, free_udp_port
+from gateway.cli.demo_progress import Progress
+from gateway.cli.line_commands import known_maps
+from gateway.cli.operate_commands import request
+from gateway.cli.status_commands import parse_status
+from gateway.core.controller import LqiConfig, PidConfig, canonical
+from gateway.core.line import Line
+from gateway.core.line_file import load_line
+from gateway.core.line_template import line_template
+from gateway.core.messages import Arm, Command, SelectRecipe, Start, Stop
+from gateway.core.topics import GATEWAY_STATUS
+from gateway.mailbox.paths import GATEWAY_SOCKET
+from gateway.mailbox.port import Unreachable
+from gateway.mailbox.unix import UnixMailbox
+from gateway.supervisor.status import GatewayStatus
+
+READY_TIME_S = 20.0
+SETTLE_TIME_S = 30.0
+SETTLED_N = 0.6  #: a measured tension this near its set-point has settled (six times the sensors' noise)
+SETTLED_FOR_S = 2.0
+SIM_PRIORITY = 40  #: below the loop's: devices of a real line do not wait for this computer
+OWN_FILES = ("line.toml", "plant.toml", "controller.json", "result.json", "report.html", "recording", "data", "logs")
+
+
+class DemoFailed(Exception):
+    """The demonstration cannot go on; the text says why."""
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What a run is made of, and where it writes."""
+
+    out: Path
+    line: Line
+    config: LqiConfig | PidConfig
+    seed: int
+
+
+@dataclass(frozen=True)
+class Window:
+    """When a case ran, on CLOCK_MONOTONIC."""
+
+    case: Case
+    begin_s: float
+    end_s: float
+
+
+def run_demo(out: Path, law: str, seed: int) -> int:
+    """Run it and write everything into `out`. Returns the exit code: 0, 1 when something failed, 130 on Ctrl-C."""
+    console = Console(highlight=False)
+    started_s = time.monotonic()
+    try:
+        _clear(out)
+        with Children(out / "logs") as children:
+            setup, world_start_s = _begin(children, out, law, seed)
+            windows = asyncio.run(_story(children, setup, console))
+            _end_in_order(children)
+        from gateway.cli.demo_analysis import analyse
+
+        console.print("measuring: the same cases in stepped time, then the report")
+        analyse(setup, windows, world_start_s, started_s, console)
+    except (ChildFailed, DemoFailed, Unreachable) as error:
+        console.print(f"the demonstration failed: {error}", style="red", markup=False)
+        return 1
+    except KeyboardInterrupt:
+        console.print("stopped: the line was brought to rest and every process has ended")
+        return 130
+    return 0
+
+
+def _clear(out: Path) -> None:
+    """Remove what an earlier demonstration left; nothing else of the folder is touched."""
+    out.mkdir(parents=True, exist_ok=True)
+    for name in OWN_FILES:
+        path = out / name
+        if path.is_dir():
+            shutil.rmtree(path)
+        else:
+            path.unlink(missing_ok=True)
+    (out / "logs").mkdir()
+
+
+def _begin(children: Children, out: Path, law: str, seed: int) -> tuple[Setup, float]:
+    """Start the three processes. The line's file describes what the simulated line offers on the wire."""
+    from gateway.control.design import design_lqi, design_pid, task_of
+
+    with as_file(files("sim_plant") / "plants" / "s_real.toml") as plant:
+        shutil.copyfile(plant, out / "plant.toml")
+    ready = children.start_sim(
+        out / "plant.toml", "--record", out / "recording", "--seed", str(seed),
+        "--can-port", str(free_udp_port()), "--modbus-port", "0", "--priority", str(SIM_PRIORITY),
+    )  # fmt: skip
+    text = line_template(6, "line.toml")
+    for default, port in (("port = 43113", ready["can_port"]), ("port = 5020", ready["modbus_port"])):
+        if default not in text:
+            raise DemoFailed(f"the line template does not say {default!r}")
+        text = text.replace(default, f"port = {port}")
+    (out / "line.toml").write_text(text, encoding="utf-8")
+    line = load_line(text, "line.toml", known_maps())
+    config = {"lqi": design_lqi, "pid": design_pid}[law](task_of(line))
+    (out / "controller.json").write_bytes(canonical(config) + b"\n")
+    folders = ("--run-dir", children.run_folder, "--data-dir", out / "data")
+    children.start("gateway", out / "line.toml", *folders)
+    children.start("loop", out / "line.toml", "--controller", out / "controller.json", *folders)
+    return Setup(out, line, config, seed), ready["monotonic_start_s"]
+
+
+async def _story(children: Children, setup: Setup, console: Console) -> list[Window]:
+    """From SILENT through both cases to rest."""
+    operator = Operator(children)
+    try:
+        with Progress(console) as progress:
+            operator.progress = progress
+            progress.step("starting the processes")
+            await operator.wait(lambda status: status.loop.running, READY_TIME_S, "the loop")
+            progress.step("arming: limits, line PLC, load cells, the drives' watchdogs")
+            await operator.order(Arm())
+            progress.step("tensioning the web, then to speed")
+            await operator.order(Start())
+            windows = [await _run_case(operator, setup, case) for case in CASES]
+            progress.step("stopping")
+            await operator.order(Stop())
+            await operator.wait(_at_rest, 20.0, "the stop")
+            return windows
+    finally:
+        await operator.close()
+
+
+async def _run_case(operator: "Operator", setup: Setup, case: Case) -> Window:
+    progress = operator.progress
+    await operator.order(SelectRecipe(name=case.name))
+    progress.step(f"{case.title.lower()}: settling at its set-points")
+    await operator.wait_settled(case.tension_n, case.unwind_speed_m_per_s)
+    begin_s = time.monotonic()
+    progress.case(case.title, DURATION_S)
+    await operator.watch(CHANGE_AT_S)
+    await operator.order(case.change)
+    await operator.watch(begin_s + DURATION_S - time.monotonic())
+    end_s = time.monotonic()
+    # Beyond the window, so that it is whole whenever exactly the change took effect.
+    await operator.watch(4 * setup.line.control.period_s)
+    return Window(case, begin_s, end_s)
+
+
+def _at_rest(status: GatewayStatus) -> bool:
+    quiet = all(span.torque_nm == 0.0 and span.drive != "ENABLED" for span in status.spans)
+    return status.loop.state == "STOP" and quiet
+
+
+def _end_in_order(children: Children) -> None:
+    for name in ("loop", "gateway", "sim"):
+        code = children.end(name)
+        if code != 0:
+            raise DemoFailed(f"{name} ended with exit code {code}: see {children.log(name)}")
+
+
+class Operator:
+    """A person at the command line, scripted: looks at the status, gives commands."""
+
+    def __init__(self, children: Children) -> None:
+        self.progress: Progress
+        self._children = children
+        self._stopping = False
+        self._mailbox = UnixMailbox()
+        self._mailbox.connect({GATEWAY_STATUS}, children.run_folder / GATEWAY_SOCKET)
+
+    async def close(self) -> None:
+        await self._mailbox.close()
+
+    async def order(self, command: Command) -> None:
+        self._stopping = isinstance(command, Stop)
+        reply = await request(self._children.run_folder, command, timeout_s=15.0)
+        if not reply.ok:
+            raise DemoFailed(f"{command.command}: {'; '.join([reply.text, *reply.reasons])}")
+
+    async def look(self) -> GatewayStatus | None:
+        """The status now; None while the gateway is not up."""
+        self._children.check()
+        try:
+            status = parse_status(await self._mailbox.request(GATEWAY_STATUS, b"", 2.0))
+        except Unreachable:
+            return None
+        self.progress.show(status)
+        if status.loop.state == "STOP" and not self._stopping:
+            told = [event.text for event in status.events if event.kind == "state"]
+            raise DemoFailed(f"the line has stopped: {told[-1] if told else 'no event says why'}")
+        return status
+
+    async def wait(self, enough, within_s: float, what: str) -> None:  # noqa: ANN001
+        """Look on until `enough(status)`."""
+        deadline_s = time.monotonic() + within_s
+        while time.monotonic() < deadline_s:
+            status = await self.look()
+            if status is not None:
+                if enough(status):
+                    return
+            await asyncio.sleep(0.1)
+        raise DemoFailed(f"{what} took longer than {within_s:g} s")
+
+    async def wait_settled(self, tension_n: tuple[float, ...], speed_m_per_s: float) -> None:
+        since_s = time.monotonic()
+
+        def settled(status: GatewayStatus) -> bool:
+            nonlocal since_s
+            spans = zip(status.spans, tension_n, strict=True)
+            near = all(span.setpoint_n == target and abs(span.error_n or 0.0) < SETTLED_N for span, target in spans)
+            if not near or status.speed_setpoint_m_per_s != speed_m_per_s:
+                since_s = time.monotonic()
+            return time.monotonic() - since_s >= SETTLED_FOR_S
+
+        await self.wait(settled, SETTLE_TIME_S, "settling")
+
+    async def watch(self, for_s: float) -> None:
+        """Look on for a while."""
+        end_s = time.monotonic() + for_s
+        while (left_s := end_s - time.monotonic()) > 0.0:
+            await asyncio.sleep(min(0.1, left_s))
+            await self.look()
+
+
+def machine_lines(log: Path) -> list[str]:
+    """What this computer is, and what it granted the loop, in the loop's own words."""
+    kernel = f"{platform.system()} {platform.release()}, Python {platform.python_version()}"
+    said = log.read_text(errors="replace").splitlines() if log.exists() else []
+    return [kernel, *(text for text in said if "SILENT" not in text)]
+
+
+def now_iso() -> str:
+    return datetime.now(timezone.utc).isoformat(timespec="seconds")
+
+
+def command_line() -> str:
+    return " ".join(["r2rgate", *sys.argv[1:]])

@@ -1,0 +1,49 @@
+"""The `r2rgate` command: every subcommand, and nothing but their names and places."""
+
+from typing import Annotated
+
+import typer
+
+from gateway.cli import line_commands, operate_commands, process_commands, status_commands
+from gateway.cli.lifetime import follow_parent
+
+app = typer.Typer(
+    name="r2rgate",
+    help="Edge gateway for roll-to-roll lines: tension and speed control over the line's own drives.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+ENGINEER, PROCESSES, LINE = "Engineer", "Processes", "Running the line"
+
+app.command(rich_help_panel=ENGINEER)(line_commands.init)
+app.command(rich_help_panel=ENGINEER)(line_commands.check)
+app.command(rich_help_panel=ENGINEER)(process_commands.design)
+app.command(rich_help_panel=PROCESSES)(process_commands.run)
+app.command(rich_help_panel=PROCESSES)(process_commands.loop)
+app.command(rich_help_panel=PROCESSES)(process_commands.gateway)
+app.command(rich_help_panel=PROCESSES)(process_commands.sim)
+app.command(rich_help_panel=PROCESSES)(process_commands.demo)
+app.command(rich_help_panel=LINE)(operate_commands.arm)
+app.command(rich_help_panel=LINE)(operate_commands.start)
+app.command(rich_help_panel=LINE)(operate_commands.hold)
+app.command(rich_help_panel=LINE)(operate_commands.stop)
+app.command("set", rich_help_panel=LINE)(operate_commands.set_tension)
+app.command(rich_help_panel=LINE)(operate_commands.speed)
+app.command(rich_help_panel=LINE)(operate_commands.recipe)
+app.command(rich_help_panel=LINE)(status_commands.status)
+
+
+@app.callback(invoke_without_command=True)
+def top(version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False) -> None:
+    if version:
+        from importlib.metadata import version as installed
+
+        typer.echo(f"r2rgate {installed('r2rgate')}")
+        raise typer.Exit
+
+
+def main() -> None:
+    follow_parent()
+    app()

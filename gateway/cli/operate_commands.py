@@ -1,0 +1,129 @@
+"""Commands of the operator. All go through the gateway, which keeps them; `stop` goes straight to the loop."""
+
+import asyncio
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from gateway.core.messages import Arm, Command, Hold, Reply, SelectRecipe, SetSpeed, SetTension, Start, Stop
+from gateway.core.topics import GATEWAY_COMMAND, LOOP_COMMAND, Topic
+from gateway.mailbox.paths import GATEWAY_SOCKET, LOOP_SOCKET
+from gateway.mailbox.port import Unreachable
+from gateway.mailbox.unix import UnixMailbox
+
+REFUSED, UNREACHABLE = 2, 3
+ARM_TIME_S = 15.0
+REPLY_TIME_S = 3.0
+
+RunFolder = Annotated[Path | None, typer.Option("--run-dir", help="Where the line's sockets lie.")]
+Json = Annotated[bool, typer.Option("--json", help="Print the reply as JSON.")]
+
+
+def arm(run_dir: RunFolder = None, as_json: Json = False) -> None:
+    """Prove limits, line PLC, load cells and the drives' watchdogs; then READY, with zero torque.
+
+    Example: r2rgate arm
+    """
+    _send(Arm(), run_dir, as_json, ARM_TIME_S)
+
+
+def start(run_dir: RunFolder = None, as_json: Json = False) -> None:
+    """Tension the web at standstill, then run at the set speed. After `hold`: back to speed.
+
+    Example: r2rgate start
+    """
+    _send(Start(), run_dir, as_json)
+
+
+def hold(run_dir: RunFolder = None, as_json: Json = False) -> None:
+    """Ramp the line to standstill and keep the web under tension.
+
+    Example: r2rgate hold
+    """
+    _send(Hold(), run_dir, as_json)
+
+
+def stop(run_dir: RunFolder = None, as_json: Json = False) -> None:
+    """Controlled stop: ramp to standstill, then torque off. Straight to the loop, also when the gateway is gone.
+
+    It is no emergency stop: that is hard-wired, beside the line.
+
+    Example: r2rgate stop
+    """
+    _send(Stop(), run_dir, as_json)
+
+
+def set_tension(
+    span: Annotated[int, typer.Argument(help="Number of the span, from 1.")],
+    tension_n: Annotated[float, typer.Argument(help="Tension in N.")],
+    step: Annotated[bool, typer.Option("--step", help="At once rather than ramped; the line's limits bound it.")] = False,
+    run_dir: RunFolder = None,
+    as_json: Json = False,
+) -> None:
+    """Set the tension of a span.
+
+    Example: r2rgate set 3 44
+    """
+    _send(SetTension(span=span, tension_n=tension_n, step=step), run_dir, as_json)
+
+
+def speed(
+    speed_m_per_s: Annotated[float, typer.Argument(help="Web speed at the unwinder in m/s.")],
+    step: Annotated[bool, typer.Option("--step", help="At once rather than ramped; the line's limits bound it.")] = False,
+    run_dir: RunFolder = None,
+    as_json: Json = False,
+) -> None:
+    """Set the line's speed.
+
+    Example: r2rgate speed 0.05
+    """
+    _send(SetSpeed(speed_m_per_s=speed_m_per_s, step=step), run_dir, as_json)
+
+
+def recipe(
+    name: Annotated[str, typer.Argument(help="A recipe of the line's file.")],
+    run_dir: RunFolder = None,
+    as_json: Json = False,
+) -> None:
+    """Move all set-points to those of a recipe: a grade change.
+
+    Example: r2rgate recipe velocity
+    """
+    _send(SelectRecipe(name=name), run_dir, as_json)
+
+
+async def request(run_folder: Path, command: Command, timeout_s: float = REPLY_TIME_S) -> Reply:
+    """Send one command and wait for its reply. Raises Unreachable."""
+    topic, socket = _way(command)
+    mailbox = UnixMailbox()
+    mailbox.connect({topic}, run_folder / socket)
+    try:
+        answer = await mailbox.request(topic, command.model_dump_json().encode(), timeout_s)
+    finally:
+        await mailbox.close()
+    return Reply.model_validate_json(answer)
+
+
+def _way(command: Command) -> tuple[Topic, str]:
+    return (LOOP_COMMAND, LOOP_SOCKET) if isinstance(command, Stop) else (GATEWAY_COMMAND, GATEWAY_SOCKET)
+
+
+def _send(command: Command, run_dir: Path | None, as_json: bool, timeout_s: float = REPLY_TIME_S) -> None:
+    from gateway.cli.status_commands import choose_run_folder
+
+    try:
+        reply = asyncio.run(request(choose_run_folder(run_dir), command, timeout_s))
+    except Unreachable as error:
+        typer.echo(str(error), err=True)
+        raise typer.Exit(UNREACHABLE) from None
+    if as_json:
+        typer.echo(reply.model_dump_json(indent=2))
+    elif reply.ok:
+        typer.echo(f"{reply.state}: {reply.text}")
+    else:
+        typer.echo(f"refused ({reply.state}): {reply.text}", err=True)
+        for reason in reply.reasons:
+            typer.echo(f"  - {reason}", err=True)
+    if not reply.ok:
+        raise typer.Exit(REFUSED)

@@ -1,0 +1,181 @@
+"""The processes of r2rgate, each in the foreground, and `run`, which starts them together."""
+
+import sys
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from gateway.cli.line_commands import known_maps
+from gateway.core.line import Line
+from gateway.core.line_file import load_line
+from gateway.core.line_problem import LineRefused
+from gateway.mailbox.paths import default_run_folder
+
+REFUSED, ALREADY_RUNNING = 2, 3
+
+LineFile = Annotated[Path, typer.Argument(help="The line description (r2rgate init writes one).")]
+RunFolder = Annotated[Path | None, typer.Option("--run-dir", help="Where the line's sockets shall lie.")]
+DataFolder = Annotated[Path | None, typer.Option("--data-dir", help="Where history and configurations are kept.")]
+ControllerFile = Annotated[
+    Path | None, typer.Option("--controller", help="The controller configuration (r2rgate design writes one).")
+]
+
+
+def read_line(file: Path) -> Line:
+    """The line of `file`; every problem goes to standard error and ends the command with code 2."""
+    try:
+        return load_line(file.read_text(encoding="utf-8"), str(file), known_maps())
+    except LineRefused as refused:
+        for problem in refused.problems:
+            typer.echo(str(problem), err=True)
+    except (OSError, UnicodeDecodeError) as error:
+        typer.echo(f"{file}: {error}", err=True)
+    raise typer.Exit(REFUSED)
+
+
+def default_data_folder(line: Line) -> Path:
+    """/var/lib/r2rgate where it may be written, else the user's own state folder; then site-line."""
+    from os import W_OK, access, environ
+
+    service = Path("/var/lib/r2rgate")
+    own = Path(environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state") / "r2rgate"
+    return (service if access(service, W_OK) else own) / f"{line.site}-{line.line}"
+
+
+def design(
+    file: LineFile,
+    law: Annotated[Literal["lqi", "pid"], typer.Option(help="The control law.")] = "lqi",
+    out: Annotated[Path, typer.Option(help="The file to write.")] = Path("controller.json"),
+) -> None:
+    """Design a controller from the line's nominal model and write its configuration.
+
+    Example: r2rgate design line.toml --law lqi --out controller.json
+    """
+    from gateway.control.design import DesignRefused, design_lqi, design_pid, task_of
+    from gateway.core.controller import canonical, config_hash
+
+    line = read_line(file)
+    try:
+        config = {"lqi": design_lqi, "pid": design_pid}[law](task_of(line))
+    except DesignRefused as refused:
+        typer.echo(f"no {law} controller for {file}: {refused}", err=True)
+        raise typer.Exit(REFUSED) from None
+    out.write_bytes(canonical(config) + b"\n")
+    typer.echo(f"{out}: {law} for {line.n} spans at {line.control.period_s * 1e3:g} ms, hash {config_hash(config)[:12]}")
+
+
+def loop(
+    file: LineFile,
+    controller: ControllerFile = None,
+    run_dir: RunFolder = None,
+    data_dir: DataFolder = None,
+) -> None:
+    """The control loop: SILENT until armed. SIGTERM and Ctrl-C stop the line first.
+
+    Example: r2rgate loop line.toml --controller controller.json
+    """
+    from gateway.core.controller import ControllerRefused, parse_controller
+    from gateway.loop.process import run_loop
+    from gateway.mailbox.listener import AlreadyRunning, CannotListen, PathTooLong
+
+    line = read_line(file)
+    path = controller or (data_dir or default_data_folder(line)) / "controller.json"
+    try:
+        config = parse_controller(path.read_bytes())
+        _require_fit(line, config.n, config.period_s, path)
+        run_loop(line, config, run_dir or default_run_folder(line), lambda text: print(text, file=sys.stderr, flush=True))
+    except FileNotFoundError:
+        _refuse(f"there is no controller configuration at {path}: r2rgate design {file} --out {path} writes one")
+    except ControllerRefused as refused:
+        _refuse(f"{path} is not used: {refused}")
+    except AlreadyRunning as error:
+        typer.echo(f"a loop runs here already, this one ends: {error}", err=True)
+        raise typer.Exit(ALREADY_RUNNING) from None
+    except (CannotListen, PathTooLong, OSError) as error:
+        _refuse(f"the loop cannot start: {error}")
+
+
+def gateway(file: LineFile, run_dir: RunFolder = None, data_dir: DataFolder = None) -> None:
+    """The gateway process: history, status, and the way of commands to the loop.
+
+    Example: r2rgate gateway line.toml
+    """
+    from gateway.supervisor.process import run_gateway
+
+    line = read_line(file)
+    raise typer.Exit(run_gateway(line, run_dir or default_run_folder(line), data_dir or default_data_folder(line)))
+
+
+def sim(
+    plant: Annotated[Path, typer.Argument(help="The plant: the truth of the simulated line.")],
+    record: Annotated[Path, typer.Option(help="A new folder for the recording of what really happens.")],
+    seed: Annotated[int, typer.Option(min=0, help="Of all noise.")] = 0,
+    scale: Annotated[float, typer.Option(min=0.001, help="How much faster than real time.")] = 1.0,
+    can_port: Annotated[int | None, typer.Option(help="In place of the plant's.")] = None,
+    modbus_port: Annotated[int | None, typer.Option(help="In place of the plant's; 0 takes a free one.")] = None,
+    priority: Annotated[
+        int, typer.Option(min=0, max=90, help="Real-time priority, where permitted: devices do not wait for a computer.")
+    ] = 0,
+) -> None:
+    """The simulated line: drives, load cells and line PLC on their wires, in a process of its own.
+
+    Prints one line of JSON once every wire is open. Runs until Ctrl-C.
+
+    Example: r2rgate sim sim_plant/plants/s_real.toml --record out/recording
+    """
+    from gateway.cli.lifetime import be_punctual
+    from sim_plant.process import run_plant
+
+    if priority:
+        be_punctual(priority)
+    code = run_plant(
+        plant, record_folder=record, seed=seed, scale=scale, can_port=can_port, modbus_port=modbus_port
+    )
+    raise typer.Exit(code)
+
+
+def run(
+    file: LineFile,
+    controller: ControllerFile = None,
+    plant: Annotated[Path | None, typer.Option(help="Start this simulated line as well.")] = None,
+    run_dir: RunFolder = None,
+    data_dir: DataFolder = None,
+) -> None:
+    """Loop and gateway together in this terminal, with the status on the screen. Ctrl-C stops the line, then ends.
+
+    Example: r2rgate run line.toml
+    """
+    from gateway.cli.together import run_together
+
+    line = read_line(file)
+    data = data_dir or default_data_folder(line)
+    raise typer.Exit(run_together(file, line, controller, plant, run_dir or default_run_folder(line), data))
+
+
+def demo(
+    out: Annotated[Path, typer.Option(help="Folder for result, report and logs; what was there is replaced.")] = Path(
+        "out/demo"
+    ),
+    law: Annotated[Literal["lqi", "pid"], typer.Option(help="The control law.")] = "lqi",
+    seed: Annotated[int, typer.Option(min=0, help="Of the simulated line's noise.")] = 1,
+) -> None:
+    """The demonstration: a simulated six-span line, loop and gateway, both benchmark cases in real time, a report.
+
+    Example: r2rgate demo --law pid
+    """
+    from gateway.cli.demo import run_demo
+
+    raise typer.Exit(run_demo(out, law, seed))
+
+
+def _require_fit(line: Line, n: int, period_s: float, path: Path) -> None:
+    if n != line.n:
+        _refuse(f"{path} is for {n} spans, the line has {line.n}: design one for it (r2rgate design)")
+    if abs(period_s - line.control.period_s) > 1e-9:
+        _refuse(f"{path} is for a period of {period_s} s, the line's is {line.control.period_s} s: design it anew")
+
+
+def _refuse(text: str) -> None:
+    typer.echo(text, err=True)
+    raise typer.Exit(REFUSED)

@@ -1,0 +1,140 @@
+"""Stepped time: the loop's whole cycle over an in-memory link against the simulated line, as fast as the machine goes."""
+
+
+import time
+from collections.abc import Awaitable
+from dataclasses import dataclass, field
+from math import ceil
+from typing import TypeVar
+
+import numpy as np
+
+from drivers.memory import MemoryLink
+from gateway.cli.cases import CHANGE_AT_S, DURATION_S, Case
+from gateway.control.laws import make_law
+from gateway.core.controller import LqiConfig, PidConfig
+from gateway.core.line import Line
+from gateway.core.messages import Arm, Command, Reply
+from gateway.core.metrics import rmse_n, rmse_per_span_n
+from gateway.core.signals import FloatArray
+from gateway.core.states import Phase
+from gateway.core.telemetry import Frame, pack, unpack
+from gateway.loop.commands import carry_out, prepare_to_arm
+from gateway.loop.cycle import Cycle
+from gateway.loop.machine import Machine
+from gateway.loop.pacer import Tick
+from safety.actions import Finding
+from sim_plant.plant import Plant
+from sim_plant.stepped import SteppedLine
+
+T = TypeVar("T")
+
+
+@dataclass
+class SteppedLoop:
+    """A loop and a simulated line that share a clock which only `step` moves."""
+
+    line: Line
+    config: LqiConfig | PidConfig
+    plant: Plant
+    seed: int = 0
+    frames: list[bytes] = field(default_factory=list[bytes])
+    transitions: list[tuple[float, Phase, str]] = field(default_factory=list[tuple[float, Phase, str]])
+
+    def __post_init__(self) -> None:
+        self.now_s = 0.0
+        self.periods = 0
+        self.truth = SteppedLine(self.plant, self.seed, self.line.control.latency_s)
+        link = MemoryLink(self.line, self.truth)
+        self.cycle = Cycle(self.line, make_law(self.config), [link], lambda: self.now_s, self._record, self._announce)
+        _finish(link.open())
+
+    def begin_in_production(self, tension_n: FloatArray, unwind_speed_m_per_s: float) -> None:
+        """Start at the plant's own equilibrium with the law engaged there, as after hours of running."""
+        torque = self.truth.start_at_equilibrium(tension_n, unwind_speed_m_per_s)
+        cycle = self.cycle
+        _finish(cycle.links[0].prepare())
+        cycle.machine = Machine(Phase.RUNNING)
+        cycle.outputs.torque_nm = torque.copy()
+        cycle.setpoints.tension_target_n = tension_n.copy()
+        cycle.setpoints.speed_m_per_s = cycle.setpoints.speed_target_m_per_s = unwind_speed_m_per_s
+
+    def arm(self) -> Reply:
+        """As the operator's `arm`, without waiting for the drives: step on until READY."""
+        return _finish(prepare_to_arm(self.cycle)) or self.command(Arm())
+
+    def command(self, command: Command) -> Reply:
+        return carry_out(self.cycle, command, self.now_s)
+
+    def step(self, periods: int = 1) -> None:
+        """Run control periods; each cycle runs at its due time."""
+        period_s = self.line.control.period_s
+        for _ in range(periods):
+            self.now_s = self.periods * period_s
+            _finish(self.cycle.period(Tick(self.now_s, self.now_s, 0)))
+            self.periods += 1
+
+    def step_until(self, phase: Phase, within_s: float) -> bool:
+        """Step until the machine is in `phase`; False when it is not within that time."""
+        for _ in range(ceil(within_s / self.line.control.period_s)):
+            if self.cycle.machine.phase is phase:
+                return True
+            self.step()
+        return self.cycle.machine.phase is phase
+
+    def recorded(self) -> list[Frame]:
+        return [unpack(frame) for frame in self.frames]
+
+    def _record(self, frame: Frame) -> None:
+        self.frames.append(pack(frame))
+
+    def _announce(self, before: Machine, after: Machine, findings: list[Finding]) -> None:
+        self.transitions.append((self.now_s, after.phase, after.reason))
+
+
+@dataclass(frozen=True)
+class SteppedResult:
+    """A case in stepped time, judged by the recorder at the simulated devices."""
+
+    rmse_n: float
+    rmse_per_span_n: FloatArray  #: (n,)
+    unsafe_events: int
+    wall_s: float  #: what it took
+    tension_n: FloatArray  #: (k, n), true, every millisecond
+    time_s: FloatArray  #: (k,)
+
+
+def run_case(line: Line, config: LqiConfig | PidConfig, plant: Plant, case: Case, seed: int) -> SteppedResult:
+    """The case from the plant's own equilibrium on, over its whole duration."""
+    loop = SteppedLoop(line, config, plant, seed)
+    loop.begin_in_production(np.array(case.tension_n), case.unwind_speed_m_per_s)
+    period_s = line.control.period_s
+    started = time.perf_counter()
+    loop.step(round(CHANGE_AT_S / period_s))
+    loop.now_s = loop.periods * period_s
+    reply = loop.command(case.change)
+    if not reply.ok:
+        raise ValueError(f"{case.title}: {reply.text}")
+    loop.step(round((DURATION_S - CHANGE_AT_S) / period_s))
+    loop.truth.sample(DURATION_S)
+    wall_s = time.perf_counter() - started
+    recording = loop.truth.recorder.recording()
+    setpoints = case.setpoints_n(recording.time_s)
+    return SteppedResult(
+        rmse_n=rmse_n(recording.tension_n, setpoints),
+        rmse_per_span_n=rmse_per_span_n(recording.tension_n, setpoints),
+        unsafe_events=loop.truth.recorder.unsafe_total,
+        wall_s=wall_s,
+        tension_n=recording.tension_n,
+        time_s=recording.time_s,
+    )
+
+
+def _finish(awaitable: Awaitable[T]) -> T:
+    """The result of something that never waits: no event loop is needed, and none is paid for."""
+    coroutine = awaitable.__await__()
+    try:
+        next(coroutine)
+    except StopIteration as end:
+        return end.value
+    raise RuntimeError("an in-memory link has waited for something")

@@ -1,0 +1,53 @@
+"""PID with gain matrices on tensions and speeds (eq. pid), filtered derivative and back-calculation."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gateway.control.law import Decision, Deviation, Measured
+from gateway.core.controller import PidConfig
+from gateway.core.signals import FloatArray
+
+
+@dataclass(slots=True)
+class PidState:
+    integral_nm: FloatArray  #: (n,), the integral part as torque, so that it can be compared with the limits
+    tension_error_n: FloatArray  #: (n,), of the period before
+    error_rate_n_per_s: FloatArray  #: (n,), filtered
+
+
+class Pid:
+    """The law of `PidConfig`, with its matrices as arrays."""
+
+    def __init__(self, config: PidConfig) -> None:
+        self.n = config.n
+        self.config = config
+        self._proportional = np.array(config.gain_proportional)
+        self._integral = np.array(config.gain_integral)
+        self._derivative = np.array(config.gain_derivative)
+        self._deviation = Deviation(config.feedforward, config.draw_spans)
+        # First-order filter, backward Euler: rate_k = a rate_{k-1} + (e_k - e_{k-1}) / (tau + h)
+        self._rate_decay = config.derivative_filter_s / (config.derivative_filter_s + config.period_s)
+        self._rate_gain = 1.0 / (config.derivative_filter_s + config.period_s)
+
+    def engage(self, measured: Measured, tension_setpoint_n: FloatArray, applied_nm: FloatArray) -> PidState:
+        error = self._deviation.errors(measured, tension_setpoint_n)[0]
+        state = PidState(np.zeros(self.n), error, np.zeros(self.n))
+        asked = self.ask(state, measured, tension_setpoint_n).torque_nm
+        return PidState(applied_nm - asked, error, np.zeros(self.n))
+
+    def ask(self, state: PidState, measured: Measured, tension_setpoint_n: FloatArray) -> Decision:
+        tension_error, speed_error, controlled, equilibrium = self._deviation.errors(measured, tension_setpoint_n)
+        # The paper's e is reference minus measurement; `Deviation` gives measurement minus reference.
+        torque = equilibrium - self._proportional @ np.concatenate((tension_error, speed_error))
+        torque += state.integral_nm
+        torque -= self._derivative @ self._rate(state, tension_error)
+        return Decision(torque, tension_error, controlled)
+
+    def commit(self, state: PidState, decision: Decision, applied_nm: FloatArray) -> PidState:
+        integral = state.integral_nm - self.config.period_s * (self._integral @ decision.controlled_error)
+        integral -= self.config.antiwindup * (decision.torque_nm - applied_nm)
+        return PidState(integral, decision.tension_error_n, self._rate(state, decision.tension_error_n))
+
+    def _rate(self, state: PidState, tension_error_n: FloatArray) -> FloatArray:
+        return self._rate_decay * state.error_rate_n_per_s + self._rate_gain * (tension_error_n - state.tension_error_n)

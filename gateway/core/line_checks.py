@@ -1,0 +1,69 @@
+"""What the tables of a line description must satisfy together: a table of rules, one function each.
+
+A rule runs when the tables that it reads are valid in themselves, so that one mistake hides as few others as
+possible, and a rule that finds something stops no other.
+"""
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from functools import partial
+
+from gateway.core import line_rules_process as process
+from gateway.core import line_rules_wiring as wiring
+from gateway.core.line import Line
+from gateway.core.line_problem import Finding
+from gateway.core.line_rules_wiring import Role
+
+__all__ = ["RULES", "Role", "findings"]
+
+
+@dataclass(frozen=True, slots=True)
+class Rule:
+    reads: frozenset[str]  #: the tables of the file that must be valid in themselves
+    check: Callable[[Line], Iterable[Finding]]
+
+
+def _rule(reads: str, check: Callable[[Line], Iterable[Finding]]) -> Rule:
+    return Rule(frozenset(reads.split()), check)
+
+
+_DEVICES = "drives load_cells plc"
+
+RULES: tuple[Rule, ...] = (
+    _rule("rollers spans", wiring.rollers_match_spans),
+    _rule("rollers drives", wiring.one_drive_per_roller),
+    _rule("spans load_cells", wiring.one_load_cell_per_span),
+    _rule("rollers", partial(wiring.unique_names, "rollers")),
+    _rule("spans", partial(wiring.unique_names, "spans")),
+    _rule("buses", partial(wiring.unique_names, "buses")),
+    _rule("recipes", partial(wiring.unique_names, "recipes")),
+    _rule(_DEVICES, wiring.unique_device_names),
+    _rule(f"buses {_DEVICES}", wiring.buses_exist),
+    _rule(f"buses {_DEVICES}", wiring.buses_are_used),
+    _rule("buses", wiring.buses_are_reachable),
+    _rule(_DEVICES, wiring.addresses_differ),
+    _rule(f"buses {_DEVICES}", wiring.canopen_addresses),
+    _rule(f"control buses {_DEVICES}", wiring.can_buses_have_room),
+    _rule("limits", process.tension_limits_ordered),
+    _rule("limits web", process.web_bears_the_tension),
+    _rule("limits", process.steps_within_limits),
+    _rule("control", process.latency_is_possible),
+    _rule("control limits", process.watchdog_outlasts_a_late_cycle),
+    _rule("limits moves", process.stop_is_possible),
+    _rule("limits drives", process.drives_give_the_torque),
+    _rule("limits load_cells", process.load_cells_see_the_tension),
+    _rule("spans recipes", process.recipes_match_spans),
+    _rule("limits recipes", process.recipes_within_tension),
+    _rule("limits web recipes", process.recipes_within_speed),
+    _rule("limits moves recipes", process.tensioning_in_time),
+    _rule("limits web rollers spans recipes", process.recipes_within_torque),
+    _rule("limits web rollers spans recipes", process.speed_limit_within_torque),
+)
+
+
+def findings(line: Line, valid: set[str], known_maps: Mapping[str, Role] | None) -> list[Finding]:
+    """What all rules find in the tables of `line` that are `valid`; the others need not exist."""
+    rules = list(RULES)
+    if known_maps is not None:
+        rules.append(_rule(f"buses {_DEVICES}", partial(wiring.maps_fit, known_maps=known_maps)))
+    return [finding for rule in rules if rule.reads <= valid for finding in rule.check(line)]

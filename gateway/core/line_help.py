@@ -1,0 +1,124 @@
+"""What each key of `line.toml` means, in one line: the comments of `init` and the descriptions of the JSON schema."""
+
+from typing import Any
+
+from gateway.core.line import Line
+
+_DEVICE = {
+    "name": "your name for the device, unique among all devices",
+    "bus": "the [[buses]] entry that it is wired to",
+    "map": "device type: which registers or objects mean what",
+}
+_PARAMETER = "nominal value, and how far the truth may lie from it"
+
+#: By the name of the model in `line.py`, then by key.
+HELP: dict[str, dict[str, str]] = {
+    "Line": {
+        "format": "version of this file format",
+        "site": "first part of every address on the network",
+        "line": "second part; unique within the site",
+        "description": "for people",
+        "control": "the loop's clock",
+        "limits": "what must never be left; changed only here, by an engineer",
+        "moves": "how set-points move, and how the line stops",
+        "web": "the material",
+        "rollers": "the driven ones, in the direction of transport; the unwinder (roller 0) is not listed",
+        "spans": "free lengths of web, in the direction of transport; span i ends at roller i",
+        "buses": "the wires",
+        "drives": "one per roller, torque-controlled",
+        "load_cells": "one per tension-controlled span",
+        "plc": "drives the unwinder, owns the permissive and the emergency stop",
+        "recipes": "set-points for a grade; the line starts with the first",
+    },
+    "Control": {
+        "period_s": "one control cycle",
+        "latency_s": "from a sample to the torque it causes; at least one period, torque acts with the next cycle",
+        "cpu": "pin the loop to this processor; without this key: the last one",
+        "priority": "real-time priority (SCHED_FIFO), where permitted",
+    },
+    "Limits": {
+        "torque_nm": "per drive, in either direction",
+        "torque_rate_nm_per_s": "fastest change of a torque command",
+        "tension_min_n": "below it the web is slack: stop",
+        "tension_max_n": "above it the web may tear: stop",
+        "speed_max_m_per_s": "fastest web speed",
+        "tension_step_max_n": "largest set-point change made at once; larger ones are ramped",
+        "speed_step_max_m_per_s": "the same for the speed",
+        "hold_periods": "periods without a signal until the line is stopped",
+        "watchdog_s": "the drives take torque off by themselves after this silence",
+        "tensioning_time_s": "after start every span must reach its tension within this time",
+    },
+    "Moves": {
+        "tension_rate_n_per_s": "ramp of tension set-points",
+        "speed_rate_m_per_s2": "ramp of the speed set-point",
+        "stop_rate_m_per_s2": "ramp of a controlled stop",
+        "stop_time_s": "torque goes off after this time in a stop, whatever the speed",
+        "torque_off_rate_nm_per_s": "ramp of the torque to zero at the end of a stop",
+    },
+    "Web": {
+        "stiffness_n": "E A, modulus times cross-section",
+        "tension_before_n": "tension ahead of span 1, as far as it acts on the rollers",
+        "tension_after_n": "tension behind the last roller",
+    },
+    "Parameter": {
+        "value": "nominal value",
+        "tolerance": "how far the truth may lie from it, as a fraction: 0.3 means 30 % either way",
+    },
+    "Roller": {
+        "name": "your name for the roller",
+        "radius_m": _PARAMETER,
+        "inertia_kg_m2": "roller, gear and motor, seen at the roller",
+        "friction_nms_per_rad": "viscous friction",
+    },
+    "Span": {
+        "name": "your name for the span",
+        "length_m": "free web between the two rollers",
+        "control": '"tension" needs a load cell; "draw" keeps a speed ratio and needs none',
+    },
+    "CanopenBus": {
+        "name": "your name for the bus",
+        "protocol": '"canopen" or "modbus-tcp"',
+        "interface": '"socketcan" for a CAN card, "udp_multicast" or "virtual" for the simulated line',
+        "channel": 'socketcan: the network interface, e.g. "can0"; udp_multicast: the group\'s address',
+        "port": "udp_multicast only",
+        "bitrate_bit_per_s": "as set in the drives",
+    },
+    "ModbusTcpBus": {
+        "name": "your name for the bus",
+        "protocol": '"canopen" or "modbus-tcp"',
+        "host": "address or name of the device or gateway",
+        "port": "TCP port",
+    },
+    "Drive": {
+        **_DEVICE,
+        "address": "CANopen node, 1 to 127",
+        "roller": "which roller it drives, counted from 1",
+        "rated_torque_nm": "at the roller, as commissioned in the drive; commands are fractions of it",
+    },
+    "LoadCell": {
+        **_DEVICE,
+        "address": "Modbus unit of the amplifier",
+        "span": "which span it measures, counted from 1",
+        "channel": "channel of the amplifier",
+        "capacity_n": "a reading beyond it is not believed",
+    },
+    "LinePlc": {**_DEVICE, "address": "Modbus unit"},
+    "Recipe": {
+        "name": "name of the grade",
+        "tension_n": "one per span; for draw spans the tension that their speed ratio is computed from",
+        "speed_m_per_s": "line speed",
+    },
+}
+
+
+def line_schema() -> dict[str, Any]:
+    """JSON schema of a line description (for editors), with the descriptions of HELP.
+
+    It says what single values must satisfy; what several tables must satisfy together, `check` knows.
+    """
+    schema = Line.model_json_schema()
+    for model, node in {"Line": schema, **schema["$defs"]}.items():
+        for key, property_ in node["properties"].items():
+            property_["description"] = HELP[model][key]
+            property_.pop("title", None)  # it only repeats the key
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}

@@ -1,0 +1,174 @@
+"""What the operator's commands do to a cycle: each is done, or refused with every reason and what is allowed."""
+
+from math import isfinite
+
+from drivers.port import PrepareRefused
+from gateway.core.line import Recipe
+from gateway.core.messages import Arm, Command, Hold, Reply, SelectRecipe, SetSpeed, SetTension, Start, Stop
+from gateway.core.nearest import nearest
+from gateway.core.signals import Quality
+from gateway.core.states import LoopState, Phase
+from gateway.loop import machine as machines
+from gateway.loop.cycle import Cycle
+
+
+class Refused(Exception):
+    """A command that is not carried out; nothing was changed."""
+
+    def __init__(self, text: str, reasons: list[str] | None = None) -> None:
+        super().__init__(text)
+        self.reasons = reasons or []
+
+
+def carry_out(cycle: Cycle, command: Command, now_s: float) -> Reply:
+    """Do `command` between two periods. `arm` takes longer: `prepare_to_arm` goes before it."""
+    try:
+        match command:
+            case Arm():
+                text = _arm(cycle, now_s)
+            case Start():
+                text = _start(cycle, now_s)
+            case Hold():
+                text = _hold(cycle, now_s)
+            case Stop():
+                text = _stop(cycle, now_s)
+            case SetTension():
+                text = _set_tension(cycle, command)
+            case SetSpeed():
+                text = _set_speed(cycle, command)
+            case SelectRecipe():
+                text = _select_recipe(cycle, command)
+    except Refused as refusal:
+        return Reply(ok=False, state=cycle.machine.state.name, text=str(refusal), reasons=refusal.reasons)
+    return Reply(ok=True, state=cycle.machine.state.name, text=text)
+
+
+async def prepare_to_arm(cycle: Cycle) -> Reply | None:
+    """Everything that must hold before torque is possible. None when it does; periods go on meanwhile."""
+    if cycle.machine.state not in (LoopState.SILENT, LoopState.STOP):
+        return None
+    reasons = not_ready(cycle)
+    if not reasons:
+        for link in cycle.links:
+            link.silence()
+            try:
+                await link.prepare()
+            except PrepareRefused as refusal:
+                reasons += refusal.reasons
+    if not reasons:
+        return None
+    for link in cycle.links:
+        link.silence()
+    text = "not armed; mend what is named and arm again"
+    return Reply(ok=False, state=cycle.machine.state.name, text=text, reasons=reasons)
+
+
+def not_ready(cycle: Cycle) -> list[str]:
+    """What speaks against arming, as far as the samples tell."""
+    inputs, reasons = cycle.inputs, []
+    if inputs.plc.quality != Quality.GOOD:
+        reasons.append(f"the line PLC ({cycle.line.plc.name}) does not answer")
+    elif inputs.plc.emergency_stop:
+        reasons.append("the emergency stop circuit is open: release it")
+    elif not inputs.plc.permissive:
+        reasons.append("the line PLC gives no permissive")
+    unwind = inputs.unwind_speed
+    if unwind.quality[0] == Quality.GOOD and abs(unwind.value[0]) > machines.STANDSTILL_M_PER_S:
+        reasons.append(f"the unwinder turns at {unwind.value[0]:.4f} m/s: wait for standstill")
+    for cell in cycle.line.load_cells:
+        if inputs.tension.quality[cell.span - 1] != Quality.GOOD:
+            reasons.append(f"load cell {cell.name} (span {cell.span}) gives no usable value")
+    return reasons
+
+
+def _arm(cycle: Cycle, now_s: float) -> str:
+    machine = cycle.machine
+    if machine.state not in (LoopState.SILENT, LoopState.STOP):
+        raise Refused(f"the line is {machine.state.name} already")
+    if machine.phase not in (Phase.SILENT, Phase.OFF):
+        raise Refused(f"the line is still {machine.phase.name.lower()}: wait until torque is off")
+    cycle.change(machines.to_phase(machine, Phase.ARMING, now_s, ""))
+    return "watchdogs confirmed; the drives become ready"
+
+
+def _start(cycle: Cycle, now_s: float) -> str:
+    machine = cycle.machine
+    match machine.phase:
+        case Phase.READY:
+            cycle.change(machines.to_phase(machine, Phase.ENABLING, now_s, ""))
+            return f"tensioning the web, then {cycle.setpoints.speed_target_m_per_s:g} m/s"
+        case Phase.HOLDING:
+            cycle.change(machines.to_phase(machine, Phase.RUNNING, now_s, ""))
+            return f"back to {cycle.setpoints.speed_target_m_per_s:g} m/s"
+        case Phase.ENABLING | Phase.TENSIONING | Phase.RUNNING:
+            return "running already"
+        case _:
+            raise Refused(f"the line is {machine.state.name}: arm it first")
+
+
+def _hold(cycle: Cycle, now_s: float) -> str:
+    machine = cycle.machine
+    if machine.phase is Phase.HOLDING:
+        return "held already"
+    if machine.phase is not Phase.RUNNING:
+        raise Refused(f"only a running line can be held; this one is {machine.phase.name.lower()}")
+    cycle.change(machines.to_phase(machine, Phase.HOLDING, now_s, ""))
+    return "the line ramps to standstill, tension control stays on; start leads back to speed"
+
+
+def _stop(cycle: Cycle, now_s: float) -> str:
+    before = cycle.machine
+    cycle.change(machines.stop(before, now_s, "operator's stop"))
+    if cycle.machine is before:
+        return "nothing is sent to the drives" if before.state is LoopState.SILENT else "stopping or stopped already"
+    return "the line ramps to standstill, then torque goes off; arm leads out of it"
+
+
+def _set_tension(cycle: Cycle, command: SetTension) -> str:
+    line, setpoints = cycle.line, cycle.setpoints
+    if command.span > line.n:
+        raise Refused(f"there is no span {command.span}; allowed: 1 to {line.n}")
+    low, high = line.limits.tension_min_n, line.limits.tension_max_n
+    if not (isfinite(command.tension_n) and low < command.tension_n < high):
+        raise Refused(f"{command.tension_n:g} N is outside the limits; allowed: above {low:g} and below {high:g} N")
+    i = command.span - 1
+    if command.step:
+        size = abs(command.tension_n - setpoints.tension_n[i])
+        _require_step(cycle, size, line.limits.tension_step_max_n, "N")
+        setpoints.tension_n[i] = command.tension_n
+    setpoints.tension_target_n[i] = command.tension_n
+    how = "at once" if command.step else f"at {line.moves.tension_rate_n_per_s:g} N/s"
+    return f"span {command.span} to {command.tension_n:g} N {how}"
+
+
+def _set_speed(cycle: Cycle, command: SetSpeed) -> str:
+    line, setpoints = cycle.line, cycle.setpoints
+    high = line.limits.speed_max_m_per_s
+    if not (isfinite(command.speed_m_per_s) and 0.0 <= command.speed_m_per_s <= high):
+        raise Refused(f"{command.speed_m_per_s:g} m/s is outside the limits; allowed: 0 to {high:g} m/s")
+    if command.step:
+        size = abs(command.speed_m_per_s - setpoints.speed_m_per_s)
+        _require_step(cycle, size, line.limits.speed_step_max_m_per_s, "m/s")
+        setpoints.speed_m_per_s = command.speed_m_per_s
+    setpoints.speed_target_m_per_s = command.speed_m_per_s
+    how = "at once" if command.step else f"at {line.moves.speed_rate_m_per_s2:g} m/s2"
+    return f"line speed to {command.speed_m_per_s:g} m/s {how}"
+
+
+def _require_step(cycle: Cycle, size: float, largest: float, unit: str) -> None:
+    if cycle.machine.phase is not Phase.RUNNING:
+        raise Refused(f"a step needs a running line, this one is {cycle.machine.state.name}; leave out the step")
+    if size > largest * (1.0 + 1e-9):
+        raise Refused(f"a step of {size:g} {unit} is too large; allowed: {largest:g} {unit}, or a ramp of any size")
+
+
+def _select_recipe(cycle: Cycle, command: SelectRecipe) -> str:
+    recipes: dict[str, Recipe] = {recipe.name: recipe for recipe in cycle.line.recipes}
+    recipe = recipes.get(command.name)
+    if recipe is None:
+        close = nearest(command.name, recipes)
+        hint = f"; did you mean {close}?" if close else ""
+        raise Refused(f"there is no recipe {command.name!r}{hint} Known: {', '.join(recipes)}")
+    cycle.setpoints.tension_target_n[:] = recipe.tension_n
+    cycle.setpoints.speed_target_m_per_s = recipe.speed_m_per_s
+    return f"recipe {recipe.name}: tensions and speed move to it"

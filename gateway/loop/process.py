@@ -1,0 +1,88 @@
+"""The loop process: one line, one controller, its links, its command socket; no other socket and no database."""
+
+import asyncio
+import signal
+from collections.abc import Callable
+from pathlib import Path
+
+from drivers.registry import build_links
+from gateway.control.laws import make_law
+from gateway.core.controller import LqiConfig, PidConfig, config_hash
+from gateway.core.line import Line
+from gateway.core.messages import Event, Stop
+from gateway.core.states import LoopState, Phase
+from gateway.core.telemetry import Frame, pack
+from gateway.core.topics import LOOP_COMMAND, LOOP_EVENT, LOOP_TELEMETRY
+from gateway.loop.cycle import Cycle
+from gateway.loop.machine import Machine
+from gateway.loop.pacer import TimerPacer, monotonic
+from gateway.loop.realtime import become_punctual, freeze_collector
+from gateway.loop.runner import Runner
+from gateway.mailbox.paths import GATEWAY_SOCKET, LOOP_SOCKET
+from gateway.mailbox.unix import UnixMailbox
+from safety.actions import Finding
+
+def run_loop(line: Line, config: LqiConfig | PidConfig, run_folder: Path, say: Callable[[str], None]) -> None:
+    """Run until SIGTERM or SIGINT, which stop the line first.
+
+    Raises AlreadyRunning before anything is sent, CannotListen, PathTooLong, and OSError when a bus cannot be opened.
+    """
+    granted, refused = become_punctual(line.control.cpu, line.control.priority)
+    say("; ".join(granted) or "no real-time help granted")
+    for sentence in refused:
+        say(sentence)
+    asyncio.run(_main(line, config, run_folder, say))
+
+
+async def _main(line: Line, config: LqiConfig | PidConfig, run_folder: Path, say: Callable[[str], None]) -> None:
+    mailbox = UnixMailbox()
+    # First the socket, whose lock makes this the only loop of the line; only then are the buses touched.
+    await mailbox.listen(run_folder / LOOP_SOCKET)
+    mailbox.connect({LOOP_TELEMETRY, LOOP_EVENT}, run_folder / GATEWAY_SOCKET)
+
+    def record(frame: Frame) -> None:
+        mailbox.publish(LOOP_TELEMETRY, pack(frame))
+
+    def tell(kind: str, text: str, data: dict[str, object] | None = None) -> None:
+        event = Event(time_s=monotonic(), kind=kind, text=text, data=data or {})
+        mailbox.publish(LOOP_EVENT, event.model_dump_json().encode())
+
+    def announce(before: Machine, after: Machine, findings: list[Finding]) -> None:
+        text = f"{before.phase.name} to {after.phase.name}" + (f": {after.reason}" if after.reason else "")
+        tell("state", text, {"state": after.state.name, "rules": [finding.rule for finding in findings]})
+
+    links = build_links(line)
+    cycle = Cycle(line, make_law(config), links, monotonic, record, announce)
+    runner = Runner(cycle)
+    ending = asyncio.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        asyncio.get_running_loop().add_signal_handler(number, ending.set)
+    try:
+        for link in links:
+            await link.open()
+        mailbox.serve(LOOP_COMMAND, runner.command)
+        tell("start", f"loop of {line.site}/{line.line}, {config.kind} controller {config_hash(config)[:12]}")
+        say(f"loop of {line.site}/{line.line} is SILENT, commands on {run_folder / LOOP_SOCKET}")
+        freeze_collector()
+        await _run_until(runner, line.control.period_s, ending)
+    finally:
+        for link in links:
+            await link.close()
+        await mailbox.close()
+
+
+async def _run_until(runner: Runner, period_s: float, ending: asyncio.Event) -> None:
+    pacer = TimerPacer(period_s)
+    try:
+        while not ending.is_set():
+            await runner.period(await pacer.wait())
+        # A controlled stop before leaving; the machine bounds its time.
+        stopping = asyncio.ensure_future(runner.submit(Stop()))
+        while not stopping.done() or not _at_rest(runner.cycle):
+            await runner.period(await pacer.wait())
+    finally:
+        pacer.close()
+
+
+def _at_rest(cycle: Cycle) -> bool:
+    return cycle.machine.state is LoopState.SILENT or cycle.machine.phase is Phase.OFF

@@ -1,0 +1,36 @@
+"""Where the sockets of a line lie: one run folder a line, named site-line, under the first base that may be written."""
+
+import os
+from pathlib import Path
+
+from gateway.core.line import Line
+from gateway.mailbox.listener import living
+
+GATEWAY_SOCKET = "gateway.sock"
+LOOP_SOCKET = "loop.sock"
+_SERVICE = Path("/run/r2rgate")  # made by the service manager for its user
+
+
+def _bases() -> list[Path]:
+    """Base folders in order of preference."""
+    session = os.environ.get("XDG_RUNTIME_DIR")
+    own = [Path(session) / "r2rgate"] if session else []
+    return [*own, _SERVICE, Path(f"/tmp/r2rgate-{os.getuid()}")]
+
+
+def _usable(base: Path) -> bool:
+    """Whether the base may be written, or made in a folder that may."""
+    return os.access(base if base.exists() else base.parent, os.W_OK | os.X_OK)
+
+
+def default_run_folder(line: Line) -> Path:
+    """$XDG_RUNTIME_DIR/r2rgate, else /run/r2rgate where it may be written, else /tmp/r2rgate-UID; then site-line."""
+    *preferred, last = _bases()
+    base = next((base for base in preferred if _usable(base)), last)
+    return base / f"{line.site}-{line.line}"
+
+
+def running_lines() -> list[Path]:
+    """Run folders in which a gateway or a loop answers now, by name."""
+    folders = {folder for base in _bases() if os.access(base, os.R_OK | os.X_OK) for folder in base.iterdir()}
+    return sorted(folder for folder in folders if living(folder / GATEWAY_SOCKET) or living(folder / LOOP_SOCKET))

@@ -1,0 +1,226 @@
+"""The mailbox between processes of one machine: AF_UNIX, SOCK_SEQPACKET, one envelope a datagram.
+
+A party listens on a path, or dials others by path, or both. Whatever a peer does (flood, stall, die, send rubbish),
+this side neither waits nor fails: sending is one non-blocking call into a bounded kernel buffer, reading has a budget,
+and what cannot be handed over is dropped and counted. All methods belong to the thread of the event loop.
+"""
+
+import asyncio
+import socket
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterable
+from functools import partial
+from itertools import count
+from pathlib import Path
+
+from gateway.core.topics import Topic
+from gateway.mailbox.codec import Envelope, Kind, MalformedEnvelope, encode
+from gateway.mailbox.connection import Connection, dial
+from gateway.mailbox.listener import Listener, accept_all, check_path
+from gateway.mailbox.port import (
+    MAX_PAYLOAD,
+    PEER,
+    Counters,
+    PublishHandler,
+    RemoteError,
+    RequestHandler,
+    Unreachable,
+    what_to_start,
+)
+
+RECONNECT_S = 1.0  #: a publisher looks for a lost listener at most this often
+MAX_CONNECTIONS = 32
+MAX_IN_FLIGHT = 32  #: requests of one peer that are answered at the same time
+
+
+class UnixMailbox:
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self.counters = Counters()
+        self._clock = clock
+        self._listeners: list[Listener] = []
+        self._accepted: set[Connection] = set()
+        self._routes: dict[str, Path] = {}
+        self._dialled: dict[Path, Connection] = {}
+        self._next_dial_s: dict[Path, float] = {}
+        self._subscribers: defaultdict[str, list[PublishHandler]] = defaultdict(list)
+        self._servers: dict[str, RequestHandler] = {}
+        self._answering: set[asyncio.Task[None]] = set()
+        self._ids = count(1)
+
+    async def listen(self, path: Path) -> None:
+        """Take connections on `path`. Raises PathTooLong, AlreadyRunning, CannotListen (see `listener`)."""
+        listener = Listener(path)
+        self._listeners.append(listener)
+        take = partial(accept_all, listener.socket, self._accept)
+        asyncio.get_running_loop().add_reader(listener.socket, take)
+
+    def connect(self, topics: Iterable[Topic], path: Path) -> None:
+        """Send `topics` to whoever listens on `path`; dialled when needed. Raises PathTooLong."""
+        check_path(path)
+        for topic in topics:
+            self._routes[topic.name] = path
+
+    def publish(self, topic: Topic, payload: bytes) -> bool:
+        path = self._routes.get(topic.name)
+        connection = None if path is None else self._dialled.get(path) or self._redial(path)
+        if connection is None:
+            self.counters.dropped += 1
+            return False
+        try:
+            datagram = encode(Envelope(Kind.PUBLISH, topic.name, 0, payload))
+        except MalformedEnvelope as error:
+            self.counters.dropped += 1
+            self.counters.last_error = str(error)
+            return False
+        return connection.send(datagram)
+
+    def subscribe(self, topic: Topic, handler: PublishHandler) -> None:
+        self._subscribers[topic.name].append(handler)
+
+    def serve(self, topic: Topic, handler: RequestHandler) -> None:
+        """Answer the requests of a topic. Raises ValueError where it has a handler already."""
+        if topic.name in self._servers:
+            raise ValueError(f"{topic.name} is served already")
+        self._servers[topic.name] = handler
+
+    async def request(self, topic: Topic, payload: bytes, timeout_s: float) -> bytes:
+        """Raises Unreachable, and RemoteError where the other side is there but could not answer."""
+        number = next(self._ids)
+        try:
+            datagram = encode(Envelope(Kind.REQUEST, topic.name, number, payload))
+        except MalformedEnvelope as error:
+            raise RemoteError(str(error)) from error
+        connection = self._send_request(topic, datagram)
+        future = connection.pending[number] = asyncio.get_running_loop().create_future()
+        try:
+            async with asyncio.timeout(timeout_s):
+                return await future
+        except TimeoutError:
+            raise Unreachable(f"{topic.name} did not answer within {timeout_s:g} s: is its process stuck?") from None
+        finally:
+            del connection.pending[number]
+
+    async def close(self) -> None:
+        """Idempotent. Requests that still wait, on either side, end as unreachable."""
+        loop = asyncio.get_running_loop()
+        for listener in self._listeners:
+            loop.remove_reader(listener.socket)
+            listener.close()
+        self._listeners.clear()
+        for task in self._answering:
+            task.cancel()
+        await asyncio.gather(*self._answering, return_exceptions=True)
+        for connection in (*self._accepted, *self._dialled.values()):
+            connection.close()
+
+    def _accept(self, accepted: socket.socket) -> None:
+        if len(self._accepted) >= MAX_CONNECTIONS:
+            self.counters.refused += 1
+            accepted.close()
+            return
+        self._accepted.add(Connection(accepted, self.counters, self._receive, self._accepted.discard))
+
+    def _dial(self, path: Path) -> Connection:
+        connection = Connection(dial(path), self.counters, self._receive, partial(self._lost, path))
+        self._dialled[path] = connection
+        self.counters.connects += 1
+        return connection
+
+    def _redial(self, path: Path) -> Connection | None:
+        now_s = self._clock()
+        if now_s < self._next_dial_s.get(path, now_s):
+            return None
+        self._next_dial_s[path] = now_s + RECONNECT_S
+        try:
+            return self._dial(path)
+        except OSError as error:
+            self.counters.last_error = f"{path}: {error.strerror}"
+            return None
+
+    def _lost(self, path: Path, connection: Connection) -> None:
+        if self._dialled.get(path) is connection:
+            del self._dialled[path]
+
+    def _send_request(self, topic: Topic, datagram: bytes) -> Connection:
+        path = self._routes.get(topic.name)
+        if path is None:
+            raise Unreachable(f"{topic.name} is connected to no path")
+        connection = self._dialled.get(path)
+        if connection is not None:
+            if connection.send(datagram):
+                return connection
+            if connection.open:
+                raise Unreachable(f"{topic.name}: its process has stopped reading")
+            # The peer was restarted since the last message, which shows on sending: dial once more.
+        try:
+            connection = self._dial(path)
+        except BlockingIOError:
+            raise Unreachable(f"{topic.name}: nobody takes connections on {path}, its process is stuck") from None
+        except PermissionError:
+            raise Unreachable(f"{path} belongs to another user: run this as the one who started it") from None
+        except OSError as error:
+            raise Unreachable(what_to_start(topic)) from error
+        if not connection.send(datagram):
+            raise Unreachable(what_to_start(topic))
+        return connection
+
+    def _receive(self, connection: Connection, envelope: Envelope) -> None:
+        if envelope.kind is Kind.PUBLISH:
+            for handler in self._subscribers.get(envelope.topic, ()):
+                try:
+                    handler(envelope.payload)
+                except Exception as error:
+                    self._failed(envelope.topic, error)
+        elif envelope.kind is Kind.REQUEST:
+            self._take_request(connection, envelope)
+        else:
+            self._resolve(connection, envelope)
+
+    def _take_request(self, connection: Connection, envelope: Envelope) -> None:
+        if connection.in_flight >= MAX_IN_FLIGHT:
+            self.counters.refused += 1
+            connection.send(_error(envelope, f"more than {MAX_IN_FLIGHT} requests at once"))
+            return
+        connection.in_flight += 1
+        task = asyncio.get_running_loop().create_task(self._answer(connection, envelope))
+        self._answering.add(task)
+        task.add_done_callback(self._answering.discard)
+
+    async def _answer(self, connection: Connection, envelope: Envelope) -> None:
+        PEER.set(connection.peer)
+        try:
+            connection.send(await self._answer_to(envelope))
+        finally:
+            connection.in_flight -= 1
+
+    async def _answer_to(self, envelope: Envelope) -> bytes:
+        handler = self._servers.get(envelope.topic)
+        if handler is None:
+            return _error(envelope, f"{envelope.topic} is not served here")
+        try:
+            payload = await handler(envelope.payload)
+            return encode(Envelope(Kind.ANSWER, envelope.topic, envelope.id, payload))
+        except MalformedEnvelope as error:
+            return _error(envelope, str(error))
+        except Exception as error:
+            self._failed(envelope.topic, error)
+            return _error(envelope, f"{envelope.topic} failed: {type(error).__name__}: {error}")
+
+    def _resolve(self, connection: Connection, envelope: Envelope) -> None:
+        future = connection.pending.get(envelope.id)
+        if future is None or future.done():
+            self.counters.late_answers += 1
+        elif envelope.kind is Kind.ANSWER:
+            future.set_result(envelope.payload)
+        else:
+            future.set_exception(RemoteError(envelope.payload.decode("utf-8", "replace")))
+
+    def _failed(self, topic: str, error: Exception) -> None:
+        self.counters.handler_errors += 1
+        self.counters.last_error = f"{topic}: {type(error).__name__}: {error}"
+
+
+def _error(envelope: Envelope, text: str) -> bytes:
+    reason = text.encode("utf-8", "replace")[:MAX_PAYLOAD]
+    return encode(Envelope(Kind.ERROR, envelope.topic, envelope.id, reason))

@@ -1,0 +1,66 @@
+"""The gateway process: one socket, one historian, one service over them, until it is told to stop.
+
+It may start before the loop, outlive it, and die without the loop noticing.
+"""
+
+import asyncio
+import signal
+import sys
+from pathlib import Path
+
+from gateway.core.line import Line
+from gateway.core.topics import LOOP_COMMAND
+from gateway.mailbox.listener import AlreadyRunning, CannotListen, PathTooLong
+from gateway.mailbox.paths import GATEWAY_SOCKET, LOOP_SOCKET
+from gateway.mailbox.unix import UnixMailbox
+from gateway.supervisor.historian import Historian
+from gateway.supervisor.service import Gateway
+
+EXIT_OK, EXIT_NOT_FLUSHED, EXIT_CANNOT_LISTEN, EXIT_ALREADY_RUNNING = 0, 1, 2, 3
+WATCH_S = 0.25
+
+
+def run_gateway(line: Line, run_folder: Path, data_folder: Path) -> int:
+    """Serve until SIGTERM or SIGINT. Returns the process's exit code."""
+    try:
+        return asyncio.run(_serve(line, run_folder, data_folder))
+    except AlreadyRunning as error:
+        print(f"a gateway runs here already, this one ends: {error}", file=sys.stderr)
+        return EXIT_ALREADY_RUNNING
+    except (CannotListen, PathTooLong) as error:
+        print(f"the gateway cannot start: {error}", file=sys.stderr)
+        return EXIT_CANNOT_LISTEN
+
+
+async def _serve(line: Line, run_folder: Path, data_folder: Path) -> int:
+    stop = asyncio.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        asyncio.get_running_loop().add_signal_handler(number, stop.set)
+    mailbox = UnixMailbox()
+    mailbox.connect((LOOP_COMMAND,), run_folder / LOOP_SOCKET)
+    historian = Historian(data_folder, line.site, line.line, line.n)
+    gateway = Gateway(line, mailbox, historian, mailbox.counters)
+    # First the socket, whose lock makes this the only instance; only then is the history touched.
+    await mailbox.listen(run_folder / GATEWAY_SOCKET)
+    historian.start()
+    gateway.note("gateway-up", "the gateway has started")
+    print(f"gateway of {line.site}/{line.line}: {run_folder / GATEWAY_SOCKET}, history {historian.path}", flush=True)
+    try:
+        while not stop.is_set():
+            gateway.watch()
+            await _wait(stop, WATCH_S)
+    finally:
+        await mailbox.close()
+        gateway.note("gateway-down", "the gateway has been stopped")
+        flushed = await asyncio.to_thread(historian.close)
+    if not flushed:
+        print("the disk did not answer in time: the last seconds of history are lost", file=sys.stderr)
+    return EXIT_OK if flushed else EXIT_NOT_FLUSHED
+
+
+async def _wait(stop: asyncio.Event, timeout_s: float) -> None:
+    try:
+        async with asyncio.timeout(timeout_s):
+            await stop.wait()
+    except TimeoutError:
+        pass

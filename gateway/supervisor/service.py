@@ -1,0 +1,179 @@
+"""What the gateway does with its messages: telemetry and events into history and status, status to whoever asks,
+commands on to the loop, with who gave them, into the events.
+"""
+
+import pwd
+import time
+from collections import deque
+from collections.abc import Callable
+from math import isfinite
+from typing import Any
+
+from pydantic import ValidationError
+
+from gateway.core.line import Line
+from gateway.core.messages import Event, MalformedMessage, Reply, parse_command
+from gateway.core.topics import GATEWAY_COMMAND, GATEWAY_STATUS, LOOP_COMMAND, LOOP_EVENT, LOOP_TELEMETRY
+from gateway.mailbox.port import PEER, Counters, Mailbox, Peer, Unreachable
+from gateway.supervisor.historian import Historian
+from gateway.supervisor.status import (
+    EventStatus,
+    GatewayStatus,
+    HistorianStatus,
+    LimitsStatus,
+    LinkStatus,
+    known,
+    loop_status,
+    span_statuses,
+    timing_status,
+)
+from gateway.supervisor.telemetry_sink import TelemetrySink
+
+LOOP_TIMEOUT_S = 5.0  #: arming writes and reads back every drive's watchdog
+EVENTS_SHOWN = 20
+TEXT_SHOWN = 300  #: characters of an event's text in the status; the history keeps all
+
+
+class Gateway:
+    """Handlers on a mailbox, and what they remember. Sockets, signals and threads are its owner's."""
+
+    def __init__(
+        self,
+        line: Line,
+        mailbox: Mailbox,
+        historian: Historian,
+        counters: Counters,
+        clock: Callable[[], float] = time.monotonic,
+        wall_clock: Callable[[], float] = time.time,
+    ) -> None:
+        self._line = line
+        self._mailbox = mailbox
+        self._historian = historian
+        self._counters = counters
+        self._clock = clock
+        self._wall_clock = wall_clock
+        self._started_s = clock()
+        self._sink = TelemetrySink(line.n, historian.frame)
+        self._events: deque[EventStatus] = deque(maxlen=EVENTS_SHOWN)
+        self._malformed_events = 0
+        self._loop_was_running = False
+        self._was_storing = True
+        mailbox.subscribe(LOOP_TELEMETRY, self._sink.take)
+        mailbox.subscribe(LOOP_EVENT, self._loop_event)
+        mailbox.serve(GATEWAY_STATUS, self._answer_status)
+        mailbox.serve(GATEWAY_COMMAND, self._answer_command)
+
+    def note(self, kind: str, text: str, **data: Any) -> None:
+        """An event of the gateway itself."""
+        self._keep(Event(time_s=self._clock(), kind=kind, text=text, data=data))
+
+    def watch(self) -> None:
+        """Called a few times a second: notes a loop or a historian that comes or goes."""
+        loop = loop_status(self._line, self._sink, self._clock())
+        if loop.running != self._loop_was_running:
+            self._loop_was_running = loop.running
+            if loop.running:
+                self.note("loop-up", f"the loop runs, state {loop.state}")
+            else:
+                self.note("loop-lost", f"no telemetry of the loop for {loop.age_s} s: {loop.next}")
+        health = self._historian.health()
+        if health.storing != self._was_storing and health.text != "starting":
+            self._was_storing = health.storing
+            self.note("historian", f"the historian is {health.text}")
+
+    def status(self) -> GatewayStatus:
+        now_s = self._clock()
+        loop = loop_status(self._line, self._sink, now_s)
+        frame = self._sink.newest()
+        limits = self._line.limits
+        return GatewayStatus(
+            format=1,
+            site=self._line.site,
+            line=self._line.line,
+            wall_s=self._wall_clock(),
+            uptime_s=round(now_s - self._started_s, 3),
+            loop=loop,
+            unwind_speed_m_per_s=known(frame.unwind_speed_m_per_s) if frame is not None else None,
+            speed_setpoint_m_per_s=known(frame.speed_setpoint_m_per_s) if frame is not None else None,
+            limits=LimitsStatus(
+                tension_min_n=limits.tension_min_n, tension_max_n=limits.tension_max_n, torque_nm=limits.torque_nm
+            ),
+            spans=span_statuses(self._line, frame, loop.running),
+            timing=timing_status(self._sink.cycles if loop.running else ()),
+            link=LinkStatus(
+                frames=self._sink.frames,
+                dropped_frames=self._sink.dropped,
+                malformed=self._sink.malformed + self._malformed_events + self._counters.malformed,
+                refused=self._counters.refused,
+            ),
+            historian=self._historian_status(now_s),
+            events=list(self._events),
+        )
+
+    def _historian_status(self, now_s: float) -> HistorianStatus:
+        health = self._historian.health()
+        return HistorianStatus(
+            storing=health.storing,
+            text=health.text,
+            path=str(self._historian.path),
+            frames_stored=health.frames_stored,
+            frames_lost=health.frames_lost,
+            events_lost=health.events_lost,
+            last_stored_age_s=None if health.last_stored_s is None else round(now_s - health.last_stored_s, 3),
+            moved_aside=health.moved_aside,
+        )
+
+    def _loop_event(self, payload: bytes) -> None:
+        try:
+            event = Event.model_validate_json(payload)
+        except ValidationError:
+            self._malformed_events += 1
+            return
+        self._keep(event)
+
+    def _keep(self, event: Event) -> None:
+        self._historian.event(event)
+        wall_s = event.time_s + self._wall_clock() - self._clock()
+        if isfinite(wall_s):
+            self._events.append(EventStatus(wall_s=round(wall_s, 3), kind=event.kind, text=event.text[:TEXT_SHOWN]))
+
+    async def _answer_status(self, _: bytes) -> bytes:
+        return self.status().model_dump_json().encode()
+
+    async def _answer_command(self, payload: bytes) -> bytes:
+        peer = PEER.get()
+        reply = await self._pass_on(payload)
+        said = payload[:1000].decode("utf-8", "replace")
+        answered = "done" if reply.ok else "refused"
+        self.note(
+            "command",
+            f"{_who(peer)}: {said}: {answered}: {reply.text}",
+            command=said,
+            reply=reply.model_dump(),
+            uid=None if peer is None else peer.uid,
+            pid=None if peer is None else peer.pid,
+        )
+        return reply.model_dump_json().encode()
+
+    async def _pass_on(self, payload: bytes) -> Reply:
+        state = loop_status(self._line, self._sink, self._clock()).state
+        try:
+            parse_command(payload)
+            answer = await self._mailbox.request(LOOP_COMMAND, payload, LOOP_TIMEOUT_S)
+            return Reply.model_validate_json(answer)
+        except MalformedMessage as error:
+            return Reply(ok=False, state=state, text=f"not understood: {error}", reasons=[str(error)])
+        except Unreachable as error:
+            return Reply(ok=False, state=state, text=str(error), reasons=[str(error)])
+        except ValidationError as error:
+            text = "the loop answered what is no reply; see `r2rgate status` for what it did"
+            return Reply(ok=False, state=state, text=text, reasons=[str(error)])
+
+
+def _who(peer: Peer | None) -> str:
+    if peer is None:
+        return "this process"
+    try:
+        return pwd.getpwuid(peer.uid).pw_name
+    except KeyError:
+        return f"user {peer.uid}"

@@ -1,0 +1,71 @@
+"""What arrives from the loop: checks each frame, counts what is missing, and knows the newest and the last seconds."""
+
+from collections import deque
+from collections.abc import Callable
+from math import isfinite
+from typing import NamedTuple
+
+import numpy as np
+
+from gateway.core.telemetry import VERSION, Frame, frame_dtype, unpack
+
+WINDOW_S = 10.0
+_RESTARTED = 2**31  # a sequence number that goes back (modulo 2^32) is one of a new loop
+
+
+class Cycle(NamedTuple):
+    time_s: float
+    cycle_s: float
+    lateness_s: float
+    missed: int  #: periods skipped since the loop's start
+
+
+class TelemetrySink:
+    """`keep` gets every well-formed frame. Nothing that arrives raises."""
+
+    def __init__(self, spans: int, keep: Callable[[bytes], None]) -> None:
+        self.frames = 0
+        self.dropped = 0  #: gaps in the sequence
+        self.malformed = 0
+        self.restarts = 0  #: a loop that began to count anew
+        self.cycles: deque[Cycle] = deque()  #: of the loop that runs, over WINDOW_S
+        self._spans = spans
+        self._dtype = frame_dtype(spans)
+        self._keep = keep
+        self._newest = b""
+        self._sequence = 0
+
+    def take(self, payload: bytes) -> None:
+        if len(payload) != self._dtype.itemsize:
+            self.malformed += 1
+            return
+        row = np.frombuffer(payload, self._dtype)[0]
+        time_s = float(row["time_s"])
+        if row["version"] != VERSION or row["n"] != self._spans or not isfinite(time_s):
+            self.malformed += 1
+            return
+        self._count(int(row["sequence"]))
+        self._newest = payload
+        self.cycles.append(Cycle(time_s, float(row["cycle_s"]), float(row["lateness_s"]), int(row["missed"])))
+        while self.cycles[0].time_s < time_s - WINDOW_S:
+            self.cycles.popleft()
+        self._keep(payload)
+
+    def newest(self) -> Frame | None:
+        """The last frame that came, whatever its age."""
+        return unpack(self._newest) if self._newest else None
+
+    def age_s(self, now_s: float) -> float | None:
+        """How long ago the cycle of the newest frame was due; None before the first."""
+        return max(0.0, now_s - self.cycles[-1].time_s) if self.cycles else None
+
+    def _count(self, sequence: int) -> None:
+        if self.frames:
+            step = (sequence - self._sequence) % 2**32
+            if 0 < step < _RESTARTED:
+                self.dropped += step - 1
+            else:
+                self.restarts += 1
+                self.cycles.clear()
+        self.frames += 1
+        self._sequence = sequence

@@ -1,0 +1,115 @@
+"""The registers of the two Modbus devices of the line, as docs/devices/ describes them."""
+
+import struct
+from math import nan
+
+from sim_plant.devices.amplifier import Amplifier, ChannelStatus
+from sim_plant.devices.line_plc import LinePlc
+from sim_plant.faces.modbus_codec import (
+    ILLEGAL_ADDRESS,
+    ILLEGAL_VALUE,
+    READ_HOLDING,
+    READ_INPUT,
+    READ_WRITE,
+    WRITE_MANY,
+    WRITE_ONE,
+    Refused,
+)
+
+AMPLIFIER_ID = 0x5201
+PLC_ID = 0x5202
+
+_FIRST_CHANNEL = 16
+_REGISTERS_PER_CHANNEL = 4
+_AMPLIFIER_HEAD = struct.Struct(">4H24x")
+_CHANNEL = struct.Struct(">fHH")
+
+_UM_PER_M = 1e6
+_INT32 = 0x7FFFFFFF
+_COMMAND = range(10, 15)  #: the registers that can be written
+_REQUEST = (11, 12)
+_WATCHDOG = 14
+_RUN_BIT = 1
+WATCHDOG_MS = range(10, 1001)
+_PLC_STATUS = struct.Struct(">HHiH10x")
+_PLC_COMMAND = struct.Struct(">HiHH")
+_FIVE_WORDS = struct.Struct(">5H")
+
+
+class AmplifierRegisters:
+    """Read-only: the head, registers that are reserved up to the first channel, then four for each channel."""
+
+    functions = frozenset({READ_HOLDING, READ_INPUT})
+
+    def __init__(self, amplifier: Amplifier) -> None:
+        self._amplifier = amplifier
+
+    def check_read(self, address: int, count: int) -> None:
+        if address + count > _FIRST_CHANNEL + _REGISTERS_PER_CHANNEL * self._amplifier.channels:
+            raise Refused(ILLEGAL_ADDRESS)
+
+    def read(self, address: int, count: int, now_s: float) -> bytes:
+        self.check_read(address, count)
+        first = max(0, address - _FIRST_CHANNEL) // _REGISTERS_PER_CHANNEL
+        channels = max(0, address + count - _FIRST_CHANNEL + _REGISTERS_PER_CHANNEL - 1) // _REGISTERS_PER_CHANNEL
+        data = b"".join(self._channel(c + 1, now_s) for c in range(first, channels))
+        if address < _FIRST_CHANNEL:
+            data, start = self._head(now_s) + data, 0
+        else:
+            start = _FIRST_CHANNEL + _REGISTERS_PER_CHANNEL * first
+        return data[2 * (address - start) : 2 * (address - start + count)]
+
+    def write(self, address: int, values: tuple[int, ...], now_s: float) -> None:
+        raise Refused(ILLEGAL_ADDRESS)
+
+    def _head(self, now_s: float) -> bytes:
+        amplifier = self._amplifier
+        return _AMPLIFIER_HEAD.pack(AMPLIFIER_ID, amplifier.channels, amplifier.healthy, amplifier.counter(now_s))
+
+    def _channel(self, channel: int, now_s: float) -> bytes:
+        status = self._amplifier.status(channel)
+        broken = status is ChannelStatus.WIRE_BREAK
+        tension_n = nan if broken else self._amplifier.tension_n(channel, now_s)
+        return _CHANNEL.pack(tension_n, status, 0)
+
+
+class PlcRegisters:
+    """Registers 0 to 4 tell, 5 to 9 are reserved, 10 to 14 command. A write takes effect as a whole or not at all."""
+
+    functions = frozenset({READ_HOLDING, WRITE_ONE, WRITE_MANY, READ_WRITE})
+
+    def __init__(self, plc: LinePlc) -> None:
+        self._plc = plc
+        self._command = [0] * len(_COMMAND)
+
+    def check_read(self, address: int, count: int) -> None:
+        if address + count > _COMMAND.stop:
+            raise Refused(ILLEGAL_ADDRESS)
+
+    def read(self, address: int, count: int, now_s: float) -> bytes:
+        self.check_read(address, count)
+        data = self._status(now_s) + _FIVE_WORDS.pack(*self._command)
+        return data[2 * address : 2 * (address + count)]
+
+    def write(self, address: int, values: tuple[int, ...], now_s: float) -> None:
+        written = range(address, address + len(values))
+        if written[0] not in _COMMAND or written[-1] not in _COMMAND:
+            raise Refused(ILLEGAL_ADDRESS)
+        if (_REQUEST[0] in written) != (_REQUEST[1] in written):
+            raise Refused(ILLEGAL_VALUE)  # half a 32-bit speed is another speed
+        after = self._command.copy()
+        for register, value in zip(written, values, strict=True):
+            after[register - _COMMAND.start] = value
+        run, request_um_per_s, life, watchdog_ms = _PLC_COMMAND.unpack(_FIVE_WORDS.pack(*after))
+        if run & ~_RUN_BIT or (watchdog_ms and watchdog_ms not in WATCHDOG_MS):
+            raise Refused(ILLEGAL_VALUE)
+        self._command = after
+        self._plc.watchdog_s = watchdog_ms * 1e-3
+        if address < _WATCHDOG:
+            self._plc.command(run == _RUN_BIT, request_um_per_s / _UM_PER_M, life, now_s)
+
+    def _status(self, now_s: float) -> bytes:
+        status = self._plc.status(now_s)
+        bits = status.permissive | (not status.emergency_stop) << 1 | status.running << 2 | status.watchdog_tripped << 3
+        speed_um_per_s = max(-_INT32, min(_INT32, round(status.unwind_speed_m_per_s * _UM_PER_M)))
+        return _PLC_STATUS.pack(PLC_ID, bits, speed_um_per_s, status.life_echo)

@@ -1,0 +1,119 @@
+"""The simulated line as a process of its own.
+
+    python -m sim_plant.process PLANT.toml --record FOLDER
+
+prints one line of JSON on standard output once every wire is open, and runs until SIGTERM or SIGINT.
+"""
+
+import argparse
+import asyncio
+import gc
+import json
+import signal
+import sys
+from collections.abc import Callable
+from math import isfinite
+from pathlib import Path
+from typing import Any
+
+from sim_plant.faces.canopen_bus import FaceUnavailable
+from sim_plant.plant import Plant, PlantRefused, load_plant
+from sim_plant.wired import Settings, WiredLine
+
+EXIT_REFUSED = 2
+SUMMARY_FILE = "summary.json"
+
+
+def run_plant(
+    plant_path: Path | str,
+    *,
+    record_folder: Path | str,
+    seed: int = 0,
+    scale: float = 1.0,
+    can_port: int | None = None,
+    modbus_port: int | None = None,
+    on_ready: Callable[[WiredLine], None] | None = None,
+) -> int:
+    """Run the line of a plant file until SIGTERM or SIGINT. Returns the exit code: 0, or 2 when it cannot run.
+
+    See `Settings`. `on_ready` is called once every wire is open; without it a line of JSON goes to standard
+    output. Why the line cannot run goes to standard error.
+    """
+    settings = Settings(Path(record_folder), seed, scale, can_port, modbus_port)
+    try:
+        if not (isfinite(settings.scale) and settings.scale > 0.0):
+            raise ValueError(f"the time scale must be finite and above 0, got {settings.scale}")
+        asyncio.run(_run(load_plant(plant_path), settings, on_ready or _print_ready))
+    except PlantRefused as error:
+        return _refused(f"{error.path} is not used", *error.reasons)
+    except FileExistsError:
+        return _refused(f"{settings.record_folder} already holds a recording: choose another folder, or remove it")
+    except (FaceUnavailable, ValueError, OSError) as error:
+        return _refused(str(error))
+    return 0
+
+
+async def _run(plant: Plant, settings: Settings, on_ready: Callable[[WiredLine], None]) -> None:
+    stop = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        loop.add_signal_handler(number, stop.set)
+    broken: list[BaseException] = []
+
+    def end(_: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+        # A line that has failed in a callback is no witness any more.
+        broken.append(context.get("exception") or RuntimeError(context["message"]))
+        stop.set()
+
+    loop.set_exception_handler(end)
+    line = WiredLine(plant, settings)
+    await line.open()
+    try:
+        gc.freeze()
+        on_ready(line)
+        await line.run(stop)
+    finally:
+        await line.close()
+        _write_summary(settings.record_folder / SUMMARY_FILE, line.summary())
+        print(f"simulated line {plant.name}: stopped, unsafe events: {line.recorder.unsafe_total}", file=sys.stderr)
+    if broken:
+        raise broken[0]
+
+
+def _print_ready(line: WiredLine) -> None:
+    print(json.dumps(line.ready()), flush=True)
+
+
+def _write_summary(path: Path, summary: dict[str, Any]) -> None:
+    """All of it or nothing, for whoever reads it meanwhile."""
+    beside = path.with_suffix(".part")
+    beside.write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+    beside.replace(path)
+
+
+def _refused(*reasons: str) -> int:
+    print("simulated line: " + "\n  ".join(reasons), file=sys.stderr)
+    return EXIT_REFUSED
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser("sim_plant", description="Run the simulated line of a plant file on its wires.")
+    parser.add_argument("plant", type=Path, help="PLANT.toml: the truth")
+    parser.add_argument("--seed", type=int, default=0, help="of the noise (default 0)")
+    parser.add_argument("--scale", type=float, default=1.0, help="seconds of the line per second (default 1)")
+    parser.add_argument("--record", type=Path, metavar="FOLDER", required=True, help="new folder for the recording")
+    parser.add_argument("--can-port", type=int, help="port of udp_multicast, in place of the plant's")
+    parser.add_argument("--modbus-port", type=int, help="in place of the plant's; 0 takes a free one")
+    given = parser.parse_args(arguments)
+    return run_plant(
+        given.plant,
+        record_folder=given.record,
+        seed=given.seed,
+        scale=given.scale,
+        can_port=given.can_port,
+        modbus_port=given.modbus_port,
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

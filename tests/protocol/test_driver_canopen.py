@@ -1,0 +1,453 @@
+"""The CANopen link against scripted drives: raw frames over udp_multicast, and over virtual."""
+
+import asyncio
+import socket
+import struct
+from collections.abc import Awaitable, Callable
+from math import inf, nan
+from typing import Any
+
+import pytest
+from driver_support import (
+    ENABLED,
+    FAULT,
+    GROUP,
+    READY,
+    SWITCH_ON_DISABLED,
+    Drive,
+    Drives,
+    cycle,
+    free_port,
+    line,
+    until,
+)
+
+from drivers.canopen.link import CanopenLink
+from drivers.port import PrepareRefused
+from drivers.registry import build_links
+from gateway.core.signals import DriveRequest, DriveState, Inputs, Outputs, Quality
+
+Body = Callable[[CanopenLink, Drives, Drive, Drive], Awaitable[None]]
+
+
+def bench(body: Body, **bus: Any) -> None:
+    """Two drives on a fresh bus, the link open."""
+    if not bus:
+        bus = {"interface": "udp_multicast", "channel": GROUP, "port": free_port(socket.SOCK_DGRAM)}
+    peer_bus = {**bus, "hop_limit": 0, "fd": False} if bus["interface"] == "udp_multicast" else bus
+
+    async def run() -> None:
+        first, second = Drive(1), Drive(2)
+        link = build_links(line(can_bus=bus))[0]
+        assert isinstance(link, CanopenLink)
+        async with Drives([first, second], **peer_bus) as drives:
+            await link.open()
+            try:
+                await body(link, drives, first, second)
+            finally:
+                await link.close()
+
+    asyncio.run(run())
+
+
+def write(link: CanopenLink, request: DriveRequest, torque_nm: float = 0.0) -> Outputs:
+    outputs = Outputs(2)
+    outputs.drive_request[:] = request
+    outputs.torque_nm[:] = torque_nm
+    link.write(outputs)
+    return outputs
+
+
+async def settle(drives: Drives) -> None:
+    """Let the peer read everything that was sent before."""
+    seen = len(drives.frames)
+    drives.send(0x67F, bytes(8))  # a frame to nobody
+    await until(lambda: any(cob_id == 0x67F for cob_id, _ in drives.frames[seen:]))
+
+
+def test_prepare_configures_and_proves_the_watchdog() -> None:
+    async def body(link: CanopenLink, drives: Drives, first: Drive, second: Drive) -> None:
+        await link.prepare()
+        for drive in (first, second):
+            assert drive.objects[0x1400, 5] == struct.pack("<H", 100)
+            assert drive.objects[0x6060, 0] == b"\x0a"
+            assert drive.objects[0x1017, 0] == struct.pack("<H", 100)
+            assert drive.objects[0x1400, 1] == struct.pack("<I", 0x200 + drive.node)
+            assert drive.objects[0x1800, 1] == struct.pack("<I", 0x40000180 + drive.node), "bit 30 is the drive's own"
+            assert drive.objects[0x1600, 0] == b"\x03"
+            mapped = [struct.unpack("<I", drive.objects[0x1600, sub])[0] for sub in (1, 2, 3)]
+            assert mapped == [0x60400010, 0x60710010, 0x60600008]
+            mapped = [struct.unpack("<I", drive.objects[0x1A00, sub])[0] for sub in (1, 2, 3)]
+            assert mapped == [0x60410010, 0x606C0020, 0x60770010]
+            assert drive.nmt == [0x80, 0x01], "configured in pre-operational, then started"
+            # The mapping is only touched while the PDO is off (bit 31) and empty (sub 0 is 0).
+            order = [(index, sub) for index, sub, _ in drive.writes]
+            off = drive.writes[order.index((0x1400, 1))]
+            assert struct.unpack("<I", off[2])[0] >> 31
+            assert order.index((0x1400, 1)) < order.index((0x1600, 0)) < order.index((0x1600, 1))
+            assert order[-2:] == [(0x1400, 1), (0x1800, 1)]
+
+    bench(body)
+
+
+def test_silent_link_sends_nothing() -> None:
+    async def body(link: CanopenLink, drives: Drives, first: Drive, second: Drive) -> None:
+        inputs = Inputs(2)
+        drives.heartbeat(1, 0x7F)
+        await cycle(link, inputs)
+        write(link, DriveRequest.ENABLE, 10.0)
+        await cycle(link, inputs)
+        await settle(drives)
+        assert [cob_id for cob_id, _ in drives.frames] == [0x67F]
+        assert list(inputs.drive_state) == [DriveState.OFF, DriveState.ABSENT]
+        assert set(inputs.speed.quality) == {Quality.MISSING}
+
+        await link.prepare()
+        link.silence()
+        drives.frames.clear()
+        await cycle(link, inputs)
+        write(link, DriveRequest.ENABLE, 10.0)
+        await settle(drives)
+        assert [cob_id for cob_id, _ in drives.frames] == [0x67F]
+
+    bench(body)
+
+
+@pytest.mark.parametrize("interface", ["udp_multicast", "virtual"])
+def test_a_cycle_reads_si_and_commands_one_transition_at_a_time(interface: str) -> None:
+    async def body(link: CanopenLink, drives: Drives, first: Drive, second: Drive) -> None:
+        inputs = Inputs(2)
+        await link.prepare()
+        first.speed_um_per_s, first.torque_per_mille = -123_456, 250
+        now_s = asyncio.get_running_loop().time()
+        link.trigger(now_s)
+        await link.collect(inputs, now_s + 0.5)
+        assert inputs.speed.value[0] == pytest.approx(-0.123456)
+        assert inputs.torque.value[0] == pytest.approx(20.0)  # 250 per mille of 80 Nm
+        assert inputs.speed.time_s[0] == now_s, "a sample is as old as its SYNC"
+        assert inputs.speed.good() and inputs.torque.good()
+        for statusword, state, controlword in (
+            (SWITCH_ON_DISABLED, DriveState.OFF, 0x06),
+            (READY, DriveState.READY, 0x07),
+            (0x0233, DriveState.READY, 0x0F),
+            (ENABLED, DriveState.ENABLED, 0x0F),
+        ):
+            first.statusword = second.statusword = statusword
+            await cycle(link, inputs)
+            assert list(inputs.drive_state) == [state, state]
+            first.rpdos.clear()
+            write(link, DriveRequest.ENABLE, 10.0)
+            await until(lambda: bool(first.rpdos))
+            torque_per_mille = 125 if statusword == ENABLED else 0  # 10 Nm of 80 Nm, and only when enabled
+            assert first.rpdos == [struct.pack("<Hhb", controlword, torque_per_mille, 10)]
+        assert link.health.malformed == link.health.timeouts == 0
+
+    if interface == "virtual":
+        bench(body, interface="virtual", channel="test-driver-canopen")
+    else:
+        bench(body)
+
+
+def test_duplicate_and_late_answers_are_discarded() -> None:
+    async def body(link: CanopenLink, drives: Drives, first: Drive, second: Drive) -> None:
+        inputs = Inputs(2)
+        await link.prepare()
+
+        def twice(drive: Drive) -> list[bytes]:
+            other = struct.pack("<Hih", SWITCH_ON_DISABLED, 999, 0)
+            return [drive.tpdo(), other]
+
+        first.speed_um_per_s = 1_000_000
+        first.on_sync = twice
+        await cycle(link, inputs)
+        assert inputs.speed.value[0] == 1.0
+        await settle(drives)
+        await until(lambda: link.health.malformed == 1)
+
+        first.on_sync = lambda drive: []
+        await cycle(link, inputs, 0.02)
+        assert list(inputs.speed.quality) == [Quality.STALE, Quality.GOOD]
+        assert link.health.timeouts == 1
+        # The answer to that SYNC comes now, and waits in the socket when the next SYNC is sent.
+        drives.send(0x181, struct.pack("<Hih", SWITCH_ON_DISABLED, 5_000_000, 0))
+        await cycle(link, inputs, 0.02)
+        assert list(inputs.speed.quality) == [Quality.STALE, Quality.GOOD]
+        assert inputs.speed.value[0] == 1.0, "the last good value stays"
+        assert (link.health.timeouts, link.health.malformed) == (2, 2)
+
+    bench(body)
+
+
+@pytest.mark.parametrize("payload", [b"", bytes(7), struct.pack("<Hi", ENABLED, 5)])
+def test_wrong_length_is_no_answer(payload: bytes) -> None:
+    async def body(link: CanopenLink, drives: Drives, first: Drive, second: Drive) -> None:
+        inputs = Inputs(2)
+        await link.prepare()
+        first.on_sync = lambda drive: [payload]
+        await cycle(link, inputs, 0.02)
+        assert list(inputs.speed.quality) == [Quality.MISSING, Quality.GOOD]
+        assert link.health.malformed == 1
+        assert "drive-1" in link.health.last_error and "8" in link.health.last_error
+
+    bench(body)
+
+
+def test_a_drive_that_does_not_answer_three_times_is_absent_and_told_to_stop() -> None:
+    async def body(link: CanopenLink, drives: Drives, first: Drive, second: Drive) -> None:
+        inputs = Inputs(2)
+        await link.prepare()
+        first.statusword = second.statusword = ENABLED
+        await cycle(link, inputs)
+        first.on_sync = lambda drive: []
+        for missed in (1, 2, 3):
+            await cycle(link, inputs, 0.02)
+            state = DriveState.ABSENT if missed == 3 else DriveState.ENABLED
+            assert list(inputs.drive_state) == [state, DriveState.ENABLED]
+            first.rpdos.clear()
+            write(link, DriveRequest.ENABLE, 10.0)
+            await until(lambda: bool(first.rpdos))
+            # Held for two periods; then a drive that may still hear us has to take its torque off.
+            assert first.rpdos[0][:4] == (struct.pack("<Hh", 0, 0) if missed == 3 else struct.pack("<Hh", 0x0F, 125))
+        assert link.health.absent == ["drive-1"]
+        assert "drive-1" in link.health.last_error
+        # An absent drive is not waited for: this returns although the deadline is far away.
+        async with asyncio.timeout(5.0):
+            await cycle(link, inputs, 60.0)
+        first.on_sync = lambda drive: [drive.tpdo()]
+        await cycle(link, inputs)
+        await cycle(link, inputs)
+        assert list(inputs.drive_state) == [DriveState.ENABLED] * 2 and link.health.absent == []
+
+    bench(body)
+
+
+def test_heartbeat_is_supervised_by_time() -> None:
+    async def body(link: CanopenLink, drives: Drives, first: Drive, second: Drive) -> None:
+        inputs = Inputs(2)
+        await link.prepare()
+        await cycle(link, inputs)
+        heard_s = asyncio.get_running_loop().time()
+        assert list(inputs.drive_state) == [DriveState.OFF] * 2
+        drives.drives.clear()  # nobody answers, no heartbeat comes
+        link.trigger(heard_s + 0.151)
+        await link.collect(inputs, 0.0)
+        assert list(inputs.drive_state) == [DriveState.ABSENT] * 2, "1.5 x 100 ms have passed"
+
+    bench(body)
+
+
+def test_boot_up_means_lost_settings() -> None:
+    async def body(link: CanopenLink, drives: Drives, first: Drive, second: Drive) -> None:
+        inputs = Inputs(2)
+        await link.prepare()
+        first.statusword = second.statusword = ENABLED
+        await cycle(link, inputs)
+        drives.heartbeat(1, 0)
+        drives.heartbeat(1, 5)  # whatever it says afterwards
+        await cycle(link, inputs)
+        assert list(inputs.drive_state) == [DriveState.FAULT, DriveState.ENABLED]
+        assert "restarted" in link.health.last_error and "drive-1" in link.health.last_error
+        write(link, DriveRequest.ENABLE, 10.0)
+        await until(lambda: bool(first.rpdos))
+        assert first.rpdos[0][:4] == bytes(4), "no torque for a drive whose watchdog is gone"
+        first.statusword = second.statusword = READY
+        await link.prepare()
+        await cycle(link, inputs)
+        assert list(inputs.drive_state) == [DriveState.READY] * 2
+
+    bench(body)
+
+
+@pytest.mark.parametrize("state", [0x04, 0x7F])
+def test_leaving_operational_is_a_fault(state: int) -> None:
+    async def body(link: CanopenLink, drives: Drives, first: Drive, second: Drive) -> None:
+        inputs = Inputs(2)
+        await link.prepare()
+        await cycle(link, inputs)
+        drives.heartbeat(2, state)
+        await cycle(link, inputs)
+        assert list(inputs.drive_state) == [DriveState.OFF, DriveState.FAULT]
+
+    bench(body)
+
+
+def test_emergency_counts_at_once_until_it_is_reset() -> None:
+    async def body(link: CanopenLink, drives: Drives, first: Drive, second: Drive) -> None:
+        inputs = Inputs(2)
+        await link.prepare()
+        first.statusword = second.statusword = ENABLED
+        await cycle(link, inputs)
+        drives.send(0x082, struct.pack("<HB5x", 0x8250, 0x11))
+        await cycle(link, inputs)
+        assert list(inputs.drive_state) == [DriveState.ENABLED, DriveState.FAULT], "before the statusword says so"
+        assert "drive-2" in link.health.last_error and "8250h" in link.health.last_error
+        second.statusword = FAULT
+        edges: list[int] = []
+        for _ in range(4):
+            await cycle(link, inputs)
+            second.rpdos.clear()
+            write(link, DriveRequest.RESET_FAULT)
+            await until(lambda: bool(second.rpdos))
+            edges.append(struct.unpack("<H", second.rpdos[0][:2])[0])
+        assert edges == [0x80, 0x00, 0x80, 0x00], "bit 7 has to rise"
+        second.statusword = SWITCH_ON_DISABLED
+        await cycle(link, inputs)
+        assert list(inputs.drive_state) == [DriveState.ENABLED, DriveState.OFF]
+
+    bench(body)
+
+
+@pytest.mark.parametrize("torque_nm", [nan, inf, -inf, 1e9, 2700.0])
+def test_a_torque_that_cannot_be_commanded_is_never_sent(torque_nm: float) -> None:
+    async def body(link: CanopenLink, drives: Drives, first: Drive, second: Drive) -> None:
+        inputs, outputs = Inputs(2), Outputs(2)
+        await link.prepare()
+        first.statusword = second.statusword = ENABLED
+        await cycle(link, inputs)
+        outputs.drive_request[:] = DriveRequest.ENABLE
+        outputs.torque_nm[:] = torque_nm, 8.0
+        link.write(outputs)
+        await until(lambda: bool(second.rpdos))
+        assert not first.rpdos
+        assert link.health.malformed == 1 and "drive-1" in link.health.last_error
+
+    bench(body)
+
+
+def test_safe_torque_off_is_asked_for_while_a_drive_may_not_switch_on() -> None:
+    async def body(link: CanopenLink, drives: Drives, first: Drive, second: Drive) -> None:
+        inputs = Inputs(2)
+        await link.prepare()
+        first.statusword = second.statusword = ENABLED
+        await cycle(link, inputs)
+        first.objects[0x60FD, 0] = struct.pack("<I", 1 << 16)
+        first.statusword = SWITCH_ON_DISABLED & ~0x10
+        while inputs.drive_state[0] != DriveState.STO:
+            await cycle(link, inputs)
+        assert inputs.drive_state[1] == DriveState.ENABLED
+        first.statusword = READY
+        await cycle(link, inputs)
+        assert inputs.drive_state[0] == DriveState.READY
+
+    bench(body)
+
+
+# what prepare refuses
+
+
+def refusal(arrange: Callable[[Drive, Drive], None]) -> tuple[list[str], Drive, Drive]:
+    seen: list[tuple[list[str], Drive, Drive]] = []
+
+    async def body(link: CanopenLink, drives: Drives, first: Drive, second: Drive) -> None:
+        arrange(first, second)
+        with pytest.raises(PrepareRefused) as refused:
+            await link.prepare()
+        drives.frames.clear()
+        await cycle(link, Inputs(2))
+        write(link, DriveRequest.ENABLE, 10.0)
+        await settle(drives)
+        assert [cob_id for cob_id, _ in drives.frames] == [0x67F], "a refused link stays silent"
+        seen.append((refused.value.reasons, first, second))
+
+    bench(body)
+    return seen[0]
+
+
+def test_every_reason_is_given_with_its_device() -> None:
+    def arrange(first: Drive, second: Drive) -> None:
+        first.objects[0x1018, 2] = struct.pack("<I", 0x999)
+        second.objects[0x6076, 0] = struct.pack("<I", 60_000)
+        second.objects[0x6072, 0] = struct.pack("<H", 500)
+        second.statusword = ENABLED
+
+    reasons, first, second = refusal(arrange)
+    assert [reason.split(":")[0] for reason in reasons] == ["drive-1", "drive-2", "drive-2", "drive-2"]
+    assert "0x999" in reasons[0] and "0x402" in reasons[0]
+    assert "still enabled" in reasons[1] and "60 Nm" in reasons[2] and "40 Nm" in reasons[3]
+    assert first.writes == second.writes == [] and first.nmt == second.nmt == []
+
+
+def test_a_missing_drive_is_refused() -> None:
+    def arrange(first: Drive, second: Drive) -> None:
+        second.sdo_answers = False
+
+    reasons, first, _ = refusal(arrange)
+    assert len(reasons) == 1 and reasons[0].startswith("drive-2: node 2 does not answer")
+    assert first.writes == []
+
+
+def test_an_sdo_abort_undoes_the_whole_transaction() -> None:
+    pristine = Drive(1).objects, Drive(2).objects
+
+    def arrange(first: Drive, second: Drive) -> None:
+        second.aborts[0x1400, 5] = 0x06090030
+
+    reasons, first, second = refusal(arrange)
+    assert len(reasons) == 1 and "drive-2" in reasons[0] and "1400h sub 5" in reasons[0] and "06090030" in reasons[0]
+    assert (first.objects, second.objects) == pristine
+    assert first.writes and second.writes, "there was something to undo"
+    assert first.nmt[-1] == second.nmt[-1] == 0x80 and 0x01 not in first.nmt
+
+
+def test_a_watchdog_that_does_not_stick_is_found_by_reading_it_back() -> None:
+    def arrange(first: Drive, second: Drive) -> None:
+        first.stubborn.add((0x1400, 5))
+
+    reasons, first, second = refusal(arrange)
+    assert len(reasons) == 1 and "drive-1" in reasons[0] and "1400h sub 5" in reasons[0] and "read back" in reasons[0]
+    assert second.objects == Drive(2).objects
+
+
+def test_a_drive_that_does_not_start_is_refused() -> None:
+    def arrange(first: Drive, second: Drive) -> None:
+        second.starts = False
+
+    reasons, first, second = refusal(arrange)
+    assert len(reasons) == 1 and "drive-2" in reasons[0] and "operational" in reasons[0]
+    assert first.objects == Drive(1).objects and second.objects == Drive(2).objects
+
+
+def test_a_drive_that_restarts_meanwhile_is_refused() -> None:
+    async def body(link: CanopenLink, drives: Drives, first: Drive, second: Drive) -> None:
+        second.starts = False
+        preparing = asyncio.create_task(link.prepare())
+        await until(lambda: 0x01 in second.nmt)
+        drives.heartbeat(2, 0)
+        drives.heartbeat(2, 5)
+        with pytest.raises(PrepareRefused, match="drive-2: restarted"):
+            await preparing
+
+    bench(body)
+
+
+def test_a_bus_that_cannot_be_opened_says_what_to_do() -> None:
+    async def run() -> None:
+        link = build_links(line(can_bus={"interface": "socketcan", "channel": "nocan9"}))[0]
+        with pytest.raises(OSError, match="ip link set nocan9 up"):
+            await link.open()
+        await link.close()
+
+    asyncio.run(run())
+
+
+def test_garbage_on_the_bus_is_counted_and_harmless() -> None:
+    port = free_port(socket.SOCK_DGRAM)
+
+    async def body(link: CanopenLink, drives: Drives, first: Drive, second: Drive) -> None:
+        inputs = Inputs(2)
+        await link.prepare()
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as raw:
+            raw.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 0)
+            # The peer reads the same bus: it must not choke, so the garbage goes out after it stopped listening.
+            drives.send(0x701, bytes(3))  # a heartbeat of a wrong length
+            drives.send(0x081, bytes(2))  # an EMCY of a wrong length
+            drives.send(0x581, bytes(5))  # an SDO answer of a wrong length
+            drives.send(0x555, bytes(8))  # nobody's
+            await cycle(link, inputs)
+            assert link.health.malformed == 2 and inputs.speed.good()
+            asyncio.get_running_loop().remove_reader(drives._bus.fileno())  # noqa: SLF001
+            raw.sendto(b"\xc1no frame", (GROUP, port))
+            await until(lambda: link.health.malformed == 3)
+            assert "discarded" in link.health.last_error
+
+    bench(body, interface="udp_multicast", channel=GROUP, port=port)

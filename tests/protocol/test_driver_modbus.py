@@ -1,0 +1,481 @@
+"""The Modbus link against a raw TCP server that follows the map, or breaks it in every way a device can."""
+
+import asyncio
+import struct
+from collections.abc import Awaitable, Callable
+from math import inf, nan
+
+import pytest
+from driver_support import Registers, cycle, frame, line, until
+
+from drivers.modbus.link import ModbusLink
+from drivers.port import PrepareRefused
+from drivers.registry import build_links
+from gateway.core.signals import Inputs, Outputs, Quality
+
+Body = Callable[[ModbusLink, Registers], Awaitable[None]]
+
+
+def bench(body: Body, n: int = 2, channels: int = 2) -> None:
+    async def run() -> None:
+        async with Registers(channels) as peer:
+            link = build_links(line(n, modbus_port=peer.port))[1]
+            assert isinstance(link, ModbusLink)
+            await link.open()
+            try:
+                await body(link, peer)
+            finally:
+                await link.close()
+
+    asyncio.run(run())
+
+
+def command(run: bool, speed_m_per_s: float, n: int = 2) -> Outputs:
+    outputs = Outputs(n)
+    outputs.run, outputs.speed_request_m_per_s = run, speed_m_per_s
+    return outputs
+
+
+def test_a_cycle_reads_si_in_one_request_a_device() -> None:
+    async def body(link: ModbusLink, peer: Registers) -> None:
+        inputs = Inputs(2)
+        peer.tension(1, 12.5)
+        peer.tension(2, -0.25)
+        peer.plc[2:4] = [0xFFFF, 0x8AD0]  # -30 000 um/s, high word first
+        now_s = asyncio.get_running_loop().time()
+        link.trigger(now_s)
+        await link.collect(inputs, now_s + 0.5)
+        assert list(inputs.tension.value) == [12.5, -0.25] and inputs.tension.good()
+        assert inputs.tension.time_s[0] == now_s
+        assert inputs.unwind_speed.value[0] == pytest.approx(-0.03) and inputs.unwind_speed.good()
+        plc = inputs.plc
+        assert (plc.quality, plc.permissive, plc.emergency_stop, plc.running) == (Quality.GOOD, True, False, False)
+        # Registers 2 (status) to 22 (status of channel 2) by function 4; registers 1 to 4 by function 3.
+        assert peer.requests == [(1, struct.pack(">BHH", 4, 2, 21)), (2, struct.pack(">BHH", 3, 1, 4))]
+        peer.plc[1] = 0b0100
+        await cycle(link, inputs)
+        assert (plc.permissive, plc.emergency_stop, plc.running) == (False, True, True)
+
+    bench(body)
+
+
+def test_sixty_channels_take_as_few_requests_as_fit() -> None:
+    async def body(link: ModbusLink, peer: Registers) -> None:
+        inputs = Inputs(60)
+        for channel in range(1, 61):
+            peer.tension(channel, channel / 4)
+        await cycle(link, inputs)
+        assert list(inputs.tension.value) == [channel / 4 for channel in range(1, 61)]
+        assert [struct.unpack(">BHH", pdu)[2] <= 125 for unit, pdu in peer.requests if unit == 1] == [True] * 3
+
+    bench(body, 60, 60)
+
+
+def test_the_command_is_written_with_a_life_counter_only_when_active() -> None:
+    async def body(link: ModbusLink, peer: Registers) -> None:
+        inputs = Inputs(2)
+        link.write(command(True, 0.1))
+        await cycle(link, inputs)
+        assert {pdu[0] for _, pdu in peer.requests} == {3, 4}, "a silent link reads only"
+        assert peer.plc[10:15] == [0, 0, 0, 0, 0]
+        await link.prepare()
+        assert peer.plc[14] == 100, "limits.watchdog_s in ms"
+        peer.requests.clear()
+        link.write(command(True, -0.1))
+        lives: list[int] = []
+        for _ in range(3):
+            await cycle(link, inputs)
+            lives.append(peer.plc[13])
+        assert lives == [1, 2, 3]
+        assert peer.plc[10:13] == [1, 0xFFFE, 0x7960]  # run, -100 000 um/s
+        written = [pdu for unit, pdu in peer.requests if unit == 2]
+        assert written[0] == struct.pack(">BHHHHBHHHH", 23, 1, 4, 10, 4, 8, 1, 0xFFFE, 0x7960, 1)
+        link.silence()
+        peer.requests.clear()
+        link.write(command(True, 0.1))
+        await cycle(link, inputs)
+        assert {pdu[0] for _, pdu in peer.requests} == {3, 4}
+        await link.prepare()
+        await cycle(link, inputs)
+        assert peer.plc[10:13] == [0, 0, 0], "nothing of an old command is left"
+
+    bench(body)
+
+
+@pytest.mark.parametrize("speed_m_per_s", [nan, inf, -inf, 51.0, -51.0, 1e30])
+def test_a_speed_that_cannot_be_commanded_is_not_written(speed_m_per_s: float) -> None:
+    async def body(link: ModbusLink, peer: Registers) -> None:
+        inputs = Inputs(2)
+        await link.prepare()
+        link.write(command(True, 0.1))
+        await cycle(link, inputs)
+        before = list(peer.plc)
+        link.write(command(True, speed_m_per_s))
+        await cycle(link, inputs)
+        assert peer.plc == before, "not even the life counter: the PLC's watchdog has the last word"
+        assert link.health.malformed == 1 and "plc" in link.health.last_error
+        assert inputs.plc.quality == Quality.GOOD, "it is read all the same"
+
+    bench(body)
+
+
+# answers that must not be believed
+
+
+async def _other_function(head: bytes, unit: int, pdu: bytes) -> list[bytes]:
+    return [frame(head, unit, bytes((6 if pdu[0] == 3 else 3, 42)) + bytes(42))]
+
+
+async def _too_short(head: bytes, unit: int, pdu: bytes) -> list[bytes]:
+    return [frame(head, unit, bytes((pdu[0], 4)) + bytes(4))]
+
+
+async def _too_long(head: bytes, unit: int, pdu: bytes) -> list[bytes]:
+    return [frame(head, unit, bytes((pdu[0], 100)) + bytes(100))]
+
+
+async def _none_at_all(head: bytes, unit: int, pdu: bytes) -> list[bytes]:
+    return [frame(head, unit, bytes((pdu[0], 0)))]
+
+
+async def _exception(head: bytes, unit: int, pdu: bytes) -> list[bytes]:
+    return [frame(head, unit, bytes((pdu[0] | 0x80, 4)))]
+
+
+async def _garbage(head: bytes, unit: int, pdu: bytes) -> list[bytes]:
+    return [b"HTTP/1.1 400 Bad Request\r\n\r\n"]
+
+
+async def _half(head: bytes, unit: int, pdu: bytes) -> list[bytes]:
+    return [frame(head, unit, bytes((pdu[0], 42)) + bytes(42))[:20]]
+
+
+async def _other_unit(head: bytes, unit: int, pdu: bytes) -> list[bytes]:
+    return [frame(head, unit + 7, bytes((pdu[0], 42)) + bytes(42))]
+
+
+async def _other_transaction(head: bytes, unit: int, pdu: bytes) -> list[bytes]:
+    return [frame(b"\x77\x77", unit, bytes((pdu[0], 42)) + bytes(42))]
+
+
+async def _nothing(head: bytes, unit: int, pdu: bytes) -> list[bytes]:
+    return []
+
+
+@pytest.mark.parametrize(
+    "script",
+    [
+        _other_function,
+        _too_short,
+        _too_long,
+        _none_at_all,
+        _exception,
+        _garbage,
+        _half,
+        _other_unit,
+        _other_transaction,
+        _nothing,
+    ],
+)
+def test_an_answer_that_does_not_fit_is_a_lost_sample(script: Callable[..., Awaitable[list[bytes]]]) -> None:
+    async def body(link: ModbusLink, peer: Registers) -> None:
+        inputs = Inputs(2)
+        peer.tension(1, 12.5)
+        await cycle(link, inputs)
+        peer.tension(1, 99.0)
+        peer.script = script
+        await cycle(link, inputs)
+        assert list(inputs.tension.quality) == [Quality.STALE] * 2
+        assert inputs.tension.value[0] == 12.5, "the last good value stays"
+        assert inputs.plc.quality == Quality.STALE and inputs.unwind_speed.quality[0] == Quality.STALE
+        assert link.health.timeouts == 2 and link.health.last_error
+        await cycle(link, inputs, 0.05)
+        await cycle(link, inputs, 0.05)
+        assert sorted(link.health.absent) == ["cell-1, cell-2", "plc"]
+        # The device recovers: so does the link, on a new connection where the old one could not be trusted.
+        peer.script = None
+        await _until_good(link, inputs)
+        assert inputs.tension.value[0] == 99.0
+
+    bench(body)
+
+
+async def _until_good(link: ModbusLink, inputs: Inputs) -> None:
+    inputs.tension.quality[:] = Quality.STALE
+    async with asyncio.timeout(5.0):
+        while not (inputs.tension.good() and inputs.plc.quality == Quality.GOOD):
+            await cycle(link, inputs, 0.01)
+
+
+def test_a_late_answer_never_passes_for_a_fresh_one() -> None:
+    async def body(link: ModbusLink, peer: Registers) -> None:
+        inputs = Inputs(2)
+        release = asyncio.Event()
+        asked = asyncio.Event()
+
+        async def late(head: bytes, unit: int, pdu: bytes) -> list[bytes]:
+            answer = frame(head, unit, peer.answer(unit, pdu))
+            asked.set()
+            await release.wait()
+            peer.script = None
+            return [answer]
+
+        peer.tension(1, 1.0)
+        await cycle(link, inputs)
+        peer.script = late
+        peer.tension(1, 2.0)
+        loop = asyncio.get_running_loop()
+        now_s = loop.time()
+        link.trigger(now_s + 10.0)  # the exchange may last; the cycle does not wait for it
+        await asked.wait()
+        await link.collect(inputs, loop.time())
+        assert list(inputs.tension.quality) == [Quality.STALE] * 2
+        count = len(peer.requests)
+        link.trigger(now_s + 10.01)  # still running: not doubled
+        release.set()
+        await link.collect(inputs, loop.time() + 0.05)
+        assert list(inputs.tension.quality) == [Quality.STALE] * 2 and inputs.tension.value[0] == 1.0
+        await until(lambda: link.health.malformed == 2)  # both devices answered after their cycle
+        assert len(peer.requests) == count + 1, "the PLC's request of the first cycle, no other"
+        assert link.health.timeouts == 4
+        await _until_good(link, inputs)
+        assert inputs.tension.value[0] == 2.0
+
+    bench(body)
+
+
+def test_what_a_load_cell_says_is_checked() -> None:
+    async def body(link: ModbusLink, peer: Registers) -> None:
+        inputs = Inputs(2)
+        peer.tension(2, 7.0)
+        for value, status in ((nan, 0), (inf, 0), (100.001, 0), (-100.001, 0), (50.0, 1), (50.0, 2), (50.0, 3), (50.0, 9)):
+            peer.tension(1, 1.0)
+            await cycle(link, inputs)
+            assert inputs.tension.good()
+            peer.tension(1, value, status)
+            await cycle(link, inputs)
+            assert list(inputs.tension.quality) == [Quality.BAD, Quality.GOOD], (value, status)
+            assert inputs.tension.value[0] == 1.0
+            assert "cell-1" in link.health.last_error
+        for value in (100.0, -100.0, -0.5, 0.0):
+            peer.tension(1, value)
+            await cycle(link, inputs)
+            assert inputs.tension.good() and inputs.tension.value[0] == value
+        peer.amplifier[2] = 0
+        await cycle(link, inputs)
+        assert list(inputs.tension.quality) == [Quality.BAD] * 2 and "not healthy" in link.health.last_error
+
+    bench(body)
+
+
+def test_a_sample_counter_that_stands_still_makes_stale() -> None:
+    async def body(link: ModbusLink, peer: Registers) -> None:
+        inputs = Inputs(2)
+        peer.amplifier[3] = 0xFFFE
+        for _ in range(4):  # also over the wrap
+            await cycle(link, inputs)
+            assert inputs.tension.good()
+        peer.counts = False
+        await cycle(link, inputs)
+        assert list(inputs.tension.quality) == [Quality.STALE] * 2
+        assert "sample counter" in link.health.last_error
+
+    bench(body)
+
+
+def test_a_plc_that_no_longer_echoes_is_stale() -> None:
+    async def body(link: ModbusLink, peer: Registers) -> None:
+        inputs = Inputs(2)
+        await link.prepare()
+        for _ in range(5):
+            link.write(command(True, 0.1))
+            await cycle(link, inputs)
+            assert inputs.plc.quality == Quality.GOOD
+        peer.echoes = False
+        qualities: list[int] = []
+        for _ in range(3):
+            link.write(command(True, 0.1))
+            await cycle(link, inputs)
+            qualities.append(inputs.plc.quality)
+        assert qualities == [Quality.GOOD, Quality.GOOD, Quality.STALE]
+
+    bench(body)
+
+
+def test_a_tripped_plc_watchdog_and_an_impossible_speed_are_named() -> None:
+    async def body(link: ModbusLink, peer: Registers) -> None:
+        inputs = Inputs(2)
+        peer.plc[1] |= 0b1000
+        await cycle(link, inputs)
+        assert "watchdog has tripped" in link.health.last_error
+        peer.plc[2:4] = [0x7FFF, 0xFFFF]  # 2147 m/s
+        await cycle(link, inputs)
+        assert inputs.unwind_speed.quality[0] == Quality.BAD
+
+    bench(body)
+
+
+def test_a_dead_unit_costs_the_other_one_cycle() -> None:
+    async def body(link: ModbusLink, peer: Registers) -> None:
+        inputs = Inputs(2)
+        await cycle(link, inputs)
+
+        async def amplifier_is_dead(head: bytes, unit: int, pdu: bytes) -> list[bytes] | None:
+            return [] if unit == 1 else None
+
+        peer.script = amplifier_is_dead
+        await cycle(link, inputs)
+        for _ in range(3):
+            await cycle(link, inputs)
+            assert inputs.plc.quality == Quality.GOOD
+            assert list(inputs.tension.quality) == [Quality.STALE] * 2
+        assert link.health.absent == ["cell-1, cell-2"]
+
+    bench(body)
+
+
+# connections
+
+
+def test_reconnects_by_itself_and_costs_no_time() -> None:
+    async def body(link: ModbusLink, peer: Registers) -> None:
+        inputs = Inputs(2)
+        await link.prepare()
+        await cycle(link, inputs)
+        await peer.stop()
+        loop = asyncio.get_running_loop()
+        for _ in range(5):
+            begin_s = loop.time()
+            link.trigger(begin_s)
+            await link.collect(inputs, begin_s + 60.0)
+            assert loop.time() - begin_s < 1.0, "nothing is waited for on a lost connection"
+        assert inputs.plc.quality == Quality.STALE and len(link.health.absent) == 2
+        await peer.start()
+        await _until_good(link, inputs)
+        assert link.health.reconnects == 1
+
+    bench(body)
+
+
+def test_a_plc_that_lost_its_watchdog_is_not_written_to_again() -> None:
+    async def body(link: ModbusLink, peer: Registers) -> None:
+        inputs = Inputs(2)
+        await link.prepare()
+        link.write(command(True, 0.1))
+        await cycle(link, inputs)
+        for watchdog_ms, written in ((100, True), (0, False)):
+            await peer.stop()
+            await cycle(link, inputs, 0.02)
+            peer.plc[14] = watchdog_ms  # 0: it was restarted, its settings are the defaults
+            await peer.start()
+            await _until_good(link, inputs)
+            peer.requests.clear()
+            await cycle(link, inputs)
+            await cycle(link, inputs)
+            functions = {pdu[0] for unit, pdu in peer.requests if unit == 2}
+            assert functions == ({23} if written else {3})
+        assert "watchdog" in link.health.last_error
+        await link.prepare()
+        await cycle(link, inputs)
+        assert peer.plc[14] == 100 and peer.requests[-1][1][0] == 23
+
+    bench(body)
+
+
+def test_open_says_what_to_do_and_the_link_goes_on_trying() -> None:
+    async def run() -> None:
+        async with Registers() as peer:
+            await peer.stop()
+            link = build_links(line(modbus_port=peer.port))[1]
+            with pytest.raises(OSError, match="check host and port"):
+                await link.open()
+            with pytest.raises(PrepareRefused, match="no connection"):
+                await link.prepare()
+            await peer.start()
+            inputs = Inputs(2)
+            assert isinstance(link, ModbusLink)
+            await _until_good(link, inputs)
+            await link.close()
+            await link.close()
+
+    asyncio.run(run())
+
+
+def test_two_addresses_are_two_links() -> None:
+    async def run() -> None:
+        async with Registers() as amplifier, Registers() as plc:
+            links = build_links(line(modbus_port=amplifier.port, plc_port=plc.port))[1:]
+            inputs = Inputs(2)
+            for link in links:
+                await link.open()
+                await cycle(link, inputs)
+                await link.close()
+            assert [link.name for link in links] == ["io", "plc-io"]
+            assert {unit for unit, _ in amplifier.requests} == {1} and {unit for unit, _ in plc.requests} == {2}
+            assert inputs.tension.good() and inputs.plc.quality == Quality.GOOD
+
+    asyncio.run(run())
+
+
+# what prepare refuses
+
+
+def refusal(arrange: Callable[[Registers], None], channels: int = 2) -> tuple[list[str], Registers]:
+    seen: list[tuple[list[str], Registers]] = []
+
+    async def body(link: ModbusLink, peer: Registers) -> None:
+        arrange(peer)
+        with pytest.raises(PrepareRefused) as refused:
+            await link.prepare()
+        peer.script = None
+        peer.requests.clear()
+        link.write(command(True, 0.1))
+        await cycle(link, Inputs(2))
+        assert 23 not in {pdu[0] for _, pdu in peer.requests}, "a refused link stays silent"
+        seen.append((refused.value.reasons, peer))
+
+    bench(body, channels=channels)
+    return seen[0]
+
+
+def test_every_wrong_device_is_named() -> None:
+    def arrange(peer: Registers) -> None:
+        peer.amplifier[0], peer.plc[0] = 0x1111, 0x2222
+
+    reasons, peer = refusal(arrange)
+    assert len(reasons) == 2 and peer.plc[14] == 0
+    assert "0x1111" in reasons[0] and "0x5201" in reasons[0] and "cell-1" in reasons[0]
+    assert "0x2222" in reasons[1] and "0x5202" in reasons[1] and reasons[1].startswith("plc:")
+
+
+def test_a_missing_channel_is_named() -> None:
+    reasons, _ = refusal(lambda peer: None, channels=1)
+    assert reasons == ["cell-2: channel 2, the amplifier has 1"]
+
+
+def test_a_watchdog_that_does_not_stick_is_refused_and_undone() -> None:
+    def arrange(peer: Registers) -> None:
+        peer.plc[14] = 500
+
+        async def stubborn(head: bytes, unit: int, pdu: bytes) -> list[bytes] | None:
+            if pdu[0] == 16:
+                peer.plc[14] = 77 if pdu[-2:] == b"\x00\x64" else struct.unpack(">H", pdu[-2:])[0]
+                return [frame(head, unit, pdu[:5])]
+            return None
+
+        peer.script = stubborn
+
+    reasons, peer = refusal(arrange)
+    assert len(reasons) == 1 and "100" in reasons[0] and "77" in reasons[0]
+    assert peer.plc[14] == 500
+
+
+def test_a_plc_that_refuses_the_watchdog_is_refused() -> None:
+    def arrange(peer: Registers) -> None:
+        async def refuses(head: bytes, unit: int, pdu: bytes) -> list[bytes] | None:
+            return [frame(head, unit, b"\x90\x03")] if pdu[0] == 16 else None
+
+        peer.script = refuses
+
+    reasons, _ = refusal(arrange)
+    assert len(reasons) == 1 and reasons[0].startswith("plc:") and "exception 3" in reasons[0]

@@ -1,0 +1,175 @@
+"""The envelope at its boundaries: one test a rule, and properties that must hold for whatever a law may ask."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gateway.core.signals import DriveState, Inputs, Quality
+from safety.actions import Action, most_severe
+from safety.envelope import (
+    EnvelopeState,
+    Supervision,
+    check_inputs,
+    check_timing,
+    check_torque,
+    feedback_usable,
+    limit_torque,
+)
+from safety.limits import EnvelopeLimits
+
+LIMITS = EnvelopeLimits(
+    period_s=0.01,
+    torque_nm=60.0,
+    torque_rate_nm_per_s=1000.0,
+    tension_min_n=2.0,
+    tension_max_n=60.0,
+    speed_max_m_per_s=0.12,
+    hold_periods=3,
+    band_periods=2,
+    overruns_in_a_row=3,
+    skipped_periods=5,
+    measured=np.array([1.0, 1.0, 0.0]),
+)
+EVERYTHING = Supervision(feedback=True, tension_floor=True, drives_enabled=True)
+NOTHING = Supervision(feedback=False, tension_floor=False, drives_enabled=False)
+
+
+def healthy():
+    inputs = Inputs(3)
+    for i in range(3):
+        inputs.tension.put(i, 30.0, 1.0)
+        inputs.speed.put(i, 0.05, 1.0)
+        inputs.torque.put(i, 10.0, 1.0)
+        inputs.drive_state[i] = DriveState.ENABLED
+    inputs.unwind_speed.put(0, 0.05, 1.0)
+    inputs.plc.quality, inputs.plc.permissive, inputs.plc.emergency_stop = Quality.GOOD, True, False
+    return inputs
+
+
+def findings_after(periods, inputs, supervision=EVERYTHING, state=None):
+    state = state or EnvelopeState()
+    found = []
+    for _ in range(periods):
+        found, state = check_inputs(LIMITS, state, inputs, supervision)
+    return found
+
+
+def test_a_healthy_line_runs_on():
+    assert findings_after(100, healthy()) == []
+
+
+@pytest.mark.parametrize("channel", ["tension", "speed", "unwind_speed"])
+@pytest.mark.parametrize("how", ["miss", "reject"])
+def test_a_missing_signal_holds_the_outputs_and_stops_at_the_third_period(channel, how):
+    inputs = healthy()
+    getattr(getattr(inputs, channel), how)(0)
+    assert not feedback_usable(LIMITS, inputs)
+    assert [most_severe(findings_after(k, inputs)) for k in (1, 2, 3)] == [
+        Action.HOLD_OUTPUTS,
+        Action.HOLD_OUTPUTS,
+        Action.STOP,
+    ]
+    assert findings_after(5, inputs, NOTHING) == []
+
+
+def test_signals_that_come_back_start_the_count_anew():
+    gone, state = healthy(), EnvelopeState()
+    gone.tension.miss(1)
+    for inputs in (gone, gone, healthy(), gone, gone):
+        found, state = check_inputs(LIMITS, state, inputs, EVERYTHING)
+        assert most_severe(found) < Action.STOP
+
+
+def test_a_draw_span_has_no_load_cell_and_none_is_missed():
+    inputs = healthy()
+    inputs.tension.reject(2)
+    assert feedback_usable(LIMITS, inputs) and findings_after(10, inputs) == []
+
+
+@pytest.mark.parametrize(
+    ("tension", "action"),
+    [
+        (60.0, Action.NONE),
+        (60.01, Action.STOP),
+        (2.0, Action.NONE),
+        (1.99, Action.TORQUE_OFF),
+        (-5.0, Action.TORQUE_OFF),
+    ],
+)
+def test_the_tension_band_trips_on_the_second_sample_outside(tension, action):
+    inputs = healthy()
+    inputs.tension.put(0, tension, 1.0)
+    assert findings_after(1, inputs) == []
+    assert most_severe(findings_after(2, inputs)) is action
+
+
+def test_the_floor_counts_only_once_the_web_is_tensioned_the_ceiling_always():
+    slack, tight = healthy(), healthy()
+    slack.tension.put(0, 0.0, 1.0)
+    tight.tension.put(0, 61.0, 1.0)
+    assert findings_after(5, slack, NOTHING) == []
+    assert most_severe(findings_after(2, tight, NOTHING)) is Action.STOP
+
+
+@pytest.mark.parametrize("state", [s for s in DriveState if s is not DriveState.ENABLED])
+def test_a_drive_that_no_longer_follows_stops_the_line_at_once(state):
+    inputs = healthy()
+    inputs.drive_state[1] = state
+    found = findings_after(1, inputs)
+    assert most_severe(found) is Action.STOP and "2 " + state.name in found[0].text
+    assert findings_after(1, inputs, NOTHING) == []
+
+
+def test_the_line_plc_speaks_and_is_missed():
+    inputs = healthy()
+    inputs.plc.permissive = False
+    assert most_severe(findings_after(1, inputs)) is Action.STOP
+    inputs.plc.emergency_stop = True
+    assert most_severe(findings_after(1, inputs)) is Action.TORQUE_OFF
+    inputs.plc.quality = Quality.STALE
+    assert most_severe(findings_after(2, inputs)) is Action.NONE
+    assert most_severe(findings_after(3, inputs)) is Action.STOP
+
+
+def test_overspeed_of_the_unwinder():
+    inputs = healthy()
+    inputs.unwind_speed.put(0, 1.1 * 0.12, 1.0)
+    assert findings_after(1, inputs) == []
+    inputs.unwind_speed.put(0, 1.1 * 0.12 + 1e-6, 1.0)
+    assert most_severe(findings_after(1, inputs)) is Action.STOP
+
+
+def timing(*skipped):
+    state, found = EnvelopeState(), []
+    for periods in skipped:
+        found, state = check_timing(LIMITS, state, periods)
+    return most_severe(found)
+
+
+def test_overruns_stop_the_line_when_they_are_long_or_many():
+    assert timing(5) is Action.NONE and timing(6) is Action.STOP
+    assert timing(1, 1) is Action.NONE and timing(1, 1, 1) is Action.STOP
+    assert timing(1, 1, 0, 1, 1) is Action.NONE
+
+
+@given(st.lists(st.sampled_from([np.nan, np.inf, -np.inf, 1.0]), min_size=3, max_size=3))
+def test_a_torque_that_is_not_finite_is_never_used(asked):
+    found = check_torque(np.array(asked))
+    assert bool(found) == (not np.isfinite(asked).all())
+    assert most_severe(found) is (Action.TORQUE_OFF if found else Action.NONE)
+
+
+torques = st.lists(st.floats(-1e6, 1e6), min_size=3, max_size=3).map(np.array)
+applied = st.lists(st.floats(-60, 60), min_size=3, max_size=3).map(np.array)
+
+
+@given(torques, applied, st.floats(-0.01, 0.1))
+def test_applied_torque_keeps_limit_and_rate_and_is_the_nearest_that_does(asked, before, interval_s):
+    torque = limit_torque(LIMITS, asked, before, interval_s)
+    step = 1000.0 * min(max(interval_s, 0.0), 0.01)
+    assert (np.abs(torque) <= 60.0).all()
+    assert (np.abs(torque - before) <= step + 1e-9).all()
+    low, high = np.maximum(before - step, -60.0), np.minimum(before + step, 60.0)
+    nearest = np.array([min((x, a, b), key=lambda y: (not a <= y <= b, abs(y - x))) for x, a, b in zip(asked, low, high, strict=True)])
+    assert np.allclose(torque, nearest)

@@ -1,0 +1,59 @@
+"""A line, its telemetry and a short folder for sockets, for the tests of the gateway process."""
+
+import shutil
+import tempfile
+import tomllib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gateway.core.line import Line
+from gateway.core.line_template import line_template
+from gateway.core.signals import DriveState, Quality
+from gateway.core.states import LoopState
+from gateway.core.telemetry import Frame, pack
+
+
+def line_of(spans: int = 6, name: str | None = None) -> Line:
+    document = tomllib.loads(line_template(spans))
+    if name is not None:
+        document["line"] = name
+    return Line.model_validate(document)
+
+
+@contextmanager
+def short_folder() -> Iterator[Path]:
+    """pytest's own folders may be longer than a socket's path may be."""
+    folder = Path(tempfile.mkdtemp(prefix="r2r-", dir="/tmp"))
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder)
+
+
+def frame_of(sequence: int, time_s: float, spans: int = 6, **changes: Any) -> bytes:
+    rng = np.random.default_rng(sequence)
+    setpoint = np.linspace(20.0, 40.0, spans)
+    values: dict[str, Any] = {
+        "sequence": sequence,
+        "time_s": time_s,
+        "lateness_s": 40e-6 + 5e-6 * rng.random(),
+        "cycle_s": 600e-6 + 50e-6 * rng.random(),
+        "missed": 0,
+        "unwind_speed_m_per_s": 0.1,
+        "speed_setpoint_m_per_s": 0.1,
+        "state": LoopState.RUN,
+        "saturated": False,
+        "held": 0,
+        "tension_n": setpoint + 0.1 * rng.standard_normal(spans),
+        "tension_setpoint_n": setpoint,
+        "speed_m_per_s": 0.1 + 1e-4 * rng.standard_normal(spans),
+        "torque_nm": 5.0 + 0.5 * rng.standard_normal(spans),
+        "torque_actual_nm": 5.0 + 0.5 * rng.standard_normal(spans),
+        "tension_quality": np.full(spans, Quality.GOOD, np.int8),
+        "drive_state": np.full(spans, DriveState.ENABLED, np.int8),
+    }
+    return pack(Frame(**(values | changes)))

@@ -1,0 +1,128 @@
+"""The state machine as stories: what is observed, and where it leads; and what may never happen."""
+
+from dataclasses import replace
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gateway.core.states import STATE_OF, LoopState, Phase
+from gateway.loop.machine import ARMING_TIME_S, Machine, Observation, Times, advance, stop, to_phase, torque_off
+from safety.actions import Action
+
+TIMES = Times(tensioning_s=20.0, stop_s=10.0)
+FINE = Observation(
+    action=Action.NONE,
+    reason="",
+    drives_ready=True,
+    drives_enabled=True,
+    tensioned=True,
+    standstill=False,
+    plc_answers=True,
+    feedback=True,
+    torque_zero=False,
+)
+TORQUE = (Phase.TENSIONING, Phase.RUNNING, Phase.HOLDING, Phase.SLOWING)
+
+
+def after(phase, seen, at_s=0.1):
+    return advance(TIMES, Machine(phase), seen, at_s)
+
+
+def test_from_arming_to_running():
+    machine = advance(TIMES, Machine(Phase.ARMING), FINE, 0.1)
+    assert machine.phase is Phase.READY
+    machine = advance(TIMES, to_phase(machine, Phase.ENABLING, 1.0), FINE, 1.01)
+    assert machine.phase is Phase.TENSIONING
+    machine = advance(TIMES, machine, replace(FINE, tensioned=False), 2.0)
+    machine = advance(TIMES, machine, FINE, 3.0)
+    machine = advance(TIMES, machine, replace(FINE, tensioned=False), 3.4)  # out of the band again: counts anew
+    machine = advance(TIMES, machine, FINE, 3.5)
+    assert advance(TIMES, machine, FINE, 3.9).phase is Phase.TENSIONING
+    assert advance(TIMES, machine, FINE, 4.0).phase is Phase.RUNNING
+
+
+def test_a_drive_that_does_not_become_ready_refuses_the_arming():
+    unready = replace(FINE, drives_ready=False)
+    assert after(Phase.ARMING, unready, ARMING_TIME_S).phase is Phase.ARMING
+    assert after(Phase.ARMING, unready, ARMING_TIME_S + 0.01).phase is Phase.OFF
+
+
+def test_a_web_that_cannot_be_tensioned_stops_the_line():
+    machine = after(Phase.TENSIONING, replace(FINE, tensioned=False), 20.01)
+    assert machine.phase is Phase.SLOWING and "threaded" in machine.reason
+
+
+def test_a_controlled_stop_slows_unloads_and_stays_off():
+    machine = advance(TIMES, Machine(Phase.RUNNING), replace(FINE, action=Action.STOP, reason="why"), 1.0)
+    assert (machine.phase, machine.reason) == (Phase.SLOWING, "why")
+    # The cause persists: the stop that is under way is not begun anew.
+    assert advance(TIMES, machine, replace(FINE, action=Action.STOP, reason="more"), 1.5) == machine
+    machine = advance(TIMES, machine, replace(FINE, standstill=True), 2.0)
+    assert machine.phase is Phase.UNLOADING
+    machine = advance(TIMES, machine, replace(FINE, torque_zero=True), 2.3)
+    assert (machine.phase, machine.reason) == (Phase.OFF, "why")
+    assert advance(TIMES, machine, FINE, 1e6) == machine
+
+
+@pytest.mark.parametrize(
+    "seen",
+    [
+        replace(FINE, plc_answers=False),
+        replace(FINE, feedback=False),
+        replace(FINE, action=Action.TORQUE_OFF, reason="slack"),
+    ],
+)
+def test_what_makes_tension_control_pointless_ends_the_slowing(seen):
+    assert after(Phase.SLOWING, seen).phase is Phase.UNLOADING
+
+
+def test_slowing_ends_when_its_time_is_up():
+    assert after(Phase.SLOWING, FINE, 10.0).phase is Phase.SLOWING
+    assert after(Phase.SLOWING, FINE, 10.01).phase is Phase.UNLOADING
+
+
+@given(st.sampled_from(list(Phase)), st.sampled_from([Action.STOP, Action.TORQUE_OFF]), st.floats(0, 1e4))
+def test_a_severe_finding_leads_to_stop_from_wherever_there_is_torque(phase, action, now_s):
+    machine = after(phase, replace(FINE, action=action, reason="r"), now_s)
+    if STATE_OF[phase] is LoopState.SILENT and phase is Phase.SILENT:
+        assert machine.phase is Phase.SILENT
+    else:
+        assert machine.state is LoopState.STOP
+    if action is Action.TORQUE_OFF and phase in TORQUE:
+        assert machine.phase is Phase.UNLOADING
+
+
+@given(
+    st.lists(
+        st.builds(
+            Observation,
+            action=st.sampled_from(list(Action)),
+            reason=st.just("r"),
+            drives_ready=st.booleans(),
+            drives_enabled=st.booleans(),
+            tensioned=st.booleans(),
+            standstill=st.booleans(),
+            plc_answers=st.booleans(),
+            feedback=st.booleans(),
+            torque_zero=st.booleans(),
+        ),
+        max_size=40,
+    ),
+    st.sampled_from(list(Phase)),
+)
+def test_stop_is_latched_and_nothing_starts_by_itself(story, phase):
+    machine = Machine(phase)
+    for k, seen in enumerate(story):
+        before, machine = machine, advance(TIMES, machine, seen, 0.5 * (k + 1))
+        if before.state is LoopState.STOP:
+            assert machine.state is LoopState.STOP
+        if before.phase in (Phase.SILENT, Phase.READY, Phase.OFF):
+            assert machine.phase in (before.phase, Phase.OFF)
+
+
+@pytest.mark.parametrize("way", [stop, torque_off])
+@pytest.mark.parametrize("phase", list(Phase))
+def test_the_operators_stop_works_in_every_phase(way, phase):
+    machine = way(Machine(phase), 5.0, "operator")
+    assert machine.state is LoopState.STOP or machine.phase is Phase.SILENT

@@ -1,0 +1,209 @@
+"""The gateway as a process: sockets, signals, single instance, restarts of it and of the loop, commands with who."""
+
+import asyncio
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
+from contextlib import asynccontextmanager, contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from supervisor_support import frame_of, short_folder
+
+from gateway.core.messages import Event, Reply
+from gateway.core.topics import GATEWAY_COMMAND, GATEWAY_STATUS, LOOP_COMMAND, LOOP_EVENT, LOOP_TELEMETRY
+from gateway.mailbox.port import RemoteError, Unreachable
+from gateway.mailbox.unix import UnixMailbox
+from gateway.supervisor.history import History
+from gateway.supervisor.status import GatewayStatus
+
+GATEWAY = """
+import sys
+from pathlib import Path
+from supervisor_support import line_of
+from gateway.supervisor.process import run_gateway
+sys.exit(run_gateway(line_of(), Path(sys.argv[1]), Path(sys.argv[1]) / "data"))
+"""
+
+
+def start(folder: Path) -> subprocess.Popen[str]:
+    command = [sys.executable, "-c", GATEWAY, str(folder)]
+    return subprocess.Popen(
+        command, cwd=Path(__file__).parent, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+
+
+@contextmanager
+def gateway(folder: Path) -> Iterator[subprocess.Popen[str]]:
+    process = start(folder)
+    with process:
+        try:
+            assert process.stdout is not None
+            assert "gateway of demo/" in process.stdout.readline()
+            yield process
+        finally:
+            process.kill()
+
+
+@asynccontextmanager
+async def loop_and_client(folder: Path) -> AsyncIterator[tuple[UnixMailbox, UnixMailbox]]:
+    """The loop's side and an operator's. The clock is fast: the loop looks for its gateway at each publish."""
+    turn = iter(range(10**9))
+    loop, client = UnixMailbox(lambda: float(next(turn))), UnixMailbox()
+    loop.connect((LOOP_TELEMETRY, LOOP_EVENT), folder / "gateway.sock")
+    client.connect((GATEWAY_STATUS, GATEWAY_COMMAND), folder / "gateway.sock")
+    try:
+        yield loop, client
+    finally:
+        await client.close()
+        await loop.close()
+
+
+def run(story: Callable[[Path], Coroutine[Any, Any, None]]) -> None:
+    async def bounded(folder: Path) -> None:
+        async with asyncio.timeout(30.0):
+            await story(folder)
+
+    with short_folder() as folder:
+        asyncio.run(bounded(folder))
+
+
+async def ask(client: UnixMailbox) -> GatewayStatus:
+    return GatewayStatus.model_validate_json(await client.request(GATEWAY_STATUS, b"", 5.0))
+
+
+async def until(client: UnixMailbox, condition: Callable[[GatewayStatus], bool]) -> GatewayStatus:
+    while not condition(status := await ask(client)):
+        await asyncio.sleep(0.01)
+    return status
+
+
+def test_from_start_to_sigterm_everything_is_kept() -> None:
+    async def story(folder: Path) -> None:
+        with gateway(folder) as process:
+            async with loop_and_client(folder) as (loop, client):
+                assert not (await ask(client)).loop.running
+                for k in range(150):
+                    assert loop.publish(LOOP_TELEMETRY, frame_of(k, time.monotonic()))
+                event = Event(time_s=time.monotonic(), kind="state", text="TENSIONING to RUNNING")
+                loop.publish(LOOP_EVENT, event.model_dump_json().encode())
+                status = await until(client, lambda status: "loop-up" in {event.kind for event in status.events})
+                assert status.link.frames == 150
+                assert (status.loop.running, status.loop.state) == (True, "RUN")
+                process.terminate()
+                assert process.wait(10.0) == 0
+                with pytest.raises(Unreachable, match="r2rgate gateway"):
+                    await ask(client)
+        assert not (folder / "gateway.sock").exists()
+        with History(folder / "data" / "history.sqlite") as history:
+            found = history.read_wall(time.time() - 60.0, time.time() + 1.0, ["sequence", "wall_s"])
+            assert found["sequence"].tolist() == list(range(150))
+            assert abs(found["wall_s"][-1] - time.time()) < 20.0
+            kinds = [event.kind for event in history.events(0.0, 1e12)]
+            assert kinds[0] == "gateway-up"
+            assert kinds[-1] == "gateway-down"
+            assert {"state", "loop-up"} <= set(kinds)
+
+    run(story)
+
+
+def test_a_second_instance_ends_with_3_and_a_sentence_and_touches_nothing() -> None:
+    async def story(folder: Path) -> None:
+        with gateway(folder) as process:
+            second = start(folder)
+            _, said = second.communicate(timeout=20.0)
+            assert second.returncode == 3
+            assert f"by process {process.pid}" in said
+            assert "Traceback" not in said
+            async with loop_and_client(folder) as (_, client):
+                assert [event.kind for event in (await ask(client)).events] == ["gateway-up"]
+
+    run(story)
+
+
+def test_a_run_folder_that_cannot_be_used_ends_with_2_and_a_sentence() -> None:
+    with short_folder() as folder:
+        (folder / "x").write_text("")
+        process = start(folder / "x")
+        _, said = process.communicate(timeout=20.0)
+        assert process.returncode == 2
+        assert said.startswith("the gateway cannot start: the run folder")
+
+
+def test_after_a_sigkill_the_next_gateway_takes_over_and_the_loop_finds_it() -> None:
+    async def story(folder: Path) -> None:
+        async with loop_and_client(folder) as (loop, client):
+            sequence = 0
+            for _ in range(2):
+                with gateway(folder) as process:
+                    loop.publish(LOOP_TELEMETRY, frame_of(sequence, time.monotonic()))
+                    sequence += 1
+                    while not loop.publish(LOOP_TELEMETRY, frame_of(sequence, time.monotonic())):
+                        await asyncio.sleep(0.01)
+                    sequence += 1
+                    status = await until(client, lambda status: status.historian.frames_stored > 0)
+                    assert status.loop.running
+                    process.kill()
+                    process.wait()
+            with History(folder / "data" / "history.sqlite") as history:
+                found = history.read(0.0, 1e12, ["sequence"])["sequence"].tolist()
+                assert found == sorted(set(found))
+                assert len(found) >= 2
+                assert history.damaged == []
+
+    run(story)
+
+
+def test_a_loop_may_come_go_and_come_again() -> None:
+    async def story(folder: Path) -> None:
+        with gateway(folder):
+            async with loop_and_client(folder) as (loop, client):
+                reply = Reply.model_validate_json(await client.request(GATEWAY_COMMAND, b'{"command":"arm"}', 5.0))
+                assert not reply.ok
+                assert "start it with `r2rgate loop" in reply.text
+
+                async def answer(payload: bytes) -> bytes:
+                    return Reply(ok=True, state="READY", text=payload.decode()).model_dump_json().encode()
+
+                for _ in range(2):
+                    running = UnixMailbox()
+                    running.serve(LOOP_COMMAND, answer)
+                    await running.listen(folder / "loop.sock")
+                    answered = await client.request(GATEWAY_COMMAND, b'{"command":"stop"}', 5.0)
+                    assert Reply.model_validate_json(answered).ok
+                    loop.publish(LOOP_TELEMETRY, frame_of(1, time.monotonic()))
+                    await until(client, lambda status: status.loop.running)
+                    await running.close()
+                    await until(client, lambda status: not status.loop.running)
+                status = await ask(client)
+                assert status.loop.restarts == 1
+                commands = [event.text for event in status.events if event.kind == "command"]
+                assert len(commands) == 3
+        with History(folder / "data" / "history.sqlite") as history:
+            stored = [event for event in history.events(0.0, 1e12) if event.kind == "command"]
+            assert stored[0].data["uid"] == os.getuid()
+            assert stored[0].data["pid"] == os.getpid()
+
+    run(story)
+
+
+def test_rubbish_on_the_socket_changes_nothing() -> None:
+    async def story(folder: Path) -> None:
+        with gateway(folder) as process:
+            async with loop_and_client(folder) as (loop, client):
+                loop.connect((LOOP_COMMAND,), folder / "gateway.sock")
+                for k in range(50):
+                    loop.publish(LOOP_TELEMETRY, os.urandom(k))
+                    loop.publish(LOOP_EVENT, os.urandom(k))
+                with pytest.raises(RemoteError, match="not served"):
+                    await loop.request(LOOP_COMMAND, b"", 5.0)
+                status = await until(client, lambda status: status.link.malformed == 100)
+                assert status.link.frames == 0
+                process.send_signal(signal.SIGINT)
+                assert process.wait(10.0) == 0
+
+    run(story)

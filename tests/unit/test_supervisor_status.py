@@ -1,0 +1,323 @@
+"""The status and the service behind it, on an in-process mailbox with a clock of the test's own."""
+
+import asyncio
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+from supervisor_support import frame_of, line_of
+
+from gateway.core.messages import Arm, Event, Reply
+from gateway.core.signals import DriveState, Quality
+from gateway.core.states import LoopState
+from gateway.core.topics import GATEWAY_COMMAND, GATEWAY_STATUS, LOOP_COMMAND, LOOP_EVENT, LOOP_TELEMETRY
+from gateway.mailbox.inprocess import Hub, InProcessMailbox
+from gateway.mailbox.port import MAX_PAYLOAD, PEER, Counters, Peer
+from gateway.supervisor.historian import Health, Historian
+from gateway.supervisor.service import EVENTS_SHOWN, TEXT_SHOWN, Gateway
+from gateway.supervisor.status import LOST_S, WORDS, GatewayStatus
+
+DOCS = Path(__file__).parents[2] / "docs"
+WALL_AHEAD_S = 1_700_000_000.0
+
+
+class KeptHistory(Historian):
+    """A historian without a thread that shows what it was given."""
+
+    def __init__(self, spans: int) -> None:
+        super().__init__(Path("/var/lib/r2rgate/demo"), "demo", "line", spans)
+        self.frames: list[bytes] = []
+        self.events: list[Event] = []
+        self.told = Health(True, "storing", frames_stored=1000, last_stored_s=99.5)
+
+    def frame(self, payload: bytes) -> None:
+        self.frames.append(payload)
+
+    def event(self, event: Event) -> None:
+        self.events.append(event)
+
+    def health(self) -> Health:
+        return self.told
+
+
+class Bench:
+    """A gateway at a hub, and the loop's side of it."""
+
+    def __init__(self, spans: int = 6) -> None:
+        hub = Hub()
+        self.now_s = 100.0
+        self.loop = InProcessMailbox(hub)
+        self.historian = KeptHistory(spans)
+        self.gateway = Gateway(
+            line_of(spans),
+            InProcessMailbox(hub),
+            self.historian,
+            Counters(),
+            clock=lambda: self.now_s,
+            wall_clock=lambda: self.now_s + WALL_AHEAD_S,
+        )
+
+    def say(self, kind: str, text: str) -> None:
+        event = Event(time_s=self.now_s, kind=kind, text=text, data={"torque_nm": 3.0})
+        assert self.loop.publish(LOOP_EVENT, event.model_dump_json().encode())
+
+    def run_loop(self, cycles: int, first: int = 0, **changes: Any) -> None:
+        for k in range(first, first + cycles):
+            self.now_s = round(self.now_s + 0.01, 6)
+            assert self.loop.publish(LOOP_TELEMETRY, frame_of(k, self.now_s, **changes))
+
+    def command(self, payload: bytes) -> Reply:
+        answer = asyncio.run(self.loop.request(GATEWAY_COMMAND, payload, 1.0))
+        return Reply.model_validate_json(answer)
+
+
+def test_without_a_loop_it_says_so_and_what_to_do() -> None:
+    status = Bench().gateway.status()
+    assert not status.loop.running
+    assert status.loop.state == "UNKNOWN"
+    assert "loop not running" in status.loop.text
+    assert "r2rgate loop" in status.loop.next
+    assert status.loop.age_s is None
+    assert [span.tension_n for span in status.spans] == [None] * 6
+    assert {span.quality for span in status.spans} == {"MISSING"}
+    assert status.timing.cycle is None
+
+
+def test_what_the_loop_says_is_what_the_status_says() -> None:
+    bench = Bench()
+    bench.run_loop(50, state=LoopState.HOLD, held=2, saturated=True)
+    bench.run_loop(
+        1,
+        first=50,
+        tension_n=np.array([21.5, 22, 23, 24, 25, 26]),
+        tension_setpoint_n=np.full(6, 20.0),
+        torque_nm=np.arange(6) + 0.5,
+        torque_actual_nm=np.arange(6) + 0.25,
+        drive_state=np.array([3, 3, 5, 6, 1, 3], np.int8),
+        tension_quality=np.array([0, 0, 1, 2, 3, 0], np.int8),
+    )
+    status = bench.gateway.status()
+    span = status.spans[0]
+    assert (status.loop.running, status.loop.state, status.loop.age_s) == (True, "RUN", 0.0)
+    assert (span.number, span.tension_n, span.setpoint_n, span.error_n) == (1, 21.5, 20.0, 1.5)
+    assert (span.torque_nm, span.torque_actual_nm) == (0.5, 0.25)
+    assert [span.drive for span in status.spans] == ["ENABLED", "ENABLED", "FAULT", "STO", "OFF", "ENABLED"]
+    assert [span.quality for span in status.spans] == ["GOOD", "GOOD", "STALE", "BAD", "MISSING", "GOOD"]
+    assert status.link.frames == len(bench.historian.frames) == 51
+
+
+def test_every_state_has_words_and_a_next_step() -> None:
+    assert set(WORDS) == {state.name for state in LoopState} | {"UNKNOWN"}
+    bench = Bench()
+    for k, state in enumerate(LoopState):
+        bench.run_loop(1, first=k, state=state)
+        assert bench.gateway.status().loop.state == state.name
+
+
+def test_values_that_are_none_and_codes_that_are_unknown_are_told_as_such() -> None:
+    bench = Bench()
+    bench.run_loop(
+        1,
+        state=77,
+        tension_n=np.array([np.nan, np.inf, 1, 2, 3, 4]),
+        drive_state=np.full(6, 99, np.int8),
+        tension_quality=np.full(6, -1, np.int8),
+        unwind_speed_m_per_s=np.nan,
+        lateness_s=np.nan,
+    )
+    status = bench.gateway.status()
+    assert [status.spans[k].tension_n for k in (0, 1, 2)] == [None, None, 1.0]
+    assert status.spans[0].error_n is None
+    assert status.loop.state == status.spans[0].drive == status.spans[0].quality == "UNKNOWN"
+    assert status.unwind_speed_m_per_s is None
+    assert status.timing.lateness is None
+    assert "NaN" not in status.model_dump_json()
+
+
+def test_a_loop_that_stops_is_noticed_after_a_second_and_its_values_become_stale() -> None:
+    bench = Bench()
+    bench.run_loop(10)
+    bench.gateway.watch()
+    bench.now_s += LOST_S
+    assert bench.gateway.status().loop.running
+    bench.now_s += 0.01
+    bench.gateway.watch()
+    bench.gateway.watch()
+    status = bench.gateway.status()
+    assert not status.loop.running
+    assert {span.quality for span in status.spans} == {Quality.STALE.name}
+    assert {span.drive for span in status.spans} == {DriveState.ABSENT.name}
+    assert status.spans[0].tension_n is not None
+    assert status.timing.frames == 0
+    assert [event.kind for event in bench.historian.events] == ["loop-up", "loop-lost"]
+
+
+def test_gaps_are_dropped_frames_and_a_new_count_is_a_restart() -> None:
+    bench = Bench()
+    bench.run_loop(5)
+    bench.run_loop(5, first=8)
+    assert bench.gateway.status().link.dropped_frames == 3
+    bench.run_loop(5, first=0)
+    status = bench.gateway.status()
+    assert (status.link.dropped_frames, status.loop.restarts, status.timing.frames) == (3, 1, 5)
+    bench.run_loop(2, first=2**32 - 1)  # the counter's end is no gap
+    assert bench.gateway.status().loop.restarts == 2
+    assert bench.gateway.status().link.dropped_frames == 3
+
+
+def test_percentiles_are_those_of_the_last_ten_seconds() -> None:
+    bench = Bench()
+    bench.run_loop(500, cycle_s=0.5, missed=4)
+    for k in range(1001):
+        bench.run_loop(1, first=500 + k, cycle_s=k * 1e-6, lateness_s=1e-4, missed=4 + (k >= 900))
+    timing = bench.gateway.status().timing
+    assert timing.frames == 1001
+    assert timing.cycle is not None
+    assert timing.lateness is not None
+    assert timing.cycle.p50_s == pytest.approx(500e-6, abs=1e-9)
+    assert timing.cycle.p99_s == pytest.approx(990e-6, abs=1e-9)
+    assert timing.cycle.max_s == pytest.approx(1000e-6, abs=1e-9)
+    assert timing.lateness.p50_s == pytest.approx(1e-4, abs=1e-7)
+    assert (timing.missed, timing.missed_total) == (1, 5)
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [
+        b"",
+        b"rubbish",
+        frame_of(1, 1.0)[:-1],
+        frame_of(1, 1.0, spans=5),
+        frame_of(1, float("nan")),
+        b"\x02\x00" + frame_of(1, 1.0)[2:],
+        frame_of(1, 1.0)[:2] + b"\x05\x00" + frame_of(1, 1.0)[4:],
+    ],
+)
+def test_a_malformed_frame_is_counted_and_not_kept(payload: bytes) -> None:
+    bench = Bench()
+    bench.loop.publish(LOOP_TELEMETRY, payload)
+    assert bench.gateway.status().link.malformed == 1
+    assert bench.historian.frames == []
+
+
+def test_events_are_kept_all_and_shown_the_last() -> None:
+    bench = Bench()
+    for k in range(30):
+        bench.say("state", f"event {k}")
+    bench.loop.publish(LOOP_EVENT, b'{"time_s": NaN, "kind": "x", "text": "y"}')
+    bench.loop.publish(LOOP_EVENT, b"rubbish")
+    status = bench.gateway.status()
+    assert len(bench.historian.events) == 30
+    assert [event.text for event in status.events] == [f"event {k}" for k in range(30 - EVENTS_SHOWN, 30)]
+    assert status.events[0].wall_s == 100.0 + WALL_AHEAD_S
+    assert status.link.malformed == 2
+
+
+def test_a_command_is_passed_on_and_remembered_with_who_gave_it() -> None:
+    bench = Bench()
+    heard: list[bytes] = []
+
+    async def loop(payload: bytes) -> bytes:
+        heard.append(payload)
+        return Reply(ok=False, state="SILENT", text="no permissive", reasons=["permissive"]).model_dump_json().encode()
+
+    bench.loop.serve(LOOP_COMMAND, loop)
+    payload = Arm().model_dump_json().encode()
+    token = PEER.set(Peer(uid=0, pid=4711))
+    try:
+        reply = bench.command(payload)
+    finally:
+        PEER.reset(token)
+    assert heard == [payload]
+    assert (reply.ok, reply.text, reply.reasons) == (False, "no permissive", ["permissive"])
+    (event,) = bench.historian.events
+    assert event.kind == "command"
+    assert event.text.startswith("root: ")
+    assert "refused: no permissive" in event.text
+    assert event.data["uid"] == 0
+    assert event.data["pid"] == 4711
+    assert event.data["reply"] == reply.model_dump()
+    assert json.loads(event.data["command"]) == {"command": "arm"}
+
+
+def test_a_command_that_is_none_never_reaches_the_loop_and_one_without_a_loop_says_what_to_start() -> None:
+    bench = Bench()
+    reply = bench.command(b'{"command": "arm"}')
+    assert not reply.ok
+    assert "loop not running: start it with `r2rgate loop" in reply.text
+
+    async def loop(_: bytes) -> bytes:
+        return b"no reply at all"
+
+    bench.loop.serve(LOOP_COMMAND, loop)
+    for payload in (b"", b"\xff", b'{"command": "fly"}', b'{"command": "arm", "command": "stop"}', b"[" * 5000):
+        assert not bench.command(payload).ok
+        assert "not understood" in bench.command(payload).text
+    assert "no reply" in bench.command(b'{"command": "arm"}').text
+    assert {event.kind for event in bench.historian.events} == {"command"}
+
+
+def test_a_historian_that_stops_and_goes_on_is_an_event() -> None:
+    bench = Bench()
+    bench.gateway.watch()
+    assert bench.historian.events == []
+    bench.historian.told = Health(False, "not storing: the disk is full")
+    bench.gateway.watch()
+    bench.gateway.watch()
+    status = bench.gateway.status()
+    assert not status.historian.storing
+    assert status.historian.text == "not storing: the disk is full"
+    bench.historian.told = Health(True, "storing")
+    bench.gateway.watch()
+    assert [event.text for event in bench.historian.events] == [
+        "the historian is not storing: the disk is full",
+        "the historian is storing",
+    ]
+
+
+def test_the_largest_status_fits_a_message() -> None:
+    bench = Bench(60)
+    bench.run_loop(3, spans=60)
+    for _ in range(EVENTS_SHOWN):
+        bench.say("state", "\u20ac" * (2 * TEXT_SHOWN))
+    answer = asyncio.run(bench.loop.request(GATEWAY_STATUS, b"", 1.0))
+    assert len(answer) < 0.8 * MAX_PAYLOAD
+    assert len(GatewayStatus.model_validate_json(answer).spans) == 60
+
+
+def example() -> GatewayStatus:
+    bench = Bench()
+    bench.gateway.note("gateway-up", "the gateway has started")
+    bench.say("state", "TENSIONING to RUNNING")
+    bench.run_loop(100)
+    bench.gateway.watch()
+    return bench.gateway.status()
+
+
+def test_schema_and_example_are_those_of_the_code() -> None:
+    schema = json.loads((DOCS / "schemas" / "status.schema.json").read_text())
+    assert schema == GatewayStatus.model_json_schema()
+    shown = (DOCS / "examples" / "status.json").read_text()
+    assert GatewayStatus.model_validate_json(shown) == example()
+
+
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [(("format",), 2), (("format",), True), (("surprise",), 1), (("loop", "age_s"), "1"), (("wall_s",), float("nan"))],
+)
+def test_a_status_that_is_not_quite_one_is_refused(path: tuple[str, ...], value: object) -> None:
+    document = json.loads(example().model_dump_json())
+    part = document
+    for key in path[:-1]:
+        part = part[key]
+    part[path[-1]] = value
+    with pytest.raises(ValidationError):
+        GatewayStatus.model_validate_json(json.dumps(document))
+
+
+if __name__ == "__main__":  # writes the two documents anew
+    (DOCS / "schemas" / "status.schema.json").write_text(json.dumps(GatewayStatus.model_json_schema(), indent=2) + "\n")
+    (DOCS / "examples" / "status.json").write_text(example().model_dump_json(indent=2) + "\n")
