@@ -6,7 +6,7 @@ RUN   := $(PY) -m gateway.cli
 export PYTHONDONTWRITEBYTECODE :=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup run test check format bench bench-stepped clean
+.PHONY: help setup run test check format bench bench-stepped lock clean
 
 help: ## this list
 	@echo "r2rgate: make TARGET"
@@ -37,6 +37,10 @@ bench: bench-stepped ## every benchmark
 
 bench-stepped: setup ## both cases in stepped time: RMSE against the goals, speed against real time
 	@$(PY) -m tests.bench.stepped $(ARGS)
+
+lock: setup ## requirements.lock anew from pyproject.toml (needs uv), hashes without any index address
+	uv pip compile -q --universal --generate-hashes --python-version 3.11 --extra dev \
+		--no-emit-index-url --no-emit-find-links --no-header -o requirements.lock pyproject.toml
 
 clean: ## remove what was built (the environment stays)
 	rm -rf out build dist *.egg-info .pytest_cache .ruff_cache .hypothesis

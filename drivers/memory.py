@@ -12,6 +12,11 @@ from gateway.core.signals import Channel, DriveRequest, DriveState, FloatArray, 
 BoolArray = NDArray[np.bool_]
 
 
+# As plain numbers: a comparison of an array with an enumeration takes microseconds.
+_OFF, _ENABLE = int(DriveRequest.OFF), int(DriveRequest.ENABLE)
+_STATE_OFF, _STATE_READY, _STATE_ENABLED = (np.int8(s) for s in (DriveState.OFF, DriveState.READY, DriveState.ENABLED))
+
+
 class MemorySample(Protocol):
     """One reading of everything. Arrays have shape (n,)."""
 
@@ -55,8 +60,8 @@ class MemoryLink:
         self._capacity_n = np.full(line.n, np.nan)  #: NaN where there is no load cell
         for cell in line.load_cells:
             self._capacity_n[cell.span - 1] = cell.capacity_n
-        self._absent = np.flatnonzero(np.isnan(self._capacity_n))
-        self._request = np.full(line.n, DriveRequest.OFF, dtype=np.int8)
+        self._without_cell = np.isnan(self._capacity_n)
+        self._idle_state = np.full(line.n, DriveState.OFF, dtype=np.int8)  #: of a drive that is not enabled
 
     async def open(self) -> None: ...
 
@@ -73,23 +78,27 @@ class MemoryLink:
         """Read the plant at the time of `trigger`. Never suspends."""
         now_s = self._now_s
         sample = self._plant.sample(now_s)
-        tension_n = sample.tension_n
-        believed = np.abs(tension_n) <= self._capacity_n  # False for NaN
-        inputs.tension.time_s[believed] = now_s
-        inputs.tension.value[believed] = tension_n[believed]
-        inputs.tension.quality[:] = np.where(believed, Quality.GOOD, Quality.BAD)
-        inputs.tension.quality[self._absent] = Quality.MISSING
+        believed = np.abs(sample.tension_n) <= self._capacity_n  # False for NaN
+        if believed.all():
+            _put_all(inputs.tension, sample.tension_n, now_s)
+        else:
+            self._put_believed(inputs.tension, sample.tension_n, believed, now_s)
         _put_all(inputs.speed, sample.speed_m_per_s, now_s)
         _put_all(inputs.torque, sample.torque_nm, now_s)
         inputs.unwind_speed.put(0, sample.unwind_speed_m_per_s, now_s)
-        off = np.where(self._request == DriveRequest.OFF, DriveState.OFF, DriveState.READY)
-        inputs.drive_state[:] = np.where(sample.enabled, DriveState.ENABLED, off)
+        inputs.drive_state[:] = np.where(sample.enabled, _STATE_ENABLED, self._idle_state)
         plc = inputs.plc
         plc.quality = Quality.GOOD
         plc.time_s = now_s
         plc.permissive = sample.permissive
         plc.emergency_stop = sample.emergency_stop
         plc.running = sample.running
+
+    def _put_believed(self, tension: Channel, value_n: FloatArray, believed: BoolArray, now_s: float) -> None:
+        tension.value[believed] = value_n[believed]
+        tension.time_s[believed] = now_s
+        tension.quality[:] = np.where(believed, Quality.GOOD, Quality.BAD)
+        tension.quality[self._without_cell] = Quality.MISSING
 
     def write(self, outputs: Outputs) -> None:
         """Command the plant for the sample of this cycle. What is not finite is not passed on, and counted."""
@@ -99,8 +108,9 @@ class MemoryLink:
             self.health.malformed += 1
             self.health.last_error = "a torque or the speed request is not finite; nothing was commanded"
             return
-        self._request[:] = outputs.drive_request
-        enable = self._request == DriveRequest.ENABLE
+        request = outputs.drive_request
+        enable = request == _ENABLE
+        self._idle_state[:] = np.where(request == _OFF, _STATE_OFF, _STATE_READY)
         self._plant.apply(outputs.torque_nm, enable, outputs.speed_request_m_per_s, outputs.run, self._now_s)
 
     async def close(self) -> None:
@@ -110,8 +120,8 @@ class MemoryLink:
 def _put_all(channel: Channel, value: FloatArray, now_s: float) -> None:
     if isfinite(value.sum()):
         channel.value[:] = value
-        channel.time_s[:] = now_s
-        channel.quality[:] = Quality.GOOD
+        channel.time_s.fill(now_s)
+        channel.quality.fill(0)  # GOOD
     else:
         for k in range(len(value)):
             channel.put(k, value[k], now_s)

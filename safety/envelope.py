@@ -45,7 +45,7 @@ def check_inputs(
             Finding(
                 "signals",
                 Action.STOP if last else Action.HOLD_OUTPUTS,
-                f"no usable sample of {', '.join(missing)} for {missing_periods} of at most {limits.hold_periods} periods: "
+                f"no usable sample of {', '.join(missing)} in {missing_periods} periods of {limits.hold_periods}: "
                 "check the device, its cable and its supply",
             )
         )
@@ -95,9 +95,7 @@ def check_torque(asked_nm: FloatArray) -> list[Finding]:
     return [Finding("finite torque", Action.TORQUE_OFF, f"the control law gave no finite torque for roller {drives}")]
 
 
-def limit_torque(
-    limits: EnvelopeLimits, asked_nm: FloatArray, applied_nm: FloatArray, interval_s: float
-) -> FloatArray:
+def limit_torque(limits: EnvelopeLimits, asked_nm: FloatArray, applied_nm: FloatArray, interval_s: float) -> FloatArray:
     """The torque (n,) nearest to `asked_nm` that keeps limit and rate, `applied_nm` being that of the period before.
 
     `interval_s` is the time for which the torque before will have acted: shorter than a period after a late wake-up.
@@ -123,7 +121,7 @@ def _missing_signals(limits: EnvelopeLimits, inputs: Inputs) -> list[str]:
 
 
 def _in_words(numbers: list[int]) -> str:
-    """"3", "1 and 4", or "1 to 6" for what is without a gap."""
+    """ "3", "1 and 4", or "1 to 6" for what is without a gap."""
     if len(numbers) > 2 and numbers[-1] - numbers[0] == len(numbers) - 1:
         return f"{numbers[0]} to {numbers[-1]}"
     return " and ".join(map(str, numbers))

@@ -192,9 +192,7 @@ def _begin(kind, index, value, row, number, going_on, counts, found):
 
 
 @_compiled
-def _judge_rows(
-    rows, bounds, may_give_torque, all_enabled, tension_kind, inside_steps, going_on, counts, found
-):
+def _judge_rows(rows, bounds, may_give_torque, all_enabled, tension_kind, inside_steps, going_on, counts, found):
     """Fill `found` with [kind, index, value, row] of each event that begins in `rows`. Returns their number."""
     tension_min, tension_max, torque_max, torque_zero = bounds
     n = inside_steps.size

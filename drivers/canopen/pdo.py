@@ -86,8 +86,8 @@ class PdoCodec:
         counts = torque_nm * self._counts_per_nm
         command: list[float] = [*self._command]
         command[self._controlword_at] = controlword
-        command[self._target_at] = round(counts) if self._whole_counts else counts
         try:
+            command[self._target_at] = round(counts) if self._whole_counts else counts
             return self._receive.pack(*command)
         except (struct.error, OverflowError) as error:
             raise ValueError(f"torque {torque_nm} Nm does not fit the target torque object: {error}") from error

@@ -15,6 +15,7 @@ class Amplifier:
         self.name = ", ".join(cell.name for cell in cells)
         self.unit = cells[0].address
         self.missed = 0  #: cycles in a row without an answer
+        self.unanswered = 0  #: requests in a row that ended without one
         self._device = device
         self._cells = cells
         self._function = device.read_function

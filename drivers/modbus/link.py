@@ -33,6 +33,7 @@ class ModbusLink:
         self._period_s = period_s
         self._task: asyncio.Task[None] | None = None
         self._open_s: float | None = None  #: the cycle whose answers still count, by its time
+        self._complete = asyncio.Event()  #: every device that is not absent has answered
         self._sent_s = 0.0
         self._connecting: asyncio.Task[None] | None = None
         self._retry_s = float("-inf")
@@ -76,26 +77,38 @@ class ModbusLink:
             self._reconnect(now_s)
             return
         self._sent_s = self._open_s = now_s
+        self._complete.clear()
         self._task = asyncio.create_task(self._exchange(now_s, now_s + EXCHANGE_SHARE * self._period_s))
 
     async def _exchange(self, sent_s: float, deadline_s: float) -> None:
-        # Who did not answer last time is asked last, so that a dead unit costs the others nothing.
-        for device in sorted(self._devices, key=lambda device: device.missed):
+        # Who did not answer is asked last, and not waited for once absent: a dead unit costs the others nothing.
+        for device in sorted(self._devices, key=lambda device: device.unanswered):
+            if device.unanswered >= ANSWERS_ALLOWED:
+                self._complete.set()
             try:
                 answer = await device.exchange(self._connection, deadline_s)
                 if self._open_s == sent_s:
                     device.answer = answer
                 else:
                     self._discard(f"{device.name}: an answer after its cycle")
+                device.unanswered = 0
             except ModbusTimeout as error:
+                device.unanswered += 1
                 self.health.last_error = f"{device.name}: {error}"
+                break  # there is no time left in which another could answer
             except (ModbusFailed, ValueError) as error:
+                device.unanswered = 0
                 self._discard(f"{device.name}: {error}")
+        self._complete.set()
 
     async def collect(self, inputs: Inputs, deadline_s: float) -> None:
         """The answers that have come by `deadline_s`."""
-        if self._open_s is not None and self._task is not None and not self._task.done():
-            await asyncio.wait([self._task], timeout=max(0.0, deadline_s - asyncio.get_running_loop().time()))
+        if self._open_s is not None and not self._complete.is_set():
+            try:
+                async with asyncio.timeout_at(deadline_s):
+                    await self._complete.wait()
+            except TimeoutError:
+                pass
         self._open_s = None
         absent: list[str] = []
         for device in self._devices:

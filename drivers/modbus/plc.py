@@ -13,6 +13,7 @@ from drivers.scaling import si_per_count
 from gateway.core.line import LinePlc
 from gateway.core.signals import Inputs, Outputs, Quality
 
+_AT_REST = (0, 0)
 ECHOES_ALLOWED = 3  #: answers in a row with the same life counter until the PLC counts as stale
 
 
@@ -21,6 +22,7 @@ class Plc:
         self.name = plc.name
         self.unit = plc.address
         self.missed = 0  #: cycles in a row without an answer
+        self.unanswered = 0  #: requests in a row that ended without one
         self.active = False  #: the link is not silent
         self.proven = False  #: its command watchdog was read back on this connection
         self.answer: list[float] | None = None  #: of this cycle
@@ -37,7 +39,7 @@ class Plc:
         self._id = RegisterBlock([(device.device_id.address - base, device.device_id.type)], order)
         self._watchdog = RegisterBlock([(device.watchdog.address - base, device.watchdog.type)], order)
         self._life = 0
-        self._command: tuple[float, float] | None = (0.0, 0.0)  #: command word and speed; None: cannot be commanded
+        self._command: tuple[int, float] | None = _AT_REST  #: command word and speed; None: cannot be commanded
         self._echo = -1.0
         self._same_echo = 0
 
@@ -47,7 +49,7 @@ class Plc:
     def silence(self) -> None:
         """Nothing is written from now on, and nothing of the last command is left."""
         self.active = False
-        self._command = (0.0, 0.0)
+        self._command = _AT_REST
         self._same_echo = 0
 
     def command(self, outputs: Outputs) -> None:
@@ -62,7 +64,7 @@ class Plc:
         if not low <= counts * write.speed.scale <= high:
             raise ValueError(f"speed request {speed_m_per_s} m/s is outside [{low:g}, {high:g}] {write.speed.unit}")
         run = outputs.run != write.run.inverted
-        self._command = (float(run << write.run.bit), counts if write.speed.type == "f32" else round(counts))
+        self._command = (run << write.run.bit, counts if write.speed.type == "f32" else round(counts))
 
     async def exchange(self, connection: ModbusConnection, deadline_s: float) -> list[float]:
         """Write and read in one transaction when active, only read when silent. Raises ModbusFailed or ValueError."""
@@ -71,7 +73,7 @@ class Plc:
             self._life = (self._life + 1) & 0xFFFF
             assert self._command is not None
             word, speed = self._command
-            payload = self._write.encode((int(word), speed, self._life))
+            payload = self._write.encode((word, speed, self._life))
             registers = await connection.read_write(
                 self.unit, read.address, read.count, self._write.address, payload, deadline_s
             )

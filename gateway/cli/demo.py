@@ -6,7 +6,7 @@ import shutil
 import sys
 import time
 from dataclasses import dataclass
-from datetime import datetime, timezone
+from datetime import UTC, datetime
 from importlib.resources import as_file, files
 from pathlib import Path
 
@@ -70,10 +70,8 @@ def run_demo(out: Path, law: str, seed: int) -> int:
             setup, world_start_s = _begin(children, out, law, seed)
             windows = asyncio.run(_story(children, setup, console))
             _end_in_order(children)
-        from gateway.cli.demo_analysis import analyse
-
         console.print("measuring: the same cases in stepped time, then the report")
-        analyse(setup, windows, world_start_s, started_s, console)
+        _conclude(setup, windows, world_start_s, started_s, console)
     except (ChildFailed, DemoFailed, Unreachable) as error:
         console.print(f"the demonstration failed: {error}", style="red", markup=False)
         return 1
@@ -81,6 +79,19 @@ def run_demo(out: Path, law: str, seed: int) -> int:
         console.print("stopped: the line was brought to rest and every process has ended")
         return 130
     return 0
+
+
+def _conclude(setup: Setup, windows: list[Window], world_start_s: float, started_s: float, console: Console) -> None:
+    """Figures, `result.json`, `report.html`, table."""
+    from gateway.cli.demo_analysis import measure, read_evidence
+    from gateway.cli.demo_report import page
+    from gateway.cli.demo_table import print_result
+
+    evidence = read_evidence(setup, windows, world_start_s)
+    result = measure(setup, windows, evidence, started_s)
+    (setup.out / "result.json").write_text(result.model_dump_json(indent=2) + "\n", encoding="utf-8")
+    (setup.out / "report.html").write_text(page(setup, result, windows, evidence), encoding="utf-8")
+    print_result(result, setup.out, console)
 
 
 def _clear(out: Path) -> None:
@@ -241,7 +252,7 @@ def machine_lines(log: Path) -> list[str]:
 
 
 def now_iso() -> str:
-    return datetime.now(timezone.utc).isoformat(timespec="seconds")
+    return datetime.now(UTC).isoformat(timespec="seconds")
 
 
 def command_line() -> str:

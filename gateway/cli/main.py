@@ -15,7 +15,8 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
-ENGINEER, PROCESSES, LINE = "Engineer", "Processes", "Running the line"
+NUMBERS = {"ignore_unknown_options": True}  # so that -5 is a number that is refused, not an option
+ENGINEER, PROCESSES, LINE, EVIDENCE = "Engineer", "Processes", "Running the line", "Evidence"
 
 app.command(rich_help_panel=ENGINEER)(line_commands.init)
 app.command(rich_help_panel=ENGINEER)(line_commands.check)
@@ -29,10 +30,11 @@ app.command(rich_help_panel=LINE)(operate_commands.arm)
 app.command(rich_help_panel=LINE)(operate_commands.start)
 app.command(rich_help_panel=LINE)(operate_commands.hold)
 app.command(rich_help_panel=LINE)(operate_commands.stop)
-app.command("set", rich_help_panel=LINE)(operate_commands.set_tension)
-app.command(rich_help_panel=LINE)(operate_commands.speed)
+app.command("set", rich_help_panel=LINE, context_settings=NUMBERS)(operate_commands.set_tension)
+app.command(rich_help_panel=LINE, context_settings=NUMBERS)(operate_commands.speed)
 app.command(rich_help_panel=LINE)(operate_commands.recipe)
 app.command(rich_help_panel=LINE)(status_commands.status)
+app.command("export", rich_help_panel=EVIDENCE)(status_commands.export_csv)
 
 
 @app.callback(invoke_without_command=True)

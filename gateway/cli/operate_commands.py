@@ -57,7 +57,9 @@ def stop(run_dir: RunFolder = None, as_json: Json = False) -> None:
 def set_tension(
     span: Annotated[int, typer.Argument(help="Number of the span, from 1.")],
     tension_n: Annotated[float, typer.Argument(help="Tension in N.")],
-    step: Annotated[bool, typer.Option("--step", help="At once rather than ramped; the line's limits bound it.")] = False,
+    step: Annotated[
+        bool, typer.Option("--step", help="At once rather than ramped; the line's limits bound it.")
+    ] = False,
     run_dir: RunFolder = None,
     as_json: Json = False,
 ) -> None:
@@ -70,7 +72,9 @@ def set_tension(
 
 def speed(
     speed_m_per_s: Annotated[float, typer.Argument(help="Web speed at the unwinder in m/s.")],
-    step: Annotated[bool, typer.Option("--step", help="At once rather than ramped; the line's limits bound it.")] = False,
+    step: Annotated[
+        bool, typer.Option("--step", help="At once rather than ramped; the line's limits bound it.")
+    ] = False,
     run_dir: RunFolder = None,
     as_json: Json = False,
 ) -> None:

@@ -62,7 +62,9 @@ def design(
         typer.echo(f"no {law} controller for {file}: {refused}", err=True)
         raise typer.Exit(REFUSED) from None
     out.write_bytes(canonical(config) + b"\n")
-    typer.echo(f"{out}: {law} for {line.n} spans at {line.control.period_s * 1e3:g} ms, hash {config_hash(config)[:12]}")
+    typer.echo(
+        f"{out}: {law} for {line.n} spans at {line.control.period_s * 1e3:g} ms, hash {config_hash(config)[:12]}"
+    )
 
 
 def loop(
@@ -84,7 +86,9 @@ def loop(
     try:
         config = parse_controller(path.read_bytes())
         _require_fit(line, config.n, config.period_s, path)
-        run_loop(line, config, run_dir or default_run_folder(line), lambda text: print(text, file=sys.stderr, flush=True))
+        run_loop(
+            line, config, run_dir or default_run_folder(line), lambda text: print(text, file=sys.stderr, flush=True)
+        )
     except FileNotFoundError:
         _refuse(f"there is no controller configuration at {path}: r2rgate design {file} --out {path} writes one")
     except ControllerRefused as refused:
@@ -115,7 +119,8 @@ def sim(
     can_port: Annotated[int | None, typer.Option(help="In place of the plant's.")] = None,
     modbus_port: Annotated[int | None, typer.Option(help="In place of the plant's; 0 takes a free one.")] = None,
     priority: Annotated[
-        int, typer.Option(min=0, max=90, help="Real-time priority, where permitted: devices do not wait for a computer.")
+        int,
+        typer.Option(min=0, max=90, help="Real-time priority, where permitted: devices do not wait for a computer."),
     ] = 0,
 ) -> None:
     """The simulated line: drives, load cells and line PLC on their wires, in a process of its own.
@@ -129,9 +134,7 @@ def sim(
 
     if priority:
         be_punctual(priority)
-    code = run_plant(
-        plant, record_folder=record, seed=seed, scale=scale, can_port=can_port, modbus_port=modbus_port
-    )
+    code = run_plant(plant, record_folder=record, seed=seed, scale=scale, can_port=can_port, modbus_port=modbus_port)
     raise typer.Exit(code)
 
 

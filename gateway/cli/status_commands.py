@@ -1,4 +1,4 @@
-"""`r2rgate status` and `r2rgate export-csv`: what a line does now, and what it did."""
+"""`r2rgate status` and `r2rgate export`: what a line does now, and what it did."""
 
 import asyncio
 import csv
@@ -7,6 +7,7 @@ import sys
 import time
 from collections.abc import Callable
 from contextlib import nullcontext, suppress
+from io import TextIOWrapper
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
@@ -46,6 +47,8 @@ def status(
 
     Examples: `r2rgate status`, `r2rgate status --watch`, `r2rgate status --json | jq .loop.state`
     """
+    if isinstance(sys.stdout, TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")  # a terminal that has no line-drawing characters shows ? for them
     folder = choose_run_folder(run_dir)
     if watch:
         raise typer.Exit(_watch_json(folder) if as_json else _watch_screen(folder))
@@ -71,10 +74,10 @@ def export_csv(
 ) -> None:
     """The last seconds of history as CSV: Unix time, then a column per field, with its span or roller where it has one.
 
-    Example: `r2rgate export-csv tensions.csv --last 600 --fields tension_n,speed_m_per_s`
+    Example: `r2rgate export tensions.csv --last 600 --fields tension_n,speed_m_per_s`
     """
     try:
-        path = history or Path(parse_status(asyncio.run(_ask(choose_run_folder(run_dir)))).historian.path)
+        path = history or Path(asyncio.run(ask_status(choose_run_folder(run_dir))).historian.path)
         names = ["wall_s", *(name.strip() for name in fields.split(","))]
         with History(path) as file:
             now_s = time.time()
@@ -118,6 +121,11 @@ def parse_status(text: bytes) -> GatewayStatus:
         raise Unreachable(
             f"the gateway is of another version than this command: {error.error_count()} fields differ"
         ) from error
+
+
+async def ask_status(folder: Path) -> GatewayStatus:
+    """The status of the line whose sockets lie in `folder`. Raises Unreachable."""
+    return parse_status(await _ask(folder))
 
 
 async def _ask(folder: Path, mailbox: UnixMailbox | None = None) -> bytes:

@@ -1,5 +1,4 @@
-"""Stepped time: the loop's whole cycle over an in-memory link against the simulated line, as fast as the machine goes."""
-
+"""Stepped time: the whole cycle over an in-memory link against the simulated line, as fast as the machine goes."""
 
 import time
 from collections.abc import Awaitable

@@ -151,7 +151,7 @@ def sampled(A: FloatArray, B: FloatArray, time_s: float) -> tuple[FloatArray, Fl
     block = np.zeros((states + inputs, states + inputs))
     block[:states, :states] = A
     block[:states, states:] = B
-    exponential = expm(block * time_s)
+    exponential: FloatArray = np.asarray(expm(block * time_s), dtype=np.float64)
     return exponential[:states, :states], exponential[:states, states:]
 
 
@@ -194,11 +194,11 @@ def _augment(
 def _dlqr(F: FloatArray, G: FloatArray, Q: FloatArray, R: FloatArray) -> FloatArray:
     """K of u = -K x that minimises sum x'Qx + u'Ru; raises DesignRefused where there is none that stabilises."""
     try:
-        P = solve_discrete_are(F, G, Q, R)
+        P: FloatArray = np.asarray(solve_discrete_are(F, G, Q, R), dtype=np.float64)
     except (LinAlgError, ValueError) as error:
         text = f"the Riccati equation has no stabilising solution ({error}): check the model's parameters"
         raise DesignRefused(text) from error
-    gain = np.linalg.solve(R + G.T @ P @ G, G.T @ P @ F)
+    gain: FloatArray = np.asarray(np.linalg.solve(R + G.T @ P @ G, G.T @ P @ F), dtype=np.float64)
     radius = np.abs(np.linalg.eigvals(F - G @ gain)).max()
     if not radius < 1.0:
         raise DesignRefused(f"the closed loop would have a spectral radius of {radius:.4f}, it must stay below 1")

@@ -56,6 +56,7 @@ RULES: tuple[Rule, ...] = (
     _rule("limits recipes", process.recipes_within_tension),
     _rule("limits web recipes", process.recipes_within_speed),
     _rule("limits moves recipes", process.tensioning_in_time),
+    _rule("limits moves web spans", process.tensioning_keeps_the_speed),
     _rule("limits web rollers spans recipes", process.recipes_within_torque),
     _rule("limits web rollers spans recipes", process.speed_limit_within_torque),
 )

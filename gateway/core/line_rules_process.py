@@ -108,7 +108,7 @@ def load_cells_see_the_tension(line: Line) -> Iterator[Finding]:
             yield Finding(
                 path, "cannot measure what the limits allow", f"limits.tension_max_n ({highest_n:g} N) or more"
             )
-        elif cell.capacity_n < (1.0 + _ROOM) * highest_n:
+        elif cell.capacity_n - highest_n < _ROOM * highest_n:
             yield odd(path, f"hardly above limits.tension_max_n ({highest_n:g} N): a tear in the making is not seen")
 
 
@@ -169,6 +169,19 @@ def tensioning_in_time(line: Line) -> Iterator[Finding]:
                 f"limits.tensioning_time_s is {time_s:g} s",
                 "a faster rate, a longer time or lower tensions",
             )
+
+
+def tensioning_keeps_the_speed(line: Line) -> Iterator[Finding]:
+    """Stretching every span at once moves the last roller at rate * sum(L) / (E A)."""
+    rate, limit = line.moves.tension_rate_n_per_s, line.limits.speed_max_m_per_s
+    per_newton = sum(span.length_m.value for span in line.spans) / line.web.stiffness_n.value
+    if rate * per_newton > limit:
+        yield Finding(
+            ("moves", "tension_rate_n_per_s"),
+            f"moving all tensions at this rate pulls the last roller at {rate * per_newton:.3g} m/s, "
+            f"limits.speed_max_m_per_s is {limit:g} m/s",
+            f"at most {limit / per_newton:.3g} N/s",
+        )
 
 
 @dataclass(frozen=True, slots=True)

@@ -32,7 +32,7 @@ def line_template(spans: int = 6, out: str = "line.toml") -> str:
         raise ValueError(f"a line has 1 to {MOST_SPANS} spans, not {spans}")
     buses = fitting_buses(spans, _BITRATE_BIT_PER_S, _PERIOD_S, most=ODD_LOAD) or 1
     more = {1: "", 2: " ~~span 2~~ roller 2"}.get(spans, f" ~~span 2~~ ... ~~span {spans}~~ roller {spans}")
-    parts = [_HEAD.format(more=more, out=out), _line(spans), _process(), _web()]
+    parts = [_HEAD.format(more=more, out=out), _line(spans), _process(spans), _web()]
     parts += [_rollers(spans), _spans(spans), _buses(buses), _drives(spans, buses), _load_cells(spans), _plc()]
     return "\n".join([*parts, _recipes(spans)])
 
@@ -70,7 +70,9 @@ def _line(spans: int) -> str:
     return _entries("Line", {"format": "1", "site": '"demo"', "line": '"line-1"', "description": description})
 
 
-def _process() -> str:
+def _process(spans: int) -> str:
+    # Tensioning all spans at once pulls the last roller at rate * sum(L) / (E A): at most half the greatest speed.
+    tension_rate = min(20.0, 0.5 * 0.12 * 2400.0 / spans)
     control = {"period_s": "0.010", "latency_s": "0.010", "cpu": "#1", "priority": "60"}
     limits = {
         "torque_nm": "60.0",
@@ -82,10 +84,10 @@ def _process() -> str:
         "speed_step_max_m_per_s": "0.09",
         "hold_periods": "3",
         "watchdog_s": "0.1",
-        "tensioning_time_s": "20.0",
+        "tensioning_time_s": "20.0" if spans <= 20 else "40.0",
     }
     moves = {
-        "tension_rate_n_per_s": "20.0",
+        "tension_rate_n_per_s": f"{tension_rate:.1f}",
         "speed_rate_m_per_s2": "0.05",
         "stop_rate_m_per_s2": "0.1",
         "stop_time_s": "10.0",

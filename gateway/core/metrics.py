@@ -6,9 +6,9 @@ from gateway.core.signals import FloatArray
 
 
 def rmse_n(tension_n: FloatArray, setpoint_n: FloatArray) -> float:
-    """Root of the time mean of the squared 2-norm over all spans (eq. rmse), in N. Arrays are (k, n), evenly sampled."""
-    error = tension_n - setpoint_n
-    return float(np.sqrt(np.mean(np.sum(error**2, axis=1))))
+    """Root of the time mean of the squared 2-norm over all spans (eq. rmse), in N. Arrays (k, n), evenly sampled."""
+    error: FloatArray = tension_n - setpoint_n
+    return float(np.sqrt(np.sum(error**2) / len(error)))
 
 
 def rmse_per_span_n(tension_n: FloatArray, setpoint_n: FloatArray) -> FloatArray:

@@ -24,16 +24,25 @@ def edits(a: str, b: str) -> int:
 
 def is_typo(word: str, known: str) -> bool:
     """Whether `word` is `known` mistyped: few edits, and fewer than half of its letters."""
+    if abs(len(word) - len(known)) > TYPO_EDITS:
+        return False
     count = edits(word.lower(), known.lower())
     return count <= TYPO_EDITS and 2 * count < len(known)
 
 
 def nearest(word: str, known: Iterable[str]) -> str:
-    """The known word most like `word`, "" if none is like it. Of equally near ones the first is taken."""
+    """The known word most like `word`, "" if none is like it. Of equally near ones the first is taken.
+
+    Letters in the wrong place count as typos; failing that, the parts of a key may stand in any order.
+    """
     words = list(known)
     typos = [candidate for candidate in words if is_typo(word, candidate)]
     if typos:
         return min(typos, key=lambda candidate: edits(word.lower(), candidate.lower()))
-    lower = {candidate.lower(): candidate for candidate in reversed(words)}
-    like = get_close_matches(word.lower()[:64], lower, n=1, cutoff=0.5)
-    return lower[like[0]] if like else ""
+    in_order = {_parts_in_order(candidate): candidate for candidate in reversed(words)}
+    like = get_close_matches(_parts_in_order(word[:64]), in_order, n=1, cutoff=0.5)
+    return in_order[like[0]] if like else ""
+
+
+def _parts_in_order(key: str) -> str:
+    return "_".join(sorted(key.lower().split("_")))

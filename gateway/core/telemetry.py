@@ -77,8 +77,9 @@ def unpack(payload: bytes) -> Frame:
     floats = np.frombuffer(payload, "<f4", n * len(FLOAT_FIELDS), _HEADER.size).astype(np.float64).reshape(-1, n)
     octets: IntArray = np.frombuffer(payload, np.int8, n * len(BYTE_FIELDS), expected - n * len(BYTE_FIELDS))
     return Frame(
-        sequence, time_s, lateness, cycle, missed, unwind, setpoint, state, bool(saturated), held, *floats, octets[:n], octets[n:]
-    )
+        sequence, time_s, lateness, cycle, missed, unwind, setpoint, state, bool(saturated), held,
+        floats[0], floats[1], floats[2], floats[3], floats[4], octets[:n], octets[n:],
+    )  # fmt: skip
 
 
 def frame_dtype(n: int) -> np.dtype[np.void]:

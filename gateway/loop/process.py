@@ -22,6 +22,7 @@ from gateway.mailbox.paths import GATEWAY_SOCKET, LOOP_SOCKET
 from gateway.mailbox.unix import UnixMailbox
 from safety.actions import Finding
 
+
 def run_loop(line: Line, config: LqiConfig | PidConfig, run_folder: Path, say: Callable[[str], None]) -> None:
     """Run until SIGTERM or SIGINT, which stop the line first.
 
@@ -49,7 +50,11 @@ async def _main(line: Line, config: LqiConfig | PidConfig, run_folder: Path, say
 
     def announce(before: Machine, after: Machine, findings: list[Finding]) -> None:
         text = f"{before.phase.name} to {after.phase.name}" + (f": {after.reason}" if after.reason else "")
-        tell("state", text, {"state": after.state.name, "rules": [finding.rule for finding in findings]})
+        data: dict[str, object] = {"state": after.state.name}
+        if findings:
+            data["rules"] = [finding.rule for finding in findings]
+            data["links"] = {link.name: link.health.last_error for link in links if link.health.last_error}
+        tell("state", text, data)
 
     links = build_links(line)
     cycle = Cycle(line, make_law(config), links, monotonic, record, announce)

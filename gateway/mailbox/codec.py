@@ -1,10 +1,10 @@
 """The envelope: one message between two processes as one datagram. Pure, no I/O.
 
-    octet 0      version
-    octet 1      kind
-    octets 2-9   id, u64 little-endian; 0 for PUBLISH
-    octet 10     length t of the topic's name, 1 .. 64
-    then         the topic's name (ASCII), then the payload
+octet 0      version
+octet 1      kind
+octets 2-9   id, u64 little-endian; 0 for PUBLISH
+octet 10     length t of the topic's name, 1 .. 64
+then         the topic's name (ASCII), then the payload
 """
 
 import struct

@@ -11,6 +11,7 @@ from gateway.mailbox.port import (
     RemoteError,
     RequestHandler,
     Unreachable,
+    no_answer,
     what_to_start,
 )
 
@@ -60,7 +61,7 @@ class InProcessMailbox:
         done, _ = await asyncio.wait((task,), timeout=timeout_s)
         if not done:
             task.cancel()
-            raise Unreachable(f"{topic.name} did not answer within {timeout_s:g} s")
+            raise Unreachable(no_answer(topic, timeout_s))
         if task.cancelled():
             raise Unreachable(f"{topic.name} was cancelled")
         error = task.exception()

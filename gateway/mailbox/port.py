@@ -46,6 +46,11 @@ class Counters:
     last_error: str = ""
 
 
+def no_answer(topic: Topic, timeout_s: float) -> str:
+    """The sentence for a request that was sent and not answered in time."""
+    return f"{topic.name} did not answer within {timeout_s:g} s; what was asked may have been done all the same"
+
+
 def what_to_start(topic: Topic) -> str:
     """The sentence for an unreachable topic; the first part of a topic's name is the process that serves it."""
     process = topic.name.partition("/")[0]

@@ -26,6 +26,7 @@ from gateway.mailbox.port import (
     RemoteError,
     RequestHandler,
     Unreachable,
+    no_answer,
     what_to_start,
 )
 
@@ -97,7 +98,7 @@ class UnixMailbox:
             async with asyncio.timeout(timeout_s):
                 return await future
         except TimeoutError:
-            raise Unreachable(f"{topic.name} did not answer within {timeout_s:g} s: is its process stuck?") from None
+            raise Unreachable(no_answer(topic, timeout_s)) from None
         finally:
             del connection.pending[number]
 

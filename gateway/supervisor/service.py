@@ -12,7 +12,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from gateway.core.line import Line
-from gateway.core.messages import Event, MalformedMessage, Reply, parse_command
+from gateway.core.messages import Arm, Event, MalformedMessage, Reply, parse_command
 from gateway.core.topics import GATEWAY_COMMAND, GATEWAY_STATUS, LOOP_COMMAND, LOOP_EVENT, LOOP_TELEMETRY
 from gateway.mailbox.port import PEER, Counters, Mailbox, Peer, Unreachable
 from gateway.supervisor.historian import Historian
@@ -29,7 +29,8 @@ from gateway.supervisor.status import (
 )
 from gateway.supervisor.telemetry_sink import TelemetrySink
 
-LOOP_TIMEOUT_S = 5.0  #: arming writes and reads back every drive's watchdog
+LOOP_TIME_S = 2.5  #: for the loop to answer a command
+ARM_TIME_S = 14.0  #: arming configures every drive and reads its watchdog back
 EVENTS_SHOWN = 20
 TEXT_SHOWN = 300  #: characters of an event's text in the status; the history keeps all
 
@@ -158,8 +159,8 @@ class Gateway:
     async def _pass_on(self, payload: bytes) -> Reply:
         state = loop_status(self._line, self._sink, self._clock()).state
         try:
-            parse_command(payload)
-            answer = await self._mailbox.request(LOOP_COMMAND, payload, LOOP_TIMEOUT_S)
+            time_s = ARM_TIME_S if isinstance(parse_command(payload), Arm) else LOOP_TIME_S
+            answer = await self._mailbox.request(LOOP_COMMAND, payload, time_s)
             return Reply.model_validate_json(answer)
         except MalformedMessage as error:
             return Reply(ok=False, state=state, text=f"not understood: {error}", reasons=[str(error)])

@@ -72,8 +72,6 @@ class Writer:
             with connection:
                 delete_blobs(connection, self._small)
                 insert_blob(connection, self._run_id, self._table(self._gathered), wall_ahead_s)
-            # Pages that lie in memory would hide damage of the file: let the next transaction read it again.
-            connection.execute("PRAGMA shrink_memory")
         self._forget()
 
     def disconnect(self) -> None:
@@ -85,7 +83,10 @@ class Writer:
 
     def _ready(self) -> apsw.Connection:
         if self._connection is not None and not self._still_there():
-            self.disconnect()  # somebody deleted or replaced the file: it must not swallow what comes
+            # Somebody moved, replaced or deleted the file. It gets what is its own, which SQLite leaves out when it
+            # closes a file that has moved, but must not swallow what comes.
+            self._connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+            self.disconnect()
         connection = self._connection or self._connect()
         free = os.statvfs(self.path.parent)
         if free.f_bavail * free.f_frsize < self._reserve_bytes:

@@ -21,7 +21,9 @@ def parameter(value: float) -> dict[str, float]:
     return {"value": value, "tolerance": 0.1}
 
 
-def line(n: int = 2, can_bus: dict[str, Any] | None = None, modbus_port: int = 5020, plc_port: int | None = None) -> Line:
+def line(
+    n: int = 2, can_bus: dict[str, Any] | None = None, modbus_port: int = 5020, plc_port: int | None = None
+) -> Line:
     """A line of n spans: drives are nodes 1 to n, rated 80 Nm; one amplifier as unit 1, the PLC as unit 2."""
     buses: list[dict[str, Any]] = [
         {"name": "drives", "protocol": "canopen", "interface": "udp_multicast", "channel": GROUP, **(can_bus or {})},
@@ -34,6 +36,7 @@ def line(n: int = 2, can_bus: dict[str, Any] | None = None, modbus_port: int = 5
             "format": 1,
             "site": "test",
             "line": "line",
+            "control": {"period_s": 0.1, "latency_s": 0.1},  # slow, so that a busy machine makes no test fail
             "limits": {
                 "torque_nm": 60.0,
                 "torque_rate_nm_per_s": 1000.0,
@@ -98,7 +101,7 @@ async def cycle(link: Any, inputs: Inputs, wait_s: float = 0.5) -> None:
 async def until(condition: Callable[[], bool]) -> None:
     """Let the loop run until something has happened."""
     async with asyncio.timeout(PATIENCE_S):
-        while not condition():
+        while not condition():  # noqa: ASYNC110 (what happens, happens in sockets)
             await asyncio.sleep(0)
 
 

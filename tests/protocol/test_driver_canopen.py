@@ -8,7 +8,12 @@ from math import inf, nan
 from typing import Any
 
 import pytest
-from driver_support import (
+
+from drivers.canopen.link import CanopenLink
+from drivers.port import PrepareRefused
+from drivers.registry import build_links
+from gateway.core.signals import DriveRequest, DriveState, Inputs, Outputs, Quality
+from tests.protocol.driver_support import (
     ENABLED,
     FAULT,
     GROUP,
@@ -21,11 +26,6 @@ from driver_support import (
     line,
     until,
 )
-
-from drivers.canopen.link import CanopenLink
-from drivers.port import PrepareRefused
-from drivers.registry import build_links
-from gateway.core.signals import DriveRequest, DriveState, Inputs, Outputs, Quality
 
 Body = Callable[[CanopenLink, Drives, Drive, Drive], Awaitable[None]]
 

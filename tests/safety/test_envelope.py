@@ -171,5 +171,7 @@ def test_applied_torque_keeps_limit_and_rate_and_is_the_nearest_that_does(asked,
     assert (np.abs(torque) <= 60.0).all()
     assert (np.abs(torque - before) <= step + 1e-9).all()
     low, high = np.maximum(before - step, -60.0), np.minimum(before + step, 60.0)
-    nearest = np.array([min((x, a, b), key=lambda y: (not a <= y <= b, abs(y - x))) for x, a, b in zip(asked, low, high, strict=True)])
+    nearest = np.array(
+        [min((x, a, b), key=lambda y: (not a <= y <= b, abs(y - x))) for x, a, b in zip(asked, low, high, strict=True)]
+    )
     assert np.allclose(torque, nearest)

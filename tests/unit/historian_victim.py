@@ -12,10 +12,9 @@ import sys
 import time
 from pathlib import Path
 
-from supervisor_support import frame_of
-
 from gateway.supervisor import historian as module
 from gateway.supervisor.historian import Historian
+from tests.unit.supervisor_support import frame_of
 
 ROUNDS = 20
 ROUND_S = 100.0  # of frame time between two children

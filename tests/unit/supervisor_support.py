@@ -1,9 +1,12 @@
 """A line, its telemetry and a short folder for sockets, for the tests of the gateway process."""
 
+import asyncio
 import shutil
+import subprocess
+import sys
 import tempfile
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -32,6 +35,25 @@ def short_folder() -> Iterator[Path]:
         yield folder
     finally:
         shutil.rmtree(folder)
+
+
+@contextmanager
+def child(program: str, *arguments: Path) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """A Python program in a process of its own, and the first line it said; killed at the end."""
+    command = [sys.executable, "-c", program, *map(str, arguments)]
+    root = Path(__file__).parents[2]
+    with subprocess.Popen(command, cwd=root, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            yield process, process.stdout.readline()
+        finally:
+            process.kill()
+
+
+async def until(condition: Callable[[], bool]) -> None:
+    """Lets the event loop turn until `condition`; what it waits for may happen in another process."""
+    while not condition():  # noqa: ASYNC110
+        await asyncio.sleep(0.001)
 
 
 def frame_of(sequence: int, time_s: float, spans: int = 6, **changes: Any) -> bytes:

@@ -155,9 +155,7 @@ def test_dead_time_becomes_torques_in_flight(latency_s, depth):
 def test_engaging_is_bumpless_and_saturation_does_not_wind_up(values, design, start, data):
     config = design(task(3, **values))
     law = make_law(config)
-    measured = Measured(
-        np.array(data.draw(st.lists(st.floats(0, 60), min_size=3, max_size=3))), np.full(3, 0.05), 0.05
-    )
+    measured = Measured(np.array(data.draw(st.lists(st.floats(0, 60), min_size=3, max_size=3))), np.full(3, 0.05), 0.05)
     setpoint, applied = np.full(3, 30.0), np.full(3, start)
     state = law.engage(measured, setpoint, applied)
     first = law.ask(state, measured, setpoint)
@@ -199,7 +197,6 @@ def test_configurations_that_must_not_run_are_refused(change, reason):
 def test_a_gain_of_the_wrong_shape_names_both_shapes():
     config = design_lqi(task(2)).model_dump()
     config["gain_integral"] = [[1.0, 0.0]]
-    import json
 
     with pytest.raises(ControllerRefused, match=r"gain_integral is \(1, 2\), for 2 spans it must be \(2, 2\)"):
         parse_controller(json.dumps(config).encode())

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from supervisor_support import frame_of
 
 from gateway.core.messages import Event
 from gateway.core.telemetry import frame_dtype, unpack
@@ -19,6 +18,7 @@ from gateway.supervisor.historian import FILE_NAME, Historian
 from gateway.supervisor.history import FIELDS, History, HistoryError
 from gateway.supervisor.store import STORED_FIELDS, Run, open_store
 from gateway.supervisor.writer import Writer
+from tests.unit.supervisor_support import frame_of
 
 WALL_AHEAD_S = 1_700_000_000.0
 
@@ -177,7 +177,8 @@ def test_unknown_fields_missing_files_and_changed_lines_are_refused_with_help(tm
         assert history.read(1.5, 3.0, ["tension_n"])["tension_n"].shape == (1, 7)
 
 
-def test_a_newer_schema_and_a_foreign_file_are_left_alone(tmp_path: Path) -> None:
+def test_a_newer_schema_and_a_foreign_file_are_left_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(historian_module, "FLUSH_S", 0.01)
     for name, statement in (("newer", "PRAGMA user_version = 99"), ("foreign", "PRAGMA application_id = 7")):
         folder = tmp_path / name
         open_store_of(folder).close()

@@ -6,19 +6,21 @@ import sys
 import threading
 import time
 from pathlib import Path
+from typing import Any
 
-import historian_victim
+import apsw
 import numpy as np
 import pytest
-from supervisor_support import frame_of
-from test_historian import eventually, running, writer_of
 
 from gateway.core.messages import Event
 from gateway.supervisor import historian as module
 from gateway.supervisor.historian import FILE_NAME, Historian
 from gateway.supervisor.history import History
+from tests.unit import historian_victim
+from tests.unit.supervisor_support import child, frame_of
+from tests.unit.test_historian import eventually, running, writer_of
 
-HERE = Path(__file__).parent
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(autouse=True)
@@ -29,8 +31,8 @@ def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_no_kill_loses_what_was_said_to_be_stored_or_harms_the_file(tmp_path: Path) -> None:
     seed = int(np.random.default_rng().integers(1 << 30))
     print(f"seed {seed}")
-    command = [sys.executable, str(HERE / "historian_victim.py"), str(tmp_path), str(seed)]
-    victims = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
+    command = [sys.executable, "-m", "tests.unit.historian_victim", str(tmp_path), str(seed)]
+    victims = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=True)
     said = [int(line) for line in victims.stdout.split()]
     assert len(said) == historian_victim.ROUNDS
     assert min(said) >= 1
@@ -66,31 +68,26 @@ def test_a_damaged_file_is_kept_aside_and_a_new_one_begun(tmp_path: Path, damage
         assert history.read(0.0, 2000.0, [])["time_s"].tolist() == [1000.0]
 
 
-def test_damage_that_comes_while_storing_is_noticed_when_a_blob_is_gathered(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(module, "BLOB_S", 0.02)
-    path = tmp_path / FILE_NAME
-    writer = writer_of(path)
-    writer.store([frame_of(k, float(k)) for k in range(1000)], [], 0.0)
-    writer.disconnect()
+def test_damage_that_is_met_while_storing_loses_nothing_new(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    store = module.Writer.store
+    met = []
+
+    def meets_damage_once(self: module.Writer, frames: list[bytes], *rest: Any) -> None:
+        if frames and not met:
+            met.append(len(frames))
+            raise apsw.CorruptError("database disk image is malformed")
+        store(self, frames, *rest)
+
     with running(tmp_path) as historian:
         eventually(lambda: historian.health().storing)
-        path.write_bytes(b"\xff" * path.stat().st_size)
-        sequence = 1000
-
-        def noticed() -> bool:
-            nonlocal sequence
-            sequence += 1
-            historian.frame(frame_of(sequence, float(sequence)))
-            return bool(historian.health().moved_aside)
-
-        eventually(noticed)
-        eventually(lambda: historian.health().storing)
-        assert Path(historian.health().moved_aside).is_file()
-        historian.event(Event(time_s=1.0, kind="after", text="after the damage"))
-    with History(path) as history:
-        assert [event.kind for event in history.events(0.0, 1e12)] == ["after"]
+        monkeypatch.setattr(module.Writer, "store", meets_damage_once)
+        historian.frame(frame_of(0, 1.0))
+        eventually(lambda: historian.health().storing and historian.health().frames_stored == 1)
+        kept = Path(historian.health().moved_aside)
+    assert len(met) == 1
+    for path, sequences in ((kept, []), (tmp_path / FILE_NAME, [0])):
+        with History(path) as history:
+            assert history.read(0.0, 2.0, ["sequence"])["sequence"].tolist() == sequences
 
 
 def test_a_blob_that_does_not_unpack_is_left_out_and_named(tmp_path: Path) -> None:
@@ -112,7 +109,7 @@ def test_a_blob_that_does_not_unpack_is_left_out_and_named(tmp_path: Path) -> No
 FULL_DISK = """
 import resource, signal, sys, time
 from pathlib import Path
-from supervisor_support import frame_of
+from tests.unit.supervisor_support import child, frame_of
 from gateway.supervisor import historian as module
 from gateway.supervisor.historian import Historian
 
@@ -123,6 +120,7 @@ def until(condition):
         time.sleep(0.005)
 
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+module.FLUSH_S = 0.02
 folder = Path(sys.argv[1])
 historian = Historian(folder, "site", "line", 6)
 historian.start()
@@ -131,12 +129,10 @@ until(lambda: historian.health().frames_stored == 1)
 # No file may grow beyond this: the kernel refuses the historian's writes as it does on a full disk.
 resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, resource.RLIM_INFINITY))
 sequence = 1
-began_s = None
 while historian.health().storing:
     historian.frame(frame_of(sequence, sequence * 0.01))
     sequence += 1
     time.sleep(0.0005)
-filled_s = time.monotonic()
 text = historian.health().text
 for _ in range(100):
     historian.frame(frame_of(sequence, sequence * 0.01))
@@ -150,7 +146,7 @@ print(sequence, historian.health().frames_lost, text, sep="\\n")
 
 def test_writes_that_the_kernel_refuses_stop_the_storing_and_it_goes_on_by_itself(tmp_path: Path) -> None:
     command = [sys.executable, "-c", FULL_DISK, str(tmp_path)]
-    run = subprocess.run(command, cwd=HERE, capture_output=True, text=True, timeout=60, check=False)
+    run = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)
     assert run.returncode == 0, run.stderr
     sent, lost, text = run.stdout.splitlines()
     assert text.startswith("not storing")
@@ -199,6 +195,18 @@ def test_when_memory_is_full_the_newest_are_lost_and_counted(tmp_path: Path, mon
         assert [event.text for event in history.events(0.0, 1e12)] == ["0", "1", "2"]
 
 
+def test_a_file_that_is_moved_away_takes_nothing_more(tmp_path: Path) -> None:
+    with running(tmp_path) as historian:
+        historian.frame(frame_of(0, 0.0))
+        eventually(lambda: historian.health().frames_stored == 1)
+        (tmp_path / FILE_NAME).rename(tmp_path / "archived")
+        historian.frame(frame_of(1, 1.0))
+        eventually(lambda: historian.health().frames_stored == 2)
+    for name, sequences in (("archived", [0]), (FILE_NAME, [1])):
+        with History(tmp_path / name) as history:
+            assert history.read(0.0, 2.0, ["sequence"])["sequence"].tolist() == sequences
+
+
 def test_a_folder_that_is_deleted_or_cannot_be_made_is_survived(tmp_path: Path) -> None:
     blocked = tmp_path / "data"
     blocked.write_text("a file where a folder should be")
@@ -215,25 +223,21 @@ def test_a_folder_that_is_deleted_or_cannot_be_made_is_survived(tmp_path: Path) 
 
 
 HOLD_LOCK = """
-import sqlite3, sys
+import sqlite3, sys, time
 connection = sqlite3.connect(sys.argv[1], isolation_level=None)
 connection.execute("BEGIN IMMEDIATE")
 print("held", flush=True)
-sys.stdin.read()
+time.sleep(60.0)
 """
 
 
 def test_a_lock_held_by_another_program_only_delays(tmp_path: Path) -> None:
     with running(tmp_path) as historian:
         eventually(lambda: historian.health().storing)
-        command = [sys.executable, "-c", HOLD_LOCK, str(tmp_path / FILE_NAME)]
-        with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as holder:
-            assert holder.stdin is not None
-            assert holder.stdout is not None
-            assert holder.stdout.readline() == b"held\n"
+        with child(HOLD_LOCK, tmp_path / FILE_NAME) as (_, said):
+            assert said == "held\n"
             historian.frame(frame_of(0, 0.0))
             eventually(lambda: "another program holds" in historian.health().text)
-            holder.stdin.close()
         eventually(lambda: historian.health().frames_stored == 1)
 
 

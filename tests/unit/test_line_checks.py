@@ -68,8 +68,7 @@ REFUSED: list[tuple[str, list[Edit], str, str, str]] = [
         [(table("[[load_cells]]", "load-cell-4"), "")],
         "spans[4]",
         "[[spans]]",
-        'span 4 has no load cell; allowed: a [[load_cells]] table with span = 4, or control = '
-        '"draw" on this span',
+        'span 4 has no load cell; allowed: a [[load_cells]] table with span = 4, or control = "draw" on this span',
     ),
     (
         "unique_names",
@@ -120,7 +119,7 @@ REFUSED: list[tuple[str, list[Edit], str, str, str]] = [
         "drives[3].address",
         "address = 2",
         '= 2: is already the address of drives[2] on bus "drives"; allowed: each device its own '
-        'address on its bus; did you mean 3?',
+        "address on its bus; did you mean 3?",
     ),
     (
         "addresses_differ",
@@ -157,7 +156,7 @@ REFUSED: list[tuple[str, list[Edit], str, str, str]] = [
         [('map = "line-plc"', 'map = "loadcell-amp"')],
         "plc.map",
         'map = "loadcell-amp"',
-        'is a map for a load-cell on modbus-tcp; allowed: for a line-plc on modbus-tcp: '
+        "is a map for a load-cell on modbus-tcp; allowed: for a line-plc on modbus-tcp: "
         '"line-plc"; did you mean "line-plc"?',
     ),
     (
@@ -246,8 +245,7 @@ REFUSED: list[tuple[str, list[Edit], str, str, str]] = [
         [("watchdog_s = 0.1", "watchdog_s = 0.019")],
         "limits.watchdog_s",
         "watchdog_s",
-        "the drives would switch off after a single late cycle; allowed: at least two periods "
-        "(0.02 s), up to 0.2 s",
+        "the drives would switch off after a single late cycle; allowed: at least two periods (0.02 s), up to 0.2 s",
     ),
     (
         "stop_is_possible",
@@ -324,6 +322,14 @@ REFUSED: list[tuple[str, list[Edit], str, str, str]] = [
         "s; allowed: a faster rate, a longer time or lower tensions",
     ),
     (
+        "tensioning_keeps_the_speed",
+        [("tension_rate_n_per_s = 20.0", "tension_rate_n_per_s = 49.0")],
+        "moves.tension_rate_n_per_s",
+        "tension_rate_n_per_s",
+        "moving all tensions at this rate pulls the last roller at 0.122 m/s, limits.speed_max_m_per_s is 0.12 "
+        "m/s; allowed: at most 48 N/s",
+    ),
+    (
         "recipes_within_torque",
         [
             ("speed_m_per_s = 0.01\n", "speed_m_per_s = 0.1\n"),
@@ -335,7 +341,7 @@ REFUSED: list[tuple[str, list[Edit], str, str, str]] = [
         "recipes[2]",
         "[[recipes]]",
         '"velocity" needs 75.95 Nm at roller 2 (roller-2; nominal model); allowed: '
-        'limits.torque_nm, 60 Nm: lower the speed or the tension differences',
+        "limits.torque_nm, 60 Nm: lower the speed or the tension differences",
     ),
 ]
 
@@ -372,8 +378,7 @@ def test_wrong_roller_and_span_numbers_name_the_free_one() -> None:
     found = {problem.key: str(problem) for problem in problems(edited(("roller = 3\n", "roller = 7\n")))}
     assert (
         "= 7: there is no such roller; allowed: 1 to 6, in the order of the [[rollers]] tables; "
-        "did you mean 3?"
-        in (found["drives[3].roller"])
+        "did you mean 3?" in (found["drives[3].roller"])
     )
     found = {problem.key: str(problem) for problem in problems(edited(("span = 5\n", "span = 4\n")))}
     assert "span 4 already has a load cell, load_cells[4]" in found["load_cells[5].span"]
@@ -435,7 +440,11 @@ WARNED: list[tuple[list[Edit], str, str]] = [
         "load_cells[2].capacity_n",
         "hardly above limits.tension_max_n",
     ),
-    ([("value = 2400.0", "value = 700.0")], "web.stiffness_n", "at limits.tension_max_n the web stretches by 12%"),
+    (
+        [("value = 2400.0", "value = 700.0"), ("tension_rate_n_per_s = 20.0", "tension_rate_n_per_s = 10.0")],
+        "web.stiffness_n",
+        "at limits.tension_max_n the web stretches by 12%",
+    ),
     (
         [("speed_max_m_per_s = 0.12", "speed_max_m_per_s = 0.3")],
         "limits.speed_max_m_per_s",
@@ -452,6 +461,64 @@ def test_odd_but_legal_lines_are_accepted_with_a_warning(edits: list[Edit], key:
     assert said in warnings[key]
 
 
+ALLOWED: list[list[Edit]] = [
+    [("tension_step_max_n = 24.0", "tension_step_max_n = 58.0")],
+    [("tension_step_max_n = 24.0", "tension_step_max_n = 0.0")],
+    [("speed_step_max_m_per_s = 0.09", "speed_step_max_m_per_s = 0.12")],
+    [("latency_s = 0.010", "latency_s = 0.015")],
+    [("latency_s = 0.010", "latency_s = 0.04")],
+    [("watchdog_s = 0.1", "watchdog_s = 0.02")],
+    [("stop_time_s = 10.0", "stop_time_s = 1.2")],
+    [("stop_rate_m_per_s2 = 0.1", "stop_rate_m_per_s2 = 0.05")],
+    [("torque_off_rate_nm_per_s = 200.0", "torque_off_rate_nm_per_s = 1000.0")],
+    [("rated_torque_nm = 60.0\n", "rated_torque_nm = 1200.0\n")],
+    [("capacity_n = 100.0\n", "capacity_n = 66.0\n")],
+    [("[28.0, 36.0", "[28.0, 7.9")],
+    [("[28.0, 36.0", "[28.0, 54.1")],
+    [("tensioning_time_s = 20.0", "tensioning_time_s = 2.1")],
+    [("address = 3\n", "address = 127\n")],
+    [('"udp_multicast"', '"virtual"'), ("port = 43113 ", "# ")],
+    [('"udp_multicast"', '"socketcan"'), ("port = 43113 ", "# "), ('"239.74.163.2"', '"can0"')],
+    [('"udp_multicast"', '"socketcan"'), ("port = 43113 ", "# "), ('"239.74.163.2"', '"slcan0123456789"')],
+    [('"239.74.163.2"', '"ff15::2"')],
+    [('"127.0.0.1"', '"::1"')],
+    [('"127.0.0.1"', '"io-rack.hall-3"')],
+]
+
+
+@pytest.mark.parametrize("edits", ALLOWED)
+def test_what_is_just_allowed_is_accepted_without_a_word(edits: list[Edit]) -> None:
+    assert check(edited(*edits)).warnings == []
+
+
+def test_at_the_limit_is_accepted() -> None:
+    (warning,) = check(edited(("capacity_n = 100.0\n", "capacity_n = 60.0\n"))).warnings
+    assert "hardly above" in str(warning)
+    # T_0 = 20 N shortens the stretch: 0.119 m/s * 2380 / 2370 = 0.1195 m/s
+    text = edited(
+        ("tension_before_n = 0.0", "tension_before_n = 20.0"), ("speed_m_per_s = 0.01\n", "speed_m_per_s = 0.119\n")
+    )
+    assert "recipes[2].speed_m_per_s" in {warning.key for warning in check(text).warnings}
+
+
+def test_an_empty_virtual_channel_is_refused() -> None:
+    text = edited(('"udp_multicast"', '"virtual"'), ("port = 43113 ", "# "), ('"239.74.163.2"', '""'))
+    assert ["buses[1].channel"] == [problem.key for problem in problems(text)]
+
+
+def test_amplifiers_of_two_types_must_not_share_a_unit() -> None:
+    text = edited(("channel = 2\n", "channel = 2 \n"), ('map = "loadcell-amp"\n', 'map = "other-amp"\n'))
+    with pytest.raises(LineRefused) as refused:
+        check_line(text, "line.toml", {**MAPS, "other-amp": ("modbus-tcp", "load-cell")})
+    # load cell 2 clashes with 1, and 3 to 6 with 2: each is told
+    assert [problem.key for problem in refused.value.problems] == [f"load_cells[{i}].address" for i in range(2, 7)]
+
+
+def test_the_free_address_is_that_of_the_same_bus() -> None:
+    (problem,) = problems(edited(("address = 5\n", "address = 4\n")))
+    assert (problem.key, problem.nearest) == ("drives[5].address", "5")
+
+
 def test_torque_that_only_a_corner_of_the_tolerances_needs_is_a_warning() -> None:
     text = edited(("speed_m_per_s = 0.01\n", "speed_m_per_s = 0.1\n"), ("torque_nm = 60.0", "torque_nm = 54.0"))
     warnings = {warning.key: str(warning) for warning in check(text).warnings}
@@ -460,6 +527,7 @@ def test_torque_that_only_a_corner_of_the_tolerances_needs_is_a_warning() -> Non
         ("torque_nm = 60.0", "torque_nm = 4.2"),
         ("speed_max_m_per_s = 0.12", "speed_max_m_per_s = 0.0102"),
         ("speed_step_max_m_per_s = 0.09", "speed_step_max_m_per_s = 0"),
+        ("tension_rate_n_per_s = 20.0", "tension_rate_n_per_s = 4.0"),
     )
     warnings = {warning.key: str(warning) for warning in check(text).warnings}
     assert "needs 3.814 Nm at roller 6 (roller-6; nominal model)" in warnings["recipes[1]"]
@@ -527,8 +595,7 @@ def test_a_bus_just_below_the_limit_passes_and_one_drive_more_is_refused() -> No
         text = line_template(drives).replace('bus = "drives-2"', 'bus = "drives-1"')
         for node in range(drives, (drives + 1) // 2, -1):
             text = text.replace(
-                f"address = {node - (drives + 1) // 2}\nroller = {node}\n", f"address = {node}\nroller = "
-                f"{node}\n"
+                f"address = {node - (drives + 1) // 2}\nroller = {node}\n", f"address = {node}\nroller = {node}\n"
             )
         return text.replace(next(b for b in text.split("\n\n") if 'name = "drives-2"\n' in b), "")
 
@@ -536,4 +603,6 @@ def test_a_bus_just_below_the_limit_passes_and_one_drive_more_is_refused() -> No
     assert "loaded to 79%" in str(warning)
     (problem,) = problems(on_one_bus(33))
     assert "loaded to 82%" in str(problem)
-    assert "the drives spread over 2 buses" in str(problem)
+    assert problem.allowed == ("at most 80%: control.period_s = 0.011 or longer, or the drives spread over 2 buses")
+    slow = problems(on_one_bus(48).replace("1_000_000", "125_000"))
+    assert slow[0].allowed == "at most 80%: a higher bitrate, or the drives spread over 16 buses"

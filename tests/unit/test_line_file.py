@@ -104,7 +104,7 @@ VALUES = [
         'site = "demo"',
         'site = "Hall 3!"',
         "site",
-        'is no valid name; allowed: lower-case letters, digits and hyphens, at most 32 characters, '
+        "is no valid name; allowed: lower-case letters, digits and hyphens, at most 32 characters, "
         'with a letter or digit at either end; did you mean "hall-3"?',
     ),
     ('site = "demo"', "site = 3", "site", "is a number; allowed: lower-case letters"),
@@ -118,8 +118,7 @@ VALUES = [
         "radius_m = { value = 0.04, tolerance = 0.2 }",
         "radius_m = 0.04",
         "rollers[1].radius_m",
-        "is a number; allowed: { value = a number above 0, tolerance = a fraction above 0 and "
-        "below 1 }, value in m",
+        "is a number; allowed: { value = a number above 0, tolerance = a fraction above 0 and below 1 }, value in m",
     ),
     (
         "tolerance = 0.2 }",

@@ -5,20 +5,19 @@ import os
 import random
 import signal
 import socket
-import subprocess
-import sys
 import time
 from pathlib import Path
 
 import pytest
-from supervisor_support import frame_of
-from test_mailbox_unix import LISTEN, echo, mailboxes, run
 
 from gateway.core.topics import LOOP_COMMAND, LOOP_TELEMETRY
-from gateway.mailbox.codec import MAX_DATAGRAM, Envelope, Kind, encode
+from gateway.mailbox.codec import MAX_DATAGRAM, Envelope, Kind, decode, encode
+from gateway.mailbox.connection import MAX_PER_WINDOW, READ_BUDGET, WINDOW_S
 from gateway.mailbox.listener import BACKLOG
 from gateway.mailbox.port import RemoteError, Unreachable
 from gateway.mailbox.unix import MAX_IN_FLIGHT, UnixMailbox
+from tests.unit.supervisor_support import child, frame_of, until
+from tests.unit.test_mailbox_unix import LISTEN, echo, mailboxes, run
 
 LONGEST_CALL_S = 0.05  # a blocked call would take for ever; this leaves room for a busy test machine
 
@@ -34,30 +33,22 @@ def _longest_publish_s(mailbox: UnixMailbox, payload: bytes, count: int) -> tupl
 
 def test_a_stopped_reader_costs_dropped_messages_and_no_time() -> None:
     async def story(folder: Path) -> None:
-        child = subprocess.Popen([sys.executable, "-c", LISTEN, str(folder / "g")], stdout=subprocess.PIPE)
-        assert child.stdout is not None
-        try:
-            assert child.stdout.readline() == b"listening\n"
+        with child(LISTEN, folder / "g") as (reader, said):
+            assert said == "listening\n"
             async with mailboxes(1) as (loop,):
                 loop.connect({LOOP_TELEMETRY}, folder / "g")
                 assert loop.publish(LOOP_TELEMETRY, b"before")
-                child.send_signal(signal.SIGSTOP)
+                reader.send_signal(signal.SIGSTOP)
                 longest_s, taken = _longest_publish_s(loop, frame_of(1, 1.0), 5000)
                 assert 100 < taken < 2000  # bounded, and some seconds' worth
                 assert loop.counters.dropped == 5000 - taken
                 assert longest_s < LONGEST_CALL_S
-                child.send_signal(signal.SIGCONT)
-                while not loop.publish(LOOP_TELEMETRY, b"again"):
-                    await asyncio.sleep(0.001)
+                reader.send_signal(signal.SIGCONT)
+                await until(lambda: loop.publish(LOOP_TELEMETRY, b"again"))
                 assert loop.counters.connects == 1
-                child.kill()
-                child.wait()
-                while loop.publish(LOOP_TELEMETRY, b"dead"):
-                    await asyncio.sleep(0.001)
-        finally:
-            child.kill()
-            child.wait()
-            child.stdout.close()
+                reader.kill()
+                reader.wait()
+                await until(lambda: not loop.publish(LOOP_TELEMETRY, b"dead"))
 
     run(story)
 
@@ -145,12 +136,10 @@ def test_a_flood_of_requests_leaves_the_others_and_the_event_loop_alive() -> Non
         async with mailboxes(2) as (asking, serving):
             serving.serve(LOOP_COMMAND, echo)
             await serving.listen(folder / "l")
-            child = subprocess.Popen([sys.executable, "-c", FLOOD, str(folder / "l")], stdout=subprocess.PIPE)
-            assert child.stdout is not None
-            try:
-                assert child.stdout.readline() == b"flooding\n"
-                while serving.counters.dropped == 0:  # its answers, which it never reads, fill its buffer first
-                    await asyncio.sleep(0.001)
+            with child(FLOOD, folder / "l") as (_, said):
+                assert said == "flooding\n"
+                # Its answers, which it never reads, fill its buffer first.
+                await until(lambda: serving.counters.dropped > 0)
                 asking.connect({LOOP_COMMAND}, folder / "l")
                 lags_s = []
                 began_s = time.perf_counter()
@@ -161,10 +150,74 @@ def test_a_flood_of_requests_leaves_the_others_and_the_event_loop_alive() -> Non
                     lags_s.append(time.perf_counter() - due_s)
                 assert time.perf_counter() - began_s < 5.0
                 assert sorted(lags_s)[50] < 0.05
-            finally:
-                child.kill()
-                child.wait()
-                child.stdout.close()
+
+    run(story)
+
+
+def test_what_waits_is_read_a_few_at_a_time_so_that_others_have_their_turn() -> None:
+    async def story(folder: Path) -> None:
+        async with mailboxes(2) as (loop, gateway):
+            in_this_turn, most = 0, 0
+            heard = 0
+
+            def hear(_: bytes) -> None:
+                nonlocal in_this_turn, most, heard
+                heard, in_this_turn = heard + 1, in_this_turn + 1
+                most = max(most, in_this_turn)
+
+            gateway.subscribe(LOOP_TELEMETRY, hear)
+            await gateway.listen(folder / "g")
+            loop.connect({LOOP_TELEMETRY}, folder / "g")
+            for _ in range(100):
+                assert loop.publish(LOOP_TELEMETRY, b"x")
+            while heard < 100:  # noqa: ASYNC110 - counts the turns of the event loop
+                in_this_turn = 0
+                await asyncio.sleep(0)
+            assert most == READ_BUDGET
+
+    run(story)
+
+
+def test_a_peer_is_read_at_most_so_often_and_loses_only_its_own_messages() -> None:
+    async def story(folder: Path) -> None:
+        async with mailboxes(2) as (loop, gateway):
+            heard: list[bytes] = []
+            gateway.subscribe(LOOP_TELEMETRY, heard.append)
+            await gateway.listen(folder / "g")
+            loop.connect({LOOP_TELEMETRY}, folder / "g")
+            began_s = time.perf_counter()
+            while loop.counters.dropped < 1000:
+                loop.publish(LOOP_TELEMETRY, b"x")
+                await asyncio.sleep(0)
+            windows = (time.perf_counter() - began_s) / WINDOW_S + 2
+            assert len(heard) <= MAX_PER_WINDOW * windows
+            before = len(heard)
+            await until(lambda: len(heard) > before)  # and is read again
+
+    run(story)
+
+
+def test_an_answer_that_comes_twice_is_taken_once() -> None:
+    async def story(folder: Path) -> None:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as listening:
+            listening.bind(str(folder / "l"))
+            listening.listen()
+            async with mailboxes(1) as (asking,):
+                asking.connect({LOOP_COMMAND}, folder / "l")
+                assert not asking.publish(LOOP_TELEMETRY, b"")
+                asking.connect({LOOP_TELEMETRY}, folder / "l")
+                assert asking.publish(LOOP_TELEMETRY, b"")
+                serving, _ = listening.accept()
+                assert decode(serving.recv(MAX_DATAGRAM)).kind is Kind.PUBLISH
+                for payload in (b"first", b"second"):
+                    waiting = asyncio.create_task(asking.request(LOOP_COMMAND, payload, 5.0))
+                    await asyncio.sleep(0)
+                    asked = decode(serving.recv(MAX_DATAGRAM))
+                    for _ in range(3):
+                        serving.send(encode(asked._replace(kind=Kind.ANSWER)))
+                    assert await waiting == payload
+                await until(lambda: asking.counters.late_answers == 4)
+                serving.close()
 
     run(story)
 
@@ -181,11 +234,12 @@ def test_too_many_requests_at_once_are_refused_with_a_word() -> None:
             serving.serve(LOOP_COMMAND, answer)
             await serving.listen(folder / "l")
             asking.connect({LOOP_COMMAND}, folder / "l")
-            asked = [asyncio.create_task(asking.request(LOOP_COMMAND, b"%d" % k, 5.0)) for k in range(MAX_IN_FLIGHT + 1)]
+            payloads = [b"%d" % k for k in range(MAX_IN_FLIGHT + 1)]
+            asked = [asyncio.create_task(asking.request(LOOP_COMMAND, payload, 5.0)) for payload in payloads]
             with pytest.raises(RemoteError, match="at once"):
                 await asked[-1]
             done.set()
-            assert await asyncio.gather(*asked[:-1]) == [b"%d" % k for k in range(MAX_IN_FLIGHT)]
+            assert await asyncio.gather(*asked[:-1]) == payloads[:-1]
             assert await asking.request(LOOP_COMMAND, b"again", 5.0) == b"again"
             assert serving.counters.refused == 1
 

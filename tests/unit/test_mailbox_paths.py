@@ -2,10 +2,10 @@ import socket
 from pathlib import Path
 
 import pytest
-from supervisor_support import line_of, short_folder
 
 from gateway.mailbox import paths
 from gateway.mailbox.paths import default_run_folder, running_lines
+from tests.unit.supervisor_support import line_of, short_folder
 
 
 def test_the_run_folder_of_a_session_a_service_and_a_plain_user(

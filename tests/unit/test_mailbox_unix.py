@@ -5,20 +5,19 @@ import os
 import signal
 import socket
 import stat
-import subprocess
-import sys
 from collections.abc import AsyncIterator, Callable, Coroutine
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import pytest
-from supervisor_support import short_folder
 
 from gateway.core.topics import GATEWAY_STATUS, LOOP_COMMAND, LOOP_EVENT, LOOP_TELEMETRY
+from gateway.mailbox.codec import Envelope, Kind, encode
 from gateway.mailbox.listener import AlreadyRunning, CannotListen, PathTooLong
 from gateway.mailbox.port import MAX_PAYLOAD, PEER, Peer, RemoteError, Unreachable
 from gateway.mailbox.unix import MAX_CONNECTIONS, MAX_IN_FLIGHT, RECONNECT_S, UnixMailbox
+from tests.unit.supervisor_support import child, short_folder, until
 
 
 class Clock:
@@ -85,8 +84,7 @@ def test_a_publisher_finds_its_listener_late_and_again_looking_once_a_second() -
             assert loop.publish(LOOP_TELEMETRY, b"here")
             assert await heard.get() == b"here"
             await gateway.close()
-            while loop.publish(LOOP_TELEMETRY, b"gone"):
-                await asyncio.sleep(0)
+            await until(lambda: not loop.publish(LOOP_TELEMETRY, b"gone"))
         assert loop.counters.connects == 2
         assert loop.counters.dropped >= 5
         await loop.close()
@@ -153,10 +151,9 @@ def test_an_answer_of_one_peer_cannot_satisfy_a_request_to_another() -> None:
             with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as forger:
                 forger.connect(str(folder / "a"))
                 for number in range(1, 20):
-                    forger.send(bytes([1, 3]) + number.to_bytes(8, "little") + bytes([12]) + b"loop/command" + b"forged")
+                    forger.send(encode(Envelope(Kind.ANSWER, LOOP_COMMAND.name, number, b"forged")))
                 assert await asking.request(LOOP_COMMAND, b"true", 5.0) == b"true"
-                while asking.counters.late_answers < 19:
-                    await asyncio.sleep(0)
+                await until(lambda: asking.counters.late_answers == 19)
 
     run(story)
 
@@ -297,23 +294,21 @@ def test_more_connections_than_allowed_are_turned_away() -> None:
             await serving.listen(folder / "l")
             crowd = []
             try:
-                for k in range(MAX_CONNECTIONS + 5):
+                for _ in range(MAX_CONNECTIONS + 5):
                     crowding = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
                     crowd.append(crowding)
                     crowding.connect(str(folder / "l"))
-                    while serving.counters.refused + MAX_CONNECTIONS < k + 1:
-                        await asyncio.sleep(0)
-                    await asyncio.sleep(0)
-                while serving.counters.refused < 5:
-                    await asyncio.sleep(0)
-                crowd[0].close()
+                    await asyncio.sleep(0)  # the backlog is shorter than the crowd
+                await until(lambda: serving.counters.refused == 5)
                 asking.connect({LOOP_COMMAND}, folder / "l")
-                while True:
-                    try:
+                with pytest.raises(Unreachable):
+                    await asking.request(LOOP_COMMAND, b"x", 5.0)
+                for crowding in crowd:
+                    crowding.close()
+                while True:  # the server has yet to see them go
+                    with suppress(Unreachable):
                         assert await asking.request(LOOP_COMMAND, b"x", 5.0) == b"x"
                         break
-                    except Unreachable:
-                        await asyncio.sleep(0)
             finally:
                 for crowding in crowd:
                     crowding.close()
@@ -386,24 +381,18 @@ asyncio.run(main())
 def test_a_living_listener_is_refused_and_a_killed_one_replaced() -> None:
     async def story(folder: Path) -> None:
         path = folder / "g"
-        child = subprocess.Popen([sys.executable, "-c", LISTEN, str(path)], stdout=subprocess.PIPE)
-        try:
-            assert child.stdout is not None
-            assert child.stdout.readline() == b"listening\n"
+        with child(LISTEN, path) as (living, said):
+            assert said == "listening\n"
             async with mailboxes(1) as (mailbox,):
-                with pytest.raises(AlreadyRunning, match=f"process {child.pid}"):
+                with pytest.raises(AlreadyRunning, match=f"process {living.pid}"):
                     await mailbox.listen(path)
-                child.send_signal(signal.SIGSTOP)
+                living.send_signal(signal.SIGSTOP)
                 with pytest.raises(AlreadyRunning):
                     await mailbox.listen(path)
-                child.kill()
-                child.wait()
+                living.kill()
+                living.wait()
                 assert path.is_socket()
                 await mailbox.listen(path)
-        finally:
-            child.kill()
-            child.wait()
-            child.stdout.close()
 
     run(story)
 

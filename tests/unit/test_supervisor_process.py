@@ -4,7 +4,6 @@ import asyncio
 import os
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
 from contextlib import asynccontextmanager, contextmanager
@@ -12,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from supervisor_support import frame_of, short_folder
 
 from gateway.core.messages import Event, Reply
 from gateway.core.topics import GATEWAY_COMMAND, GATEWAY_STATUS, LOOP_COMMAND, LOOP_EVENT, LOOP_TELEMETRY
@@ -20,33 +18,22 @@ from gateway.mailbox.port import RemoteError, Unreachable
 from gateway.mailbox.unix import UnixMailbox
 from gateway.supervisor.history import History
 from gateway.supervisor.status import GatewayStatus
+from tests.unit.supervisor_support import child, frame_of, short_folder, until
 
 GATEWAY = """
 import sys
 from pathlib import Path
-from supervisor_support import line_of
+from tests.unit.supervisor_support import line_of
 from gateway.supervisor.process import run_gateway
 sys.exit(run_gateway(line_of(), Path(sys.argv[1]), Path(sys.argv[1]) / "data"))
 """
 
 
-def start(folder: Path) -> subprocess.Popen[str]:
-    command = [sys.executable, "-c", GATEWAY, str(folder)]
-    return subprocess.Popen(
-        command, cwd=Path(__file__).parent, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
-
-
 @contextmanager
 def gateway(folder: Path) -> Iterator[subprocess.Popen[str]]:
-    process = start(folder)
-    with process:
-        try:
-            assert process.stdout is not None
-            assert "gateway of demo/" in process.stdout.readline()
-            yield process
-        finally:
-            process.kill()
+    with child(GATEWAY, folder) as (process, said):
+        assert said.startswith("gateway of demo/")
+        yield process
 
 
 @asynccontextmanager
@@ -76,8 +63,8 @@ async def ask(client: UnixMailbox) -> GatewayStatus:
     return GatewayStatus.model_validate_json(await client.request(GATEWAY_STATUS, b"", 5.0))
 
 
-async def until(client: UnixMailbox, condition: Callable[[GatewayStatus], bool]) -> GatewayStatus:
-    while not condition(status := await ask(client)):
+async def status_with(client: UnixMailbox, condition: Callable[[GatewayStatus], bool]) -> GatewayStatus:
+    while not condition(status := await ask(client)):  # noqa: ASYNC110
         await asyncio.sleep(0.01)
     return status
 
@@ -91,7 +78,7 @@ def test_from_start_to_sigterm_everything_is_kept() -> None:
                     assert loop.publish(LOOP_TELEMETRY, frame_of(k, time.monotonic()))
                 event = Event(time_s=time.monotonic(), kind="state", text="TENSIONING to RUNNING")
                 loop.publish(LOOP_EVENT, event.model_dump_json().encode())
-                status = await until(client, lambda status: "loop-up" in {event.kind for event in status.events})
+                status = await status_with(client, lambda status: "loop-up" in {event.kind for event in status.events})
                 assert status.link.frames == 150
                 assert (status.loop.running, status.loop.state) == (True, "RUN")
                 process.terminate()
@@ -114,9 +101,9 @@ def test_from_start_to_sigterm_everything_is_kept() -> None:
 def test_a_second_instance_ends_with_3_and_a_sentence_and_touches_nothing() -> None:
     async def story(folder: Path) -> None:
         with gateway(folder) as process:
-            second = start(folder)
-            _, said = second.communicate(timeout=20.0)
-            assert second.returncode == 3
+            with child(GATEWAY, folder) as (second, _):
+                said = second.communicate(timeout=20.0)[1]
+                assert second.returncode == 3
             assert f"by process {process.pid}" in said
             assert "Traceback" not in said
             async with loop_and_client(folder) as (_, client):
@@ -128,9 +115,9 @@ def test_a_second_instance_ends_with_3_and_a_sentence_and_touches_nothing() -> N
 def test_a_run_folder_that_cannot_be_used_ends_with_2_and_a_sentence() -> None:
     with short_folder() as folder:
         (folder / "x").write_text("")
-        process = start(folder / "x")
-        _, said = process.communicate(timeout=20.0)
-        assert process.returncode == 2
+        with child(GATEWAY, folder / "x") as (process, _):
+            said = process.communicate(timeout=20.0)[1]
+            assert process.returncode == 2
         assert said.startswith("the gateway cannot start: the run folder")
 
 
@@ -142,10 +129,10 @@ def test_after_a_sigkill_the_next_gateway_takes_over_and_the_loop_finds_it() -> 
                 with gateway(folder) as process:
                     loop.publish(LOOP_TELEMETRY, frame_of(sequence, time.monotonic()))
                     sequence += 1
-                    while not loop.publish(LOOP_TELEMETRY, frame_of(sequence, time.monotonic())):
-                        await asyncio.sleep(0.01)
+                    again = frame_of(sequence, time.monotonic())
+                    await until(lambda again=again: loop.publish(LOOP_TELEMETRY, again))
                     sequence += 1
-                    status = await until(client, lambda status: status.historian.frames_stored > 0)
+                    status = await status_with(client, lambda status: status.historian.frames_stored > 0)
                     assert status.loop.running
                     process.kill()
                     process.wait()
@@ -176,9 +163,9 @@ def test_a_loop_may_come_go_and_come_again() -> None:
                     answered = await client.request(GATEWAY_COMMAND, b'{"command":"stop"}', 5.0)
                     assert Reply.model_validate_json(answered).ok
                     loop.publish(LOOP_TELEMETRY, frame_of(1, time.monotonic()))
-                    await until(client, lambda status: status.loop.running)
+                    await status_with(client, lambda status: status.loop.running)
                     await running.close()
-                    await until(client, lambda status: not status.loop.running)
+                    await status_with(client, lambda status: not status.loop.running)
                 status = await ask(client)
                 assert status.loop.restarts == 1
                 commands = [event.text for event in status.events if event.kind == "command"]
@@ -201,7 +188,7 @@ def test_rubbish_on_the_socket_changes_nothing() -> None:
                     loop.publish(LOOP_EVENT, os.urandom(k))
                 with pytest.raises(RemoteError, match="not served"):
                     await loop.request(LOOP_COMMAND, b"", 5.0)
-                status = await until(client, lambda status: status.link.malformed == 100)
+                status = await status_with(client, lambda status: status.link.malformed == 100)
                 assert status.link.frames == 0
                 process.send_signal(signal.SIGINT)
                 assert process.wait(10.0) == 0

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 from pydantic import ValidationError
-from supervisor_support import frame_of, line_of
 
 from gateway.core.messages import Arm, Event, Reply
 from gateway.core.signals import DriveState, Quality
@@ -19,6 +18,7 @@ from gateway.mailbox.port import MAX_PAYLOAD, PEER, Counters, Peer
 from gateway.supervisor.historian import Health, Historian
 from gateway.supervisor.service import EVENTS_SHOWN, TEXT_SHOWN, Gateway
 from gateway.supervisor.status import LOST_S, WORDS, GatewayStatus
+from tests.unit.supervisor_support import frame_of, line_of
 
 DOCS = Path(__file__).parents[2] / "docs"
 WALL_AHEAD_S = 1_700_000_000.0

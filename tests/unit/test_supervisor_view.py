@@ -14,9 +14,6 @@ import numpy as np
 import pytest
 import typer
 from rich.console import Console
-from supervisor_support import frame_of, short_folder
-from test_historian import writer_of
-from test_supervisor_status import Bench
 from typer.testing import CliRunner
 
 from gateway.cli import status_commands
@@ -25,6 +22,9 @@ from gateway.cli.status_view import render
 from gateway.core.topics import GATEWAY_STATUS
 from gateway.mailbox.unix import UnixMailbox
 from gateway.supervisor.status import GatewayStatus
+from tests.unit.supervisor_support import frame_of, short_folder
+from tests.unit.test_historian import writer_of
+from tests.unit.test_supervisor_status import Bench
 
 app = typer.Typer()
 app.command("status")(status)

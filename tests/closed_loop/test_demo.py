@@ -1,0 +1,89 @@
+"""The demonstration as a user runs it: result and report, an orderly Ctrl-C, and no process left behind."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from gateway.cli.demo_result import DemoResult
+
+pytestmark = [pytest.mark.realtime, pytest.mark.timeout(180)]
+
+
+def demo(folder: Path) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-m", "gateway.cli", "demo", "--out", str(folder)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        start_new_session=True,
+    )
+
+
+def left_over(folder: Path) -> list[str]:
+    """Command lines of living processes that name this folder."""
+    found = []
+    for process in Path("/proc").iterdir():
+        if process.name.isdigit() and int(process.name) != os.getpid():
+            try:
+                command = (process / "cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace")
+            except OSError:
+                continue
+            if str(folder) in command:
+                found.append(command)
+    return found
+
+
+def test_the_demonstration_runs_both_cases_and_leaves_nothing_behind(tmp_path):
+    folder = tmp_path / "a folder with spaces"
+    process = demo(folder)
+    output, _ = process.communicate(timeout=150)
+    assert process.returncode == 0, output
+    result = DemoResult.model_validate(json.loads((folder / "result.json").read_text()))
+    assert [case.name for case in result.cases] == ["tension", "velocity"]
+    for case in result.cases:
+        assert case.ratio_to_stepped <= case.limit_ratio, output
+        assert case.tension_min_n > 2.0 and case.tension_max_n < 60.0
+    assert not any(result.unsafe_events.values()), result.unsafe_events
+    assert result.timing.periods > 3000
+    page = (folder / "report.html").read_text()
+    assert all(f"{case.rmse_n:.4f}" in page for case in result.cases)
+    assert "report.html" in output and left_over(folder) == []
+
+
+def test_ctrl_c_stops_the_line_and_ends_every_process(tmp_path):
+    folder = tmp_path / "demo"
+    process = demo(folder)
+    assert process.stdout is not None
+    for line in process.stdout:
+        if "settling" in line:
+            break
+    time.sleep(1.0)  # somewhere in mid-run
+    os.kill(process.pid, signal.SIGINT)
+    output = process.stdout.read()
+    assert process.wait(30) == 130, output
+    process.stdout.close()
+    assert left_over(folder) == []
+    summary = json.loads((folder / "recording" / "summary.json").read_text())
+    assert summary["unsafe_total"] == 0 and "watchdog" not in summary["counts"]
+
+
+def test_a_parent_that_is_killed_takes_its_children_with_it(tmp_path):
+    folder = tmp_path / "demo"
+    process = demo(folder)
+    assert process.stdout is not None
+    for line in process.stdout:
+        if "settling" in line:
+            break
+    process.kill()
+    process.wait()
+    process.stdout.close()
+    deadline_s = time.monotonic() + 25.0  # the loop stops the line before it ends
+    while left_over(folder) and time.monotonic() < deadline_s:
+        time.sleep(0.1)
+    assert left_over(folder) == []

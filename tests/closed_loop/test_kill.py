@@ -1,0 +1,140 @@
+"""Processes killed for real, in mid-run; the recorder inside the simulated line and a tap on the wire judge."""
+
+import struct
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from gateway.core.messages import Arm, SetSpeed, Start, Stop
+from tests.closed_loop.wire import WireLine, from_master, heard, settled
+
+pytestmark = pytest.mark.realtime
+
+WATCHDOG_S, PERIOD_S = 0.1, 0.01
+
+
+@pytest.fixture
+def wire(tmp_path):
+    with WireLine(tmp_path) as line:
+        yield line
+
+
+def test_killing_the_loop_the_drives_own_watchdog_takes_torque_off_and_the_restart_is_disarmed(wire):
+    wire.run()
+    with wire.tap() as bus:
+        killed_s = wire.kill("loop")
+        wire.children.end("loop")
+        heard(bus, 0.5)
+        wire.start_loop()
+        wire.wait(lambda status: status.loop.running and status.loop.state == "SILENT")
+        assert not [frame for frame in heard(bus, 0.5) if from_master(frame)]
+    refused = wire.order(Start())
+    assert not refused.ok and "arm" in refused.text
+    # The drives are in fault now; a person arms again, which acknowledges it, and the line runs.
+    assert wire.order(Arm()).ok and wire.order(Start()).ok
+    wire.wait(settled)
+    assert wire.order(Stop()).ok
+    wire.wait(lambda status: status.loop.state == "STOP" and status.spans[0].drive == "OFF")
+    recording = wire.recording()
+    trips = recording.of_kind("watchdog")
+    assert sorted(event["roller"] for event in trips) == [1, 2, 3, 4, 5, 6]
+    assert max(event["time_s"] for event in trips) - killed_s <= WATCHDOG_S + 2 * PERIOD_S
+    after = (recording.time_s > killed_s + WATCHDOG_S + 3 * PERIOD_S) & (recording.time_s < killed_s + 0.5)
+    assert not recording.torque_nm[after].any()
+    assert not any(wire.unsafe().values()), wire.unsafe()
+
+
+def test_killing_the_gateway_process_the_loop_runs_on_and_stop_goes_straight_to_it(wire):
+    wire.run()
+    killed_s = wire.kill("gateway")
+    wire.children.end("gateway")
+    time.sleep(1.0)  # the line runs without its gateway
+    assert wire.order(Stop()).ok
+    time.sleep(1.5)  # the stop takes its time
+    recording = wire.recording()
+    alone = (recording.time_s > killed_s) & (recording.time_s < killed_s + 1.0)
+    assert (recording.torque_nm[alone] != 0.0).all()
+    assert np.abs(recording.tension_n[alone] - np.array([28, 36, 20, 40, 24, 32])).max() < 1.0
+    assert not recording.of_kind("watchdog")
+    assert not recording.torque_nm[-100:].any() and not recording.unwind_speed_m_per_s[-100:].any()
+    assert not any(wire.unsafe().values()), wire.unsafe()
+
+
+def test_a_gateway_that_comes_back_finds_the_loop_where_it_was(wire):
+    wire.run()
+    wire.kill("gateway")
+    wire.children.end("gateway")
+    wire.start_gateway()
+    wire.wait(settled)
+    assert wire.order(SetSpeed(speed_m_per_s=0.02)).ok
+
+
+def test_killing_the_simulated_line_the_loop_stops_within_three_periods_and_takes_the_drives_off(wire):
+    """The recorder dies with the line, so a tap on the wire sees what the loop sends to drives that are gone."""
+    wire.run()
+    with wire.tap() as bus:
+        heard(bus, 0.1)
+        wire.kill("sim")
+        frames = heard(bus, 0.7)
+    # No drive has answered since; the first SYNC after the kill is the first period that went without.
+    first_s = min(frame.timestamp for frame in frames if frame.arbitration_id == 0x80)
+    commands = [
+        (frame.timestamp, *struct.unpack_from("<Hh", frame.data))
+        for frame in frames
+        if 0x200 < frame.arbitration_id < 0x280
+    ]
+    status = wire.wait(lambda status: status.loop.state == "STOP")
+    reason = next(event.text for event in reversed(status.events) if event.kind == "state" and "RUNNING" in event.text)
+    assert "no usable sample" in reason
+    # Torque commands die away at 200 Nm/s from a few Nm, then the drives are told to take it off: no enable bit.
+    late = [word & 0x0F != 0x0F and torque == 0 for at_s, word, torque in commands if at_s > first_s + 0.25]
+    assert len(late) > 6 and all(late)
+    # A person may not arm what is not there.
+    refusal = wire.order(Arm())
+    assert not refusal.ok and refusal.reasons
+
+
+def test_a_second_loop_exits_within_a_second_having_sent_nothing(wire):
+    wire.start_gateway()
+    wire.start_loop()
+    wire.wait(lambda status: status.loop.running)
+    with wire.tap() as bus:
+        began_s = time.monotonic()
+        second = subprocess.run(
+            [sys.executable, "-m", "gateway.cli", "loop", wire.folder / "line.toml", "--controller",
+             wire.folder / "controller.json", *wire.folders],
+            capture_output=True, text=True, timeout=20, check=False,
+        )  # fmt: skip
+        assert second.returncode == 3 and "already" in second.stderr
+        frames = heard(bus, 0.2)
+        assert time.monotonic() - began_s < 10.0
+    assert not [frame for frame in frames if from_master(frame)]
+
+
+def test_the_loop_sends_nothing_to_the_drives_until_it_is_armed(wire):
+    with wire.tap() as bus:
+        wire.start_gateway()
+        wire.start_loop()
+        wire.wait(lambda status: status.loop.running)
+        frames = heard(bus, 1.0)
+        assert [frame for frame in frames if 0x700 < frame.arbitration_id] and not [f for f in frames if from_master(f)]
+        assert wire.order(Arm()).ok
+        assert [frame for frame in heard(bus, 0.2) if from_master(frame)]
+
+
+def test_the_running_loop_has_no_listening_internet_socket_and_no_database(wire):
+    wire.run()
+    pid = wire.children.pid("loop")
+    from pathlib import Path
+
+    links = [link.readlink().as_posix() for link in Path(f"/proc/{pid}/fd").iterdir()]
+    assert not [link for link in links if "sqlite" in link or link.endswith(".db")]
+    inodes = {link[8:-1] for link in links if link.startswith("socket:[")}
+    for table in ("tcp", "tcp6"):
+        for row in Path(f"/proc/{pid}/net/{table}").read_text().splitlines()[1:]:
+            columns = row.split()
+            listening = columns[3] == "0A"
+            assert not (listening and columns[9] in inodes)

@@ -1,0 +1,191 @@
+"""The whole cycle in stepped time: arm, start, run, hold, stop, and what the recorder at the drives says of it."""
+
+import numpy as np
+import pytest
+
+from gateway.cli.cases import CASES, TENSION
+from gateway.cli.stepped import run_case
+from gateway.control.design import design_lqi, design_pid, task_of
+from gateway.core.messages import Arm, Hold, SelectRecipe, SetSpeed, SetTension, Start, Stop
+from gateway.core.states import LoopState, Phase
+from tests.closed_loop.conftest import demo_line, real_plant, start, stepped
+
+TENSIONS = np.array(TENSION.tension_n)
+
+
+def test_silent_until_armed_and_no_torque_until_started(loop):
+    for command in (Start(), Hold()):
+        assert not loop.command(command).ok
+    loop.step(100)
+    assert loop.cycle.machine.state is LoopState.SILENT
+    assert loop.arm().ok and loop.step_until(Phase.READY, 1.0)
+    loop.step(100)
+    recording = loop.truth.recorder.recording()
+    assert not recording.torque_nm.any()
+    commands = recording.of_kind("torques")
+    armed_s = next(time_s for time_s, phase, _ in loop.transitions if phase is Phase.ARMING)
+    assert all(command["time_s"] > armed_s and not any(command["commanded_nm"]) for command in commands)
+
+
+@pytest.mark.parametrize("law", ["lqi", "pid"])
+@pytest.mark.parametrize("spans", [1, 2, 6, 20, 60])
+def test_any_number_of_spans_starts_settles_and_stops(spans, law):
+    loop = start(stepped(spans, law))
+    setpoints = np.array(loop.line.recipes[0].tension_n)
+    loop.step(round(3.0 / loop.line.control.period_s))
+    assert np.abs(loop.truth.world.tension_n - setpoints).max() < 1.5
+    assert loop.truth.world.unwind_speed_m_per_s == pytest.approx(loop.line.recipes[0].speed_m_per_s)
+    assert loop.command(Stop()).ok
+    assert loop.step_until(Phase.OFF, 12.0)
+    loop.step(5)
+    assert not loop.truth.world.torque_nm.any() and loop.truth.world.unwind_speed_m_per_s == 0.0
+    assert loop.truth.recorder.unsafe_total == 0, loop.truth.recorder.unsafe_events
+
+
+def test_hold_brings_standstill_under_tension_and_start_leads_back(running):
+    assert running.command(Hold()).state == "HOLD"
+    running.step(300)
+    assert running.truth.world.unwind_speed_m_per_s == 0.0
+    assert np.abs(running.truth.world.tension_n - TENSIONS).max() < 1.0
+    assert running.command(Start()).state == "RUN"
+    running.step(300)
+    assert running.truth.world.unwind_speed_m_per_s == pytest.approx(0.01)
+    assert running.truth.recorder.unsafe_total == 0
+
+
+def test_stop_is_latched_and_only_arm_leads_out(running):
+    running.command(Stop())
+    assert running.step_until(Phase.OFF, 5.0)
+    for command in (Start(), Hold()):
+        assert not running.command(command).ok
+    assert running.arm().ok and running.step_until(Phase.READY, 1.0)
+    assert "already" in running.command(Arm()).text
+
+
+def test_setpoints_ramp_or_step_within_the_limits(running):
+    assert running.command(SetTension(span=1, tension_n=38.0)).ok
+    running.step(25)
+    assert running.cycle.setpoints.tension_n[0] == pytest.approx(28.0 + 0.25 * 20.0)
+    running.step(200)
+    assert running.truth.world.tension_n[0] == pytest.approx(38.0, abs=1.0)
+    assert running.command(SetTension(span=3, tension_n=44.0, step=True)).ok
+    assert running.cycle.setpoints.tension_n[2] == 44.0
+    assert running.command(SetSpeed(speed_m_per_s=0.1)).ok
+    running.step(400)
+    assert running.truth.world.unwind_speed_m_per_s == pytest.approx(0.1)
+    assert running.command(SelectRecipe(name="velocity")).ok
+    running.step(500)
+    assert np.abs(running.truth.world.tension_n - 30.0).max() < 1.0
+    assert running.truth.recorder.unsafe_total == 0
+
+
+@pytest.mark.parametrize(
+    ("command", "reason"),
+    [
+        (SetTension(span=7, tension_n=30.0), "there is no span 7; allowed: 1 to 6"),
+        (SetTension(span=1, tension_n=60.0), "60 N is outside the limits; allowed: above 2 and below 60 N"),
+        (SetTension(span=1, tension_n=2.0), "2 N is outside the limits"),
+        (SetTension(span=3, tension_n=44.1, step=True), "a step of 24.1 N is too large; allowed: 24 N"),
+        (SetSpeed(speed_m_per_s=0.121), "0.121 m/s is outside the limits; allowed: 0 to 0.12 m/s"),
+        (SetSpeed(speed_m_per_s=-0.01), "outside the limits"),
+        (SetSpeed(speed_m_per_s=0.11, step=True), "a step of 0.1 m/s is too large; allowed: 0.09 m/s"),
+        (SelectRecipe(name="velocty"), "there is no recipe 'velocty'; did you mean velocity?"),
+    ],
+)
+def test_what_is_outside_the_limits_is_refused_and_changes_nothing(running, command, reason):
+    before = running.cycle.setpoints.tension_target_n.copy(), running.cycle.setpoints.speed_target_m_per_s
+    reply = running.command(command)
+    assert not reply.ok and reason in reply.text
+    assert (before[0] == running.cycle.setpoints.tension_target_n).all()
+    assert before[1] == running.cycle.setpoints.speed_target_m_per_s
+
+
+def test_the_line_plc_takes_its_permissive_back(running):
+    running.command(SetSpeed(speed_m_per_s=0.05))
+    running.step(200)
+    running.truth.plc.permissive = False
+    running.step(2)
+    assert running.cycle.machine.phase is Phase.SLOWING and "permissive" in running.cycle.machine.reason
+    assert running.step_until(Phase.OFF, 5.0)
+    reply = running.arm()
+    assert not reply.ok and "permissive" in reply.reasons[0]
+
+
+def test_emergency_stop_takes_torque_off_without_waiting_for_standstill(running):
+    running.truth.plc.emergency_stop = True
+    running.step(2)
+    assert running.cycle.machine.phase is Phase.UNLOADING
+    assert running.step_until(Phase.OFF, 1.0)
+    running.step(2)
+    assert not running.truth.world.torque_nm.any()
+
+
+def test_a_law_that_gives_nan_never_reaches_the_drives(running, monkeypatch):
+    from gateway.control.law import Decision
+
+    broken = Decision(np.full(6, np.nan), np.zeros(6), np.zeros(6))
+    monkeypatch.setattr(running.cycle.law, "ask", lambda *_: broken)
+    running.step(1)
+    assert running.cycle.machine.phase is Phase.UNLOADING and "finite" in running.cycle.machine.reason
+    assert running.step_until(Phase.OFF, 1.0)
+    assert np.isfinite(running.truth.recorder.recording().torque_nm).all()
+    assert running.truth.recorder.unsafe_total == 0
+
+
+def test_a_missing_load_cell_holds_for_two_periods_and_stops_at_the_third(running, monkeypatch):
+    held = running.cycle.outputs.torque_nm.copy()
+    sample = running.truth.sample
+
+    def without(now_s):
+        reading = sample(now_s)
+        reading.tension_n[3] = np.nan
+        return reading
+
+    monkeypatch.setattr(running.truth, "sample", without)
+    running.step(2)
+    assert running.cycle.machine.phase is Phase.RUNNING and (running.cycle.outputs.torque_nm == held).all()
+    assert running.recorded()[-1].held == 2
+    running.step(1)
+    assert running.cycle.machine.state is LoopState.STOP and "tension 4" in running.cycle.machine.reason
+    assert running.step_until(Phase.OFF, 1.0)
+
+
+def test_one_missing_sample_costs_nothing(running, monkeypatch):
+    sample = running.truth.sample
+    monkeypatch.setattr(running.cycle.links[0], "collect", _deaf(running.cycle.links[0]))
+    running.step(1)
+    monkeypatch.undo()
+    assert running.truth.sample == sample
+    running.step(100)
+    assert running.cycle.machine.phase is Phase.RUNNING
+    assert np.abs(running.truth.world.tension_n - TENSIONS).max() < 1.0
+
+
+def _deaf(link):
+    async def collect(inputs, deadline_s):
+        inputs.tension.miss(0)
+
+    return collect
+
+
+def test_the_same_seed_gives_the_same_run_and_another_one_does_not():
+    line, plant = demo_line(), real_plant()
+    config = design_lqi(task_of(line))
+    runs = [run_case(line, config, plant, TENSION, seed) for seed in (5, 5, 6)]
+    assert (runs[0].tension_n == runs[1].tension_n).all() and (runs[0].tension_n != runs[2].tension_n).any()
+
+
+@pytest.mark.parametrize(("case", "reference_n"), [(CASES[0], 2.01), (CASES[1], 1.16)])
+def test_lqi_on_the_wrong_model_keeps_the_reference_figures(case, reference_n):
+    """Tier A of the benchmark; the reference is an independent study's LQI."""
+    line = demo_line()
+    results = [run_case(line, design_lqi(task_of(line)), real_plant(), case, seed) for seed in range(6)]
+    assert np.mean([result.rmse_n for result in results]) <= 1.05 * reference_n
+    assert sum(result.unsafe_events for result in results) == 0
+
+
+def test_pid_holds_both_cases_without_an_unsafe_event():
+    line = demo_line()
+    results = [run_case(line, design_pid(task_of(line)), real_plant(), case, 1) for case in CASES]
+    assert sum(result.unsafe_events for result in results) == 0
+    assert max(result.rmse_n for result in results) < 3.0

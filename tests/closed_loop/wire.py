@@ -1,0 +1,145 @@
+"""A line in its three processes over real wires, for tests that start, kill and watch them from outside."""
+
+import asyncio
+import json
+import os
+import signal
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import can
+
+from gateway.cli.children import Children, free_udp_port
+from gateway.cli.operate_commands import request
+from gateway.control.design import design_lqi, task_of
+from gateway.core.controller import canonical
+from gateway.core.line_file import load_line
+from gateway.core.line_template import line_template
+from gateway.core.messages import Arm, Command, Reply, Start
+from gateway.core.topics import GATEWAY_STATUS
+from gateway.mailbox.paths import GATEWAY_SOCKET
+from gateway.mailbox.port import Unreachable
+from gateway.mailbox.unix import UnixMailbox
+from gateway.supervisor.status import GatewayStatus
+from sim_plant.recorder import read_recording
+from sim_plant.recording import Recording
+
+CHANNEL = "239.74.163.2"
+
+
+class WireLine:
+    """Context: everything it started is ended at its end."""
+
+    def __init__(self, folder: Path, seed: int = 1) -> None:
+        (folder / "logs").mkdir()
+        self.folder = folder
+        self.children = Children(folder / "logs")
+        self.can_port = free_udp_port()
+        ready = self.children.start_sim(
+            "sim_plant/plants/s_real.toml", "--record", folder / "recording", "--seed", str(seed),
+            "--can-port", str(self.can_port), "--modbus-port", "0", "--priority", "40",
+        )  # fmt: skip
+        self.world_start_s: float = ready["monotonic_start_s"]
+        text = line_template(6, "line.toml").replace("port = 43113", f"port = {self.can_port}")
+        text = text.replace("port = 5020", f"port = {ready['modbus_port']}")
+        (folder / "line.toml").write_text(text)
+        self.line = load_line(text, "line.toml")
+        (folder / "controller.json").write_bytes(canonical(design_lqi(task_of(self.line))))
+        self.folders = ("--run-dir", self.children.run_folder, "--data-dir", folder / "data")
+
+    def __enter__(self) -> "WireLine":
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.children.__exit__(None, None, None)
+
+    def start_gateway(self) -> None:
+        self.children.start("gateway", self.folder / "line.toml", *self.folders)
+
+    def start_loop(self) -> None:
+        self.children.start(
+            "loop", self.folder / "line.toml", "--controller", self.folder / "controller.json", *self.folders
+        )
+
+    def run(self) -> None:
+        """All processes up, the line RUN at its first recipe and settled."""
+        self.start_gateway()
+        self.start_loop()
+        self.wait(lambda status: status.loop.running)
+        assert self.order(Arm()).ok
+        assert self.order(Start()).ok
+        self.wait(settled)
+
+    def order(self, command: Command) -> Reply:
+        return asyncio.run(request(self.children.run_folder, command, 15.0))
+
+    def status(self) -> GatewayStatus | None:
+        async def ask() -> bytes:
+            mailbox = UnixMailbox()
+            mailbox.connect({GATEWAY_STATUS}, self.children.run_folder / GATEWAY_SOCKET)
+            try:
+                return await mailbox.request(GATEWAY_STATUS, b"", 2.0)
+            finally:
+                await mailbox.close()
+
+        try:
+            return GatewayStatus.model_validate_json(asyncio.run(ask()))
+        except Unreachable:
+            return None
+
+    def wait(self, enough: Callable[[GatewayStatus], bool], within_s: float = 30.0) -> GatewayStatus:
+        status = None
+        deadline_s = time.monotonic() + within_s
+        while time.monotonic() < deadline_s:
+            status = self.status()
+            if status is not None and enough(status):
+                return status
+            time.sleep(0.05)  # a person looks at the status now and then
+        raise AssertionError(f"not reached within {within_s} s: {status}")
+
+    def kill(self, name: str) -> float:
+        """SIGKILL; returns the time (world)."""
+        now_s = time.monotonic() - self.world_start_s
+        os.kill(self.children.pid(name), signal.SIGKILL)
+        return now_s
+
+    def recording(self) -> Recording:
+        """What the recorder has; ends the simulated line in order if it still runs."""
+        self.children.end("sim")
+        return read_recording(self.folder / "recording")
+
+    def unsafe(self) -> dict[str, int]:
+        return json.loads((self.folder / "recording" / "summary.json").read_text())["unsafe_events"]
+
+    def tap(self) -> can.BusABC:
+        """A listener on the CAN wire that shares nothing with either side."""
+        return can.Bus(interface="udp_multicast", channel=CHANNEL, port=self.can_port, hop_limit=0, fd=False)
+
+
+def settled(status: GatewayStatus) -> bool:
+    return (
+        status.loop.state == "RUN"
+        and status.speed_setpoint_m_per_s == 0.01
+        and all(abs(span.error_n or 0.0) < 0.6 for span in status.spans)
+    )
+
+
+def heard(bus: can.BusABC, for_s: float) -> list[can.Message]:
+    """Everything on the wire within `for_s`, each with the monotonic time at which it was read."""
+    frames: list[can.Message] = []
+    end_s = time.monotonic() + for_s
+    while (left_s := end_s - time.monotonic()) > 0.0:
+        frame = bus.recv(left_s)
+        if frame is not None:
+            frames.append(frame)
+    return frames
+
+
+def from_master(frame: can.Message) -> bool:
+    """NMT, SYNC, RPDO1 and SDO requests: what only a master sends."""
+    return (
+        frame.arbitration_id in (0x000, 0x080)
+        or 0x200 < frame.arbitration_id < 0x280
+        or 0x600 < frame.arbitration_id < 0x680
+    )

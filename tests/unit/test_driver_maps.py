@@ -1,0 +1,147 @@
+"""Device maps: the shipped ones load, and what is wrong in one is refused with file, key, allowed and nearest."""
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import get_args
+
+import pytest
+
+from drivers.canopen.configure import DriveSettings, drive_steps
+from drivers.device_map import (
+    DriveMap,
+    LoadCellMap,
+    MapRefused,
+    PlcMap,
+    SpeedUnit,
+    TensionUnit,
+    TimeUnit,
+    TorqueUnit,
+    WebSpeedUnit,
+    load_map,
+)
+from drivers.registry import MAPS, LinksRefused, build_links, known_maps
+from gateway.core.line import Line
+from gateway.core.units import SI_PER_UNIT
+from tests.protocol.driver_support import line
+
+
+def test_the_shipped_maps_load() -> None:
+    assert known_maps() == ["cia402-torque", "line-plc", "loadcell-amp"]
+    kinds = {name: type(load_map(MAPS / f"{name}.toml")) for name in known_maps()}
+    assert kinds == {"cia402-torque": DriveMap, "line-plc": PlcMap, "loadcell-amp": LoadCellMap}
+
+
+def test_units_go_by_the_names_of_the_vocabulary() -> None:
+    for names in (SpeedUnit, WebSpeedUnit, TorqueUnit, TensionUnit, TimeUnit):
+        assert set(get_args(names)) - {"rated torque"} <= set(SI_PER_UNIT)
+
+
+def refused(tmp_path: Path, name: str, change: Callable[[str], str]) -> list[str]:
+    text = (MAPS / f"{name}.toml").read_text()
+    changed = change(text)
+    assert changed != text, "the change did not apply"
+    (tmp_path / f"{name}.toml").write_text(changed)
+    with pytest.raises(MapRefused) as refusal:
+        load_map(tmp_path / f"{name}.toml")
+    assert all(reason.startswith(f"{name}.toml: ") for reason in refusal.value.reasons)
+    return refusal.value.reasons
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new", "key", "words"),
+    [
+        ("cia402-torque", "heartbeat]", "hartbeat]", "hartbeat", ["unknown key", "did you mean 'heartbeat'"]),
+        ("cia402-torque", 'unit = "um/s"', 'unit = "um/sec"', "objects.speed.unit", ["allowed", "'um/s'", "mean"]),
+        ("cia402-torque", 'unit = "um/s"', 'unit = "Nm"', "objects.speed.unit", ["'Nm'", "rpm"]),
+        ("cia402-torque", "index = 0x6041", 'index = "0x6041"', "objects.statusword.index", ["integer"]),
+        ("cia402-torque", "index = 0x6041", "index = 0x6040", "objects.statusword", ["6040h", "objects.controlword"]),
+        ("cia402-torque", "index = 0x6041, ", "", "objects.statusword.index", ["missing"]),
+        ("cia402-torque", '"speed", "torque"]', '"speed"]', "transmit_pdo.objects", ["lacks torque"]),
+        ("cia402-torque", '"speed", "torque"]', '"speed", "torque", "speed"]', "transmit_pdo", ["speed listed twice"]),
+        ("cia402-torque", '"torque"]', '"torque", "safe_torque_off"]', "transmit_pdo", ["12 bytes", "at most 8"]),
+        ("cia402-torque", '"torque"]', '"torque", "torqe"]', "transmit_pdo.objects.3", ["allowed", "'torque'"]),
+        ("cia402-torque", "value = 100", "value = 5", "heartbeat.value", ["[10.0, 10000.0]"]),
+        ("cia402-torque", "range = [10, 200]", "range = [200, 10]", "watchdog.range", ["rise"]),
+        ("cia402-torque", "range = [10, 200]", "range = [10]", "watchdog.range", ["at least 2"]),
+        ("cia402-torque", "scale = 0.001 }", "scale = nan }", "objects.target_torque.scale", ["finite"]),
+        ("cia402-torque", "scale = 0.001 }", "scale = true }", "objects.target_torque.scale", ["number"]),
+        ("cia402-torque", "format = 1", "format = true", "format", ["integer"]),
+        ("cia402-torque", 'role = "drive"', 'role = "servo"', "protocol", ["'servo'", "'line-plc'"]),
+        ("cia402-torque", "format = 1", "format = 1\nformat = 1", "cannot be read", ["line 4"]),
+        ("loadcell-amp", "address_base = 0", "address_base = 2", "address_base", ["less than or equal to 1"]),
+        ("loadcell-amp", "address_base = 0", "address_base = 1", "device_id", ["below address_base 1"]),
+        ("loadcell-amp", '"high-first"', '"big"', "word_order", ["high-first, low-first"]),
+        ("loadcell-amp", 'type = "f32"', 'type = "f64"', "channels.tension.type", ["f32"]),
+        ("loadcell-amp", "offset = 2, ok", "offset = 1, ok", "channels.status", ["register 1", "channels.tension"]),
+        ("loadcell-amp", "stride = 4", "stride = 2", "channels.status.offset", ["stride 2"]),
+        ("loadcell-amp", "first = 16", "first = 3", "sample_counter.address", ["overlaps channels"]),
+        ("line-plc", "speed = { address = 11", "speed = { address = 12", "write.life", ["register 13", "write.speed"]),
+        ("line-plc", "life = { address = 13 }", "life = { address = 20 }", "write", ["side by side"]),
+        ("line-plc", "life_echo = { address = 4 }", "life_echo = { address = 3 }", "read.life_echo", ["read.speed"]),
+        ("line-plc", "read_function = 3", "read_function = 4", "read_function", ["allowed: 3"]),
+        ("line-plc", 'unit = "um/s"', 'unit = "rpm"', "read.speed.unit", ["allowed: m/s"]),
+        ("line-plc", "address = 14", "address = 10", "write.command", ["register 10", "watchdog"]),
+    ],
+)
+def test_what_is_wrong_is_named(tmp_path: Path, name: str, old: str, new: str, key: str, words: list[str]) -> None:
+    reasons = refused(tmp_path, name, lambda text: text.replace(old, new, 1))
+    text = " / ".join(reasons)
+    assert f"toml: {key}" in text, text
+    assert all(word in text for word in words), text
+
+
+def test_every_error_comes_at_once(tmp_path: Path) -> None:
+    reasons = refused(
+        tmp_path,
+        "line-plc",
+        lambda text: text.replace("device_id", "divice_id").replace('"um/s"', '"um"').replace("bit = 2", "bit = 99"),
+    )
+    assert len(reasons) == 5  # the unknown key, the missing one, two units, the bit
+
+
+# The registry
+
+
+def reasons_for(line: Line, folder: Path = MAPS) -> list[str]:
+    with pytest.raises(LinksRefused) as refusal:
+        build_links(line, folder)
+    return refusal.value.reasons
+
+
+def changed(**tables: object) -> Line:
+    return line().model_copy(update=tables)
+
+
+def test_unknown_and_unfitting_maps_are_refused_together() -> None:
+    good = line()
+    maps = ("cia402-torq", "line-plc")
+    drives = [drive.model_copy(update={"map": name}) for drive, name in zip(good.drives, maps, strict=True)]
+    cells = [good.load_cells[0].model_copy(update={"bus": "drives"}), good.load_cells[1]]
+    plc = good.plc.model_copy(update={"bus": "oi"})
+    reasons = reasons_for(changed(drives=drives, load_cells=cells, plc=plc))
+    assert len(reasons) == 4
+    assert reasons[0].startswith("drive-1: map 'cia402-torq' is unknown") and "mean 'cia402-torque'" in reasons[0]
+    assert reasons[1].startswith("drive-2: map 'line-plc' is for a line-plc") and "allowed: cia402-torque" in reasons[1]
+    assert reasons[2] == "cell-1: map 'loadcell-amp' speaks modbus-tcp, bus 'drives' is canopen"
+    assert reasons[3] == "plc: bus 'oi' is unknown; allowed: drives, io"
+
+
+def test_a_watchdog_that_a_drive_cannot_do_is_refused() -> None:
+    good = line()
+    reasons = reasons_for(changed(limits=good.limits.model_copy(update={"watchdog_s": 0.005})))
+    assert len(reasons) == 2 and "10 to 200 ms" in reasons[0]
+
+
+def test_a_new_drive_is_a_map(tmp_path: Path) -> None:
+    """The worked example of docs/adding-a-device.md: the files on that page are enough for a link."""
+    shutil.copytree(MAPS, tmp_path, dirs_exist_ok=True)
+    page = (Path(__file__).parents[2] / "docs/adding-a-device.md").read_text()
+    (tmp_path / "acme-spin.toml").write_text(page.split("```toml\n")[1].split("```")[0])
+    good = line()
+    drives = [drive.model_copy(update={"map": "acme-spin"}) for drive in good.drives]
+    assert len(build_links(changed(drives=drives), tmp_path)) == 2
+    device = load_map(tmp_path / "acme-spin.toml")
+    assert isinstance(device, DriveMap)
+    steps = drive_steps(device, DriveSettings(1, 80.0, 60.0, 0.1))
+    assert [step.value for step in steps if (step.index, step.sub) == (0x6072, 0)] == [750], "writable: 60 of 80 Nm"

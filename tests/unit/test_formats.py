@@ -1,0 +1,65 @@
+"""The formats that others rely on: a published JSON schema and an example each, held against the code.
+
+`python -m tests.unit.test_formats` writes the schemas anew.
+"""
+
+import json
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from pydantic import TypeAdapter
+
+from gateway.cli.demo_result import DemoResult
+from gateway.core.controller import ControllerConfig, parse_controller
+from gateway.core.messages import Command, Event, Reply
+from sim_plant.plant import Plant, plant_of
+from tests.bench.figures import BenchResult
+
+DOCS = Path("docs")
+
+
+def _json(adapter: TypeAdapter[Any]) -> Callable[[bytes], object]:
+    return lambda payload: adapter.validate_json(payload)
+
+
+#: name: (schema, how a program reads the example, the example's ending)
+FORMATS: dict[str, tuple[TypeAdapter[Any], Callable[[bytes], object], str]] = {
+    "controller": (TypeAdapter(ControllerConfig), parse_controller, "json"),
+    "plant": (TypeAdapter(Plant), lambda payload: plant_of(tomllib.loads(payload.decode())), "toml"),
+    "demo-result": (TypeAdapter(DemoResult), _json(TypeAdapter(DemoResult)), "json"),
+    "bench": (TypeAdapter(BenchResult), _json(TypeAdapter(BenchResult)), "json"),
+    "command": (TypeAdapter(Command), _json(TypeAdapter(Command)), "json"),
+    "reply": (TypeAdapter(Reply), _json(TypeAdapter(Reply)), "json"),
+    "event": (TypeAdapter(Event), _json(TypeAdapter(Event)), "json"),
+}
+
+
+def schema_text(name: str) -> str:
+    return json.dumps(FORMATS[name][0].json_schema(), indent=2) + "\n"
+
+
+def schema_path(name: str) -> Path:
+    return DOCS / "schemas" / f"{name}.schema.json"
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_the_published_schema_is_the_code(name):
+    assert schema_path(name).read_text() == schema_text(name), "python -m tests.unit.test_formats writes it anew"
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_the_example_is_accepted_and_an_unknown_key_in_it_is_not(name):
+    _, read, ending = FORMATS[name]
+    payload = (DOCS / "examples" / f"{name}.{ending}").read_bytes()
+    read(payload)
+    strange = b"colour = 1\n" + payload if ending == "toml" else payload.replace(b"{", b'{"colour": 1, ', 1)
+    with pytest.raises(Exception, match="colour"):
+        read(strange)
+
+
+if __name__ == "__main__":
+    for format_name in FORMATS:
+        schema_path(format_name).write_text(schema_text(format_name))
