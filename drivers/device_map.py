@@ -7,13 +7,12 @@ allowed and the nearest valid thing. Numbers in a map are in the device's own un
 
 import tomllib
 from pathlib import Path
-from types import UnionType
-from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
+from typing import Annotated, Literal, TypeVar
 
-from pydantic import BaseModel, Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, model_validator
 
+from drivers.map_errors import MapRefused, reasons_of
 from gateway.core.line import Positive, Strict
-from gateway.core.nearest import nearest
 
 SpeedUnit = Literal["m/s", "mm/s", "um/s", "m/min", "rad/s", "rpm", "mrpm"]
 WebSpeedUnit = Literal["m/s", "mm/s", "um/s", "m/min"]  #: where there is no roller to convert an angular speed with
@@ -28,15 +27,8 @@ M = TypeVar("M", bound=Strict)
 BYTES = {"u8": 1, "i8": 1, "u16": 2, "i16": 2, "u32": 4, "i32": 4, "f32": 4}
 MAX_PDO_BYTES = 8
 MAX_READ_REGISTERS = 125
-MAX_READ_WRITE_REGISTERS = 121  #: what function 23 may write
 
-
-class MapRefused(ValueError):
-    """A map that cannot be used. `reasons` name file, key, what is wrong, what is allowed and the nearest."""
-
-    def __init__(self, reasons: list[str]) -> None:
-        super().__init__("; ".join(reasons))
-        self.reasons = reasons
+MAPS = Path(__file__).parent / "maps"  #: one file a device type
 
 
 class Bit(Strict):
@@ -337,51 +329,24 @@ MODELS: dict[tuple[str, str], type[DriveMap] | type[LoadCellMap] | type[PlcMap]]
 }
 
 
+def map_names(folder: Path = MAPS) -> list[str]:
+    """The names that `map` may have in a line's file."""
+    return sorted(path.stem for path in folder.glob("*.toml"))
+
+
 def load_map(path: Path) -> DeviceMap:
     """The device map in `path`. Raises MapRefused with every reason."""
     try:
         document = tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise MapRefused([f"{path.name}: cannot be read: {error}"]) from error
-    kind = (document.get("protocol"), document.get("role"))
-    model = MODELS.get(kind)  # type: ignore[arg-type]
+    kind = (str(document.get("protocol")), str(document.get("role")))
+    model = MODELS.get(kind)
     if model is None:
         allowed = ", ".join(f"protocol = {p!r} with role = {r!r}" for p, r in MODELS)
         raise MapRefused([f"{path.name}: protocol {kind[0]!r} with role {kind[1]!r} is unknown; allowed: {allowed}"])
     try:
         return model.model_validate(document)
     except ValidationError as refusal:
-        reasons = [line for error in refusal.errors() for line in _reasons(model, error)]
+        reasons = [line for error in refusal.errors() for line in reasons_of(model, error)]
         raise MapRefused([f"{path.name}: {reason}" for reason in reasons]) from refusal
-
-
-def _reasons(model: type[BaseModel], error: Any) -> list[str]:
-    """One pydantic error as what is wrong, where, what is allowed and the nearest."""
-    key = ".".join(str(part) for part in error["loc"])
-    if error["type"] == "value_error":
-        prefix = f"{key}." if key else ""
-        return [prefix + line for line in str(error["ctx"]["error"]).splitlines()]
-    if error["type"] == "extra_forbidden":
-        return [f"{key}: unknown key; {_nearest(str(error['loc'][-1]), _keys_at(model, error['loc'][:-1]))}"]
-    if error["type"] == "missing":
-        return [f"{key}: is missing"]
-    if error["type"] == "literal_error":
-        allowed = [word.strip("'") for word in error["ctx"]["expected"].replace(" or ", ", ").split(", ")]
-        return [f"{key}: {error['input']!r}; {_nearest(str(error['input']), allowed)}"]
-    return [f"{key}: {error['input']!r}: {error['msg'].lower()}"]
-
-
-def _nearest(given: str, allowed: list[str]) -> str:
-    near = nearest(given, allowed)
-    return f"allowed: {', '.join(allowed)}" + (f"; did you mean {near!r}?" if near else "")
-
-
-def _keys_at(model: type[BaseModel], location: tuple[int | str, ...]) -> list[str]:
-    """The keys that are known at a place in a map."""
-    for part in location:
-        annotation = model.model_fields[str(part)].annotation
-        if get_origin(annotation) in (Union, UnionType):
-            annotation = next(choice for choice in get_args(annotation) if choice is not type(None))
-        assert isinstance(annotation, type) and issubclass(annotation, BaseModel)
-        model = annotation
-    return list(model.model_fields)

@@ -7,7 +7,7 @@ from typing import TypeVar
 from drivers.canopen.configure import DriveSettings, torque_limit_counts, watchdog_counts
 from drivers.canopen.link import CanopenLink
 from drivers.canopen.node import DriveNode
-from drivers.device_map import DeviceMap, DriveMap, LoadCellMap, MapRefused, PlcMap, load_map
+from drivers.device_map import MAPS, DeviceMap, DriveMap, LoadCellMap, MapRefused, PlcMap, load_map, map_names
 from drivers.modbus.amplifier import Amplifier
 from drivers.modbus.link import Device as ModbusDevice
 from drivers.modbus.link import ModbusLink
@@ -16,7 +16,6 @@ from drivers.port import Link
 from gateway.core.line import CanopenBus, Device, Drive, Line, LoadCell, ModbusTcpBus
 from gateway.core.nearest import nearest
 
-MAPS = Path(__file__).parent / "maps"
 M = TypeVar("M", DriveMap, LoadCellMap, PlcMap)
 B = TypeVar("B", CanopenBus, ModbusTcpBus)
 
@@ -27,11 +26,6 @@ class LinksRefused(ValueError):
     def __init__(self, reasons: list[str]) -> None:
         super().__init__("; ".join(reasons))
         self.reasons = reasons
-
-
-def known_maps(folder: Path = MAPS) -> list[str]:
-    """The names that `map` may have in a line's file."""
-    return sorted(path.stem for path in folder.glob("*.toml"))
 
 
 def build_links(line: Line, folder: Path = MAPS) -> list[Link]:
@@ -117,7 +111,7 @@ class _Builder:
         device = self._load(item)
         if device is None or isinstance(device, model):
             return device
-        fitting = [name for name in known_maps(self._folder) if isinstance(self._load_quietly(name), model)]
+        fitting = [name for name in map_names(self._folder) if isinstance(self._load_quietly(name), model)]
         self.reasons.append(
             f"{item.name}: map {item.map!r} is for a {device.role}, not for {table}; allowed: {', '.join(fitting)}"
         )
@@ -127,7 +121,7 @@ class _Builder:
         if item.map in self._maps:
             return self._maps[item.map]
         self._maps[item.map] = None
-        if item.map not in (known := known_maps(self._folder)):
+        if item.map not in (known := map_names(self._folder)):
             near = nearest(item.map, known)
             hint = f"; did you mean {near!r}?" if near else ""
             self.reasons.append(f"{item.name}: map {item.map!r} is unknown; allowed: {', '.join(known)}{hint}")

@@ -5,12 +5,17 @@ saw PDOs it would keep their last values, and on interfaces that echo, its own c
 """
 
 import asyncio
+import logging
 from collections.abc import Callable
 
 import canopen
 from canopen.sdo.client import SdoClient
 
 SDO_TIMEOUT_S = 0.2
+
+# A failed transfer is reported by whoever asked for it; the library need not print it as well.
+logging.getLogger("canopen").addHandler(logging.NullHandler())
+
 _REQUEST = 0x600  #: COB-ID of node 0, client to server
 _RESPONSE = 0x580
 

@@ -126,9 +126,7 @@ class Plc:
             counts = watchdog_counts(self._device.watchdog, self._watchdog_s)
             before = await self._read_one(self._watchdog, connection, deadline_s)
             try:
-                await connection.write(
-                    self.unit, self._watchdog.address, self._watchdog.encode([counts]), deadline_s
-                )
+                await connection.write(self.unit, self._watchdog.address, self._watchdog.encode([counts]), deadline_s)
                 found = await self._read_one(self._watchdog, connection, deadline_s)
                 if found == counts:
                     self.proven = True

@@ -3,14 +3,13 @@
 import json
 from collections.abc import Mapping
 from dataclasses import asdict
-from importlib.resources import as_file, files
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 import typer
 
-from drivers.device_map import load_map
+from drivers.device_map import MAPS, load_map, map_names
 from gateway.core.can_load import REFUSED_LOAD, bus_load
 from gateway.core.line import Bus, CanopenBus, Line
 from gateway.core.line_checks import Role
@@ -71,8 +70,7 @@ def check(
 
 def known_maps() -> Mapping[str, Role]:
     """Protocol and role of every device type that the drivers have a map for."""
-    with as_file(files("drivers") / "maps") as folder:
-        maps = {path.stem: load_map(path) for path in sorted(folder.glob("*.toml"))}
+    maps = {name: load_map(MAPS / f"{name}.toml") for name in map_names()}
     return {name: (device.protocol, device.role) for name, device in maps.items()}
 
 

@@ -77,6 +77,7 @@ def loop(
 
     Example: r2rgate loop line.toml --controller controller.json
     """
+    from drivers.registry import LinksRefused
     from gateway.core.controller import ControllerRefused, parse_controller
     from gateway.loop.process import run_loop
     from gateway.mailbox.listener import AlreadyRunning, CannotListen, PathTooLong
@@ -96,7 +97,7 @@ def loop(
     except AlreadyRunning as error:
         typer.echo(f"a loop runs here already, this one ends: {error}", err=True)
         raise typer.Exit(ALREADY_RUNNING) from None
-    except (CannotListen, PathTooLong, OSError) as error:
+    except (CannotListen, PathTooLong, LinksRefused, OSError) as error:
         _refuse(f"the loop cannot start: {error}")
 
 

@@ -60,6 +60,12 @@ Command = Annotated[Arm | Start | Hold | Stop | SetTension | SetSpeed | SelectRe
 _command: TypeAdapter[Command] = TypeAdapter(Command)
 
 
+def in_words(command: Command) -> str:
+    """A command as a person would type it: "set 3 44.0 step"."""
+    values = command.model_dump().items()
+    return " ".join(key if value is True else str(value) for key, value in values if value is not False)
+
+
 class Reply(Strict):
     """What was done, or why not. A refusal has done nothing."""
 

@@ -142,6 +142,7 @@ class Cycle:
         applied = self.outputs.torque_nm
         if self.machine.phase not in CONTROLLED:
             self._law_state = None
+            self.account.held = 0
             return self._unload(applied), False
         self._advance_setpoints()
         if not feedback_usable(self.limits, self.inputs):

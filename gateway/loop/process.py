@@ -26,7 +26,8 @@ from safety.actions import Finding
 def run_loop(line: Line, config: LqiConfig | PidConfig, run_folder: Path, say: Callable[[str], None]) -> None:
     """Run until SIGTERM or SIGINT, which stop the line first.
 
-    Raises AlreadyRunning before anything is sent, CannotListen, PathTooLong, and OSError when a bus cannot be opened.
+    Raises AlreadyRunning before anything is sent, CannotListen, PathTooLong, and LinksRefused
+    when the drivers cannot carry the line.
     """
     granted, refused = become_punctual(line.control.cpu, line.control.priority)
     say("; ".join(granted) or "no real-time help granted")
@@ -64,7 +65,11 @@ async def _main(line: Line, config: LqiConfig | PidConfig, run_folder: Path, say
         asyncio.get_running_loop().add_signal_handler(number, ending.set)
     try:
         for link in links:
-            await link.open()
+            try:
+                await link.open()
+            except OSError as error:  # its devices are absent until it comes; arming is refused, and says so
+                say(str(error))
+                tell("bus", str(error))
         mailbox.serve(LOOP_COMMAND, runner.command)
         tell("start", f"loop of {line.site}/{line.line}, {config.kind} controller {config_hash(config)[:12]}")
         say(f"loop of {line.site}/{line.line} is SILENT, commands on {run_folder / LOOP_SOCKET}")

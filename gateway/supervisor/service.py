@@ -12,7 +12,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from gateway.core.line import Line
-from gateway.core.messages import Arm, Event, MalformedMessage, Reply, parse_command
+from gateway.core.messages import Arm, Event, MalformedMessage, Reply, in_words, parse_command
 from gateway.core.topics import GATEWAY_COMMAND, GATEWAY_STATUS, LOOP_COMMAND, LOOP_EVENT, LOOP_TELEMETRY
 from gateway.mailbox.port import PEER, Counters, Mailbox, Peer, Unreachable
 from gateway.supervisor.historian import Historian
@@ -148,7 +148,7 @@ class Gateway:
         answered = "done" if reply.ok else "refused"
         self.note(
             "command",
-            f"{_who(peer)}: {said}: {answered}: {reply.text}",
+            f"{_who(peer)}: {_in_words(payload)}: {answered}: {reply.text}",
             command=said,
             reply=reply.model_dump(),
             uid=None if peer is None else peer.uid,
@@ -169,6 +169,13 @@ class Gateway:
         except ValidationError as error:
             text = "the loop answered what is no reply; see `r2rgate status` for what it did"
             return Reply(ok=False, state=state, text=text, reasons=[str(error)])
+
+
+def _in_words(payload: bytes) -> str:
+    try:
+        return in_words(parse_command(payload))
+    except MalformedMessage:
+        return payload[:80].decode("utf-8", "replace")
 
 
 def _who(peer: Peer | None) -> str:

@@ -56,7 +56,7 @@ def test_killing_the_gateway_process_the_loop_runs_on_and_stop_goes_straight_to_
     time.sleep(1.5)  # the stop takes its time
     recording = wire.recording()
     alone = (recording.time_s > killed_s) & (recording.time_s < killed_s + 1.0)
-    assert (recording.torque_nm[alone] != 0.0).all()
+    assert recording.torque_nm[alone].any(axis=1).all()  # some drive pulls in every millisecond
     assert np.abs(recording.tension_n[alone] - np.array([28, 36, 20, 40, 24, 32])).max() < 1.0
     assert not recording.of_kind("watchdog")
     assert not recording.torque_nm[-100:].any() and not recording.unwind_speed_m_per_s[-100:].any()

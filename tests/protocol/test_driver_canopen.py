@@ -1,6 +1,7 @@
 """The CANopen link against scripted drives: raw frames over udp_multicast, and over virtual."""
 
 import asyncio
+import os
 import socket
 import struct
 from collections.abc import Awaitable, Callable
@@ -217,6 +218,43 @@ def test_a_drive_that_does_not_answer_three_times_is_absent_and_told_to_stop() -
         await cycle(link, inputs)
         await cycle(link, inputs)
         assert list(inputs.drive_state) == [DriveState.ENABLED] * 2 and link.health.absent == []
+
+    bench(body)
+
+
+def test_the_answer_of_an_absent_drive_does_not_stand_in_for_another() -> None:
+    async def body(link: CanopenLink, drives: Drives, first: Drive, second: Drive) -> None:
+        inputs = Inputs(2)
+        await link.prepare()
+        first.on_sync = lambda drive: []
+        for _ in range(3):
+            await cycle(link, inputs, 0.02)
+        asked = asyncio.Event()
+
+        def later(drive: Drive) -> list[bytes]:
+            asked.set()
+            return []
+
+        first.on_sync, second.on_sync = (lambda drive: [drive.tpdo()]), later
+        collecting = asyncio.create_task(cycle(link, inputs, 5.0))
+        await asked.wait()
+        drives.send(0x081, bytes(1))  # an EMCY of a wrong length: counted once the link has read what came before
+        await until(lambda: link.health.malformed == 1)
+        await asyncio.sleep(0)
+        await asyncio.sleep(0)
+        assert not collecting.done(), "the second drive's answer is still to come"
+        drives.send(0x182, second.tpdo())
+        await collecting
+        assert inputs.speed.good()
+
+    bench(body)
+
+
+def test_frames_stay_on_this_machine() -> None:
+    async def body(link: CanopenLink, drives: Drives, first: Drive, second: Drive) -> None:
+        descriptor = link._bus._fileno  # noqa: SLF001
+        with socket.socket(fileno=os.dup(descriptor)) as interface:
+            assert interface.getsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL) == 0
 
     bench(body)
 

@@ -208,6 +208,30 @@ async def _until_good(link: ModbusLink, inputs: Inputs) -> None:
             await asyncio.sleep(0)  # without a connection a cycle waits for nothing
 
 
+def test_after_half_an_answer_the_connection_is_made_anew() -> None:
+    async def body(link: ModbusLink, peer: Registers) -> None:
+        inputs = Inputs(2)
+        await cycle(link, inputs)
+        held: list[bytes] = []
+
+        async def halves(head: bytes, unit: int, pdu: bytes) -> list[bytes]:
+            answer = frame(head, unit, peer.answer(unit, pdu))
+            if peer.connections > 1:
+                return [answer]
+            before, held[:] = b"".join(held), [answer[20:]]
+            return [before + answer[:20]]
+
+        peer.script = halves
+        peer.tension(1, 3.0)
+        await cycle(link, inputs)
+        assert list(inputs.tension.quality) == [Quality.STALE] * 2
+        await _until_good(link, inputs)
+        assert inputs.tension.value[0] == 3.0
+        assert peer.connections == 2, "at once, not after some more lost samples"
+
+    bench(body)
+
+
 def test_a_late_answer_never_passes_for_a_fresh_one() -> None:
     async def body(link: ModbusLink, peer: Registers) -> None:
         inputs = Inputs(2)

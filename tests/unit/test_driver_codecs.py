@@ -8,9 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.canopen.pdo import MalformedPdo, PdoCodec, mapping_entries
-from drivers.device_map import DriveMap, load_map
+from drivers.device_map import MAPS, DriveMap, load_map
 from drivers.modbus.registers import RegisterBlock, spans
-from drivers.registry import MAPS
 
 CIA402 = load_map(MAPS / "cia402-torque.toml")
 assert isinstance(CIA402, DriveMap)

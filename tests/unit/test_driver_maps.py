@@ -9,6 +9,7 @@ import pytest
 
 from drivers.canopen.configure import DriveSettings, drive_steps
 from drivers.device_map import (
+    MAPS,
     DriveMap,
     LoadCellMap,
     MapRefused,
@@ -19,16 +20,17 @@ from drivers.device_map import (
     TorqueUnit,
     WebSpeedUnit,
     load_map,
+    map_names,
 )
-from drivers.registry import MAPS, LinksRefused, build_links, known_maps
+from drivers.registry import LinksRefused, build_links
 from gateway.core.line import Line
 from gateway.core.units import SI_PER_UNIT
 from tests.protocol.driver_support import line
 
 
 def test_the_shipped_maps_load() -> None:
-    assert known_maps() == ["cia402-torque", "line-plc", "loadcell-amp"]
-    kinds = {name: type(load_map(MAPS / f"{name}.toml")) for name in known_maps()}
+    assert map_names() == ["cia402-torque", "line-plc", "loadcell-amp"]
+    kinds = {name: type(load_map(MAPS / f"{name}.toml")) for name in map_names()}
     assert kinds == {"cia402-torque": DriveMap, "line-plc": PlcMap, "loadcell-amp": LoadCellMap}
 
 
@@ -68,6 +70,8 @@ def refused(tmp_path: Path, name: str, change: Callable[[str], str]) -> list[str
         ("cia402-torque", "scale = 0.001 }", "scale = true }", "objects.target_torque.scale", ["number"]),
         ("cia402-torque", "format = 1", "format = true", "format", ["integer"]),
         ("cia402-torque", 'role = "drive"', 'role = "servo"', "protocol", ["'servo'", "'line-plc'"]),
+        ("cia402-torque", 'role = "drive"', "role = []", "protocol", ["'[]'", "'line-plc'"]),
+        ("cia402-torque", "[watchdog]", "[watch]", "watchdog", ["missing", "unknown key"]),
         ("cia402-torque", "format = 1", "format = 1\nformat = 1", "cannot be read", ["line 4"]),
         ("loadcell-amp", "address_base = 0", "address_base = 2", "address_base", ["less than or equal to 1"]),
         ("loadcell-amp", "address_base = 0", "address_base = 1", "device_id", ["below address_base 1"]),

@@ -4,6 +4,7 @@
 import re
 import string
 import tomllib
+from copy import deepcopy
 from datetime import date
 from typing import Any
 
@@ -376,7 +377,7 @@ def replaced(path: tuple[Any, ...], junk: Any) -> dict[str, Any]:
     parent = document
     for part in path[:-1]:
         parent = parent[part]
-    parent[path[-1]] = junk
+    parent[path[-1]] = deepcopy(junk)  # a later edit may reach into it
     return document
 
 
@@ -415,7 +416,7 @@ def test_junk_anywhere_is_refused_or_read_but_never_crashes(edits: list[tuple[tu
         try:
             for part in path[:-1]:
                 parent = parent[part]
-            parent[path[-1]] = junk
+            parent[path[-1]] = deepcopy(junk)  # a later edit may reach into it
         except (KeyError, IndexError, TypeError):
             continue  # an earlier edit took the place away
     text = "\n".join(f"{key} = {written(value)}" for key, value in document.items())
