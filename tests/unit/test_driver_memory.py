@@ -1,6 +1,5 @@
 """The link of stepped time."""
 
-import time
 from dataclasses import dataclass, field
 from math import inf, nan
 
@@ -118,22 +117,3 @@ def test_what_is_not_finite_is_not_commanded(value: float) -> None:
     outputs.speed_request_m_per_s = value
     link.write(outputs)
     assert plant.applied == [] and link.health.malformed == 2
-
-
-@pytest.mark.realtime
-def test_it_costs_next_to_nothing() -> None:
-    plant, link = prepared()
-    inputs, outputs = Inputs(N), Outputs(N)
-    best_s = inf
-    for _ in range(20):
-        begin_s = time.perf_counter()
-        for k in range(100):
-            link.trigger(k * 0.01)
-            coroutine = link.collect(inputs, 0.0)
-            try:
-                coroutine.send(None)
-            except StopIteration:
-                pass
-            link.write(outputs)
-        best_s = min(best_s, (time.perf_counter() - begin_s) / 100)
-    assert best_s < 25e-6, f"{best_s * 1e6:.1f} us a cycle"

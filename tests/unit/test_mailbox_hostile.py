@@ -19,7 +19,7 @@ from gateway.mailbox.unix import MAX_IN_FLIGHT, UnixMailbox
 from tests.unit.supervisor_support import child, frame_of, until
 from tests.unit.test_mailbox_unix import LISTEN, echo, mailboxes, run
 
-LONGEST_CALL_S = 0.05  # a blocked call would take for ever; this leaves room for a busy test machine
+LONGEST_CALL_S = 1.0  # a blocked call would take for ever; a busy test machine may take its time
 
 
 def _longest_publish_s(mailbox: UnixMailbox, payload: bytes, count: int) -> tuple[float, int]:

@@ -1,7 +1,6 @@
-"""The line without wires: when commands act, what is sampled, and what it costs."""
+"""The line without wires: when commands act and what is sampled."""
 
 from pathlib import Path
-from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -117,20 +116,3 @@ def test_drives_that_are_told_off_are_no_unsafe_event() -> None:
     line.sample(20.0)
     assert line.world.tension_n.min() < 2.0
     assert line.recorder.unsafe_total == 0
-
-
-def test_fifteen_seconds_cost_little() -> None:
-    """The bound is 0.15 s; an idle machine needs about 0.05 s. The best of five, for the machine is shared."""
-    best = min(seconds_for_fifteen() for _ in range(5))
-    assert best < 0.15
-
-
-def seconds_for_fifteen() -> float:
-    line = SteppedLine(PLANT, seed=1, latency_s=0.010)
-    torque_nm = line.start_at_equilibrium(TENSION_N, 0.01)
-    begin = perf_counter()
-    for k in range(1500):
-        line.sample(k * 0.01)
-        line.apply(torque_nm, ALL, 0.01, True, k * 0.01)
-    line.sample(15.0)
-    return perf_counter() - begin
