@@ -6,7 +6,7 @@ RUN   := $(PY) -m gateway.cli
 export PYTHONDONTWRITEBYTECODE :=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup run test check format bench bench-stepped lock clean
+.PHONY: help setup run test check format bench bench-stepped bench-wire bench-processes lock clean
 
 help: ## this list
 	@echo "r2rgate: make TARGET"
@@ -33,10 +33,16 @@ format: setup ## format the code
 	@$(PY) -m ruff format .
 	@$(PY) -m ruff check --fix .
 
-bench: bench-stepped ## every benchmark
+bench: bench-stepped bench-wire bench-processes ## every benchmark (about 10 min)
 
 bench-stepped: setup ## both cases in stepped time: RMSE against the goals, speed against real time
 	@$(PY) -m tests.bench.stepped $(ARGS)
+
+bench-wire: setup ## the demonstration in real time, both laws, three seeds
+	@$(PY) -m tests.bench.wire $(ARGS)
+
+bench-processes: setup ## processes killed in mid-run, judged by the recorder
+	@$(PY) -m tests.bench.processes $(ARGS)
 
 lock: setup ## requirements.lock anew from pyproject.toml (needs uv), hashes without any index address
 	uv pip compile -q --universal --generate-hashes --python-version 3.11 --extra dev \

@@ -80,7 +80,7 @@ def check_timing(limits: EnvelopeLimits, state: EnvelopeState, skipped: int) -> 
             Finding(
                 "overrun",
                 Action.STOP,
-                f"{skipped} periods of {limits.period_s * 1e3:g} ms were missed at once, {overruns} times in a row: "
+                f"missed {skipped} periods of {limits.period_s * 1e3:g} ms at once, {overruns} times in a row: "
                 "take load off this computer or give the loop real-time priority",
             )
         )

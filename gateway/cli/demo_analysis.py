@@ -52,7 +52,7 @@ class CaseTrace:
     setpoint_n: NDArray[Any]  #: (k, n)
 
 
-def measure(setup: Setup, windows: list[Window], evidence: Evidence, started_s: float) -> DemoResult:
+def measure(setup: Setup, windows: list[Window], stops: list[str], evidence: Evidence, started_s: float) -> DemoResult:
     """Every figure of the run, beside the same cases in stepped time."""
     return DemoResult(
         command=command_line(),
@@ -65,6 +65,7 @@ def measure(setup: Setup, windows: list[Window], evidence: Evidence, started_s: 
         cases=[_case(setup, trace_of(window, evidence), evidence) for window in windows],
         timing=_timing(setup, evidence.history),
         unsafe_events=evidence.summary["unsafe_events"],
+        stops=stops,
         wall_s=round(time.monotonic() - started_s, 1),
     )
 

@@ -41,6 +41,7 @@ def page(setup: Setup, result: DemoResult, windows: list[Window], evidence: Evid
             "Both cases are literal steps, as in the paper; the line starts each of them settled at its set-points.",
             "The controller is designed on the nominal model of the line file, which is wrong on purpose: stiffness, "
             "radius, inertia, friction and span length differ from the simulated line's by 5 to 33 %.",
+            *(f"A case was repeated: {stop}" for stop in result.stops),
             f"In stepped time: the mean of {STEPPED_SEEDS} runs of the whole cycle without wires and without waiting.",
         ),
     )

@@ -45,4 +45,5 @@ class DemoResult(Strict):
     cases: list[CaseResult]
     timing: TimingResult
     unsafe_events: dict[str, int]  #: by kind, over the whole run, with 0 where none was seen
+    stops: list[str]  #: why the line stopped by itself and a case was begun anew; empty in a smooth run
     wall_s: float

@@ -38,6 +38,7 @@ def print_result(result: DemoResult, out: Path, console: Console) -> None:
         f"{lateness.p50:.0f}, p99 {lateness.p99:.0f} us; cycle p50 {cycle.p50:.0f}, p99 {cycle.p99:.0f} us",
         *result.machine[1:],
     ]
+    lines += [f"a case was repeated: {stop}" for stop in result.stops]
     for line in lines:
         console.print(line, markup=False, soft_wrap=True)
     console.print(f"unsafe events at the drives, whole run: {unsafe}", style="bold red" if unsafe else "")

@@ -1,9 +1,12 @@
 """Processes killed for real, in mid-run; the recorder inside the simulated line and a tap on the wire judge."""
 
+import os
+import signal
 import struct
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -97,6 +100,38 @@ def test_killing_the_simulated_line_the_loop_stops_within_three_periods_and_take
     assert not refusal.ok and refusal.reasons
 
 
+def stall(wire, seconds):
+    """The loop process does not run for a while, as on a computer that is starved."""
+    pid = wire.children.pid("loop")
+    os.kill(pid, signal.SIGSTOP)
+    time.sleep(seconds)
+    os.kill(pid, signal.SIGCONT)
+
+
+def test_a_short_stall_is_skipped_not_caught_up_and_stops_the_line(wire):
+    wire.run()
+    stall(wire, 0.08)
+    status = wire.wait(lambda status: status.loop.state == "STOP" and status.spans[0].drive == "OFF")
+    assert any("missed" in event.text for event in status.events)
+    recording = wire.recording()
+    at_s = np.array([event["time_s"] for event in recording.of_kind("command") if event["roller"] == 1])
+    assert np.diff(at_s).max() > 0.06 and not recording.of_kind("watchdog")
+    # No burst: after the gap, commands come a period apart.
+    gap = int(np.argmax(np.diff(at_s)))
+    assert np.diff(at_s[gap + 1 : gap + 10]).min() > 0.3 * PERIOD_S
+    assert not any(wire.unsafe().values()), wire.unsafe()
+
+
+def test_a_hang_is_ended_by_the_drives_own_watchdog_and_the_loop_finds_them_in_fault(wire):
+    wire.run()
+    stall(wire, 0.4)
+    wire.wait(lambda status: status.loop.state == "STOP")
+    recording = wire.recording()
+    trips = recording.of_kind("watchdog")
+    assert sorted(event["roller"] for event in trips) == [1, 2, 3, 4, 5, 6]
+    assert not any(wire.unsafe().values()), wire.unsafe()
+
+
 def test_a_second_loop_exits_within_a_second_having_sent_nothing(wire):
     wire.start_gateway()
     wire.start_loop()
@@ -128,8 +163,6 @@ def test_the_loop_sends_nothing_to_the_drives_until_it_is_armed(wire):
 def test_the_running_loop_has_no_listening_internet_socket_and_no_database(wire):
     wire.run()
     pid = wire.children.pid("loop")
-    from pathlib import Path
-
     links = [link.readlink().as_posix() for link in Path(f"/proc/{pid}/fd").iterdir()]
     assert not [link for link in links if "sqlite" in link or link.endswith(".db")]
     inodes = {link[8:-1] for link in links if link.startswith("socket:[")}
