@@ -71,6 +71,10 @@ class MemoryLink:
     def silence(self) -> None:
         self._active = False
 
+    async def release(self) -> None:
+        """Nobody waits in memory."""
+        self.silence()
+
     def trigger(self, now_s: float) -> None:
         self._now_s = now_s
 

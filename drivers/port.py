@@ -43,6 +43,13 @@ class Link(Protocol):
         """Back to silent: from now on nothing is sent that changes a device."""
         ...
 
+    async def release(self) -> None:
+        """Leave the devices in order, then be silent: no command comes any more, and none is waited for.
+
+        For when torque is off, or an arming has failed. Devices that are not released trip their watchdogs.
+        """
+        ...
+
     def trigger(self, now_s: float) -> None:
         """Start a cycle: latch and sample (SYNC), or send the read requests. A silent link only listens and reads."""
         ...

@@ -1,74 +1,83 @@
 """The envelope: what is checked in every cycle, before and after the control law. Pure; time is counted in periods.
 
-It trusts nobody: neither the sensors (quality, staleness, band), nor the drives (state), nor the law (finite, limits).
+It trusts nobody: neither the sensors (quality, staleness, band, speed), nor the drives and the line PLC (state), nor
+the law (finite, limits), nor the computer (overruns).
 """
 
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from gateway.core.signals import DriveState, FloatArray, Inputs, IntArray, Quality
+from gateway.core.signals import BoolArray, DriveState, FloatArray, Inputs, IntArray, Quality
 from safety.actions import Action, Finding
 from safety.limits import EnvelopeLimits
 
 
+@dataclass(frozen=True, slots=True)
+class Supervision:
+    """Which rules apply now; the phase of the loop says so."""
+
+    feedback: bool  #: the law is engaged: its signals must be there, and rollers must not run away
+    standstill: bool  #: the unwinder stands still
+    tension_floor: bool  #: the web has been tensioned: no span may go slack
+    drives: tuple[DriveState, ...]  #: the states that every drive must be in; empty: any
+    transport: bool  #: the line PLC has been asked for transport, and must give it
+
+
+NOTHING = Supervision(feedback=False, standstill=False, tension_floor=False, drives=(), transport=False)
+
+
 @dataclass(slots=True)
 class EnvelopeState:
-    """What the envelope remembers from period to period."""
+    """What the envelope remembers from period to period. Counts are periods in a row."""
 
-    missing_periods: int = 0  #: in a row, in which a signal that control needs was not GOOD
-    plc_missing_periods: int = 0
-    overruns: int = 0  #: in a row, in which at least one period was skipped
-    #: (n,), in a row outside the tension band
-    outside_periods: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int8))
+    missing: int = 0  #: without a signal that control needs
+    missing_history: int = 0  #: a bit a period over the last periods, the newest lowest
+    plc_missing: int = 0
+    overruns: int = 0  #: in which at least one period was skipped
+    stopped: int = 0  #: in which the PLC gave no transport
+    #: (n,), outside the tension band; and over the speed
+    outside: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int8))
+    fast: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int8))
 
 
 @dataclass(frozen=True, slots=True)
-class Supervision:
-    """Which rules apply now; the state machine says so."""
+class Assessment:
+    """What the samples of a period say."""
 
-    feedback: bool  #: the law is engaged: its signals must be there
-    tension_floor: bool  #: the web has been tensioned: no span may go slack
-    drives_enabled: bool  #: every drive must follow its torque
+    findings: list[Finding]
+    usable: bool  #: every signal that control needs is there in this period
+    feedback_lost: bool  #: and has been missing for too long
+    plc_lost: bool
 
 
 def check_inputs(
     limits: EnvelopeLimits, state: EnvelopeState, inputs: Inputs, supervision: Supervision
-) -> tuple[list[Finding], EnvelopeState]:
+) -> tuple[Assessment, EnvelopeState]:
     """Everything that the samples of this period say against running on."""
-    findings: list[Finding] = []
     missing = _missing_signals(limits, inputs)
-    missing_periods = state.missing_periods + 1 if missing else 0
-    if missing and supervision.feedback:
-        last = missing_periods >= limits.hold_periods
-        findings.append(
-            Finding(
-                "signals",
-                Action.STOP if last else Action.HOLD_OUTPUTS,
-                f"no usable sample of {', '.join(missing)} in {missing_periods} periods of {limits.hold_periods}: "
-                "check the device, its cable and its supply",
-            )
-        )
-    plc_missing = state.plc_missing_periods + 1 if inputs.plc.quality != Quality.GOOD else 0
-    if plc_missing >= limits.hold_periods:
-        findings.append(Finding("line PLC", Action.STOP, f"the line PLC has not answered for {plc_missing} periods"))
-    findings += _plc_findings(inputs)
-    if supervision.drives_enabled:
-        findings += _drive_findings(inputs)
-    outside, band = _band_findings(limits, state, inputs, supervision.tension_floor)
-    findings += band
-    unwind = inputs.unwind_speed
-    if unwind.quality[0] == Quality.GOOD and unwind.value[0] > 1.1 * limits.speed_max_m_per_s:
-        findings.append(
-            Finding(
-                "overspeed",
-                Action.STOP,
-                f"the unwinder runs at {unwind.value[0]:.4f} m/s, allowed is {limits.speed_max_m_per_s} m/s",
-            )
-        )
-    return findings, replace(
-        state, missing_periods=missing_periods, plc_missing_periods=plc_missing, outside_periods=outside
+    window = (1 << limits.miss_window) - 1
+    after = EnvelopeState(
+        missing=state.missing + 1 if missing else 0,
+        missing_history=((state.missing_history << 1) | bool(missing)) & window if supervision.feedback else 0,
+        plc_missing=state.plc_missing + 1 if inputs.plc.quality != Quality.GOOD else 0,
+        overruns=state.overruns,
+        stopped=state.stopped + 1 if supervision.transport and not inputs.plc.running else 0,
+        outside=_count(state.outside, _outside_band(limits, inputs, supervision), inputs.tension.quality),
+        fast=_count(state.fast, _too_fast(limits, inputs, supervision), inputs.speed.quality),
     )
+    plc_lost = after.plc_missing >= limits.hold_periods
+    findings = _signal_findings(limits, after, missing) if supervision.feedback else []
+    if plc_lost:
+        findings.append(
+            Finding("line PLC", Action.STOP, f"the line PLC has not answered for {after.plc_missing} periods")
+        )
+    findings += _plc_findings(limits, after, inputs)
+    findings += _drive_findings(inputs, supervision)
+    findings += [_out_of_band(limits, i, inputs) for i in _beyond(after.outside, limits)]
+    findings += _speed_findings(limits, after, inputs)
+    feedback_lost = after.missing >= limits.hold_periods
+    return Assessment(findings, not missing, feedback_lost, plc_lost), after
 
 
 def check_timing(limits: EnvelopeLimits, state: EnvelopeState, skipped: int) -> tuple[list[Finding], EnvelopeState]:
@@ -91,8 +100,8 @@ def check_torque(asked_nm: FloatArray) -> list[Finding]:
     """Whether a law's answer may be used at all. Limits are not its concern: `limit_torque` applies them."""
     if np.isfinite(asked_nm).all():
         return []
-    drives = ", ".join(str(i + 1) for i in np.flatnonzero(~np.isfinite(asked_nm)))
-    return [Finding("finite torque", Action.TORQUE_OFF, f"the control law gave no finite torque for roller {drives}")]
+    rollers = ", ".join(str(i + 1) for i in np.flatnonzero(~np.isfinite(asked_nm)))
+    return [Finding("finite torque", Action.TORQUE_OFF, f"the control law gave no finite torque for roller {rollers}")]
 
 
 def limit_torque(limits: EnvelopeLimits, asked_nm: FloatArray, applied_nm: FloatArray, interval_s: float) -> FloatArray:
@@ -104,11 +113,6 @@ def limit_torque(limits: EnvelopeLimits, asked_nm: FloatArray, applied_nm: Float
     step = limits.torque_rate_nm_per_s * min(max(interval_s, 0.0), limits.period_s)
     torque = np.minimum(np.maximum(asked_nm, applied_nm - step), applied_nm + step)
     return np.minimum(np.maximum(torque, -limits.torque_nm), limits.torque_nm)
-
-
-def feedback_usable(limits: EnvelopeLimits, inputs: Inputs) -> bool:
-    """Whether every signal that the control law needs has a GOOD sample in this period."""
-    return not _missing_signals(limits, inputs)
 
 
 def _missing_signals(limits: EnvelopeLimits, inputs: Inputs) -> list[str]:
@@ -127,7 +131,24 @@ def _in_words(numbers: list[int]) -> str:
     return " and ".join(map(str, numbers))
 
 
-def _plc_findings(inputs: Inputs) -> list[Finding]:
+def _signal_findings(limits: EnvelopeLimits, state: EnvelopeState, missing: list[str]) -> list[Finding]:
+    """A missing signal holds the outputs; too many in a row, or too many at all, stop the line."""
+    often = state.missing_history.bit_count()
+    if not missing:
+        return []
+    if state.missing >= limits.hold_periods:
+        action, text = Action.STOP, f"in {state.missing} periods of {limits.hold_periods}"
+    elif often > 2 * limits.hold_periods:
+        action, text = Action.STOP, f"in {often} of the last {limits.miss_window} periods"
+    else:
+        action, text = Action.HOLD_OUTPUTS, f"in {state.missing} periods of {limits.hold_periods}"
+    named = ", ".join(missing)
+    return [
+        Finding("signals", action, f"no usable sample of {named} {text}: check the device, its cable and its supply")
+    ]
+
+
+def _plc_findings(limits: EnvelopeLimits, state: EnvelopeState, inputs: Inputs) -> list[Finding]:
     plc = inputs.plc
     if plc.quality != Quality.GOOD:
         return []
@@ -135,38 +156,73 @@ def _plc_findings(inputs: Inputs) -> list[Finding]:
         return [Finding("emergency stop", Action.TORQUE_OFF, "the emergency stop circuit is open")]
     if not plc.permissive:
         return [Finding("permissive", Action.STOP, "the line PLC has withdrawn its permissive")]
+    if state.stopped >= limits.transport_periods:
+        return [Finding("transport", Action.STOP, "the line PLC has stopped the transport: read its fault")]
     return []
 
 
-def _drive_findings(inputs: Inputs) -> list[Finding]:
-    if (inputs.drive_state == DriveState.ENABLED).all():
+def _drive_findings(inputs: Inputs, supervision: Supervision) -> list[Finding]:
+    if not supervision.drives or np.isin(inputs.drive_state, supervision.drives).all():
         return []
-    lost = [i for i in range(inputs.n) if inputs.drive_state[i] != DriveState.ENABLED]
-    texts = [f"{i + 1} {DriveState(int(inputs.drive_state[i])).name}" for i in lost]
-    return [Finding("drives", Action.STOP, f"drives that no longer follow: {', '.join(texts)}: read their fault")]
+    wrong = [i for i in range(inputs.n) if inputs.drive_state[i] not in supervision.drives]
+    texts = [f"{i + 1} {DriveState(int(inputs.drive_state[i])).name}" for i in wrong]
+    wanted = " or ".join(state.name for state in supervision.drives)
+    return [Finding("drives", Action.STOP, f"drives that are not {wanted}: {', '.join(texts)}: read their fault")]
 
 
-def _band_findings(
-    limits: EnvelopeLimits, state: EnvelopeState, inputs: Inputs, floor: bool
-) -> tuple[IntArray, list[Finding]]:
-    tension = inputs.tension
+def _count(before: IntArray, now: BoolArray, quality: IntArray) -> IntArray:
+    """Periods in a row for which `now` (n,) holds. A sample that did not come says nothing: the count stays."""
+    if len(before) != len(now):
+        before = np.zeros(len(now), np.int8)
+    return np.where(quality == Quality.GOOD, np.where(now, np.minimum(before + 1, 100), 0), before).astype(np.int8)
+
+
+def _beyond(count: IntArray, limits: EnvelopeLimits) -> list[int]:
+    return [int(i) for i in np.flatnonzero(count >= limits.band_periods)]
+
+
+def _outside_band(limits: EnvelopeLimits, inputs: Inputs, supervision: Supervision) -> BoolArray:
+    value = inputs.tension.value
     with np.errstate(invalid="ignore"):  # a channel that was never heard is NaN, and of no GOOD quality
-        outside = tension.value > limits.tension_max_n
-        if floor:
-            outside |= tension.value < limits.tension_min_n
-    fresh = tension.quality == Quality.GOOD
-    before = state.outside_periods if len(state.outside_periods) == inputs.n else np.zeros(inputs.n, np.int8)
-    # A sample that did not come says nothing: the count stays.
-    count = np.where(fresh, np.where(outside, np.minimum(before + 1, 100), 0), before).astype(np.int8)
-    return count, [_out_of_band(limits, int(i), tension.value[i]) for i in np.flatnonzero(count >= limits.band_periods)]
+        outside = value > limits.tension_max_n
+        return outside | (value < limits.tension_min_n) if supervision.tension_floor else outside
 
 
-def _out_of_band(limits: EnvelopeLimits, span: int, tension_n: float) -> Finding:
+def _out_of_band(limits: EnvelopeLimits, span: int, inputs: Inputs) -> Finding:
     # Over-tension: the law itself relieves it best, while the line slows down. Slack or a broken web: a tension loop
     # would only spin its roller up.
+    tension_n = float(inputs.tension.value[span])
     action = Action.STOP if tension_n > limits.tension_max_n else Action.TORQUE_OFF
-    return Finding(
-        "tension band",
-        action,
-        f"tension {span + 1} is {tension_n:.2f} N, allowed is {limits.tension_min_n:g} to {limits.tension_max_n:g} N",
-    )
+    allowed = f"{limits.tension_min_n:g} to {limits.tension_max_n:g} N"
+    return Finding("tension band", action, f"tension {span + 1} is {tension_n:.2f} N, allowed is {allowed}")
+
+
+def _roller_limit(limits: EnvelopeLimits, supervision: Supervision) -> float:
+    factor = limits.standstill_overspeed if supervision.standstill else limits.roller_overspeed
+    return factor * limits.speed_max_m_per_s
+
+
+def _too_fast(limits: EnvelopeLimits, inputs: Inputs, supervision: Supervision) -> BoolArray:
+    if not supervision.feedback:
+        return np.zeros(inputs.n, dtype=np.bool_)
+    with np.errstate(invalid="ignore"):
+        return np.abs(inputs.speed.value) > _roller_limit(limits, supervision)
+
+
+def _speed_findings(limits: EnvelopeLimits, state: EnvelopeState, inputs: Inputs) -> list[Finding]:
+    # A roller that runs away has no web to pull: torque off. An unwinder that is too fast is slowed down.
+    findings = [
+        Finding(
+            "roller speed",
+            Action.TORQUE_OFF,
+            f"roller {i + 1} runs at {inputs.speed.value[i]:.3f} m/s, the line's greatest speed is "
+            f"{limits.speed_max_m_per_s:g} m/s: is the web threaded and whole?",
+        )
+        for i in _beyond(state.fast, limits)
+    ]
+    unwind = inputs.unwind_speed
+    greatest = limits.unwinder_overspeed * limits.speed_max_m_per_s
+    if unwind.quality[0] == Quality.GOOD and abs(unwind.value[0]) > greatest:
+        text = f"the unwinder runs at {unwind.value[0]:.4f} m/s, allowed is {limits.speed_max_m_per_s:g} m/s"
+        findings.append(Finding("overspeed", Action.STOP, text))
+    return findings

@@ -10,7 +10,7 @@ from gateway.core.signals import FloatArray
 
 @dataclass(frozen=True, slots=True)
 class EnvelopeLimits:
-    """Limits of a line. SI, one entry per span where an array."""
+    """Limits of a line. SI, one entry per span where an array. Periods are counted in a row unless said otherwise."""
 
     period_s: float
     torque_nm: float  #: per drive, either direction
@@ -18,11 +18,16 @@ class EnvelopeLimits:
     tension_min_n: float
     tension_max_n: float
     speed_max_m_per_s: float
-    hold_periods: int  #: periods in a row without a signal until STOP
-    band_periods: int  #: periods in a row outside the tension band until STOP
-    overruns_in_a_row: int  #: periods in a row with an overrun until STOP
-    skipped_periods: int  #: more than these skipped at once: STOP
     measured: FloatArray  #: (n,), 1.0 where a load cell measures the span
+    hold_periods: int  #: without a signal until STOP
+    miss_window: int = 20  #: periods over which single misses are counted
+    band_periods: int = 2  #: outside the tension band, or over a speed: one sample may be a spike, two are the web
+    transport_periods: int = 10  #: without transport on the PLC's side until STOP
+    overruns_in_a_row: int = 3
+    skipped_periods: int = 5  #: more than these skipped at once: STOP
+    unwinder_overspeed: float = 1.1  #: times the greatest speed
+    roller_overspeed: float = 1.5  #: a roller runs ahead while it tensions its span
+    standstill_overspeed: float = 1.0  #: of a roller while the unwinder stands still
 
 
 def envelope_limits(line: Line) -> EnvelopeLimits:
@@ -34,10 +39,6 @@ def envelope_limits(line: Line) -> EnvelopeLimits:
         tension_min_n=line.limits.tension_min_n,
         tension_max_n=line.limits.tension_max_n,
         speed_max_m_per_s=line.limits.speed_max_m_per_s,
-        hold_periods=line.limits.hold_periods,
-        # One sample outside may be a spike; two in a row are the web.
-        band_periods=2,
-        overruns_in_a_row=3,
-        skipped_periods=5,
         measured=np.array([1.0 if span.control == "tension" else 0.0 for span in line.spans]),
+        hold_periods=line.limits.hold_periods,
     )

@@ -47,6 +47,7 @@ class SteppedLine:
         self._max_torque_nm = drives.max_torque_nm
         self._torque_rate_nm_per_s = drives.torque_rate_nm_per_s or inf
         self._enabled = np.zeros(plant.spans, dtype=np.bool_)
+        self._blocked = np.zeros(plant.spans, dtype=np.bool_)  #: left by themselves, and not told off since
         self._underway: deque[tuple[float, FloatArray, BoolArray]] = deque()
         self._arrival = self.world.timer(self._arrive)
         self._life = 0
@@ -104,6 +105,20 @@ class SteppedLine:
         else:
             self._arrival.due_s = self._underway[0][0]
 
+    def take_off(self, index: int, now_s: float) -> None:
+        """Drive `index` (from 0) takes torque off by itself, as by a short safe torque off.
+
+        It gives torque again only after it has been told off and then enabled anew.
+        """
+        self.world.advance(now_s)
+        self._blocked[index] = True
+        enabled = self._enabled.copy()
+        enabled[index] = False
+        self._set_enabled(enabled, now_s, "sto")
+        torque_nm = self.world.torque_nm.copy()
+        torque_nm[index] = 0.0
+        self._give(torque_nm)
+
     def _command_plc(self, speed_request_m_per_s: float, run: bool, now_s: float) -> None:
         self._life = (self._life + 1) & 0xFFFF
         self.plc.command(run, speed_request_m_per_s, self._life, now_s)
@@ -112,6 +127,8 @@ class SteppedLine:
         _, torque_nm, enable = self._underway.popleft()
         self._arrival.due_s = self._underway[0][0] if self._underway else inf
         possible = np.minimum(np.maximum(torque_nm, -self._max_torque_nm), self._max_torque_nm)
+        self._blocked &= enable
+        enable = enable & ~self._blocked
         possible[~enable] = 0.0
         self._set_enabled(enable, now_s)
         self._give(possible)
@@ -124,8 +141,8 @@ class SteppedLine:
         for i, target in enumerate(torque_nm):
             self.world.ramp_torque_nm(i, float(target), self._torque_rate_nm_per_s if self._enabled[i] else inf)
 
-    def _set_enabled(self, enable: BoolArray, now_s: float) -> None:
+    def _set_enabled(self, enable: BoolArray, now_s: float, cause: str = "command") -> None:
         for i in np.flatnonzero(enable != self._enabled):
             state = "OPERATION_ENABLED" if enable[i] else "SWITCH_ON_DISABLED"
-            self.recorder.drive_state(int(i), state, "command", now_s)
+            self.recorder.drive_state(int(i), state, cause, now_s)
         self._enabled = enable

@@ -2,8 +2,8 @@
 
 A cycle: SYNC (the drives latch their RPDOs and sample), the TPDOs of this SYNC, one RPDO a drive. An answer
 counts for the SYNC after which it arrives, once: what comes twice, or after `collect` has closed the cycle, is
-discarded and counted. What is in the socket before the next SYNC is read before it, so that a late answer cannot
-pass for a fresh one.
+discarded and counted. What is in the socket before the next SYNC is read before it, so that an answer that is
+late within its period cannot pass for a fresh one. One that comes a whole period late can: SYNC has no counter.
 """
 
 import asyncio
@@ -103,6 +103,12 @@ class CanopenLink:
         self._sync_open = False
         for node in self._nodes:
             node.forget()
+
+    async def release(self) -> None:
+        """Drives leave operational: torque off, and their deadline monitoring ends without a fault."""
+        self.silence()
+        for node in self._nodes:
+            self._command_nmt(ENTER_PRE_OPERATIONAL, node)
 
     # the cycle
 

@@ -67,6 +67,10 @@ class ModbusLink:
         for plc in self._plcs:
             plc.silence()
 
+    async def release(self) -> None:
+        """The PLC's watchdog does not run while transport is off: nothing is left to say."""
+        self.silence()
+
     def trigger(self, now_s: float) -> None:
         """Send the requests of this cycle."""
         for device in self._devices:

@@ -93,6 +93,10 @@ class Plc:
         if self._echo_stands_still(answer[2]):
             self._miss(inputs)
             return [f"{self.name}: answers, but its echo of the life counter stands still"]
+        if self.active and not self._may_write():
+            # It can be read, and not told to stop: for the loop it is not there.
+            self._miss(inputs)
+            return [f"{self.name}: is not written to: its watchdog is not proven, or the command is refused"]
         read, status = self._device.read, int(answer[0])
         plc.quality, plc.time_s = Quality.GOOD, time_s
         plc.permissive = _is(read.permissive, status)

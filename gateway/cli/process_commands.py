@@ -2,7 +2,7 @@
 
 import sys
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -11,6 +11,9 @@ from gateway.core.line import Line
 from gateway.core.line_file import load_line
 from gateway.core.line_problem import LineRefused
 from gateway.mailbox.paths import default_run_folder
+
+if TYPE_CHECKING:
+    from gateway.core.controller import LqiConfig, PidConfig
 
 REFUSED, ALREADY_RUNNING = 2, 3
 
@@ -86,7 +89,7 @@ def loop(
     path = controller or (data_dir or default_data_folder(line)) / "controller.json"
     try:
         config = parse_controller(path.read_bytes())
-        _require_fit(line, config.n, config.period_s, path)
+        _require_fit(line, config, path)
         run_loop(
             line, config, run_dir or default_run_folder(line), lambda text: print(text, file=sys.stderr, flush=True)
         )
@@ -173,11 +176,21 @@ def demo(
     raise typer.Exit(run_demo(out, law, seed))
 
 
-def _require_fit(line: Line, n: int, period_s: float, path: Path) -> None:
-    if n != line.n:
-        _refuse(f"{path} is for {n} spans, the line has {line.n}: design one for it (r2rgate design)")
-    if abs(period_s - line.control.period_s) > 1e-9:
-        _refuse(f"{path} is for a period of {period_s} s, the line's is {line.control.period_s} s: design it anew")
+def _require_fit(line: Line, config: "LqiConfig | PidConfig", path: Path) -> None:
+    """A configuration for another line must not run on this one."""
+    draw = [i for i, span in enumerate(line.spans) if span.control == "draw"]
+    reasons: list[str] = []
+    if config.n != line.n:
+        reasons.append(f"it is for {config.n} spans, the line has {line.n}")
+    elif config.draw_spans != draw:
+        spans = [[i + 1 for i in indices] for indices in (config.draw_spans, draw)]
+        reasons.append(f"its draw-controlled spans are {spans[0]}, the line's {spans[1]}")
+    if abs(config.period_s - line.control.period_s) > 1e-9:
+        reasons.append(f"it is for a period of {config.period_s} s, the line's is {line.control.period_s} s")
+    if config.feedforward.stiffness_n <= line.limits.tension_max_n:
+        reasons.append(f"its web stiffness of {config.feedforward.stiffness_n:g} N is below the greatest tension")
+    if reasons:
+        _refuse(f"{path} is not used: {'; '.join(reasons)}. Design one for this line: r2rgate design")
 
 
 def _refuse(text: str) -> None:

@@ -12,7 +12,7 @@ from drivers.memory import MemoryLink
 from gateway.cli.cases import CHANGE_AT_S, DURATION_S, Case
 from gateway.control.laws import make_law
 from gateway.core.controller import LqiConfig, PidConfig
-from gateway.core.line import Line
+from gateway.core.line import Line, Recipe
 from gateway.core.messages import Arm, Command, Reply
 from gateway.core.metrics import rmse_n, rmse_per_span_n
 from gateway.core.signals import FloatArray
@@ -55,8 +55,9 @@ class SteppedLoop:
         _finish(cycle.links[0].prepare())
         cycle.machine = Machine(Phase.RUNNING)
         cycle.outputs.torque_nm = torque.copy()
-        cycle.setpoints.tension_target_n = tension_n.copy()
-        cycle.setpoints.speed_m_per_s = cycle.setpoints.speed_target_m_per_s = unwind_speed_m_per_s
+        recipe = Recipe(name="production", tension_n=tension_n.tolist(), speed_m_per_s=unwind_speed_m_per_s)
+        cycle.setpoints.aim_at(recipe)
+        cycle.setpoints.speed_m_per_s = unwind_speed_m_per_s
 
     def arm(self) -> Reply:
         """As the operator's `arm`, without waiting for the drives: step on until READY."""

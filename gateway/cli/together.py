@@ -20,7 +20,7 @@ from gateway.cli.status_view import render
 from gateway.core.controller import canonical
 from gateway.core.line import Line
 
-STOP_TIME_S = 15.0
+PATIENCE_S = 3.0  #: beyond the time that a stop may take
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.5, 10.0
 REFRESH_S = 0.2
 
@@ -64,7 +64,7 @@ def run_together(
         console.print("stopping the line, then ending")
         for child in reversed(children):
             if child.process is not None:
-                end(child.process, STOP_TIME_S)
+                end(child.process, line.longest_stop_s + PATIENCE_S)
     return 0
 
 

@@ -7,6 +7,7 @@ import hashlib
 import json
 from typing import Annotated, Literal, Self
 
+import numpy as np
 from pydantic import Field, TypeAdapter, ValidationError, model_validator
 
 from gateway.core.line import NonNegative, Positive, Strict
@@ -41,6 +42,15 @@ class _Law(Strict):
     def n(self) -> int:
         return len(self.feedforward.radius_m)
 
+    @model_validator(mode="after")
+    def _check_spans(self) -> Self:
+        feedforward = self.feedforward
+        if len(feedforward.friction_nms_per_rad) != self.n:
+            raise ValueError(f"{len(feedforward.friction_nms_per_rad)} friction values for {self.n} radii")
+        if sorted(set(self.draw_spans)) != self.draw_spans or not all(0 <= i < self.n for i in self.draw_spans):
+            raise ValueError(f"draw_spans is {self.draw_spans}; allowed: indices from 0 to {self.n - 1}, ascending")
+        return self
+
     def _require(self, name: str, matrix: Matrix, shape: tuple[int, int]) -> None:
         if _shape(matrix) != shape:
             raise ValueError(f"{name} is {_shape(matrix)}, for {self.n} spans it must be {shape}")
@@ -63,6 +73,8 @@ class LqiConfig(_Law):
         n = self.n
         self._require("gain_state", self.gain_state, (n, 2 * n))
         self._require("gain_integral", self.gain_integral, (n, n))
+        if np.linalg.matrix_rank(np.array(self.gain_integral)) < n:
+            raise ValueError("gain_integral is singular: some combination of errors would never be integrated away")
         rows, columns = _shape(self.gain_input)
         if rows != n or columns % n:
             raise ValueError(f"gain_input is {(rows, columns)}, it must have {n} rows and a multiple of {n} columns")

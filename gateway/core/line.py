@@ -45,7 +45,7 @@ class Limits(Strict):
     speed_max_m_per_s: Positive
     tension_step_max_n: NonNegative = 0.0  #: largest set-point change that may be made at once; larger ones are ramped
     speed_step_max_m_per_s: NonNegative = 0.0
-    hold_periods: Annotated[int, Field(ge=1, le=10)] = 3  #: periods without a signal until STOP
+    hold_periods: Annotated[int, Field(ge=1, le=3)] = 3  #: periods without a signal until STOP
     watchdog_s: Annotated[float, Field(ge=0.01, le=0.2)] = 0.1  #: the drives take torque off after this silence
     tensioning_time_s: Positive = 20.0  #: after `start`, every span must have reached the band within this time
 
@@ -149,3 +149,8 @@ class Line(Strict):
     def n(self) -> int:
         """Number of spans, and of driven rollers."""
         return len(self.spans)
+
+    @property
+    def longest_stop_s(self) -> float:
+        """How long the line may take from a stop to torque off."""
+        return self.moves.stop_time_s + self.limits.torque_nm / self.moves.torque_off_rate_nm_per_s + 1.0

@@ -67,7 +67,7 @@ def in_words(command: Command) -> str:
 
 
 class Reply(Strict):
-    """What was done, or why not. A refusal has done nothing."""
+    """What was done, or why not. A refusal has changed nothing; a refused arming leaves links silent, devices released."""
 
     ok: bool
     state: str  #: the loop's state after the command

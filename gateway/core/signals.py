@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int8]
+BoolArray = NDArray[np.bool_]
 
 
 class Quality(IntEnum):

@@ -1,6 +1,6 @@
 """One telemetry frame per cycle, as bytes of fixed layout: a header, then arrays over the spans (little-endian).
 
-The loop packs it without allocating more than the frame itself; whoever reads it needs only this file.
+The loop packs it and forgets it; whoever reads it needs only this file.
 """
 
 import struct

@@ -9,7 +9,7 @@ from gateway.core.nearest import nearest
 from gateway.core.signals import Quality
 from gateway.core.states import LoopState, Phase
 from gateway.loop import machine as machines
-from gateway.loop.cycle import Cycle
+from gateway.loop.cycle import Cycle, standing
 
 
 class Refused(Exception):
@@ -33,9 +33,9 @@ def carry_out(cycle: Cycle, command: Command, now_s: float) -> Reply:
             case Stop():
                 text = _stop(cycle, now_s)
             case SetTension():
-                text = _set_tension(cycle, command)
+                text = _set_tension(cycle, command, now_s)
             case SetSpeed():
-                text = _set_speed(cycle, command)
+                text = _set_speed(cycle, command, now_s)
             case SelectRecipe():
                 text = _select_recipe(cycle, command)
     except Refused as refusal:
@@ -44,50 +44,70 @@ def carry_out(cycle: Cycle, command: Command, now_s: float) -> Reply:
 
 
 async def prepare_to_arm(cycle: Cycle) -> Reply | None:
-    """Everything that must hold before torque is possible. None when it does; periods go on meanwhile."""
-    if cycle.machine.state not in (LoopState.SILENT, LoopState.STOP):
-        return None
+    """Everything that must hold before torque is possible. None when it does; periods go on meanwhile.
+
+    Touches no link unless the line is SILENT or at rest, and no sample speaks against it. Cancelled or refused, it
+    leaves every link silent and every device released.
+    """
+    try:
+        _require_rest(cycle)
+    except Refused as refusal:
+        return Reply(ok=False, state=cycle.machine.state.name, text=str(refusal))
     reasons = not_ready(cycle)
     if not reasons:
-        for link in cycle.links:
-            link.silence()
-            try:
-                await link.prepare()
-            except PrepareRefused as refusal:
-                reasons += refusal.reasons
+        try:
+            if cycle.machine.phase is Phase.OFF:
+                await release(cycle)
+            for link in cycle.links:
+                try:
+                    await link.prepare()
+                except PrepareRefused as refusal:
+                    reasons += refusal.reasons
+        except BaseException:  # cancelled by a stop, or a link that failed: nothing stays half-way
+            await release(cycle)
+            raise
+        if reasons:
+            await release(cycle)
     if not reasons:
         return None
-    for link in cycle.links:
-        link.silence()
     text = "not armed; mend what is named and arm again"
     return Reply(ok=False, state=cycle.machine.state.name, text=text, reasons=reasons)
+
+
+async def release(cycle: Cycle) -> None:
+    """No link sends any more, and no device waits for it."""
+    for link in cycle.links:
+        await link.release()
 
 
 def not_ready(cycle: Cycle) -> list[str]:
     """What speaks against arming, as far as the samples tell."""
     inputs, reasons = cycle.inputs, []
-    if inputs.plc.quality != Quality.GOOD:
-        reasons.append(f"the line PLC ({cycle.line.plc.name}) does not answer")
+    if inputs.plc.quality != Quality.GOOD or inputs.unwind_speed.quality[0] != Quality.GOOD:
+        reasons.append(f"the line PLC ({cycle.line.plc.name}) gives no usable answer")
     elif inputs.plc.emergency_stop:
         reasons.append("the emergency stop circuit is open: release it")
     elif not inputs.plc.permissive:
         reasons.append("the line PLC gives no permissive")
-    unwind = inputs.unwind_speed
-    if unwind.quality[0] == Quality.GOOD and abs(unwind.value[0]) > machines.STANDSTILL_M_PER_S:
-        reasons.append(f"the unwinder turns at {unwind.value[0]:.4f} m/s: wait for standstill")
+    elif not standing(inputs):
+        reasons.append(f"the unwinder turns at {inputs.unwind_speed.value[0]:.4f} m/s: wait for standstill")
     for cell in cycle.line.load_cells:
         if inputs.tension.quality[cell.span - 1] != Quality.GOOD:
             reasons.append(f"load cell {cell.name} (span {cell.span}) gives no usable value")
     return reasons
 
 
-def _arm(cycle: Cycle, now_s: float) -> str:
+def _require_rest(cycle: Cycle) -> None:
     machine = cycle.machine
     if machine.state not in (LoopState.SILENT, LoopState.STOP):
         raise Refused(f"the line is {machine.state.name} already")
     if machine.phase not in (Phase.SILENT, Phase.OFF):
         raise Refused(f"the line is still {machine.phase.name.lower()}: wait until torque is off")
-    cycle.change(machines.to_phase(machine, Phase.ARMING, now_s, ""))
+
+
+def _arm(cycle: Cycle, now_s: float) -> str:
+    _require_rest(cycle)
+    cycle.change(machines.to_phase(cycle.machine, Phase.ARMING, now_s, ""))
     return "watchdogs confirmed; the drives become ready"
 
 
@@ -95,6 +115,9 @@ def _start(cycle: Cycle, now_s: float) -> str:
     machine = cycle.machine
     match machine.phase:
         case Phase.READY:
+            reasons = not_ready(cycle) + _moving_rollers(cycle)
+            if reasons:
+                raise Refused("not started; mend what is named and start again", reasons)
             cycle.change(machines.to_phase(machine, Phase.ENABLING, now_s, ""))
             return f"tensioning the web, then {cycle.setpoints.speed_target_m_per_s:g} m/s"
         case Phase.HOLDING:
@@ -104,6 +127,15 @@ def _start(cycle: Cycle, now_s: float) -> str:
             return "running already"
         case _:
             raise Refused(f"the line is {machine.state.name}: arm it first")
+
+
+def _moving_rollers(cycle: Cycle) -> list[str]:
+    speed = cycle.inputs.speed
+    return [
+        f"roller {i + 1} does not stand still, or its speed is not known"
+        for i in range(cycle.line.n)
+        if speed.quality[i] != Quality.GOOD or abs(speed.value[i]) > machines.STANDSTILL_M_PER_S
+    ]
 
 
 def _hold(cycle: Cycle, now_s: float) -> str:
@@ -124,7 +156,7 @@ def _stop(cycle: Cycle, now_s: float) -> str:
     return "the line ramps to standstill, then torque goes off; arm leads out of it"
 
 
-def _set_tension(cycle: Cycle, command: SetTension) -> str:
+def _set_tension(cycle: Cycle, command: SetTension, now_s: float) -> str:
     line, setpoints = cycle.line, cycle.setpoints
     if command.span > line.n:
         raise Refused(f"there is no span {command.span}; allowed: 1 to {line.n}")
@@ -134,32 +166,34 @@ def _set_tension(cycle: Cycle, command: SetTension) -> str:
     i = command.span - 1
     if command.step:
         size = abs(command.tension_n - setpoints.tension_n[i])
-        _require_step(cycle, size, line.limits.tension_step_max_n, "N")
-        setpoints.tension_n[i] = command.tension_n
+        _require_step(cycle, size, line.limits.tension_step_max_n, "N", setpoints.tension_step_pause_s(i, now_s))
+        setpoints.step_tension(i, command.tension_n, now_s)
     setpoints.tension_target_n[i] = command.tension_n
     how = "at once" if command.step else f"at {line.moves.tension_rate_n_per_s:g} N/s"
     return f"span {command.span} to {command.tension_n:g} N {how}"
 
 
-def _set_speed(cycle: Cycle, command: SetSpeed) -> str:
+def _set_speed(cycle: Cycle, command: SetSpeed, now_s: float) -> str:
     line, setpoints = cycle.line, cycle.setpoints
     high = line.limits.speed_max_m_per_s
     if not (isfinite(command.speed_m_per_s) and 0.0 <= command.speed_m_per_s <= high):
         raise Refused(f"{command.speed_m_per_s:g} m/s is outside the limits; allowed: 0 to {high:g} m/s")
     if command.step:
         size = abs(command.speed_m_per_s - setpoints.speed_m_per_s)
-        _require_step(cycle, size, line.limits.speed_step_max_m_per_s, "m/s")
-        setpoints.speed_m_per_s = command.speed_m_per_s
+        _require_step(cycle, size, line.limits.speed_step_max_m_per_s, "m/s", setpoints.speed_step_pause_s(now_s))
+        setpoints.step_speed(command.speed_m_per_s, now_s)
     setpoints.speed_target_m_per_s = command.speed_m_per_s
     how = "at once" if command.step else f"at {line.moves.speed_rate_m_per_s2:g} m/s2"
     return f"line speed to {command.speed_m_per_s:g} m/s {how}"
 
 
-def _require_step(cycle: Cycle, size: float, largest: float, unit: str) -> None:
+def _require_step(cycle: Cycle, size: float, largest: float, unit: str, pause_s: float) -> None:
     if cycle.machine.phase is not Phase.RUNNING:
         raise Refused(f"a step needs a running line, this one is {cycle.machine.state.name}; leave out the step")
     if size > largest * (1.0 + 1e-9):
         raise Refused(f"a step of {size:g} {unit} is too large; allowed: {largest:g} {unit}, or a ramp of any size")
+    if pause_s > 0.0:
+        raise Refused(f"the last step was just now; the next one may come in {pause_s:.1f} s, a ramp at any time")
 
 
 def _select_recipe(cycle: Cycle, command: SelectRecipe) -> str:
@@ -169,6 +203,5 @@ def _select_recipe(cycle: Cycle, command: SelectRecipe) -> str:
         close = nearest(command.name, recipes)
         hint = f"; did you mean {close}?" if close else ""
         raise Refused(f"there is no recipe {command.name!r}{hint} Known: {', '.join(recipes)}")
-    cycle.setpoints.tension_target_n[:] = recipe.tension_n
-    cycle.setpoints.speed_target_m_per_s = recipe.speed_m_per_s
+    cycle.setpoints.aim_at(recipe)
     return f"recipe {recipe.name}: tensions and speed move to it"

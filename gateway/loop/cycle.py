@@ -9,37 +9,34 @@ import numpy as np
 from drivers.port import Link
 from gateway.control.law import Law, Measured
 from gateway.core.line import Line
-from gateway.core.signals import DriveRequest, DriveState, FloatArray, Inputs, Outputs, Quality
+from gateway.core.signals import BoolArray, DriveRequest, DriveState, FloatArray, Inputs, Outputs, Quality
 from gateway.core.states import LoopState, Phase
 from gateway.core.telemetry import Frame
 from gateway.loop import machine as machines
 from gateway.loop.machine import Machine, Observation, Times
 from gateway.loop.pacer import Tick
 from gateway.loop.setpoints import Setpoints
+from gateway.loop.torque import LawFailed, TorquePath
 from safety.actions import Action, Finding, most_severe
-from safety.envelope import (
-    EnvelopeState,
-    Supervision,
-    check_inputs,
-    check_timing,
-    check_torque,
-    feedback_usable,
-    limit_torque,
-)
+from safety.envelope import NOTHING, Assessment, EnvelopeState, Supervision, check_inputs, check_timing
 from safety.limits import envelope_limits
 
 READ_SHARE = 0.5  #: of a period, for samples to arrive; the rest is for control and writing
+STILL_ON_PERIODS = 10  #: a drive that is told OFF and still says ENABLED is told to stop quickly
 
 CONTROLLED = (Phase.TENSIONING, Phase.RUNNING, Phase.HOLDING, Phase.SLOWING)
-TENSIONED = (Phase.RUNNING, Phase.HOLDING, Phase.SLOWING)
-REQUEST_OF = {
-    Phase.READY: DriveRequest.READY,
-    Phase.ENABLING: DriveRequest.ENABLE,
-    Phase.TENSIONING: DriveRequest.ENABLE,
-    Phase.RUNNING: DriveRequest.ENABLE,
-    Phase.HOLDING: DriveRequest.ENABLE,
-    Phase.SLOWING: DriveRequest.ENABLE,
-    Phase.UNLOADING: DriveRequest.ENABLE,
+WITH_TORQUE = (*CONTROLLED, Phase.UNLOADING)
+SUPERVISION = {
+    Phase.SILENT: NOTHING,
+    Phase.ARMING: NOTHING,
+    Phase.READY: Supervision(False, False, False, (DriveState.READY,), False),
+    Phase.ENABLING: NOTHING,
+    Phase.TENSIONING: Supervision(True, True, False, (DriveState.ENABLED,), False),
+    Phase.RUNNING: Supervision(True, False, True, (DriveState.ENABLED,), True),
+    Phase.HOLDING: Supervision(True, False, True, (DriveState.ENABLED,), True),
+    Phase.SLOWING: Supervision(True, False, True, (DriveState.ENABLED,), False),
+    Phase.UNLOADING: NOTHING,
+    Phase.OFF: NOTHING,
 }
 
 
@@ -65,33 +62,35 @@ class Cycle:
         announce: Callable[[Machine, Machine, list[Finding]], None],
     ) -> None:
         self.line = line
-        self.law = law
         self.links = links
         self.limits = envelope_limits(line)
+        self.torque_path = TorquePath(law, self.limits, line.moves)
         self.machine = Machine(since_s=clock())
         self.inputs = Inputs(line.n)
         self.outputs = Outputs(line.n)
-        recipe = line.recipes[0]
-        targets = np.array(recipe.tension_n)
-        self.setpoints = Setpoints(np.zeros(line.n), targets, 0.0, recipe.speed_m_per_s)
+        self.setpoints = Setpoints(line.recipes[0])
         self.account = Account()
         self._clock = clock
         self._record = record
         self._announce = announce
         self._times = Times(line.limits.tensioning_time_s, line.moves.stop_time_s)
         self._envelope = EnvelopeState()
-        self._law_state: Any = None  #: None while the law is not engaged
+        self._still_on = np.zeros(line.n, dtype=np.int64)  #: periods in a row ENABLED while told OFF
 
     async def period(self, tick: Tick) -> None:
+        """Read, decide, write."""
         await self._read(tick)
-        findings = self._check(tick)
-        self._step_machine(findings, tick.now_s)
-        torque, saturated = self._torque(tick)
-        self._write(torque)
+        seen = self._check(tick)
+        self._step_machine(seen, tick.now_s)
+        torque_nm, saturated = self._torque(seen, tick)
+        self._write(torque_nm)
         self._frame(tick, saturated)
 
     def change(self, machine: Machine) -> None:
         """Take over what a command decided. Between two periods only."""
+        if machine.phase is Phase.ARMING:
+            self.torque_path.lost[:] = False
+            self.setpoints.aim_at(self.setpoints.recipe)
         self._move_to(machine, [])
 
     async def _read(self, tick: Tick) -> None:
@@ -101,102 +100,105 @@ class Cycle:
         for link in self.links:
             await link.collect(self.inputs, deadline_s)
 
-    def _check(self, tick: Tick) -> list[Finding]:
+    def _check(self, tick: Tick) -> Assessment:
         phase = self.machine.phase
-        supervision = Supervision(
-            feedback=phase in CONTROLLED,
-            tension_floor=phase in TENSIONED,
-            drives_enabled=phase in CONTROLLED,
-        )
+        if phase in WITH_TORQUE:
+            self.torque_path.lost |= self.inputs.drive_state != DriveState.ENABLED
         late, self._envelope = check_timing(self.limits, self._envelope, tick.skipped)
-        findings, self._envelope = check_inputs(self.limits, self._envelope, self.inputs, supervision)
-        return [] if phase is Phase.SILENT else late + findings
+        seen, self._envelope = check_inputs(self.limits, self._envelope, self.inputs, SUPERVISION[phase])
+        if phase is Phase.SILENT:
+            seen.findings.clear()
+        elif phase is not Phase.ARMING:
+            seen.findings.extend(late)
+        return seen
 
-    def _step_machine(self, findings: list[Finding], now_s: float) -> None:
+    def _step_machine(self, seen: Assessment, now_s: float) -> None:
         states = self.inputs.drive_state
-        unwind = self.inputs.unwind_speed
-        tension = self.inputs.tension.value[self.limits.measured > 0]
-        seen = Observation(
-            action=most_severe(findings),
-            reason="; ".join(finding.text for finding in findings if finding.action >= Action.STOP),
-            drives_ready=bool(((states == DriveState.READY) | (states == DriveState.ENABLED)).all()),
+        observation = Observation(
+            action=most_severe(seen.findings),
+            reason="; ".join(finding.text for finding in seen.findings if finding.action >= Action.STOP),
+            drives_ready=bool((states == DriveState.READY).all()),
             drives_enabled=bool((states == DriveState.ENABLED).all()),
-            tensioned=self.setpoints.reached()
-            and bool(((tension >= self.limits.tension_min_n) & (tension <= self.limits.tension_max_n)).all()),
-            standstill=self.setpoints.speed_m_per_s == 0.0
-            and unwind.quality[0] == Quality.GOOD
-            and abs(unwind.value[0]) <= machines.STANDSTILL_M_PER_S,
-            plc_answers=self._envelope.plc_missing_periods < self.limits.hold_periods,
-            feedback=self._envelope.missing_periods < self.limits.hold_periods,
+            tensioned=self.setpoints.followed_by(self.inputs.tension.value, self.limits.measured),
+            standstill=self.setpoints.speed_m_per_s == 0.0 and standing(self.inputs),
+            plc_answers=not seen.plc_lost,
+            feedback=not seen.feedback_lost,
             torque_zero=not self.outputs.torque_nm.any(),
         )
-        self._move_to(machines.advance(self._times, self.machine, seen, now_s), findings)
+        self._move_to(machines.advance(self._times, self.machine, observation, now_s), seen.findings)
 
     def _move_to(self, machine: Machine, findings: list[Finding]) -> None:
         before, self.machine = self.machine, machine
         if before.phase is not machine.phase:
             self._announce(before, machine, findings)
 
-    def _torque(self, tick: Tick) -> tuple[FloatArray, bool]:
+    def _torque(self, seen: Assessment, tick: Tick) -> tuple[FloatArray, bool]:
         """The torque (n,) to apply in this period, and whether a limit cut it."""
-        applied = self.outputs.torque_nm
+        applied_nm = self.outputs.torque_nm
         if self.machine.phase not in CONTROLLED:
-            self._law_state = None
+            self.torque_path.disengage()
             self.account.held = 0
-            return self._unload(applied), False
-        self._advance_setpoints()
-        if not feedback_usable(self.limits, self.inputs):
+            unloading = self.machine.phase is Phase.UNLOADING
+            return self.torque_path.unload(applied_nm) if unloading else np.zeros(self.line.n), False
+        if not seen.usable:
             self.account.held += 1
-            return applied, False
+            return np.where(self.torque_path.lost, 0.0, applied_nm), False
         self.account.held = 0
-        measured = self._estimate()
-        if self._law_state is None:
-            self.setpoints.begin_at(np.where(self.limits.measured > 0, measured.tension_n, 0.0))
-            self._law_state = self.law.engage(measured, self.setpoints.tension_n, applied)
-        decision = self.law.ask(self._law_state, measured, self.setpoints.tension_n)
-        unusable = check_torque(decision.torque_nm)
-        if unusable:
-            self._move_to(machines.torque_off(self.machine, tick.now_s, unusable[0].text), unusable)
-            return self._torque(tick)
+        self._advance_setpoints()
         # It is latched at the next tick: after a late wake-up that is less than a period away.
         interval_s = tick.due_s + self.limits.period_s - tick.now_s
-        torque = limit_torque(self.limits, decision.torque_nm, applied, interval_s)
-        self._law_state = self.law.commit(self._law_state, decision, torque)
-        return torque, bool((torque != decision.torque_nm).any())
+        try:
+            return self.torque_path.control(self._estimate(), self.setpoints, applied_nm, interval_s)
+        except LawFailed as failed:
+            off = machines.torque_off(self.machine, tick.now_s, failed.finding.text)
+            self._move_to(off, [failed.finding])
+            return self._torque(seen, tick)
 
     def _estimate(self) -> Measured:
         # The measured values as they are; a law with an observer takes its place here.
         inputs = self.inputs
         return Measured(inputs.tension.value, inputs.speed.value, float(inputs.unwind_speed.value[0]))
 
-    def _unload(self, applied: FloatArray) -> FloatArray:
-        if self.machine.phase is not Phase.UNLOADING:
-            return np.zeros(self.line.n)
-        reach = self.line.moves.torque_off_rate_nm_per_s * self.limits.period_s
-        return np.sign(applied) * np.maximum(np.abs(applied) - reach, 0.0)
-
     def _advance_setpoints(self) -> None:
         moves = self.line.moves
-        running = self.machine.phase is Phase.RUNNING
-        goal = self.setpoints.speed_target_m_per_s if running else 0.0
+        goal = self.setpoints.speed_target_m_per_s if self.machine.phase is Phase.RUNNING else 0.0
         stopping = self.machine.state is LoopState.STOP
         rate = moves.stop_rate_m_per_s2 if stopping else moves.speed_rate_m_per_s2
         self.setpoints.advance(moves, self.limits.period_s, goal, rate)
 
-    def _write(self, torque: FloatArray) -> None:
-        outputs, machine = self.outputs, self.machine
-        request = REQUEST_OF.get(machine.phase, DriveRequest.OFF)
-        outputs.torque_nm = torque
-        outputs.drive_request[:] = request
-        if machine.phase is Phase.ARMING:
-            faulty = self.inputs.drive_state == DriveState.FAULT
-            outputs.drive_request[:] = np.where(faulty, DriveRequest.RESET_FAULT, DriveRequest.READY)
-        if machine.phase not in CONTROLLED:
+    def _write(self, torque_nm: FloatArray) -> None:
+        outputs, phase = self.outputs, self.machine.phase
+        outputs.torque_nm = torque_nm
+        outputs.drive_request[:] = self._requests()
+        if phase not in CONTROLLED:
             self.setpoints.speed_m_per_s = 0.0
         outputs.speed_request_m_per_s = self.setpoints.speed_m_per_s
-        outputs.run = machine.phase in CONTROLLED
+        outputs.run = phase in CONTROLLED
         for link in self.links:
             link.write(outputs)
+
+    def _requests(self) -> Any:
+        """What is asked of each drive: enabling only while ENABLING, and again only after a person has armed."""
+        states, phase = self.inputs.drive_state, self.machine.phase
+        off, enable = int(DriveRequest.OFF), int(DriveRequest.ENABLE)
+        if phase in WITH_TORQUE:
+            return np.where(self.torque_path.lost, off, enable)
+        if phase is Phase.ENABLING:
+            return enable
+        if phase is Phase.READY:
+            return int(DriveRequest.READY)
+        if phase is Phase.ARMING:
+            return np.where(states == DriveState.FAULT, int(DriveRequest.RESET_FAULT), int(DriveRequest.READY))
+        return np.where(self._stays_on(), int(DriveRequest.QUICK_STOP), off)
+
+    def _stays_on(self) -> BoolArray:
+        """Drives (n,) that do not obey OFF. Said once, when it begins."""
+        on = self.inputs.drive_state == DriveState.ENABLED
+        self._still_on = np.where(on, self._still_on + 1, 0)
+        for i in np.flatnonzero(self._still_on == STILL_ON_PERIODS):
+            text = f"drive {i + 1} stays enabled though it was told off; it is told to stop quickly: cut its power"
+            self._announce(self.machine, self.machine, [Finding("drive stays on", Action.TORQUE_OFF, text)])
+        return self._still_on >= STILL_ON_PERIODS
 
     def _frame(self, tick: Tick, saturated: bool) -> None:
         inputs, account = self.inputs, self.account
@@ -223,3 +225,9 @@ class Cycle:
                 drive_state=inputs.drive_state,
             )
         )
+
+
+def standing(inputs: Inputs) -> bool:
+    """Whether the unwinder is known to stand still."""
+    unwind = inputs.unwind_speed
+    return unwind.quality[0] == Quality.GOOD and abs(float(unwind.value[0])) <= machines.STANDSTILL_M_PER_S

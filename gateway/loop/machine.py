@@ -1,11 +1,9 @@
 """The loop's state machine. Pure: what was observed in a period and the time go in, the next phase comes out.
 
-                arm                  start                                  hold
-    SILENT -> ARMING -> READY -> ENABLING -> TENSIONING -> RUNNING <-> HOLDING
-                                     |            |           |            |
-                                     +------------+-----+-----+------------+   stop, or a finding of safety/
-                                                        v
-                                          SLOWING -> UNLOADING -> OFF -> (arm) ARMING
+    SILENT --arm--> ARMING --> READY --start--> ENABLING --> TENSIONING --> RUNNING <--hold, start--> HOLDING
+
+    ARMING, READY, ENABLING       --stop, or a finding of safety/--> OFF
+    TENSIONING, RUNNING, HOLDING  --stop, or a finding of safety/--> SLOWING --> UNLOADING --> OFF --arm--> ARMING
 
 From OFF and SILENT only a person's `arm` leads on.
 """

@@ -3,16 +3,19 @@
 import asyncio
 import signal
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 from drivers.registry import build_links
 from gateway.control.laws import make_law
 from gateway.core.controller import LqiConfig, PidConfig, config_hash
 from gateway.core.line import Line
-from gateway.core.messages import Event, Stop
-from gateway.core.states import LoopState, Phase
+from gateway.core.messages import Event
+from gateway.core.signals import Outputs
+from gateway.core.states import Phase
 from gateway.core.telemetry import Frame, pack
 from gateway.core.topics import LOOP_COMMAND, LOOP_EVENT, LOOP_TELEMETRY
+from gateway.loop.commands import release
 from gateway.loop.cycle import Cycle
 from gateway.loop.machine import Machine
 from gateway.loop.pacer import TimerPacer, monotonic
@@ -22,6 +25,8 @@ from gateway.mailbox.paths import GATEWAY_SOCKET, LOOP_SOCKET
 from gateway.mailbox.unix import UnixMailbox
 from safety.actions import Finding
 
+RESTING_PERIODS = 5
+
 
 def run_loop(line: Line, config: LqiConfig | PidConfig, run_folder: Path, say: Callable[[str], None]) -> None:
     """Run until SIGTERM or SIGINT, which stop the line first.
@@ -29,10 +34,6 @@ def run_loop(line: Line, config: LqiConfig | PidConfig, run_folder: Path, say: C
     Raises AlreadyRunning before anything is sent, CannotListen, PathTooLong, and LinksRefused
     when the drivers cannot carry the line.
     """
-    granted, refused = become_punctual(line.control.cpu, line.control.priority)
-    say("; ".join(granted) or "no real-time help granted")
-    for sentence in refused:
-        say(sentence)
     asyncio.run(_main(line, config, run_folder, say))
 
 
@@ -74,25 +75,44 @@ async def _main(line: Line, config: LqiConfig | PidConfig, run_folder: Path, say
         tell("start", f"loop of {line.site}/{line.line}, {config.kind} controller {config_hash(config)[:12]}")
         say(f"loop of {line.site}/{line.line} is SILENT, commands on {run_folder / LOOP_SOCKET}")
         freeze_collector()
-        await _run_until(runner, line.control.period_s, ending)
+        # Last: what starts up must not take a processor from another line's loop.
+        granted, refused = become_punctual(line.control.cpu, line.control.priority)
+        for sentence in ["; ".join(granted) or "no real-time help granted", *refused]:
+            say(sentence)
+        await _run_until(runner, line, ending)
     finally:
         for link in links:
             await link.close()
         await mailbox.close()
 
 
-async def _run_until(runner: Runner, period_s: float, ending: asyncio.Event) -> None:
-    pacer = TimerPacer(period_s)
+async def _run_until(runner: Runner, line: Line, ending: asyncio.Event) -> None:
+    pacer = TimerPacer(line.control.period_s)
     try:
         while not ending.is_set():
             await runner.period(await pacer.wait())
-        # A controlled stop before leaving; the machine bounds its time.
-        stopping = asyncio.ensure_future(runner.submit(Stop()))
-        while not stopping.done() or not _at_rest(runner.cycle):
+        await runner.end()
+        deadline_s = monotonic() + line.longest_stop_s
+        resting = 0  # periods; what is handed over acts with the next, and the drives say so with the one after
+        while resting < RESTING_PERIODS and monotonic() < deadline_s:
             await runner.period(await pacer.wait())
+            resting = resting + 1 if runner.at_rest else 0
+        if runner.cycle.machine.phase is Phase.OFF:
+            await release(runner.cycle)
+    except Exception:
+        await _torque_off(runner.cycle, pacer)
+        raise
     finally:
         pacer.close()
 
 
-def _at_rest(cycle: Cycle) -> bool:
-    return cycle.machine.state is LoopState.SILENT or cycle.machine.phase is Phase.OFF
+async def _torque_off(cycle: Cycle, pacer: TimerPacer) -> None:
+    """The last thing a broken loop does: tell every drive to take torque off. Their watchdogs stand behind it."""
+    for link in cycle.links:
+        with suppress(Exception):
+            link.write(Outputs(cycle.line.n))
+    tick = await pacer.wait()
+    for link in cycle.links:
+        with suppress(Exception):
+            link.trigger(tick.now_s)
+            await link.release()

@@ -3,24 +3,29 @@
 import asyncio
 from collections import deque
 
-from gateway.core.messages import Arm, Command, MalformedMessage, Reply, parse_command
+from gateway.core.messages import Arm, Command, MalformedMessage, Reply, Stop, parse_command
 from gateway.core.states import LoopState, Phase
 from gateway.loop.commands import carry_out, prepare_to_arm
 from gateway.loop.cycle import Cycle
 from gateway.loop.pacer import Tick
 
-MAX_WAITING = 32  #: commands between two periods; more are refused
+MAX_WAITING = 32  #: commands between two periods; more are refused, but for a stop
+
+Answer = asyncio.Future[Reply]
 
 
 class Runner:
     def __init__(self, cycle: Cycle) -> None:
         self.cycle = cycle
-        self._waiting: deque[tuple[Command, asyncio.Future[Reply]]] = deque()
-        self._passed: asyncio.Event = asyncio.Event()
-        self._arming = False
+        self._waiting: deque[tuple[Command, Answer]] = deque()
+        self._passed = asyncio.Event()
+        self._arming: asyncio.Task[Reply | None] | None = None
+        self._ending = False
 
     async def period(self, tick: Tick) -> None:
         """Carry out what waits, then one control period."""
+        if self._ending:
+            carry_out(self.cycle, Stop(), tick.now_s)
         while self._waiting:
             command, answer = self._waiting.popleft()
             reply = carry_out(self.cycle, command, tick.now_s)
@@ -29,6 +34,15 @@ class Runner:
         await self.cycle.period(tick)
         self._passed.set()
         self._passed = asyncio.Event()
+
+    async def end(self) -> None:
+        """From now on the line is being stopped, and no other command is taken. Periods must go on until it rests."""
+        self._ending = True
+        await self._cancel_arming()
+
+    @property
+    def at_rest(self) -> bool:
+        return self.cycle.machine.phase in (Phase.SILENT, Phase.OFF)
 
     async def command(self, payload: bytes) -> bytes:
         """Answer a command from outside. Never raises for what is in `payload`."""
@@ -40,31 +54,44 @@ class Runner:
 
     async def submit(self, command: Command) -> Reply:
         """Do `command` at the next boundary between periods; the reply says what was done, or why not."""
+        if isinstance(command, Stop):  # whatever else waits, and also into an arming
+            await self._cancel_arming()
+            return await self._at_boundary(command)
+        if self._ending:
+            return self._refused("the loop is ending")
         if len(self._waiting) >= MAX_WAITING:
             return self._refused("too many commands at once: try again")
-        if isinstance(command, Arm):
-            return await self._arm(command)
-        return await self._at_boundary(command)
+        return await (self._arm(command) if isinstance(command, Arm) else self._at_boundary(command))
 
     async def _at_boundary(self, command: Command) -> Reply:
-        answer: asyncio.Future[Reply] = asyncio.get_running_loop().create_future()
-        self._waiting.append((command, answer))
+        answer: Answer = asyncio.get_running_loop().create_future()
+        (self._waiting.appendleft if isinstance(command, Stop) else self._waiting.append)((command, answer))
         return await answer
 
     async def _arm(self, command: Arm) -> Reply:
-        if self._arming:
+        if self._arming is not None:
             return self._refused("arming is under way")
-        self._arming = True
+        self._arming = asyncio.create_task(prepare_to_arm(self.cycle))
         try:
-            refusal = await prepare_to_arm(self.cycle)
-            reply = refusal or await self._at_boundary(command)
-            while reply.ok and self.cycle.machine.phase is Phase.ARMING:
-                await self._passed.wait()
+            await asyncio.wait([self._arming])
+            if self._arming.cancelled():
+                return self._refused("not armed: it was stopped")
+            refusal = self._arming.result()
         finally:
-            self._arming = False
-        if reply.ok and self.cycle.machine.state is not LoopState.READY:
+            self._arming = None
+        reply = refusal or await self._at_boundary(command)
+        while reply.ok and self.cycle.machine.phase is Phase.ARMING:
+            await self._passed.wait()
+        if not reply.ok:
+            return reply
+        if self.cycle.machine.state is not LoopState.READY:
             return self._refused(f"not armed: {self.cycle.machine.reason}")
-        return reply.model_copy(update={"state": self.cycle.machine.state.name}) if reply.ok else reply
+        return reply.model_copy(update={"state": self.cycle.machine.state.name})
+
+    async def _cancel_arming(self) -> None:
+        if self._arming is not None:
+            self._arming.cancel()
+            await asyncio.wait([self._arming])
 
     def _refused(self, text: str) -> Reply:
         return Reply(ok=False, state=self.cycle.machine.state.name, text=text)

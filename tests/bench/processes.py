@@ -8,7 +8,7 @@ import numpy as np
 
 from gateway.core.messages import Stop
 from tests.bench.figures import Bench
-from tests.closed_loop.wire import WireLine, heard
+from tests.closed_loop.wire import WireLine, heard, silent_periods_until_ramp
 
 KILLS = 10
 PERIOD_S = 0.01
@@ -66,19 +66,7 @@ def kill_sim(seed: int) -> int:
             wire.kill("sim")
             frames = heard(bus, 0.5)
         wire.wait(lambda status: status.loop.state == "STOP")
-        syncs = 0
-        held: dict[int, bytes] = {}
-        for frame in frames:
-            cob_id = frame.arbitration_id
-            if 0x180 < cob_id < 0x200:
-                syncs, held = 0, {}
-            elif cob_id == 0x80:
-                syncs += 1
-            elif 0x200 < cob_id < 0x280 and syncs:
-                torque = bytes(frame.data[2:4])
-                if held.setdefault(cob_id, torque) != torque:
-                    return syncs
-        raise AssertionError("the torque commands never moved")
+        return silent_periods_until_ramp(frames)
 
 
 if __name__ == "__main__":

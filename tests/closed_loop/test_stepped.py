@@ -124,7 +124,7 @@ def test_a_law_that_gives_nan_never_reaches_the_drives(running, monkeypatch):
     from gateway.control.law import Decision
 
     broken = Decision(np.full(6, np.nan), np.zeros(6), np.zeros(6))
-    monkeypatch.setattr(running.cycle.law, "ask", lambda *_: broken)
+    monkeypatch.setattr(running.cycle.torque_path.law, "ask", lambda *_: broken)
     running.step(1)
     assert running.cycle.machine.phase is Phase.UNLOADING and "finite" in running.cycle.machine.reason
     assert running.step_until(Phase.OFF, 1.0)

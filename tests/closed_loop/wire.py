@@ -143,3 +143,20 @@ def from_master(frame: can.Message) -> bool:
         or 0x200 < frame.arbitration_id < 0x280
         or 0x600 < frame.arbitration_id < 0x680
     )
+
+
+def silent_periods_until_ramp(frames: list[can.Message]) -> int:
+    """SYNCs in a row without any answer until a torque command differs from the one held since the first of them."""
+    silent = 0
+    held: dict[int, bytes] = {}
+    for frame in frames:
+        cob_id = frame.arbitration_id
+        if 0x180 < cob_id < 0x200:
+            silent, held = 0, {}
+        elif cob_id == 0x80:
+            silent += 1
+        elif 0x200 < cob_id < 0x280 and silent:
+            torque = bytes(frame.data[2:4])
+            if held.setdefault(cob_id, torque) != torque:
+                return silent
+    raise AssertionError("the torque commands never moved")

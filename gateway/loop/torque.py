@@ -1,0 +1,62 @@
+"""From the samples of a period to the torque that is applied: engage, ask, limit; unloading at the end of a stop."""
+
+from typing import Any
+
+import numpy as np
+
+from gateway.control.law import Law, Measured
+from gateway.core.line import Moves
+from gateway.core.signals import BoolArray, FloatArray
+from gateway.loop.setpoints import Setpoints
+from safety.actions import Finding
+from safety.envelope import check_torque, limit_torque
+from safety.limits import EnvelopeLimits
+
+
+class LawFailed(Exception):
+    """The control law gave what must not be applied."""
+
+    def __init__(self, finding: Finding) -> None:
+        super().__init__(finding.text)
+        self.finding = finding
+
+
+class TorquePath:
+    """A law, its state, and the drives that it has lost."""
+
+    def __init__(self, law: Law[Any], limits: EnvelopeLimits, moves: Moves) -> None:
+        self.law = law
+        self.lost: BoolArray = np.zeros(law.n, dtype=np.bool_)  #: drives that left by themselves: off until armed
+        self._limits = limits
+        self._moves = moves
+        self._state: Any = None  #: None while the law is not engaged
+
+    def disengage(self) -> None:
+        """The next `control` engages anew, from what is measured then."""
+        self._state = None
+
+    def control(
+        self, measured: Measured, setpoints: Setpoints, applied_nm: FloatArray, interval_s: float
+    ) -> tuple[FloatArray, bool]:
+        """The torque (n,) to apply, and whether a limit cut it. Raises LawFailed.
+
+        `applied_nm` (n,) is that of the period before. A drive that was lost gives nothing, and the law is told so.
+        """
+        applied_nm = np.where(self.lost, 0.0, applied_nm)
+        if self._state is None:
+            setpoints.begin_at(np.where(self._limits.measured > 0, measured.tension_n, 0.0))
+            self._state = self.law.engage(measured, setpoints.tension_n, applied_nm)
+        decision = self.law.ask(self._state, measured, setpoints.tension_n)
+        for finding in check_torque(decision.torque_nm):
+            raise LawFailed(finding)
+        torque_nm = limit_torque(self._limits, decision.torque_nm, applied_nm, interval_s)
+        torque_nm[self.lost] = 0.0
+        self._state = self.law.commit(self._state, decision, torque_nm)
+        return torque_nm, bool((torque_nm != decision.torque_nm).any())
+
+    def unload(self, applied_nm: FloatArray) -> FloatArray:
+        """A period's way from `applied_nm` (n,) to zero."""
+        reach = self._moves.torque_off_rate_nm_per_s * self._limits.period_s
+        torque_nm = np.sign(applied_nm) * np.maximum(np.abs(applied_nm) - reach, 0.0)
+        torque_nm[self.lost] = 0.0
+        return torque_nm

@@ -1,0 +1,150 @@
+"""Commands against periods: a stop goes before everything, into an arming, and into the end of the process."""
+
+import asyncio
+
+import numpy as np
+import pytest
+
+from drivers.memory import MemoryLink
+from gateway.core.messages import Arm, SetSpeed, SetTension, Start, Stop
+from gateway.core.states import LoopState, Phase
+from gateway.loop.pacer import Tick
+from gateway.loop.process import _run_until
+from gateway.loop.runner import MAX_WAITING, Runner
+from tests.closed_loop.conftest import start, stepped
+
+
+class Story:
+    """A runner whose periods are run by the test."""
+
+    def __init__(self, loop):
+        self.loop = loop
+        self.runner = Runner(loop.cycle)
+
+    async def periods(self, count):
+        for _ in range(count):
+            self.loop.now_s = self.loop.periods * self.loop.line.control.period_s
+            await self.runner.period(Tick(self.loop.now_s, self.loop.now_s, 0))
+            self.loop.periods += 1
+            await asyncio.sleep(0)
+
+    async def until(self, answer, most=1000):
+        for _ in range(most):
+            if answer.done():
+                return answer.result()
+            await self.periods(1)
+        raise AssertionError("no answer")
+
+    def order(self, command):
+        return asyncio.ensure_future(self.runner.submit(command))
+
+
+def test_a_stop_is_taken_however_many_commands_wait():
+    async def story():
+        told = Story(start(stepped()))
+        waiting = [told.order(SetTension(span=1, tension_n=30.0)) for _ in range(MAX_WAITING + 3)]
+        stop = told.order(Stop())
+        await asyncio.sleep(0)
+        await told.periods(1)
+        assert (await stop).ok and told.loop.cycle.machine.phase is Phase.SLOWING
+        replies = [await answer for answer in waiting]
+        assert sum("too many" in reply.text for reply in replies) == 3
+
+    asyncio.run(story())
+
+
+def test_a_stop_goes_into_an_arming_and_nothing_is_left_half_way(monkeypatch):
+    released = []
+
+    async def never(self):
+        await asyncio.Event().wait()
+
+    async def release(self):
+        released.append(self)
+        self.silence()
+
+    async def story():
+        told = Story(stepped())
+        await told.periods(3)
+        monkeypatch.setattr(MemoryLink, "prepare", never)
+        monkeypatch.setattr(MemoryLink, "release", release)
+        arming = told.order(Arm())
+        await told.periods(3)
+        assert not arming.done() and not (await told.until(told.order(Arm()))).ok
+        stop = told.order(Stop())
+        assert (await told.until(stop)).ok
+        reply = await told.until(arming)
+        assert not reply.ok and "stopped" in reply.text
+        assert told.loop.cycle.machine.state is LoopState.SILENT and len(released) == 1
+        monkeypatch.undo()
+        assert (await told.until(told.order(Arm()))).state == "READY"
+
+    asyncio.run(story())
+
+
+def test_arm_answers_when_the_drives_are_ready_and_not_before():
+    async def story():
+        told = Story(stepped())
+        await told.periods(3)
+        reply = await told.until(told.order(Arm()))
+        assert reply.ok and reply.state == "READY"
+        assert not (await told.until(told.order(Arm()))).ok
+
+    asyncio.run(story())
+
+
+@pytest.mark.parametrize("command", [Start(), SetSpeed(speed_m_per_s=0.1)])
+def test_an_ending_loop_stops_the_line_and_takes_no_other_command(command):
+    async def story():
+        told = Story(start(stepped()))
+        await told.runner.end()
+        assert "ending" in (await told.runner.submit(command)).text
+        await told.periods(1)
+        assert told.loop.cycle.machine.phase is Phase.SLOWING
+        await told.periods(400)
+        assert told.runner.at_rest and not told.loop.truth.world.torque_nm.any()
+        assert told.loop.truth.recorder.unsafe_total == 0
+
+    asyncio.run(story())
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [b"", b"nonsense", b'{"command": "arm", "command": "start"}', b'{"command": "fly"}',
+     b'{"command": "set", "span": 1}',
+     b'{"command": "set", "span": true, "tension_n": 30}', b'{"command": "speed", "speed_m_per_s": NaN}',
+     b"[" * 3000, b'{"command": "hold", "now": 1}', b" " * 5000],
+)  # fmt: skip
+def test_what_is_no_command_is_answered_and_does_nothing(payload):
+    async def story():
+        told = Story(stepped())
+        before = told.loop.cycle.machine
+        assert b'"ok":false' in await told.runner.command(payload)
+        await told.periods(2)
+        assert told.loop.cycle.machine == before
+
+    asyncio.run(story())
+
+
+def test_a_cycle_that_breaks_tells_every_drive_to_take_torque_off(monkeypatch):
+    """In real time: the last resort of the process waits for one more period."""
+
+    async def story():
+        loop = start(stepped())
+        told = Story(loop)
+        assert loop.truth.world.torque_nm.any()
+        plant_s = loop.now_s
+
+        def broken(*_):
+            raise RuntimeError("a defect")
+
+        monkeypatch.setattr(loop.cycle, "_estimate", broken)
+        monkeypatch.setattr(MemoryLink, "trigger", lambda self, now_s: setattr(self, "_now_s", plant_s + 0.01))
+        with pytest.raises(RuntimeError, match="a defect"):
+            await _run_until(told.runner, loop.line, asyncio.Event())
+        loop.truth.sample(plant_s + 1.0)
+        assert not loop.truth.world.torque_nm.any()
+        enabled = loop.truth.sample(plant_s + 1.1).enabled
+        assert not np.any(enabled)
+
+    asyncio.run(story())
