@@ -93,16 +93,16 @@ class Plc:
         if self._echo_stands_still(answer[2]):
             self._miss(inputs)
             return [f"{self.name}: answers, but its echo of the life counter stands still"]
-        if self.active and not self._may_write():
-            # It can be read, and not told to stop: for the loop it is not there.
-            self._miss(inputs)
-            return [f"{self.name}: is not written to: its watchdog is not proven, or the command is refused"]
         read, status = self._device.read, int(answer[0])
-        plc.quality, plc.time_s = Quality.GOOD, time_s
+        # A PLC that can be read but not told to stop is not there for the loop; its v0 is true all the same.
+        mute = self.active and not self._may_write()
+        plc.quality, plc.time_s = Quality.STALE if mute else Quality.GOOD, time_s
         plc.permissive = _is(read.permissive, status)
         plc.emergency_stop = _is(read.emergency_stop, status)
         plc.running = _is(read.running, status)
         troubles = [f"{self.name}: its command watchdog has tripped"] if _is(read.watchdog_tripped, status) else []
+        if mute:
+            troubles.append(f"{self.name}: is not written to: its watchdog is not proven, or the command is refused")
         low, high = read.speed.range
         if low <= answer[1] * read.speed.scale <= high:
             inputs.unwind_speed.put(0, answer[1] * self._read_speed_scale, time_s)

@@ -67,7 +67,7 @@ def in_words(command: Command) -> str:
 
 
 class Reply(Strict):
-    """What was done, or why not. A refusal has changed nothing; a refused arming leaves links silent, devices released."""
+    """What was done, or why not. A refusal has changed nothing, but that a refused arming has released the devices."""
 
     ok: bool
     state: str  #: the loop's state after the command

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
+from drivers.port import Link
 from drivers.registry import build_links
 from gateway.control.laws import make_law
 from gateway.core.controller import LqiConfig, PidConfig, config_hash
@@ -51,6 +52,9 @@ async def _main(line: Line, config: LqiConfig | PidConfig, run_folder: Path, say
         mailbox.publish(LOOP_EVENT, event.model_dump_json().encode())
 
     def announce(before: Machine, after: Machine, findings: list[Finding]) -> None:
+        if after.phase is before.phase:
+            tell("alarm", "; ".join(finding.text for finding in findings))
+            return
         text = f"{before.phase.name} to {after.phase.name}" + (f": {after.reason}" if after.reason else "")
         data: dict[str, object] = {"state": after.state.name}
         if findings:
@@ -65,12 +69,9 @@ async def _main(line: Line, config: LqiConfig | PidConfig, run_folder: Path, say
     for number in (signal.SIGTERM, signal.SIGINT):
         asyncio.get_running_loop().add_signal_handler(number, ending.set)
     try:
-        for link in links:
-            try:
-                await link.open()
-            except OSError as error:  # its devices are absent until it comes; arming is refused, and says so
-                say(str(error))
-                tell("bus", str(error))
+        for trouble in await _open(links):
+            say(trouble)
+            tell("bus", trouble)
         mailbox.serve(LOOP_COMMAND, runner.command)
         tell("start", f"loop of {line.site}/{line.line}, {config.kind} controller {config_hash(config)[:12]}")
         say(f"loop of {line.site}/{line.line} is SILENT, commands on {run_folder / LOOP_SOCKET}")
@@ -84,6 +85,17 @@ async def _main(line: Line, config: LqiConfig | PidConfig, run_folder: Path, say
         for link in links:
             await link.close()
         await mailbox.close()
+
+
+async def _open(links: list[Link]) -> list[str]:
+    """Open every bus. One that cannot be opened leaves its devices absent, and arming is refused; returns why."""
+    troubles: list[str] = []
+    for link in links:
+        try:
+            await link.open()
+        except OSError as error:
+            troubles.append(str(error))
+    return troubles
 
 
 async def _run_until(runner: Runner, line: Line, ending: asyncio.Event) -> None:

@@ -114,7 +114,8 @@ def test_a_speed_that_cannot_be_commanded_is_not_written(speed_m_per_s: float) -
         await cycle(link, inputs)
         assert peer.plc == before, "not even the life counter: the PLC's watchdog has the last word"
         assert link.health.malformed == 1 and "plc" in link.health.last_error
-        assert inputs.plc.quality == Quality.GOOD, "it is read all the same"
+        assert inputs.unwind_speed.quality[0] == Quality.GOOD, "it is read all the same"
+        assert inputs.plc.quality == Quality.STALE, "but a PLC that cannot be told to stop does not count as there"
 
     bench(body)
 
@@ -201,9 +202,9 @@ def test_an_answer_that_does_not_fit_is_a_lost_sample(script: Callable[..., Awai
 
 
 async def _until_good(link: ModbusLink, inputs: Inputs) -> None:
-    inputs.tension.quality[:] = Quality.STALE
+    inputs.tension.quality[:] = inputs.unwind_speed.quality[:] = Quality.STALE
     async with asyncio.timeout(5.0):
-        while not (inputs.tension.good() and inputs.plc.quality == Quality.GOOD):
+        while not (inputs.tension.good() and inputs.unwind_speed.good()):
             await cycle(link, inputs, 0.01)
             await asyncio.sleep(0)  # without a connection a cycle waits for nothing
 

@@ -97,7 +97,7 @@ VALUES = [
         "hold_periods = 3",
         "hold_periods = 3.0",
         "limits.hold_periods",
-        "is not a whole number; allowed: a whole number from 1 to 10",
+        "is not a whole number; allowed: a whole number from 1 to 3",
     ),
     ("format = 1", "format = 2", "format", "= 2: is too large; allowed: 1"),
     ("format = 1", "format = true", "format", "= true: is true or false; allowed: 1"),
