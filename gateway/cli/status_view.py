@@ -6,6 +6,7 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from gateway.core.messages import BusReport
 from gateway.supervisor.status import GatewayStatus, LimitsStatus, SpanStatus, Spread
 
 STATE_STYLE = {
@@ -18,7 +19,7 @@ STATE_STYLE = {
 }
 DRIVE_STYLE = {"ENABLED": "green", "READY": "cyan", "OFF": "", "STOPPING": "yellow"}  # all others: red
 GOOD_ERROR, POOR_ERROR = 0.05, 0.20  # of the set-point: where a tension is shown green, and where red
-FIXED_LINES = 11  # everything but spans and events
+FIXED_LINES = 12  # everything but spans and events
 LEAST_EVENTS = 3
 
 
@@ -133,6 +134,7 @@ def _health(status: GatewayStatus) -> RenderableType:
         "yellow" if link.dropped_frames or link.malformed else "",
     )
     grid.add_row("telemetry", Text.assemble(age, "; ", lost))
+    grid.add_row("buses", _buses(status.buses))
     stored = historian.text
     if historian.storing and historian.last_stored_age_s is not None:
         stored = f"{historian.frames_stored} frames, the last {_duration(historian.last_stored_age_s)} ago"
@@ -142,6 +144,17 @@ def _health(status: GatewayStatus) -> RenderableType:
         stored += f"; a damaged one is kept as {historian.moved_aside}"
     grid.add_row("history", Text(stored, "" if historian.storing else "bold red"))
     return grid
+
+
+def _buses(buses: list[BusReport]) -> Text:
+    """One line: every bus, who is absent, and the last trouble of a bus that has an absent device."""
+    words: list[str] = []
+    absent = False
+    for bus in buses:
+        absent = absent or bool(bus.absent)
+        lost = f", absent: {', '.join(bus.absent)} ({bus.last_error})" if bus.absent else ""
+        words.append(f"{bus.name} {bus.timeouts} late, {bus.malformed} discarded{lost}")
+    return Text("; ".join(words) or "not known", "bold red" if absent else "")
 
 
 def _events(status: GatewayStatus, count: int) -> RenderableType:

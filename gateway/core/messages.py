@@ -84,6 +84,20 @@ class Event(Strict):
     data: dict[str, Any] = {}
 
 
+class BusReport(Strict):
+    """How a bus and its devices fare, in the loop's words."""
+
+    name: str
+    absent: list[str]  #: devices that do not answer now
+    timeouts: int  #: samples that did not come in time, since the loop's start
+    malformed: int  #: frames and answers that were discarded
+    reconnects: int
+    last_error: str
+
+
+BUS_REPORTS: TypeAdapter[list[BusReport]] = TypeAdapter(list[BusReport])
+
+
 class MalformedMessage(Exception):
     """Bytes from outside that are no message; the text says why."""
 

@@ -14,8 +14,9 @@ class Topic:
 
 LOOP_TELEMETRY = Topic("loop/telemetry", "publish", "once a period", kept=True)
 LOOP_EVENT = Topic("loop/event", "publish", "100/s", kept=True)
+LOOP_BUSES = Topic("loop/buses", "publish", "1/s", kept=False)
 LOOP_COMMAND = Topic("loop/command", "request", "100/s", kept=False)
 GATEWAY_COMMAND = Topic("gateway/command", "request", "100/s", kept=True)
 GATEWAY_STATUS = Topic("gateway/status", "request", "20/s", kept=False)
 
-TOPICS = (LOOP_TELEMETRY, LOOP_EVENT, LOOP_COMMAND, GATEWAY_COMMAND, GATEWAY_STATUS)
+TOPICS = (LOOP_TELEMETRY, LOOP_EVENT, LOOP_BUSES, LOOP_COMMAND, GATEWAY_COMMAND, GATEWAY_STATUS)

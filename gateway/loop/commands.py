@@ -131,10 +131,12 @@ def _start(cycle: Cycle, now_s: float) -> str:
 
 def _moving_rollers(cycle: Cycle) -> list[str]:
     speed = cycle.inputs.speed
+    # A web that gives way after a stop lets its rollers creep; a tenth of the line's speed is no creeping.
+    creeping = 0.1 * cycle.line.limits.speed_max_m_per_s
     return [
         f"roller {i + 1} does not stand still, or its speed is not known"
         for i in range(cycle.line.n)
-        if speed.quality[i] != Quality.GOOD or abs(speed.value[i]) > machines.STANDSTILL_M_PER_S
+        if speed.quality[i] != Quality.GOOD or abs(speed.value[i]) > creeping
     ]
 
 
@@ -153,6 +155,8 @@ def _stop(cycle: Cycle, now_s: float) -> str:
     cycle.change(machines.stop(before, now_s, "operator's stop"))
     if cycle.machine is before:
         return "nothing is sent to the drives" if before.state is LoopState.SILENT else "stopping or stopped already"
+    if cycle.machine.phase is Phase.OFF:
+        return "torque is off; arm leads out of it"
     return "the line ramps to standstill, then torque goes off; arm leads out of it"
 
 
@@ -169,7 +173,7 @@ def _set_tension(cycle: Cycle, command: SetTension, now_s: float) -> str:
         _require_step(cycle, size, line.limits.tension_step_max_n, "N", setpoints.tension_step_pause_s(i, now_s))
         setpoints.step_tension(i, command.tension_n, now_s)
     setpoints.tension_target_n[i] = command.tension_n
-    how = "at once" if command.step else f"at {line.moves.tension_rate_n_per_s:g} N/s"
+    how = "at once" if command.step else _pace(cycle, f"at {line.moves.tension_rate_n_per_s:g} N/s")
     return f"span {command.span} to {command.tension_n:g} N {how}"
 
 
@@ -183,8 +187,13 @@ def _set_speed(cycle: Cycle, command: SetSpeed, now_s: float) -> str:
         _require_step(cycle, size, line.limits.speed_step_max_m_per_s, "m/s", setpoints.speed_step_pause_s(now_s))
         setpoints.step_speed(command.speed_m_per_s, now_s)
     setpoints.speed_target_m_per_s = command.speed_m_per_s
-    how = "at once" if command.step else f"at {line.moves.speed_rate_m_per_s2:g} m/s2"
+    how = "at once" if command.step else _pace(cycle, f"at {line.moves.speed_rate_m_per_s2:g} m/s2")
     return f"line speed to {command.speed_m_per_s:g} m/s {how}"
+
+
+def _pace(cycle: Cycle, rate: str) -> str:
+    """Set-points move while the line is controlled; before that they are where it will start to."""
+    return rate if cycle.machine.state in (LoopState.RUN, LoopState.HOLD) else "from the next start on"
 
 
 def _require_step(cycle: Cycle, size: float, largest: float, unit: str, pause_s: float) -> None:

@@ -90,7 +90,6 @@ class Cycle:
         """Take over what a command decided. Between two periods only."""
         if machine.phase is Phase.ARMING:
             self.torque_path.lost[:] = False
-            self.setpoints.aim_at(self.setpoints.recipe)
         self._move_to(machine, [])
 
     async def _read(self, tick: Tick) -> None:
@@ -113,12 +112,11 @@ class Cycle:
         return seen
 
     def _step_machine(self, seen: Assessment, now_s: float) -> None:
-        states = self.inputs.drive_state
         observation = Observation(
             action=most_severe(seen.findings),
             reason="; ".join(finding.text for finding in seen.findings if finding.action >= Action.STOP),
-            drives_ready=bool((states == DriveState.READY).all()),
-            drives_enabled=bool((states == DriveState.ENABLED).all()),
+            not_ready=self._drives_other_than(DriveState.READY),
+            not_enabled=self._drives_other_than(DriveState.ENABLED),
             tensioned=self.setpoints.followed_by(self.inputs.tension.value, self.limits.measured),
             standstill=self.setpoints.speed_m_per_s == 0.0 and standing(self.inputs),
             plc_answers=not seen.plc_lost,
@@ -127,10 +125,23 @@ class Cycle:
         )
         self._move_to(machines.advance(self._times, self.machine, observation, now_s), seen.findings)
 
+    def _drives_other_than(self, wanted: DriveState) -> str:
+        """ "drive-3 STO, drive-5 FAULT": the drives that are not as wanted."""
+        states = self.inputs.drive_state
+        if (states == wanted).all():
+            return ""
+        names = {drive.roller - 1: drive.name for drive in self.line.drives}
+        return ", ".join(
+            f"{names[i]} {DriveState(int(states[i])).name}" for i in range(self.line.n) if states[i] != wanted
+        )
+
     def _move_to(self, machine: Machine, findings: list[Finding]) -> None:
         before, self.machine = self.machine, machine
-        if before.phase is not machine.phase:
-            self._announce(before, machine, findings)
+        if before.phase is machine.phase:
+            return
+        if machine.phase is Phase.OFF:  # a speed from before the stop is not taken up again
+            self.setpoints.speed_target_m_per_s = self.setpoints.recipe.speed_m_per_s
+        self._announce(before, machine, findings)
 
     def _torque(self, seen: Assessment, tick: Tick) -> tuple[FloatArray, bool]:
         """The torque (n,) to apply in this period, and whether a limit cut it."""

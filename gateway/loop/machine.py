@@ -45,8 +45,8 @@ class Observation:
 
     action: Action
     reason: str  #: the texts of the findings
-    drives_ready: bool  #: every drive may be enabled
-    drives_enabled: bool
+    not_ready: str  #: the drives that may not be enabled, and what they say; empty when all may
+    not_enabled: str
     tensioned: bool  #: set-points reached, every tension inside its band
     standstill: bool  #: request and measured unwinder speed are zero
     plc_answers: bool
@@ -105,17 +105,19 @@ def _trip(machine: Machine, seen: Observation, now_s: float) -> Machine:
 
 
 def _arming(machine: Machine, seen: Observation, now_s: float, elapsed: float) -> Machine:
-    if seen.drives_ready:
+    if not seen.not_ready:
         return to_phase(machine, Phase.READY, now_s, "")
-    return machine if elapsed <= ARMING_TIME_S else to_phase(machine, Phase.OFF, now_s, "a drive did not become ready")
+    if elapsed <= ARMING_TIME_S:
+        return machine
+    return to_phase(machine, Phase.OFF, now_s, f"drives that do not become ready: {seen.not_ready}")
 
 
 def _enabling(machine: Machine, seen: Observation, now_s: float, elapsed: float) -> Machine:
-    if seen.drives_enabled:
+    if not seen.not_enabled:
         return to_phase(machine, Phase.TENSIONING, now_s)
     if elapsed <= ENABLING_TIME_S:
         return machine
-    return to_phase(machine, Phase.OFF, now_s, "a drive did not take over torque control in time")
+    return to_phase(machine, Phase.OFF, now_s, f"drives that do not take over torque control: {seen.not_enabled}")
 
 
 def _tensioning(times: Times, machine: Machine, seen: Observation, now_s: float, elapsed: float) -> Machine:

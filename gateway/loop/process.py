@@ -11,20 +11,17 @@ from drivers.registry import build_links
 from gateway.control.laws import make_law
 from gateway.core.controller import LqiConfig, PidConfig, config_hash
 from gateway.core.line import Line
-from gateway.core.messages import Event
 from gateway.core.signals import Outputs
 from gateway.core.states import Phase
-from gateway.core.telemetry import Frame, pack
-from gateway.core.topics import LOOP_COMMAND, LOOP_EVENT, LOOP_TELEMETRY
+from gateway.core.topics import LOOP_BUSES, LOOP_COMMAND, LOOP_EVENT, LOOP_TELEMETRY
 from gateway.loop.commands import release
 from gateway.loop.cycle import Cycle
-from gateway.loop.machine import Machine
 from gateway.loop.pacer import TimerPacer, monotonic
 from gateway.loop.realtime import become_punctual, freeze_collector
 from gateway.loop.runner import Runner
+from gateway.loop.voice import Voice
 from gateway.mailbox.paths import GATEWAY_SOCKET, LOOP_SOCKET
 from gateway.mailbox.unix import UnixMailbox
-from safety.actions import Finding
 
 RESTING_PERIODS = 5
 
@@ -42,28 +39,10 @@ async def _main(line: Line, config: LqiConfig | PidConfig, run_folder: Path, say
     mailbox = UnixMailbox()
     # First the socket, whose lock makes this the only loop of the line; only then are the buses touched.
     await mailbox.listen(run_folder / LOOP_SOCKET)
-    mailbox.connect({LOOP_TELEMETRY, LOOP_EVENT}, run_folder / GATEWAY_SOCKET)
-
-    def record(frame: Frame) -> None:
-        mailbox.publish(LOOP_TELEMETRY, pack(frame))
-
-    def tell(kind: str, text: str, data: dict[str, object] | None = None) -> None:
-        event = Event(time_s=monotonic(), kind=kind, text=text, data=data or {})
-        mailbox.publish(LOOP_EVENT, event.model_dump_json().encode())
-
-    def announce(before: Machine, after: Machine, findings: list[Finding]) -> None:
-        if after.phase is before.phase:
-            tell("alarm", "; ".join(finding.text for finding in findings))
-            return
-        text = f"{before.phase.name} to {after.phase.name}" + (f": {after.reason}" if after.reason else "")
-        data: dict[str, object] = {"state": after.state.name}
-        if findings:
-            data["rules"] = [finding.rule for finding in findings]
-            data["links"] = {link.name: link.health.last_error for link in links if link.health.last_error}
-        tell("state", text, data)
-
+    mailbox.connect({LOOP_TELEMETRY, LOOP_EVENT, LOOP_BUSES}, run_folder / GATEWAY_SOCKET)
     links = build_links(line)
-    cycle = Cycle(line, make_law(config), links, monotonic, record, announce)
+    voice = Voice(mailbox, links, line.control.period_s)
+    cycle = Cycle(line, make_law(config), links, monotonic, voice.record, voice.announce)
     runner = Runner(cycle)
     ending = asyncio.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
@@ -71,9 +50,9 @@ async def _main(line: Line, config: LqiConfig | PidConfig, run_folder: Path, say
     try:
         for trouble in await _open(links):
             say(trouble)
-            tell("bus", trouble)
+            voice.tell("bus", trouble)
         mailbox.serve(LOOP_COMMAND, runner.command)
-        tell("start", f"loop of {line.site}/{line.line}, {config.kind} controller {config_hash(config)[:12]}")
+        voice.tell("start", f"loop of {line.site}/{line.line}, {config.kind} controller {config_hash(config)[:12]}")
         say(f"loop of {line.site}/{line.line} is SILENT, commands on {run_folder / LOOP_SOCKET}")
         freeze_collector()
         # Last: what starts up must not take a processor from another line's loop.

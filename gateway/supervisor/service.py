@@ -12,8 +12,8 @@ from typing import Any
 from pydantic import ValidationError
 
 from gateway.core.line import Line
-from gateway.core.messages import Arm, Event, MalformedMessage, Reply, in_words, parse_command
-from gateway.core.topics import GATEWAY_COMMAND, GATEWAY_STATUS, LOOP_COMMAND, LOOP_EVENT, LOOP_TELEMETRY
+from gateway.core.messages import BUS_REPORTS, Arm, BusReport, Event, MalformedMessage, Reply, in_words, parse_command
+from gateway.core.topics import GATEWAY_COMMAND, GATEWAY_STATUS, LOOP_BUSES, LOOP_COMMAND, LOOP_EVENT, LOOP_TELEMETRY
 from gateway.mailbox.port import PEER, Counters, Mailbox, Peer, Unreachable
 from gateway.supervisor.historian import Historian
 from gateway.supervisor.status import (
@@ -56,11 +56,13 @@ class Gateway:
         self._started_s = clock()
         self._sink = TelemetrySink(line.n, historian.frame)
         self._events: deque[EventStatus] = deque(maxlen=EVENTS_SHOWN)
+        self._buses: list[BusReport] = []
         self._malformed_events = 0
         self._loop_was_running = False
         self._was_storing = True
         mailbox.subscribe(LOOP_TELEMETRY, self._sink.take)
         mailbox.subscribe(LOOP_EVENT, self._loop_event)
+        mailbox.subscribe(LOOP_BUSES, self._loop_buses)
         mailbox.serve(GATEWAY_STATUS, self._answer_status)
         mailbox.serve(GATEWAY_COMMAND, self._answer_command)
 
@@ -107,6 +109,7 @@ class Gateway:
                 malformed=self._sink.malformed + self._malformed_events + self._counters.malformed,
                 refused=self._counters.refused,
             ),
+            buses=self._buses if loop.running else [],
             historian=self._historian_status(now_s),
             events=list(self._events),
         )
@@ -123,6 +126,12 @@ class Gateway:
             last_stored_age_s=None if health.last_stored_s is None else round(now_s - health.last_stored_s, 3),
             moved_aside=health.moved_aside,
         )
+
+    def _loop_buses(self, payload: bytes) -> None:
+        try:
+            self._buses = BUS_REPORTS.validate_json(payload)
+        except ValidationError:
+            self._malformed_events += 1
 
     def _loop_event(self, payload: bytes) -> None:
         try:

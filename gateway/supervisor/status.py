@@ -9,6 +9,7 @@ import numpy as np
 from pydantic import Field
 
 from gateway.core.line import Line, Strict
+from gateway.core.messages import BusReport
 from gateway.core.signals import DriveState, Quality
 from gateway.core.states import LoopState
 from gateway.core.telemetry import Frame
@@ -116,6 +117,7 @@ class GatewayStatus(Strict):
     spans: list[SpanStatus]
     timing: TimingStatus
     link: LinkStatus
+    buses: list[BusReport]  #: as the loop sees them; empty until it has said so
     historian: HistorianStatus
     events: list[EventStatus]  #: the last ones, the newest at the end
 

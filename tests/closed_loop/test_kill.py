@@ -111,9 +111,9 @@ def test_a_short_stall_is_skipped_not_caught_up_and_stops_the_line(wire):
     recording = wire.recording()
     at_s = np.array([event["time_s"] for event in recording.of_kind("command") if event["roller"] == 1])
     assert np.diff(at_s).max() > 0.06 and not recording.of_kind("watchdog")
-    # No burst: after the gap, commands come a period apart.
+    # No burst: the first command after the gap is late, and those behind it keep to the periods.
     gap = int(np.argmax(np.diff(at_s)))
-    assert np.diff(at_s[gap + 1 : gap + 10]).min() > 0.3 * PERIOD_S
+    assert np.diff(at_s[gap + 2 : gap + 12]).min() > 0.5 * PERIOD_S
     assert not any(wire.unsafe().values()), wire.unsafe()
 
 

@@ -14,8 +14,8 @@ TIMES = Times(tensioning_s=20.0, stop_s=10.0)
 FINE = Observation(
     action=Action.NONE,
     reason="",
-    drives_ready=True,
-    drives_enabled=True,
+    not_ready="",
+    not_enabled="",
     tensioned=True,
     standstill=False,
     plc_answers=True,
@@ -43,9 +43,10 @@ def test_from_arming_to_running():
 
 
 def test_a_drive_that_does_not_become_ready_refuses_the_arming():
-    unready = replace(FINE, drives_ready=False)
+    unready = replace(FINE, not_ready="drive-3 STO")
     assert after(Phase.ARMING, unready, ARMING_TIME_S).phase is Phase.ARMING
-    assert after(Phase.ARMING, unready, ARMING_TIME_S + 0.01).phase is Phase.OFF
+    refused = after(Phase.ARMING, unready, ARMING_TIME_S + 0.01)
+    assert refused.phase is Phase.OFF and "drive-3 STO" in refused.reason
 
 
 def test_a_web_that_cannot_be_tensioned_stops_the_line():
@@ -99,8 +100,8 @@ def test_a_severe_finding_leads_to_stop_from_wherever_there_is_torque(phase, act
             Observation,
             action=st.sampled_from(list(Action)),
             reason=st.just("r"),
-            drives_ready=st.booleans(),
-            drives_enabled=st.booleans(),
+            not_ready=st.sampled_from(["", "drive-3 STO"]),
+            not_enabled=st.sampled_from(["", "drive-3 STO"]),
             tensioned=st.booleans(),
             standstill=st.booleans(),
             plc_answers=st.booleans(),

@@ -1,0 +1,54 @@
+"""What the loop says to the gateway: a frame a period, events, and how its buses fare. Never blocks, never waits."""
+
+from drivers.port import Link
+from gateway.core.messages import BUS_REPORTS, BusReport, Event
+from gateway.core.telemetry import Frame, pack
+from gateway.core.topics import LOOP_BUSES, LOOP_EVENT, LOOP_TELEMETRY
+from gateway.loop.machine import Machine
+from gateway.loop.pacer import monotonic
+from gateway.mailbox.port import Mailbox
+from safety.actions import Finding
+
+REPORT_EVERY_S = 1.0
+
+
+class Voice:
+    def __init__(self, mailbox: Mailbox, links: list[Link], period_s: float) -> None:
+        self._mailbox = mailbox
+        self._links = links
+        self._report_every = max(1, round(REPORT_EVERY_S / period_s))  # periods
+
+    def record(self, frame: Frame) -> None:
+        """A period's telemetry, and now and then the buses."""
+        self._mailbox.publish(LOOP_TELEMETRY, pack(frame))
+        if frame.sequence % self._report_every == 0:
+            self._mailbox.publish(LOOP_BUSES, BUS_REPORTS.dump_json([_report(link) for link in self._links]))
+
+    def tell(self, kind: str, text: str, **data: object) -> None:
+        """An event."""
+        event = Event(time_s=monotonic(), kind=kind, text=text, data=data)
+        self._mailbox.publish(LOOP_EVENT, event.model_dump_json().encode())
+
+    def announce(self, before: Machine, after: Machine, findings: list[Finding]) -> None:
+        """A change of phase with what led to it and what the buses say; or an alarm within a phase."""
+        rules = [finding.rule for finding in findings]
+        if after.phase is before.phase:
+            self.tell("alarm", "; ".join(finding.text for finding in findings), rules=rules)
+            return
+        text = f"{before.phase.name} to {after.phase.name}" + (f": {after.reason}" if after.reason else "")
+        troubles = [f"{link.name}: {link.health.last_error}" for link in self._links if link.health.last_error]
+        if findings and troubles:
+            text += f" [{'; '.join(troubles)}]"
+        self.tell("state", text, state=after.state.name, rules=rules)
+
+
+def _report(link: Link) -> BusReport:
+    health = link.health
+    return BusReport(
+        name=link.name,
+        absent=health.absent,
+        timeouts=health.timeouts,
+        malformed=health.malformed,
+        reconnects=health.reconnects,
+        last_error=health.last_error,
+    )
