@@ -26,6 +26,7 @@ test: setup ## set up, then all tests
 check: setup ## lint, types, import contracts
 	@$(PY) -m ruff check .
 	@$(PY) -m ruff format --check .
+	@mkdir -p out
 	@$(VENV)/bin/lint-imports --no-cache > out/lint-imports.txt 2>&1 || { cat out/lint-imports.txt; exit 1; }
 	@$(PY) -m basedpyright
 

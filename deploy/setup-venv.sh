@@ -10,6 +10,7 @@ for candidate in ${PYTHON:-} python3.14 python3.13 python3.12 python3.11 python3
     fi
 done
 [ -n "$python" ] || { echo "r2rgate needs Python 3.11 or newer; set PYTHON=/path/to/python3" >&2; exit 1; }
+[ ! -L "$venv" ] || { echo "$venv is a link: it is not touched; remove it, and it is made anew" >&2; exit 1; }
 mkdir -p out
 echo "setting up $venv with $($python --version) (once, about a minute)"
 "$python" -m venv --clear "$venv" >out/setup.log 2>&1 || {

@@ -12,6 +12,18 @@ from typing import Annotated, Literal, TypeVar
 from pydantic import Field, ValidationError, model_validator
 
 from drivers.map_errors import MapRefused, reasons_of
+from drivers.map_rules import (
+    BYTES,
+    INTEGERS,
+    UNSIGNED,
+    base_problems,
+    bit_problems,
+    fit_problems,
+    overlap_problems,
+    range_problems,
+    registers_of,
+    type_problems,
+)
 from gateway.core.line import Positive, Strict
 
 SpeedUnit = Literal["m/s", "mm/s", "um/s", "m/min", "rad/s", "rpm", "mrpm"]
@@ -24,7 +36,6 @@ Format = Annotated[int, Field(ge=1, le=1)]  # not Literal, which takes `true` an
 Bits = Annotated[int, Field(ge=0, le=31)]
 
 M = TypeVar("M", bound=Strict)
-BYTES = {"u8": 1, "i8": 1, "u16": 2, "i16": 2, "u32": 4, "i32": 4, "f32": 4}
 MAX_PDO_BYTES = 8
 MAX_READ_REGISTERS = 125
 
@@ -124,14 +135,30 @@ class DriveMap(Strict):
         for name, entry in self.objects:
             if entry is not None and (other := spans.setdefault((entry.index, entry.sub), name)) != name:
                 problems.append(f"objects.{name}: {entry.index:04X}h sub {entry.sub} is already objects.{other}")
-        if self.objects.safe_torque_off is not None and self.objects.safe_torque_off.type == "f32":
-            problems.append("objects.safe_torque_off.type: f32 has no bits; allowed: an integer type")
-        problems += _range_problems("watchdog", self.watchdog.range)
-        problems += _range_problems("heartbeat", self.heartbeat.range)
+        problems += _drive_type_problems(self.objects)
+        if self.follows_command is not None:
+            problems += bit_problems("follows_command", self.follows_command.bit, "u16")
+        problems += range_problems("watchdog", self.watchdog.range) + fit_problems("watchdog", *_time(self.watchdog))
+        problems += range_problems("heartbeat", self.heartbeat.range) + fit_problems(
+            "heartbeat", *_time(self.heartbeat)
+        )
         low, high = self.heartbeat.range
         if not low <= self.heartbeat.value <= high:
             problems.append(f"heartbeat.value: {self.heartbeat.value} is outside heartbeat.range [{low}, {high}]")
         return _refuse_together(self, problems)
+
+
+def _drive_type_problems(objects: DriveObjects) -> list[str]:
+    problems = type_problems("objects.controlword", objects.controlword.type, ("u16",))
+    problems += type_problems("objects.statusword", objects.statusword.type, ("u16",))
+    problems += type_problems("objects.mode", objects.mode.type, ("i8",))
+    if (sto := objects.safe_torque_off) is not None:
+        problems += type_problems("objects.safe_torque_off", sto.type, INTEGERS)
+        problems += bit_problems("objects.safe_torque_off", sto.bit, sto.type)
+    rated = objects.rated_torque
+    if rated is not None and rated.unit == "rated torque":
+        problems.append("objects.rated_torque.unit: 'rated torque' of itself says nothing; allowed: Nm, mNm")
+    return problems
 
 
 def _pdo_problems(key: str, pdo: Pdo, objects: DriveObjects, needed: set[str]) -> list[str]:
@@ -231,13 +258,18 @@ class LoadCellMap(ModbusMap):
         inside = {"channels.tension": (channels.tension.offset, channels.tension.type)}
         if channels.status is not None:
             inside["channels.status"] = (channels.status.offset, channels.status.type)
-        problems = _overlaps(fields) + _overlaps(inside) + _base_problems(fields, self.address_base)
+        problems = overlap_problems(fields) + overlap_problems(inside) + base_problems(fields, self.address_base)
         for name, (offset, kind) in inside.items():
-            if offset + _registers(kind) > channels.stride:
+            if offset + registers_of(kind) > channels.stride:
                 problems.append(f"{name}.offset: {offset} does not fit channels.stride {channels.stride}")
         end = channels.first + channels.stride * channels.count
+        for name, (_, kind) in fields.items():
+            problems += type_problems(name, kind, UNSIGNED)
+        problems += bit_problems("status.healthy", self.status.healthy.bit, self.status.type)
+        if channels.status is not None:
+            problems += type_problems("channels.status", channels.status.type, UNSIGNED)
         for name, (address, kind) in fields.items():
-            if address < end and channels.first < address + _registers(kind):
+            if address < end and channels.first < address + registers_of(kind):
                 problems.append(f"{name}.address: {address} overlaps channels ({channels.first} to {end - 1})")
         return _refuse_together(self, problems)
 
@@ -271,46 +303,39 @@ class PlcMap(ModbusMap):
         fields = {"device_id": (self.device_id.address, self.device_id.type)}
         fields |= {"watchdog": (self.watchdog.address, self.watchdog.type)}
         fields |= _register_fields("read", self.read) | written
-        problems = _overlaps(fields) + _base_problems(fields, self.address_base)
+        problems = overlap_problems(fields) + base_problems(fields, self.address_base)
         first = min(address for address, _ in written.values())
-        last = max(address + _registers(kind) for address, kind in written.values())
-        if last - first != sum(_registers(kind) for _, kind in written.values()):
+        last = max(address + registers_of(kind) for address, kind in written.values())
+        if last - first != sum(registers_of(kind) for _, kind in written.values()):
             problems.append("write: the registers must lie side by side, they are written in one request")
         if self.read_function != 3:
             problems.append(f"read_function: {self.read_function}; allowed: 3, the registers that function 23 reads")
-        for name, bits in (("read.status", self.read.status), ("write.command", self.write.command)):
-            if bits.type != "u16":
-                problems.append(f"{name}.type: {bits.type}; allowed: u16")
-        problems += _range_problems("read.speed", self.read.speed.range)
-        problems += _range_problems("write.speed", self.write.speed.range)
-        return _refuse_together(self, problems + _range_problems("watchdog", self.watchdog.range))
+        problems += _plc_type_problems(self)
+        problems += range_problems("read.speed", self.read.speed.range)
+        problems += range_problems("write.speed", self.write.speed.range)
+        problems += range_problems("watchdog", self.watchdog.range) + fit_problems("watchdog", *_time(self.watchdog))
+        return _refuse_together(self, problems)
+
+
+def _plc_type_problems(device: PlcMap) -> list[str]:
+    read, write = device.read, device.write
+    problems = type_problems("device_id", device.device_id.type, UNSIGNED)
+    problems += type_problems("read.status", read.status.type, UNSIGNED)
+    problems += type_problems("read.life_echo", read.life_echo.type, UNSIGNED)
+    problems += type_problems("write.command", write.command.type, UNSIGNED)
+    problems += type_problems("write.life", write.life.type, UNSIGNED)
+    problems += bit_problems("write.run", write.run.bit, write.command.type)
+    for name in ("permissive", "emergency_stop", "running", "watchdog_tripped"):
+        problems += bit_problems(f"read.{name}", getattr(read, name).bit, read.status.type)
+    return problems
 
 
 def _register_fields(key: str, table: Strict) -> dict[str, tuple[int, str]]:
     return {f"{key}.{name}": (field.address, field.type) for name, field in table if isinstance(field, Register)}
 
 
-def _registers(kind: str) -> int:
-    return BYTES[kind] // 2
-
-
-def _overlaps(fields: dict[str, tuple[int, str]]) -> list[str]:
-    problems: list[str] = []
-    taken: dict[int, str] = {}
-    for name, (address, kind) in fields.items():
-        for register in range(address, address + _registers(kind)):
-            if (other := taken.setdefault(register, name)) != name:
-                problems.append(f"{name}: register {register} is already {other}")
-                break
-    return problems
-
-
-def _base_problems(fields: dict[str, tuple[int, str]], base: int) -> list[str]:
-    return [f"{name}: address {at} is below address_base {base}" for name, (at, _) in fields.items() if at < base]
-
-
-def _range_problems(key: str, bounds: Range) -> list[str]:
-    return [] if bounds[0] < bounds[1] else [f"{key}.range: {bounds} must rise"]
+def _time(entry: TimeObject | TimeRegister) -> tuple[str, Range, float]:
+    return entry.type, entry.range, entry.scale
 
 
 def _refuse_together(model: M, problems: list[str]) -> M:

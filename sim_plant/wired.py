@@ -66,7 +66,7 @@ class Settings:
 class WiredLine:
     """All devices of a plant on their wires, in the running event loop. The devices are there to be reached.
 
-    Raises FileExistsError when the folder already holds a recording.
+    Raises FileExistsError when the folder already holds a recording, ValueError for a port that cannot be.
     """
 
     def __init__(self, plant: Plant, settings: Settings) -> None:
@@ -74,9 +74,12 @@ class WiredLine:
         self.settings = settings
         self.can_port = plant.wires.canopen.port if settings.can_port is None else settings.can_port
         self.modbus_port = plant.wires.modbus.port if settings.modbus_port is None else settings.modbus_port
+        _check_port("the CAN port (--can-port)", self.can_port, 1)
+        _check_port("the Modbus port (--modbus-port)", self.modbus_port, 0)
         _compile(plant)
         self.clock = WorldClock(settings.scale)
         self.world = World(plant, settings.seed)
+        self._folder_was_there = settings.record_folder.exists()
         self.recorder = Recorder.to_folder(
             settings.record_folder, self.world, self.clock.monotonic_start_s, settings.scale
         )
@@ -95,7 +98,7 @@ class WiredLine:
         try:
             self._open_canopen()
             await self._open_modbus()
-        except FaceUnavailable:
+        except BaseException:
             await self.close()
             self._discard_recording()
             raise
@@ -184,6 +187,8 @@ class WiredLine:
         """Of a line that never lived: the next attempt may have the folder."""
         for name in (EVENTS_FILE, TRACE_FILE):
             (self.settings.record_folder / name).unlink()
+        if not self._folder_was_there:
+            self.settings.record_folder.rmdir()
 
     def _drive(self, index: int) -> Drive:
         drives = self.plant.drives
@@ -198,6 +203,11 @@ class WiredLine:
     def _pump(self) -> None:
         if self.canopen is not None:
             self.canopen.pump()
+
+
+def _check_port(name: str, port: int, lowest: int) -> None:
+    if not lowest <= port <= 65535:
+        raise ValueError(f"{name} is {port}; allowed: {lowest} to 65535")
 
 
 def _compile(plant: Plant) -> None:

@@ -6,6 +6,7 @@ only fetches.
 """
 
 import asyncio
+import errno
 import threading
 from collections import deque
 from collections.abc import Callable
@@ -15,6 +16,7 @@ import can
 from gateway.core.line import CanopenBus
 
 FRAMES_PER_WAKEUP = 256  #: a flooded bus does not hold the loop
+MOST_FRAMES_WAITING = 4096  #: several times what a socket's buffer holds
 THREAD_POLL_S = 0.02  #: how soon the fetching thread notices that the bus is closed
 
 FrameHandler = Callable[[int, bytes | bytearray, float], None]
@@ -35,7 +37,9 @@ class CanBus:
         self._closing = threading.Event()
 
     def open(self) -> None:
-        """Open the interface and read it; sends nothing. Raises OSError with what to do about it."""
+        """Open the interface and read it; sends nothing. Idempotent. Raises OSError with what to do about it."""
+        if self._bus is not None:
+            return
         config = self._config
         options: dict[str, object] = {"interface": config.interface, "channel": config.channel}
         if config.interface == "udp_multicast":
@@ -46,12 +50,8 @@ class CanBus:
         try:
             self._bus = can.Bus(ignore_config=True, **options)  # type: ignore[arg-type]
         except (can.CanError, OSError, ValueError, ImportError) as error:
-            advice = {
-                "socketcan": f"is it up? `ip link set {config.channel} up type can bitrate {config.bitrate_bit_per_s}`",
-                "udp_multicast": "channel must be a multicast group, and a route to it must exist",
-            }.get(config.interface, "check interface and channel")
             where = f"{config.interface} {config.channel}"
-            raise OSError(f"bus {config.name}: cannot open {where}: {error}; {advice}") from error
+            raise OSError(f"bus {config.name}: cannot open {where}: {error}; {_advice(config, error)}") from error
         self._loop = asyncio.get_running_loop()
         try:
             self._fileno = self._bus.fileno()
@@ -77,11 +77,18 @@ class CanBus:
         return True
 
     def drain(self) -> None:
-        """Hand over the frames that have arrived."""
+        """Hand over frames that have arrived, as many as the loop can wait for."""
+        self._drain(FRAMES_PER_WAKEUP)
+
+    def drain_all(self) -> None:
+        """Hand over all frames that have arrived."""
+        self._drain(MOST_FRAMES_WAITING)
+
+    def _drain(self, most: int) -> None:
         if self._loop is None:
             return
         now_s = self._loop.time()
-        for _ in range(FRAMES_PER_WAKEUP):
+        for _ in range(most):
             try:
                 message = self._receive()
             except (can.CanError, OSError, ValueError) as error:
@@ -130,3 +137,13 @@ class CanBus:
             self._thread = None
         self._fetched.clear()
         bus.shutdown()
+
+
+def _advice(config: CanopenBus, error: BaseException) -> str:
+    if config.interface == "udp_multicast":
+        return "channel must be a multicast group, and a route to it must exist"
+    if config.interface != "socketcan":
+        return "check interface and channel"
+    if isinstance(error, OSError) and error.errno == errno.EAFNOSUPPORT:
+        return "this kernel has no CAN: load its modules can and can_raw, or use another machine"
+    return f"is it up? `ip link set {config.channel} up type can bitrate {config.bitrate_bit_per_s}`"

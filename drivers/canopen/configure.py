@@ -7,6 +7,7 @@ from math import floor
 from drivers.canopen.pdo import mapping_entries, type_code
 from drivers.canopen.sdo import SdoBus, SdoFailed, SdoSilent
 from drivers.device_map import CanObject, DriveMap, Pdo, TimeObject
+from drivers.map_rules import BYTES
 from drivers.scaling import si_per_count, torque_per_count
 
 _PDO_INVALID = 1 << 31
@@ -118,7 +119,7 @@ class Transaction:
         """Write every step, then read back what must stand in the end. Raises SdoFailed at the first that fails."""
         final: dict[tuple[int, int], tuple[Step, bytes]] = {}
         for step in steps:
-            present = await self._sdo.upload(self._node, step.index, step.sub)
+            present = await self._sdo.upload(self._node, step.index, step.sub, BYTES[step.type])
             wanted = step.bytes_after(present)
             try:
                 await self._sdo.download(self._node, step.index, step.sub, wanted)
@@ -128,7 +129,7 @@ class Transaction:
             self._before.append((step, present))
             final[step.index, step.sub] = (step, wanted)
         for step, wanted in final.values():
-            found = await self._sdo.upload(self._node, step.index, step.sub)
+            found = await self._sdo.upload(self._node, step.index, step.sub, len(wanted))
             if found != wanted:
                 raise SdoFailed(f"{step.name}: written {wanted.hex()}, read back {found.hex()} (bytes, low first)")
 

@@ -4,6 +4,10 @@ A cycle: SYNC (the drives latch their RPDOs and sample), the TPDOs of this SYNC,
 counts for the SYNC after which it arrives, once: what comes twice, or after `collect` has closed the cycle, is
 discarded and counted. What is in the socket before the next SYNC is read before it, so that an answer that is
 late within its period cannot pass for a fresh one. One that comes a whole period late can: SYNC has no counter.
+
+A drive that is no longer heard may still hear: every RPDO would renew its watchdog, although the drive may act on
+none of them (they act at SYNC). So it is told once to leave operational, which takes torque off without a SYNC, and
+gets no RPDO until the next `prepare`: if it does not hear the one, its watchdog fires for want of the other.
 """
 
 import asyncio
@@ -11,7 +15,7 @@ from collections.abc import Callable
 
 from drivers.canopen.bus import CanBus
 from drivers.canopen.cia402 import PowerState
-from drivers.canopen.node import ANSWERS_ALLOWED, OPERATIONAL, DriveNode
+from drivers.canopen.node import OPERATIONAL, DriveNode
 from drivers.canopen.prepare import check_drive, configure_drives, read_safe_torque_off, undo_all
 from drivers.canopen.sdo import SdoBus, SdoFailed
 from drivers.port import PrepareRefused
@@ -59,12 +63,16 @@ class CanopenLink:
     async def prepare(self) -> None:
         """Configure all drives and prove their watchdogs. Raises PrepareRefused; what was written is undone then."""
         self.silence()
+        try:
+            self._bus.open()
+        except OSError as error:
+            raise PrepareRefused([str(error)]) from error
+        for node in self._nodes:
+            node.boot_ups = 0
+            self._command_nmt(ENTER_PRE_OPERATIONAL, node)  # a node that is stopped does not answer SDO
         reasons = [f"{node.name}: {reason}" for node in self._nodes for reason in await check_drive(self._sdo, node)]
         if reasons:
             raise PrepareRefused(reasons)
-        for node in self._nodes:
-            node.boot_ups = 0
-            self._command_nmt(ENTER_PRE_OPERATIONAL, node)
         transactions, reasons = await configure_drives(self._sdo, self._nodes)
         if not reasons:
             reasons = await self._start()
@@ -115,13 +123,13 @@ class CanopenLink:
     def trigger(self, now_s: float) -> None:
         """SYNC when active; only listens when silent."""
         self._sync_open = False
-        self._bus.drain()
+        self._bus.drain_all()
         self._sync_s = now_s
         if not self._active:
             return
         for node in self._nodes:
             node.begin_sync()
-        self._awaited = sum(node.missed < ANSWERS_ALLOWED for node in self._nodes)
+        self._awaited = sum(node.awaited for node in self._nodes)
         self._answered = asyncio.get_running_loop().create_future()
         self._sync_open = True
         self._bus.send(SYNC, b"")
@@ -165,14 +173,20 @@ class CanopenLink:
                     self.health.last_error = f"{node.name}: {node.trouble(self._sync_s)}"
 
     def write(self, outputs: Outputs) -> None:
-        """One RPDO a drive. A torque that cannot be commanded is not sent: the drive's watchdog has the last word."""
+        """One RPDO a drive that is there. What cannot be commanded is not sent: the watchdog has the last word."""
         if not self._active:
             return
         for node in self._nodes:
+            state = node.state(self._sync_s)
+            if state == DriveState.ABSENT and not node.dropped:
+                node.drop(self._sync_s)
+                self._command_nmt(ENTER_PRE_OPERATIONAL, node)
+            if node.dropped:
+                continue
             request = int(outputs.drive_request[node.index])
             torque_nm = float(outputs.torque_nm[node.index])
             try:
-                payload = node.command(request, torque_nm, node.state(self._sync_s))
+                payload = node.command(request, torque_nm, state)
             except ValueError as error:
                 self._discard(f"{node.name}: {error}")
                 continue
@@ -209,17 +223,19 @@ class CanopenLink:
             self._sdo.on_frame(cob_id, data, now_s)
 
     def _on_answer(self, node: DriveNode, data: bytes | bytearray, now_s: float) -> None:
-        if not self._sync_open:
-            if self._active:
-                self._discard(f"{node.name}: an answer after its cycle")
+        if not self._active:
             return
-        absent = node.missed >= ANSWERS_ALLOWED
         try:
-            node.on_answer(data)
+            if self._sync_open:
+                node.on_answer(data)
+            else:
+                node.on_late_answer(data)
+                self._discard(f"{node.name}: an answer after its cycle")
         except ValueError as error:
             self._discard(f"{node.name}: {error}")
             return
-        if not absent:
+        if self._sync_open and node.awaited:
+            node.awaited = False
             self._awaited -= 1
             if self._awaited == 0 and self._answered is not None and not self._answered.done():
                 self._answered.set_result(None)

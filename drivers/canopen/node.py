@@ -39,6 +39,9 @@ class DriveNode:
         self.missed = 0  #: SYNCs in a row without an answer
         self.emergency = ""
         self.distrust = ""
+        self.dropped = False  #: was lost while supervised: no RPDO any more, so that its own watchdog can fire
+        self.awaited = False  #: its answer to the present SYNC is waited for
+        self._heard_again = False  #: it answered, though too late, while it was absent
         self.boot_ups = 0
         self.supervised = False  #: must stay operational
         self._controlword = DISABLE_VOLTAGE
@@ -67,6 +70,11 @@ class DriveNode:
         if self._request == DriveRequest.RESET_FAULT and drive_state(self.power) != DriveState.FAULT:
             self.emergency = ""
 
+    def on_late_answer(self, data: bytes | bytearray) -> None:
+        """A TPDO outside its cycle. Its sample is not used; who was absent is waited for again. Raises MalformedPdo."""
+        self.codec.decode(data)
+        self._heard_again = True
+
     def on_heartbeat(self, data: bytes | bytearray, now_s: float) -> None:
         """A heartbeat or boot-up message. Raises ValueError for a wrong length."""
         if len(data) != 1:
@@ -74,9 +82,11 @@ class DriveNode:
         self.nmt_state = data[0] & 0x7F
         self.heard_s = now_s
         self.boot_ups += self.nmt_state == BOOT_UP
-        if self.supervised and self.nmt_state == BOOT_UP:
+        if not self.supervised or self.dropped:
+            return
+        if self.nmt_state == BOOT_UP:
             self.distrust = "restarted: its settings are lost, arm again"
-        elif self.supervised and self.nmt_state != OPERATIONAL:
+        elif self.nmt_state != OPERATIONAL:
             self.distrust = f"left operational for {_NMT_NAMES.get(self.nmt_state, hex(self.nmt_state))}, arm again"
 
     def on_emergency(self, data: bytes | bytearray) -> None:
@@ -91,6 +101,8 @@ class DriveNode:
 
     def begin_sync(self) -> None:
         self.sample = None
+        self.awaited = self.missed < ANSWERS_ALLOWED or self._heard_again
+        self._heard_again = False
 
     def end_sync(self) -> None:
         if self.sample is None:
@@ -112,13 +124,18 @@ class DriveNode:
             return DriveState.READY  # no torque, whatever is commanded
         return drive_state(self.power)
 
+    def drop(self, now_s: float) -> None:
+        """It is lost: no RPDO until the next `prepare`, which would keep a watchdog fed that nobody listens behind."""
+        self.distrust = f"{self.trouble(now_s)}; its torque was taken off, arm again"
+        self.dropped = True
+
     def command(self, request: int, torque_nm: float, state: DriveState) -> bytes:
-        """The RPDO towards `request`. A drive that is not trusted, or not heard, is told to take torque off.
+        """The RPDO towards `request`. A drive that is not trusted is told to take torque off.
 
         Raises ValueError when the torque cannot be commanded; nothing may be sent then.
         """
         self._request = request
-        if self.distrust or self.power is None or state == DriveState.ABSENT:
+        if self.distrust or self.power is None:
             self._controlword = DISABLE_VOLTAGE
         elif state == DriveState.FAULT and request != DriveRequest.RESET_FAULT:
             self._controlword = DISABLE_VOLTAGE  # an emergency counts before the statusword shows it
@@ -137,6 +154,7 @@ class DriveNode:
         self.power = None
         self.missed = 0
         self.distrust = ""
+        self.dropped = False
         self._controlword = DISABLE_VOLTAGE
         self._request = int(DriveRequest.OFF)
 

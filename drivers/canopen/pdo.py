@@ -7,7 +7,8 @@ import struct
 from dataclasses import dataclass
 from math import isfinite
 
-from drivers.device_map import BYTES, DriveMap, Pdo, PdoEntry
+from drivers.device_map import DriveMap, Pdo, PdoEntry
+from drivers.map_rules import BYTES
 from drivers.scaling import speed_per_count, torque_per_count
 
 _CODE = {"u8": "B", "i8": "b", "u16": "H", "i16": "h", "u32": "I", "i32": "i", "f32": "f"}

@@ -8,6 +8,7 @@ from drivers.canopen.node import DriveNode
 from drivers.canopen.pdo import type_code
 from drivers.canopen.sdo import SdoBus, SdoFailed, SdoSilent
 from drivers.device_map import CanObject
+from drivers.map_rules import BYTES
 from drivers.scaling import torque_per_count
 from gateway.core.signals import DriveState
 
@@ -17,7 +18,7 @@ _RATED_TORQUE_TOLERANCE = 1e-3  #: of the line's figure; more would scale every 
 
 async def read_number(sdo: SdoBus, node: int, entry: CanObject) -> int | float:
     """The raw number in an object. Raises SdoFailed, also for a length that is not that of its type."""
-    data = await sdo.upload(node, entry.index, entry.sub)
+    data = await sdo.upload(node, entry.index, entry.sub, BYTES[entry.type])
     try:
         return struct.unpack(type_code(entry.type), data)[0]
     except struct.error as error:
@@ -52,8 +53,8 @@ async def check_drive(sdo: SdoBus, node: DriveNode) -> list[str]:
 
 async def _check_identity(sdo: SdoBus, node: DriveNode) -> list[str]:
     wanted = node.device.identity
-    vendor = int.from_bytes(await sdo.upload(node.node, _IDENTITY, 1), "little")
-    product = int.from_bytes(await sdo.upload(node.node, _IDENTITY, 2), "little")
+    vendor = int.from_bytes(await sdo.upload(node.node, _IDENTITY, 1, 4), "little")
+    product = int.from_bytes(await sdo.upload(node.node, _IDENTITY, 2, 4), "little")
     if (vendor, product) == (wanted.vendor_id, wanted.product_code):
         return []
     return [

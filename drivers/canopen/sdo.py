@@ -64,9 +64,13 @@ class SdoBus:
         if len(data) == 8:
             self._network.notify(cob_id, bytearray(data), now_s)
 
-    async def upload(self, node: int, index: int, sub: int) -> bytes:
-        """The bytes of an object. Raises SdoFailed."""
-        return await self._run(node, index, sub, lambda client: client.upload(index, sub))
+    async def upload(self, node: int, index: int, sub: int, size: int) -> bytes:
+        """The `size` bytes of an object, or as many as came. Raises SdoFailed.
+
+        A server that does not state the size (CiA 301, 7.2.4.3.6: s = 0) sends four bytes: surplus zeros are no data.
+        """
+        data = await self._run(node, index, sub, lambda client: client.upload(index, sub))
+        return data if any(data[size:]) else data[:size]
 
     async def download(self, node: int, index: int, sub: int, data: bytes) -> None:
         """Write an object. Raises SdoFailed."""

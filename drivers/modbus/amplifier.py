@@ -1,7 +1,8 @@
 """A load-cell amplifier on Modbus: what is asked of it each cycle, and which of its answers may be believed."""
 
 from drivers.device_map import LoadCellMap
-from drivers.modbus.client import ModbusConnection, ModbusFailed
+from drivers.modbus.client import ModbusConnection, ModbusFailed, ModbusTimeout
+from drivers.modbus.proof import Proof
 from drivers.modbus.registers import Field, RegisterBlock, spans
 from drivers.scaling import si_per_count
 from gateway.core.line import LoadCell
@@ -33,11 +34,20 @@ class Amplifier:
         self._reads = [(group, RegisterBlock([fields[k] for k in group], device.word_order)) for group in spans(fields)]
         self._fields = len(fields)
         self._per_cell = (self._fields - 2) // len(cells)
+        identity = RegisterBlock([(device.device_id.address - base, device.device_id.type)], device.word_order)
+        channel_count = RegisterBlock(
+            [(device.channel_count.address - base, device.channel_count.type)], device.word_order
+        )
+        checks = [(identity, self._against_identity), (channel_count, self._against_channel_count)]
+        self._proof = Proof(self.name, self.unit, self._function, checks)
+        self._proof.confirm()  # `prepare` will prove it before there is torque; nobody would after a reconnection
         self.answer: list[float] | None = None  #: of this cycle
         self._counter: float | None = None
 
     async def exchange(self, connection: ModbusConnection, deadline_s: float) -> list[float]:
-        """Ask. Raises ModbusFailed or ValueError when there is no answer that fits."""
+        """Ask. Raises ModbusFailed or ValueError when there is no answer that fits, or it is another device."""
+        if reasons := await self._proof.go_on(connection, deadline_s):
+            raise ModbusFailed("not proven: " + "; ".join(reasons))
         numbers = [0.0] * self._fields
         for group, block in self._reads:
             registers = await connection.read(self._function, self.unit, block.address, block.count, deadline_s)
@@ -50,7 +60,7 @@ class Amplifier:
         answer = self.answer
         if answer is None:
             self.missed += 1
-            self._miss(inputs)
+            (self._miss if self._proof.complete else self._reject)(inputs)
             return []
         self.missed = 0
         counter, self._counter = self._counter, answer[1]
@@ -59,8 +69,7 @@ class Amplifier:
             return [f"{self.name}: the sample counter stands still"]
         healthy = self._device.status.healthy
         if bool(int(answer[0]) >> healthy.bit & 1) == healthy.inverted:
-            for cell in self._cells:
-                inputs.tension.reject(cell.span - 1)
+            self._reject(inputs)
             return [f"{self.name}: the amplifier is not healthy (status {int(answer[0]):04X}h)"]
         troubles = (self._fill_cell(inputs, time_s, k, cell) for k, cell in enumerate(self._cells))
         return [trouble for trouble in troubles if trouble]
@@ -83,26 +92,29 @@ class Amplifier:
         for cell in self._cells:
             inputs.tension.miss(cell.span - 1)
 
+    def _reject(self, inputs: Inputs) -> None:
+        for cell in self._cells:
+            inputs.tension.reject(cell.span - 1)
+
+    def connection_lost(self) -> None:
+        """Whatever answers on the next connection has to prove itself; until then nothing of it is believed."""
+        self._proof.void()
+
     async def prepare(self, connection: ModbusConnection, deadline_s: float) -> list[str]:
         """What speaks against the unit: another device, too few channels. Reads only."""
-        device = self._device
-        base = device.address_base
-        fields = [
-            (device.device_id.address - base, device.device_id.type),
-            (device.channel_count.address - base, device.channel_count.type),
-        ]
-        numbers: list[float] = []
+        self._proof.void()
         try:
-            for field in fields:
-                block = RegisterBlock([field], device.word_order)
-                registers = await connection.read(self._function, self.unit, block.address, block.count, deadline_s)
-                numbers += block.decode(registers)
-        except (ModbusFailed, ValueError) as error:
+            return await self._proof.go_on(connection, deadline_s)
+        except ModbusTimeout as error:
             return [f"{self.name}: unit {self.unit} at {connection.where}: {error}"]
-        if numbers[0] != device.device_id.value:
-            return [f"{self.name}: device id {int(numbers[0]):#x}, the map says {device.device_id.value:#x}"]
+
+    def _against_identity(self, found: float) -> list[str]:
+        wanted = self._device.device_id.value
+        return [] if found == wanted else [f"{self.name}: device id {int(found):#x}, the map says {wanted:#x}"]
+
+    def _against_channel_count(self, found: float) -> list[str]:
         return [
-            f"{cell.name}: channel {cell.channel}, the amplifier has {int(numbers[1])}"
+            f"{cell.name}: channel {cell.channel}, the amplifier has {int(found)}"
             for cell in self._cells
-            if cell.channel > numbers[1]
+            if cell.channel > found
         ]

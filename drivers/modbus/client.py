@@ -7,6 +7,8 @@ when to reconnect is the link's decision.
 
 import asyncio
 import logging
+import socket
+import struct
 from collections.abc import Awaitable
 
 from pymodbus.client import AsyncModbusTcpClient
@@ -32,6 +34,7 @@ class ModbusConnection:
 
     def __init__(self, host: str, port: int) -> None:
         self.where = f"{host}:{port}"
+        self.answers = 0  #: on this connection, of whatever content
         self._host, self._port = host, port
         self._client: AsyncModbusTcpClient | None = None
 
@@ -42,16 +45,24 @@ class ModbusConnection:
     async def connect(self) -> bool:
         """Try once, afresh: nothing of an earlier connection is left that could be mistaken for an answer."""
         self.close()
+        self.answers = 0
         self._client = AsyncModbusTcpClient(
             self._host, port=self._port, timeout=CONNECT_TIMEOUT_S, retries=0, reconnect_delay=0
         )
         return await self._client.connect()
 
     def close(self) -> None:
-        """Drop the connection. Idempotent."""
+        """Drop the connection at once, and with it what the other side has not taken yet. Idempotent."""
         client, self._client = self._client, None
-        if client is not None:
-            client.close()
+        if client is None:
+            return
+        transport = client.ctx.transport
+        if isinstance(transport, asyncio.Transport):
+            # Requests that wait for a peer that has stopped must not come to life when it goes on.
+            tcp = transport.get_extra_info("socket")
+            tcp.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+            transport.abort()
+        client.close()
 
     async def read(self, function: int, unit: int, address: int, count: int, deadline_s: float) -> list[int]:
         """Function 3 or 4: `count` registers. Raises ModbusFailed."""
@@ -94,6 +105,7 @@ class ModbusConnection:
         except (ModbusException, OSError) as error:
             self.close()
             raise ModbusFailed(str(error)) from error
+        self.answers += 1
         if answer.isError():
             raise ModbusFailed(f"exception {answer.exception_code} to function {function}")
         if answer.function_code != function:

@@ -2,7 +2,8 @@
 
 A cycle's requests leave with `trigger`, one after the other on the one connection, and what has come by the deadline
 counts. A request that is still running at the next `trigger` is not doubled: that cycle's samples are lost, and
-counted. A lost connection is made again beside the cycle, with growing pauses.
+counted. A connection on which nothing answers any more is dropped, with all that waits in it, and a lost one is made
+again beside the cycle, with growing pauses; the first request on it is sent alone.
 """
 
 import asyncio
@@ -15,6 +16,7 @@ from gateway.core.signals import Inputs, LinkHealth, Outputs
 
 EXCHANGE_SHARE = 0.8  #: of a period; what has not come by then leaves room for the next request
 PREPARE_TIMEOUT_S = 0.5  #: per device
+MUTE_S = 0.3  #: without any answer, until the connection is dropped
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.1, 2.0  #: between attempts to connect
 ANSWERS_ALLOWED = 3  #: cycles in a row without an answer until a device counts as absent
 
@@ -35,13 +37,14 @@ class ModbusLink:
         self._open_s: float | None = None  #: the cycle whose answers still count, by its time
         self._complete = asyncio.Event()  #: every device that is not absent has answered
         self._sent_s = 0.0
+        self._mute = 0  #: exchanges in a row without any answer
         self._connecting: asyncio.Task[None] | None = None
         self._retry_s = float("-inf")
         self._pause_s = FIRST_PAUSE_S
 
     async def open(self) -> None:
         """Connect. Raises OSError with what to do; the link may be used all the same, and goes on trying then."""
-        if not await self._connection.connect():
+        if not await self._connect():
             raise OSError(
                 f"bus {self.name}: no connection to {self._connection.where}; "
                 "check host and port, and that the device is switched on"
@@ -51,7 +54,9 @@ class ModbusLink:
         """Check every device; set and prove the PLC's command watchdog. Raises PrepareRefused with every reason."""
         self.silence()
         await _cancel(self._connecting)
-        if not self._connection.connected and not await self._connection.connect():
+        if not self._connection.connected:
+            await _cancel(self._task)  # it would take the new connection for its own
+        if not self._connection.connected and not await self._connect():
             raise PrepareRefused([f"{d.name}: no connection to {self._connection.where}" for d in self._devices])
         reasons: list[str] = []
         for device in self._devices:
@@ -82,9 +87,11 @@ class ModbusLink:
             return
         self._sent_s = self._open_s = now_s
         self._complete.clear()
-        self._task = asyncio.create_task(self._exchange(now_s, now_s + EXCHANGE_SHARE * self._period_s))
+        patience_s = EXCHANGE_SHARE * self._period_s if self._connection.answers else MUTE_S
+        self._task = asyncio.create_task(self._exchange(now_s, now_s + patience_s))
 
     async def _exchange(self, sent_s: float, deadline_s: float) -> None:
+        answers = self._connection.answers
         # Who did not answer is asked last, and not waited for once absent: a dead unit costs the others nothing.
         for device in sorted(self._devices, key=lambda device: device.unanswered):
             if device.unanswered >= ANSWERS_ALLOWED:
@@ -104,6 +111,13 @@ class ModbusLink:
                 device.unanswered = 0
                 self._discard(f"{device.name}: {error}")
         self._complete.set()
+        if self._connection.answers > answers:
+            self._mute = 0
+            self._pause_s = FIRST_PAUSE_S
+            return
+        self._mute += 1
+        if self._mute * self._period_s >= MUTE_S or not answers:
+            self._connection.close()
 
     async def collect(self, inputs: Inputs, deadline_s: float) -> None:
         """The answers that have come by `deadline_s`."""
@@ -136,20 +150,19 @@ class ModbusLink:
         if now_s >= self._retry_s and (self._connecting is None or self._connecting.done()):
             self._retry_s = now_s + self._pause_s
             self._pause_s = min(2.0 * self._pause_s, LONGEST_PAUSE_S)
-            for plc in self._plcs:
-                plc.proven = False
+            for device in self._devices:
+                device.connection_lost()
             self._connecting = asyncio.create_task(self._connect_again())
 
     async def _connect_again(self) -> None:
-        if not await self._connection.connect():
+        if await self._connect():
+            self.health.reconnects += 1
+        else:
             self.health.last_error = f"no connection to {self._connection.where}"
-            return
-        self._pause_s = FIRST_PAUSE_S
-        self.health.reconnects += 1
-        for plc in self._plcs:
-            deadline_s = asyncio.get_running_loop().time() + PREPARE_TIMEOUT_S
-            if reasons := await plc.prove_again(self._connection, deadline_s):
-                self.health.last_error = reasons[0]
+
+    async def _connect(self) -> bool:
+        self._mute = 0
+        return await self._connection.connect()
 
     def _discard(self, reason: str) -> None:
         self.health.malformed += 1

@@ -8,6 +8,7 @@ from math import floor, isfinite
 
 from drivers.device_map import Bit, PlcMap, TimeRegister
 from drivers.modbus.client import ModbusConnection, ModbusFailed
+from drivers.modbus.proof import Proof
 from drivers.modbus.registers import RegisterBlock
 from drivers.scaling import si_per_count
 from gateway.core.line import LinePlc
@@ -24,7 +25,6 @@ class Plc:
         self.missed = 0  #: cycles in a row without an answer
         self.unanswered = 0  #: requests in a row that ended without one
         self.active = False  #: the link is not silent
-        self.proven = False  #: its command watchdog was read back on this connection
         self.answer: list[float] | None = None  #: of this cycle
         self._device = device
         self._watchdog_s = watchdog_s
@@ -38,13 +38,21 @@ class Plc:
         self._write = RegisterBlock([(entry.address - base, entry.type) for entry in entries], order)
         self._id = RegisterBlock([(device.device_id.address - base, device.device_id.type)], order)
         self._watchdog = RegisterBlock([(device.watchdog.address - base, device.watchdog.type)], order)
+        #: Of device and command watchdog on this connection. Without it the PLC is not written to.
+        self._proof = Proof(
+            plc.name,
+            plc.address,
+            device.read_function,
+            [(self._id, self._against_identity), (self._watchdog, self._against_watchdog)],
+        )
         self._life = 0
         self._command: tuple[int, float] | None = _AT_REST  #: command word and speed; None: cannot be commanded
         self._echo = -1.0
         self._same_echo = 0
+        self._doubts: list[str] = []  #: why it is not proven
 
     def _may_write(self) -> bool:
-        return self.active and self.proven and self._command is not None
+        return self.active and self._proof.complete and self._command is not None
 
     def silence(self) -> None:
         """Nothing is written from now on, and nothing of the last command is left."""
@@ -69,6 +77,8 @@ class Plc:
     async def exchange(self, connection: ModbusConnection, deadline_s: float) -> list[float]:
         """Write and read in one transaction when active, only read when silent. Raises ModbusFailed or ValueError."""
         read = self._read
+        if self.active:
+            self._doubts = await self._proof.go_on(connection, deadline_s)
         if self._may_write():
             self._life = (self._life + 1) & 0xFFFF
             assert self._command is not None
@@ -102,7 +112,8 @@ class Plc:
         plc.running = _is(read.running, status)
         troubles = [f"{self.name}: its command watchdog has tripped"] if _is(read.watchdog_tripped, status) else []
         if mute:
-            troubles.append(f"{self.name}: is not written to: its watchdog is not proven, or the command is refused")
+            troubles.append("; ".join(self._doubts) or f"{self.name}: its command was refused")
+            troubles[-1] += "; it is not written to"
         low, high = read.speed.range
         if low <= answer[1] * read.speed.scale <= high:
             inputs.unwind_speed.put(0, answer[1] * self._read_speed_scale, time_s)
@@ -122,10 +133,15 @@ class Plc:
         if inputs.plc.quality != Quality.MISSING:
             inputs.plc.quality = Quality.STALE
 
+    def connection_lost(self) -> None:
+        """A PLC that was restarted has lost its watchdog: it is not written to before that is read back."""
+        self._proof.void()
+
     async def prepare(self, connection: ModbusConnection, deadline_s: float) -> list[str]:
         """Check the device, set its command watchdog and read it back; undone when that fails."""
+        self._proof.void()
         try:
-            if reasons := await self._check_id(connection, deadline_s):
+            if reasons := self._against_identity(await self._read_one(self._id, connection, deadline_s)):
                 return reasons
             counts = watchdog_counts(self._device.watchdog, self._watchdog_s)
             before = await self._read_one(self._watchdog, connection, deadline_s)
@@ -133,7 +149,7 @@ class Plc:
                 await connection.write(self.unit, self._watchdog.address, self._watchdog.encode([counts]), deadline_s)
                 found = await self._read_one(self._watchdog, connection, deadline_s)
                 if found == counts:
-                    self.proven = True
+                    self._proof.confirm()
                     return []
                 reason = f"its command watchdog was set to {counts} and reads back {found:g}"
             except ModbusFailed as error:
@@ -143,23 +159,17 @@ class Plc:
         except (ModbusFailed, ValueError) as error:
             return [f"{self.name}: unit {self.unit} at {connection.where}: {error}"]
 
-    async def prove_again(self, connection: ModbusConnection, deadline_s: float) -> list[str]:
-        """After a reconnection: a PLC that was restarted has lost its watchdog and is not written to. Reads only."""
-        try:
-            reasons = await self._check_id(connection, deadline_s)
-            counts = watchdog_counts(self._device.watchdog, self._watchdog_s)
-            found = await self._read_one(self._watchdog, connection, deadline_s)
-        except (ModbusFailed, ValueError) as error:
-            return [f"{self.name}: {error}"]
-        if found != counts:
-            reasons.append(f"{self.name}: its command watchdog reads {found:g}, {counts} was set; arm again")
-        self.proven = not reasons
-        return reasons
-
-    async def _check_id(self, connection: ModbusConnection, deadline_s: float) -> list[str]:
+    def _against_identity(self, found: float) -> list[str]:
         wanted = self._device.device_id.value
-        found = await self._read_one(self._id, connection, deadline_s)
         return [] if found == wanted else [f"{self.name}: device id {int(found):#x}, the map says {wanted:#x}"]
+
+    def _against_watchdog(self, found: float) -> list[str]:
+        counts = watchdog_counts(self._device.watchdog, self._watchdog_s)
+        return (
+            []
+            if found == counts
+            else [f"{self.name}: its command watchdog reads {found:g}, {counts} was set; arm again"]
+        )
 
     async def _read_one(self, block: RegisterBlock, connection: ModbusConnection, deadline_s: float) -> float:
         function = self._device.read_function

@@ -8,7 +8,8 @@ import struct
 from collections.abc import Sequence
 from math import isfinite
 
-from drivers.device_map import BYTES, MAX_READ_REGISTERS
+from drivers.device_map import MAX_READ_REGISTERS
+from drivers.map_rules import BYTES
 
 _CODE = {"u16": "H", "i16": "h", "u32": "I", "i32": "i", "f32": "f"}
 

@@ -4,6 +4,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
+from shlex import quote
 from typing import Annotated, Any
 
 import numpy as np
@@ -33,7 +34,7 @@ def init(
 
     Example: r2rgate init --spans 4 --out coater.toml
     """
-    text = line_template(spans, out.name)
+    text = line_template(spans, quote(out.name))
     try:
         with out.open("w" if force else "x", encoding="utf-8") as file:
             file.write(text)
@@ -41,7 +42,9 @@ def init(
         _refuse(f"{out} exists and was left as it is; use another --out, or --force to overwrite it")
     except OSError as error:
         _refuse(f"{out} cannot be written: {error.strerror}")
-    typer.echo(f"{out}: a line with {spans} {_count(spans, 'span')}. Fill in your line, then: r2rgate check {out}")
+    typer.echo(
+        f"{out}: a line with {spans} {_count(spans, 'span')}. Fill in your line, then: r2rgate check {quote(str(out))}"
+    )
 
 
 def check(

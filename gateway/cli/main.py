@@ -1,11 +1,15 @@
 """The `r2rgate` command: every subcommand, and nothing but their names and places."""
 
-from typing import Annotated
+import sys
+from typing import Annotated, NoReturn
 
 import typer
+from pydantic import ValidationError
 
 from gateway.cli import line_commands, operate_commands, process_commands, status_commands
 from gateway.cli.lifetime import follow_parent
+from gateway.cli.process_commands import REFUSED
+from gateway.core.line_problem import printable
 
 app = typer.Typer(
     name="r2rgate",
@@ -47,5 +51,17 @@ def top(version: Annotated[bool, typer.Option("--version", help="Print the versi
 
 
 def main() -> None:
+    """The program. Last resort for mistakes that no command has foreseen: one sentence and exit code 2."""
     follow_parent()
-    app()
+    try:
+        app()
+    except ValidationError as error:
+        reasons = (f"{'.'.join(map(str, e['loc']))}: {e['msg']}, is {e['input']!r}" for e in error.errors())
+        _end("; ".join(reasons))
+    except OSError as error:
+        _end(f"{error.filename}: {error.strerror}" if error.filename and error.strerror else str(error))
+
+
+def _end(text: str) -> NoReturn:
+    print(f"r2rgate: {printable(text)}", file=sys.stderr)
+    sys.exit(REFUSED)

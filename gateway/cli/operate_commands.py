@@ -1,13 +1,16 @@
 """Commands of the operator. All go through the gateway, which keeps them; `stop` goes straight to the loop."""
 
 import asyncio
+from math import isfinite
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NoReturn
 
 import typer
+from pydantic import ValidationError
 
 from gateway.core.messages import Arm, Command, Hold, Reply, SelectRecipe, SetSpeed, SetTension, Start, Stop
 from gateway.core.topics import GATEWAY_COMMAND, LOOP_COMMAND, Topic
+from gateway.mailbox.listener import PathTooLong
 from gateway.mailbox.paths import GATEWAY_SOCKET, LOOP_SOCKET
 from gateway.mailbox.port import Unreachable
 from gateway.mailbox.unix import UnixMailbox
@@ -67,6 +70,9 @@ def set_tension(
 
     Example: r2rgate set 3 44
     """
+    if span < 1:
+        _refuse(f"there is no span {span}; allowed: 1 or more, as they stand in the line's file")
+    _require_number(tension_n, "N", "a tension inside the line's limits")
     _send(SetTension(span=span, tension_n=tension_n, step=step), run_dir, as_json)
 
 
@@ -82,6 +88,7 @@ def speed(
 
     Example: r2rgate speed 0.05
     """
+    _require_number(speed_m_per_s, "m/s", "a speed from 0 to the line's limit")
     _send(SetSpeed(speed_m_per_s=speed_m_per_s, step=step), run_dir, as_json)
 
 
@@ -98,7 +105,7 @@ def recipe(
 
 
 async def request(run_folder: Path, command: Command, timeout_s: float = REPLY_TIME_S) -> Reply:
-    """Send one command and wait for its reply. Raises Unreachable."""
+    """Send one command and wait for its reply. Raises Unreachable and PathTooLong."""
     topic, socket = _way(command)
     mailbox = UnixMailbox()
     mailbox.connect({topic}, run_folder / socket)
@@ -106,7 +113,20 @@ async def request(run_folder: Path, command: Command, timeout_s: float = REPLY_T
         answer = await mailbox.request(topic, command.model_dump_json().encode(), timeout_s)
     finally:
         await mailbox.close()
-    return Reply.model_validate_json(answer)
+    try:
+        return Reply.model_validate_json(answer)
+    except ValidationError as error:
+        raise Unreachable("what answers there is of another version than this command") from error
+
+
+def _require_number(value: float, unit: str, allowed: str) -> None:
+    if not isfinite(value):
+        _refuse(f"{value} {unit} is no set-point; allowed: {allowed}, a finite number in {unit}")
+
+
+def _refuse(text: str) -> NoReturn:
+    typer.echo(text, err=True)
+    raise typer.Exit(REFUSED)
 
 
 def _way(command: Command) -> tuple[Topic, str]:
@@ -118,7 +138,7 @@ def _send(command: Command, run_dir: Path | None, as_json: bool, timeout_s: floa
 
     try:
         reply = asyncio.run(request(choose_run_folder(run_dir), command, timeout_s))
-    except Unreachable as error:
+    except (Unreachable, PathTooLong) as error:
         typer.echo(str(error), err=True)
         raise typer.Exit(UNREACHABLE) from None
     if as_json:

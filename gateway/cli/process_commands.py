@@ -1,8 +1,12 @@
 """The processes of r2rgate, each in the foreground, and `run`, which starts them together."""
 
 import sys
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from shlex import quote
+from typing import TYPE_CHECKING, Annotated, Literal, NoReturn
 
 import typer
 
@@ -15,7 +19,8 @@ from gateway.mailbox.paths import default_run_folder
 if TYPE_CHECKING:
     from gateway.core.controller import LqiConfig, PidConfig
 
-REFUSED, ALREADY_RUNNING = 2, 3
+#: Exit codes. `run` starts a crashed child again, but not one that was refused or that runs already.
+CRASHED, REFUSED, ALREADY_RUNNING = 1, 2, 3
 
 LineFile = Annotated[Path, typer.Argument(help="The line description (r2rgate init writes one).")]
 RunFolder = Annotated[Path | None, typer.Option("--run-dir", help="Where the line's sockets shall lie.")]
@@ -49,7 +54,7 @@ def default_data_folder(line: Line) -> Path:
 def design(
     file: LineFile,
     law: Annotated[Literal["lqi", "pid"], typer.Option(help="The control law.")] = "lqi",
-    out: Annotated[Path, typer.Option(help="The file to write.")] = Path("controller.json"),
+    out: Annotated[Path, typer.Option(help="The file to write; its folder is made.")] = Path("controller.json"),
 ) -> None:
     """Design a controller from the line's nominal model and write its configuration.
 
@@ -64,10 +69,13 @@ def design(
     except DesignRefused as refused:
         typer.echo(f"no {law} controller for {file}: {refused}", err=True)
         raise typer.Exit(REFUSED) from None
-    out.write_bytes(canonical(config) + b"\n")
-    typer.echo(
-        f"{out}: {law} for {line.n} spans at {line.control.period_s * 1e3:g} ms, hash {config_hash(config)[:12]}"
-    )
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        out.write_bytes(canonical(config) + b"\n")
+    except OSError as error:
+        _refuse(f"--out {out} cannot be written: {error.strerror}; name a file in a folder that you may write")
+    spans = f"{line.n} span{'' if line.n == 1 else 's'}"
+    typer.echo(f"{out}: {law} for {spans} at {line.control.period_s * 1e3:g} ms, hash {config_hash(config)[:12]}")
 
 
 def loop(
@@ -87,20 +95,24 @@ def loop(
 
     line = read_line(file)
     path = controller or (data_dir or default_data_folder(line)) / "controller.json"
+    way_out = f"r2rgate design {quote(str(file))} --out {quote(str(path))}"
     try:
         config = parse_controller(path.read_bytes())
-        _require_fit(line, config, path)
-        run_loop(
-            line, config, run_dir or default_run_folder(line), lambda text: print(text, file=sys.stderr, flush=True)
-        )
     except FileNotFoundError:
-        _refuse(f"there is no controller configuration at {path}: r2rgate design {file} --out {path} writes one")
+        _refuse(f"there is no controller configuration at {path}: {way_out} writes one")
+    except OSError as error:
+        _refuse(f"{path} cannot be read: {error.strerror}")
     except ControllerRefused as refused:
-        _refuse(f"{path} is not used: {refused}")
+        _refuse(f"{path} is not used: {refused}. {way_out} writes another")
+    _require_fit(line, config, path, way_out)
+    try:
+        with _a_crash_is_no_refusal():
+            run_loop(
+                line, config, run_dir or default_run_folder(line), lambda text: print(text, file=sys.stderr, flush=True)
+            )
     except AlreadyRunning as error:
-        typer.echo(f"a loop runs here already, this one ends: {error}", err=True)
-        raise typer.Exit(ALREADY_RUNNING) from None
-    except (CannotListen, PathTooLong, LinksRefused, OSError) as error:
+        _refuse(f"a loop runs here already, this one ends: {error}", ALREADY_RUNNING)
+    except (CannotListen, PathTooLong, LinksRefused) as error:
         _refuse(f"the loop cannot start: {error}")
 
 
@@ -112,7 +124,10 @@ def gateway(file: LineFile, run_dir: RunFolder = None, data_dir: DataFolder = No
     from gateway.supervisor.process import run_gateway
 
     line = read_line(file)
-    raise typer.Exit(run_gateway(line, run_dir or default_run_folder(line), data_dir or default_data_folder(line)))
+    data = _folder(data_dir or default_data_folder(line), "--data-dir")
+    with _a_crash_is_no_refusal():
+        code = run_gateway(line, run_dir or default_run_folder(line), data)
+    raise typer.Exit(code)
 
 
 def sim(
@@ -151,13 +166,35 @@ def run(
 ) -> None:
     """Loop and gateway together in this terminal, with the status on the screen. Ctrl-C stops the line, then ends.
 
+    Without --controller one is designed on the line's nominal model, kept, and designed anew when the line changes.
+    What crashes is started again. Exit code: 0 ended as asked, 2 refused, 3 the line runs already.
+
     Example: r2rgate run line.toml
     """
+    from gateway.cli.kept_controller import kept_controller
     from gateway.cli.together import run_together
+    from gateway.control.design import DesignRefused
 
     line = read_line(file)
+    if plant is not None:
+        _require_plant(line, file, plant)
     data = data_dir or default_data_folder(line)
-    raise typer.Exit(run_together(file, line, controller, plant, run_dir or default_run_folder(line), data))
+    run_folder = run_dir or default_run_folder(line)
+    _require_alone(run_folder)
+    _folder(run_folder, "--run-dir", 0o700)
+    _folder(data, "--data-dir")
+    opening: list[str] = []
+    if controller is None:
+        try:
+            controller, said = kept_controller(line, data)
+        except DesignRefused as refused:
+            _refuse(f"no lqi controller for {file}: {refused}; design one yourself and name it with --controller")
+        except OSError as error:
+            _refuse(f"a controller cannot be kept at {error.filename}: {error.strerror}")
+        opening = [said] if said else []
+    for sentence in opening:
+        typer.echo(sentence, err=True)
+    raise typer.Exit(run_together(file, line, controller, plant, run_folder, data, opening))
 
 
 def demo(
@@ -173,15 +210,71 @@ def demo(
     """
     from gateway.cli.demo import run_demo
 
+    _folder(out, "--out")
     raise typer.Exit(run_demo(out, law, seed))
 
 
-def _require_fit(line: Line, config: "LqiConfig | PidConfig", path: Path) -> None:
+def _folder(path: Path, option: str, mode: int = 0o777) -> Path:
+    """`path` as a folder that exists and may be written."""
+    from os import W_OK, X_OK, access
+
+    try:
+        path.mkdir(parents=True, exist_ok=True, mode=mode)
+        why = "" if access(path, W_OK | X_OK) else "Permission denied"
+    except FileExistsError:
+        why = "it is a file"
+    except OSError as error:
+        why = str(error.strerror)
+    if why:
+        _refuse(f"the folder {path} cannot be used: {why}; name one that you may write with {option}")
+    return path
+
+
+def _require_plant(line: Line, file: Path, plant_file: Path) -> None:
+    """The simulated line must offer what the line's file expects."""
+    from gateway.cli.plant_fit import misfits
+    from sim_plant.plant import PlantRefused, load_plant
+
+    try:
+        found = misfits(line, file, load_plant(plant_file), plant_file)
+    except PlantRefused as refused:
+        _refuse(f"{plant_file} is not used: {'; '.join(refused.reasons)}")
+    except OSError as error:
+        _refuse(f"{plant_file} cannot be read: {error.strerror}; a plant is sim_plant/plants/s_real.toml")
+    if found:
+        _refuse(f"line and plant do not fit: {'; '.join(found)}. Change either so that they agree")
+
+
+def _require_alone(run_folder: Path) -> None:
+    """Nothing may be started, least of all a second simulated line on the same wires, where the line runs already."""
+    from gateway.mailbox.listener import PathTooLong, check_path, living
+    from gateway.mailbox.paths import GATEWAY_SOCKET, LOOP_SOCKET
+
+    for name, socket in (("loop", LOOP_SOCKET), ("gateway", GATEWAY_SOCKET)):
+        try:
+            check_path(run_folder / socket)
+        except PathTooLong as error:
+            _refuse(f"{error} with --run-dir")
+        if living(run_folder / socket):
+            _refuse(f"a {name} of this line runs already, on {run_folder / socket}: end it first", ALREADY_RUNNING)
+
+
+@contextmanager
+def _a_crash_is_no_refusal() -> Iterator[None]:
+    """What fails in mid-run is told with its place in the program, and `run` starts it again."""
+    try:
+        yield
+    except OSError:
+        traceback.print_exc()
+        raise typer.Exit(CRASHED) from None
+
+
+def _require_fit(line: Line, config: "LqiConfig | PidConfig", path: Path, way_out: str) -> None:
     """A configuration for another line must not run on this one."""
     draw = [i for i, span in enumerate(line.spans) if span.control == "draw"]
     reasons: list[str] = []
     if config.n != line.n:
-        reasons.append(f"it is for {config.n} spans, the line has {line.n}")
+        reasons.append(f"it is for {config.n} span{'' if config.n == 1 else 's'}, the line has {line.n}")
     elif config.draw_spans != draw:
         spans = [[i + 1 for i in indices] for indices in (config.draw_spans, draw)]
         reasons.append(f"its draw-controlled spans are {spans[0]}, the line's {spans[1]}")
@@ -190,9 +283,9 @@ def _require_fit(line: Line, config: "LqiConfig | PidConfig", path: Path) -> Non
     if config.feedforward.stiffness_n <= line.limits.tension_max_n:
         reasons.append(f"its web stiffness of {config.feedforward.stiffness_n:g} N is below the greatest tension")
     if reasons:
-        _refuse(f"{path} is not used: {'; '.join(reasons)}. Design one for this line: r2rgate design")
+        _refuse(f"{path} is not used: {'; '.join(reasons)}. Design one for this line: {way_out}")
 
 
-def _refuse(text: str) -> None:
+def _refuse(text: str, code: int = REFUSED) -> NoReturn:
     typer.echo(text, err=True)
-    raise typer.Exit(REFUSED)
+    raise typer.Exit(code)

@@ -1,109 +1,159 @@
 """`r2rgate run`: gateway and loop (and, where asked for, the simulated line) as children of one terminal.
 
-A child that ends is started again, with growing pauses; the loop comes back SILENT, as after a reboot.
+A child that ends is started again, with growing pauses; the loop comes back SILENT, as after a reboot. What a start
+cannot mend (a refused file, a line that runs already) ends all of it, with that child's exit code.
 """
 
 import signal
-import subprocess
 import sys
 import time
-from dataclasses import dataclass
+from collections.abc import Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from types import FrameType
 
-from rich.console import Console
+from rich.console import Console, Group, RenderableType
 from rich.live import Live
 from rich.text import Text
 
-from gateway.cli.lifetime import end, start
 from gateway.cli.status_view import render
-from gateway.core.controller import canonical
+from gateway.cli.tended import Child, Exit
 from gateway.core.line import Line
 
 PATIENCE_S = 3.0  #: beyond the time that a stop may take
-FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.5, 10.0
 REFRESH_S = 0.2
-
-
-@dataclass
-class Child:
-    """One process and when it may be started (again)."""
-
-    name: str
-    arguments: list[str]
-    process: subprocess.Popen[str] | None = None
-    pause_s: float = FIRST_PAUSE_S
-    due_s: float = 0.0
+NOTES_S = 20.0  #: how long the screen shows what the loop said of its start
+EXIT_S = 60.0  #: how long it shows the last words of a child that has ended; then one line remains
+#: How the loop's ordinary words at its start begin; all others are for the person at the terminal.
+_ORDINARY = ("loop of ", "pinned to ", "real-time priority ", "memory locked")
 
 
 def run_together(
-    file: Path, line: Line, controller: Path | None, plant: Path | None, run_folder: Path, data_folder: Path
+    file: Path,
+    line: Line,
+    controller: Path,
+    plant: Path | None,
+    run_folder: Path,
+    data_folder: Path,
+    opening: Sequence[str] = (),
 ) -> int:
-    """Run until Ctrl-C or SIGTERM, which stop the line first. Returns the exit code."""
-    data_folder.mkdir(parents=True, exist_ok=True)
-    run_folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+    """Run until Ctrl-C or SIGTERM, which stop the line first. Returns the exit code: 0, or that of a refused child.
+
+    Both folders exist. The screen shows the sentences of `opening` at first.
+    """
     folders = ["--run-dir", str(run_folder), "--data-dir", str(data_folder)]
-    controller = controller or _controller(line, data_folder)
+    gateway, loop = [str(file), *folders], [str(file), "--controller", str(controller), *folders]
     children = [
-        Child("gateway", [str(file), *folders]),
-        Child("loop", [str(file), "--controller", str(controller), *folders]),
+        Child("gateway", lambda: gateway, data_folder / "gateway.log"),
+        Child("loop", lambda: loop, data_folder / "loop.log"),
     ]
     if plant is not None:
-        recording = data_folder / time.strftime("recording-%Y%m%dT%H%M%S")
-        children.insert(0, Child("sim", [str(plant), "--record", str(recording), "--priority", "40"]))
+
+        def sim() -> list[str]:
+            return [str(plant), "--record", str(new_recording(data_folder)), "--priority", "40"]
+
+        children.insert(0, Child("sim", sim, data_folder / "sim.log"))
     ending = _Ending()
     console = Console(highlight=False)
+    notices = Notices(console, time.monotonic(), opening)
+    final: Exit | None = None
     try:
-        with Live(console=console, screen=console.is_terminal, auto_refresh=False) as live:
-            while not ending.asked:
-                for child in children:
-                    _look_after(child, data_folder)
-                live.update(_screen(console, run_folder, data_folder), refresh=console.is_terminal)
+        with Live(console=console, screen=True, auto_refresh=False) if console.is_terminal else nullcontext() as live:
+            while not ending.asked and final is None:
+                final = _tend(children, notices)
+                if live is not None:
+                    live.update(_screen(console, notices, run_folder, data_folder), refresh=True)
                 time.sleep(REFRESH_S)
     finally:
         console.print("stopping the line, then ending")
         for child in reversed(children):
-            if child.process is not None:
-                end(child.process, line.longest_stop_s + PATIENCE_S)
-    return 0
+            child.end(line.longest_stop_s + PATIENCE_S)
+    if final is None:
+        return 0
+    print("\n".join(final.lines()), file=sys.stderr)
+    return final.code
 
 
-def _controller(line: Line, data_folder: Path) -> Path:
-    """The configuration that is kept for this line; the first time, one is designed on its nominal model."""
-    from gateway.control.design import design_lqi, task_of
-
-    path = data_folder / "controller.json"
-    if not path.exists():
-        path.write_bytes(canonical(design_lqi(task_of(line))) + b"\n")
-        print(f"{path}: designed an LQI on the line's nominal model", file=sys.stderr)
-    return path
+def new_recording(data_folder: Path) -> Path:
+    """A folder that does not exist yet: a recording is never written over."""
+    stem = time.strftime("recording-%Y%m%dT%H%M%S")
+    names = (stem, *(f"{stem}-{k}" for k in range(2, 1000)))
+    return next(data_folder / name for name in names if not (data_folder / name).exists())
 
 
-def _look_after(child: Child, data_folder: Path) -> None:
-    now_s = time.monotonic()
-    if child.process is not None and child.process.poll() is None:
-        if now_s - child.due_s > LONGEST_PAUSE_S:
-            child.pause_s = FIRST_PAUSE_S
-        return
-    if child.process is not None:  # it has ended
-        child.process = None
-        child.due_s = now_s + child.pause_s
-        child.pause_s = min(2.0 * child.pause_s, LONGEST_PAUSE_S)
-    if now_s >= child.due_s:
-        child.due_s = now_s
-        child.process = start([child.name, *child.arguments], data_folder / f"{child.name}.log")
+def _tend(children: Sequence[Child], notices: "Notices") -> Exit | None:
+    """Look after every child. Returns the exit that ends all."""
+    final: Exit | None = None
+    for child in children:
+        now_s = time.monotonic()
+        ended = child.tend(now_s)
+        if ended is None:
+            if child.name == "loop" and not child.ended:
+                notices.hear(child.said(), now_s)
+        elif ended.is_final:
+            final = final or ended
+        else:
+            notices.tell(ended)
+        if child.name == "sim" and not child.ended and not child.said():
+            break  # its wires are not open yet: a loop would only report that nobody answers
+    return final
 
 
-def _screen(console: Console, run_folder: Path, data_folder: Path):  # noqa: ANN202
+class Notices:
+    """What a person must see beside the status: why a child has ended, and what help the loop was not granted.
+
+    Without a terminal each is printed once, as it comes.
+    """
+
+    def __init__(self, console: Console, start_s: float, opening: Sequence[str] = ()) -> None:
+        self._console = console
+        self._opening = list(opening)  #: has been printed already
+        self._start_s = start_s
+        self._notes: list[str] = []
+        self._exits: dict[str, Exit] = {}
+
+    def hear(self, said: list[str], now_s: float) -> None:
+        """What the loop has said since its start, all of it every time."""
+        if now_s - self._start_s > NOTES_S:
+            return
+        notes = [text for text in said if not text.startswith(_ORDINARY)]
+        self._print([f"loop: {text}" for text in notes[len(self._notes) :]])
+        self._notes = notes
+
+    def tell(self, ended: Exit) -> None:
+        self._exits[ended.name] = ended
+        self._print(ended.lines())
+
+    def lines(self, now_s: float) -> list[str]:
+        """What stands above the status now."""
+        notes = [*self._opening, *(f"loop: {text}" for text in self._notes)]
+        shown = notes if now_s - self._start_s <= NOTES_S else []
+        for ended in self._exits.values():
+            ago_s = now_s - ended.at_s
+            shown += (
+                ended.lines() if ago_s <= EXIT_S else [f"{ended.headline()} ({ago_s / 60:.0f} min ago; {ended.log})"]
+            )
+        return shown
+
+    def _print(self, lines: list[str]) -> None:
+        if not self._console.is_terminal:
+            for text in lines:
+                print(text, file=sys.stderr, flush=True)
+
+
+def _screen(console: Console, notices: Notices, run_folder: Path, data_folder: Path) -> RenderableType:
     import asyncio
 
     from gateway.cli.status_commands import ask_status
     from gateway.mailbox.port import Unreachable
 
+    told = [Text(text, "yellow", no_wrap=True, overflow="ellipsis") for text in notices.lines(time.monotonic())]
+    height = console.height - len(told) - bool(told)
     try:
-        return render(asyncio.run(ask_status(run_folder)), console.width, console.height)
+        status = render(asyncio.run(ask_status(run_folder)), console.width, height)
     except Unreachable as error:
-        return Text(f"{error}\nlogs: {data_folder}")
+        status = Text(f"{error}\nlogs: {data_folder}")
+    return Group(*told, Text(), status) if told else status
 
 
 class _Ending:

@@ -9,6 +9,7 @@ from typing import Annotated, Literal, Self
 
 import numpy as np
 from pydantic import Field, TypeAdapter, ValidationError, model_validator
+from pydantic_core import ErrorDetails
 
 from gateway.core.line import NonNegative, Positive, Strict
 
@@ -126,5 +127,9 @@ def parse_controller(payload: bytes) -> LqiConfig | PidConfig:
     try:
         return _adapter.validate_json(payload)
     except ValidationError as error:
-        reasons = "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())
-        raise ControllerRefused(reasons) from error
+        raise ControllerRefused("; ".join(map(_reason, error.errors()))) from error
+
+
+def _reason(error: ErrorDetails) -> str:
+    place = ".".join(map(str, error["loc"]))  # empty for text that is no JSON at all
+    return f"{place}: {error['msg']}" if place else error["msg"]

@@ -42,6 +42,7 @@ class Limits(Strict):
     torque_rate_nm_per_s: Positive
     tension_min_n: NonNegative
     tension_max_n: Positive
+    tension_margin_n: NonNegative = 1.0  #: set-points keep this far from either: noise at a limit stops the line
     speed_max_m_per_s: Positive
     tension_step_max_n: NonNegative = 0.0  #: largest set-point change that may be made at once; larger ones are ramped
     speed_step_max_m_per_s: NonNegative = 0.0
@@ -56,7 +57,9 @@ class Moves(Strict):
     tension_rate_n_per_s: Positive = 20.0
     speed_rate_m_per_s2: Positive = 0.05
     stop_rate_m_per_s2: Positive = 0.1  #: the controlled stop
-    stop_time_s: Positive = 10.0  #: torque goes off after this time in STOP, whatever the speed
+    stop_time_s: Annotated[float, Field(gt=0.0, le=120.0)] = (
+        10.0  #: torque goes off after this time in STOP, whatever the speed
+    )
     torque_off_rate_nm_per_s: Positive = 200.0  #: at the end of a stop
 
 

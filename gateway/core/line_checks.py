@@ -41,7 +41,6 @@ RULES: tuple[Rule, ...] = (
     _rule(f"buses {_DEVICES}", wiring.buses_exist),
     _rule(f"buses {_DEVICES}", wiring.buses_are_used),
     _rule("buses", wiring.buses_are_reachable),
-    _rule(_DEVICES, wiring.addresses_differ),
     _rule(f"buses {_DEVICES}", wiring.canopen_addresses),
     _rule(f"control buses {_DEVICES}", wiring.can_buses_have_room),
     _rule("limits", process.tension_limits_ordered),
@@ -64,7 +63,7 @@ RULES: tuple[Rule, ...] = (
 
 def findings(line: Line, valid: set[str], known_maps: Mapping[str, Role] | None) -> list[Finding]:
     """What all rules find in the tables of `line` that are `valid`; the others need not exist."""
-    rules = list(RULES)
+    rules = [*RULES, _rule(_DEVICES, partial(wiring.addresses_differ, known_maps=known_maps))]
     if known_maps is not None:
         rules.append(_rule(f"buses {_DEVICES}", partial(wiring.maps_fit, known_maps=known_maps)))
     return [finding for rule in rules if rule.reads <= valid for finding in rule.check(line)]

@@ -41,6 +41,7 @@ HELP: dict[str, dict[str, str]] = {
         "torque_rate_nm_per_s": "fastest change of a torque command",
         "tension_min_n": "below it the web is slack: stop",
         "tension_max_n": "above it the web may tear: stop",
+        "tension_margin_n": "set-points keep this far from both, so that noise does not stop the line",
         "speed_max_m_per_s": "fastest web speed",
         "tension_step_max_n": "largest set-point change made at once; larger ones are ramped",
         "speed_step_max_m_per_s": "the same for the speed",

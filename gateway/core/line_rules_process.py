@@ -20,6 +20,9 @@ def tension_limits_ordered(line: Line) -> Iterator[Finding]:
     low, high = line.limits.tension_min_n, line.limits.tension_max_n
     if low >= high:
         yield Finding(("limits", "tension_min_n"), "leaves no band", f"below limits.tension_max_n, {high:g} N")
+    elif low + line.limits.tension_margin_n >= high - line.limits.tension_margin_n:
+        allowed = f"0 or more, and below {0.5 * (high - low):g} N, half of the band of {low:g} to {high:g} N"
+        yield Finding(("limits", "tension_margin_n"), "leaves no room for a set-point", allowed)
 
 
 def web_bears_the_tension(line: Line) -> Iterator[Finding]:
@@ -123,16 +126,20 @@ def recipes_match_spans(line: Line) -> Iterator[Finding]:
 
 
 def recipes_within_tension(line: Line) -> Iterator[Finding]:
-    low, high = line.limits.tension_min_n, line.limits.tension_max_n
-    if low >= high:
+    low, high, margin = line.limits.tension_min_n, line.limits.tension_max_n, line.limits.tension_margin_n
+    lowest, highest = low + margin, high - margin
+    if lowest >= highest:
         return  # another rule's
     room_n = _ROOM * (high - low)
     for i, recipe in enumerate(line.recipes):
         for k, tension_n in enumerate(recipe.tension_n):
             path = ("recipes", i, "tension_n", k)
-            if not low < tension_n < high:
-                allowed = f"above limits.tension_min_n ({low:g} N) and below limits.tension_max_n ({high:g} N)"
-                yield Finding(path, "the limits exclude this set-point", allowed)
+            if not (lowest <= tension_n <= highest and low < tension_n < high):
+                says = "the limits exclude this set-point" if not low < tension_n < high else "is too near to a limit"
+                allowed = (
+                    f"{lowest:g} to {highest:g} N: limits.tension_margin_n ({margin:g} N) inside the tension limits"
+                )
+                yield Finding(path, says, allowed)
             elif min(tension_n - low, high - tension_n) < room_n:
                 yield odd(path, f"within {room_n:g} N of a limit of {low:g} to {high:g} N: overshoot stops the line")
 

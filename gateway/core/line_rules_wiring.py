@@ -11,6 +11,7 @@ from gateway.core.toml_places import Path
 
 #: Protocol and role of a device type: ("canopen", "drive"), ("modbus-tcp", "load-cell"), ("modbus-tcp", "line-plc").
 Role = tuple[str, str]
+_ROLES = {"drives": "drive", "load_cells": "load-cell", "plc": "line-plc"}
 
 
 def devices(line: Line) -> list[tuple[Path, Device]]:
@@ -121,10 +122,16 @@ def buses_are_used(line: Line) -> Iterator[Finding]:
             yield Finding(("buses", i, "name"), "no device is on this bus", "a bus that some device names, or no table")
 
 
-def addresses_differ(line: Line) -> Iterator[Finding]:
-    """Load cells share the unit of their amplifier and differ in the channel; all else has an address of its own."""
+def addresses_differ(line: Line, known_maps: Mapping[str, Role] | None = None) -> Iterator[Finding]:
+    """Load cells share the unit of their amplifier and differ in the channel; all else has an address of its own.
+
+    Where maps are known, a device whose map is none for its kind is left out: it may share an address once that
+    mistake, which is another rule's, is mended.
+    """
     seats: dict[tuple[str, int], list[tuple[Path, Device]]] = {}
     for path, device in devices(line):
+        if known_maps is not None and known_maps.get(device.map, ("", ""))[1] != _ROLES[str(path[0])]:
+            continue
         seat = seats.setdefault((device.bus, device.address), [])
         finding = _clash(path, device, seat, line)
         if finding is not None:
@@ -160,9 +167,8 @@ def canopen_addresses(line: Line) -> Iterator[Finding]:
 def maps_fit(line: Line, known_maps: Mapping[str, Role]) -> Iterator[Finding]:
     """The map of every device exists, speaks the protocol of its bus, and is for its kind of device."""
     protocols = {bus.name: bus.protocol for bus in line.buses}
-    roles = {"drives": "drive", "load_cells": "load-cell", "plc": "line-plc"}
     for path, device in devices(line):
-        role, protocol = roles[str(path[0])], protocols.get(device.bus)
+        role, protocol = _ROLES[str(path[0])], protocols.get(device.bus)
         fitting = [name for name in sorted(known_maps) if _map_fits(known_maps[name], role, protocol)]
         if device.map in fitting:
             continue

@@ -79,6 +79,7 @@ def _process(spans: int) -> str:
         "torque_rate_nm_per_s": "1000.0",
         "tension_min_n": "2.0",
         "tension_max_n": "60.0",
+        "tension_margin_n": "1.0",
         "speed_max_m_per_s": "0.12",
         "tension_step_max_n": "24.0",
         "speed_step_max_m_per_s": "0.09",

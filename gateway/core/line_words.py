@@ -52,6 +52,8 @@ def finding_of(error: ErrorDetails, document: dict[str, Any]) -> Finding:
     value = value_at(document, path)
     schema = schema_at(path, document)
     wrong = _WRONG.get(kind, _other)(value, schema)
+    if path == ("format",) and kind == "less_than_equal":
+        wrong = "is a newer format than this program knows"
     return Finding(path, wrong, allowed_in_words(schema, path), _nearest_value(kind, value, schema))
 
 

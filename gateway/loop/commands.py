@@ -83,7 +83,8 @@ async def release(cycle: Cycle) -> None:
 def not_ready(cycle: Cycle) -> list[str]:
     """What speaks against arming, as far as the samples tell."""
     inputs, reasons = cycle.inputs, []
-    if inputs.plc.quality != Quality.GOOD or inputs.unwind_speed.quality[0] != Quality.GOOD:
+    # v0 comes in the same answer. A PLC that answers but lost its watchdog is not GOOD either: arming proves it anew.
+    if inputs.unwind_speed.quality[0] != Quality.GOOD or inputs.plc.quality not in (Quality.GOOD, Quality.STALE):
         reasons.append(f"the line PLC ({cycle.line.plc.name}) gives no usable answer")
     elif inputs.plc.emergency_stop:
         reasons.append("the emergency stop circuit is open: release it")
@@ -164,9 +165,11 @@ def _set_tension(cycle: Cycle, command: SetTension, now_s: float) -> str:
     line, setpoints = cycle.line, cycle.setpoints
     if command.span > line.n:
         raise Refused(f"there is no span {command.span}; allowed: 1 to {line.n}")
-    low, high = line.limits.tension_min_n, line.limits.tension_max_n
-    if not (isfinite(command.tension_n) and low < command.tension_n < high):
-        raise Refused(f"{command.tension_n:g} N is outside the limits; allowed: above {low:g} and below {high:g} N")
+    # Noise and overshoot need room: a set-point at the limit would trip the line.
+    low = line.limits.tension_min_n + line.limits.tension_margin_n
+    high = line.limits.tension_max_n - line.limits.tension_margin_n
+    if not (isfinite(command.tension_n) and low <= command.tension_n <= high):
+        raise Refused(f"{command.tension_n:g} N is too near a limit or beyond it; allowed: {low:g} to {high:g} N")
     i = command.span - 1
     if command.step:
         size = abs(command.tension_n - setpoints.tension_n[i])

@@ -11,18 +11,20 @@ def become_punctual(cpu: int | None, priority: int) -> tuple[list[str], list[str
     """Ask for real-time priority, an own processor and locked memory. Returns what was granted and what was not."""
     granted: list[str] = []
     refused: list[str] = []
-    processors = sorted(os.sched_getaffinity(0))
-    wanted = processors[-1] if cpu is None else cpu
-    try:
-        os.sched_setaffinity(0, {wanted})
-        granted.append(f"pinned to processor {wanted}")
-    except OSError:
-        refused.append(f"not pinned: processor {wanted} is not among {processors}")
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
         granted.append(f"real-time priority {priority} (SCHED_FIFO)")
     except PermissionError:
+        # Pinned without priority it would only queue behind whatever else runs on that processor.
         refused.append("no real-time priority: needs CAP_SYS_NICE or an rtprio limit (ulimit -r) for this user")
+    else:
+        processors = sorted(os.sched_getaffinity(0))
+        wanted = processors[-1] if cpu is None else cpu
+        try:
+            os.sched_setaffinity(0, {wanted})
+            granted.append(f"pinned to processor {wanted}")
+        except OSError:
+            refused.append(f"not pinned: processor {wanted} is not among {processors}")
     if ctypes.CDLL(None).mlockall(_MCL_CURRENT_AND_FUTURE) == 0:
         granted.append("memory locked")
     else:

@@ -31,13 +31,13 @@ def open_bus(interface: str, channel: str, port: int) -> OpenBus:
     """
     if interface != "udp_multicast":
         try:
-            return OpenBus(can.Bus(channel, interface))
-        except (can.CanError, OSError, ValueError) as error:
+            return OpenBus(can.Bus(channel, interface, ignore_config=True))
+        except (can.CanError, OSError, ValueError, ImportError) as error:
             raise FaceUnavailable(f"the CAN bus {interface}:{channel} cannot be opened: {error}") from error
     guard = _guard(channel, port)
     try:
-        return OpenBus(can.Bus(channel, interface, port=port, hop_limit=0, fd=False), guard)
-    except (can.CanError, OSError) as error:
+        return OpenBus(can.Bus(channel, interface, port=port, hop_limit=0, fd=False, ignore_config=True), guard)
+    except (can.CanError, OSError, ValueError, ImportError) as error:
         guard.close()
         raise FaceUnavailable(explain(channel, port, error)) from error
 
@@ -62,12 +62,14 @@ def _causes(error: BaseException | None) -> list[BaseException]:
 
 
 def _guard(channel: str, port: int) -> socket.socket:
-    """Multicast ports are shared by design, so a second line would go unnoticed: this name is not."""
+    """Multicast groups are shared by design, so a second line would go unnoticed: this name is not."""
     guard = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
     try:
-        guard.bind(f"\0r2r-drives:{port}")
-    except OSError:
+        guard.bind(f"\0r2r-drives:{channel}:{port}")
+    except OSError as error:
         guard.close()
+        if error.errno != errno.EADDRINUSE:
+            raise FaceUnavailable(explain(channel, port, error)) from error
         raise FaceUnavailable(
             f"CAN port {port} is taken: a simulated line already answers on {channel}. "
             "Stop it, or choose another port for this one"

@@ -38,6 +38,7 @@ _RPDO_OBJECTS = {_CONTROLWORD: "H", _TARGET_TORQUE: "h", _MODE: "b"}
 _TPDO_OBJECTS = {0x603F: "H", 0x6041: "H", 0x6061: "b", 0x606C: "i", 0x6077: "h", 0x60FD: "I"}
 _EMERGENCY = struct.Struct("<HB5x")
 _ERROR_HISTORY = 4
+SHORT_RPDO = 0x8210  #: EMCY: a PDO with too few bytes, not processed
 _INT16, _INT32 = 0x7FFF, 0x7FFFFFFF
 
 
@@ -56,6 +57,7 @@ class DriveNode:
         self.sample = DriveSample(drive.statusword, 0.0, 0.0)  #: of the last SYNC
         self._commands = dict.fromkeys(_RPDO_OBJECTS, 0)
         self._errors: list[int] = []
+        self._rpdo_too_short = False  #: the last one was
         self._heartbeat_s = 0.0
         self._heartbeat_due_s = inf
         self._now_s = 0.0
@@ -71,6 +73,7 @@ class DriveNode:
         self.tpdo.reset()
         self._commands = dict.fromkeys(_RPDO_OBJECTS, 0)
         self._errors.clear()
+        self._rpdo_too_short = False
         self.drive.watchdog_s = 0.0
         self._set_heartbeat(self.objects.default(0x1017))
         self.network.send_message(0x700 + self.node_id, b"\0")
@@ -92,14 +95,22 @@ class DriveNode:
         return True
 
     def on_rpdo(self, data: bytes | bytearray, now_s: float) -> bool:
-        """The command PDO: held by the drive until the next SYNC. False when its length is wrong."""
+        """The command PDO: held by the drive until the next SYNC. False when it is too short.
+
+        Of one that is too long the leading bytes count (CiA 301, 7.2.2.5).
+        """
         self._now_s = now_s
         if self.state != OPERATIONAL or not self.rpdo.valid:
             return True
-        if len(data) != self.rpdo.layout.size:
+        too_short = len(data) < self.rpdo.layout.size
+        if too_short != self._rpdo_too_short:
+            self._rpdo_too_short = too_short
+            if too_short or not self.drive.error_code:  # 0000h says that nothing at all is wrong
+                self._send_emergency(SHORT_RPDO if too_short else 0)
+        if too_short:
             return False
         commands = self._commands
-        commands.update(zip(self.rpdo.fields, self.rpdo.layout.unpack(data), strict=True))
+        commands.update(zip(self.rpdo.fields, self.rpdo.layout.unpack_from(data), strict=True))
         target_torque_nm = commands[_TARGET_TORQUE] * 1e-3 * self.drive.rated_torque_nm
         self.drive.receive(commands[_CONTROLWORD], target_torque_nm, commands[_MODE], now_s)
         return True
@@ -146,7 +157,7 @@ class DriveNode:
         """Which objects are computed, and which writes take effect or are refused."""
         readers, writers = self.objects.readers, self.objects.writers
         drive = self.drive
-        readers[0x1001, 0] = lambda: _error_register(drive.error_code)
+        readers[0x1001, 0] = lambda: _error_register(drive.error_code or SHORT_RPDO * self._rpdo_too_short)
         readers[0x1003, 0] = lambda: len(self._errors)
         writers[0x1003, 0] = self._clear_errors
         for k in range(_ERROR_HISTORY):

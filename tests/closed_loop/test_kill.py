@@ -2,7 +2,6 @@
 
 import os
 import signal
-import struct
 import subprocess
 import sys
 import time
@@ -87,9 +86,10 @@ def test_killing_the_simulated_line_the_loop_ramps_after_three_silent_periods_an
     status = wire.wait(lambda status: status.loop.state == "STOP")
     reason = next(event.text for event in reversed(status.events) if event.kind == "state" and "RUNNING" in event.text)
     assert "no usable sample" in reason
-    # In the end the drives are told to take torque off: no enable, no torque.
-    last = [struct.unpack_from("<Hh", frame.data) for frame in frames if 0x200 < frame.arbitration_id < 0x280][-6:]
-    assert all(word & 0x0F != 0x0F and torque == 0 for word, torque in last)
+    # Every drive is told once to leave operational, and no RPDO follows that would renew a watchdog.
+    dropped = [k for k, frame in enumerate(frames) if frame.arbitration_id == 0x000]
+    assert sorted(bytes(frames[k].data) for k in dropped) == [bytes((0x80, node)) for node in range(1, 7)]
+    assert not [frame for frame in frames[dropped[-1] :] if 0x200 < frame.arbitration_id < 0x280]
     # A person may not arm what is not there.
     refusal = wire.order(Arm())
     assert not refusal.ok and refusal.reasons

@@ -83,8 +83,9 @@ def test_setpoints_ramp_or_step_within_the_limits(running):
     ("command", "reason"),
     [
         (SetTension(span=7, tension_n=30.0), "there is no span 7; allowed: 1 to 6"),
-        (SetTension(span=1, tension_n=60.0), "60 N is outside the limits; allowed: above 2 and below 60 N"),
-        (SetTension(span=1, tension_n=2.0), "2 N is outside the limits"),
+        (SetTension(span=1, tension_n=59.1), "59.1 N is too near a limit or beyond it; allowed: 3 to 59 N"),
+        (SetTension(span=1, tension_n=2.9), "allowed: 3 to 59 N"),
+        (SetTension(span=1, tension_n=-30.0), "allowed: 3 to 59 N"),
         (SetTension(span=3, tension_n=44.1, step=True), "a step of 24.1 N is too large; allowed: 24 N"),
         (SetSpeed(speed_m_per_s=0.121), "0.121 m/s is outside the limits; allowed: 0 to 0.12 m/s"),
         (SetSpeed(speed_m_per_s=-0.01), "outside the limits"),

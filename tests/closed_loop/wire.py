@@ -159,4 +159,6 @@ def silent_periods_until_ramp(frames: list[can.Message]) -> int:
             torque = bytes(frame.data[2:4])
             if held.setdefault(cob_id, torque) != torque:
                 return silent
+        elif cob_id == 0x000 and silent:  # told to leave operational: torque off
+            return silent
     raise AssertionError("the torque commands never moved")

@@ -1,6 +1,7 @@
 """The CANopen link against scripted drives: raw frames over udp_multicast, and over virtual."""
 
 import asyncio
+import errno
 import os
 import socket
 import struct
@@ -8,6 +9,7 @@ from collections.abc import Awaitable, Callable
 from math import inf, nan
 from typing import Any
 
+import can
 import pytest
 
 from drivers.canopen.link import CanopenLink
@@ -193,33 +195,113 @@ def test_wrong_length_is_no_answer(payload: bytes) -> None:
     bench(body)
 
 
-def test_a_drive_that_does_not_answer_three_times_is_absent_and_told_to_stop() -> None:
+def test_a_drive_that_is_lost_is_told_to_stop_and_its_watchdog_is_not_fed() -> None:
     async def body(link: CanopenLink, drives: Drives, first: Drive, second: Drive) -> None:
         inputs = Inputs(2)
         await link.prepare()
         first.statusword = second.statusword = ENABLED
         await cycle(link, inputs)
         first.on_sync = lambda drive: []
-        for missed in (1, 2, 3):
+        for missed in (1, 2):  # held meanwhile
             await cycle(link, inputs, 0.02)
-            state = DriveState.ABSENT if missed == 3 else DriveState.ENABLED
-            assert list(inputs.drive_state) == [state, DriveState.ENABLED]
+            assert list(inputs.drive_state) == [DriveState.ENABLED] * 2
             first.rpdos.clear()
             write(link, DriveRequest.ENABLE, 10.0)
             await until(lambda: bool(first.rpdos))
-            # Held for two periods; then a drive that may still hear us has to take its torque off.
-            assert first.rpdos[0][:4] == (struct.pack("<Hh", 0, 0) if missed == 3 else struct.pack("<Hh", 0x0F, 125))
-        assert link.health.absent == ["drive-1"]
-        assert "drive-1" in link.health.last_error
+            assert first.rpdos[0][:4] == struct.pack("<Hh", 0x0F, 125), missed
+        first.rpdos.clear()
+        first.nmt.clear()
+        for _ in range(4):
+            await cycle(link, inputs, 0.02)
+            assert list(inputs.drive_state) == [DriveState.ABSENT, DriveState.ENABLED]
+            write(link, DriveRequest.ENABLE, 10.0)
+            await settle(drives)
+        assert first.nmt == [0x80], "once; it takes torque off without a SYNC"
+        assert first.rpdos == [], "if it did not hear that, its watchdog has to fire"
+        assert link.health.absent == ["drive-1"] and "drive-1" in link.health.last_error
+        assert second.rpdos and second.nmt == [0x80, 0x01]
         # An absent drive is not waited for: this returns although the deadline is far away.
         async with asyncio.timeout(5.0):
             await cycle(link, inputs, 60.0)
+        # It did not hear the command and is back: heard, but not fed until it has been prepared again.
         first.on_sync = lambda drive: [drive.tpdo()]
+        await until_back(link, inputs)
+        assert list(inputs.drive_state) == [DriveState.FAULT, DriveState.ENABLED] and inputs.speed.good()
+        write(link, DriveRequest.ENABLE, 10.0)
+        await settle(drives)
+        assert first.rpdos == [] and first.nmt == [0x80]
+        first.statusword = second.statusword = READY
+        await link.prepare()
         await cycle(link, inputs)
-        await cycle(link, inputs)
-        assert list(inputs.drive_state) == [DriveState.ENABLED] * 2 and link.health.absent == []
+        assert list(inputs.drive_state) == [DriveState.READY] * 2
+        write(link, DriveRequest.READY)
+        await until(lambda: bool(first.rpdos))
 
     bench(body)
+
+
+def test_a_drive_without_heartbeats_is_not_fed_either() -> None:
+    async def body(link: CanopenLink, drives: Drives, first: Drive, second: Drive) -> None:
+        inputs = Inputs(2)
+        await link.prepare()
+        first.statusword = second.statusword = ENABLED
+        await cycle(link, inputs)
+        first.rpdos.clear()
+        drives.drives[1].nmt.clear()
+        node = link._nodes[0]  # noqa: SLF001
+        assert node.heard_s is not None
+        node.heard_s -= 10.0
+        write(link, DriveRequest.ENABLE, 10.0)
+        await settle(drives)
+        assert (first.nmt, first.rpdos) == ([0x80], [])
+
+    bench(body)
+
+
+async def until_back(link: CanopenLink, inputs: Inputs) -> None:
+    """Cycles that wait as briefly as those of a line until every drive is heard again."""
+    async with asyncio.timeout(5.0):
+        while DriveState.ABSENT in inputs.drive_state:
+            await cycle(link, inputs, 0.02)
+
+
+def test_drives_that_were_all_absent_are_heard_again() -> None:
+    async def body(link: CanopenLink, drives: Drives, first: Drive, second: Drive) -> None:
+        inputs = Inputs(2)
+        await link.prepare()
+        first.on_sync = second.on_sync = lambda drive: []
+        for _ in range(5):
+            await cycle(link, inputs, 0.02)
+        assert list(inputs.drive_state) == [DriveState.ABSENT] * 2
+        first.on_sync = second.on_sync = lambda drive: [drive.tpdo()]
+        first.speed_um_per_s = 1_000_000
+        await cycle(link, inputs, 0.02)
+        await settle(drives)  # their answers are under way, though nobody waited for them
+        assert inputs.speed.quality[0] != Quality.GOOD, "a late sample is not used"
+        await cycle(link, inputs)
+        assert inputs.speed.good() and inputs.speed.value[0] == 1.0
+
+    bench(body)
+
+
+def test_all_that_waits_is_read_before_a_sync() -> None:
+    async def body(link: CanopenLink, drives: Drives, first: Drive, second: Drive) -> None:
+        inputs = Inputs(2)
+        await link.prepare()
+        await cycle(link, inputs)
+        first.on_sync = lambda drive: []
+        others = [can.Message(arbitration_id=0x555, is_extended_id=False)] * 300
+        link._bus._drain(1 << 16)  # noqa: SLF001
+        link._bus._receive = iter([*others, tpdo_of(first), None, None, None]).__next__  # noqa: SLF001
+        link.trigger(asyncio.get_running_loop().time())
+        assert link.health.malformed == 1, "the old answer is found behind all the others, before the SYNC"
+        del link._bus._receive  # noqa: SLF001
+
+    bench(body)
+
+
+def tpdo_of(drive: Drive) -> can.Message:
+    return can.Message(arbitration_id=0x180 + drive.node, data=drive.tpdo(), is_extended_id=False)
 
 
 def test_the_answer_of_an_absent_drive_does_not_stand_in_for_another() -> None:
@@ -402,7 +484,7 @@ def test_every_reason_is_given_with_its_device() -> None:
     assert [reason.split(":")[0] for reason in reasons] == ["drive-1", "drive-2", "drive-2", "drive-2"]
     assert "0x999" in reasons[0] and "0x402" in reasons[0]
     assert "still enabled" in reasons[1] and "60 Nm" in reasons[2] and "40 Nm" in reasons[3]
-    assert first.writes == second.writes == [] and first.nmt == second.nmt == []
+    assert first.writes == second.writes == [] and first.nmt == second.nmt == [0x80]
 
 
 def test_a_missing_drive_is_refused() -> None:
@@ -458,14 +540,98 @@ def test_a_drive_that_restarts_meanwhile_is_refused() -> None:
     bench(body)
 
 
-def test_a_bus_that_cannot_be_opened_says_what_to_do() -> None:
+@pytest.mark.parametrize(
+    ("number", "advice"), [(errno.ENODEV, "ip link set nocan9 up"), (errno.EAFNOSUPPORT, "this kernel has no CAN")]
+)
+def test_a_bus_that_cannot_be_opened_says_what_to_do(number: int, advice: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(**_: Any) -> None:
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(can, "Bus", fails)
+
     async def run() -> None:
         link = build_links(line(can_bus={"interface": "socketcan", "channel": "nocan9"}))[0]
-        with pytest.raises(OSError, match="ip link set nocan9 up"):
+        with pytest.raises(OSError, match=advice):
             await link.open()
+        with pytest.raises(PrepareRefused, match=advice):
+            await link.prepare()
         await link.close()
 
     asyncio.run(run())
+
+
+def test_a_bus_that_was_not_there_is_opened_by_prepare(monkeypatch: pytest.MonkeyPatch) -> None:
+    real, attempts = can.Bus, [OSError(errno.ENODEV, "No such device")]
+
+    def comes_up(**options: Any) -> can.BusABC:
+        if attempts:
+            raise attempts.pop()
+        return real(**options)
+
+    async def run() -> None:
+        bus = {"interface": "udp_multicast", "channel": GROUP, "port": free_port(socket.SOCK_DGRAM)}
+        link = build_links(line(can_bus=bus))[0]
+        async with Drives([Drive(1), Drive(2)], **bus, hop_limit=0, fd=False):
+            monkeypatch.setattr(can, "Bus", comes_up)
+            with pytest.raises(OSError, match="No such device"):
+                await link.open()
+            inputs = Inputs(2)
+            await link.prepare()
+            await cycle(link, inputs)
+            assert inputs.speed.good()
+            await link.close()
+
+    asyncio.run(run())
+
+
+def test_a_stopped_node_is_recovered() -> None:
+    """In NMT stopped a node answers no SDO; its heartbeats may not even have been seen yet."""
+
+    async def body(link: CanopenLink, drives: Drives, first: Drive, second: Drive) -> None:
+        second.sdo_answers = False
+        leave_stopped = drives._on_nmt  # noqa: SLF001
+
+        def on_nmt(command: int, node: int) -> None:
+            second.sdo_answers |= (command, node) == (0x80, 2)
+            leave_stopped(command, node)
+
+        drives._on_nmt = on_nmt  # noqa: SLF001
+        await link.prepare()
+        await cycle(link, inputs := Inputs(2))
+        assert inputs.speed.good()
+
+    bench(body)
+
+
+def test_an_object_of_unstated_size_is_read_without_its_surplus_zeros() -> None:
+    """CiA 301: an expedited upload may leave its size open (s = 0); four bytes come then."""
+    pristine = Drive(1).objects
+
+    async def body(link: CanopenLink, drives: Drives, first: Drive, second: Drive) -> None:
+        stated = first.sdo
+
+        def unstated(request: bytes) -> bytes | None:
+            answer = stated(request)
+            return b"\x42" + answer[1:] if answer is not None and answer[0] & 0xE2 == 0x42 else answer
+
+        first.sdo = unstated
+        await link.prepare()
+        assert first.objects[0x1400, 5] == struct.pack("<H", 100) and len(first.objects[0x6060, 0]) == 1
+        second.aborts[0x1400, 5] = 0x06090030
+        first.objects.update(pristine)
+        with pytest.raises(PrepareRefused):
+            await link.prepare()
+        assert first.objects == pristine, "undone with the lengths that the objects have"
+
+    bench(body)
+
+
+def test_surplus_bytes_that_are_not_zero_are_refused() -> None:
+    def arrange(first: Drive, second: Drive) -> None:
+        first.objects[0x6072, 0] = struct.pack("<HH", 1000, 1)
+
+    reasons, _, _ = refusal(arrange)
+    assert reasons == ["drive-1: object 6072h sub 0: 4 bytes are no u16"]
 
 
 def test_garbage_on_the_bus_is_counted_and_harmless() -> None:

@@ -388,6 +388,91 @@ def test_reconnects_by_itself_and_costs_no_time() -> None:
     bench(body)
 
 
+def test_a_peer_that_stops_and_goes_on_does_not_find_a_heap_of_requests() -> None:
+    async def body(link: ModbusLink, peer: Registers) -> None:
+        inputs = Inputs(2)
+        await link.prepare()
+        link.write(command(True, 0.1))
+        await cycle(link, inputs)
+        goes_on = asyncio.Event()
+
+        async def stopped(head: bytes, unit: int, pdu: bytes) -> list[bytes] | None:
+            await goes_on.wait()
+            return None
+
+        peer.script = stopped
+        peer.requests.clear()
+        before, loop = peer.connections, asyncio.get_running_loop()
+        end_s = loop.time() + 2.0  # twenty periods
+        while loop.time() < end_s:
+            link.write(command(True, 0.1))
+            await cycle(link, inputs, 0.1)
+            await asyncio.sleep(0.01)
+        assert len(link.health.absent) == 2
+        waiting = peer.connections - before  # each got one request, and waited alone for its answer
+        assert 1 <= waiting <= 6
+        await until(lambda: len(peer.requests) >= 1 + waiting)
+        goes_on.set()
+        await settle(peer)
+        written = [pdu for _, pdu in peer.requests if pdu[0] == 23]
+        assert len(written) <= 3 and len(peer.requests) <= 3 + waiting, "0.3 s of requests, one a connection later"
+        await _until_good(link, inputs)
+
+    bench(body)
+
+
+async def settle(peer: Registers) -> None:
+    """Let the peer take everything that was sent before, on every connection it has."""
+    seen = -1
+    while seen != len(peer.requests):
+        seen = len(peer.requests)
+        await asyncio.sleep(0.02)
+
+
+def test_an_amplifier_is_proven_again_after_a_reconnection() -> None:
+    async def body(link: ModbusLink, peer: Registers) -> None:
+        inputs = Inputs(2)
+        await link.prepare()
+        await cycle(link, inputs)
+        assert inputs.tension.good()
+        for registers in ([0x7777, 2], [0x5201, 1]):
+            await peer.stop()
+            await cycle(link, inputs, 0.02)
+            peer.amplifier[:2] = registers
+            await peer.start()
+            async with asyncio.timeout(5.0):
+                while inputs.unwind_speed.quality[0] != Quality.GOOD or not peer.requests:
+                    await cycle(link, inputs, 0.1)
+                    await asyncio.sleep(0)
+            assert list(inputs.tension.quality) == [Quality.BAD] * 2
+        await cycle(link, inputs)
+        assert "not proven: cell-2: channel 2, the amplifier has 1" in link.health.last_error
+        peer.amplifier[:2] = [0x5201, 2]
+        await cycle(link, inputs)
+        assert inputs.tension.good()
+
+    bench(body)
+
+
+def test_a_slow_device_is_proven_over_several_cycles() -> None:
+    async def body(link: ModbusLink, peer: Registers) -> None:
+        inputs = Inputs(2)
+        await peer.stop()
+        await cycle(link, inputs, 0.02)
+        seen: list[int] = []
+
+        async def slow(head: bytes, unit: int, pdu: bytes) -> list[bytes] | None:
+            # Of its requests in a cycle only the first is answered; the second is what the cycle has no time for.
+            seen.append(unit)
+            return [] if unit == 1 and seen.count(1) % 2 == 0 else None
+
+        peer.script = slow
+        await peer.start()
+        await _until_good(link, inputs)
+
+    bench(body)
+
+
 def test_a_plc_that_lost_its_watchdog_is_not_written_to_again() -> None:
     async def body(link: ModbusLink, peer: Registers) -> None:
         inputs = Inputs(2)

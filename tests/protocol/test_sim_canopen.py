@@ -435,8 +435,6 @@ def test_quick_stop_ramps_and_switches_off(bench: Bench) -> None:
 @pytest.mark.parametrize(
     "message",
     [
-        can.Message(arbitration_id=0x200 + FIRST_NODE, data=bytes(4), is_extended_id=False),
-        can.Message(arbitration_id=0x200 + FIRST_NODE, data=bytes(8), is_extended_id=False),
         can.Message(arbitration_id=0x200 + FIRST_NODE, data=bytes(5), is_extended_id=True),
         can.Message(arbitration_id=0x200 + FIRST_NODE, dlc=5, data=bytes(3), is_extended_id=False),
         can.Message(arbitration_id=0x180 + FIRST_NODE, is_remote_frame=True, is_extended_id=False),
@@ -458,6 +456,41 @@ def test_malformed_frames_are_counted_and_change_nothing(bench: Bench, message: 
     assert bench.face.malformed == 1
     assert (bench.drive.state, len(bench.recorder.recording().events)) == before
     assert bench.take() == []
+
+
+def test_a_command_that_is_too_long_counts_as_far_as_it_is_mapped(bench: Bench) -> None:
+    bench.start()
+    bench.enable()
+    bench.send_message(0x200 + FIRST_NODE, struct.pack("<HhBHB", ENABLE, 100, 10, 0xFFFF, 0xFF))
+    bench.latch()
+    assert bench.world.torque_nm[0] == pytest.approx(0.1 * RATED_NM)
+    assert bench.face.malformed == 0
+
+
+def test_a_command_that_is_too_short_is_told_once_and_feeds_no_watchdog(bench: Bench) -> None:
+    bench.remote.sdo[0x1400][5].raw = 50
+    bench.start()
+    bench.enable()
+    emergency = (0x80 + FIRST_NODE, struct.pack("<HB5x", 0x8210, 0x11))
+    for expected in ([emergency], []):
+        bench.wait(0.02)
+        bench.take()
+        bench.send_message(0x200 + FIRST_NODE, bytes(4))
+        assert bench.take() == expected
+        assert bench.drive.state.name == "OPERATION_ENABLED", "it goes on as it was"
+    assert bench.face.malformed == 2
+    assert (bench.sdo(0x1001), bench.sdo(0x1003, 1)) == (0x11, 0x8210)
+    bench.take()
+    bench.command(ENABLE)
+    assert bench.take() == [(0x80 + FIRST_NODE, bytes(8))]
+    assert bench.sdo(0x1001) == 0
+    for _ in range(3):
+        bench.wait(0.02)
+        bench.send_message(0x200 + FIRST_NODE, bytes(4))
+    assert bench.drive.error_code == 0x8250
+    bench.take()
+    bench.command(ENABLE)
+    assert bench.take() == [], "there is still a fault"
 
 
 @pytest.mark.parametrize(("can_id", "data"), [(0x263, bytes(5)), (0x663, bytes(8)), (0x000, b"\1\x63"), (0x100, b"")])

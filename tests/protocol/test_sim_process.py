@@ -1,5 +1,6 @@
 """The simulated line as a process on real wires: the canopen library, bare frames and pymodbus as its peers."""
 
+import asyncio
 import json
 import re
 import select
@@ -20,8 +21,9 @@ import pytest
 from pymodbus.client import ModbusTcpClient
 
 from sim_plant.faces.canopen import CanopenFace
-from sim_plant.faces.canopen_bus import open_bus
+from sim_plant.faces.canopen_bus import FaceUnavailable, open_bus
 from sim_plant.faces.canopen_sdo import EDS_PATH
+from sim_plant.plant import load_plant
 from sim_plant.process import main
 from sim_plant.recorder import read_recording
 from sim_plant.wired import WorldClock
@@ -185,7 +187,10 @@ def test_says_what_to_do_when_something_is_taken(line: Line, refused: Refused, t
     # The folder of the attempt that failed is free for the next.
     said = refused(str(PLANT), "--record", other, "--can-port", str(free_port()), "--modbus-port", modbus_port)
     assert modbus_port in said and "0 takes a free one" in said
-    assert not list((tmp_path / "other").iterdir())
+    assert not (tmp_path / "other").exists()
+    (tmp_path / "other").mkdir()
+    refused(str(PLANT), "--record", other, "--can-port", str(free_port()), "--modbus-port", modbus_port)
+    assert not list((tmp_path / "other").iterdir()), "a folder that was there before stays"
     said = refused(str(PLANT), "--record", str(line.folder))
     assert "already holds a recording" in said
 
@@ -198,6 +203,55 @@ def test_says_what_is_wrong_with_its_arguments(refused: Refused, tmp_path: Path)
     bad.write_text(PLANT.read_text().replace("spans = 6", "spans = 600"))
     assert "spans" in refused(str(bad), "--record", record)
     assert not (tmp_path / "recording").exists()
+
+
+@pytest.mark.parametrize(
+    ("option", "port", "allowed"),
+    [
+        ("--can-port", "-1", "1 to 65535"),
+        ("--can-port", "0", "1 to 65535"),
+        ("--can-port", "99999", "1 to 65535"),
+        ("--modbus-port", "-1", "0 to 65535"),
+        ("--modbus-port", "99999", "0 to 65535"),
+    ],
+)
+def test_a_port_that_cannot_be_is_refused(option: str, port: str, allowed: str, refused: Refused, tmp_path: Path):
+    said = refused(str(PLANT), "--record", str(tmp_path / "recording"), option, port)
+    assert option in said and port in said and allowed in said
+    assert not (tmp_path / "recording").exists()
+
+
+def test_whatever_fails_at_the_opening_leaves_no_recording(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    from sim_plant import wired
+
+    async def run() -> None:
+        settings = wired.Settings(tmp_path / "recording", can_port=free_port(), modbus_port=0)
+        line = wired.WiredLine(load_plant(PLANT), settings)
+        monkeypatch.setattr(wired, "open_bus", lambda *_: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            await line.open()
+
+    asyncio.run(run())
+    assert not (tmp_path / "recording").exists()
+
+
+def test_two_lines_may_have_one_port_in_two_groups() -> None:
+    port = free_port()
+    first = open_bus("udp_multicast", GROUP, port)
+    second = open_bus("udp_multicast", "239.74.163.3", port)
+    with pytest.raises(FaceUnavailable, match="taken"):
+        open_bus("udp_multicast", GROUP, port)
+    first.close()
+    second.close()
+
+
+def test_a_configuration_file_of_the_user_does_not_choose_the_bus(monkeypatch: pytest.MonkeyPatch) -> None:
+    """python-can would add what its files and CAN_CONFIG say."""
+    monkeypatch.setenv("CAN_CONFIG", '{"receive_own_messages": true}')
+    bus = open_bus("virtual", f"config-{free_port()}", 0)
+    bus.bus.send(can.Message(arbitration_id=0x123, is_extended_id=False))
+    assert bus.bus.recv(0) is None
+    bus.close()
 
 
 def test_without_a_multicast_route_it_says_how_to_add_one(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -217,8 +271,6 @@ def test_without_a_multicast_route_it_says_how_to_add_one(monkeypatch: pytest.Mo
 
 
 def test_frames_of_a_bus_without_a_descriptor_come_through_a_thread() -> None:
-    import asyncio
-
     async def run() -> list[int]:
         channel = f"thread-{free_port()}"
         here, there = can.Bus(channel, "virtual"), can.Bus(channel, "virtual")

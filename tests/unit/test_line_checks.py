@@ -288,8 +288,8 @@ REFUSED: list[tuple[str, list[Edit], str, str, str]] = [
         [("[28.0, 36.0", "[28.0, 60.0")],
         "recipes[1].tension_n[2]",
         "tension_n",
-        "= 60.0: the limits exclude this set-point; allowed: above limits.tension_min_n (2 N) and "
-        "below limits.tension_max_n (60 N)",
+        "= 60.0: the limits exclude this set-point; allowed: 3 to 59 N: limits.tension_margin_n (1 N) "
+        "inside the tension limits",
     ),
     (
         "recipes_within_tension",
@@ -297,6 +297,27 @@ REFUSED: list[tuple[str, list[Edit], str, str, str]] = [
         "recipes[1].tension_n[2]",
         "tension_n",
         "the limits exclude this set-point",
+    ),
+    (
+        "recipes_within_tension",
+        [("[28.0, 36.0", "[28.0, 59.1")],
+        "recipes[1].tension_n[2]",
+        "tension_n",
+        "= 59.1: is too near to a limit; allowed: 3 to 59 N: limits.tension_margin_n (1 N) inside the tension limits",
+    ),
+    (
+        "recipes_within_tension",
+        [("[28.0, 36.0", "[28.0, 60.0"), ("tension_margin_n = 1.0", "tension_margin_n = 0.0")],
+        "recipes[1].tension_n[2]",
+        "tension_n",
+        "the limits exclude this set-point",
+    ),
+    (
+        "tension_limits_ordered",
+        [("tension_margin_n = 1.0", "tension_margin_n = 29.0")],
+        "limits.tension_margin_n",
+        "tension_margin_n",
+        "= 29.0: leaves no room for a set-point; allowed: 0 or more, and below 29 N, half of the band of 2 to 60 N",
     ),
     (
         "recipes_within_speed",
@@ -360,7 +381,8 @@ def test_each_rule_refuses_what_it_is_for(rule: str, edits: list[Edit], key: str
 
 def test_every_rule_is_tested() -> None:
     tested = {rule for rule, *_ in REFUSED} | {"speed_limit_within_torque"}  # which only warns
-    names = {getattr(rule.check, "func", rule.check).__name__ for rule in RULES} | {"maps_fit"}
+    names = {getattr(rule.check, "func", rule.check).__name__ for rule in RULES}
+    names |= {"addresses_differ", "maps_fit"}  # which need the maps
     assert names == tested
     written = {
         name
@@ -512,6 +534,25 @@ def test_amplifiers_of_two_types_must_not_share_a_unit() -> None:
         check_line(text, "line.toml", {**MAPS, "other-amp": ("modbus-tcp", "load-cell")})
     # load cell 2 clashes with 1, and 3 to 6 with 2: each is told
     assert [problem.key for problem in refused.value.problems] == [f"load_cells[{i}].address" for i in range(2, 7)]
+
+
+def test_a_wrong_map_is_told_once_and_not_as_clashes_of_addresses() -> None:
+    # All load cells share the amplifier's address. With the map of one mistyped only that is wrong.
+    for wrong in ("loadcel-amp", "line-plc"):
+        (problem,) = problems(edited(('map = "loadcell-amp"', f'map = "{wrong}"')))
+        assert (problem.key, problem.nearest) == ("load_cells[1].map", '"loadcell-amp"')
+
+
+def test_a_recipe_as_near_to_a_limit_as_allowed_is_accepted() -> None:
+    for tension_n in ("59.0", "3.0"):
+        (warning,) = check(edited(("[28.0, 36.0", f"[28.0, {tension_n}"))).warnings
+        assert "overshoot stops the line" in str(warning)
+
+
+def test_a_stop_that_takes_minutes_is_refused() -> None:
+    assert check(edited(("stop_time_s = 10.0", "stop_time_s = 120.0"))).warnings == []
+    (problem,) = problems(edited(("stop_time_s = 10.0", "stop_time_s = 120.1")))
+    assert "is too large; allowed: a number above 0 up to 120 s" in str(problem)
 
 
 def test_the_free_address_is_that_of_the_same_bus() -> None:

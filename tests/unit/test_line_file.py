@@ -99,7 +99,7 @@ VALUES = [
         "limits.hold_periods",
         "is not a whole number; allowed: a whole number from 1 to 3",
     ),
-    ("format = 1", "format = 2", "format", "= 2: is too large; allowed: 1"),
+    ("format = 1", "format = 2", "format", "= 2: is a newer format than this program knows; allowed: 1"),
     ("format = 1", "format = true", "format", "= true: is true or false; allowed: 1"),
     (
         'site = "demo"',

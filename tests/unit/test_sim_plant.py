@@ -67,6 +67,13 @@ def test_a_typo_is_told_with_the_nearest_key() -> None:
     assert reasons(zzz=1)[0].startswith("zzz: unknown key; allowed here: format, name, spans, web")
 
 
+def test_a_port_that_cannot_be_is_told_with_the_range() -> None:
+    assert reasons(wires={"modbus": {"port": 99999}, "canopen": {"port": -1}}) == [
+        "wires.canopen.port: is -1, should be a port: 1 to 65535",
+        "wires.modbus.port: is 99999, should be a port: 1 to 65535",
+    ]
+
+
 def test_every_mistake_is_told_at_once() -> None:
     found = reasons(
         format=2,
