@@ -1,7 +1,7 @@
 """One control period, on one screen: wait -> read -> estimate -> control -> envelope -> write -> record."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -22,19 +22,27 @@ from safety.envelope import NOTHING, Assessment, EnvelopeState, Supervision, che
 from safety.limits import envelope_limits
 
 READ_SHARE = 0.5  #: of a period, for samples to arrive; the rest is for control and writing
+_ENABLED = int(DriveState.ENABLED)
 STILL_ON_PERIODS = 10  #: a drive that is told OFF and still says ENABLED is told to stop quickly
 
 CONTROLLED = (Phase.TENSIONING, Phase.RUNNING, Phase.HOLDING, Phase.SLOWING)
 WITH_TORQUE = (*CONTROLLED, Phase.UNLOADING)
+_PRODUCTION = Supervision(
+    feedback=True, standstill=False, tension_floor=True, drives=DriveState.ENABLED, transport=True
+)
 SUPERVISION = {
     Phase.SILENT: NOTHING,
     Phase.ARMING: NOTHING,
-    Phase.READY: Supervision(False, False, False, (DriveState.READY,), False),
+    Phase.READY: Supervision(
+        feedback=False, standstill=False, tension_floor=False, drives=DriveState.READY, transport=False
+    ),
     Phase.ENABLING: NOTHING,
-    Phase.TENSIONING: Supervision(True, True, False, (DriveState.ENABLED,), False),
-    Phase.RUNNING: Supervision(True, False, True, (DriveState.ENABLED,), True),
-    Phase.HOLDING: Supervision(True, False, True, (DriveState.ENABLED,), True),
-    Phase.SLOWING: Supervision(True, False, True, (DriveState.ENABLED,), False),
+    Phase.TENSIONING: Supervision(
+        feedback=True, standstill=True, tension_floor=False, drives=DriveState.ENABLED, transport=False
+    ),
+    Phase.RUNNING: _PRODUCTION,
+    Phase.HOLDING: _PRODUCTION,
+    Phase.SLOWING: replace(_PRODUCTION, transport=False),
     Phase.UNLOADING: NOTHING,
     Phase.OFF: NOTHING,
 }
@@ -102,7 +110,7 @@ class Cycle:
     def _check(self, tick: Tick) -> Assessment:
         phase = self.machine.phase
         if phase in WITH_TORQUE:
-            self.torque_path.lost |= self.inputs.drive_state != DriveState.ENABLED
+            self.torque_path.lost |= self.inputs.drive_state != _ENABLED
         late, self._envelope = check_timing(self.limits, self._envelope, tick.skipped)
         seen, self._envelope = check_inputs(self.limits, self._envelope, self.inputs, SUPERVISION[phase])
         if phase is Phase.SILENT:
@@ -112,11 +120,12 @@ class Cycle:
         return seen
 
     def _step_machine(self, seen: Assessment, now_s: float) -> None:
+        phase = self.machine.phase
         observation = Observation(
             action=most_severe(seen.findings),
             reason="; ".join(finding.text for finding in seen.findings if finding.action >= Action.STOP),
-            not_ready=self._drives_other_than(DriveState.READY),
-            not_enabled=self._drives_other_than(DriveState.ENABLED),
+            not_ready=self._drives_other_than(DriveState.READY) if phase is Phase.ARMING else "",
+            not_enabled=self._drives_other_than(DriveState.ENABLED) if phase is Phase.ENABLING else "",
             tensioned=self.setpoints.followed_by(self.inputs.tension.value, self.limits.measured),
             standstill=self.setpoints.speed_m_per_s == 0.0 and standing(self.inputs),
             plc_answers=not seen.plc_lost,
@@ -128,8 +137,6 @@ class Cycle:
     def _drives_other_than(self, wanted: DriveState) -> str:
         """ "drive-3 STO, drive-5 FAULT": the drives that are not as wanted."""
         states = self.inputs.drive_state
-        if (states == wanted).all():
-            return ""
         names = {drive.roller - 1: drive.name for drive in self.line.drives}
         return ", ".join(
             f"{names[i]} {DriveState(int(states[i])).name}" for i in range(self.line.n) if states[i] != wanted
@@ -204,7 +211,7 @@ class Cycle:
 
     def _stays_on(self) -> BoolArray:
         """Drives (n,) that do not obey OFF. Said once, when it begins."""
-        on = self.inputs.drive_state == DriveState.ENABLED
+        on = self.inputs.drive_state == _ENABLED
         self._still_on = np.where(on, self._still_on + 1, 0)
         for i in np.flatnonzero(self._still_on == STILL_ON_PERIODS):
             text = f"drive {i + 1} stays enabled though it was told off; it is told to stop quickly: cut its power"

@@ -45,8 +45,8 @@ class Observation:
 
     action: Action
     reason: str  #: the texts of the findings
-    not_ready: str  #: the drives that may not be enabled, and what they say; empty when all may
-    not_enabled: str
+    not_ready: str  #: while ARMING: the drives that may not be enabled, and what they say; empty when all may
+    not_enabled: str  #: while ENABLING: the drives that do not follow yet
     tensioned: bool  #: set-points reached, every tension inside its band
     standstill: bool  #: request and measured unwinder speed are zero
     plc_answers: bool

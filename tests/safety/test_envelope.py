@@ -27,9 +27,9 @@ LIMITS = EnvelopeLimits(
     hold_periods=3,
     measured=np.array([1.0, 1.0, 0.0]),
 )
-EVERYTHING = Supervision(True, False, True, (DriveState.ENABLED,), True)
-AT_STANDSTILL = Supervision(True, True, False, (DriveState.ENABLED,), False)
-TORQUE_FREE = Supervision(False, False, False, (), False)
+EVERYTHING = Supervision(True, False, True, DriveState.ENABLED, True)
+AT_STANDSTILL = Supervision(True, True, False, DriveState.ENABLED, False)
+TORQUE_FREE = Supervision(False, False, False, None, False)
 
 
 def healthy():
@@ -177,7 +177,7 @@ def test_transport_that_the_plc_has_stopped_stops_the_line():
 
 def test_a_ready_line_wants_ready_drives():
     inputs = healthy()
-    ready = Supervision(False, False, False, (DriveState.READY,), False)
+    ready = Supervision(False, False, False, DriveState.READY, False)
     assert most_severe(findings_after(1, inputs, ready)) is Action.STOP
     inputs.drive_state[:] = DriveState.READY
     assert findings_after(1, inputs, ready) == []
