@@ -5,6 +5,7 @@ import platform
 import shutil
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.resources import as_file, files
@@ -232,7 +233,7 @@ class Operator:
             raise DemoFailed(f"the line has stopped: {told[-1] if told else 'no event says why'}")
         return status
 
-    async def wait(self, enough, within_s: float, what: str) -> None:  # noqa: ANN001
+    async def wait(self, enough: Callable[[GatewayStatus], bool], within_s: float, what: str) -> None:
         """Look on until `enough(status)`."""
         deadline_s = time.monotonic() + within_s
         while time.monotonic() < deadline_s:
