@@ -67,9 +67,15 @@ class WireLine:
         self.start_gateway()
         self.start_loop()
         self.wait(lambda status: status.loop.running)
-        assert self.order(Arm()).ok
-        assert self.order(Start()).ok
-        self.wait(settled)
+        for _ in range(3):
+            assert self.order(Arm()).ok
+            assert self.order(Start()).ok
+            status = self.wait(lambda status: settled(status) or at_rest(status))
+            if settled(status):
+                return
+            # A test machine that stalls for longer than the loop may miss stops the line, as it must.
+            assert any("missed" in event.text for event in status.events), status.events
+        raise AssertionError("this machine stalls too often for a line in real time")
 
     def order(self, command: Command) -> Reply:
         return asyncio.run(request(self.children.run_folder, command, 15.0))
@@ -115,6 +121,10 @@ class WireLine:
     def tap(self) -> can.BusABC:
         """A listener on the CAN wire that shares nothing with either side."""
         return can.Bus(interface="udp_multicast", channel=CHANNEL, port=self.can_port, hop_limit=0, fd=False)
+
+
+def at_rest(status: GatewayStatus) -> bool:
+    return status.loop.state == "STOP" and all(span.torque_nm == 0.0 for span in status.spans)
 
 
 def settled(status: GatewayStatus) -> bool:
