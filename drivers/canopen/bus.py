@@ -10,6 +10,7 @@ import errno
 import threading
 from collections import deque
 from collections.abc import Callable
+from typing import Any
 
 import can
 
@@ -41,14 +42,14 @@ class CanBus:
         if self._bus is not None:
             return
         config = self._config
-        options: dict[str, object] = {"interface": config.interface, "channel": config.channel}
+        options: dict[str, Any] = {"interface": config.interface, "channel": config.channel}
         if config.interface == "udp_multicast":
             # Zero hops: frames stay on this machine.
             options |= {"hop_limit": 0, "fd": False}
             if config.port is not None:
                 options["port"] = config.port
         try:
-            self._bus = can.Bus(ignore_config=True, **options)  # type: ignore[arg-type]
+            self._bus = can.Bus(ignore_config=True, **options)
         except (can.CanError, OSError, ValueError, ImportError) as error:
             where = f"{config.interface} {config.channel}"
             raise OSError(f"bus {config.name}: cannot open {where}: {error}; {_advice(config, error)}") from error

@@ -50,7 +50,7 @@ def kill_gateway(seed: int) -> tuple[float, int]:
         wire.children.end("gateway")
         time.sleep(1.0)  # the line runs alone
         assert wire.order(Stop()).ok
-        time.sleep(1.5)  # the stop takes its time
+        wire.wait_at_rest()
         recording = wire.recording()
         at_s = [event["time_s"] for event in recording.of_kind("command") if event["roller"] == 1]
         after = [time_s for time_s in at_s if killed_s - 0.05 <= time_s <= killed_s + 1.0]

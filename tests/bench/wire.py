@@ -41,7 +41,9 @@ def main() -> None:
 def run(law: str, seed: int) -> DemoResult:
     with tempfile.TemporaryDirectory() as folder:
         command = [sys.executable, "-m", "gateway.cli", "demo", "--out", folder, "--law", law, "--seed", str(seed)]
-        subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+        done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False)
+        if done.returncode:
+            raise SystemExit(f"{law}, seed {seed}: the demonstration has failed\n{done.stdout}")
         print(f"{law}, seed {seed}: done", flush=True)
         return DemoResult.model_validate_json((Path(folder) / "result.json").read_bytes())
 

@@ -27,6 +27,15 @@ def demo(folder: Path) -> subprocess.Popen[str]:
     )
 
 
+def until_running(process: subprocess.Popen[str]) -> None:
+    """Read its progress until the line is being tensioned or runs."""
+    assert process.stdout is not None
+    for line in process.stdout:
+        if "settling" in line:
+            return
+    raise AssertionError(f"the demonstration has ended with {process.wait()}")
+
+
 def left_over(folder: Path) -> list[str]:
     """Command lines of living processes that name this folder."""
     found = []
@@ -62,12 +71,10 @@ def test_the_demonstration_runs_both_cases_and_leaves_nothing_behind(tmp_path):
 def test_ctrl_c_stops_the_line_and_ends_every_process(tmp_path):
     folder = tmp_path / "demo"
     process = demo(folder)
-    assert process.stdout is not None
-    for line in process.stdout:
-        if "settling" in line:
-            break
+    until_running(process)
     time.sleep(1.0)  # somewhere in mid-run
     os.kill(process.pid, signal.SIGINT)
+    assert process.stdout is not None
     output = process.stdout.read()
     assert process.wait(30) == 130, output
     process.stdout.close()
@@ -81,12 +88,10 @@ def test_ctrl_c_stops_the_line_and_ends_every_process(tmp_path):
 def test_a_parent_that_is_killed_takes_its_children_with_it(tmp_path):
     folder = tmp_path / "demo"
     process = demo(folder)
-    assert process.stdout is not None
-    for line in process.stdout:
-        if "settling" in line:
-            break
+    until_running(process)
     process.kill()
     process.wait()
+    assert process.stdout is not None
     process.stdout.close()
     deadline_s = time.monotonic() + 25.0  # the loop stops the line before it ends
     while left_over(folder) and time.monotonic() < deadline_s:

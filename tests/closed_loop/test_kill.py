@@ -55,7 +55,7 @@ def test_killing_the_gateway_process_the_loop_runs_on_and_stop_goes_straight_to_
     wire.children.end("gateway")
     time.sleep(1.0)  # the line runs without its gateway
     assert wire.order(Stop()).ok
-    time.sleep(1.5)  # the stop takes its time
+    wire.wait_at_rest()
     recording = wire.recording()
     alone = (recording.time_s > killed_s) & (recording.time_s < killed_s + 1.0)
     assert recording.torque_nm[alone].any(axis=1).all()  # some drive pulls in every millisecond

@@ -104,6 +104,13 @@ class WireLine:
             time.sleep(0.05)  # a person looks at the status now and then
         raise AssertionError(f"not reached within {within_s} s: {status}")
 
+    def wait_at_rest(self, within_s: float = 15.0) -> None:
+        """Until the recorder has seen no torque for 0.1 s; for when there is no gateway to ask."""
+        deadline_s = time.monotonic() + within_s
+        while read_recording(self.folder / "recording").torque_nm[-100:].any():
+            assert time.monotonic() < deadline_s, "there is torque still"
+            time.sleep(0.05)  # between two looks
+
     def kill(self, name: str) -> float:
         """SIGKILL; returns the time (world)."""
         now_s = time.monotonic() - self.world_start_s
