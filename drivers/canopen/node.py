@@ -11,7 +11,8 @@ from drivers.device_map import DriveMap
 from drivers.scaling import si_per_count
 from gateway.core.signals import DriveRequest, DriveState
 
-HEARTBEATS_ALLOWED = 1.5  #: producer times without a heartbeat until a drive counts as lost
+HEARTBEATS_ALLOWED = 1.5  #: producer times without a heartbeat until a drive that may give torque counts as lost
+HEARTBEATS_ALLOWED_AT_REST = 3.0  #: the same while it gives none and none is asked of it
 ANSWERS_ALLOWED = 3  #: SYNCs in a row without an answer until a drive counts as absent
 
 BOOT_UP, STOPPED, OPERATIONAL, PRE_OPERATIONAL = 0x00, 0x04, 0x05, 0x7F
@@ -109,7 +110,9 @@ class DriveNode:
             self.missed += 1
 
     def heartbeat_lost(self, now_s: float) -> bool:
-        return self.heard_s is None or now_s - self.heard_s > HEARTBEATS_ALLOWED * self.heartbeat_s
+        gives_torque = self._request == DriveRequest.ENABLE or self.power is PowerState.OPERATION_ENABLED
+        allowed = HEARTBEATS_ALLOWED if gives_torque else HEARTBEATS_ALLOWED_AT_REST
+        return self.heard_s is None or now_s - self.heard_s > allowed * self.heartbeat_s
 
     def state(self, now_s: float) -> DriveState:
         if self.heartbeat_lost(now_s) or self.missed >= ANSWERS_ALLOWED:

@@ -144,10 +144,7 @@ async def _story(children: Children, setup: Setup, console: Console) -> tuple[li
             operator.progress = progress
             progress.step("starting the processes")
             await operator.wait(lambda status: status.loop.running, READY_TIME_S, "the loop")
-            progress.step("arming: limits, line PLC, load cells, the drives' watchdogs")
-            await operator.order(Arm())
-            progress.step("tensioning the web, then to speed")
-            await operator.order(Start())
+            await _begin_with_repeats(operator)
             windows = [await _run_with_repeats(operator, setup, case) for case in CASES]
             progress.step("stopping")
             await operator.order(Stop())
@@ -157,18 +154,28 @@ async def _story(children: Children, setup: Setup, console: Console) -> tuple[li
         await operator.close()
 
 
+async def _begin_with_repeats(operator: "Operator") -> None:
+    """From rest to a line that is being tensioned. Refused, a person reads why and tries again."""
+    for repeats in range(MOST_REPEATS + 1):
+        try:
+            await operator.begin()
+            return
+        except DemoFailed as failed:
+            if repeats == MOST_REPEATS:
+                raise
+            await operator.recover(f"not started; once more ({failed})", str(failed))
+
+
 async def _run_with_repeats(operator: "Operator", setup: Setup, case: Case) -> Window:
     """A computer that stalls for more periods than the loop may miss stops the line, as it must; then once more."""
     for repeats in range(MOST_REPEATS + 1):
         try:
-            if repeats:
-                await operator.begin_anew()
             return await _run_case(operator, setup, case)
         except DemoFailed as failed:
             if repeats == MOST_REPEATS or not await operator.stalled():
                 raise
-            operator.stops.append(str(failed))
-            operator.progress.step(f"this computer stalled, so the line stopped; the case once more ({failed})")
+            await operator.recover(f"this computer stalled; the case once more ({failed})", str(failed))
+            await _begin_with_repeats(operator)
     raise AssertionError("the last repeat returns or raises")
 
 
@@ -190,7 +197,7 @@ async def _run_case(operator: "Operator", setup: Setup, case: Case) -> Window:
 
 def _at_rest(status: GatewayStatus) -> bool:
     quiet = all(span.torque_nm == 0.0 and span.drive != "ENABLED" for span in status.spans)
-    return status.loop.state == "STOP" and quiet
+    return status.loop.state in ("SILENT", "STOP") and quiet
 
 
 def _end_in_order(children: Children) -> None:
@@ -251,12 +258,19 @@ class Operator:
         told = [event.text for event in status.events if event.kind == "state"] if status else []
         return any(STALLED in text for text in told[-3:])
 
-    async def begin_anew(self) -> None:
-        """From a stop back to a running line."""
-        await self.wait_at_rest()
-        await asyncio.sleep(1.0)  # a computer that has just stalled is given time to come to itself
+    async def begin(self) -> None:
+        """From rest to a line that is being tensioned."""
+        self.progress.step("arming: limits, line PLC, load cells, the drives' watchdogs")
         await self.order(Arm())
+        self.progress.step("tensioning the web, then to speed")
         await self.order(Start())
+
+    async def recover(self, story: str, why: str) -> None:
+        """Until torque is off; then a computer that has just stalled is given time to come to itself."""
+        self.stops.append(why)
+        self.progress.step(story)
+        await self.wait_at_rest()
+        await asyncio.sleep(1.0)
 
     async def wait_at_rest(self) -> None:
         """Until torque is off."""

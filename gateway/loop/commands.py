@@ -6,10 +6,11 @@ from drivers.port import PrepareRefused
 from gateway.core.line import Recipe
 from gateway.core.messages import Arm, Command, Hold, Reply, SelectRecipe, SetSpeed, SetTension, Start, Stop
 from gateway.core.nearest import nearest
-from gateway.core.signals import Quality
+from gateway.core.signals import Channel, Quality
 from gateway.core.states import LoopState, Phase
 from gateway.loop import machine as machines
-from gateway.loop.cycle import Cycle, standing
+from gateway.loop.cycle import Cycle
+from gateway.loop.machine import STANDSTILL_M_PER_S
 
 
 class Refused(Exception):
@@ -81,21 +82,27 @@ async def release(cycle: Cycle) -> None:
 
 
 def not_ready(cycle: Cycle) -> list[str]:
-    """What speaks against arming, as far as the samples tell."""
+    """What speaks against arming, as far as the samples tell. One that is late is no reason to send a person away."""
     inputs, reasons = cycle.inputs, []
     # v0 comes in the same answer. A PLC that answers but lost its watchdog is not GOOD either: arming proves it anew.
-    if inputs.unwind_speed.quality[0] != Quality.GOOD or inputs.plc.quality not in (Quality.GOOD, Quality.STALE):
+    if not _heard(cycle, inputs.unwind_speed, 0) or inputs.plc.quality not in (Quality.GOOD, Quality.STALE):
         reasons.append(f"the line PLC ({cycle.line.plc.name}) gives no usable answer")
     elif inputs.plc.emergency_stop:
         reasons.append("the emergency stop circuit is open: release it")
     elif not inputs.plc.permissive:
         reasons.append("the line PLC gives no permissive")
-    elif not standing(inputs):
+    elif abs(inputs.unwind_speed.value[0]) > STANDSTILL_M_PER_S:
         reasons.append(f"the unwinder turns at {inputs.unwind_speed.value[0]:.4f} m/s: wait for standstill")
     for cell in cycle.line.load_cells:
-        if inputs.tension.quality[cell.span - 1] != Quality.GOOD:
+        if not _heard(cycle, inputs.tension, cell.span - 1):
             reasons.append(f"load cell {cell.name} (span {cell.span}) gives no usable value")
     return reasons
+
+
+def _heard(cycle: Cycle, channel: Channel, index: int) -> bool:
+    """Whether a usable sample came within as many periods as a running line may miss."""
+    age_s = cycle.clock() - channel.time_s[index]  # NaN for one that was never heard
+    return bool(age_s < (cycle.limits.hold_periods + 1) * cycle.limits.period_s)
 
 
 def _require_rest(cycle: Cycle) -> None:
@@ -137,7 +144,7 @@ def _moving_rollers(cycle: Cycle) -> list[str]:
     return [
         f"roller {i + 1} does not stand still, or its speed is not known"
         for i in range(cycle.line.n)
-        if speed.quality[i] != Quality.GOOD or abs(speed.value[i]) > creeping
+        if not _heard(cycle, speed, i) or abs(speed.value[i]) > creeping
     ]
 
 

@@ -78,7 +78,7 @@ class Cycle:
         self.outputs = Outputs(line.n)
         self.setpoints = Setpoints(line.recipes[0])
         self.account = Account()
-        self._clock = clock
+        self.clock = clock
         self._record = record
         self._announce = announce
         self._times = Times(line.limits.tensioning_time_s, line.moves.stop_time_s)
@@ -227,7 +227,7 @@ class Cycle:
                 sequence=account.sequence,
                 time_s=tick.due_s,
                 lateness_s=tick.now_s - tick.due_s,
-                cycle_s=self._clock() - tick.now_s,
+                cycle_s=self.clock() - tick.now_s,
                 missed=account.skipped,
                 unwind_speed_m_per_s=float(inputs.unwind_speed.value[0]),
                 speed_setpoint_m_per_s=self.setpoints.speed_m_per_s,

@@ -101,21 +101,23 @@ def test_transport_that_the_plc_stops_stops_the_line_and_does_not_come_back_by_i
 def test_arming_and_starting_want_to_know_that_the_line_stands_still(loop, monkeypatch):
     sample = loop.truth.sample
 
-    def unwinder_says(speed_m_per_s):
+    def unwinder_says(speed_m_per_s, periods=1):
         def reading(now_s):
             taken = sample(now_s)
             object.__setattr__(taken, "unwind_speed_m_per_s", speed_m_per_s)
             return taken
 
         monkeypatch.setattr(loop.truth, "sample", reading)
-        loop.step(1)
+        loop.step(periods)
 
     loop.step(3)
     unwinder_says(0.05)
     assert "unwinder turns" in loop.arm().reasons[0]
-    unwinder_says(float("nan"))
+    unwinder_says(float("nan"), periods=5)
     assert "no usable answer" in loop.arm().reasons[0]
     unwinder_says(0.0)
+    unwinder_says(float("nan"))  # one lost sample is no reason to send a person away
+    unwinder_says(0.0, periods=0)
     assert loop.arm().ok and loop.step_until(Phase.READY, 1.0)
     unwinder_says(0.05)
     reply = loop.command(Start())

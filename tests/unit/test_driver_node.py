@@ -60,6 +60,15 @@ def test_heartbeats_end_at_one_and_a_half_producer_times() -> None:
     assert drive.state(0.3) == DriveState.ENABLED
 
 
+def test_a_drive_without_torque_may_be_late_with_its_heartbeat() -> None:
+    drive = node()
+    answer(drive, SWITCH_ON_DISABLED)
+    assert drive.state(0.3) == DriveState.OFF
+    assert drive.state(0.3001) == DriveState.ABSENT
+    drive.command(DriveRequest.ENABLE, 0.0, DriveState.OFF)
+    assert drive.state(0.1501) == DriveState.ABSENT
+
+
 def test_never_heard_is_absent() -> None:
     drive = DriveNode("drive-1", 0, CIA402, DriveSettings(1, 80.0, 60.0, 0.1), radius_m=0.04)
     assert drive.state(0.0) == DriveState.ABSENT
