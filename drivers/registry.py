@@ -1,23 +1,18 @@
-"""From a line description to the links that carry it: device types are looked up, devices grouped by bus."""
+"""From a line description to the links that carry it: device types are looked up, each protocol builds its links."""
 
-from collections.abc import Iterable
 from pathlib import Path
-from typing import TypeVar
 
-from drivers.canopen.configure import DriveSettings, torque_limit_counts, watchdog_counts
-from drivers.canopen.link import CanopenLink
-from drivers.canopen.node import DriveNode
-from drivers.device_map import MAPS, DeviceMap, DriveMap, LoadCellMap, MapRefused, PlcMap, load_map, map_names
-from drivers.modbus.amplifier import Amplifier
-from drivers.modbus.link import Device as ModbusDevice
-from drivers.modbus.link import ModbusLink
-from drivers.modbus.plc import Plc
+from drivers.canopen import build as canopen
+from drivers.device_map import MAPS, DeviceMap, MapRefused, load_map, map_names
+from drivers.modbus import build as modbus
 from drivers.port import Link
-from gateway.core.line import CanopenBus, Device, Drive, Line, LoadCell, ModbusTcpBus
+from drivers.wiring import Builder, Wired
+from gateway.core.line import Drive, Line, LinePlc, LoadCell
 from gateway.core.nearest import nearest
 
-M = TypeVar("M", DriveMap, LoadCellMap, PlcMap)
-B = TypeVar("B", CanopenBus, ModbusTcpBus)
+BUILDERS: dict[str, Builder] = {"canopen": canopen.build, "modbus-tcp": modbus.build}
+
+_ROLES = {Drive: ("drive", "drives"), LoadCell: ("load-cell", "load_cells"), LinePlc: ("line-plc", "plc")}
 
 
 class LinksRefused(ValueError):
@@ -29,123 +24,73 @@ class LinksRefused(ValueError):
 
 
 def build_links(line: Line, folder: Path = MAPS) -> list[Link]:
-    """One link a CANopen bus and one a Modbus TCP address, not yet open, for a line that has passed its own checks.
+    """The links of every bus, not yet open, for a line that has passed its own checks.
 
     Raises LinksRefused with every reason.
     """
-    builder = _Builder(line, folder)
-    links: list[Link] = [*builder.canopen_links(), *builder.modbus_links()]
-    if builder.reasons:
-        raise LinksRefused(builder.reasons)
+    wired, reasons = _Lookup(line, folder).devices()
+    links: list[Link] = []
+    for protocol, build in BUILDERS.items():
+        built, refused = build(line, [device for device in wired if device.bus.protocol == protocol])
+        links += built
+        reasons += refused
+    if reasons:
+        raise LinksRefused(reasons)
     return links
 
 
-class _Builder:
-    """Collects links and the reasons why there cannot be any."""
+class _Lookup:
+    """Finds bus and device type of every device, and collects the reasons why there is none."""
 
     def __init__(self, line: Line, folder: Path) -> None:
-        self.reasons: list[str] = []
         self._line = line
         self._folder = folder
         self._maps: dict[str, DeviceMap | None] = {}
         self._buses = {bus.name: bus for bus in line.buses}
+        self._reasons: list[str] = []
 
-    def canopen_links(self) -> list[CanopenLink]:
-        nodes: dict[str, list[DriveNode]] = {}
-        for drive in self._line.drives:
-            device = self._map_of(drive, "drives", DriveMap)
-            bus = self._bus_of(drive, CanopenBus, device)
-            if device is not None and bus is not None:
-                node = self._drive_node(drive, device)
-                if node is not None:
-                    nodes.setdefault(bus.name, []).append(node)
-        buses = (bus for bus in self._line.buses if isinstance(bus, CanopenBus) and bus.name in nodes)
-        return [CanopenLink(bus, nodes[bus.name]) for bus in buses]
+    def devices(self) -> tuple[list[Wired], list[str]]:
+        items = [*self._line.drives, *self._line.load_cells, self._line.plc]
+        found = [wired for item in items if (wired := self._wired(item)) is not None]
+        return found, self._reasons
 
-    def modbus_links(self) -> list[ModbusLink]:
-        devices: dict[tuple[str, int], list[ModbusDevice]] = {}
-        names: dict[tuple[str, int], str] = {}
-        for place, bus, device in [*self._amplifiers(), *self._plc()]:
-            devices.setdefault(place, []).append(device)
-            names.setdefault(place, bus)
-        period_s = self._line.control.period_s
-        return [ModbusLink(names[place], *place, devices[place], period_s) for place in devices]
-
-    def _drive_node(self, drive: Drive, device: DriveMap) -> DriveNode | None:
-        limits = self._line.limits
-        settings = DriveSettings(drive.address, drive.rated_torque_nm, limits.torque_nm, limits.watchdog_s)
-        try:
-            watchdog_counts(device.watchdog, limits.watchdog_s)
-            if device.objects.max_torque.writable:
-                torque_limit_counts(device, settings)
-        except ValueError as error:
-            self.reasons.append(f"{drive.name}: {error}")
-            return None
-        radius_m = self._line.rollers[drive.roller - 1].radius_m.value
-        return DriveNode(drive.name, drive.roller - 1, device, settings, radius_m)
-
-    def _amplifiers(self) -> Iterable[tuple[tuple[str, int], str, Amplifier]]:
-        """The load cells, one amplifier a unit."""
-        units: dict[tuple[str, int, int, str], tuple[ModbusTcpBus, LoadCellMap, list[LoadCell]]] = {}
-        for cell in self._line.load_cells:
-            device = self._map_of(cell, "load_cells", LoadCellMap)
-            bus = self._bus_of(cell, ModbusTcpBus, device)
-            if device is None or bus is None:
-                continue
-            if cell.channel > device.channels.count:
-                self.reasons.append(f"{cell.name}: channel {cell.channel}; allowed: 1 to {device.channels.count}")
-                continue
-            units.setdefault((bus.host, bus.port, cell.address, cell.map), (bus, device, []))[2].append(cell)
-        for bus, device, cells in units.values():
-            yield (bus.host, bus.port), bus.name, Amplifier(device, cells)
-
-    def _plc(self) -> Iterable[tuple[tuple[str, int], str, Plc]]:
-        plc = self._line.plc
-        device = self._map_of(plc, "plc", PlcMap)
-        bus = self._bus_of(plc, ModbusTcpBus, device)
-        if device is not None and bus is not None:
-            yield (bus.host, bus.port), bus.name, Plc(device, plc, self._line.limits.watchdog_s)
-
-    def _map_of(self, item: Device, table: str, model: type[M]) -> M | None:
-        """The map of a device, if it is of the kind that stands in `table`."""
+    def _wired(self, item: Drive | LoadCell | LinePlc) -> Wired | None:
         device = self._load(item)
-        if device is None or isinstance(device, model):
-            return device
-        fitting = [name for name in map_names(self._folder) if isinstance(self._load_quietly(name), model)]
-        self.reasons.append(
-            f"{item.name}: map {item.map!r} is for a {device.role}, not for {table}; allowed: {', '.join(fitting)}"
-        )
+        role, table = _ROLES[type(item)]
+        if device is not None and device.role != role:
+            fitting = [name for name in map_names(self._folder) if self._role_of(name) == role]
+            self._reasons.append(
+                f"{item.name}: map {item.map!r} is for a {device.role}, not for {table}; allowed: {', '.join(fitting)}"
+            )
+            device = None
+        bus = self._buses.get(item.bus)
+        if bus is None:
+            self._reasons.append(f"{item.name}: bus {item.bus!r} is unknown; allowed: {', '.join(self._buses)}")
+        elif device is not None and device.protocol != bus.protocol:
+            self._reasons.append(
+                f"{item.name}: map {item.map!r} speaks {device.protocol}, bus {bus.name!r} is {bus.protocol}"
+            )
+        elif device is not None:
+            return Wired(item, bus, device)
         return None
 
-    def _load(self, item: Device) -> DeviceMap | None:
+    def _load(self, item: Drive | LoadCell | LinePlc) -> DeviceMap | None:
         if item.map in self._maps:
             return self._maps[item.map]
         self._maps[item.map] = None
         if item.map not in (known := map_names(self._folder)):
             near = nearest(item.map, known)
             hint = f"; did you mean {near!r}?" if near else ""
-            self.reasons.append(f"{item.name}: map {item.map!r} is unknown; allowed: {', '.join(known)}{hint}")
+            self._reasons.append(f"{item.name}: map {item.map!r} is unknown; allowed: {', '.join(known)}{hint}")
             return None
         try:
             self._maps[item.map] = load_map(self._folder / f"{item.map}.toml")
         except MapRefused as refusal:
-            self.reasons += refusal.reasons
+            self._reasons += refusal.reasons
         return self._maps[item.map]
 
-    def _load_quietly(self, name: str) -> DeviceMap | None:
+    def _role_of(self, name: str) -> str:
         try:
-            return load_map(self._folder / f"{name}.toml")
+            return load_map(self._folder / f"{name}.toml").role
         except MapRefused:
-            return None
-
-    def _bus_of(self, item: Device, kind: type[B], device: DeviceMap | None) -> B | None:
-        bus = self._buses.get(item.bus)
-        if bus is None:
-            self.reasons.append(f"{item.name}: bus {item.bus!r} is unknown; allowed: {', '.join(self._buses)}")
-        elif isinstance(bus, kind):
-            return bus
-        elif device is not None:
-            self.reasons.append(
-                f"{item.name}: map {item.map!r} speaks {device.protocol}, bus {bus.name!r} is {bus.protocol}"
-            )
-        return None
+            return ""

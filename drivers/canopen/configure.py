@@ -4,9 +4,9 @@ import struct
 from dataclasses import dataclass
 from math import floor
 
+from drivers.canopen.maps import CanObject, DriveMap, Pdo, TimeObject
 from drivers.canopen.pdo import mapping_entries, type_code
 from drivers.canopen.sdo import SdoBus, SdoFailed, SdoSilent
-from drivers.device_map import CanObject, DriveMap, Pdo, TimeObject
 from drivers.map_rules import BYTES
 from drivers.scaling import si_per_count, torque_per_count
 

@@ -14,10 +14,10 @@ import asyncio
 from collections.abc import Callable
 
 from drivers.canopen.bus import CanBus
-from drivers.canopen.cia402 import PowerState
 from drivers.canopen.node import OPERATIONAL, DriveNode
 from drivers.canopen.prepare import check_drive, configure_drives, read_safe_torque_off, undo_all
 from drivers.canopen.sdo import SdoBus, SdoFailed
+from drivers.cia402 import PowerState
 from drivers.port import PrepareRefused
 from gateway.core.line import CanopenBus
 from gateway.core.signals import DriveState, Inputs, LinkHealth, Outputs
@@ -197,7 +197,7 @@ class CanopenLink:
         blocked = [
             node
             for node in self._nodes
-            if node.power is PowerState.SWITCH_ON_DISABLED
+            if node.stage.power is PowerState.SWITCH_ON_DISABLED
             and node.device.objects.safe_torque_off is not None
             and "safe_torque_off" not in node.device.transmit_pdo.objects
         ]
@@ -209,7 +209,7 @@ class CanopenLink:
     async def _read_safe_torque_off(self, nodes: list[DriveNode]) -> None:
         for node in nodes:
             try:
-                node.safe_torque_off = await read_safe_torque_off(self._sdo, node)
+                node.stage.safe_torque_off = await read_safe_torque_off(self._sdo, node)
             except SdoFailed as error:
                 self._discard(f"{node.name}: {error}")
 

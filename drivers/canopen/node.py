@@ -4,12 +4,12 @@ import struct
 
 from canopen.emcy import EmcyError
 
-from drivers.canopen.cia402 import DISABLE_VOLTAGE, PowerState, controlword, drive_state, power_state
 from drivers.canopen.configure import DriveSettings
+from drivers.canopen.maps import DriveMap
 from drivers.canopen.pdo import DriveSample, MalformedPdo, PdoCodec
-from drivers.device_map import DriveMap
+from drivers.power_stage import PowerStage
 from drivers.scaling import si_per_count
-from gateway.core.signals import DriveRequest, DriveState
+from gateway.core.signals import DriveState
 
 HEARTBEATS_ALLOWED = 1.5  #: producer times without a heartbeat until a drive that may give torque counts as lost
 HEARTBEATS_ALLOWED_AT_REST = 3.0  #: the same while it gives none and none is asked of it
@@ -34,9 +34,7 @@ class DriveNode:
         self.nmt_state: int | None = None
         self.heard_s: float | None = None
         self.sample: DriveSample | None = None  #: the answer to the present SYNC
-        self.power: PowerState | None = None
-        self.safe_torque_off = False
-        self.follows_command = False
+        self.stage = PowerStage(device.follows_command)
         self.missed = 0  #: SYNCs in a row without an answer
         self.emergency = ""
         self.distrust = ""
@@ -45,8 +43,6 @@ class DriveNode:
         self._heard_again = False  #: it answered, though too late, while it was absent
         self.boot_ups = 0
         self.supervised = False  #: must stay operational
-        self._controlword = DISABLE_VOLTAGE
-        self._request = int(DriveRequest.OFF)
 
     @property
     def node(self) -> int:
@@ -61,14 +57,8 @@ class DriveNode:
         sample = self.codec.decode(data)
         self.sample = sample
         self.missed = 0
-        self.power = power_state(sample.statusword)
-        follows = self.device.follows_command
-        self.follows_command = follows is None or bool(sample.statusword >> follows.bit & 1) != follows.inverted
-        if sample.safe_torque_off is not None:
-            self.safe_torque_off = sample.safe_torque_off
-        elif self.power is not PowerState.SWITCH_ON_DISABLED:
-            self.safe_torque_off = False  # what was asked for is over
-        if self._request == DriveRequest.RESET_FAULT and drive_state(self.power) != DriveState.FAULT:
+        self.stage.on_statusword(sample.statusword, sample.safe_torque_off)
+        if self.stage.fault_was_reset:
             self.emergency = ""
 
     def on_late_answer(self, data: bytes | bytearray) -> None:
@@ -110,8 +100,7 @@ class DriveNode:
             self.missed += 1
 
     def heartbeat_lost(self, now_s: float) -> bool:
-        gives_torque = self._request == DriveRequest.ENABLE or self.power is PowerState.OPERATION_ENABLED
-        allowed = HEARTBEATS_ALLOWED if gives_torque else HEARTBEATS_ALLOWED_AT_REST
+        allowed = HEARTBEATS_ALLOWED if self.stage.gives_torque else HEARTBEATS_ALLOWED_AT_REST
         return self.heard_s is None or now_s - self.heard_s > allowed * self.heartbeat_s
 
     def state(self, now_s: float) -> DriveState:
@@ -119,13 +108,7 @@ class DriveNode:
             return DriveState.ABSENT
         if self.distrust or self.emergency:
             return DriveState.FAULT
-        if self.power is None:
-            return DriveState.OFF
-        if self.safe_torque_off and self.power is PowerState.SWITCH_ON_DISABLED:
-            return DriveState.STO
-        if self.power is PowerState.OPERATION_ENABLED and not self.follows_command:
-            return DriveState.READY  # no torque, whatever is commanded
-        return drive_state(self.power)
+        return self.stage.state
 
     def drop(self, now_s: float) -> None:
         """It is lost: no RPDO until the next `prepare`, which would keep a watchdog fed that nobody listens behind."""
@@ -137,16 +120,10 @@ class DriveNode:
 
         Raises ValueError when the torque cannot be commanded; nothing may be sent then.
         """
-        self._request = request
-        if self.distrust or self.power is None:
-            self._controlword = DISABLE_VOLTAGE
-        elif state == DriveState.FAULT and request != DriveRequest.RESET_FAULT:
-            self._controlword = DISABLE_VOLTAGE  # an emergency counts before the statusword shows it
-        else:
-            self._controlword = controlword(self.power, request, self._controlword)
-        follows = state == DriveState.ENABLED and request == DriveRequest.ENABLE
-        payload = self.codec.encode(self._controlword, torque_nm)
-        return payload if follows else self.codec.encode(self._controlword, 0.0)
+        word, given_nm = self.stage.command(request, torque_nm, state, trusted=not self.distrust)
+        # Encoded also where it is not given: what cannot be commanded says that something is wrong.
+        self.codec.encode(word, torque_nm)
+        return self.codec.encode(word, given_nm)
 
     # prepare
 
@@ -154,12 +131,10 @@ class DriveNode:
         """Nothing that was true of the drive before counts any more, except that it was heard."""
         self.supervised = False
         self.sample = None
-        self.power = None
+        self.stage.forget()
         self.missed = 0
         self.distrust = ""
         self.dropped = False
-        self._controlword = DISABLE_VOLTAGE
-        self._request = int(DriveRequest.OFF)
 
     def trouble(self, now_s: float) -> str:
         """What is wrong with it, for a person; empty when nothing is."""

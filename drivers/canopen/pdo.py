@@ -7,7 +7,7 @@ import struct
 from dataclasses import dataclass
 from math import isfinite
 
-from drivers.device_map import DriveMap, Pdo, PdoEntry
+from drivers.canopen.maps import DriveMap, Pdo, PdoEntry
 from drivers.map_rules import BYTES
 from drivers.scaling import speed_per_count, torque_per_count
 

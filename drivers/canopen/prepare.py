@@ -2,12 +2,12 @@
 
 import struct
 
-from drivers.canopen.cia402 import drive_state, power_state
 from drivers.canopen.configure import Transaction, drive_steps
+from drivers.canopen.maps import CanObject
 from drivers.canopen.node import DriveNode
 from drivers.canopen.pdo import type_code
 from drivers.canopen.sdo import SdoBus, SdoFailed, SdoSilent
-from drivers.device_map import CanObject
+from drivers.cia402 import drive_state, power_state
 from drivers.map_rules import BYTES
 from drivers.scaling import torque_per_count
 from gateway.core.signals import DriveState
@@ -43,7 +43,7 @@ async def check_drive(sdo: SdoBus, node: DriveNode) -> list[str]:
         if drive_state(power_state(statusword)) in (DriveState.ENABLED, DriveState.STOPPING):
             reasons.append(f"is still enabled (statusword {statusword:04X}h); take its torque off first")
         reasons += await _check_rated_torque(sdo, node) + await _check_max_torque(sdo, node)
-        node.safe_torque_off = await read_safe_torque_off(sdo, node)
+        node.stage.safe_torque_off = await read_safe_torque_off(sdo, node)
         return reasons
     except SdoSilent:
         return [f"node {node.node} does not answer; check its power, node number, bit rate and wiring"]

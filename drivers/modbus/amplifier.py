@@ -1,7 +1,7 @@
 """A load-cell amplifier on Modbus: what is asked of it each cycle, and which of its answers may be believed."""
 
-from drivers.device_map import LoadCellMap
 from drivers.modbus.client import ModbusConnection, ModbusFailed, ModbusTimeout
+from drivers.modbus.maps import LoadCellMap
 from drivers.modbus.proof import Proof
 from drivers.modbus.registers import Field, RegisterBlock, spans
 from drivers.scaling import si_per_count

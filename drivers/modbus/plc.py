@@ -6,8 +6,9 @@ stops. The PLC's echo of it is watched the same way: an interface that still ans
 
 from math import floor, isfinite
 
-from drivers.device_map import Bit, PlcMap, TimeRegister
+from drivers.life import LifeCounter
 from drivers.modbus.client import ModbusConnection, ModbusFailed
+from drivers.modbus.maps import PlcMap, TimeRegister
 from drivers.modbus.proof import Proof
 from drivers.modbus.registers import RegisterBlock
 from drivers.scaling import si_per_count
@@ -15,7 +16,6 @@ from gateway.core.line import LinePlc
 from gateway.core.signals import Inputs, Outputs, Quality
 
 _AT_REST = (0, 0)
-ECHOES_ALLOWED = 3  #: answers in a row with the same life counter until the PLC counts as stale
 
 
 class Plc:
@@ -45,10 +45,8 @@ class Plc:
             device.read_function,
             [(self._id, self._against_identity), (self._watchdog, self._against_watchdog)],
         )
-        self._life = 0
+        self._life = LifeCounter()
         self._command: tuple[int, float] | None = _AT_REST  #: command word and speed; None: cannot be commanded
-        self._echo = -1.0
-        self._same_echo = 0
         self._doubts: list[str] = []  #: why it is not proven
 
     def _may_write(self) -> bool:
@@ -58,7 +56,7 @@ class Plc:
         """Nothing is written from now on, and nothing of the last command is left."""
         self.active = False
         self._command = _AT_REST
-        self._same_echo = 0
+        self._life.forget()
 
     def command(self, outputs: Outputs) -> None:
         """What the next transaction writes. Raises ValueError; nothing is written then, and the life counter stops."""
@@ -80,10 +78,9 @@ class Plc:
         if self.active:
             self._doubts = await self._proof.go_on(connection, deadline_s)
         if self._may_write():
-            self._life = (self._life + 1) & 0xFFFF
             assert self._command is not None
             word, speed = self._command
-            payload = self._write.encode((word, speed, self._life))
+            payload = self._write.encode((word, speed, self._life.next()))
             registers = await connection.read_write(
                 self.unit, read.address, read.count, self._write.address, payload, deadline_s
             )
@@ -100,17 +97,17 @@ class Plc:
             self._miss(inputs)
             return []
         self.missed = 0
-        if self._echo_stands_still(answer[2]):
+        if self._life.stands_still(answer[2], moving=self._may_write()):
             self._miss(inputs)
             return [f"{self.name}: answers, but its echo of the life counter stands still"]
         read, status = self._device.read, int(answer[0])
         # A PLC that can be read but not told to stop is not there for the loop; its v0 is true all the same.
         mute = self.active and not self._may_write()
         plc.quality, plc.time_s = Quality.STALE if mute else Quality.GOOD, time_s
-        plc.permissive = _is(read.permissive, status)
-        plc.emergency_stop = _is(read.emergency_stop, status)
-        plc.running = _is(read.running, status)
-        troubles = [f"{self.name}: its command watchdog has tripped"] if _is(read.watchdog_tripped, status) else []
+        plc.permissive = read.permissive.is_set(status)
+        plc.emergency_stop = read.emergency_stop.is_set(status)
+        plc.running = read.running.is_set(status)
+        troubles = [f"{self.name}: its command watchdog has tripped"] if read.watchdog_tripped.is_set(status) else []
         if mute:
             troubles.append("; ".join(self._doubts) or f"{self.name}: its command was refused")
             troubles[-1] += "; it is not written to"
@@ -121,12 +118,6 @@ class Plc:
             inputs.unwind_speed.reject(0)
             troubles.append(f"{self.name}: speed {answer[1]:g} is outside [{low:g}, {high:g}] {read.speed.unit}")
         return troubles
-
-    def _echo_stands_still(self, echo: float) -> bool:
-        moved = echo != self._echo or not self._may_write()
-        self._same_echo = 0 if moved else self._same_echo + 1
-        self._echo = echo
-        return self._same_echo >= ECHOES_ALLOWED
 
     def _miss(self, inputs: Inputs) -> None:
         inputs.unwind_speed.miss(0)
@@ -185,7 +176,3 @@ def watchdog_counts(watchdog: TimeRegister, watchdog_s: float) -> int:
             f"limits.watchdog_s = {watchdog_s} s is outside what the PLC can do ({low:g} to {high:g} {watchdog.unit})"
         )
     return counts
-
-
-def _is(bit: Bit, word: int) -> bool:
-    return bool(word >> bit.bit & 1) != bit.inverted

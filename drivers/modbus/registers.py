@@ -8,8 +8,8 @@ import struct
 from collections.abc import Sequence
 from math import isfinite
 
-from drivers.device_map import MAX_READ_REGISTERS
 from drivers.map_rules import BYTES
+from drivers.modbus.maps import MAX_READ_REGISTERS
 
 _CODE = {"u16": "H", "i16": "h", "u32": "I", "i32": "i", "f32": "f"}
 

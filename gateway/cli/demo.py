@@ -35,7 +35,6 @@ SETTLE_TIME_S = 30.0
 SETTLED_N = 0.6  #: a measured tension this near its set-point has settled (six times the sensors' noise)
 SETTLED_FOR_S = 2.0
 SIM_PRIORITY = 40  #: below the loop's: devices of a real line do not wait for this computer
-STALLED = "missed"  #: in the loop's reason when the computer was away for too long
 MOST_REPEATS = 2  #: of a case, after such a stop
 OWN_FILES = ("line.toml", "plant.toml", "controller.json", "result.json", "report.html", "recording", "data", "logs")
 
@@ -167,14 +166,14 @@ async def _begin_with_repeats(operator: "Operator") -> None:
 
 
 async def _run_with_repeats(operator: "Operator", setup: Setup, case: Case) -> Window:
-    """A computer that stalls for more periods than the loop may miss stops the line, as it must; then once more."""
+    """A computer that stalls, or on which the simulated devices do, stops the line, as it must; then once more."""
     for repeats in range(MOST_REPEATS + 1):
         try:
             return await _run_case(operator, setup, case)
         except DemoFailed as failed:
-            if repeats == MOST_REPEATS or not await operator.stalled():
+            if repeats == MOST_REPEATS or not await operator.has_stopped():
                 raise
-            await operator.recover(f"this computer stalled; the case once more ({failed})", str(failed))
+            await operator.recover(f"the case once more: {failed}", str(failed))
             await _begin_with_repeats(operator)
     raise AssertionError("the last repeat returns or raises")
 
@@ -251,12 +250,11 @@ class Operator:
             await asyncio.sleep(0.1)
         raise DemoFailed(f"{what} took longer than {within_s:g} s")
 
-    async def stalled(self) -> bool:
-        """Whether the line has stopped because this computer was away for too long."""
+    async def has_stopped(self) -> bool:
+        """Whether the line has stopped by itself."""
         self._stopping = True
         status = await self.look()
-        told = [event.text for event in status.events if event.kind == "state"] if status else []
-        return any(STALLED in text for text in told[-3:])
+        return status is not None and status.loop.state == "STOP"
 
     async def begin(self) -> None:
         """From rest to a line that is being tensioned."""

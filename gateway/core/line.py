@@ -98,6 +98,7 @@ class ModbusTcpBus(Strict):
     port: Annotated[int, Field(ge=1, le=65535)] = 502
 
 
+Channel = Annotated[int, Field(ge=1, le=60)]  #: counted from 1
 Bus = Annotated[CanopenBus | ModbusTcpBus, Field(discriminator="protocol")]
 
 
@@ -109,13 +110,14 @@ class Device(Strict):
 
 
 class Drive(Device):
+    channel: Channel = 1  #: axis, of a device that moves several
     roller: Annotated[int, Field(ge=1)]
     rated_torque_nm: Positive
 
 
 class LoadCell(Device):
+    channel: Channel = 1  #: of the amplifier
     span: Annotated[int, Field(ge=1)]
-    channel: Annotated[int, Field(ge=1, le=60)] = 1  #: of an amplifier with at most 60
     capacity_n: Positive  #: a reading beyond it is not believed
 
 

@@ -93,6 +93,7 @@ HELP: dict[str, dict[str, str]] = {
     "Drive": {
         **_DEVICE,
         "address": "CANopen node, 1 to 127",
+        "channel": "axis, of a device that moves several rollers",
         "roller": "which roller it drives, counted from 1",
         "rated_torque_nm": "at the roller, as commissioned in the drive; commands are fractions of it",
     },

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from ipaddress import ip_address
 
 from gateway.core import can_load
-from gateway.core.line import CanopenBus, Device, Line, LoadCell, ModbusTcpBus
+from gateway.core.line import CanopenBus, Device, Drive, Line, LoadCell, ModbusTcpBus
 from gateway.core.line_problem import Finding, key_in_words, odd
 from gateway.core.nearest import nearest
 from gateway.core.toml_places import Path
@@ -141,20 +141,29 @@ def addresses_differ(line: Line, known_maps: Mapping[str, Role] | None = None) -
 
 def _clash(path: Path, device: Device, seat: list[tuple[Path, Device]], line: Line) -> Finding | None:
     for other_path, other in seat:
-        if isinstance(device, LoadCell) and isinstance(other, LoadCell) and device.map == other.map:
-            if device.channel != other.channel:
+        if _share(device, other):
+            if _channel_of(device) != _channel_of(other):
                 continue
-            used = {
-                cell.channel for cell in line.load_cells if (cell.bus, cell.address) == (device.bus, device.address)
-            }
+            place = (device.bus, device.address)
+            used = {_channel_of(known) for _, known in devices(line) if (known.bus, known.address) == place}
             taken = f"is already the channel of {key_in_words(other_path)}"
             free = _first(channel for channel in range(1, 61) if channel not in used)
-            return Finding((*path, "channel"), taken, "each load cell its own channel of the amplifier", free)
+            return Finding((*path, "channel"), taken, "each its own channel of the device they share", free)
         used = {known.address for _, known in devices(line) if known.bus == device.bus}
         taken = f'is already the address of {key_in_words(other_path)} on bus "{device.bus}"'
         free = _first(address for address in range(1, 128) if address not in used)
         return Finding((*path, "address"), taken, "each device its own address on its bus", free)
     return None
+
+
+def _share(device: Device, other: Device) -> bool:
+    """Whether both are channels of one device: load cells of an amplifier, axes of a drive."""
+    one_device = type(device) is type(other) and device.map == other.map
+    return one_device and (isinstance(device, LoadCell) or (_channel_of(device), _channel_of(other)) != (1, 1))
+
+
+def _channel_of(device: Device) -> int:
+    return device.channel if isinstance(device, Drive | LoadCell) else 1
 
 
 def canopen_addresses(line: Line) -> Iterator[Finding]:

@@ -170,6 +170,7 @@ def _drives(spans: int, buses: int) -> str:
                 "bus": f'"{bus}"',
                 "map": '"cia402-torque"',
                 "address": str(node),
+                **({} if i else {"channel": "#1"}),
                 "roller": str(i + 1),
                 "rated_torque_nm": "60.0",
             }

@@ -83,6 +83,7 @@ class Cycle:
         self._announce = announce
         self._times = Times(line.limits.tensioning_time_s, line.moves.stop_time_s)
         self._envelope = EnvelopeState()
+        self._latched_s = clock()  #: when the drives latched the torque of the period before
         self._still_on = np.zeros(line.n, dtype=np.int64)  #: periods in a row ENABLED while told OFF
 
     async def period(self, tick: Tick) -> None:
@@ -103,6 +104,7 @@ class Cycle:
     async def _read(self, tick: Tick) -> None:
         for link in self.links:
             link.trigger(tick.now_s)
+        self._latched_s = self.clock()  # later than it was: it may take time to be sent on a busy computer
         deadline_s = tick.now_s + READ_SHARE * self.limits.period_s
         for link in self.links:
             await link.collect(self.inputs, deadline_s)
@@ -163,8 +165,8 @@ class Cycle:
             return np.where(self.torque_path.lost, 0.0, applied_nm), False
         self.account.held = 0
         self._advance_setpoints()
-        # It is latched at the next tick: after a late wake-up that is less than a period away.
-        interval_s = tick.due_s + self.limits.period_s - tick.now_s
+        # It is latched at the next tick: after a late wake-up that is less than a period from the last.
+        interval_s = tick.due_s + self.limits.period_s - self._latched_s
         try:
             return self.torque_path.control(self._estimate(), self.setpoints, applied_nm, interval_s)
         except LawFailed as failed:

@@ -3,7 +3,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.canopen.cia402 import PowerState, controlword, drive_state, power_state
+from drivers.cia402 import PowerState, controlword, drive_state, power_state
 from gateway.core.signals import DriveRequest, DriveState
 
 S = PowerState

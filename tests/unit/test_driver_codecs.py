@@ -7,8 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from drivers.canopen.maps import DriveMap
 from drivers.canopen.pdo import MalformedPdo, PdoCodec, mapping_entries
-from drivers.device_map import MAPS, DriveMap, load_map
+from drivers.device_map import MAPS, load_map
 from drivers.modbus.registers import RegisterBlock, spans
 
 CIA402 = load_map(MAPS / "cia402-torque.toml")

@@ -8,20 +8,10 @@ from typing import get_args
 import pytest
 
 from drivers.canopen.configure import DriveSettings, drive_steps
-from drivers.device_map import (
-    MAPS,
-    DriveMap,
-    LoadCellMap,
-    MapRefused,
-    PlcMap,
-    SpeedUnit,
-    TensionUnit,
-    TimeUnit,
-    TorqueUnit,
-    WebSpeedUnit,
-    load_map,
-    map_names,
-)
+from drivers.canopen.maps import DriveMap
+from drivers.device_map import MAPS, MapRefused, load_map, map_names
+from drivers.map_fields import SpeedUnit, TensionUnit, TimeUnit, TorqueUnit, WebSpeedUnit
+from drivers.modbus.maps import LoadCellMap, PlcMap
 from drivers.registry import LinksRefused, build_links
 from gateway.core.line import Line
 from gateway.core.units import SI_PER_UNIT

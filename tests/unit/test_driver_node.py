@@ -5,8 +5,10 @@ import struct
 import pytest
 
 from drivers.canopen.configure import DriveSettings
+from drivers.canopen.maps import DriveMap
 from drivers.canopen.node import DriveNode
-from drivers.device_map import MAPS, Bit, DriveMap, load_map
+from drivers.device_map import MAPS, load_map
+from drivers.map_fields import Bit
 from gateway.core.signals import DriveRequest, DriveState
 
 CIA402 = load_map(MAPS / "cia402-torque.toml")
