@@ -126,7 +126,8 @@ REFUSED: list[tuple[str, list[Edit], str, str, str]] = [
         [("channel = 3\n", "channel = 2\n")],
         "load_cells[3].channel",
         "channel = 2",
-        "= 2: is already the channel of load_cells[2]; allowed: each its own channel of the device they share; did you mean 3?",
+        "= 2: is already the channel of load_cells[2]; allowed: each its own channel of the device they share; "
+        "did you mean 3?",
     ),
     (
         "canopen_addresses",
