@@ -66,10 +66,10 @@ class Settings:
 class WiredLine:
     """All devices of a plant on their wires, in the running event loop. The devices are there to be reached.
 
-    Raises FileExistsError when the folder already holds a recording, ValueError for a port that cannot be.
+    `clock` is the real one unless told otherwise. Raises FileExistsError when the folder already holds a recording, ValueError for a port that cannot be.
     """
 
-    def __init__(self, plant: Plant, settings: Settings) -> None:
+    def __init__(self, plant: Plant, settings: Settings, clock: WorldClock | None = None) -> None:
         self.plant = plant
         self.settings = settings
         self.can_port = plant.wires.canopen.port if settings.can_port is None else settings.can_port
@@ -77,7 +77,7 @@ class WiredLine:
         _check_port("the CAN port (--can-port)", self.can_port, 1)
         _check_port("the Modbus port (--modbus-port)", self.modbus_port, 0)
         _compile(plant)
-        self.clock = WorldClock(settings.scale)
+        self.clock = clock or WorldClock(settings.scale)
         self.world = World(plant, settings.seed)
         self._folder_was_there = settings.record_folder.exists()
         self.recorder = Recorder.to_folder(
