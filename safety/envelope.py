@@ -12,6 +12,8 @@ from gateway.core.signals import BoolArray, DriveState, FloatArray, Inputs, IntA
 from safety.actions import Action, Finding
 from safety.limits import EnvelopeLimits
 
+PARTING_M_PER_S = 0.001  #: by which the roller behind a break runs ahead; ten times a good encoder's noise
+PARTING = 0.03  #: the same as a fraction of the speed; an elastic web stretches by less
 _GOOD = int(Quality.GOOD)  # numpy compares with plain integers several times as fast as with members of an enum
 
 
@@ -196,9 +198,19 @@ def _out_of_band(limits: EnvelopeLimits, span: int, inputs: Inputs) -> Finding:
     # Over-tension: the law itself relieves it best, while the line slows down. Slack or a broken web: a tension loop
     # would only spin its roller up.
     tension_n = float(inputs.tension.value[span])
-    action = Action.STOP if tension_n > limits.tension_max_n else Action.TORQUE_OFF
-    allowed = f"{limits.tension_min_n:g} to {limits.tension_max_n:g} N"
-    return Finding("tension band", action, f"tension {span + 1} is {tension_n:.2f} N, allowed is {allowed}")
+    text = f"tension {span + 1} is {tension_n:.2f} N, allowed is {limits.tension_min_n:g} to {limits.tension_max_n:g} N"
+    if tension_n > limits.tension_max_n:
+        return Finding("tension band", Action.STOP, text)
+    if _rollers_part(span, inputs):
+        text += f", and roller {span + 1} runs away from the one before: the web has broken"
+        return Finding("web break", Action.TORQUE_OFF, text)
+    return Finding("slack", Action.TORQUE_OFF, text)
+
+
+def _rollers_part(span: int, inputs: Inputs) -> bool:
+    """Whether the rollers at both ends of a span (from 0) say, too, that nothing holds them together."""
+    before = inputs.speed.value[span - 1] if span else inputs.unwind_speed.value[0]
+    return float(inputs.speed.value[span] - before) > max(PARTING_M_PER_S, PARTING * abs(float(before)))
 
 
 def _roller_limit(limits: EnvelopeLimits, supervision: Supervision) -> float:

@@ -72,9 +72,9 @@ def check(
 
 
 def known_maps() -> Mapping[str, Role]:
-    """Protocol and role of every device type that the drivers have a map for."""
+    """Protocol, role and family of every device type that the drivers have a map for."""
     maps = {name: load_map(MAPS / f"{name}.toml") for name in map_names()}
-    return {name: (device.protocol, device.role) for name, device in maps.items()}
+    return {name: (device.protocol, device.role, getattr(device, "family", None) or "") for name, device in maps.items()}
 
 
 def _read(file: Path, source: str) -> str:

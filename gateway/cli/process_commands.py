@@ -137,6 +137,7 @@ def sim(
     scale: Annotated[float, typer.Option(min=0.001, help="How much faster than real time.")] = 1.0,
     can_port: Annotated[int | None, typer.Option(help="In place of the plant's.")] = None,
     modbus_port: Annotated[int | None, typer.Option(help="In place of the plant's; 0 takes a free one.")] = None,
+    opcua_port: Annotated[int | None, typer.Option(help="In place of the plant's; 0 takes a free one.")] = None,
     priority: Annotated[
         int,
         typer.Option(min=0, max=90, help="Real-time priority, where permitted: devices do not wait for a computer."),
@@ -153,7 +154,15 @@ def sim(
 
     if priority:
         be_punctual(priority)
-    code = run_plant(plant, record_folder=record, seed=seed, scale=scale, can_port=can_port, modbus_port=modbus_port)
+    code = run_plant(
+        plant,
+        record_folder=record,
+        seed=seed,
+        scale=scale,
+        can_port=can_port,
+        modbus_port=modbus_port,
+        opcua_port=opcua_port,
+    )
     raise typer.Exit(code)
 
 

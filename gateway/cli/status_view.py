@@ -51,6 +51,8 @@ def _head(status: GatewayStatus) -> RenderableType:
     if loop.saturated:
         title.append("  torque at its limit", style="bold yellow")
     head.add_row(title, _clock_time(status.wall_s))
+    for doubt in loop.doubts:
+        head.add_row(Text(f"Proposals are blocked: {doubt}", "bold yellow"), "")
     head.add_row(Text(f"Next: {loop.next}", style="italic"), "")
     speed, setpoint = (_number(value, ".4f") for value in (status.unwind_speed_m_per_s, status.speed_setpoint_m_per_s))
     head.add_row(Text(f"Web {speed} m/s, set-point {setpoint} m/s", "" if loop.running else "dim"), "")

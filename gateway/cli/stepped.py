@@ -39,6 +39,7 @@ class SteppedLoop:
     seed: int = 0
     frames: list[bytes] = field(default_factory=list[bytes])
     transitions: list[tuple[float, Phase, str]] = field(default_factory=list[tuple[float, Phase, str]])
+    alarms: list[tuple[float, Finding]] = field(default_factory=list[tuple[float, Finding]])
 
     def __post_init__(self) -> None:
         self.now_s = 0.0
@@ -89,7 +90,10 @@ class SteppedLoop:
         self.frames.append(pack(frame))
 
     def _announce(self, before: Machine, after: Machine, findings: list[Finding]) -> None:
-        self.transitions.append((self.now_s, after.phase, after.reason))
+        if after.phase is before.phase:
+            self.alarms += [(self.now_s, finding) for finding in findings]
+        else:
+            self.transitions.append((self.now_s, after.phase, after.reason))
 
 
 @dataclass(frozen=True)

@@ -48,6 +48,7 @@ class Limits(Strict):
     speed_step_max_m_per_s: NonNegative = 0.0
     hold_periods: Annotated[int, Field(ge=1, le=3)] = 3  #: periods without a signal until STOP
     watchdog_s: Annotated[float, Field(ge=0.01, le=0.2)] = 0.1  #: the drives take torque off after this silence
+    stuck_s: Annotated[float, Field(gt=0.0, le=60.0)] = 0.9  #: a load cell that shows one value for so long is stuck
     tensioning_time_s: Positive = 20.0  #: after `start`, every span must have reached the band within this time
 
 
@@ -98,15 +99,27 @@ class ModbusTcpBus(Strict):
     port: Annotated[int, Field(ge=1, le=65535)] = 502
 
 
+class OpcUaBus(Strict):
+    """One server. Without security anybody on the network can command its devices."""
+
+    name: Name
+    protocol: Literal["opcua"]
+    endpoint: str  #: opc.tcp://HOST:PORT, with a path where the server has one
+    security: Literal["none", "Basic256Sha256"] = "none"  #: the latter signs and encrypts
+    certificate: str | None = None  #: file, our own; this and the next two with security only
+    private_key: str | None = None  #: file
+    server_certificate: str | None = None  #: file; no other server is talked to
+
+
 Channel = Annotated[int, Field(ge=1, le=60)]  #: counted from 1
-Bus = Annotated[CanopenBus | ModbusTcpBus, Field(discriminator="protocol")]
+Bus = Annotated[CanopenBus | ModbusTcpBus | OpcUaBus, Field(discriminator="protocol")]
 
 
 class Device(Strict):
     name: Name
     bus: Name
     map: Name  #: device type, a file of `drivers/maps`
-    address: Annotated[int, Field(ge=1, le=247)]  #: CANopen node (1 to 127) or Modbus unit (1 to 247)
+    address: Annotated[int, Field(ge=1, le=247)]  #: CANopen node (1 to 127), Modbus unit, or OPC UA instance
 
 
 class Drive(Device):

@@ -11,6 +11,8 @@ _DEVICE = {
 }
 _PARAMETER = "nominal value, and how far the truth may lie from it"
 
+_PROTOCOL = '"canopen", "modbus-tcp" or "opcua"'
+
 #: By the name of the model in `line.py`, then by key.
 HELP: dict[str, dict[str, str]] = {
     "Line": {
@@ -47,6 +49,7 @@ HELP: dict[str, dict[str, str]] = {
         "speed_step_max_m_per_s": "the same for the speed",
         "hold_periods": "periods without a signal until the line is stopped",
         "watchdog_s": "the drives take torque off by themselves after this silence",
+        "stuck_s": "a load cell that shows one value for so long, while rollers move, is stuck: stop",
         "tensioning_time_s": "after start every span must reach its tension within this time",
     },
     "Moves": {
@@ -78,7 +81,7 @@ HELP: dict[str, dict[str, str]] = {
     },
     "CanopenBus": {
         "name": "your name for the bus",
-        "protocol": '"canopen" or "modbus-tcp"',
+        "protocol": _PROTOCOL,
         "interface": '"socketcan" for a CAN card, "udp_multicast" or "virtual" for the simulated line',
         "channel": 'socketcan: the network interface, e.g. "can0"; udp_multicast: the group\'s address',
         "port": "udp_multicast only",
@@ -86,9 +89,18 @@ HELP: dict[str, dict[str, str]] = {
     },
     "ModbusTcpBus": {
         "name": "your name for the bus",
-        "protocol": '"canopen" or "modbus-tcp"',
+        "protocol": _PROTOCOL,
         "host": "address or name of the device or gateway",
         "port": "TCP port",
+    },
+    "OpcUaBus": {
+        "name": "your name for the server",
+        "protocol": _PROTOCOL,
+        "endpoint": 'where the server listens, e.g. "opc.tcp://192.168.0.10:4840"',
+        "security": '"none", or "Basic256Sha256": everything signed and encrypted, and nothing without',
+        "certificate": "file with the gateway's certificate, .der or .pem; with security only",
+        "private_key": "file with its private key, .der or .pem",
+        "server_certificate": "file with the server's certificate, .der or .pem: no other server is talked to",
     },
     "Drive": {
         **_DEVICE,

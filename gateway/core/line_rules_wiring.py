@@ -4,13 +4,16 @@ from collections.abc import Iterable, Iterator, Mapping
 from ipaddress import ip_address
 
 from gateway.core import can_load
-from gateway.core.line import CanopenBus, Device, Drive, Line, LoadCell, ModbusTcpBus
+from gateway.core.line import Bus, CanopenBus, Device, Drive, Line, LoadCell, ModbusTcpBus, OpcUaBus
 from gateway.core.line_problem import Finding, key_in_words, odd
+from gateway.core.line_rules_opcua import host_and_port, is_host, opcua_endpoint, opcua_security
 from gateway.core.nearest import nearest
 from gateway.core.toml_places import Path
 
-#: Protocol and role of a device type: ("canopen", "drive"), ("modbus-tcp", "load-cell"), ("modbus-tcp", "line-plc").
-Role = tuple[str, str]
+#: Protocol, role and family of a device type: ("canopen", "drive", ""), ("modbus-tcp", "load-cell", "r2r-rack").
+#: Devices of one family may share an address; "" is none.
+Role = tuple[str, str, str]
+_UNKNOWN: Role = ("", "", "")
 _ROLES = {"drives": "drive", "load_cells": "load-cell", "plc": "line-plc"}
 
 
@@ -123,29 +126,33 @@ def buses_are_used(line: Line) -> Iterator[Finding]:
 
 
 def addresses_differ(line: Line, known_maps: Mapping[str, Role] | None = None) -> Iterator[Finding]:
-    """Load cells share the unit of their amplifier and differ in the channel; all else has an address of its own.
+    """Load cells share the unit of their amplifier and differ in the channel, as do the drives and the load cells of
+    one family; all else has an address of its own.
 
     Where maps are known, a device whose map is none for its kind is left out: it may share an address once that
     mistake, which is another rule's, is mended.
     """
     seats: dict[tuple[str, int], list[tuple[Path, Device]]] = {}
     for path, device in devices(line):
-        if known_maps is not None and known_maps.get(device.map, ("", ""))[1] != _ROLES[str(path[0])]:
+        if known_maps is not None and known_maps.get(device.map, _UNKNOWN)[1] != _ROLES[str(path[0])]:
             continue
         seat = seats.setdefault((device.bus, device.address), [])
-        finding = _clash(path, device, seat, line)
+        finding = _clash(path, device, seat, line, known_maps or {})
         if finding is not None:
             yield finding
         seat.append((path, device))
 
 
-def _clash(path: Path, device: Device, seat: list[tuple[Path, Device]], line: Line) -> Finding | None:
+def _clash(
+    path: Path, device: Device, seat: list[tuple[Path, Device]], line: Line, known_maps: Mapping[str, Role]
+) -> Finding | None:
     for other_path, other in seat:
-        if _share(device, other):
-            if _channel_of(device) != _channel_of(other):
+        if _share(device, other, known_maps):
+            if type(device) is not type(other) or _channel_of(device) != _channel_of(other):
                 continue
             place = (device.bus, device.address)
-            used = {_channel_of(known) for _, known in devices(line) if (known.bus, known.address) == place}
+            alike = [known for _, known in devices(line) if type(known) is type(device)]
+            used = {_channel_of(known) for known in alike if (known.bus, known.address) == place}
             taken = f"is already the channel of {key_in_words(other_path)}"
             free = _first(channel for channel in range(1, 61) if channel not in used)
             return Finding((*path, "channel"), taken, "each its own channel of the device they share", free)
@@ -156,8 +163,11 @@ def _clash(path: Path, device: Device, seat: list[tuple[Path, Device]], line: Li
     return None
 
 
-def _share(device: Device, other: Device) -> bool:
-    """Whether both are channels of one device: load cells of an amplifier, axes of a drive."""
+def _share(device: Device, other: Device, known_maps: Mapping[str, Role]) -> bool:
+    """Whether both are channels of one device (load cells of an amplifier, axes of a drive) or of one family."""
+    family = known_maps.get(device.map, _UNKNOWN)[2]
+    if family and family == known_maps.get(other.map, _UNKNOWN)[2]:
+        return True
     one_device = type(device) is type(other) and device.map == other.map
     return one_device and (isinstance(device, LoadCell) or (_channel_of(device), _channel_of(other)) != (1, 1))
 
@@ -199,20 +209,37 @@ def buses_are_reachable(line: Line) -> Iterator[Finding]:
     wires: dict[tuple[str, str, int | None], Path] = {}
     for i, bus in enumerate(line.buses):
         path = ("buses", i)
-        yield from _host(bus, path) if isinstance(bus, ModbusTcpBus) else _channel(bus, path)
-        wire = (
-            (bus.protocol, bus.host, bus.port)
-            if isinstance(bus, ModbusTcpBus)
-            else (bus.interface, bus.channel, bus.port)
-        )
+        yield from _reach(bus, path)
+        key, wire = _wire(bus)
         if wire in wires:
-            key = "host" if isinstance(bus, ModbusTcpBus) else "channel"
             yield Finding((*path, key), f"is the same wire as {key_in_words(wires[wire])}", "one table per wire")
         wires.setdefault(wire, path)
 
 
+def _reach(bus: Bus, path: Path) -> Iterator[Finding]:
+    match bus:
+        case CanopenBus():
+            yield from _channel(bus, path)
+        case ModbusTcpBus():
+            yield from _host(bus, path)
+        case OpcUaBus():
+            yield from opcua_endpoint(bus, path)
+            yield from opcua_security(bus, path)
+
+
+def _wire(bus: Bus) -> tuple[str, tuple[str, str, int | None]]:
+    """What tells two wires apart, and the key that says it."""
+    match bus:
+        case CanopenBus():
+            return "channel", (bus.interface, bus.channel, bus.port)
+        case ModbusTcpBus():
+            return "host", (bus.protocol, bus.host, bus.port)
+        case OpcUaBus():
+            return "endpoint", (bus.protocol, *host_and_port(bus.endpoint))
+
+
 def _host(bus: ModbusTcpBus, path: Path) -> Iterator[Finding]:
-    if not bus.host or not all(c.isalnum() or c in ".-_:" for c in bus.host):
+    if not is_host(bus.host):
         host = bus.host.split("://")[-1].split("/")[0].strip()
         plain = f'"{host}"' if host and host != bus.host else ""
         yield Finding((*path, "host"), "is no host", 'an address or a name, as "192.168.0.10"', plain)

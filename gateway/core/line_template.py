@@ -85,6 +85,7 @@ def _process(spans: int) -> str:
         "speed_step_max_m_per_s": "0.09",
         "hold_periods": "3",
         "watchdog_s": "0.1",
+        "stuck_s": "0.9",
         "tensioning_time_s": "20.0" if spans <= 20 else "40.0",
     }
     moves = {

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int8]
 BoolArray = NDArray[np.bool_]
+CountArray = NDArray[np.int64]
 
 
 class Quality(IntEnum):

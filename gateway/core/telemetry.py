@@ -10,8 +10,8 @@ import numpy as np
 
 from gateway.core.signals import FloatArray, IntArray
 
-VERSION = 1
-_HEADER = struct.Struct("<HHIdffIffBBH")
+VERSION = 2
+_HEADER = struct.Struct("<HHIdffIffBBHB")
 FLOAT_FIELDS = ("tension_n", "tension_setpoint_n", "speed_m_per_s", "torque_nm", "torque_actual_nm")
 BYTE_FIELDS = ("tension_quality", "drive_state")
 
@@ -34,6 +34,7 @@ class Frame:
     state: int  #: LoopState
     saturated: bool  #: a torque or its rate is at its limit
     held: int  #: periods in a row in which a signal was missing and the outputs were held
+    doubts: int  #: a mask of Doubt: why proposals are blocked
     tension_n: FloatArray
     tension_setpoint_n: FloatArray
     speed_m_per_s: FloatArray
@@ -58,6 +59,7 @@ def pack(frame: Frame) -> bytes:
         frame.state,
         frame.saturated,
         min(frame.held, 0xFFFF),
+        frame.doubts,
     )
     floats = np.concatenate([getattr(frame, name) for name in FLOAT_FIELDS]).astype("<f4").tobytes()
     return header + floats + frame.tension_quality.tobytes() + frame.drive_state.tobytes()
@@ -68,7 +70,7 @@ def unpack(payload: bytes) -> Frame:
     if len(payload) < _HEADER.size:
         raise MalformedFrame(f"{len(payload)} bytes are shorter than a header")
     version, n, *scalars = _HEADER.unpack_from(payload)
-    sequence, time_s, lateness, cycle, missed, unwind, setpoint, state, saturated, held = scalars
+    sequence, time_s, lateness, cycle, missed, unwind, setpoint, state, saturated, held, doubts = scalars
     if version != VERSION:
         raise MalformedFrame(f"version {version}, this program reads {VERSION}")
     expected = _HEADER.size + n * (4 * len(FLOAT_FIELDS) + len(BYTE_FIELDS))
@@ -77,7 +79,7 @@ def unpack(payload: bytes) -> Frame:
     floats = np.frombuffer(payload, "<f4", n * len(FLOAT_FIELDS), _HEADER.size).astype(np.float64).reshape(-1, n)
     octets: IntArray = np.frombuffer(payload, np.int8, n * len(BYTE_FIELDS), expected - n * len(BYTE_FIELDS))
     return Frame(
-        sequence, time_s, lateness, cycle, missed, unwind, setpoint, state, bool(saturated), held,
+        sequence, time_s, lateness, cycle, missed, unwind, setpoint, state, bool(saturated), held, doubts,
         floats[0], floats[1], floats[2], floats[3], floats[4], octets[:n], octets[n:],
     )  # fmt: skip
 
@@ -97,6 +99,7 @@ def frame_dtype(n: int) -> np.dtype[np.void]:
         ("state", "u1"),
         ("saturated", "u1"),
         ("held", "<u2"),
+        ("doubts", "u1"),
     )
     floats = [(name, "<f4", (n,)) for name in FLOAT_FIELDS]
     octets = [(name, "i1", (n,)) for name in BYTE_FIELDS]

@@ -17,12 +17,14 @@ from gateway.loop.machine import Machine, Observation, Times
 from gateway.loop.pacer import Tick
 from gateway.loop.setpoints import Setpoints
 from gateway.loop.torque import LawFailed, TorquePath
+from gateway.loop.watch import Watch
 from safety.actions import Action, Finding, most_severe
 from safety.envelope import NOTHING, Assessment, EnvelopeState, Supervision, check_inputs, check_timing
 from safety.limits import envelope_limits
 
 READ_SHARE = 0.5  #: of a period, for samples to arrive; the rest is for control and writing
 _ENABLED = int(DriveState.ENABLED)
+_BAD = int(Quality.BAD)
 STILL_ON_PERIODS = 10  #: a drive that is told OFF and still says ENABLED is told to stop quickly
 
 CONTROLLED = (Phase.TENSIONING, Phase.RUNNING, Phase.HOLDING, Phase.SLOWING)
@@ -78,6 +80,7 @@ class Cycle:
         self.outputs = Outputs(line.n)
         self.setpoints = Setpoints(line.recipes[0])
         self.account = Account()
+        self.watch = Watch(line)
         self.clock = clock
         self._record = record
         self._announce = announce
@@ -99,6 +102,7 @@ class Cycle:
         """Take over what a command decided. Between two periods only."""
         if machine.phase is Phase.ARMING:
             self.torque_path.lost[:] = False
+            self._alarm(self.watch.armed())
         self._move_to(machine, [])
 
     async def _read(self, tick: Tick) -> None:
@@ -111,10 +115,15 @@ class Cycle:
 
     def _check(self, tick: Tick) -> Assessment:
         phase = self.machine.phase
+        supervision = SUPERVISION[phase]
+        jumps = self.watch.reject_jumps(self.inputs)
         if phase in WITH_TORQUE:
             self.torque_path.lost |= self.inputs.drive_state != _ENABLED
         late, self._envelope = check_timing(self.limits, self._envelope, tick.skipped)
-        seen, self._envelope = check_inputs(self.limits, self._envelope, self.inputs, SUPERVISION[phase])
+        seen, self._envelope = check_inputs(self.limits, self._envelope, self.inputs, supervision)
+        if supervision.feedback:
+            seen.findings.extend(jumps)
+            seen.findings.extend(self.watch.find_stuck(self.inputs) if seen.usable else ())
         if phase is Phase.SILENT:
             seen.findings.clear()
         elif phase is not Phase.ARMING:
@@ -157,6 +166,7 @@ class Cycle:
         applied_nm = self.outputs.torque_nm
         if self.machine.phase not in CONTROLLED:
             self.torque_path.disengage()
+            self.watch.off()
             self.account.held = 0
             unloading = self.machine.phase is Phase.UNLOADING
             return self.torque_path.unload(applied_nm) if unloading else np.zeros(self.line.n), False
@@ -168,11 +178,13 @@ class Cycle:
         # It is latched at the next tick: after a late wake-up that is less than a period from the last.
         interval_s = tick.due_s + self.limits.period_s - self._latched_s
         try:
-            return self.torque_path.control(self._estimate(), self.setpoints, applied_nm, interval_s)
+            torque_nm, saturated = self.torque_path.control(self._estimate(), self.setpoints, applied_nm, interval_s)
         except LawFailed as failed:
             off = machines.torque_off(self.machine, tick.now_s, failed.finding.text)
             self._move_to(off, [failed.finding])
             return self._torque(seen, tick)
+        self._alarm(self.watch.controlled(self.inputs, self.setpoints, applied_nm, saturated))
+        return torque_nm, saturated
 
     def _estimate(self) -> Measured:
         # The measured values as they are; a law with an observer takes its place here.
@@ -211,13 +223,17 @@ class Cycle:
             return np.where(states == DriveState.FAULT, int(DriveRequest.RESET_FAULT), int(DriveRequest.READY))
         return np.where(self._stays_on(), int(DriveRequest.QUICK_STOP), off)
 
+    def _alarm(self, findings: list[Finding]) -> None:
+        if findings:
+            self._announce(self.machine, self.machine, findings)
+
     def _stays_on(self) -> BoolArray:
         """Drives (n,) that do not obey OFF. Said once, when it begins."""
         on = self.inputs.drive_state == _ENABLED
         self._still_on = np.where(on, self._still_on + 1, 0)
         for i in np.flatnonzero(self._still_on == STILL_ON_PERIODS):
             text = f"drive {i + 1} stays enabled though it was told off; it is told to stop quickly: cut its power"
-            self._announce(self.machine, self.machine, [Finding("drive stays on", Action.TORQUE_OFF, text)])
+            self._alarm([Finding("drive stays on", Action.TORQUE_OFF, text)])
         return self._still_on >= STILL_ON_PERIODS
 
     def _frame(self, tick: Tick, saturated: bool) -> None:
@@ -236,12 +252,13 @@ class Cycle:
                 state=self.machine.state,
                 saturated=saturated,
                 held=account.held,
+                doubts=int(self.watch.doubts),
                 tension_n=inputs.tension.value,
                 tension_setpoint_n=self.setpoints.tension_n,
                 speed_m_per_s=inputs.speed.value,
                 torque_nm=self.outputs.torque_nm,
                 torque_actual_nm=inputs.torque.value,
-                tension_quality=inputs.tension.quality,
+                tension_quality=np.where(self.watch.stuck, _BAD, inputs.tension.quality).astype(np.int8),
                 drive_state=inputs.drive_state,
             )
         )

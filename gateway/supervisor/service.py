@@ -31,6 +31,7 @@ from gateway.supervisor.telemetry_sink import TelemetrySink
 
 LOOP_TIME_S = 2.5  #: for the loop to answer a command
 ARM_TIME_S = 14.0  #: arming configures every drive and reads its watchdog back
+WALL_CLOCK_JUMP_S = 0.5  #: between two looks; less is a clock that is being disciplined
 EVENTS_SHOWN = 20
 TEXT_SHOWN = 300  #: characters of an event's text in the status; the history keeps all
 
@@ -54,6 +55,7 @@ class Gateway:
         self._clock = clock
         self._wall_clock = wall_clock
         self._started_s = clock()
+        self._wall_ahead_s = wall_clock() - clock()
         self._sink = TelemetrySink(line.n, historian.frame)
         self._events: deque[EventStatus] = deque(maxlen=EVENTS_SHOWN)
         self._buses: list[BusReport] = []
@@ -79,10 +81,20 @@ class Gateway:
                 self.note("loop-up", f"the loop runs, state {loop.state}")
             else:
                 self.note("loop-lost", f"no telemetry of the loop for {loop.age_s} s: {loop.next}")
+        self._watch_wall_clock()
         health = self._historian.health()
         if health.storing != self._was_storing and health.text != "starting":
             self._was_storing = health.storing
             self.note("historian", f"the historian is {health.text}")
+
+    def _watch_wall_clock(self) -> None:
+        """Nothing here goes by the wall clock, but people's records do: a clock that was set is noted."""
+        ahead_s = self._wall_clock() - self._clock()
+        moved_s, self._wall_ahead_s = ahead_s - self._wall_ahead_s, ahead_s
+        if abs(moved_s) >= WALL_CLOCK_JUMP_S:
+            way = "forward" if moved_s > 0 else "back"
+            text = f"the wall clock was set {way} by {abs(moved_s):.1f} s; control goes by the monotonic clock alone"
+            self.note("wall-clock", text, moved_s=moved_s)
 
     def status(self) -> GatewayStatus:
         now_s = self._clock()

@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field
 
+from gateway.core.doubts import in_words
 from gateway.core.line import Line, Strict
 from gateway.core.messages import BusReport
 from gateway.core.signals import DriveState, Quality
@@ -38,6 +39,7 @@ class LoopStatus(Strict):
     period_s: float
     held: int  #: periods in a row in which a signal was missing
     saturated: bool  #: a torque or its rate is at its limit
+    doubts: list[str]  #: why proposals are blocked, and what to do; empty when they are not
     restarts: int  #: seen by this gateway
 
 
@@ -136,6 +138,7 @@ def loop_status(line: Line, sink: TelemetrySink, now_s: float) -> LoopStatus:
         period_s=line.control.period_s,
         held=frame.held if frame is not None and running else 0,
         saturated=frame.saturated if frame is not None and running else False,
+        doubts=in_words(frame.doubts) if frame is not None and running else [],
         restarts=sink.restarts,
     )
 

@@ -37,6 +37,7 @@ STORED_FIELDS: dict[str, str] = {
     "state": "u1",
     "saturated": "u1",
     "held": "<u2",
+    "doubts": "u1",
     **dict.fromkeys(FLOAT_FIELDS, "<f4"),
     **dict.fromkeys(BYTE_FIELDS, "i1"),
 }

@@ -70,6 +70,7 @@ def frame_of(sequence: int, time_s: float, spans: int = 6, **changes: Any) -> by
         "state": LoopState.RUN,
         "saturated": False,
         "held": 0,
+        "doubts": 0,
         "tension_n": setpoint + 0.1 * rng.standard_normal(spans),
         "tension_setpoint_n": setpoint,
         "speed_m_per_s": 0.1 + 1e-4 * rng.standard_normal(spans),

@@ -49,6 +49,7 @@ class Bench:
     def __init__(self, spans: int = 6) -> None:
         hub = Hub()
         self.now_s = 100.0
+        self.wall_ahead_s = WALL_AHEAD_S
         self.loop = InProcessMailbox(hub)
         self.historian = KeptHistory(spans)
         self.gateway = Gateway(
@@ -57,7 +58,7 @@ class Bench:
             self.historian,
             Counters(),
             clock=lambda: self.now_s,
-            wall_clock=lambda: self.now_s + WALL_AHEAD_S,
+            wall_clock=lambda: self.now_s + self.wall_ahead_s,
         )
 
     def say(self, kind: str, text: str) -> None:
@@ -192,7 +193,7 @@ def test_percentiles_are_those_of_the_last_ten_seconds() -> None:
         frame_of(1, 1.0)[:-1],
         frame_of(1, 1.0, spans=5),
         frame_of(1, float("nan")),
-        b"\x02\x00" + frame_of(1, 1.0)[2:],
+        b"\xff\x00" + frame_of(1, 1.0)[2:],
         frame_of(1, 1.0)[:2] + b"\x05\x00" + frame_of(1, 1.0)[4:],
     ],
 )
@@ -316,6 +317,21 @@ def test_a_status_that_is_not_quite_one_is_refused(path: tuple[str, ...], value:
     part[path[-1]] = value
     with pytest.raises(ValidationError):
         GatewayStatus.model_validate_json(json.dumps(document))
+
+
+def test_a_wall_clock_that_is_set_is_noted_once_and_changes_nothing() -> None:
+    bench = Bench()
+    bench.gateway.watch()
+    assert not [event for event in bench.historian.events if event.kind == "wall-clock"]
+    bench.wall_ahead_s -= 3600.0
+    for _ in range(3):
+        bench.now_s += 0.2
+        bench.gateway.watch()
+    (noted,) = [event for event in bench.historian.events if event.kind == "wall-clock"]
+    assert "back by 3600.0 s" in noted.text and noted.data == {"moved_s": pytest.approx(-3600.0)}
+    bench.wall_ahead_s += 0.4
+    bench.gateway.watch()
+    assert len([event for event in bench.historian.events if event.kind == "wall-clock"]) == 1
 
 
 if __name__ == "__main__":  # writes the two documents anew

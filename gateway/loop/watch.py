@@ -1,0 +1,112 @@
+"""What the loop watches beside its envelope: samples that cannot be true, and doubts that block proposals."""
+
+import numpy as np
+
+from gateway.core.doubts import Doubt
+from gateway.core.line import Line
+from gateway.core.signals import BoolArray, FloatArray, Inputs
+from gateway.loop.setpoints import Setpoints
+from safety.actions import Action, Finding
+from safety.drift import DriftState, drift_limits, restart, watch_balance
+from safety.jumps import JumpState, jump_limits, reject_jumps
+from safety.stuck import StuckState, find_stuck, stuck_limits
+
+SATURATED_S = 2.0  #: at a limit, net of the time away from it, until proposals are blocked
+
+
+class Watch:
+    """`doubts` is what blocks proposals now; `stuck` (n,) are the spans whose load cell stands still."""
+
+    def __init__(self, line: Line) -> None:
+        self.doubts = Doubt.NONE
+        self.stuck: BoolArray = np.zeros(line.n, np.bool_)
+        self._cells = {cell.span: cell.name for cell in line.load_cells}
+        self._jump_limits, self._jumps = jump_limits(line), JumpState()
+        self._stuck_limits, self._stuck = stuck_limits(line), StuckState()
+        self._drift_limits, self._drift = drift_limits(line), DriftState()
+        self._saturated = 0  # periods, up and down
+        self._saturated_periods = max(1, round(SATURATED_S / line.control.period_s))
+        self._setpoints: tuple[FloatArray, float] | None = None
+        restart(self._drift_limits, self._drift)
+
+    def reject_jumps(self, inputs: Inputs) -> list[Finding]:
+        """Discard speeds that cannot be true; what stops the line."""
+        return reject_jumps(self._jump_limits, self._jumps, inputs)
+
+    def find_stuck(self, inputs: Inputs) -> list[Finding]:
+        """Load cells that stand still while the line is controlled: what stops the line."""
+        findings = find_stuck(self._stuck_limits, self._stuck, inputs)
+        self.stuck = self._stuck.stuck
+        return findings
+
+    def controlled(
+        self, inputs: Inputs, setpoints: Setpoints, applied_nm: FloatArray, saturated: bool
+    ) -> list[Finding]:
+        """A period under control; `applied_nm` (n,) acted while the samples were taken. Returns what is to be told."""
+        count = self._saturated + 1 if saturated else self._saturated - 1
+        self._saturated = min(max(count, 0), self._saturated_periods)
+        now = (setpoints.tension_n, setpoints.speed_m_per_s)
+        if self.stuck.any() or self._setpoints is None or self._moved(now):
+            restart(self._drift_limits, self._drift)
+        else:
+            watch_balance(self._drift_limits, self._drift, inputs.tension.value, inputs.speed.value, applied_nm)
+        self._setpoints = now
+        return self._tell(self._doubts())
+
+    def off(self) -> None:
+        """Control is off. What was doubted stays so, until somebody has looked and arms."""
+        if self._setpoints is None:
+            return
+        self._setpoints = None
+        self._saturated = 0
+        self._stuck = StuckState()
+        self._drift = DriftState()
+        restart(self._drift_limits, self._drift)
+
+    def armed(self) -> list[Finding]:
+        """A person arms: everything begins anew. Returns what is to be told."""
+        self.stuck = np.zeros_like(self.stuck)
+        return self._tell(Doubt.NONE)
+
+    def _moved(self, now: tuple[FloatArray, float]) -> bool:
+        assert self._setpoints is not None
+        before_n, before_m_per_s = self._setpoints
+        return before_m_per_s != now[1] or not np.array_equal(before_n, now[0])
+
+    def _doubts(self) -> Doubt:
+        doubts = Doubt.NONE
+        if self._saturated >= self._saturated_periods or (self.doubts & Doubt.SATURATED and self._saturated > 0):
+            doubts |= Doubt.SATURATED
+        if self.stuck.any():
+            doubts |= Doubt.CELL_STUCK
+        # It stays until somebody arms: a zero is checked at standstill, and a new set-point only hides it.
+        if self._drift.drift_n.any() or self.doubts & Doubt.CELL_DRIFTS:
+            doubts |= Doubt.CELL_DRIFTS
+        return doubts
+
+    def _tell(self, doubts: Doubt) -> list[Finding]:
+        """What has changed, once, in words."""
+        if doubts == self.doubts:
+            return []
+        came, went = doubts & ~self.doubts, self.doubts & ~doubts
+        self.doubts = doubts
+        told = [Finding(_name(doubt), Action.NONE, self._text(doubt)) for doubt in came]
+        return told + [Finding(_name(doubt), Action.NONE, f"over: {_name(doubt)}") for doubt in went]
+
+    def _text(self, doubt: Doubt) -> str:
+        if doubt == Doubt.SATURATED:
+            return f"torques have been at their limits for {SATURATED_S:g} s: proposals are blocked"
+        if doubt == Doubt.CELL_STUCK:
+            cells = ", ".join(self._cell(int(i)) for i in np.flatnonzero(self.stuck))
+            return f"stuck: {cells}; proposals are blocked: check cell, amplifier and cable"
+        drift_n = self._drift.drift_n
+        cells = ", ".join(f"{self._cell(int(i))} by about {drift_n[i]:+.1f} N" for i in np.flatnonzero(drift_n))
+        first = " (or the friction of roller 1 has changed)" if drift_n[0] else ""
+        return f"drifting: {cells}{first}; proposals are blocked: check the zero when the line stands"
+
+    def _cell(self, i: int) -> str:
+        return f"{self._cells.get(i + 1, 'load cell')} (span {i + 1})"
+
+
+def _name(doubt: Doubt) -> str:
+    return (doubt.name or "doubt").lower().replace("_", " ")

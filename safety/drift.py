@@ -1,0 +1,102 @@
+"""Load cells that drift, told from the balance of torques. Pure; time is counted in periods.
+
+At constant set-points the average of eq. roller_velocity_dynamics is
+
+    rho_i = u_i - f_i/R_i v_i + R_i (T_{i+1} - T_i) = 0
+
+with the true tensions. What is wrong in the model shifts rho_i by a constant. If cell k shows d_k too much, control
+keeps the shown value, and rho_i moves by R_i (d_{i+1} - d_i): a drift of cell k alone moves rho_{k-1}/R and rho_k/R
+by the same amount in opposite directions, which no change of one roller's friction does. (Roller 0 has no torque
+that is known here, so cell 1 is told from roller 1 alone, and at a higher threshold.)
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from gateway.core.line import Line
+from gateway.core.signals import FloatArray
+from gateway.core.web_model import WebModel, nominal_model
+
+BLOCK_S = 1.0  #: averages are taken over blocks of this length
+WINDOW_BLOCKS = 10  #: of the moving average, and of the reference
+SETTLE_S = 5.0  #: after a set-point moved, until the reference begins
+DRIFT_N = 2.0  #: a change that is told. Ten seconds of the benchmark's disturbance move the average by 0.4 N (1 sigma)
+DRIFT_ALONE_N = 3.0  #: the same for cell 1
+
+
+@dataclass(frozen=True, slots=True)
+class DriftLimits:
+    model: WebModel
+    measured: FloatArray  #: (n,), 1.0 where a load cell measures the span
+    block_periods: int
+    settle_periods: int
+
+
+def drift_limits(line: Line) -> DriftLimits:
+    period_s = line.control.period_s
+    measured = np.array([1.0 if span.control == "tension" else 0.0 for span in line.spans])
+    return DriftLimits(nominal_model(line), measured, round(BLOCK_S / period_s), round(SETTLE_S / period_s))
+
+
+@dataclass(slots=True)
+class DriftState:
+    settling: int = 0  #: periods until blocks count
+    in_block: int = 0  #: periods summed so far
+    sum_nm: FloatArray = field(default_factory=lambda: np.zeros(0))  #: of rho (n,) over the block
+    blocks_nm: list[FloatArray] = field(default_factory=list[FloatArray])  #: the last averages, the newest at the end
+    reference_nm: FloatArray | None = None  #: (n,)
+    drift_n: FloatArray = field(default_factory=lambda: np.zeros(0))  #: (n,), of each cell, as far as it is told
+
+
+def restart(limits: DriftLimits, state: DriftState) -> None:
+    """A set-point moved, a cell is stuck, or control was not on: what was balanced before does not count."""
+    state.settling = limits.settle_periods
+    state.in_block = 0
+    state.blocks_nm = []
+    state.reference_nm = None
+    state.sum_nm = np.zeros(limits.model.n)
+
+
+def watch_balance(
+    limits: DriftLimits, state: DriftState, tension_n: FloatArray, speed_m_per_s: FloatArray, torque_nm: FloatArray
+) -> None:
+    """Take in a period at constant set-points: samples (n,), and the torque (n,) that was applied meanwhile."""
+    if state.settling > 0:
+        state.settling -= 1
+        return
+    model = limits.model
+    downstream = np.append(tension_n[1:], model.tension_after_n)
+    friction = model.friction_nms_per_rad / model.radius_m * speed_m_per_s
+    state.sum_nm += torque_nm - friction + model.radius_m * (downstream - tension_n)
+    state.in_block += 1
+    if state.in_block >= limits.block_periods:
+        state.blocks_nm.append(state.sum_nm / state.in_block)
+        state.in_block = 0
+        state.sum_nm = np.zeros(model.n)
+        _judge(limits, state)
+
+
+def _judge(limits: DriftLimits, state: DriftState) -> None:
+    if len(state.blocks_nm) < WINDOW_BLOCKS:
+        return
+    state.blocks_nm = state.blocks_nm[-WINDOW_BLOCKS:]
+    average_nm: FloatArray = np.mean(state.blocks_nm, axis=0)
+    if state.reference_nm is None:
+        state.reference_nm = average_nm
+        state.drift_n = np.zeros(limits.model.n)
+        return
+    change_n = (average_nm - state.reference_nm) / limits.model.radius_m
+    state.drift_n = drift_of(change_n) * limits.measured
+
+
+def drift_of(change_n: FloatArray) -> FloatArray:
+    """Which cells (n,) drift by how much (N), from the change of rho_i / R_i (n,) since the reference; 0: none told."""
+    drift_n = np.zeros(len(change_n))
+    before, after = change_n[:-1], -change_n[1:]
+    agree = (np.minimum(np.abs(before), np.abs(after)) > DRIFT_N) & (before * after > 0)
+    drift_n[1:] = np.where(agree, 0.5 * (before + after), 0.0)
+    # What cell 2 explains of roller 1 is not cell 1's.
+    alone = -change_n[0] + (drift_n[1] if len(change_n) > 1 else 0.0)
+    drift_n[0] = alone if abs(alone) > DRIFT_ALONE_N else 0.0
+    return drift_n
