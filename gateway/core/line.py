@@ -146,6 +146,14 @@ class Recipe(Strict):
     speed_m_per_s: NonNegative
 
 
+class History(Strict):
+    """What the gateway keeps on disk. The oldest goes first; six spans at 100 Hz write about 0.7 GB a day."""
+
+    keep_days: Positive = 90.0  #: of telemetry
+    keep_gb: Positive = 20.0  #: at most, of telemetry and events together
+    keep_events_days: Positive = 3650.0
+
+
 class Line(Strict):
     format: Annotated[int, Field(ge=1, le=1)]  #: not Literal: that takes `true` and 1.0 for 1
     site: Name
@@ -161,6 +169,7 @@ class Line(Strict):
     drives: list[Drive]
     load_cells: list[LoadCell]
     plc: LinePlc
+    history: History = History()
     recipes: Annotated[list[Recipe], Field(min_length=1)]  #: the first is the one a line starts with
 
     @property

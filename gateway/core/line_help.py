@@ -30,6 +30,7 @@ HELP: dict[str, dict[str, str]] = {
         "drives": "one per roller, torque-controlled",
         "load_cells": "one per tension-controlled span",
         "plc": "drives the unwinder, owns the permissive and the emergency stop",
+        "history": "what the gateway keeps on disk; the oldest goes first",
         "recipes": "set-points for a grade; the line starts with the first",
     },
     "Control": {
@@ -117,6 +118,11 @@ HELP: dict[str, dict[str, str]] = {
         "capacity_n": "a reading beyond it is not believed",
     },
     "LinePlc": {**_DEVICE, "address": "Modbus unit"},
+    "History": {
+        "keep_days": "of telemetry: about 0.7 GB a day for six spans at 100 Hz",
+        "keep_gb": "largest size, of telemetry and events together",
+        "keep_events_days": "of events: state changes, commands, alarms",
+    },
     "Recipe": {
         "name": "name of the grade",
         "tension_n": "one per span; for draw spans the tension that their speed ratio is computed from",

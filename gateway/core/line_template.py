@@ -34,7 +34,7 @@ def line_template(spans: int = 6, out: str = "line.toml") -> str:
     more = {1: "", 2: " ~~span 2~~ roller 2"}.get(spans, f" ~~span 2~~ ... ~~span {spans}~~ roller {spans}")
     parts = [_HEAD.format(more=more, out=out), _line(spans), _process(spans), _web()]
     parts += [_rollers(spans), _spans(spans), _buses(buses), _drives(spans, buses), _load_cells(spans), _plc()]
-    return "\n".join([*parts, _recipes(spans)])
+    return "\n".join([*parts, _history(), _recipes(spans)])
 
 
 def _entries(model: str, values: dict[str, str]) -> str:
@@ -200,6 +200,10 @@ def _load_cells(spans: int) -> str:
 
 def _plc() -> str:
     return _table("plc", "LinePlc", {"name": '"line-plc"', "bus": '"io"', "map": '"line-plc"', "address": "2"})
+
+
+def _history() -> str:
+    return _table("history", "History", {"keep_days": "90.0", "keep_gb": "20.0", "keep_events_days": "3650.0"})
 
 
 def _recipes(spans: int) -> str:

@@ -17,8 +17,10 @@ from typing import Any
 
 import apsw
 
+from gateway.core.line import History
 from gateway.core.messages import Event
 from gateway.core.telemetry import frame_dtype
+from gateway.supervisor.retention import Retention, retention_of
 from gateway.supervisor.store import NotOurs, Run, boot_id
 from gateway.supervisor.writer import BLOB_S, DiskFull, Writer
 
@@ -27,6 +29,7 @@ FLUSH_S = 0.8
 STALLED_S = 3.0  #: a turn that takes longer than this: the disk does not answer
 MAX_WAITING_BYTES = 32 * 2**20  #: frames that wait for the disk; beyond it what comes is lost
 MAX_WAITING_EVENTS = 10_000
+KEPT = retention_of(History())
 RESERVE_BYTES = 64 * 2**20  #: left free on the disk, for the rest of the machine
 
 
@@ -51,11 +54,13 @@ class Historian:
         line: str,
         spans: int,
         *,
+        retention: Retention = KEPT,
         reserve_bytes: int = RESERVE_BYTES,
         clock: Callable[[], float] = time.monotonic,
         wall_clock: Callable[[], float] = time.time,
     ) -> None:
         self.path = folder / FILE_NAME
+        self._retention = retention
         self._clock = clock
         self._wall_clock = wall_clock
         now_s = clock()
@@ -131,6 +136,7 @@ class Historian:
             self._stored()
             if finish or idle or self._writer.gathered_s() >= BLOB_S:
                 self._writer.pack(wall_ahead_s)
+                self._writer.expire(self._retention, self._wall_clock())
         except Exception as error:  # the thread must outlive whatever happens to the disk
             self._recover(error)
 

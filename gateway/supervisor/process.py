@@ -14,6 +14,7 @@ from gateway.mailbox.listener import AlreadyRunning, CannotListen, PathTooLong
 from gateway.mailbox.paths import GATEWAY_SOCKET, LOOP_SOCKET
 from gateway.mailbox.unix import UnixMailbox
 from gateway.supervisor.historian import Historian
+from gateway.supervisor.retention import retention_of
 from gateway.supervisor.service import Gateway
 
 EXIT_OK, EXIT_NOT_FLUSHED, EXIT_CANNOT_LISTEN, EXIT_ALREADY_RUNNING = 0, 1, 2, 3
@@ -38,7 +39,7 @@ async def _serve(line: Line, run_folder: Path, data_folder: Path) -> int:
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
     mailbox = UnixMailbox()
     mailbox.connect((LOOP_COMMAND,), run_folder / LOOP_SOCKET)
-    historian = Historian(data_folder, line.site, line.line, line.n)
+    historian = Historian(data_folder, line.site, line.line, line.n, retention=retention_of(line.history))
     gateway = Gateway(line, mailbox, historian, mailbox.counters)
     # First the socket, whose lock makes this the only instance; only then is the history touched.
     await mailbox.listen(run_folder / GATEWAY_SOCKET)

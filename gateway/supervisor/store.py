@@ -111,6 +111,7 @@ def open_store(path: Path) -> apsw.Connection:
     connection = apsw.Connection(os.fspath(path))
     try:
         connection.set_busy_timeout(500)
+        connection.execute("PRAGMA auto_vacuum = INCREMENTAL")  # of a new file; needed before its first table
         connection.execute("PRAGMA journal_mode = WAL")
         connection.execute("PRAGMA synchronous = NORMAL")
         _migrate(connection)

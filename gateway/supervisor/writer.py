@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from gateway.core.messages import Event
 from gateway.core.telemetry import frame_dtype
+from gateway.supervisor.retention import Retention, expire
 from gateway.supervisor.store import (
     Run,
     check_whole,
@@ -73,6 +74,10 @@ class Writer:
                 delete_blobs(connection, self._small)
                 insert_blob(connection, self._run_id, self._table(self._gathered), wall_ahead_s)
         self._forget()
+
+    def expire(self, retention: Retention, wall_s: float) -> None:
+        """Delete some of what is too old or too much."""
+        expire(self._ready(), retention, wall_s)
 
     def disconnect(self) -> None:
         """Close the file, whatever state it is in; the next `store` opens it again."""
