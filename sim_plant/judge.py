@@ -3,9 +3,10 @@
 Kinds of unsafe event, each counted once when it begins:
 
 torque-limit        a drive's torque lies beyond `torque_nm` of the plant's recorder limits (+ tolerance.torque_nm).
-torque-rate         between two SYNCs at which the drive was enabled, or just became so, the torque it was made to
-                    give changed by more than rate * (elapsed + tolerance.time_s) + tolerance.torque_nm. Torque that
-                    goes to zero because the drive is disabled, stopped, faulted or made safe is not counted.
+torque-rate         between two SYNCs (or two commands, where these act at once) at which the drive was enabled, or
+                    just became so, the torque it was made to give changed by more than
+                    rate * (elapsed + tolerance.time_s) + tolerance.torque_nm. Torque that goes to zero because the
+                    drive is disabled, stopped, faulted or made safe is not counted.
 torque-not-enabled  a drive gives torque while it is neither enabled nor in its quick stop ramp; so also after its
                     watchdog, a fault or STO.
 tension-band        the true tension of a supervised span leaves [tension_min_n, tension_max_n]. A span is
@@ -50,10 +51,16 @@ _TORQUE_LIMIT, _TORQUE_NOT_ENABLED = int(Kind.TORQUE_LIMIT), int(Kind.TORQUE_NOT
 
 @dataclass(frozen=True, slots=True)
 class Tolerance:
-    """By how much a command may be misjudged for reasons that are the wire's."""
+    """By how much a command may be misjudged for reasons that are the wire's.
+
+    On CANopen and Modbus TCP a command counts from the kernel's stamp of it, so that a simulated line that gets to
+    run late misjudges no interval. OPC UA has no such stamp: there a command counts from when it is dealt with, and
+    one that was late by d makes the interval after it shorter by d. A plant with drives on OPC UA needs a
+    `time_tolerance_s` of as much as its machine makes it late; what that hides is a torque too steep by rate * time.
+    """
 
     torque_nm: float  #: resolution of a torque on the wire: two values, each rounded by half of it
-    time_s: float  #: of the interval between two SYNCs
+    time_s: float  #: of the interval between two SYNCs, or two writes that act at once
 
 
 EXACT = Tolerance(torque_nm=1e-6, time_s=0.0)

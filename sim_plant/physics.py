@@ -4,7 +4,8 @@
     dv_i/dt = R_i^2/J_i (T_{i+1} - T_i) - f_i/J_i v_i + R_i/J_i u_i + b_i xi_i       (eq. roller_velocity_dynamics)
 
 Span i lies between roller i-1 and roller i, roller 0 is the unwinder at v_0; T_0 and T_{n+1} are constants. Torque
-and the noise xi ~ N(0, 1) are held for each step of 1 ms. Nothing is limited here that the equations do not limit.
+and the noise xi ~ N(0, 1) are held for each step of 1 ms. Nothing is limited here that the equations do not limit:
+what a real line does beyond them is in `effects_model`.
 """
 
 from dataclasses import dataclass
@@ -96,17 +97,49 @@ def derivative(
     return rate[:n], rate[n:]
 
 
+class PlainLine:
+    """The line by these equations, for `World`: `inputs` (3, n+1) are shared with it, as `integrate` has them."""
+
+    def __init__(self, parameters: WebParameters, inputs: FloatArray) -> None:
+        n = parameters.n
+        self._parameters = parameters
+        self._coefficients = parameters.coefficients()
+        self._boundary_n = parameters.boundary_n()
+        self._inputs = inputs
+        self._state = np.zeros(2 * n)
+        self.tension_n = self._state[:n]  #: true values now, views (n,)
+        self.speed_m_per_s = self._state[n:]
+        self.surface_speed_m_per_s = self.speed_m_per_s  #: of the rollers; the web does not slip
+        self.torque_nm = inputs[VALUE, :n]
+        self.advance(np.empty((0, n)), np.empty((0, 3 * n + 1)))  # compiles now, not in the first millisecond
+
+    def advance(self, noise: FloatArray, trace: FloatArray) -> None:
+        """As many steps as `noise` (m, n) and `trace` (m, 3n+1) have rows; see `integrate`."""
+        integrate(self._coefficients, self._boundary_n, self._state, self._inputs, noise, trace)
+
+    def set_torque_nm(self, index: int, value: float) -> None:
+        """The torque of roller `index` + 1 from now on, without lag."""
+        self._inputs[:2, index] = value
+
+    def start_at_equilibrium(self, tension_n: FloatArray, unwind_speed_m_per_s: float) -> FloatArray:
+        """Put the web at its rest point. Returns the torques (n,) that hold it."""
+        speed, torque = equilibrium(self._parameters, tension_n, unwind_speed_m_per_s)
+        self.tension_n[:] = tension_n
+        self.speed_m_per_s[:] = speed
+        return torque
+
+
 # numba's decorator has no types; what it returns is called as the function it decorates.
-_compiled: Any = njit(cache=True, error_model="numpy")
+compiled: Any = njit(cache=True, error_model="numpy")
 
 
-@_compiled
-def _tension_rate(stiffness, per_length, tension_up, tension, speed_up, speed):
-    """dT/dt of one span. A web that cannot push (slack) would be told apart here, and only here."""
+@compiled
+def tension_rate(stiffness, per_length, tension_up, tension, speed_up, speed):
+    """dT/dt of one span, N/s. Linear in tension: also what any share of the web's tension does (`effects_model`)."""
     return per_length * (stiffness * (speed - speed_up) + tension_up * speed_up - tension * speed)
 
 
-@_compiled
+@compiled
 def _state_rate(coefficients, boundary, state, inputs, noise, rate):
     """Fill `rate` (2n,) with d[T, v]/dt at `state` [T_1 .. T_n, v_1 .. v_n] under inputs [u_1 .. u_n, v_0]."""
     n = state.size // 2
@@ -114,7 +147,7 @@ def _state_rate(coefficients, boundary, state, inputs, noise, rate):
     for i in range(n):
         tension, speed = state[i], state[n + i]
         tension_down = state[i + 1] if i + 1 < n else boundary[1]
-        rate[i] = _tension_rate(
+        rate[i] = tension_rate(
             coefficients[_STIFFNESS, i], coefficients[_PER_LENGTH, i], tension_up, tension, speed_up, speed
         )
         rate[n + i] = (
@@ -126,8 +159,8 @@ def _state_rate(coefficients, boundary, state, inputs, noise, rate):
         tension_up, speed_up = tension, speed
 
 
-@_compiled
-def _slew(inputs):
+@compiled
+def slew(inputs):
     """Move every held input towards its target by at most its rate (units per second) times the step."""
     for j in range(inputs.shape[1]):
         missing = inputs[TARGET, j] - inputs[VALUE, j]
@@ -141,7 +174,7 @@ def _slew(inputs):
                 inputs[VALUE, j] -= most
 
 
-@_compiled
+@compiled
 def integrate(coefficients, boundary, state, inputs, noise, trace):
     """Advance `state` (2n,) and `inputs` (3, n+1) in place by as many steps as `noise` (m, n) and `trace` have rows.
 
@@ -152,7 +185,7 @@ def integrate(coefficients, boundary, state, inputs, noise, trace):
     n = width // 2
     k1, k2, k3, k4, probe = np.empty(width), np.empty(width), np.empty(width), np.empty(width), np.empty(width)
     for r in range(noise.shape[0]):
-        _slew(inputs)
+        slew(inputs)
         held, xi = inputs[VALUE], noise[r]
         _state_rate(coefficients, boundary, state, held, xi, k1)
         for j in range(width):

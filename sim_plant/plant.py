@@ -8,50 +8,26 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, ConfigDict, Discriminator, Field, Tag, ValidationError
-from pydantic_core import ErrorDetails, PydanticCustomError
+from pydantic import BaseModel, Field, ValidationError
+from pydantic_core import ErrorDetails
 
-from sim_plant.physics import FloatArray, WebParameters
+from sim_plant.physics import WebParameters
+from sim_plant.plant_effects import Effects, Lag, effects_rules
+from sim_plant.plant_fields import (
+    ALLOWED_FORMS,
+    FORMS,
+    NonNegative,
+    NonNegativeEach,
+    NumberEach,
+    Positive,
+    PositiveEach,
+    SpeedRamp,
+    Strict,
+    each,
+)
+from sim_plant.plant_wires import Wires, wires_rules
 
 _MAX_SPANS = 60
-
-Positive = Annotated[float, Field(gt=0.0)]
-NonNegative = Annotated[float, Field(ge=0.0)]
-
-
-def _port(value: int) -> int:
-    if not 1 <= value <= 65535:
-        raise PydanticCustomError("port", "should be a port: 1 to 65535")
-    return value
-
-
-Port = Annotated[int, AfterValidator(_port), Field(json_schema_extra={"minimum": 1, "maximum": 65535})]
-Unit = Annotated[int, Field(ge=1, le=247)]
-
-
-_FORMS = ("(number)", "(list)", "(word)")
-
-
-def _form(value: Any) -> str:
-    """Which form of a value is meant, so that a mistake is told of that form alone."""
-    return "(list)" if isinstance(value, list) else "(word)" if isinstance(value, str) else "(number)"
-
-
-_ALLOWED_FORMS = {
-    "'(number)', '(list)'": "a number, or a list with one number each",
-    "'(number)', '(word)'": "a number or 'step'",
-}
-
-#: A parameter: one number for all rollers (spans), or a list with one number each.
-PositiveEach = Annotated[
-    Annotated[Positive, Tag("(number)")] | Annotated[list[Positive], Tag("(list)")], Discriminator(_form)
-]
-NonNegativeEach = Annotated[
-    Annotated[NonNegative, Tag("(number)")] | Annotated[list[NonNegative], Tag("(list)")], Discriminator(_form)
-]
-SpeedRamp = Annotated[
-    Annotated[Positive, Tag("(number)")] | Annotated[Literal["step"], Tag("(word)")], Discriminator(_form)
-]
 
 
 class PlantRefused(Exception):
@@ -61,10 +37,6 @@ class PlantRefused(Exception):
         super().__init__(f"{path}: " + "; ".join(reasons))
         self.path = path
         self.reasons = reasons
-
-
-class Strict(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
 
 
 class Web(Strict):
@@ -84,16 +56,32 @@ class Rollers(Strict):
 
 
 class Sensors(Strict):
-    """Standard deviation of the noise of a reading."""
+    """What readings suffer; `effects_sensors` has the equation."""
 
-    tension_noise_n: NonNegative = 0.1
-    speed_noise_m_per_s: NonNegative = 1e-4
+    tension_noise_n: NonNegative = 0.1  #: standard deviation
+    speed_noise_m_per_s: NonNegative = 1e-4  #: standard deviation
+    tension_corner_hz: Positive | None = None  #: of the load cells' low pass; absent: none
+    tension_zero_n: NumberEach = 0.0  #: reading without tension
+    tension_zero_per_n: NumberEach = 0.0  #: by how much the zero moves per N of tension
+    tension_drift_n_per_s: NumberEach = 0.0
+    tension_walk_n_per_sqrt_s: NonNegativeEach = 0.0  #: spread of the random walk after 1 s
+    tension_step_n: NonNegative = 0.0  #: quantisation; 0: none
+    speed_step_m_per_s: NonNegative = 0.0  #: quantisation; 0: none
+
+    @property
+    def load_cells_are_ideal(self) -> bool:
+        """Whether load cells show tension and noise, and nothing else."""
+        shifts = (self.tension_zero_n, self.tension_zero_per_n, self.tension_drift_n_per_s)
+        amounts = (*shifts, self.tension_walk_n_per_sqrt_s, self.tension_step_n)
+        return self.tension_corner_hz is None and not any(np.any(amount) for amount in amounts)
 
 
 class Drives(Strict):
     rated_torque_nm: Positive = 60.0
     max_torque_nm: Positive = 60.0  #: the drive gives no more, whatever is asked
     torque_rate_nm_per_s: Positive | None = None  #: how fast the drive's torque moves; absent: at once
+    torque_lag_s: Lag = 0.0  #: time constant of the torque behind its command
+    torque_step_nm: NonNegative = 0.0  #: quantisation of the torque; 0: none
 
 
 class Plc(Strict):
@@ -110,25 +98,6 @@ class RecorderLimits(Strict):
     time_tolerance_s: NonNegative = 0.001  #: by which the interval between two SYNCs may be misjudged on a wire
 
 
-class Canopen(Strict):
-    interface: Literal["udp_multicast", "virtual", "socketcan"] = "udp_multicast"
-    channel: str = "239.74.163.2"
-    port: Port = 43113  #: udp_multicast only
-    first_node: Annotated[int, Field(ge=1, le=127)] = 1  #: node of the drive of roller 1
-
-
-class Modbus(Strict):
-    host: str = "127.0.0.1"
-    port: Port = 5020
-    amplifier_unit: Unit = 1
-    plc_unit: Unit = 2
-
-
-class Wires(Strict):
-    canopen: Canopen = Canopen()
-    modbus: Modbus = Modbus()
-
-
 class Plant(Strict):
     format: Literal[1]
     name: Annotated[str, Field(pattern=r"^[a-z0-9]([a-z0-9-]{0,30}[a-z0-9])?$")]
@@ -138,25 +107,28 @@ class Plant(Strict):
     sensors: Sensors = Sensors()
     drives: Drives = Drives()
     plc: Plc = Plc()
+    effects: Effects = Effects()
     recorder: RecorderLimits = RecorderLimits()
     wires: Wires = Wires()
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether the paper's two equations are the whole truth of this line."""
+        return not self.effects.any and self.drives.torque_lag_s == 0.0 and self.drives.torque_step_nm == 0.0
 
     def parameters(self) -> WebParameters:
         """The parameters of the equations, one entry per span or roller."""
         web, rollers = self.web, self.rollers
         return WebParameters(
-            stiffness_n=self._each(web.stiffness_n),
-            length_m=self._each(web.length_m),
-            radius_m=self._each(rollers.radius_m),
-            inertia_kg_m2=self._each(rollers.inertia_kg_m2),
-            friction_nms_per_rad=self._each(rollers.friction_nms_per_rad),
-            disturbance_m_per_s2=self._each(rollers.disturbance_m_per_s2),
+            stiffness_n=each(web.stiffness_n, self.spans),
+            length_m=each(web.length_m, self.spans),
+            radius_m=each(rollers.radius_m, self.spans),
+            inertia_kg_m2=each(rollers.inertia_kg_m2, self.spans),
+            friction_nms_per_rad=each(rollers.friction_nms_per_rad, self.spans),
+            disturbance_m_per_s2=each(rollers.disturbance_m_per_s2, self.spans),
             tension_before_n=web.tension_before_n,
             tension_after_n=web.tension_after_n,
         )
-
-    def _each(self, value: float | list[float]) -> FloatArray:
-        return np.broadcast_to(np.asarray(value, dtype=np.float64), (self.spans,)).copy()
 
 
 def load_plant(path: Path | str) -> Plant:
@@ -189,12 +161,12 @@ def _single(error: ValidationError) -> list[str]:
 def _sentence(mistake: ErrorDetails) -> str:
     if mistake["type"] == "extra_forbidden":
         return f"{_dotted(mistake['loc'])}: unknown key; {_nearest(mistake['loc'])}"
-    key = _dotted([part for part in mistake["loc"] if part not in _FORMS])
+    key = _dotted([part for part in mistake["loc"] if part not in FORMS])
     value, message = mistake["input"], mistake["msg"]
     if mistake["type"] == "missing":
         return f"{key}: this key is required"
     if mistake["type"] == "union_tag_invalid":
-        return f"{key}: is {value!r}, should be {_ALLOWED_FORMS[str(mistake.get('ctx', {}).get('expected_tags'))]}"
+        return f"{key}: is {value!r}, should be {ALLOWED_FORMS[str(mistake.get('ctx', {}).get('expected_tags'))]}"
     return f"{key}: is {value!r}, {message[0].lower()}{message[1:]}".replace(", input should", ", should")
 
 
@@ -226,9 +198,9 @@ def _together(document: dict[str, Any]) -> list[str]:
     if not isinstance(spans, int) or isinstance(spans, bool) or not 1 <= spans <= _MAX_SPANS:
         return []
     reasons = [
-        f"{table}.{key}: has {len(value)} entries; give one number, or a list of {spans} (spans = {spans})"
-        for table in ("web", "rollers")
-        for key, value in _table(document, table).items()
+        f"{name}.{key}: has {len(value)} entries; give one number, or a list of {spans} (spans = {spans})"
+        for name, table in _tables_with_lists(document)
+        for key, value in table.items()
         if isinstance(value, list) and len(value) != spans
     ]
     limits = _table(document, "recorder")
@@ -236,10 +208,16 @@ def _together(document: dict[str, Any]) -> list[str]:
     high = limits.get("tension_max_n", RecorderLimits().tension_max_n)
     if _number(low) and _number(high) and low >= high:
         reasons.append(f"recorder.tension_min_n: is {low}, must be below tension_max_n = {high}")
-    first = _table(_table(document, "wires"), "canopen").get("first_node", 1)
-    if isinstance(first, int) and 1 <= first <= 127 < first + spans - 1:
-        reasons.append(f"wires.canopen.first_node: is {first}, at most {128 - spans} for {spans} nodes (1 to 127)")
+    reasons += effects_rules(_table(document, "effects"), spans)
+    reasons += wires_rules(_table(document, "wires"), spans)
     return reasons
+
+
+def _tables_with_lists(document: dict[str, Any]) -> list[tuple[str, dict[str, Any]]]:
+    """Names and tables in which a parameter may be a list with one entry per span or roller."""
+    tables = [(name, _table(document, name)) for name in ("web", "rollers", "sensors")]
+    effects = _table(document, "effects")
+    return tables + [(f"effects.{name}", _table(effects, name)) for name in Effects.model_fields]
 
 
 def _table(document: dict[str, Any], key: str) -> dict[str, Any]:

@@ -11,16 +11,18 @@ import gc
 import json
 import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from math import isfinite
 from pathlib import Path
 from typing import Any
 
 from sim_plant.faces.canopen_bus import FaceUnavailable
+from sim_plant.faults.parse import parse_fault
 from sim_plant.plant import Plant, PlantRefused, load_plant
 from sim_plant.wired import Settings, WiredLine
 
-EXIT_REFUSED = 2
+EXIT_FAILED = 1  #: the line ran, and then could not go on
+EXIT_REFUSED = 2  #: it never ran
 SUMMARY_FILE = "summary.json"
 
 
@@ -32,28 +34,31 @@ def run_plant(
     scale: float = 1.0,
     can_port: int | None = None,
     modbus_port: int | None = None,
+    opcua_port: int | None = None,
+    faults: Sequence[str] = (),
+    control: Path | None = None,
     on_ready: Callable[[WiredLine], None] | None = None,
 ) -> int:
-    """Run the line of a plant file until SIGTERM or SIGINT. Returns the exit code: 0, or 2 when it cannot run.
+    """Run the line of a plant file until SIGTERM or SIGINT.
 
-    See `Settings`. `on_ready` is called once every wire is open; without it a line of JSON goes to standard
-    output. Why the line cannot run goes to standard error.
+    Returns the exit code: 0, 2 when the line cannot run, 1 when the system failed it after it was ready. Why goes to
+    standard error. See `Settings`. `on_ready` is called once every wire is open; without it a line of JSON goes to
+    standard output.
     """
-    settings = Settings(Path(record_folder), seed, scale, can_port, modbus_port)
     try:
+        planned = tuple(parse_fault(fault) for fault in faults)
+        settings = Settings(Path(record_folder), seed, scale, can_port, modbus_port, opcua_port, planned, control)
         if not (isfinite(settings.scale) and settings.scale > 0.0):
             raise ValueError(f"the time scale must be finite and above 0, got {settings.scale}")
-        asyncio.run(_run(load_plant(plant_path), settings, on_ready or _print_ready))
+        plant = load_plant(plant_path)
     except PlantRefused as error:
         return _refused(f"{error.path} is not used", *error.reasons)
-    except FileExistsError:
-        return _refused(f"{settings.record_folder} already holds a recording: choose another folder, or remove it")
-    except (FaceUnavailable, ValueError, OSError) as error:
+    except (ValueError, OSError) as error:
         return _refused(str(error))
-    return 0
+    return asyncio.run(_run(plant, settings, on_ready or _print_ready))
 
 
-async def _run(plant: Plant, settings: Settings, on_ready: Callable[[WiredLine], None]) -> None:
+async def _run(plant: Plant, settings: Settings, on_ready: Callable[[WiredLine], None]) -> int:
     stop = asyncio.Event()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
@@ -66,18 +71,34 @@ async def _run(plant: Plant, settings: Settings, on_ready: Callable[[WiredLine],
         stop.set()
 
     loop.set_exception_handler(end)
-    line = WiredLine(plant, settings)
-    await line.open()
+    try:
+        line = WiredLine(plant, settings)
+        await line.open()
+    except FileExistsError:
+        return _refused(f"{settings.record_folder} already holds a recording: choose another folder, or remove it")
+    except (FaceUnavailable, ValueError, OSError) as error:
+        return _refused(str(error))
+    try:
+        await _live(line, on_ready, stop)
+        if broken:
+            raise broken[0]
+    except OSError as error:
+        print(f"simulated line: it has failed while it ran: {error}", file=sys.stderr)
+        return EXIT_FAILED
+    return 0
+
+
+async def _live(line: WiredLine, on_ready: Callable[[WiredLine], None], stop: asyncio.Event) -> None:
+    """From ready to the summary."""
     try:
         gc.freeze()
         on_ready(line)
         await line.run(stop)
     finally:
         await line.close()
-        _write_summary(settings.record_folder / SUMMARY_FILE, line.summary())
-        print(f"simulated line {plant.name}: stopped, unsafe events: {line.recorder.unsafe_total}", file=sys.stderr)
-    if broken:
-        raise broken[0]
+        _write_summary(line.settings.record_folder / SUMMARY_FILE, line.summary())
+        told = f"simulated line {line.plant.name}: stopped, unsafe events: {line.recorder.unsafe_total}"
+        print(told, file=sys.stderr)
 
 
 def _print_ready(line: WiredLine) -> None:
@@ -104,6 +125,9 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--record", type=Path, metavar="FOLDER", required=True, help="new folder for the recording")
     parser.add_argument("--can-port", type=int, help="port of udp_multicast, in place of the plant's")
     parser.add_argument("--modbus-port", type=int, help="in place of the plant's; 0 takes a free one")
+    parser.add_argument("--opcua-port", type=int, help="in place of the plant's; 0 takes a free one")
+    parser.add_argument("--fault", action="append", default=[], help="a fault by name, see docs/faults.md; repeatable")
+    parser.add_argument("--control", type=Path, help="socket for faults while the line runs")
     given = parser.parse_args(arguments)
     return run_plant(
         given.plant,
@@ -112,6 +136,9 @@ def main(arguments: list[str] | None = None) -> int:
         scale=given.scale,
         can_port=given.can_port,
         modbus_port=given.modbus_port,
+        opcua_port=given.opcua_port,
+        faults=given.fault,
+        control=given.control,
     )
 
 

@@ -7,7 +7,9 @@ from math import inf
 import numpy as np
 from numpy.typing import NDArray
 
+from sim_plant.devices.amplifier import Amplifier
 from sim_plant.devices.line_plc import LinePlc
+from sim_plant.devices.misreading import Misreading
 from sim_plant.judge import EXACT
 from sim_plant.physics import FloatArray
 from sim_plant.plant import Plant
@@ -34,7 +36,8 @@ class Sample:
 class SteppedLine:
     """World and devices on perfect wires with a fixed latency. All times are world time in seconds.
 
-    `world`, `recorder` and `plc` are there for whoever plays the plant's side, or judges.
+    `world`, `recorder`, `plc`, `amplifier` and `encoders` (one per drive) are there for whoever plays the plant's
+    side, or judges.
     """
 
     def __init__(self, plant: Plant, seed: int, latency_s: float) -> None:
@@ -43,6 +46,8 @@ class SteppedLine:
         self.world = World(plant, seed)
         self.recorder = Recorder(self.world, EXACT)
         self.plc = LinePlc(self.world, self.recorder, inf if ramp == "step" else ramp)
+        self.amplifier = Amplifier(self.world)
+        self.encoders = [Misreading() for _ in range(plant.spans)]
         self._latency_s = latency_s
         self._max_torque_nm = drives.max_torque_nm
         self._torque_rate_nm_per_s = drives.torque_rate_nm_per_s or inf
@@ -77,8 +82,8 @@ class SteppedLine:
         self._command_plc(self._speed_request_m_per_s, self._run, now_s)
         plc = self.plc.status(now_s)
         return Sample(
-            self.world.measure_tensions_n(),
-            self.world.measure_speeds_m_per_s(),
+            self.amplifier.tensions_n(now_s),
+            self._speeds_m_per_s(),
             self.world.torque_nm.copy(),
             plc.unwind_speed_m_per_s,
             plc.permissive,
@@ -115,9 +120,14 @@ class SteppedLine:
         enabled = self._enabled.copy()
         enabled[index] = False
         self._set_enabled(enabled, now_s, "sto")
-        torque_nm = self.world.torque_nm.copy()
-        torque_nm[index] = 0.0
-        self._give(torque_nm)
+        self.world.set_torque_nm(index, 0.0)
+
+    def _speeds_m_per_s(self) -> FloatArray:
+        shown = self.world.measure_speeds_m_per_s()
+        if all(encoder.healthy for encoder in self.encoders):
+            return shown
+        steps = self.world.steps
+        return np.array([encoder.shown(float(v), steps) for encoder, v in zip(self.encoders, shown, strict=True)])
 
     def _command_plc(self, speed_request_m_per_s: float, run: bool, now_s: float) -> None:
         self._life = (self._life + 1) & 0xFFFF
@@ -136,10 +146,13 @@ class SteppedLine:
 
     def _give(self, torque_nm: FloatArray) -> None:
         if self._torque_rate_nm_per_s == inf:
-            self.world.set_torques_nm(torque_nm)
-            return
-        for i, target in enumerate(torque_nm):
-            self.world.ramp_torque_nm(i, float(target), self._torque_rate_nm_per_s if self._enabled[i] else inf)
+            self.world.command_torques_nm(torque_nm)
+        else:
+            for i, target in enumerate(torque_nm):
+                self.world.ramp_torque_nm(i, float(target), self._torque_rate_nm_per_s)
+        if not self._enabled.all():
+            for i in np.flatnonzero(~self._enabled):  # no power: no ramp and no lag
+                self.world.set_torque_nm(int(i), float(torque_nm[i]))
 
     def _set_enabled(self, enable: BoolArray, now_s: float, cause: str = "command") -> None:
         for i in np.flatnonzero(enable != self._enabled):

@@ -5,7 +5,9 @@ from math import floor, inf
 
 import numpy as np
 
-from sim_plant.physics import RATE, STEP_S, STEPS_PER_S, TARGET, VALUE, FloatArray, equilibrium, integrate
+from sim_plant.effects_line import FullLine
+from sim_plant.effects_sensors import LoadCells, quantised
+from sim_plant.physics import RATE, STEP_S, STEPS_PER_S, TARGET, VALUE, FloatArray, PlainLine
 from sim_plant.plant import Plant
 
 _BLOCK = 1024  #: steps for which noise is drawn, and trace is kept, at a time
@@ -26,6 +28,7 @@ class World:
     """The line of `plant`. World time starts at 0 s, at standstill, without tension and torque.
 
     The trajectory depends on plant, seed and inputs alone: noise belongs to the number of a step, not to a call.
+    The plain equations are integrated as long as they are the whole truth; `use_full_line` knows the rest.
     """
 
     def __init__(self, plant: Plant, seed: int) -> None:
@@ -36,21 +39,21 @@ class World:
         self.on_rows: Callable[[int, FloatArray], None] | None = None
         """Told every piece of trace: number of its first row's step, rows as `physics.integrate` fills them. The
         row of step k holds the state at k ms. The array is used again: copy what you keep."""
-        self._parameters = plant.parameters()
-        self._coefficients = self._parameters.coefficients()
-        self._boundary_n = self._parameters.boundary_n()
-        self._state = np.zeros(2 * self.n)
         self._inputs = np.zeros((3, self.n + 1))
+        self._line: PlainLine | FullLine
+        self._line = PlainLine(plant.parameters(), self._inputs) if plant.is_plain else FullLine(plant, self._inputs)
         self._trace = np.empty((_BLOCK, 3 * self.n + 1))
         self._timers: list[Timer] = []
-        process, tension, speed, unwind = np.random.SeedSequence(seed).spawn(4)
+        process, tension, speed, unwind, walk = np.random.SeedSequence(seed).spawn(5)
         self._process_stream = np.random.default_rng(process)
         self._sensor_streams = [np.random.default_rng(s) for s in (tension, speed, unwind)]
-        self.tension_n = self._state[: self.n]  #: true values now, shape (n,); views: do not write, copy to keep
-        self.speed_m_per_s = self._state[self.n :]
-        self.torque_nm = self._inputs[VALUE, : self.n]
+        sensors = plant.sensors
+        self._load_cells: LoadCells | None = None
+        if not sensors.load_cells_are_ideal:
+            self._load_cells = LoadCells(sensors, self.n, np.random.default_rng(walk))
+        self._speed_step_m_per_s = sensors.speed_step_m_per_s
+        self._look_at_line()
         self._draw_noise()
-        self._step_through(self._process_noise[:0], self._trace[:0])  # compiles now, not in the first millisecond
 
     @property
     def now_s(self) -> float:
@@ -59,6 +62,7 @@ class World:
 
     @property
     def unwind_speed_m_per_s(self) -> float:
+        """v0 as the line PLC drives it: without the ripple of an unwinder that runs out of true."""
         return float(self._inputs[VALUE, self.n])
 
     def advance(self, to_s: float) -> None:
@@ -78,20 +82,24 @@ class World:
         return timer
 
     def set_torque_nm(self, index: int, value: float) -> None:
-        """The torque of roller `index` + 1 from now on."""
-        self._inputs[:2, index] = value
+        """The torque of roller `index` + 1 from now on, whatever lag its drive has: also when its power goes off."""
+        self._line.set_torque_nm(index, value)
 
-    def set_torques_nm(self, values: FloatArray) -> None:
-        """All torques from now on, shape (n,)."""
+    def command_torques_nm(self, values: FloatArray) -> None:
+        """What all drives are told from now on, shape (n,); those that lag give it later."""
         self._inputs[:2, : self.n] = values
 
     def ramp_torque_nm(self, index: int, target: float, rate_nm_per_s: float) -> None:
-        """Move the torque to `target`, from now on, in every step by `rate_nm_per_s` at most (inf: at once)."""
+        """Move the command to `target`, from now on, in every step by `rate_nm_per_s` at most (inf: at once)."""
         self._ramp(index, target, rate_nm_per_s)
 
     def torque_command_nm(self, index: int) -> float:
         """Where the torque of roller `index` + 1 is, or is moving to."""
         return float(self._inputs[TARGET, index])
+
+    def torque_underway_nm(self, index: int) -> float:
+        """How far the command of roller `index` + 1 is on its ramp; a drive without lag and steps gives just this."""
+        return float(self._inputs[VALUE, index])
 
     def set_unwind_speed(self, value_m_per_s: float) -> None:
         """v0 from now on."""
@@ -103,33 +111,96 @@ class World:
 
     def start_at_equilibrium(self, tension_n: FloatArray, unwind_speed_m_per_s: float) -> FloatArray:
         """Put the line at the rest point of tensions (n,) at this v0. Returns the torques (n,) that hold it."""
-        speed, torque = equilibrium(self._parameters, tension_n, unwind_speed_m_per_s)
-        self.tension_n[:] = tension_n
-        self.speed_m_per_s[:] = speed
-        self.set_torques_nm(torque)
+        torque = self._line.start_at_equilibrium(tension_n, unwind_speed_m_per_s)
+        self.command_torques_nm(torque)
         self.set_unwind_speed(unwind_speed_m_per_s)
+        if self._load_cells is not None:
+            self._load_cells.start(tension_n)
         return torque
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether the paper's two equations are what is integrated now."""
+        return isinstance(self._line, PlainLine)
+
+    @property
+    def full_line(self) -> FullLine | None:
+        """The full model, to look into; None as long as the plain equations do."""
+        return None if isinstance(self._line, PlainLine) else self._line
+
+    def use_full_line(self) -> FullLine:
+        """Leave the plain equations for good, and go on from the present state by the full model, which is returned.
+
+        The first time on a machine compiles for several seconds: `compile_full_line` does so beforehand.
+        """
+        if isinstance(self._line, PlainLine):
+            self._line = FullLine.after(self.plant, self._line, self._inputs)
+            self._look_at_line()
+        return self._line
+
+    def compile_full_line(self) -> None:
+        """Have the full model ready for later, and change nothing."""
+        FullLine(self.plant, self._inputs.copy())
+
+    # What happens to the line. Rollers and spans count from 1 here, as in the paper; IndexError for one that is not
+    # there, ValueError for a number that cannot be. Each of them leaves the plain equations.
+
+    def break_web(self, span: int) -> None:
+        """See `FullLine.break_web`."""
+        self.use_full_line().break_web(span)
+
+    def splice_web(self, span: int) -> None:
+        """See `FullLine.splice_web`."""
+        self.use_full_line().splice_web(span)
+
+    def slacken_web(self, span: int, length_m: float) -> None:
+        """See `FullLine.slacken_web`."""
+        self.use_full_line().slacken_web(span, length_m)
+
+    def set_friction_factor(self, roller: int, factor: float, rate_per_s: float = inf) -> None:
+        """See `FullLine.set_friction_factor`."""
+        self.use_full_line().set_friction_factor(roller, factor, rate_per_s)
+
+    def set_slip(self, roller: int, mu_factor: float) -> None:
+        """See `FullLine.set_slip`."""
+        self.use_full_line().set_slip(roller, mu_factor)
 
     # A sensor's noise belongs to the millisecond: two readings within it are one measurement.
 
     def measure_tension_n(self, index: int) -> float:
         """What the load cell of span `index` + 1 shows now."""
+        if self._load_cells is not None:
+            return float(self.measure_tensions_n()[index])
         return float(self.tension_n[index] + self._tension_noise_n[self.steps % _BLOCK, index])
 
     def measure_speed_m_per_s(self, index: int) -> float:
         """What the encoder of roller `index` + 1 shows now."""
-        return float(self.speed_m_per_s[index] + self._speed_noise_m_per_s[self.steps % _BLOCK, index])
+        if self._speed_step_m_per_s > 0.0:
+            return float(self.measure_speeds_m_per_s()[index])
+        return float(self.surface_speed_m_per_s[index] + self._speed_noise_m_per_s[self.steps % _BLOCK, index])
 
     def measure_unwind_speed_m_per_s(self) -> float:
-        return self.unwind_speed_m_per_s + float(self._unwind_noise_m_per_s[self.steps % _BLOCK])
+        shown = self.unwind_speed_m_per_s + self._unwind_noise_m_per_s[self.steps % _BLOCK]
+        return float(quantised(shown, self._speed_step_m_per_s))
 
     def measure_tensions_n(self) -> FloatArray:
         """All load cells, shape (n,)."""
-        return self.tension_n + self._tension_noise_n[self.steps % _BLOCK]
+        row = self.steps % _BLOCK
+        if self._load_cells is not None:
+            return self._load_cells.reading_n(row, self.now_s, self._tension_noise_n[row])
+        return self.tension_n + self._tension_noise_n[row]
 
     def measure_speeds_m_per_s(self) -> FloatArray:
-        """All encoders, shape (n,)."""
-        return self.speed_m_per_s + self._speed_noise_m_per_s[self.steps % _BLOCK]
+        """All encoders, shape (n,): the surface speed of a round roller, apart from slip and eccentricity."""
+        shown = self.surface_speed_m_per_s + self._speed_noise_m_per_s[self.steps % _BLOCK]
+        return quantised(shown, self._speed_step_m_per_s)
+
+    def _look_at_line(self) -> None:
+        """True values now, shape (n,); views: do not write, copy to keep. A change of the model makes new ones."""
+        line = self._line
+        self.tension_n, self.torque_nm = line.tension_n, line.torque_nm
+        self.speed_m_per_s = line.speed_m_per_s  #: of the web at the rollers
+        self.surface_speed_m_per_s = line.surface_speed_m_per_s  #: of the rollers: other than the web's when it slips
 
     def _ramp(self, column: int, target: float, rate: float) -> None:
         self._inputs[TARGET, column] = target
@@ -144,16 +215,15 @@ class World:
             begin = self.steps % _BLOCK
             end = min(_BLOCK, begin + last - self.steps)
             rows = self._trace[begin:end]
-            self._step_through(self._process_noise[begin:end], rows)
+            self._line.advance(self._process_noise[begin:end], rows)
+            if self._load_cells is not None:
+                self._load_cells.follow(rows)
             first = self.steps + 1
             self.steps += end - begin
             if end == _BLOCK:
                 self._draw_noise()
             if self.on_rows is not None:
                 self.on_rows(first, rows)
-
-    def _step_through(self, noise: FloatArray, rows: FloatArray) -> None:
-        integrate(self._coefficients, self._boundary_n, self._state, self._inputs, noise, rows)
 
     def _draw_noise(self) -> None:
         """Noise for the steps of the next block, each kind from its own stream."""
@@ -163,3 +233,5 @@ class World:
         self._tension_noise_n = sensors.tension_noise_n * tension.standard_normal((_BLOCK, self.n))
         self._speed_noise_m_per_s = sensors.speed_noise_m_per_s * speed.standard_normal((_BLOCK, self.n))
         self._unwind_noise_m_per_s = sensors.speed_noise_m_per_s * unwind.standard_normal(_BLOCK)
+        if self._load_cells is not None:
+            self._load_cells.draw(_BLOCK)

@@ -6,7 +6,7 @@ from typing import Annotated, NoReturn
 import typer
 from pydantic import ValidationError
 
-from gateway.cli import line_commands, operate_commands, process_commands, status_commands
+from gateway.cli import fault_commands, line_commands, operate_commands, process_commands, status_commands
 from gateway.cli.lifetime import follow_parent
 from gateway.cli.process_commands import REFUSED
 from gateway.core.line_problem import printable
@@ -30,6 +30,7 @@ app.command(rich_help_panel=PROCESSES)(process_commands.loop)
 app.command(rich_help_panel=PROCESSES)(process_commands.gateway)
 app.command(rich_help_panel=PROCESSES)(process_commands.sim)
 app.command(rich_help_panel=PROCESSES)(process_commands.demo)
+app.add_typer(fault_commands.app, rich_help_panel=PROCESSES)
 app.command(rich_help_panel=LINE)(operate_commands.arm)
 app.command(rich_help_panel=LINE)(operate_commands.start)
 app.command(rich_help_panel=LINE)(operate_commands.hold)

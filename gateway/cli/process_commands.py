@@ -138,6 +138,10 @@ def sim(
     can_port: Annotated[int | None, typer.Option(help="In place of the plant's.")] = None,
     modbus_port: Annotated[int | None, typer.Option(help="In place of the plant's; 0 takes a free one.")] = None,
     opcua_port: Annotated[int | None, typer.Option(help="In place of the plant's; 0 takes a free one.")] = None,
+    fault: Annotated[
+        list[str] | None, typer.Option(help="Something that goes wrong, as `r2rgate fault list` shows; repeatable.")
+    ] = None,
+    control: Annotated[Path | None, typer.Option(help="Socket for `r2rgate fault` while the line runs.")] = None,
     priority: Annotated[
         int,
         typer.Option(min=0, max=90, help="Real-time priority, where permitted: devices do not wait for a computer."),
@@ -162,6 +166,8 @@ def sim(
         can_port=can_port,
         modbus_port=modbus_port,
         opcua_port=opcua_port,
+        faults=fault or (),
+        control=control,
     )
     raise typer.Exit(code)
 

@@ -9,6 +9,7 @@ from math import inf, isfinite
 
 from sim_plant.devices import cia402
 from sim_plant.devices.cia402 import Machine, State
+from sim_plant.devices.misreading import Misreading
 from sim_plant.recorder import Recorder
 from sim_plant.world import World
 
@@ -49,6 +50,8 @@ class Drive:
         self.max_torque_nm = max_torque_nm
         self.error_code = 0  #: 603Fh; 0 is no fault
         self.watchdog_s = 0.0  #: torque goes off this long after the last command; 0 is off. Acts from the next command
+        self.watchdog_is_dead = False  #: a drive that takes the setting, and never acts on it
+        self.encoder = Misreading()
         self.on_emergency: Callable[[int], None] | None = None  #: told the code of each fault, and 0 when it is cleared
         self._world = world
         self._recorder = recorder
@@ -91,8 +94,13 @@ class Drive:
         if not value:
             self._enter(cia402.without_power(self._machine), "nmt", self._world.now_s)
 
-    def receive(self, controlword: int, target_torque_nm: float, mode: int, now_s: float) -> None:
-        """Stage a command for the next `sync`. Raises ValueError when the target is not finite."""
+    def receive(
+        self, controlword: int, target_torque_nm: float, mode: int, now_s: float, *, alive: bool = True
+    ) -> None:
+        """Stage a command for the next `sync`; one that is not `alive` does not renew the watchdog.
+
+        Raises ValueError when the target is not finite.
+        """
         if not isfinite(target_torque_nm):
             raise ValueError(f"target torque of drive {self.index + 1} must be finite, got {target_torque_nm}")
         self._world.advance(now_s)
@@ -100,7 +108,8 @@ class Drive:
         if not self._operational:
             return
         self._staged = _Command(controlword, target_torque_nm, mode)
-        self._watchdog.due_s = now_s + self.watchdog_s if self.watchdog_s > 0.0 else inf
+        if alive:
+            self._watchdog.due_s = now_s + self.watchdog_s if self.watchdog_s > 0.0 else inf
 
     def sync(self, now_s: float) -> DriveSample:
         """Let what is staged act from now on, then sample."""
@@ -109,9 +118,14 @@ class Drive:
         if command is not None:
             self._latch(command, now_s)
         self._recorder.synced(self.index, self._world.torque_command_nm(self.index), now_s)
+        return self.sample(now_s)
+
+    def sample(self, now_s: float) -> DriveSample:
+        """What the drive shows now. To the recorder it is not there: only a command is."""
+        self._world.advance(now_s)
         return DriveSample(
             self.statusword,
-            self._world.measure_speed_m_per_s(self.index),
+            self.encoder.shown(self._world.measure_speed_m_per_s(self.index), self._world.steps),
             float(self._world.torque_nm[self.index]),
         )
 
@@ -133,6 +147,18 @@ class Drive:
         """An internal fault (code as in 603Fh): torque off at once, FAULT until it is reset."""
         self._world.advance(now_s)
         self._fail(code, "fault", now_s)
+
+    def freeze_speed(self) -> None:
+        """The encoder stays at the speed that it shows next, until `heal_speed`."""
+        self.encoder.stick()
+
+    def jump_speed(self, delta_m_per_s: float) -> None:
+        """The encoder is off by this from now on, until `heal_speed`."""
+        self.encoder.offset(delta_m_per_s, 0.0, self._world.steps)
+
+    def heal_speed(self) -> None:
+        """The encoder shows the speed again."""
+        self.encoder.heal()
 
     def set_sto(self, active: bool, now_s: float) -> None:
         """The safe torque off input. Released, the drive stays in SWITCH ON DISABLED until it is told otherwise."""
@@ -172,12 +198,14 @@ class Drive:
     def _begin_quick_stop(self, now_s: float) -> None:
         rate = self.rated_torque_nm / QUICK_STOP_TIME_S
         self._world.ramp_torque_nm(self.index, 0.0, rate)
-        self._quick_stop.due_s = now_s + abs(float(self._world.torque_nm[self.index])) / rate
+        self._quick_stop.due_s = now_s + abs(self._world.torque_underway_nm(self.index)) / rate
 
     def _quick_stop_done(self, now_s: float) -> None:
         self._enter(cia402.quick_stop_done(self._machine), "quick stop", now_s)
 
     def _watchdog_expired(self, now_s: float) -> None:
+        if self.watchdog_is_dead:
+            return
         self._recorder.note("watchdog", now_s, roller=self.index + 1, watchdog_s=self.watchdog_s)
         self._fail(WATCHDOG_ERROR, "watchdog", now_s)
 

@@ -38,6 +38,8 @@ class LinePlc:
         drives: Sequence[Drive] = (),
         sto_delay_s: float = 0.5,
     ) -> None:
+        self.watchdog_is_dead = False  #: it takes its setting, and never acts on it
+        self._frozen: LinePlcStatus | None = None
         self.watchdog_s = 0.0  #: v0 ramps to zero this long after the life counter's last change; 0 is off
         self._world = world
         self._recorder = recorder
@@ -80,11 +82,23 @@ class LinePlc:
             for drive in self._drives:
                 drive.set_sto(False, now_s)
 
+    def freeze(self, now_s: float) -> None:
+        """Its program stands still: it shows what it shows now, and does nothing of what it is told."""
+        self._frozen = self.status(now_s)
+        self._watchdog.due_s = inf
+
+    def thaw(self, now_s: float) -> None:
+        """Its program goes on; its watchdog counts from the next change of the life counter."""
+        self._world.advance(now_s)
+        self._frozen = None
+
     def command(self, run: bool, speed_request_m_per_s: float, life: int, now_s: float) -> None:
         """What the gateway asks for. Raises ValueError when the speed is not finite."""
         if not isfinite(speed_request_m_per_s):
             raise ValueError(f"the speed request must be finite, got {speed_request_m_per_s}")
         self._world.advance(now_s)
+        if self._frozen is not None:
+            return
         if (run, speed_request_m_per_s) != (self._run, self._request_m_per_s):
             self._recorder.note("plc_command", now_s, run=run, speed_request_m_per_s=speed_request_m_per_s)
         started = run and not self._run
@@ -103,6 +117,8 @@ class LinePlc:
 
     def status(self, now_s: float) -> LinePlcStatus:
         self._world.advance(now_s)
+        if self._frozen is not None:
+            return self._frozen
         return LinePlcStatus(
             self._permissive,
             self._emergency_stop,
@@ -129,6 +145,8 @@ class LinePlc:
         self._world.ramp_unwind_speed(target, self._ramp_m_per_s2)
 
     def _watchdog_expired(self, now_s: float) -> None:
+        if self.watchdog_is_dead:
+            return
         self._watchdog_tripped = True
         self._recorder.note("plc_watchdog", now_s, watchdog_s=self.watchdog_s)
         self._stop_unless_allowed()

@@ -1,19 +1,21 @@
-"""One drive on the CANopen bus: NMT slave, heartbeat, PDOs, emergency messages, and the objects behind the SDOs.
+"""One node on the CANopen bus: NMT slave, heartbeat, PDOs, emergency messages, and the SDO server.
 
-The face hands it frames that are for it; it answers through `network.send_message`. Time is an argument.
+What the node is beside that (a drive, an amplifier, a PLC) is its `Device`. The face hands it frames that are for it;
+it answers through `network.send_message`. Time is an argument.
 """
 
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from math import inf
+from typing import Protocol
 
 from canopen import Network
+from canopen.objectdictionary import ObjectDictionary, ODRecord
 from canopen.sdo.exceptions import SdoAbortedError
 
-from sim_plant.devices.drive import Drive, DriveSample
-from sim_plant.faces.canopen_pdo import MAX_ENTRIES, OUT_OF_RANGE, Pdo
-from sim_plant.faces.canopen_sdo import DriveSdoServer, Objects
+from sim_plant.faces.canopen_pdo import MAX_ENTRIES, OUT_OF_RANGE, Key, Pdo
+from sim_plant.faces.canopen_sdo import NodeSdoServer, Objects, Reader, Writer
 
 INITIALISING = 0
 STOPPED = 4
@@ -26,55 +28,112 @@ NMT_ENTER_PRE_OPERATIONAL = 128
 NMT_RESET_NODE = 129
 NMT_RESET_COMMUNICATION = 130
 
-CYCLIC_SYNCHRONOUS_TORQUE = 10
-NO_MODE = 0
-QUICK_STOP_RAMP_THEN_OFF = 2
-STO_ACTIVE = 1 << 16  #: in 60FDh
-WATCHDOG_MS = range(10, 201)
 SHORTEST_HEARTBEAT_MS = 10
+SHORT_RPDO = 0x8210  #: EMCY: a PDO with too few bytes, not processed
 
-_CONTROLWORD, _TARGET_TORQUE, _MODE = 0x6040, 0x6071, 0x6060
-_RPDO_OBJECTS = {_CONTROLWORD: "H", _TARGET_TORQUE: "h", _MODE: "b"}
-_TPDO_OBJECTS = {0x603F: "H", 0x6041: "H", 0x6061: "b", 0x606C: "i", 0x6077: "h", 0x60FD: "I"}
 _EMERGENCY = struct.Struct("<HB5x")
 _ERROR_HISTORY = 4
-SHORT_RPDO = 0x8210  #: EMCY: a PDO with too few bytes, not processed
-_INT16, _INT32 = 0x7FFF, 0x7FFFFFFF
+_RPDO = 0x1400
+_TPDOS = range(0x1800, 0x1804)
+_MAPPING = 0x200  #: a PDO's mapping parameters stand this far behind its communication parameters
 
 
-class DriveNode:
-    """The CANopen side of `drive`, as node `node_id`. Nothing is sent before `boot`."""
+class Device(Protocol):
+    """What a node is. Times are in s, on the world's clock."""
 
-    def __init__(self, node_id: int, drive: Drive, network: Network) -> None:
+    @property
+    def dictionary(self) -> ObjectDictionary:
+        """Its objects, as of node 0; the PDO communication parameters in it say which PDOs it has."""
+        ...
+
+    @property
+    def commands(self) -> Mapping[Key, str]:
+        """The objects that its RPDO takes, with their struct format characters."""
+        ...
+
+    @property
+    def values(self) -> Mapping[Key, str]:
+        """The objects that its TPDOs take."""
+        ...
+
+    @property
+    def readers(self) -> Mapping[Key, Reader]:
+        """Objects that are computed when asked; those of the TPDOs among them."""
+        ...
+
+    @property
+    def writers(self) -> Mapping[Key, Writer]:
+        """What writing an object does. Raises SdoAbortedError to refuse it."""
+        ...
+
+    @property
+    def error_code(self) -> int:
+        """The code of the error that there is, 0 without."""
+        ...
+
+    def tell_errors(self, to: Callable[[int], None]) -> None:
+        """`to` wants to be told the code of each error, and 0 when it is gone."""
+        ...
+
+    def reset(self) -> None:
+        """What was written to it is at its default again."""
+        ...
+
+    def set_operational(self, operational: bool, now_s: float) -> None:
+        """Only while operational it takes commands, and is asked to `sync`."""
+        ...
+
+    def command(self, values: Mapping[Key, int], now_s: float) -> bool:
+        """Hold a command until the next `sync`. False when it cannot be used."""
+        ...
+
+    def sync(self, now_s: float) -> None:
+        """Act on what is held, then measure."""
+        ...
+
+    def poll(self, now_s: float) -> None:
+        """Notice what time has brought. The world's own timers run without this."""
+        ...
+
+
+class Node:
+    """`device` as node `node_id`. Nothing is sent before `boot`."""
+
+    def __init__(self, node_id: int, device: Device, network: Network) -> None:
         self.node_id = node_id
-        self.drive = drive
+        self.device = device
         self.network = network
         self.state = INITIALISING
-        self.objects = Objects(node_id)
-        self.sdo = DriveSdoServer(node_id, self.objects, network)
-        self.rpdo = _default_pdo(self.objects, _RPDO_OBJECTS, 0x1400, 0x1600)
-        self.tpdo = _default_pdo(self.objects, _TPDO_OBJECTS, 0x1800, 0x1A00)
-        self.sample = DriveSample(drive.statusword, 0.0, 0.0)  #: of the last SYNC
-        self._commands = dict.fromkeys(_RPDO_OBJECTS, 0)
+        self.objects = Objects(node_id, device.dictionary)
+        self.sdo = NodeSdoServer(node_id, self.objects, network)
+        self.rpdo = self._pdo(_RPDO, device.commands) if _RPDO in device.dictionary else None
+        self.tpdos = [self._pdo(k, device.values) for k in _TPDOS if k in device.dictionary]
+        self._commands = dict.fromkeys(device.commands, 0)
         self._errors: list[int] = []
         self._rpdo_too_short = False  #: the last one was
         self._heartbeat_s = 0.0
         self._heartbeat_due_s = inf
         self._now_s = 0.0
         self._wire_objects()
-        drive.on_emergency = self._send_emergency
+        device.tell_errors(self._send_emergency)
+
+    @property
+    def sends(self) -> set[int]:
+        """The identifiers of its frames."""
+        services = {base + self.node_id for base in (0x80, 0x180, 0x580, 0x700)}
+        return services | {pdo.can_id for pdo in self.tpdos}
 
     def boot(self, now_s: float) -> None:
         """Everything back to the defaults, the boot-up message, then pre-operational."""
         self._now_s = now_s
         self._enter(INITIALISING)
         self.objects.forget()
-        self.rpdo.reset()
-        self.tpdo.reset()
-        self._commands = dict.fromkeys(_RPDO_OBJECTS, 0)
+        for pdo in (*self.tpdos, *([self.rpdo] if self.rpdo else [])):
+            pdo.reset()
+        self._commands = dict.fromkeys(self._commands, 0)
         self._errors.clear()
         self._rpdo_too_short = False
-        self.drive.watchdog_s = 0.0
+        self.device.reset()
         self._set_heartbeat(self.objects.default(0x1017))
         self.network.send_message(0x700 + self.node_id, b"\0")
         self._enter(PRE_OPERATIONAL)
@@ -95,57 +154,56 @@ class DriveNode:
         return True
 
     def on_rpdo(self, data: bytes | bytearray, now_s: float) -> bool:
-        """The command PDO: held by the drive until the next SYNC. False when it is too short.
+        """The command PDO: held by the device until the next SYNC. False when it cannot be used.
 
         Of one that is too long the leading bytes count (CiA 301, 7.2.2.5).
         """
         self._now_s = now_s
-        if self.state != OPERATIONAL or not self.rpdo.valid:
+        if self.state != OPERATIONAL or self.rpdo is None or not self.rpdo.valid:
             return True
         too_short = len(data) < self.rpdo.layout.size
         if too_short != self._rpdo_too_short:
             self._rpdo_too_short = too_short
-            if too_short or not self.drive.error_code:  # 0000h says that nothing at all is wrong
+            if too_short or not self.device.error_code:  # 0000h says that nothing at all is wrong
                 self._send_emergency(SHORT_RPDO if too_short else 0)
         if too_short:
             return False
-        commands = self._commands
-        commands.update(zip(self.rpdo.fields, self.rpdo.layout.unpack_from(data), strict=True))
-        target_torque_nm = commands[_TARGET_TORQUE] * 1e-3 * self.drive.rated_torque_nm
-        self.drive.receive(commands[_CONTROLWORD], target_torque_nm, commands[_MODE], now_s)
-        return True
+        self._commands.update(zip(self.rpdo.fields, self.rpdo.layout.unpack_from(data), strict=True))
+        return self.device.command(self._commands, now_s)
 
     def on_sync(self, now_s: float) -> None:
-        """The drive acts on what it holds, and what it samples at this instant goes out."""
+        """The device acts on what it holds, and what it samples at this instant goes out."""
         if self.state != OPERATIONAL:
             return
         self._now_s = now_s
-        self.sample = self.drive.sync(now_s)
-        if self.tpdo.valid:
-            values = [_TPDO_VALUES[index](self) for index in self.tpdo.fields]
-            self.network.send_message(self.tpdo.can_id, self.tpdo.layout.pack(*values))
+        self.device.sync(now_s)
+        for tpdo in self.tpdos:
+            if tpdo.valid:
+                values = [self.objects.value(key) for key in tpdo.fields]
+                self.network.send_message(tpdo.can_id, tpdo.layout.pack(*values))
 
     def on_sdo(self, data: bytes | bytearray, now_s: float) -> bool:
-        """A request to the SDO server. False when its length is wrong."""
+        """An SDO request. False when it has another length than 8 bytes."""
         self._now_s = now_s
         if len(data) != 8:
             return False
         if self.state != STOPPED:
+            self.device.poll(now_s)
             self.sdo.on_request(self.sdo.rx_cobid, data, now_s)
         return True
 
     def poll(self, now_s: float) -> None:
         """The heartbeat, when it is due."""
         self._now_s = now_s
+        self.device.poll(now_s)
         if now_s >= self._heartbeat_due_s:
             # Late by more than a period: skip, never catch up.
             self._heartbeat_due_s = max(self._heartbeat_due_s + self._heartbeat_s, now_s)
             self.network.send_message(0x700 + self.node_id, bytes((self.state,)))
 
     def _enter(self, state: int) -> None:
-        self.drive.poll(self._now_s)
         self.state = state
-        self.drive.operational = state == OPERATIONAL
+        self.device.set_operational(state == OPERATIONAL, self._now_s)
 
     def _send_emergency(self, code: int) -> None:
         if code:
@@ -153,30 +211,38 @@ class DriveNode:
         if self.state != STOPPED:
             self.network.send_message(0x80 + self.node_id, _EMERGENCY.pack(code, _error_register(code)))
 
+    def _pdo(self, communication: int, mappable: Mapping[Key, str]) -> Pdo:
+        objects, mapping = self.objects, communication + _MAPPING
+        highest = len(_record(objects, mapping)) - 1
+        entries = [objects.default(mapping, k) for k in range(1, highest + 1)]
+        return Pdo(mappable, objects.default(communication, 1), entries, objects.default(mapping))
+
     def _wire_objects(self) -> None:
         """Which objects are computed, and which writes take effect or are refused."""
         readers, writers = self.objects.readers, self.objects.writers
-        drive = self.drive
-        readers[0x1001, 0] = lambda: _error_register(drive.error_code or SHORT_RPDO * self._rpdo_too_short)
+        readers[0x1001, 0] = lambda: _error_register(self.device.error_code or SHORT_RPDO * self._rpdo_too_short)
         readers[0x1003, 0] = lambda: len(self._errors)
         writers[0x1003, 0] = self._clear_errors
         for k in range(_ERROR_HISTORY):
             readers[0x1003, k + 1] = lambda k=k: self._errors[k] if k < len(self._errors) else 0
         writers[0x1017, 0] = self._set_heartbeat
-        writers[0x1400, 5] = self._set_watchdog
-        writers[0x605A, 0] = _quick_stop_option
-        writers[_MODE, 0] = self._set_mode
-        for index in _RPDO_OBJECTS:
-            readers[index, 0] = lambda index=index: self._commands[index]
-        for index in (_CONTROLWORD, _TARGET_TORQUE):
-            writers[index, 0] = lambda value, index=index: self._commands.__setitem__(index, value)
-        for index, value in _TPDO_VALUES.items():
-            readers[index, 0] = partial(value, self)
-        readers[0x6041, 0] = lambda: drive.statusword
-        readers[0x6072, 0] = lambda: round(1e3 * drive.max_torque_nm / drive.rated_torque_nm)
-        readers[0x6076, 0] = lambda: round(1e3 * drive.rated_torque_nm)
-        _wire_pdo(self.objects, self.rpdo, 0x1400, 0x1600)
-        _wire_pdo(self.objects, self.tpdo, 0x1800, 0x1A00)
+        readers.update(self.device.readers)
+        writers.update(self.device.writers)
+        for key in self._commands:
+            readers[key] = partial(self._read_command, key)
+            writers[key] = partial(self._write_command, key)
+        pdos = [(_RPDO, self.rpdo)] if self.rpdo else []
+        for communication, pdo in (*pdos, *zip(_TPDOS, self.tpdos, strict=False)):
+            _wire_pdo(self.objects, pdo, communication)
+
+    def _read_command(self, key: Key) -> int:
+        return self._commands[key]
+
+    def _write_command(self, key: Key, value: int) -> None:
+        check = self.device.writers.get(key)
+        if check is not None:
+            check(value)
+        self._commands[key] = value
 
     def _set_heartbeat(self, period_ms: int) -> None:
         if period_ms and period_ms < SHORTEST_HEARTBEAT_MS:
@@ -184,31 +250,19 @@ class DriveNode:
         self._heartbeat_s = period_ms * 1e-3
         self._heartbeat_due_s = self._now_s + self._heartbeat_s if period_ms else inf
 
-    def _set_watchdog(self, time_ms: int) -> None:
-        if time_ms and time_ms not in WATCHDOG_MS:
-            raise SdoAbortedError(OUT_OF_RANGE)
-        self.drive.watchdog_s = time_ms * 1e-3
-
-    def _set_mode(self, mode: int) -> None:
-        if mode not in (NO_MODE, CYCLIC_SYNCHRONOUS_TORQUE):
-            raise SdoAbortedError(OUT_OF_RANGE)
-        self._commands[_MODE] = mode
-
     def _clear_errors(self, count: int) -> None:
         if count:
             raise SdoAbortedError(OUT_OF_RANGE)
         self._errors.clear()
 
 
-def _default_pdo(objects: Objects, mappable: dict[int, str], communication: int, mapping: int) -> Pdo:
-    entries = [objects.default(mapping, subindex) for subindex in range(1, MAX_ENTRIES + 1)]
-    return Pdo(mappable, objects.default(communication, 1), entries, objects.default(mapping))
-
-
-def _wire_pdo(objects: Objects, pdo: Pdo, communication: int, mapping: int) -> None:
+def _wire_pdo(objects: Objects, pdo: Pdo, communication: int) -> None:
+    """The parameters of a PDO. What the dictionary has as read only, the mapping of a fixed one, is never written."""
     readers, writers = objects.readers, objects.writers
+    mapping = communication + _MAPPING
+    fixed = not _record(objects, mapping)[0].writable
     readers[communication, 1] = lambda: pdo.cob_id
-    writers[communication, 1] = pdo.write_cob_id
+    writers[communication, 1] = pdo.write_switch if fixed else pdo.write_cob_id
     writers[communication, 2] = pdo.write_transmission_type
     readers[mapping, 0] = lambda: pdo.count
     writers[mapping, 0] = partial(pdo.write_mapping, 0)
@@ -217,9 +271,10 @@ def _wire_pdo(objects: Objects, pdo: Pdo, communication: int, mapping: int) -> N
         writers[mapping, k] = partial(pdo.write_mapping, k)
 
 
-def _quick_stop_option(value: int) -> None:
-    if value != QUICK_STOP_RAMP_THEN_OFF:
-        raise SdoAbortedError(OUT_OF_RANGE)
+def _record(objects: Objects, index: int) -> ODRecord:
+    record = objects.object_dictionary[index]
+    assert isinstance(record, ODRecord), f"{index:04X}h is no record"
+    return record
 
 
 def _error_register(code: int) -> int:
@@ -229,20 +284,5 @@ def _error_register(code: int) -> int:
     return 1 | _ERROR_CLASS_BITS.get(code >> 12, 0)
 
 
-def _saturated(value: float, highest: int) -> int:
-    """The nearest number that the object can hold: a drive shows its range's end, it does not wrap."""
-    return max(-highest, min(highest, round(value)))
-
-
 #: Current, voltage, temperature, communication, maker's own.
 _ERROR_CLASS_BITS = {0x2: 1 << 1, 0x3: 1 << 2, 0x4: 1 << 3, 0x8: 1 << 4, 0xF: 1 << 7}
-
-#: What the objects of the TPDO hold, as numbers of the wire.
-_TPDO_VALUES: dict[int, Callable[[DriveNode], int]] = {
-    0x603F: lambda node: node.drive.error_code,
-    0x6041: lambda node: node.sample.statusword,
-    0x6061: lambda node: node.drive.mode,
-    0x606C: lambda node: _saturated(node.sample.speed_m_per_s * 1e6, _INT32),
-    0x6077: lambda node: _saturated(1e3 * node.sample.torque_nm / node.drive.rated_torque_nm, _INT16),
-    0x60FD: lambda node: STO_ACTIVE if node.drive.sto else 0,
-}

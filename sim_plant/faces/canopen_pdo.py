@@ -1,6 +1,6 @@
-"""One PDO of a drive as CiA 301 has it: COB-ID and mapping, what may be written to them, and the bytes.
+"""One PDO of a node as CiA 301 has it: COB-ID and mapping, what may be written to them, and the bytes.
 
-No I/O. A write that the drive does not support raises canopen's SdoAbortedError with the code that the SDO
+No I/O. A write that the node does not support raises canopen's SdoAbortedError with the code that the SDO
 server answers, and nothing has changed then.
 """
 
@@ -15,7 +15,7 @@ OUT_OF_RANGE = 0x06090030
 WRONG_STATE = 0x08000022
 
 INVALID = 1 << 31  #: the PDO does not exist
-NO_RTR = 1 << 30  #: no remote request on it; no drive of this kind answers one, whatever the bit says
+NO_RTR = 1 << 30  #: no remote request on it; no node of these kinds answers one, whatever the bit says
 MAX_ENTRIES = 8
 SYNCHRONOUS = 1  #: transmission type: acts, or is sent, with every SYNC
 _CAN_ID = 0x7FF
@@ -24,15 +24,17 @@ _RESERVED = ((0x000, 0x180), (0x581, 0x5FF), (0x601, 0x67F), (0x6E0, 0x7FF))
 
 _BITS = {"b": 8, "B": 8, "h": 16, "H": 16, "i": 32, "I": 32}
 
+Key = tuple[int, int]  #: index and sub-index of an object
+
 
 class Pdo:
-    """A PDO over the objects of `mappable` (index to struct format character, all at sub-index 0).
+    """A PDO over the objects of `mappable` (to struct format characters).
 
-    `fields` are the indices of the objects in the frame, `layout` packs and unpacks them. While the PDO is
-    not valid it is neither sent nor taken.
+    `fields` are the objects in the frame, `layout` packs and unpacks them. While the PDO is not valid it is neither
+    sent nor taken.
     """
 
-    def __init__(self, mappable: Mapping[int, str], cob_id: int, entries: Sequence[int], count: int) -> None:
+    def __init__(self, mappable: Mapping[Key, str], cob_id: int, entries: Sequence[int], count: int) -> None:
         self._mappable = dict(mappable)
         self._default = (cob_id, [*entries, *[0] * (MAX_ENTRIES - len(entries))], count)
         self.reset()
@@ -60,8 +62,14 @@ class Pdo:
             raise SdoAbortedError(WRONG_STATE)
         self.cob_id = value
 
+    def write_switch(self, value: int) -> None:
+        """As `write_cob_id`, of a PDO that can be put on and off, and no more."""
+        if value & ~(INVALID | NO_RTR) != self._default[0] & _CAN_ID:
+            raise SdoAbortedError(OUT_OF_RANGE)
+        self.cob_id = value
+
     def write_transmission_type(self, value: int) -> None:
-        """Sub-index 2 of the communication parameters. The drives know only 1, with every SYNC."""
+        """Sub-index 2 of the communication parameters. The nodes know only 1, with every SYNC."""
         if value != SYNCHRONOUS:
             raise SdoAbortedError(OUT_OF_RANGE)
 
@@ -87,12 +95,16 @@ class Pdo:
         if layout.size > 8:
             raise SdoAbortedError(PDO_TOO_LONG)
         self.layout = layout
-        self.fields: tuple[int, ...] = tuple(entry >> 16 for entry in self.entries[:count])
+        self.fields: tuple[Key, ...] = tuple(_key(entry) for entry in self.entries[:count])
         self.count = count
 
     def _format(self, entry: int) -> str:
         """The format character of a mapping entry: index, sub-index and length in bits."""
-        character = self._mappable.get(entry >> 16)
-        if character is None or entry & 0xFFFF != _BITS[character]:
+        character = self._mappable.get(_key(entry))
+        if character is None or entry & 0xFF != _BITS[character]:
             raise SdoAbortedError(NOT_MAPPABLE)
         return character
+
+
+def _key(entry: int) -> Key:
+    return entry >> 16, entry >> 8 & 0xFF

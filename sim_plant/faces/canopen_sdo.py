@@ -1,4 +1,4 @@
-"""The object dictionary of one drive and the SDO server over it: canopen's transfers, our objects."""
+"""The object dictionary of one node and the SDO server over it: canopen's transfers, our objects."""
 
 from collections.abc import Callable
 from functools import cache
@@ -11,6 +11,8 @@ from canopen.sdo.constants import NO_MORE_DATA
 from canopen.sdo.exceptions import SdoAbortedError
 from canopen.sdo.server import SdoServer
 
+from sim_plant.faces.canopen_pdo import Key
+
 EDS_PATH = Path(__file__).parent.parent / "devices" / "r2r-drive.eds"
 
 UNKNOWN_COMMAND = 0x05040001
@@ -21,10 +23,10 @@ NO_OBJECT = 0x06020000
 WRONG_LENGTH = 0x06070010
 NO_SUBINDEX = 0x06090011
 
-#: No object of the drive is longer: a segmented download that goes on is stopped here.
+#: No object of a node is longer: a segmented download that goes on is stopped here.
 _LONGEST_DOWNLOAD = 64
 
-Reader = Callable[[], int]
+Reader = Callable[[], float]
 Writer = Callable[[int], None]
 
 
@@ -35,24 +37,28 @@ def drive_dictionary() -> ObjectDictionary:
 
 
 class Objects:
-    """The values of one drive's object dictionary, keyed by (index, sub-index).
+    """The values of one node's object dictionary, keyed by (index, sub-index).
 
-    An object has a reader (computed when asked), or a stored value, or the default of the EDS. A writer is
+    An object has a reader (computed when asked), or a stored value, or the dictionary's default. A writer is
     called before a value is stored and refuses it by raising SdoAbortedError.
     """
 
-    def __init__(self, node_id: int) -> None:
-        self.object_dictionary = drive_dictionary()
+    def __init__(self, node_id: int, dictionary: ObjectDictionary) -> None:
+        self.object_dictionary = dictionary
         self.node_id = node_id
-        self.readers: dict[tuple[int, int], Reader] = {}
-        self.writers: dict[tuple[int, int], Writer] = {}
-        self._stored: dict[tuple[int, int], bytes] = {}
+        self.readers: dict[Key, Reader] = {}
+        self.writers: dict[Key, Writer] = {}
+        self._stored: dict[Key, bytes] = {}
 
     def default(self, index: int, subindex: int = 0) -> int:
-        """The number that the EDS gives the object for this node."""
+        """The number that the dictionary gives the object for this node."""
         variable = self._find(index, subindex)
-        assert variable.default is not None, f"the EDS gives {index:04X}h sub {subindex} no default"
+        assert variable.default is not None, f"the dictionary gives {index:04X}h sub {subindex} no default"
         return variable.default + self.node_id * variable.relative
+
+    def value(self, key: Key) -> float:
+        """The number that a PDO carries: as an SDO reads it."""
+        return self.readers[key]()
 
     def forget(self) -> None:
         """Back to the defaults."""
@@ -96,7 +102,7 @@ class Objects:
         return variable
 
 
-class DriveSdoServer(SdoServer):
+class NodeSdoServer(SdoServer):
     """canopen's server, where a request out of order is aborted: the library's own runs into None there."""
 
     def __init__(self, node_id: int, objects: Objects, network: Network) -> None:

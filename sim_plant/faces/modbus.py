@@ -15,8 +15,12 @@ from sim_plant.faces.modbus_codec import (
     exception_answer,
     take_frames,
 )
+from sim_plant.faces.tcp_stamp import ArrivalStamps, Stamp
+from sim_plant.faults.frames import Direction
+from sim_plant.faults.wire_faults import WireFaults
 
 MAX_CONNECTIONS = 32
+_BUFFER_BYTES = 4096  #: read at a time
 
 log = logging.getLogger(__name__)
 
@@ -24,13 +28,26 @@ log = logging.getLogger(__name__)
 class ModbusFace:
     """Serves `units` (unit identifier to registers). `clock` gives the time that the units live in, seconds.
 
-    A request to a unit that is not there is answered with exception 11. Bytes that cannot be Modbus TCP close
-    the connection they came on, and no other.
+    `arrival` turns a stamp of the kernel into the time, on that same clock, at which a request came in; without it
+    that is when the request is read. A request to a unit that is not there is answered with exception 11. Bytes that
+    cannot be Modbus TCP close the connection they came on, and no other.
     """
 
-    def __init__(self, units: Mapping[int, Registers], clock: Callable[[], float]) -> None:
+    def __init__(
+        self,
+        units: Mapping[int, Registers],
+        clock: Callable[[], float],
+        arrival: Callable[[Stamp], float] | None = None,
+        faults: WireFaults[bytes] | None = None,
+        time_scale: float = 1.0,
+    ) -> None:
         self.units = dict(units)
         self.clock = clock
+        self.arrival = arrival
+        self.faults = faults
+        self.time_scale = time_scale
+        if faults is not None:
+            faults.on_disconnect = self.break_off
         self.requests = 0
         self.malformed = 0  #: connections closed because of what came in on them
         self.refused = 0  #: connections closed because there were MAX_CONNECTIONS already
@@ -54,39 +71,56 @@ class ModbusFace:
         await asyncio.gather(*(connection.lost for connection in self.connections))
         await server.wait_closed()
 
-    def answer(self, frame: Frame) -> bytes:
-        """The bytes that answer one request."""
+    def break_off(self) -> None:
+        """Drop every connection."""
+        for connection in list(self.connections):
+            connection.abort()
+
+    def answer(self, frame: Frame, now_s: float) -> bytes:
+        """The bytes that answer one request, which came at `now_s`."""
         self.requests += 1
         registers = self.units.get(frame.unit)
         if registers is None:
             pdu = exception_answer(frame.pdu[0], TARGET_SILENT)
         else:
-            pdu = answer(frame.pdu, registers, self.clock())
+            pdu = answer(frame.pdu, registers, now_s)
         return encode_frame(Frame(frame.transaction, frame.unit, pdu))
 
 
-class _Connection(asyncio.Protocol):
+class _Connection(asyncio.BufferedProtocol):
     """One client. Holds the beginning of a request until the rest comes."""
 
     def __init__(self, face: ModbusFace) -> None:
         self._face = face
+        self._incoming = bytearray(_BUFFER_BYTES)
         self._buffer = bytearray()
         self._transport: asyncio.Transport | None = None
+        self._stamps: ArrivalStamps | None = None
+        self._stamp: Stamp | None = None
         self.lost: asyncio.Future[None] = asyncio.get_running_loop().create_future()
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self._transport = cast(asyncio.Transport, transport)
-        if len(self._face.connections) >= MAX_CONNECTIONS:
+        if self._face.faults is not None and self._face.faults.disconnected:
+            self.abort()
+        elif len(self._face.connections) >= MAX_CONNECTIONS:
             self._face.refused += 1
             self.abort()
         else:
             self._face.connections.add(self)
+            if self._face.arrival is not None:
+                self._stamps = ArrivalStamps(transport.get_extra_info("socket"))
 
-    def data_received(self, data: bytes) -> None:
+    def get_buffer(self, sizehint: int) -> bytearray:
+        # Called when there is something to read: now its stamp can still be seen.
+        self._stamp = None if self._stamps is None else self._stamps.next()
+        return self._incoming
+
+    def buffer_updated(self, nbytes: int) -> None:
         transport = self._transport
         if transport is None or transport.is_closing():
             return
-        self._buffer += data
+        self._buffer += memoryview(self._incoming)[:nbytes]
         try:
             frames = take_frames(self._buffer)
         except NotModbus as error:
@@ -94,8 +128,39 @@ class _Connection(asyncio.Protocol):
             log.warning("Modbus: closing %s: %s", transport.get_extra_info("peername"), error)
             self.abort()
             return
-        for frame in frames:
-            transport.write(self._face.answer(frame))
+        if frames:
+            now_s = self._arrived_s()
+            for frame in frames:
+                self._take(frame, now_s)
+
+    def _take(self, frame: Frame, now_s: float) -> None:
+        faults = self._face.faults
+        if faults is None:
+            self._write(self._face.answer(frame, now_s), 0.0)
+            return
+
+        def act(request: bytes, delay_s: float) -> None:
+            try:
+                (taken,) = take_frames(bytearray(request)) or (None,)
+            except NotModbus:
+                self.abort()
+                return
+            if taken is not None:
+                answer = self._face.answer(taken, now_s + delay_s)
+                faults.carry(Direction.FROM_DEVICE, frame.unit, answer, self._write, self._later)
+
+        faults.carry(Direction.TO_DEVICE, frame.unit, encode_frame(frame), act, self._later)
+
+    def _write(self, answer: bytes, delay_s: float) -> None:
+        if self._transport is not None and not self._transport.is_closing():
+            self._transport.write(answer)
+
+    def _later(self, delay_s: float, call: Callable[[], object]) -> None:
+        asyncio.get_running_loop().call_later(delay_s / self._face.time_scale, call)
+
+    def _arrived_s(self) -> float:
+        face = self._face
+        return face.clock() if face.arrival is None or self._stamp is None else face.arrival(self._stamp)
 
     def pause_writing(self) -> None:
         # A client that asks without reading its answers is not heard until it has read them.
@@ -109,6 +174,8 @@ class _Connection(asyncio.Protocol):
     def connection_lost(self, exc: Exception | None) -> None:
         self._face.connections.discard(self)
         self._transport = None
+        if self._stamps is not None:
+            self._stamps.close()
         self.lost.set_result(None)
 
     def abort(self) -> None:

@@ -1,6 +1,7 @@
-"""The registers of the two Modbus devices of the line, as docs/devices/ describes them."""
+"""The registers of load-cell amplifier and line PLC, as docs/devices/ describes them."""
 
 import struct
+from collections.abc import Collection
 from math import nan
 
 from sim_plant.devices.amplifier import Amplifier, ChannelStatus
@@ -15,6 +16,7 @@ from sim_plant.faces.modbus_codec import (
     WRITE_ONE,
     Refused,
 )
+from sim_plant.faces.words import PLC_WATCHDOG_MS, RUN_BIT, UM_PER_M, speed_word, status_word, watchdog_allowed
 
 AMPLIFIER_ID = 0x5201
 PLC_ID = 0x5202
@@ -24,25 +26,25 @@ _REGISTERS_PER_CHANNEL = 4
 _AMPLIFIER_HEAD = struct.Struct(">4H24x")
 _CHANNEL = struct.Struct(">fHH")
 
-_UM_PER_M = 1e6
-_INT32 = 0x7FFFFFFF
 _COMMAND = range(10, 15)  #: the registers that can be written
 _REQUEST = (11, 12)
 _WATCHDOG = 14
-_RUN_BIT = 1
-WATCHDOG_MS = range(10, 1001)
 _PLC_STATUS = struct.Struct(">HHiH10x")
 _PLC_COMMAND = struct.Struct(">HiHH")
 _FIVE_WORDS = struct.Struct(">5H")
 
 
 class AmplifierRegisters:
-    """Read-only: the head, registers that are reserved up to the first channel, then four for each channel."""
+    """Read-only: the head, registers that are reserved up to the first channel, then four for each channel.
+
+    To a channel that is not in `cells` (all, unless told otherwise) nothing is connected.
+    """
 
     functions = frozenset({READ_HOLDING, READ_INPUT})
 
-    def __init__(self, amplifier: Amplifier) -> None:
+    def __init__(self, amplifier: Amplifier, cells: Collection[int] | None = None) -> None:
         self._amplifier = amplifier
+        self._cells = frozenset(range(1, amplifier.channels + 1) if cells is None else cells)
 
     def check_read(self, address: int, count: int) -> None:
         if address + count > _FIRST_CHANNEL + _REGISTERS_PER_CHANNEL * self._amplifier.channels:
@@ -67,10 +69,7 @@ class AmplifierRegisters:
         return _AMPLIFIER_HEAD.pack(AMPLIFIER_ID, amplifier.channels, amplifier.healthy, amplifier.counter(now_s))
 
     def _channel(self, channel: int, now_s: float) -> bytes:
-        status = self._amplifier.status(channel)
-        broken = status is ChannelStatus.WIRE_BREAK
-        tension_n = nan if broken else self._amplifier.tension_n(channel, now_s)
-        return _CHANNEL.pack(tension_n, status, 0)
+        return _CHANNEL.pack(*channel_words(self._amplifier, channel, channel in self._cells, now_s), 0)
 
 
 class PlcRegisters:
@@ -101,15 +100,20 @@ class PlcRegisters:
         for register, value in zip(written, values, strict=True):
             after[register - _COMMAND.start] = value
         run, request_um_per_s, life, watchdog_ms = _PLC_COMMAND.unpack(_FIVE_WORDS.pack(*after))
-        if run & ~_RUN_BIT or (watchdog_ms and watchdog_ms not in WATCHDOG_MS):
+        if run & ~RUN_BIT or not watchdog_allowed(watchdog_ms, PLC_WATCHDOG_MS):
             raise Refused(ILLEGAL_VALUE)
         self._command = after
         self._plc.watchdog_s = watchdog_ms * 1e-3
         if address < _WATCHDOG:
-            self._plc.command(run == _RUN_BIT, request_um_per_s / _UM_PER_M, life, now_s)
+            self._plc.command(run == RUN_BIT, request_um_per_s / UM_PER_M, life, now_s)
 
     def _status(self, now_s: float) -> bytes:
         status = self._plc.status(now_s)
-        bits = status.permissive | (not status.emergency_stop) << 1 | status.running << 2 | status.watchdog_tripped << 3
-        speed_um_per_s = max(-_INT32, min(_INT32, round(status.unwind_speed_m_per_s * _UM_PER_M)))
-        return _PLC_STATUS.pack(PLC_ID, bits, speed_um_per_s, status.life_echo)
+        return _PLC_STATUS.pack(PLC_ID, status_word(status), speed_word(status.unwind_speed_m_per_s), status.life_echo)
+
+
+def channel_words(amplifier: Amplifier, channel: int, connected: bool, now_s: float) -> tuple[float, int]:
+    """Tension in N and status of a channel. Without a load cell it shows a broken wire."""
+    status = amplifier.status(channel) if connected else ChannelStatus.WIRE_BREAK
+    broken = status is ChannelStatus.WIRE_BREAK
+    return nan if broken else amplifier.tension_n(channel, now_s), int(status)

@@ -145,6 +145,21 @@ def test_reset_brings_the_defaults_back(bench: Bench) -> None:
         assert not bench.drive.operational
 
 
+def test_a_node_that_restarts_boots_alone_with_its_defaults(bench: Bench) -> None:
+    bench.remote.sdo[0x1400][5].raw = 100
+    bench.remote.sdo[0x1400][1].raw = 0x80000200 + FIRST_NODE
+    bench.start()
+    bench.take()
+    bench.face.restart(FIRST_NODE, bench.now_s)
+    assert bench.take() == [(0x700 + FIRST_NODE, b"\0")]
+    assert bench.sdo(0x1400, 5) == 0 and not bench.drive.operational
+    bench.start()
+    bench.command(SHUTDOWN)  # its command PDO is there again
+    assert bench.latch()[0] & 0x6F == READY
+    with pytest.raises(KeyError):
+        bench.face.restart(99, bench.now_s)
+
+
 def test_only_operational_nodes_do_process_data(bench: Bench) -> None:
     bench.command(SHUTDOWN)
     bench.take()

@@ -1,6 +1,7 @@
 """The simulated line as a process on real wires: the canopen library, bare frames and pymodbus as its peers."""
 
 import asyncio
+import gc
 import json
 import re
 import select
@@ -11,6 +12,7 @@ import subprocess
 import sys
 import threading
 import time
+import tomllib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -23,10 +25,11 @@ from pymodbus.client import ModbusTcpClient
 from sim_plant.faces.canopen import CanopenFace
 from sim_plant.faces.canopen_bus import FaceUnavailable, open_bus
 from sim_plant.faces.canopen_sdo import EDS_PATH
-from sim_plant.plant import load_plant
-from sim_plant.process import main
+from sim_plant.faces.tcp_stamp import Stamp
+from sim_plant.plant import PlantRefused, load_plant, plant_of
+from sim_plant.process import main, run_plant
 from sim_plant.recorder import read_recording
-from sim_plant.wired import WorldClock
+from sim_plant.wired import WiredLine, WorldClock
 
 ROOT = Path(__file__).parents[2]
 PLANT = ROOT / "sim_plant/plants/s_real.toml"
@@ -42,14 +45,18 @@ def free_port() -> int:
 class Line:
     """The process, and what it said when it was ready."""
 
-    def __init__(self, folder: Path, *more: str) -> None:
+    def __init__(self, folder: Path, *more: str, plant: Path = PLANT) -> None:
         self.folder = folder
         self.can_port = free_port()
-        command = [sys.executable, "-m", "sim_plant.process", str(PLANT), "--record", str(folder)]
+        command = [sys.executable, "-m", "sim_plant.process", str(plant), "--record", str(folder)]
         command += ["--can-port", str(self.can_port), "--modbus-port", "0", *more]
         self.process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
         assert self.process.stdout is not None
-        self.ready: dict[str, Any] = json.loads(self.process.stdout.readline())
+        told = self.process.stdout.readline()
+        if not told:
+            _, errors = self.process.communicate()
+            raise AssertionError(f"the line was not ready: {errors}")
+        self.ready: dict[str, Any] = json.loads(told)
 
     def end(self, number: int) -> tuple[int, str]:
         """Exit code and standard error after a signal."""
@@ -133,6 +140,146 @@ def test_ready_talks_and_ends_with_a_summary(line: Line, master: canopen.Network
     assert trip["time_s"] - command["time_s"] == pytest.approx(0.1, abs=0.002)
 
 
+# Every role on every wire
+
+
+def plant_with(tmp_path: Path, roles: str, more: str = "") -> Path:
+    """The plant S_real with these words at the top of its wires."""
+    path = tmp_path / "plant.toml"
+    text = re.sub(r"(?m)^(drives|load_cells|plc) = .*\n", "", PLANT.read_text())
+    text = re.sub(r"(?m)^\[wires\].*\n", "", text)
+    path.write_text(text.replace("[wires.canopen]\n", f"[wires]\n{roles}\n[wires.canopen]\n{more}"))
+    return path
+
+
+@pytest.fixture
+def any_line(tmp_path: Path) -> Iterator[Callable[..., Line]]:
+    lines: list[Line] = []
+
+    def start(roles: str, more: str = "") -> Line:
+        lines.append(Line(tmp_path / "recording", "--opcua-port", "0", plant=plant_with(tmp_path, roles, more)))
+        return lines[-1]
+
+    yield start
+    for line in lines:
+        if line.process.poll() is None:
+            line.process.kill()
+            line.process.communicate()
+        for pipe in (line.process.stdout, line.process.stderr):
+            assert pipe is not None
+            pipe.close()
+
+
+def faces(line: Line) -> dict[str, Any]:
+    """What the summary says of the faces."""
+    code, errors = line.end(signal.SIGTERM)
+    assert code == 0, errors
+    return json.loads((line.folder / "summary.json").read_text())["faces"]
+
+
+def test_everything_on_one_can_bus_with_wire_time(any_line: Callable[..., Line]) -> None:
+    line = any_line('drives = "canopen"\nload_cells = "canopen"\nplc = "canopen"', "wire_time = true\n")
+    assert (line.ready["can_port"], line.ready["modbus_port"]) == (line.can_port, None)
+    network = canopen.Network()
+    network.NOTIFIER_CYCLE = 0.05
+    network.connect(interface="udp_multicast", channel=GROUP, port=line.can_port, hop_limit=0, fd=False)
+    try:
+        seen: list[int] = []
+        nodes = [*range(1, 7), 101, 120]
+        for can_id in [0x180 + node for node in nodes] + [0x281 + 100, 0x381 + 100]:
+            network.subscribe(can_id, lambda can_id, _data, _time: seen.append(can_id))
+        network.send_message(0, b"\1\0")
+        network.send_message(0x80, b"")
+        until(lambda: len(seen) == 10)
+    finally:
+        network.disconnect()
+    assert seen == sorted(seen)
+    counts = faces(line)
+    assert counts.keys() == {"canopen"} and counts["canopen"]["wire_busy_s"] > 0.0
+
+
+def test_everything_in_one_rack(any_line: Callable[..., Line]) -> None:
+    line = any_line('drives = "rack"\nload_cells = "rack"\nplc = "rack"')
+    assert line.ready["can_port"] is None and line.ready["opcua_port"] is None
+    with ModbusTcpClient("127.0.0.1", port=line.ready["modbus_port"]) as client:
+        assert client.read_holding_registers(0, count=2, device_id=3).registers == [0x5204, 6]
+        for unit in (1, 2, 11):
+            assert client.read_holding_registers(0, count=1, device_id=unit).exception_code == 11
+    assert faces(line).keys() == {"modbus"}
+
+
+def test_roles_may_be_divided_between_wires(any_line: Callable[..., Line]) -> None:
+    drives = [*["modbus-tcp"] * 5, "canopen"]
+    line = any_line(f'drives = {drives}\nload_cells = "modbus-tcp"\nplc = "rack"')
+    with ModbusTcpClient("127.0.0.1", port=line.ready["modbus_port"]) as client:
+        for unit, device in ((1, 0x5201), (3, 0x5204), (11, 0x5203), (15, 0x5203)):
+            assert client.read_holding_registers(0, count=1, device_id=unit).registers == [device]
+        assert client.read_holding_registers(0, count=1, device_id=16).exception_code == 11
+    network = canopen.Network()
+    network.NOTIFIER_CYCLE = 0.05
+    network.connect(interface="udp_multicast", channel=GROUP, port=line.can_port, hop_limit=0, fd=False)
+    try:
+        assert network.add_node(6, str(EDS_PATH)).nmt.wait_for_heartbeat(2) == "PRE-OPERATIONAL"
+    finally:
+        network.disconnect()
+    assert faces(line).keys() == {"canopen", "modbus"}
+
+
+def test_opc_ua_is_opened_when_it_is_used(any_line: Callable[..., Line]) -> None:
+    line = any_line('drives = "opcua"\nload_cells = "opcua"\nplc = "opcua"')
+    assert line.ready["can_port"] is None and line.ready["modbus_port"] is None
+    with socket.create_connection(("127.0.0.1", line.ready["opcua_port"]), timeout=5):
+        pass
+    counts = faces(line)
+    assert counts.keys() == {"opcua"} and counts["opcua"].keys() == {"requests", "malformed"}
+
+
+@pytest.mark.parametrize(
+    ("wires", "reason"),
+    [
+        ({"drives": ["canopen"] * 5}, "wires.drives: has 5 entries; give one word, or a list of 6 (spans = 6)"),
+        ({"drives": "profibus"}, "wires.drives: is 'profibus', should be 'canopen', 'modbus-tcp', 'opcua' or 'rack'"),
+        ({"plc": "canopen", "canopen": {"plc_node": 6}}, "so the line PLC has node 6, as the drive of roller 6 has"),
+        (
+            {"load_cells": "canopen", "canopen": {"amplifier_node": 3}},
+            "so load-cell amplifier 1 has node 3, as the drive of roller 3 has (first_node = 1)",
+        ),
+        ({"modbus": {"plc_unit": 1}}, "wires.modbus.plc_unit: is 1, and so the line PLC has unit 1, as the load-cell"),
+        (
+            {"drives": "rack", "modbus": {"rack_unit": 2}},
+            "wires.modbus.rack_unit: is 2, and so the rack has unit 2, as the line PLC has (plc_unit = 2)",
+        ),
+        (
+            {"drives": "modbus-tcp", "modbus": {"first_drive_unit": 243}},
+            "wires.modbus.first_drive_unit: is 243, at most 242 for 6 units (1 to 247)",
+        ),
+        ({"plc": "opcua", "opcua": {"port": 5020}}, "wires.opcua.port: is 5020, as wires.modbus.port"),
+        ({"canopen": {"wire_tme": True}}, "wires.canopen.wire_tme: unknown key; did you mean wire_time?"),
+    ],
+)
+def test_wires_that_cannot_be_are_refused_by_name(wires: dict[str, Any], reason: str) -> None:
+    document = tomllib.loads(PLANT.read_text()) | {"wires": wires}
+    with pytest.raises(PlantRefused) as refused:
+        plant_of(document)
+    assert len(refused.value.reasons) == 1
+    assert reason in refused.value.reasons[0]
+
+
+def test_a_rack_has_room_for_fourteen_spans() -> None:
+    document = tomllib.loads(PLANT.read_text()) | {"wires": {"drives": "rack"}}
+    assert plant_of(document | {"spans": 14}).wires.on("rack", 14).rollers == tuple(range(1, 15))
+    with pytest.raises(
+        PlantRefused, match=r"wires\.drives: is 'rack', which carries at most 14 spans; the plant has 15"
+    ):
+        plant_of(document | {"spans": 15})
+
+
+def test_addresses_of_devices_that_are_elsewhere_do_not_clash() -> None:
+    document = tomllib.loads(PLANT.read_text())
+    wires = {"canopen": {"plc_node": 1, "amplifier_node": 1}, "modbus": {"rack_unit": 1, "first_drive_unit": 1}}
+    assert plant_of(document | {"wires": wires}).wires.canopen.plc_node == 1
+
+
 def test_a_killed_process_leaves_a_recording(line: Line, master: canopen.Network) -> None:
     master.send_message(0, bytes((1, 1)))
     master.send_message(0x201, struct.pack("<HhB", 0x06, 0, 10))
@@ -154,11 +301,50 @@ def test_ends_on_an_interrupt_too(line: Line) -> None:
 
 def test_a_scaled_line_runs_faster(tmp_path: Path) -> None:
     line = Line(tmp_path / "recording", "--scale", "10")
-    begin = time.monotonic()
-    until(lambda: len(read_recording(line.folder).time_s) > 5000)
-    assert time.monotonic() - begin < 4.0
+    until(lambda: len(read_recording(line.folder).time_s) > 10_000, timeout_s=30.0)
+    assert time.monotonic() - line.ready["monotonic_start_s"] < 10.0  # in which it has lived for 10 s at the least
     assert line.end(signal.SIGTERM)[0] == 0
     assert read_recording(line.folder).events[0]["time_scale"] == 10.0
+
+
+# A line that fails
+
+
+def failing_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception) -> int:
+    """The exit code of a line that meets `error` once it has been ready."""
+
+    async def run(_: WiredLine, __: asyncio.Event) -> None:
+        raise error
+
+    monkeypatch.setattr(WiredLine, "run", run)
+    ready: list[WiredLine] = []
+    code = run_plant(
+        PLANT, record_folder=tmp_path / "recording", can_port=free_port(), modbus_port=0, on_ready=ready.append
+    )
+    assert len(ready) == 1
+    return code
+
+
+@pytest.fixture
+def unfrozen() -> Iterator[None]:
+    """A line freezes what lives when it is ready; a test process goes on living."""
+    yield
+    gc.unfreeze()
+
+
+@pytest.mark.usefixtures("unfrozen")
+def test_a_line_that_the_system_fails_in_mid_run_was_not_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert failing_line(tmp_path, monkeypatch, OSError(28, "No space left on device")) == 1
+    assert "failed while it ran: [Errno 28] No space left on device" in capsys.readouterr().err
+    assert (tmp_path / "recording" / "summary.json").exists()
+
+
+@pytest.mark.usefixtures("unfrozen")
+def test_a_mistake_in_the_program_is_no_refusal_either(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(ValueError, match="our own"):
+        failing_line(tmp_path, monkeypatch, ValueError("our own"))
 
 
 class Refused:
@@ -213,6 +399,7 @@ def test_says_what_is_wrong_with_its_arguments(refused: Refused, tmp_path: Path)
         ("--can-port", "99999", "1 to 65535"),
         ("--modbus-port", "-1", "0 to 65535"),
         ("--modbus-port", "99999", "0 to 65535"),
+        ("--opcua-port", "65536", "0 to 65535"),
     ],
 )
 def test_a_port_that_cannot_be_is_refused(option: str, port: str, allowed: str, refused: Refused, tmp_path: Path):
@@ -294,6 +481,7 @@ def test_a_frame_acts_when_it_arrived_and_never_on_a_wall_clock_that_was_set() -
     clock = WorldClock(2.0)
     clock.monotonic_start_s -= 1.0  # two seconds of the line ago
     at = time.time()
-    assert clock.arrival_s(can.Message(timestamp=at - 0.1)) == pytest.approx(1.8, abs=0.05)
+    for stamped in (can.Message(timestamp=at - 0.1), Stamp(at - 0.1)):
+        assert clock.arrival_s(stamped) == pytest.approx(1.8, abs=0.05)
     for stamp in (at + 3600.0, at - 3600.0, float("nan")):
         assert clock.arrival_s(can.Message(timestamp=stamp)) == pytest.approx(2.0, abs=0.05)

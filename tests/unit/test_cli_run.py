@@ -195,12 +195,17 @@ def test_a_plant_that_does_not_fit_is_named_with_the_line() -> None:
     assert misfits(small, file, plant, PLANT) == [f"line.toml has 4 spans, {PLANT} has 6 spans"]
     other = load_line(TEXT.replace("43113", "43114").replace("5020", "5021"), "line.toml")
     assert misfits(other, file, plant, PLANT) == [
-        "line.toml has its drives on udp_multicast 239.74.163.2 port 43114, "
+        "line.toml has drive-1 to drive-6 on udp_multicast 239.74.163.2 port 43114, "
         f"{PLANT} on udp_multicast 239.74.163.2 port 43113",
-        f"line.toml has Modbus TCP on port 5021, {PLANT} on port 5020",
+        f"line.toml has load-cell-1 to line-plc on Modbus TCP port 5021, {PLANT} on Modbus TCP port 5020",
     ]
-    (two_buses,) = misfits(load_line(line_template(48), "line.toml"), file, plant, PLANT)[1:]
-    assert "port 43113 and udp_multicast 239.74.163.2 port 43114" in two_buses
+    found = misfits(load_line(line_template(48), "line.toml"), file, plant, PLANT)
+    assert found == [f"line.toml has 48 spans, {PLANT} has 6 spans"]
+    moved = load_line(TEXT.replace("address = 3\n", "address = 7\n"), "line.toml")
+    wire = "udp_multicast 239.74.163.2 port 43113"
+    assert misfits(moved, file, plant, PLANT) == [
+        f"line.toml has drive-3 at {wire} address 7, {PLANT} at {wire} address 3"
+    ]
 
 
 @pytest.fixture

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import sim_plant
@@ -10,11 +11,12 @@ from sim_plant.devices.amplifier import Amplifier, ChannelStatus
 from sim_plant.devices.cia402 import State
 from sim_plant.devices.drive import Drive
 from sim_plant.devices.line_plc import LinePlc
-from sim_plant.plant import load_plant
+from sim_plant.plant import Plant, load_plant
 from sim_plant.recorder import Recorder
 from sim_plant.world import World
 
 PLANT = load_plant(Path(sim_plant.__file__).parent / "plants" / "s_real.toml")
+TENSION_N = np.array([28.0, 36.0, 20.0, 40.0, 24.0, 32.0])
 CST = 10
 SHUTDOWN, ENABLE, QUICK_STOP, RESET = 0x06, 0x0F, 0x02, 0x80
 
@@ -245,6 +247,89 @@ def test_the_amplifiers_channels_count_from_one() -> None:
     for channel in (0, 7):
         with pytest.raises(IndexError, match=f"channel {channel}: this amplifier has channels 1 to 6"):
             amplifier.tension_n(channel, 0.0)
+
+
+@pytest.fixture
+def amplifier() -> Amplifier:
+    quiet = {**PLANT.model_dump(), "sensors": {"tension_noise_n": 0.0}}
+    world = World(Plant.model_validate(quiet), seed=1)
+    world.start_at_equilibrium(TENSION_N, 0.0)
+    return Amplifier(world)
+
+
+def test_a_load_cell_that_sticks_stays_and_the_others_do_not(amplifier: Amplifier) -> None:
+    amplifier.stick(2)
+    assert amplifier.tension_n(2, 0.0) == pytest.approx(36.0)
+    rows = np.array([amplifier.tensions_n(0.001 * k) for k in range(1, 200)])
+    assert (rows[:, 1] == amplifier.tension_n(2, 0.2)).all()
+    assert (rows[:, [0, 2, 3, 4, 5]].std(axis=0) > 0.0).all()
+    amplifier.heal(2)
+    assert amplifier.tensions_n(0.2)[1] != rows[0, 1]
+
+
+def test_a_load_cell_can_show_no_number_or_any_with_status_ok(amplifier: Amplifier) -> None:
+    amplifier.nan(1)
+    amplifier.show_n(3, 1e5)
+    assert np.isnan(amplifier.tension_n(1, 0.0)) and np.isnan(amplifier.tensions_n(0.0)[0])
+    assert amplifier.tension_n(3, 0.0) == 1e5
+    assert amplifier.status(1) is amplifier.status(3) is ChannelStatus.OK
+
+
+def test_a_load_cell_drifts_from_the_moment_it_is_told() -> None:
+    healthy, drifting = Amplifier(World(PLANT, seed=1)), Amplifier(World(PLANT, seed=1))
+    healthy.tension_n(1, 1.0)
+    drifting.tension_n(1, 1.0)
+    drifting.offset_n(1, 0.5, start_n=2.0)
+    for now_s in (1.0, 2.0, 4.0):
+        off = drifting.tension_n(1, now_s) - healthy.tension_n(1, now_s)
+        assert off == pytest.approx(2.0 + 0.5 * (now_s - 1.0), abs=1e-9)
+
+
+def test_a_spike_is_one_measurement(amplifier: Amplifier) -> None:
+    amplifier.spike(4, 25.0)
+    assert amplifier.tension_n(4, 0.010) > 60.0
+    assert amplifier.tensions_n(0.0105)[3] > 60.0  # the same millisecond
+    assert amplifier.tension_n(4, 0.011) < 45.0
+    with pytest.raises(IndexError, match="channel 7: this amplifier has channels 1 to 6"):
+        amplifier.spike(7, 1.0)
+
+
+def test_an_encoder_freezes_jumps_and_heals(enabled: Bench) -> None:
+    drive = enabled.drive
+    drive.freeze_speed()
+    shown = {drive.sync(0.01 * k).speed_m_per_s for k in range(2, 20)}
+    assert len(shown) == 1
+    drive.heal_speed()
+    assert drive.sync(0.2).speed_m_per_s == enabled.world.measure_speed_m_per_s(0)
+    drive.jump_speed(0.5)
+    assert drive.sync(0.21).speed_m_per_s - enabled.world.measure_speed_m_per_s(0) == pytest.approx(0.5)
+
+
+def test_a_dead_watchdog_takes_its_setting_and_never_acts(enabled: Bench) -> None:
+    enabled.drive.watchdog_is_dead = True
+    enabled.drive.watchdog_s = 0.05
+    enabled.command(ENABLE, 5.0, 0.010)
+    enabled.drive.poll(1.0)
+    assert enabled.drive.state is State.OPERATION_ENABLED and enabled.drive.watchdog_s == 0.05
+
+
+def test_a_drive_that_lags_follows_its_commands_and_loses_its_power_at_once() -> None:
+    document = PLANT.model_dump()
+    world = World(Plant.model_validate({**document, "drives": {"torque_lag_s": 0.02}}), seed=1)
+    recorder = Recorder(world)
+    drive = Drive(0, world, recorder, 60.0, 60.0)
+    drive.operational = True
+    for word, torque_nm, now_s in ((SHUTDOWN, 0.0, 0.0), (ENABLE, 10.0, 0.010)):
+        drive.receive(word, torque_nm, CST, now_s)
+        drive.sync(now_s)
+    assert drive.sync(0.030).torque_nm == pytest.approx(10.0 * (1.0 - np.exp(-1.0)), rel=1e-4)
+    drive.receive(QUICK_STOP, 0.0, CST, 0.040)
+    drive.sync(0.040)
+    drive.poll(0.0565)  # the ramp of the command takes 10 Nm / 600 Nm/s; what lags behind it is still there
+    assert drive.state is State.QUICK_STOP_ACTIVE and world.torque_nm[0] > 2.0
+    drive.poll(0.058)
+    assert drive.state is State.SWITCH_ON_DISABLED and world.torque_nm[0] == 0.0
+    assert recorder.unsafe_total == 0
 
 
 def plc_bench(ramp_m_per_s2: float = 1.0) -> tuple[World, Recorder, LinePlc]:

@@ -120,6 +120,70 @@ def reasons_without(key: str) -> list[str]:
     return refused.value.reasons
 
 
+def test_the_papers_plants_are_plain_and_the_realistic_one_has_every_effect_on() -> None:
+    for name in TABLE:
+        plant = load_plant(PLANTS / f"{name}.toml")
+        assert plant.is_plain and plant.sensors.load_cells_are_ideal and plant.sensors.speed_step_m_per_s == 0.0
+    realistic = load_plant(PLANTS / "realistic.toml")
+    default = Plant.model_validate(document())
+    for name in ("effects", "sensors", "drives"):
+        table, plain = getattr(realistic, name), getattr(default, name)
+        for key in type(table).model_fields:
+            if key in ("tension_noise_n", "speed_noise_m_per_s", "rated_torque_nm", "max_torque_nm"):
+                continue
+            assert getattr(table, key) != getattr(plain, key) or key == "torque_rate_nm_per_s", f"{name}.{key}"
+    nominal, paper = realistic.parameters(), load_plant(PLANTS / "s_real.toml").parameters()
+    assert np.array_equal(nominal.coefficients(), paper.coefficients())
+
+
+@pytest.mark.parametrize(
+    "tables",
+    [
+        {"effects": {"slack": True}},
+        {"effects": {"friction": {"coulomb_nm": [0.0, 0.1, 0.0]}}},
+        {"effects": {"friction": {"breakaway_nm": 0.1}}},
+        {"effects": {"friction": {"rise_per_s": 0.1}}},
+        {"effects": {"eccentricity": {"share": 1e-3}}},
+        {"effects": {"relaxation": {"stiffness_share": 0.1}}},
+        {"effects": {"slip": {"on": True}}},
+        {"effects": {"unwinder": {"eccentricity": 1e-3}}},
+        {"effects": {"reels": {"thickness_m": 1e-4}}},
+        {"drives": {"torque_lag_s": 0.004}},
+        {"drives": {"torque_step_nm": 0.1}},
+    ],
+)
+def test_each_effect_alone_leaves_the_plain_equations(tables: dict[str, Any]) -> None:
+    assert not plant_of(document(**tables)).is_plain
+
+
+def test_sizes_of_effects_that_are_off_do_not_matter() -> None:
+    effects = {"relaxation": {"time_s": 3.0}, "slip": {"wrap_rad": 1.0}, "unwinder": {"radius_m": 0.4}}
+    assert plant_of(document(effects=effects)).is_plain
+
+
+def test_mistakes_in_effects_are_told() -> None:
+    found = reasons(
+        effects={
+            "friction": {"coulomb_nm": [1.0, 1.0, 2.0], "breakaway_nm": 1.5},
+            "eccentricity": {"share": 0.5, "phase_rad": [0.0, 1.0]},
+            "unwinder": {"radius_m": 0.03},
+            "relaxations": {},
+        },
+        sensors={"tension_zero_n": [0.1]},
+        drives={"torque_lag_s": 0.0004},
+    )
+    expected = [
+        "drives.torque_lag_s: is 0.0004, should be 0, or at least 0.001 (one step of the physics)",
+        "effects.eccentricity.share: is 0.5, should be less than or equal to 0.1",
+        "effects.relaxations: unknown key; did you mean relaxation?",
+        "sensors.tension_zero_n: has 1 entries; give one number, or a list of 3 (spans = 3)",
+        "effects.eccentricity.phase_rad: has 2 entries; give one number, or a list of 3 (spans = 3)",
+        "effects.friction.breakaway_nm: must not be below coulomb_nm (0 means the same as it)",
+        "effects.unwinder.core_radius_m: is 0.04, at most radius_m = 0.03",
+    ]
+    assert sorted(found) == sorted(expected)
+
+
 def test_nodes_beyond_the_bus_are_refused() -> None:
     wires = {"canopen": {"first_node": 126}}
     assert reasons(wires=wires) == ["wires.canopen.first_node: is 126, at most 125 for 3 nodes (1 to 127)"]

@@ -116,3 +116,28 @@ def test_drives_that_are_told_off_are_no_unsafe_event() -> None:
     line.sample(20.0)
     assert line.world.tension_n.min() < 2.0
     assert line.recorder.unsafe_total == 0
+
+
+def test_faulty_sensors_are_what_is_sampled() -> None:
+    line, healthy = SteppedLine(PLANT, seed=1, latency_s=0.010), SteppedLine(PLANT, seed=1, latency_s=0.010)
+    for each in (line, healthy):
+        each.start_at_equilibrium(TENSION_N, 0.1)
+    line.amplifier.nan(2)
+    line.amplifier.spike(3, 10.0)
+    line.encoders[4].offset(0.25, 0.0, line.world.steps)
+    shown, true = line.sample(0.010), healthy.sample(0.010)
+    assert np.isnan(shown.tension_n[1])
+    assert shown.tension_n[2] - true.tension_n[2] == pytest.approx(10.0)
+    assert shown.speed_m_per_s[4] - true.speed_m_per_s[4] == pytest.approx(0.25)
+    others = [0, 3, 4, 5]
+    assert np.array_equal(shown.tension_n[others], true.tension_n[others])
+    assert np.array_equal(line.world.tension_n, healthy.world.tension_n)
+
+
+def test_a_drive_that_takes_itself_off_leaves_the_others_on_their_ramps() -> None:
+    line = SteppedLine(changed(drives={"torque_rate_nm_per_s": 100.0}), seed=1, latency_s=0.0)
+    line.apply(np.full(6, 10.0), ALL, 0.0, False, 0.0)
+    line.take_off(1, 0.050)
+    sample = line.sample(0.2)
+    assert sample.torque_nm[1] == 0.0 and sample.torque_nm[[0, 2]].tolist() == [10.0, 10.0]
+    assert not sample.enabled[1] and sample.enabled[0]
