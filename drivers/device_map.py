@@ -14,15 +14,32 @@ from drivers.canopen import maps as canopen
 from drivers.map_errors import MapRefused, reasons_of
 from drivers.map_fields import MAPS
 from drivers.modbus import maps as modbus
+from drivers.opcua import maps as opcua
 
 __all__ = ["MAPS", "MODELS", "DeviceMap", "MapRefused", "load_map", "map_names"]
 
-DeviceMap = canopen.DriveMap | modbus.LoadCellMap | modbus.PlcMap
+DeviceMap = (
+    canopen.DriveMap
+    | canopen.LoadCellMap
+    | canopen.PlcMap
+    | modbus.DriveMap
+    | modbus.LoadCellMap
+    | modbus.PlcMap
+    | opcua.DriveMap
+    | opcua.LoadCellMap
+    | opcua.PlcMap
+)
 #: What a map of a protocol and role must be.
 MODELS: dict[tuple[str, str], type[DeviceMap]] = {
     ("canopen", "drive"): canopen.DriveMap,
+    ("canopen", "load-cell"): canopen.LoadCellMap,
+    ("canopen", "line-plc"): canopen.PlcMap,
+    ("modbus-tcp", "drive"): modbus.DriveMap,
     ("modbus-tcp", "load-cell"): modbus.LoadCellMap,
     ("modbus-tcp", "line-plc"): modbus.PlcMap,
+    ("opcua", "drive"): opcua.DriveMap,
+    ("opcua", "load-cell"): opcua.LoadCellMap,
+    ("opcua", "line-plc"): opcua.PlcMap,
 }
 
 

@@ -5,12 +5,13 @@ from pathlib import Path
 from drivers.canopen import build as canopen
 from drivers.device_map import MAPS, DeviceMap, MapRefused, load_map, map_names
 from drivers.modbus import build as modbus
+from drivers.opcua import build as opcua
 from drivers.port import Link
 from drivers.wiring import Builder, Wired
 from gateway.core.line import Drive, Line, LinePlc, LoadCell
 from gateway.core.nearest import nearest
 
-BUILDERS: dict[str, Builder] = {"canopen": canopen.build, "modbus-tcp": modbus.build}
+BUILDERS: dict[str, Builder] = {"canopen": canopen.build, "modbus-tcp": modbus.build, "opcua": opcua.build}
 
 _ROLES = {Drive: ("drive", "drives"), LoadCell: ("load-cell", "load_cells"), LinePlc: ("line-plc", "plc")}
 

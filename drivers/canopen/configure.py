@@ -1,39 +1,14 @@
-"""What `prepare` writes to a drive, as data, and the transaction that writes it, reads it back, or undoes it."""
+"""What a line asks of its CANopen nodes, as the values of their objects. No I/O."""
 
 import struct
 from dataclasses import dataclass
 from math import floor
 
-from drivers.canopen.maps import CanObject, DriveMap, Pdo, TimeObject
-from drivers.canopen.pdo import mapping_entries, type_code
-from drivers.canopen.sdo import SdoBus, SdoFailed, SdoSilent
-from drivers.map_rules import BYTES
+from drivers.canopen.map_parts import CanObject, HeartbeatObject, Watchdog
+from drivers.canopen.maps import DriveMap, LoadCellMap, PlcMap
+from drivers.canopen.pdo import type_code
+from drivers.canopen.transaction import Expected, Step, expected_pdo, mapping_steps, pdo_off, pdo_on
 from drivers.scaling import si_per_count, torque_per_count
-
-_PDO_INVALID = 1 << 31
-_NO_REMOTE_REQUEST = 1 << 30  #: a bit of a COB-ID that is the device's own business
-_SYNCHRONOUS = 1  #: acts on every SYNC
-
-
-@dataclass(frozen=True, slots=True)
-class Step:
-    """One object to write. `keep` are bits of the present value that stay as they are."""
-
-    index: int
-    sub: int
-    type: str
-    value: int | float
-    keep: int = 0
-
-    @property
-    def name(self) -> str:
-        return f"object {self.index:04X}h sub {self.sub}"
-
-    def bytes_after(self, present: bytes) -> bytes:
-        value = self.value
-        if self.keep:
-            value = int(value) | int.from_bytes(present, "little") & self.keep
-        return struct.pack(type_code(self.type), value)
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,20 +21,21 @@ class DriveSettings:
     watchdog_s: float
 
 
-def watchdog_counts(watchdog: TimeObject, watchdog_s: float) -> int:
-    """The value of the watchdog object: at most the time asked for. Raises ValueError when the drive cannot do it."""
+def watchdog_counts(watchdog: Watchdog, watchdog_s: float) -> int:
+    """The value of the watchdog object: at most the time asked for. Raises ValueError when the device cannot do it."""
     counts = floor(watchdog_s / si_per_count(watchdog.unit, watchdog.scale) + 1e-9)
     low, high = watchdog.range
     if counts < 1 or not low <= counts * watchdog.scale <= high:
         raise ValueError(
-            f"limits.watchdog_s = {watchdog_s} s is outside what the drive can do ({low:g} to {high:g} {watchdog.unit})"
+            f"limits.watchdog_s = {watchdog_s} s is outside what it can do ({low:g} to {high:g} {watchdog.unit})"
         )
-    return counts
+    return watchdog.node << 16 | counts if watchdog.kind == "heartbeat-consumer" else counts
 
 
 def torque_limit_counts(device: DriveMap, settings: DriveSettings) -> int:
     """The value of the max torque object: at most the line's limit. Raises ValueError when it does not fit."""
     entry = device.objects.max_torque
+    assert entry is not None
     nm_per_count = torque_per_count(entry.unit, entry.scale, settings.rated_torque_nm)
     counts = floor(settings.torque_limit_nm / nm_per_count + 1e-9)
     try:
@@ -71,78 +47,81 @@ def torque_limit_counts(device: DriveMap, settings: DriveSettings) -> int:
     return counts
 
 
+def check_target_range(device: DriveMap, settings: DriveSettings) -> None:
+    """Raises ValueError when the line's limit is more than the target torque object takes."""
+    target = device.objects.target_torque
+    if target.range is None:
+        return
+    nm_per_unit = torque_per_count(target.unit, 1.0, settings.rated_torque_nm)
+    most_nm = nm_per_unit * min(-target.range[0], target.range[1])
+    if settings.torque_limit_nm > most_nm:
+        raise ValueError(
+            f"limits.torque_nm = {settings.torque_limit_nm} Nm is more than it can be asked for ({most_nm:g} Nm)"
+        )
+
+
 def drive_steps(device: DriveMap, settings: DriveSettings) -> list[Step]:
-    """Everything to write, in order: both PDOs off, mapping and parameters, both PDOs on. Raises ValueError."""
-    receive, transmit = device.receive_pdo, device.transmit_pdo
-    steps = [_pdo_off(receive, settings.node), _pdo_off(transmit, settings.node)]
-    steps += _mapping_steps(device, receive) + _mapping_steps(device, transmit)
+    """Everything to write to a drive, in order: its PDOs off, mapping and parameters, its PDOs on. Raises ValueError.
+
+    What the map calls fixed is not among it: see `drive_expected`.
+    """
+    pdos = [pdo for pdo in (device.receive_pdo, device.transmit_pdo) if pdo.writable]
+    steps = [pdo_off(pdo, settings.node) for pdo in pdos]
+    for pdo in pdos:
+        steps += mapping_steps(pdo, device.objects_of(pdo))
     objects = device.objects
     steps.append(_write(objects.mode, device.cyclic_torque_mode))
-    if objects.max_torque.writable:
+    steps += [_write(option, option.value) for option in device.options.present() if option.writable]
+    if objects.max_torque is not None and objects.max_torque.writable:
         steps.append(_write(objects.max_torque, torque_limit_counts(device, settings)))
-    steps.append(_write(device.heartbeat, round(device.heartbeat.value / device.heartbeat.scale)))
+    steps.append(heartbeat_step(device.heartbeat))
     steps.append(_write(device.watchdog, watchdog_counts(device.watchdog, settings.watchdog_s)))
-    steps += [_pdo_on(receive, settings.node), _pdo_on(transmit, settings.node)]
-    return steps
+    return steps + [pdo_on(pdo, settings.node) for pdo in pdos]
+
+
+def drive_expected(device: DriveMap, node: int) -> list[Expected]:
+    """What a drive must have without being told."""
+    expected: list[Expected] = []
+    for pdo in (device.receive_pdo, device.transmit_pdo):
+        expected += [] if pdo.writable else expected_pdo(pdo, device.objects_of(pdo), node)
+    fixed = [option for option in device.options.present() if not option.writable]
+    return expected + [Expected(option.index, option.sub, option.type, option.value) for option in fixed]
+
+
+def plc_steps(device: PlcMap, node: int, watchdog_s: float) -> list[Step]:
+    """Everything to write to a line PLC, in order. Raises ValueError."""
+    pdos = [pdo for pdo in (device.receive_pdo, device.transmit_pdo) if pdo.writable]
+    steps = [pdo_off(pdo, node) for pdo in pdos]
+    for pdo in pdos:
+        steps += mapping_steps(pdo, device.objects_of(pdo))
+    steps += [heartbeat_step(device.heartbeat), _write(device.watchdog, watchdog_counts(device.watchdog, watchdog_s))]
+    return steps + [pdo_on(pdo, node) for pdo in pdos]
+
+
+def plc_expected(device: PlcMap, node: int) -> list[Expected]:
+    pdos = [pdo for pdo in (device.receive_pdo, device.transmit_pdo) if not pdo.writable]
+    return [entry for pdo in pdos for entry in expected_pdo(pdo, device.objects_of(pdo), node)]
+
+
+def cell_steps(device: LoadCellMap, node: int, pdos: list[int]) -> list[Step]:
+    """Everything to write to a load-cell amplifier of which the PDOs `pdos`, counted from 0, are needed."""
+    steps: list[Step] = []
+    if device.transmit_pdos.writable:
+        for k in pdos:
+            pdo = device.transmit_pdo(k)
+            steps += [pdo_off(pdo, node), *mapping_steps(pdo, device.objects_of(k)), pdo_on(pdo, node)]
+    return [*steps, heartbeat_step(device.heartbeat)]
+
+
+def cell_expected(device: LoadCellMap, node: int, pdos: list[int]) -> list[Expected]:
+    if device.transmit_pdos.writable:
+        return []
+    return [entry for k in pdos for entry in expected_pdo(device.transmit_pdo(k), device.objects_of(k), node)]
+
+
+def heartbeat_step(heartbeat: HeartbeatObject) -> Step:
+    return _write(heartbeat, round(heartbeat.value / heartbeat.scale))
 
 
 def _write(entry: CanObject, value: int) -> Step:
     return Step(entry.index, entry.sub, entry.type, value)
-
-
-def _pdo_off(pdo: Pdo, node: int) -> Step:
-    return Step(pdo.communication, 1, "u32", _PDO_INVALID | pdo.cob_id + node, keep=_NO_REMOTE_REQUEST)
-
-
-def _pdo_on(pdo: Pdo, node: int) -> Step:
-    return Step(pdo.communication, 1, "u32", pdo.cob_id + node, keep=_NO_REMOTE_REQUEST)
-
-
-def _mapping_steps(device: DriveMap, pdo: Pdo) -> list[Step]:
-    entries = mapping_entries(device, pdo)
-    steps = [Step(pdo.communication, 2, "u8", _SYNCHRONOUS), Step(pdo.mapping, 0, "u8", 0)]
-    steps += [Step(pdo.mapping, sub, "u32", entry) for sub, entry in enumerate(entries, 1)]
-    steps.append(Step(pdo.mapping, 0, "u8", len(entries)))
-    return steps
-
-
-class Transaction:
-    """Writes to one node that can be taken back. Undone in reverse, each object gets what it had before its step,
-    so that a PDO mapping passes through the same legal states backwards."""
-
-    def __init__(self, sdo: SdoBus, node: int) -> None:
-        self._sdo = sdo
-        self._node = node
-        self._before: list[tuple[Step, bytes]] = []
-
-    async def run(self, steps: list[Step]) -> None:
-        """Write every step, then read back what must stand in the end. Raises SdoFailed at the first that fails."""
-        final: dict[tuple[int, int], tuple[Step, bytes]] = {}
-        for step in steps:
-            present = await self._sdo.upload(self._node, step.index, step.sub, BYTES[step.type])
-            wanted = step.bytes_after(present)
-            try:
-                await self._sdo.download(self._node, step.index, step.sub, wanted)
-            except SdoSilent:
-                self._before.append((step, present))  # it may have been written all the same
-                raise
-            self._before.append((step, present))
-            final[step.index, step.sub] = (step, wanted)
-        for step, wanted in final.values():
-            found = await self._sdo.upload(self._node, step.index, step.sub, len(wanted))
-            if found != wanted:
-                raise SdoFailed(f"{step.name}: written {wanted.hex()}, read back {found.hex()} (bytes, low first)")
-
-    async def undo(self) -> list[str]:
-        """Write back what was there before; returns what could not be restored. A node that is silent is left."""
-        failures: list[str] = []
-        while self._before:
-            step, present = self._before.pop()
-            try:
-                await self._sdo.download(self._node, step.index, step.sub, present)
-            except SdoSilent as error:
-                self._before.clear()
-                failures.append(f"{error}; the rest could not be restored")
-            except SdoFailed as error:
-                failures.append(f"not restored: {error}")
-        return failures

@@ -1,79 +1,92 @@
-"""CiA 402 drives on one CANopen bus, behind the driver port.
+"""The nodes of one CANopen bus, behind the driver port: drives, load-cell amplifiers, a line PLC.
 
-A cycle: SYNC (the drives latch their RPDOs and sample), the TPDOs of this SYNC, one RPDO a drive. An answer
-counts for the SYNC after which it arrives, once: what comes twice, or after `collect` has closed the cycle, is
+A cycle: SYNC (the nodes latch their RPDOs and sample), the TPDOs of this SYNC, one RPDO a node that takes commands. An
+answer counts for the SYNC after which it arrives, once: what comes twice, or after `collect` has closed the cycle, is
 discarded and counted. What is in the socket before the next SYNC is read before it, so that an answer that is
 late within its period cannot pass for a fresh one. One that comes a whole period late can: SYNC has no counter.
 
-A drive that is no longer heard may still hear: every RPDO would renew its watchdog, although the drive may act on
-none of them (they act at SYNC). So it is told once to leave operational, which takes torque off without a SYNC, and
+A node that is no longer heard may still hear: every RPDO would renew its watchdog, although it may act on none of them
+(they act at SYNC). So it is told once to leave operational, which takes torque off (or run away) without a SYNC, and
 gets no RPDO until the next `prepare`: if it does not hear the one, its watchdog fires for want of the other.
+
+Drives whose watchdog is a heartbeat consumer share one heartbeat, which cannot be withheld from one of them: see
+`heartbeat`.
+
+A silent link sends no SYNC and writes nothing. What no node says by itself (tensions, the PLC's status) it asks for by
+SDO then, one transfer at a time per node: a dead one costs the others nothing.
 """
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from drivers.canopen.bus import CanBus
-from drivers.canopen.node import OPERATIONAL, DriveNode
-from drivers.canopen.prepare import check_drive, configure_drives, read_safe_torque_off, undo_all
+from drivers.canopen.heartbeat import HEARTBEAT, HeartbeatProducer
+from drivers.canopen.node import Node
+from drivers.canopen.prepare import check_nodes, configure_nodes, undo_all
+from drivers.canopen.questions import Questions
 from drivers.canopen.sdo import SdoBus, SdoFailed
-from drivers.cia402 import PowerState
+from drivers.canopen.station import OPERATIONAL
 from drivers.port import PrepareRefused
 from gateway.core.line import CanopenBus
-from gateway.core.signals import DriveState, Inputs, LinkHealth, Outputs
+from gateway.core.signals import Inputs, LinkHealth, Outputs
 
-NMT, SYNC, EMERGENCY, HEARTBEAT = 0x000, 0x080, 0x080, 0x700  #: COB-IDs, the last two of node 0
+NMT, SYNC, EMERGENCY = 0x000, 0x080, 0x080  #: COB-IDs, the last of node 0
 START, ENTER_PRE_OPERATIONAL = 0x01, 0x80  #: NMT commands
-STO_POLL_S = 0.2  #: how often drives that may not switch on are asked whether safe torque off is why
-START_HEARTBEATS = 3  #: producer times within which a started drive must say that it is operational
+START_HEARTBEATS = 3  #: producer times within which a started node must say that it is operational
 
-Handler = Callable[[DriveNode, bytes | bytearray, float], None]
+Handler = Callable[[Node, int, bytes | bytearray, float], None]
 
 
 class CanopenLink:
-    """A `drivers.port.Link` for the drives in `nodes`, all on the bus `config`."""
+    """A `drivers.port.Link` for `nodes`, all on the bus `config`.
 
-    def __init__(self, config: CanopenBus, nodes: list[DriveNode]) -> None:
+    `heartbeat` is needed when the watchdog of a node listens to one.
+    """
+
+    def __init__(self, config: CanopenBus, nodes: Sequence[Node], heartbeat: HeartbeatProducer | None = None) -> None:
         self.name = config.name
         self.health = LinkHealth()
         self._nodes = nodes
-        self._bus = CanBus(config, self._on_frame, self._discard)
-        self._sdo = SdoBus(self._bus.send, [node.node for node in nodes])
-        self._handlers: dict[int, tuple[Handler, DriveNode]] = {}
+        self._heartbeat = heartbeat
+        self._handlers: dict[int, tuple[Handler, Node]] = {}
         for node in nodes:
-            self._handlers[node.device.transmit_pdo.cob_id + node.node] = (self._on_answer, node)
-            self._handlers[HEARTBEAT + node.node] = (self._on_heartbeat, node)
-            self._handlers[EMERGENCY + node.node] = (self._on_emergency, node)
+            for cob_id in node.answers:
+                self._handlers[cob_id] = (self._on_answer, node)
+            self._handlers[HEARTBEAT + node.station.node] = (self._on_heartbeat, node)
+            self._handlers[EMERGENCY + node.station.node] = (self._on_emergency, node)
+        self._sdo = SdoBus(self._send_sdo, [node.station.node for node in nodes])
+        self._questions = Questions(self._sdo, self.health)
         self._sdo_responses = set(self._sdo.response_cob_ids())
+        self._bus = CanBus(config, {*self._handlers, *self._sdo_responses}, self._on_frame, self._discard)
         self._active = False
         self._sync_s = 0.0
         self._sync_open = False  #: between SYNC and the end of `collect`
-        self._awaited = 0  #: drives whose answer `collect` still waits for
+        self._awaited = 0  #: nodes whose answer `collect` still waits for
         self._answered: asyncio.Future[None] | None = None
         self._heartbeat_came = asyncio.Event()
-        self._sto_asked_s = float("-inf")
-        self._sto_task: asyncio.Task[None] | None = None
+        self._told: set[int] = set()  #: dropped nodes whose order to leave operational was sent
+        self._prepared = False  #: the nodes wait for us: they were prepared, and not released since
 
     async def open(self) -> None:
         """Open the bus and listen. Raises OSError with what to do about it."""
         self._bus.open()
 
-    # proving the drives
+    # proving the nodes
 
     async def prepare(self) -> None:
-        """Configure all drives and prove their watchdogs. Raises PrepareRefused; what was written is undone then."""
+        """Configure all nodes and prove their watchdogs. Raises PrepareRefused; what was written is undone then."""
         self.silence()
         try:
+            await self._bus.restore()
             self._bus.open()
         except OSError as error:
             raise PrepareRefused([str(error)]) from error
         for node in self._nodes:
-            node.boot_ups = 0
-            self._command_nmt(ENTER_PRE_OPERATIONAL, node)  # a node that is stopped does not answer SDO
-        reasons = [f"{node.name}: {reason}" for node in self._nodes for reason in await check_drive(self._sdo, node)]
-        if reasons:
+            node.station.boot_ups = 0
+        await self._leave_operational()  # a node that is stopped does not answer SDO
+        if reasons := await check_nodes(self._sdo, self._nodes):
             raise PrepareRefused(reasons)
-        transactions, reasons = await configure_drives(self._sdo, self._nodes)
+        transactions, reasons = await configure_nodes(self._sdo, self._nodes)
         if not reasons:
             reasons = await self._start()
         if reasons:
@@ -81,61 +94,91 @@ class CanopenLink:
                 self._command_nmt(ENTER_PRE_OPERATIONAL, node)
             raise PrepareRefused(reasons + await undo_all(transactions))
         for node in self._nodes:
-            node.emergency = ""
-            node.supervised = True
-        self._active = True
+            node.station.emergency = ""
+            node.station.supervised = True
+        self._questions.stop()  # what a silent link asked for must not come among the answers to SYNC
+        self._active = self._prepared = True
 
     async def _start(self) -> list[str]:
-        """NMT start, and every drive's own word that it is operational and was not restarted meanwhile."""
+        """NMT start, and every node's own word that it is operational and was not restarted meanwhile."""
+        stations = [node.station for node in self._nodes]
         for node in self._nodes:
-            node.nmt_state = None
+            node.station.nmt_state = None
             self._command_nmt(START, node)
-        patience_s = START_HEARTBEATS * max(node.heartbeat_s for node in self._nodes)
+        patience_s = START_HEARTBEATS * max(station.heartbeat_s for station in stations)
         try:
             async with asyncio.timeout(patience_s):
-                while any(node.nmt_state != OPERATIONAL for node in self._nodes):
+                while any(station.nmt_state != OPERATIONAL for station in stations):
                     self._heartbeat_came.clear()
                     await self._heartbeat_came.wait()
         except TimeoutError:
             pass
-        late = [node for node in self._nodes if node.nmt_state != OPERATIONAL]
-        reasons = [f"{node.name}: started, but not operational within {patience_s:g} s" for node in late]
-        return reasons + [f"{node.name}: restarted while it was configured" for node in self._nodes if node.boot_ups]
+        late = [station for station in stations if station.nmt_state != OPERATIONAL]
+        reasons = [f"{station.name}: started, but not operational within {patience_s:g} s" for station in late]
+        return reasons + [
+            f"{station.name}: restarted while it was configured" for station in stations if station.boot_ups
+        ]
 
-    def _command_nmt(self, command: int, node: DriveNode) -> None:
-        self._bus.send(NMT, bytes((command, node.node)))
+    def _command_nmt(self, command: int, node: Node) -> bool:
+        return self._bus.send(NMT, bytes((command, node.station.node)))
+
+    def _send_sdo(self, cob_id: int, data: bytes) -> bool:
+        return self._bus.send(cob_id, data)
 
     def silence(self) -> None:
-        """Nothing is sent from now on. What the drives said of their power stage is forgotten with it."""
+        """Nothing is sent from now on that changes a node. What the nodes said is forgotten with it."""
         self._active = False
         self._sync_open = False
+        self._told.clear()
+        self._questions.stop()
+        if self._heartbeat is not None:
+            self._heartbeat.forget()
         for node in self._nodes:
             node.forget()
 
     async def release(self) -> None:
-        """Drives leave operational: torque off, and their deadline monitoring ends without a fault."""
+        """The nodes leave operational: torque off, and their deadline monitoring ends without a fault.
+
+        A consumer of our heartbeat is told by SDO to wait for it no more.
+        """
         self.silence()
+        await self._leave_operational()
+
+    async def _leave_operational(self) -> None:
         for node in self._nodes:
             self._command_nmt(ENTER_PRE_OPERATIONAL, node)
+        if self._prepared:
+            self._prepared = False
+            await asyncio.gather(*(self._let_go(node) for node in self._nodes))
+
+    async def _let_go(self, node: Node) -> None:
+        for step in node.release_steps():
+            try:
+                await self._sdo.download(node.station.node, step.index, step.sub, step.bytes_after(b""))
+            except SdoFailed as error:  # its watchdog fires then, and it is in fault when it is armed again
+                self.health.last_error = f"{node.station.name}: {error}"
 
     # the cycle
 
     def trigger(self, now_s: float) -> None:
-        """SYNC when active; only listens when silent."""
+        """SYNC when active; a silent link asks for what does not come by itself. Opens a bus again that is gone."""
         self._sync_open = False
         self._bus.drain_all()
         self._sync_s = now_s
+        self._bus.tend(now_s)
+        for node in self._nodes:
+            self._questions.ask(node, now_s, active=self._active)
         if not self._active:
             return
         for node in self._nodes:
             node.begin_sync()
-        self._awaited = sum(node.awaited for node in self._nodes)
+        self._awaited = sum(node.station.awaited for node in self._nodes)
         self._answered = asyncio.get_running_loop().create_future()
         self._sync_open = True
         self._bus.send(SYNC, b"")
 
     async def collect(self, inputs: Inputs, deadline_s: float) -> None:
-        """The answers to this SYNC. Drives that are absent already are heard, but not waited for."""
+        """The answers to this SYNC. Nodes that are absent already are heard, but not waited for."""
         if self._sync_open:
             self._bus.drain()
             if self._awaited > 0 and self._answered is not None:
@@ -146,118 +189,112 @@ class CanopenLink:
                     pass
             self._sync_open = False
             for node in self._nodes:
-                node.end_sync()
-            self._ask_for_safe_torque_off()
+                node.station.end_sync()
         self._fill(inputs)
 
     def _fill(self, inputs: Inputs) -> None:
         absent: list[str] = []
         for node in self._nodes:
-            index = node.index
-            state = node.state(self._sync_s)
-            inputs.drive_state[index] = state
-            if state == DriveState.ABSENT:
-                absent.append(node.name)
-            sample = node.sample
-            if sample is not None:
-                inputs.speed.put(index, sample.speed_m_per_s, self._sync_s)
-                inputs.torque.put(index, sample.torque_nm, self._sync_s)
-            else:
-                self.health.timeouts += self._active
-                inputs.speed.miss(index)
-                inputs.torque.miss(index)
+            for trouble in node.fill(inputs, self._sync_s, active=self._active):
+                self.health.last_error = trouble
+            self.health.timeouts += self._active and not node.station.answered
+            if node.absent(self._sync_s):
+                absent.append(node.station.name)
         if absent != self.health.absent:
             self.health.absent = absent
             for node in self._nodes:
-                if node.name in absent:
-                    self.health.last_error = f"{node.name}: {node.trouble(self._sync_s)}"
+                if node.station.name in absent:
+                    self.health.last_error = f"{node.station.name}: {node.trouble(self._sync_s)}"
+        self.health.reconnects = self._bus.reopened
+        if self._bus.gone:
+            self.health.last_error = self._bus.gone
 
     def write(self, outputs: Outputs) -> None:
-        """One RPDO a drive that is there. What cannot be commanded is not sent: the watchdog has the last word."""
+        """One RPDO for each node that takes commands and is there, and the heartbeat when all that need it have one.
+
+        What cannot be commanded is not sent: the watchdog has the last word.
+        """
         if not self._active:
             return
-        for node in self._nodes:
-            state = node.state(self._sync_s)
-            if state == DriveState.ABSENT and not node.dropped:
-                node.drop(self._sync_s)
-                self._command_nmt(ENTER_PRE_OPERATIONAL, node)
-            if node.dropped:
-                continue
-            request = int(outputs.drive_request[node.index])
-            torque_nm = float(outputs.torque_nm[node.index])
-            try:
-                payload = node.command(request, torque_nm, state)
-            except ValueError as error:
-                self._discard(f"{node.name}: {error}")
-                continue
-            self._bus.send(node.device.receive_pdo.cob_id + node.node, payload)
+        fed = [self._command(node, outputs) for node in self._nodes]
+        heartbeat = self._heartbeat
+        if heartbeat is not None and all(fed) and heartbeat.due(self._sync_s):
+            if self._bus.send(heartbeat.cob_id, heartbeat.payload):
+                heartbeat.sent(self._sync_s)
 
-    def _ask_for_safe_torque_off(self) -> None:
-        """Where the PDO does not carry it, ask by SDO, and only while a drive may not switch on."""
-        blocked = [
-            node
-            for node in self._nodes
-            if node.stage.power is PowerState.SWITCH_ON_DISABLED
-            and node.device.objects.safe_torque_off is not None
-            and "safe_torque_off" not in node.device.transmit_pdo.objects
-        ]
-        busy = self._sto_task is not None and not self._sto_task.done()
-        if blocked and not busy and self._sync_s - self._sto_asked_s >= STO_POLL_S:
-            self._sto_asked_s = self._sync_s
-            self._sto_task = asyncio.create_task(self._read_safe_torque_off(blocked))
+    def _command(self, node: Node, outputs: Outputs) -> bool:
+        """Whether the node may hear the heartbeat: it was given its command, or has no torque, or needs neither."""
+        station = node.station
+        if not station.fed:
+            return True
+        if not station.dropped and node.absent(self._sync_s):
+            station.drop(node.trouble(self._sync_s))
+        if not station.dropped:
+            sent = self._send_command(node, outputs)
+        else:
+            sent = False
+            # Told once; again only where the bus did not take it.
+            if station.node not in self._told and self._command_nmt(ENTER_PRE_OPERATIONAL, node):
+                self._told.add(station.node)
+        if station.listens_to is None:
+            return True
+        return self._questions.has_confirmed(node) if station.distrust else sent
 
-    async def _read_safe_torque_off(self, nodes: list[DriveNode]) -> None:
-        for node in nodes:
-            try:
-                node.stage.safe_torque_off = await read_safe_torque_off(self._sdo, node)
-            except SdoFailed as error:
-                self._discard(f"{node.name}: {error}")
+    def _send_command(self, node: Node, outputs: Outputs) -> bool:
+        try:
+            frame = node.command(outputs, self._sync_s)
+        except ValueError as error:
+            self._discard(f"{node.station.name}: {error}")
+            return False
+        return frame is not None and self._bus.send(*frame)
 
     # what arrives
 
     def _on_frame(self, cob_id: int, data: bytes | bytearray, now_s: float) -> None:
         handler = self._handlers.get(cob_id)
         if handler is not None:
-            handler[0](handler[1], data, now_s)
+            handler[0](handler[1], cob_id, data, now_s)
         elif cob_id in self._sdo_responses:
             self._sdo.on_frame(cob_id, data, now_s)
 
-    def _on_answer(self, node: DriveNode, data: bytes | bytearray, now_s: float) -> None:
+    def _on_answer(self, node: Node, cob_id: int, data: bytes | bytearray, now_s: float) -> None:
         if not self._active:
             return
+        station = node.station
         try:
             if self._sync_open:
-                node.on_answer(data)
+                node.on_answer(cob_id, data)
             else:
-                node.on_late_answer(data)
-                self._discard(f"{node.name}: an answer after its cycle")
+                node.check_answer(cob_id, data)
+                station.on_late_frame()
+                self._discard(f"{station.name}: an answer after its cycle")
         except ValueError as error:
-            self._discard(f"{node.name}: {error}")
+            self._discard(f"{station.name}: {error}")
             return
-        if self._sync_open and node.awaited:
-            node.awaited = False
+        if self._sync_open and station.awaited and station.answered:
+            station.awaited = False
             self._awaited -= 1
             if self._awaited == 0 and self._answered is not None and not self._answered.done():
                 self._answered.set_result(None)
 
-    def _on_heartbeat(self, node: DriveNode, data: bytes | bytearray, now_s: float) -> None:
+    def _on_heartbeat(self, node: Node, cob_id: int, data: bytes | bytearray, now_s: float) -> None:
         try:
-            node.on_heartbeat(data, now_s)
+            node.station.on_heartbeat(data, now_s)
         except ValueError as error:
-            self._discard(f"{node.name}: {error}")
+            self._discard(f"{node.station.name}: {error}")
             return
-        if node.distrust:
-            self.health.last_error = f"{node.name}: {node.distrust}"
+        if node.station.distrust:
+            self.health.last_error = f"{node.station.name}: {node.station.distrust}"
         self._heartbeat_came.set()
 
-    def _on_emergency(self, node: DriveNode, data: bytes | bytearray, now_s: float) -> None:
+    def _on_emergency(self, node: Node, cob_id: int, data: bytes | bytearray, now_s: float) -> None:
         try:
-            node.on_emergency(data)
+            node.station.on_emergency(data)
         except ValueError as error:
-            self._discard(f"{node.name}: {error}")
+            self._discard(f"{node.station.name}: {error}")
             return
-        if node.emergency:
-            self.health.last_error = f"{node.name}: {node.emergency}"
+        if node.station.emergency:
+            self.health.last_error = f"{node.station.name}: {node.station.emergency}"
 
     def _discard(self, reason: str) -> None:
         self.health.malformed += 1
@@ -266,8 +303,5 @@ class CanopenLink:
     async def close(self) -> None:
         """Release the bus. Idempotent."""
         self.silence()
-        if self._sto_task is not None:
-            self._sto_task.cancel()
-            await asyncio.gather(self._sto_task, return_exceptions=True)
-            self._sto_task = None
+        await self._questions.close()
         await self._bus.close()

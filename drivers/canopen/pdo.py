@@ -1,13 +1,16 @@
-"""The process data of a drive: bytes of a PDO to SI and back, as its map says. No I/O.
+"""Process data: bytes of a PDO to numbers and back, as a map says, and for a drive to SI. No I/O.
 
 Objects follow one another in mapping order, little-endian, without gaps (CiA 301, 7.4.7).
 """
 
 import struct
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import isfinite
+from typing import Any
 
-from drivers.canopen.maps import DriveMap, Pdo, PdoEntry
+from drivers.canopen.map_parts import CanObject
+from drivers.canopen.maps import DriveMap
 from drivers.map_rules import BYTES
 from drivers.scaling import speed_per_count, torque_per_count
 
@@ -28,19 +31,34 @@ class DriveSample:
     safe_torque_off: bool | None  #: None: not in this PDO
 
 
-def pdo_struct(device: DriveMap, pdo: Pdo) -> struct.Struct:
-    return struct.Struct("<" + "".join(_CODE[_object(device, name).type] for name in pdo.objects))
-
-
-def mapping_entries(device: DriveMap, pdo: Pdo) -> list[int]:
+def mapping_entries(objects: Sequence[CanObject]) -> list[int]:
     """The values of the mapping record: index, sub-index and length in bits of each object."""
-    objects = [_object(device, name) for name in pdo.objects]
     return [entry.index << 16 | entry.sub << 8 | 8 * BYTES[entry.type] for entry in objects]
 
 
 def type_code(kind: str) -> str:
     """The struct code of an object's type, little-endian: how SDO carries it, too."""
     return "<" + _CODE[kind]
+
+
+class PdoLayout:
+    """The numbers of one PDO in mapping order."""
+
+    def __init__(self, objects: Sequence[CanObject]) -> None:
+        self._struct = struct.Struct("<" + "".join(_CODE[entry.type] for entry in objects))
+
+    def decode(self, data: bytes | bytearray) -> tuple[Any, ...]:
+        """Raises MalformedPdo for a wrong length."""
+        if len(data) != self._struct.size:
+            raise MalformedPdo(f"{len(data)} bytes, the mapped PDO has {self._struct.size}")
+        return self._struct.unpack(data)
+
+    def encode(self, numbers: Sequence[float]) -> bytes:
+        """Raises ValueError for a number that does not fit its object."""
+        try:
+            return self._struct.pack(*numbers)
+        except (struct.error, OverflowError) as error:
+            raise ValueError(str(error)) from error
 
 
 class PdoCodec:
@@ -53,14 +71,14 @@ class PdoCodec:
         target = objects.target_torque
         self._counts_per_nm = 1.0 / torque_per_count(target.unit, target.scale, rated_torque_nm)
         self._whole_counts = target.type != "f32"
-        self._transmit = pdo_struct(device, device.transmit_pdo)
+        self._transmit = PdoLayout(device.objects_of(device.transmit_pdo))
         names = device.transmit_pdo.objects
         self._statusword_at = names.index("statusword")
         self._speed_at = names.index("speed")
         self._torque_at = names.index("torque")
         self._sto = objects.safe_torque_off if "safe_torque_off" in names else None
         self._sto_at = names.index("safe_torque_off") if self._sto else 0
-        self._receive = pdo_struct(device, device.receive_pdo)
+        self._receive = PdoLayout(device.objects_of(device.receive_pdo))
         names = device.receive_pdo.objects
         self._command = [device.cyclic_torque_mode if name == "mode" else 0 for name in names]
         self._controlword_at = names.index("controlword")
@@ -68,16 +86,12 @@ class PdoCodec:
 
     def decode(self, data: bytes | bytearray) -> DriveSample:
         """The sample in a transmit PDO. Raises MalformedPdo for a wrong length or a number that is not finite."""
-        if len(data) != self._transmit.size:
-            raise MalformedPdo(f"{len(data)} bytes, the mapped PDO has {self._transmit.size}")
-        fields = self._transmit.unpack(data)
+        fields = self._transmit.decode(data)
         speed = fields[self._speed_at] * self._speed_scale
         torque = fields[self._torque_at] * self._torque_scale
         if not (isfinite(speed) and isfinite(torque)):
             raise MalformedPdo(f"speed {speed} or torque {torque} is not finite")
-        sto = None
-        if self._sto is not None:
-            sto = bool(fields[self._sto_at] >> self._sto.bit & 1) != self._sto.inverted
+        sto = None if self._sto is None else self._sto.is_set(fields[self._sto_at])
         return DriveSample(fields[self._statusword_at], speed, torque, sto)
 
     def encode(self, controlword: int, torque_nm: float) -> bytes:
@@ -89,12 +103,6 @@ class PdoCodec:
         command[self._controlword_at] = controlword
         try:
             command[self._target_at] = round(counts) if self._whole_counts else counts
-            return self._receive.pack(*command)
-        except (struct.error, OverflowError) as error:
+            return self._receive.encode(command)
+        except (ValueError, OverflowError) as error:
             raise ValueError(f"torque {torque_nm} Nm does not fit the target torque object: {error}") from error
-
-
-def _object(device: DriveMap, name: PdoEntry):
-    entry = getattr(device.objects, name)
-    assert entry is not None  # held by the map's own check
-    return entry

@@ -44,17 +44,18 @@ class _Network(canopen.Network):
 
 
 class SdoBus:
-    """Raw uploads and downloads, one at a time on the bus."""
+    """Raw uploads and downloads, one at a time per node: a node that does not answer costs the others nothing."""
 
     def __init__(self, send: Callable[[int, bytes], bool], nodes: list[int]) -> None:
         self._network = _Network(send)
-        self._one_at_a_time = asyncio.Lock()
         self._clients: dict[int, SdoClient] = {}
+        self._one_at_a_time: dict[int, asyncio.Lock] = {}
         for node in nodes:
             client = _Client(_REQUEST + node, _RESPONSE + node, canopen.ObjectDictionary())
             client.network = self._network
             self._network.subscribe(_RESPONSE + node, client.on_response)
             self._clients[node] = client
+            self._one_at_a_time[node] = asyncio.Lock()
 
     def response_cob_ids(self) -> list[int]:
         return [_RESPONSE + node for node in self._clients]
@@ -77,10 +78,21 @@ class SdoBus:
         await self._run(node, index, sub, lambda client: client.download(index, sub, data))
 
     async def _run(self, node: int, index: int, sub: int, transfer: Callable[[SdoClient], bytes | None]) -> bytes:
-        async with self._one_at_a_time:
-            try:
-                return await asyncio.to_thread(transfer, self._clients[node]) or b""
-            except canopen.SdoAbortedError as error:
-                raise SdoFailed(f"object {index:04X}h sub {sub}: the device aborted: {error}") from error
-            except canopen.SdoCommunicationError as error:
-                raise SdoSilent(f"object {index:04X}h sub {sub}: {error}") from error
+        lock = self._one_at_a_time[node]
+        await lock.acquire()
+        work = asyncio.ensure_future(asyncio.to_thread(transfer, self._clients[node]))
+
+        def over(done: asyncio.Future[bytes | None]) -> None:
+            lock.release()
+            if not done.cancelled():
+                done.exception()  # whoever asked may have gone; that is no error of the loop's
+
+        # A transfer in its thread cannot be taken back. The next one on this node waits for its end, or would get its
+        # answer; whoever is cancelled does not.
+        work.add_done_callback(over)
+        try:
+            return await asyncio.shield(work) or b""
+        except canopen.SdoAbortedError as error:
+            raise SdoFailed(f"object {index:04X}h sub {sub}: the device aborted: {error}") from error
+        except canopen.SdoCommunicationError as error:
+            raise SdoSilent(f"object {index:04X}h sub {sub}: {error}") from error

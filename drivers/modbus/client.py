@@ -90,6 +90,11 @@ class ModbusConnection:
     def _connection(self) -> AsyncModbusTcpClient:
         if self._client is None or not self._client.connected:
             raise ModbusTimeout("not connected")
+        # pymodbus forgets what came unasked. After whole frames (an answer came twice) the stream is as it was;
+        # the rest of half a frame would be taken for the beginning of the next.
+        if not _whole_frames(self._client.ctx.recv_buffer):
+            self.close()
+            raise ModbusTimeout("connection dropped: half a frame came unasked")
         return self._client
 
     async def _answer(self, request: Awaitable[ModbusPDU], function: int, deadline_s: float) -> ModbusPDU:
@@ -106,6 +111,8 @@ class ModbusConnection:
             self.close()
             raise ModbusFailed(str(error)) from error
         self.answers += 1
+        if self._client is not None and answer.transaction_id != self._client.ctx.request_transaction_id:
+            raise ModbusFailed(f"answer to transaction {answer.transaction_id}")  # pymodbus takes a 0 for any
         if answer.isError():
             raise ModbusFailed(f"exception {answer.exception_code} to function {function}")
         if answer.function_code != function:
@@ -116,6 +123,18 @@ class ModbusConnection:
         """After half an answer the stream cannot be trusted any more; a merely late one is told by its number."""
         if self._client is not None and self._client.ctx.recv_buffer:
             self.close()
+
+
+def _whole_frames(data: bytes) -> bool:
+    """Whether `data` is any number of Modbus TCP frames, the last one complete."""
+    while data:
+        if len(data) < 8 or data[2:4] != b"\0\0":
+            return False
+        end = 6 + int.from_bytes(data[4:6], "big")
+        if not 8 <= end <= len(data):
+            return False
+        data = data[end:]
+    return True
 
 
 def _registers(answer: ModbusPDU, count: int) -> list[int]:

@@ -4,7 +4,17 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from drivers.map_fields import Bit, Format, Range, TensionUnit, TimeUnit, WebSpeedUnit, refuse_together
+from drivers.map_fields import (
+    Bit,
+    Format,
+    Range,
+    SpeedUnit,
+    TensionUnit,
+    TimeUnit,
+    TorqueUnit,
+    WebSpeedUnit,
+    refuse_together,
+)
 from drivers.map_rules import (
     UNSIGNED,
     base_problems,
@@ -15,9 +25,10 @@ from drivers.map_rules import (
     registers_of,
     type_problems,
 )
-from gateway.core.line import Positive, Strict
+from gateway.core.line import Name, Positive, Strict
 
 MAX_READ_REGISTERS = 125
+MAX_WRITE_REGISTERS = 121  #: of function 23; function 16 would take two more
 
 RegisterType = Literal["u16", "i16", "u32", "i32", "f32"]
 Address = Annotated[int, Field(ge=0, le=65536)]
@@ -29,7 +40,8 @@ class Register(Strict):
 
 
 class RegisterCheck(Register):
-    value: int  #: what a device of this type has there
+    value: int  #: what a device of this type has there, in the bits of `mask`
+    mask: Annotated[int, Field(ge=1)] | None = None  #: all bits where it is left out
 
 
 class StatusRegister(Register):
@@ -62,6 +74,7 @@ class ChannelTension(Strict):
 class ChannelStatus(Strict):
     offset: Annotated[int, Field(ge=0, le=MAX_READ_REGISTERS)]
     type: RegisterType = "u16"
+    mask: Annotated[int, Field(ge=1)] | None = None  #: the bits that count; all where it is left out
     ok: int
     texts: dict[str, str] = {}  #: what the other values mean; keys are the values
 
@@ -83,21 +96,25 @@ class ModbusMap(Strict):
     address_base: Annotated[int, Field(ge=0, le=1)]
     word_order: Literal["high-first", "low-first"]
     read_function: Annotated[int, Field(ge=3, le=4)]
-    device_id: RegisterCheck
+    function_23: bool = True  #: false: the device does not know it, and is written with 16 before it is read
+    #: Devices of one family may share a unit identifier; they are exchanged in one transaction then.
+    family: Name | None = None
 
 
 class LoadCellMap(ModbusMap):
     role: Literal["load-cell"]
-    channel_count: Register
-    status: StatusRegister
-    sample_counter: Register
+    device_id: RegisterCheck | None = None  #: without it another device at this address is not found out
+    channel_count: Register | None = None  #: without it a channel that the device lacks is found by its exception
+    status: StatusRegister | None = None
+    sample_counter: Register | None = None  #: without it the link cannot tell a frozen device from a steady web
     channels: Channels
 
     @model_validator(mode="after")
     def _layout(self) -> "LoadCellMap":
         fields: dict[str, tuple[int, str]] = {
-            name: (getattr(self, name).address, getattr(self, name).type)
+            name: (register.address, register.type)
             for name in ("device_id", "channel_count", "status", "sample_counter")
+            if (register := getattr(self, name)) is not None
         }
         channels = self.channels
         inside = {"channels.tension": (channels.tension.offset, channels.tension.type)}
@@ -110,7 +127,8 @@ class LoadCellMap(ModbusMap):
         end = channels.first + channels.stride * channels.count
         for name, (_, kind) in fields.items():
             problems += type_problems(name, kind, UNSIGNED)
-        problems += bit_problems("status.healthy", self.status.healthy.bit, self.status.type)
+        if self.status is not None:
+            problems += bit_problems("status.healthy", self.status.healthy.bit, self.status.type)
         if channels.status is not None:
             problems += type_problems("channels.status", channels.status.type, UNSIGNED)
         for name, (address, kind) in fields.items():
@@ -138,6 +156,7 @@ class PlcWrite(Strict):
 
 class PlcMap(ModbusMap):
     role: Literal["line-plc"]
+    device_id: RegisterCheck
     read: PlcRead
     write: PlcWrite
     watchdog: TimeRegister
@@ -149,10 +168,7 @@ class PlcMap(ModbusMap):
         fields |= {"watchdog": (self.watchdog.address, self.watchdog.type)}
         fields |= _register_fields("read", self.read) | written
         problems = overlap_problems(fields) + base_problems(fields, self.address_base)
-        first = min(address for address, _ in written.values())
-        last = max(address + registers_of(kind) for address, kind in written.values())
-        if last - first != sum(registers_of(kind) for _, kind in written.values()):
-            problems.append("write: the registers must lie side by side, they are written in one request")
+        problems += _side_by_side("write", written)
         if self.read_function != 3:
             problems.append(f"read_function: {self.read_function}; allowed: 3, the registers that function 23 reads")
         problems += _plc_type_problems(self)
@@ -177,3 +193,132 @@ def _plc_type_problems(device: PlcMap) -> list[str]:
 
 def _register_fields(key: str, table: Strict) -> dict[str, tuple[int, str]]:
     return {f"{key}.{name}": (field.address, field.type) for name, field in table if isinstance(field, Register)}
+
+
+class ReadTorque(Register):
+    unit: TorqueUnit
+    scale: Positive = 1.0
+
+
+class RollerSpeed(Register):
+    unit: SpeedUnit
+    scale: Positive = 1.0
+
+
+class FlagRegister(Register, Bit):
+    """One bit of a register."""
+
+
+class ErrorCode(Register):
+    texts: dict[str, str] = {}  #: what its values mean; keys are the values
+
+
+class MaxTorque(ReadTorque):
+    writable: bool  #: true: set to the line's limit; false: the drive's own, which must allow the line's limit
+
+
+class DriveRead(Strict):
+    statusword: Register
+    speed: RollerSpeed
+    torque: ReadTorque
+    safe_torque_off: FlagRegister | None = None
+    error_code: ErrorCode | None = None  #: of a fault
+
+
+class DriveWrite(Strict):
+    controlword: Register
+    target_torque: ReadTorque
+
+
+class Axes(Strict):
+    """Of a device with several: where each is, from the first, whose addresses the map gives."""
+
+    count: Annotated[int, Field(ge=1)]
+    read_stride: Annotated[int, Field(ge=1, le=MAX_READ_REGISTERS)]  #: registers of `read` from one axis to the next
+    write_stride: Annotated[int, Field(ge=1, le=MAX_WRITE_REGISTERS)]  #: the same of `write`
+
+
+class DriveMap(ModbusMap):
+    role: Literal["drive"]
+    device_id: RegisterCheck
+    follows_command: Bit | None = None  #: of the statusword: the target torque is followed, not ignored
+    read: DriveRead
+    write: DriveWrite
+    axes: Axes | None = None
+    axis_count: Register | None = None  #: how many axes the device has
+    rated_torque: ReadTorque | None = None  #: compared with the line's file when it is there
+    max_torque: MaxTorque
+    watchdog: TimeRegister
+
+    @model_validator(mode="after")
+    def _layout(self) -> "DriveMap":
+        read, write = _register_fields("read", self.read), _register_fields("write", self.write)
+        fields = {
+            name: (register.address, register.type)
+            for name in ("device_id", "axis_count", "rated_torque", "max_torque", "watchdog")
+            if (register := getattr(self, name)) is not None
+        }
+        everything = fields | read | write
+        problems = overlap_problems(_apart(everything)) + base_problems(everything, self.address_base)
+        problems += _side_by_side("write", write)
+        problems += _drive_type_problems(self) + _axes_problems(self, read, write)
+        problems += range_problems("watchdog", self.watchdog.range) + fit_problems("watchdog", *self.watchdog.written())
+        return refuse_together(self, problems)
+
+
+def _apart(fields: dict[str, tuple[int, str]]) -> dict[str, tuple[int, str]]:
+    """Without the flags: several may be bits of one register, and of the statusword."""
+    return {name: field for name, field in fields.items() if name != "read.safe_torque_off"}
+
+
+def _side_by_side(key: str, fields: dict[str, tuple[int, str]]) -> list[str]:
+    first = min(address for address, _ in fields.values())
+    last = max(address + registers_of(kind) for address, kind in fields.values())
+    if last - first == sum(registers_of(kind) for _, kind in fields.values()):
+        return []
+    return [f"{key}: the registers must lie side by side, they are written in one request"]
+
+
+def _drive_type_problems(device: DriveMap) -> list[str]:
+    read = device.read
+    problems = type_problems("read.statusword", read.statusword.type, ("u16",))
+    problems += type_problems("write.controlword", device.write.controlword.type, ("u16",))
+    problems += type_problems("write.target_torque", device.write.target_torque.type, ("i16", "i32", "f32"))
+    problems += type_problems("device_id", device.device_id.type, UNSIGNED)
+    if device.axis_count is not None:
+        problems += type_problems("axis_count", device.axis_count.type, UNSIGNED)
+    if (sto := read.safe_torque_off) is not None:
+        problems += type_problems("read.safe_torque_off", sto.type, UNSIGNED)
+        problems += bit_problems("read.safe_torque_off", sto.bit, sto.type)
+    if read.error_code is not None:
+        problems += type_problems("read.error_code", read.error_code.type, UNSIGNED)
+        problems += [
+            f"read.error_code.texts: {key!r} is no number" for key in read.error_code.texts if not _is_number(key)
+        ]
+    if device.follows_command is not None:
+        problems += bit_problems("follows_command", device.follows_command.bit, "u16")
+    rated = device.rated_torque
+    if rated is not None and rated.unit == "rated torque":
+        problems.append("rated_torque.unit: 'rated torque' of itself says nothing; allowed: Nm, mNm")
+    return problems
+
+
+def _is_number(text: str) -> bool:
+    try:
+        int(text, 0)
+    except ValueError:
+        return False
+    return True
+
+
+def _axes_problems(device: DriveMap, read: dict[str, tuple[int, str]], write: dict[str, tuple[int, str]]) -> list[str]:
+    axes = device.axes
+    if axes is None:
+        return []
+    problems: list[str] = []
+    for key, fields, stride in (("read", read, axes.read_stride), ("write", write, axes.write_stride)):
+        first = min(address for address, _ in fields.values())
+        extent = max(address + registers_of(kind) for address, kind in fields.values()) - first
+        if extent > stride:
+            problems.append(f"axes.{key}_stride: {stride}; `{key}` takes {extent} registers of an axis")
+    return problems

@@ -1,26 +1,30 @@
-"""What is read from a device on every connection before it is believed: that it is the one it was."""
+"""What is read from a unit on every connection before it is believed or written to: that it is the one it was."""
 
-from collections.abc import Callable
+from collections.abc import Sequence
 
 from drivers.modbus.client import ModbusConnection, ModbusFailed, ModbusTimeout
-from drivers.modbus.registers import RegisterBlock
-
-Judge = Callable[[float], list[str]]  #: what speaks against a number that was read
+from drivers.modbus.device import Check
 
 
 class Proof:
-    """Checks in their order. It keeps how far it came, so that a slow device gets there over several cycles."""
+    """Checks in their order; those of one register share a request.
 
-    def __init__(self, name: str, unit: int, function: int, checks: list[tuple[RegisterBlock, Judge]]) -> None:
+    It keeps how far it came, so that a slow device gets there over several cycles.
+    """
+
+    def __init__(self, name: str, unit: int, function: int, checks: Sequence[Check]) -> None:
         self._name = name
         self._unit = unit
         self._function = function
-        self._checks = checks
+        groups: dict[tuple[int, int], list[Check]] = {}
+        for check in checks:
+            groups.setdefault((check.register.address, check.register.count), []).append(check)
+        self.groups = list(groups.items())
         self._passed = 0
 
     @property
     def complete(self) -> bool:
-        return self._passed == len(self._checks)
+        return self._passed == len(self.groups)
 
     def void(self) -> None:
         """Nothing is proven any more: the connection was lost."""
@@ -28,21 +32,24 @@ class Proof:
 
     def confirm(self) -> None:
         """All of it is proven, in another way."""
-        self._passed = len(self._checks)
+        self._passed = len(self.groups)
 
     async def go_on(self, connection: ModbusConnection, deadline_s: float) -> list[str]:
-        """The checks that are left; what speaks against the device. Raises ModbusTimeout."""
+        """The checks that are left; what speaks against the unit. Raises ModbusTimeout."""
         while not self.complete:
-            at = self._passed
-            block, judge = self._checks[at]
-            try:
-                registers = await connection.read(self._function, self._unit, block.address, block.count, deadline_s)
-                reasons = judge(block.decode(registers)[0])
-            except ModbusTimeout:
-                raise
-            except (ModbusFailed, ValueError) as error:
-                return [f"{self._name}: unit {self._unit} at {connection.where}: {error}"]
-            if reasons:
+            at = self._passed  # `prepare` may prove, or void, all of it meanwhile
+            if reasons := await self.judge(at, connection, deadline_s):
                 return reasons
             self._passed = at + 1
         return []
+
+    async def judge(self, group: int, connection: ModbusConnection, deadline_s: float) -> list[str]:
+        """What speaks against the unit in one group of checks. Raises ModbusTimeout."""
+        (address, count), checks = self.groups[group]
+        try:
+            registers = await connection.read(self._function, self._unit, address, count, deadline_s)
+            return [reason for check in checks for reason in check.judge(check.register.decode(registers)[0])]
+        except ModbusTimeout:
+            raise
+        except (ModbusFailed, ValueError) as error:
+            return [f"{self._name}: unit {self._unit} at {connection.where}: {error}"]

@@ -36,6 +36,8 @@ class RegisterBlock:
         self._registers = struct.Struct(f">{self.count}H")
         self._swapped = swapped
         self._position = [order.index(k) for k in range(len(fields))]  #: of field k, in order of address
+        self._has_floats = any(kind == "f32" for _, kind in fields)  #: only they take what is not finite
+        self._in_address_order = self._position == list(range(len(fields)))
 
     def decode(self, registers: Sequence[int]) -> list[float]:
         """The numbers, in the order in which the fields were given. Raises ValueError for a wrong count."""
@@ -45,25 +47,30 @@ class RegisterBlock:
             numbers = self._fields.unpack(self._registers.pack(*self._in_order(registers)))
         except struct.error as error:
             raise ValueError(f"no registers: {error}") from error
-        return [numbers[position] for position in self._position]
+        return list(numbers) if self._in_address_order else [numbers[position] for position in self._position]
 
     def encode(self, numbers: Sequence[float]) -> list[int]:
         """The registers of numbers in the order of the fields.
 
         Raises ValueError for a number that is not finite or does not fit its type.
         """
-        if not all(isfinite(number) for number in numbers):
+        if self._has_floats and not all(isfinite(number) for number in numbers):
             raise ValueError(f"{list(numbers)}: not finite")
+        try:
+            packed = self._fields.pack(*(numbers if self._in_address_order else self._by_address(numbers)))
+        except (struct.error, OverflowError) as error:
+            raise ValueError(f"{list(numbers)}: {error}") from error
+        return list(self._in_order(self._registers.unpack(packed)))
+
+    def _by_address(self, numbers: Sequence[float]) -> list[float]:
         ordered: list[float] = [0.0] * len(numbers)
         for number, position in zip(numbers, self._position, strict=True):
             ordered[position] = number
-        try:
-            packed = self._fields.pack(*ordered)
-        except (struct.error, OverflowError) as error:
-            raise ValueError(f"{list(numbers)}: {error}") from error
-        return self._in_order(self._registers.unpack(packed))
+        return ordered
 
-    def _in_order(self, registers: Sequence[int]) -> list[int]:
+    def _in_order(self, registers: Sequence[int]) -> Sequence[int]:
+        if not self._swapped:
+            return registers
         words = list(registers)
         for at in self._swapped:
             words[at], words[at + 1] = words[at + 1], words[at]

@@ -12,7 +12,7 @@ import typer
 
 from drivers.device_map import MAPS, load_map, map_names
 from gateway.core.can_load import REFUSED_LOAD, bus_load
-from gateway.core.line import Bus, CanopenBus, Line
+from gateway.core.line import Bus, CanopenBus, Line, OpcUaBus
 from gateway.core.line_checks import Role
 from gateway.core.line_file import CheckedLine, check_line
 from gateway.core.line_problem import LineRefused, Problem, printable
@@ -74,7 +74,8 @@ def check(
 def known_maps() -> Mapping[str, Role]:
     """Protocol, role and family of every device type that the drivers have a map for."""
     maps = {name: load_map(MAPS / f"{name}.toml") for name in map_names()}
-    return {name: (device.protocol, device.role, getattr(device, "family", None) or "") for name, device in maps.items()}
+    families = {name: getattr(device, "family", None) or "" for name, device in maps.items()}
+    return {name: (device.protocol, device.role, families[name]) for name, device in maps.items()}
 
 
 def _read(file: Path, source: str) -> str:
@@ -131,15 +132,20 @@ def summary_of(line: Line) -> dict[str, Any]:
 
 def _bus_summary(line: Line, bus: Bus) -> dict[str, Any]:
     kinds = [_KINDS[str(path[0])] for path, device in devices(line) if device.bus == bus.name]
-    canopen = isinstance(bus, CanopenBus)
-    port = f":{bus.port}" if bus.port is not None else ""
     return {
         "name": bus.name,
         "protocol": bus.protocol,
-        "wire": f"{bus.interface} {bus.channel}{port}" if canopen else f"{bus.host}{port}",
+        "wire": _wire(bus),
         "devices": {kind: kinds.count(kind) for kind in dict.fromkeys(kinds)},
-        "load": round(bus_load(line, bus), 4) if canopen else None,
+        "load": round(bus_load(line, bus), 4) if isinstance(bus, CanopenBus) else None,
     }
+
+
+def _wire(bus: Bus) -> str:
+    if isinstance(bus, OpcUaBus):
+        return bus.endpoint
+    port = f":{bus.port}" if bus.port is not None else ""
+    return f"{bus.interface} {bus.channel}{port}" if isinstance(bus, CanopenBus) else f"{bus.host}{port}"
 
 
 def _recipe_summary(line: Line, index: int) -> dict[str, Any]:

@@ -5,6 +5,7 @@ A data frame with an 11-bit identifier and s bytes has at most 55 + 10 s bits, i
 Real-Time Systems 35, 2007, eq. 1).
 """
 
+from collections import Counter
 from math import ceil
 
 from gateway.core.line import CanopenBus, Line
@@ -14,7 +15,8 @@ REFUSED_LOAD = 0.8  #: above it, retransmissions after an error no longer fit in
 ODD_LOAD = 0.6
 _SYNC_BYTES, _HEARTBEAT_BYTES = 0, 1
 _DRIVE_BYTES = (5, 8)  #: RPDO: controlword, torque, mode; TPDO: statusword, speed, torque
-_OTHER_BYTES = (8, 8)  #: any other device, at most
+_OTHER_BYTES = (8, 8)  #: any other device, at most: what a PLC sends and gets, or what an amplifier sends
+_CHANNELS_PER_AMPLIFIER = 4  #: that two frames carry; each further four count as another device
 
 
 def frame_bits(data_bytes: int) -> int:
@@ -31,9 +33,10 @@ def can_load(drives: int, others: int, bitrate_bit_per_s: int, period_s: float) 
 
 
 def bus_devices(line: Line, bus: CanopenBus) -> tuple[int, int]:
-    """Drives, and other nodes, on `bus`."""
-    others = {device.address for device in [*line.load_cells, line.plc] if device.bus == bus.name}
-    return sum(drive.bus == bus.name for drive in line.drives), len(others)
+    """Drives, and other nodes, on `bus`; a load-cell amplifier with many channels counts for several."""
+    channels = Counter(cell.address for cell in line.load_cells if cell.bus == bus.name)
+    others = sum(ceil(count / _CHANNELS_PER_AMPLIFIER) for count in channels.values()) + (line.plc.bus == bus.name)
+    return sum(drive.bus == bus.name for drive in line.drives), others
 
 
 def bus_load(line: Line, bus: CanopenBus) -> float:

@@ -158,7 +158,20 @@ def _buses(buses: int) -> str:
         '# A CAN card is interface = "socketcan" with channel = "can0" and no port. Modbus TCP is mostly on port 502.\n'
         "# A CAN bus carries what fits into a period: check says how much of it that is.\n"
     )
-    return _tables("buses", "CanopenBus", canopen, real) + f"\n[[buses]]\n{_entries('ModbusTcpBus', modbus)}"
+    opcua = {
+        "name": '#"server"',
+        "protocol": '#"opcua"',
+        "endpoint": '#"opc.tcp://127.0.0.1:4840"',
+        "security": '#"none"',
+        "certificate": '#"/etc/r2rgate/pki/gateway.der"',
+        "private_key": '#"/etc/r2rgate/pki/gateway-key.pem"',
+        "server_certificate": '#"/etc/r2rgate/pki/server.der"',
+    }
+    return (
+        _tables("buses", "CanopenBus", canopen, real)
+        + f"\n[[buses]]\n{_entries('ModbusTcpBus', modbus)}"
+        + f"\n# [[buses]]\n{_entries('OpcUaBus', opcua)}"
+    )
 
 
 def _drives(spans: int, buses: int) -> str:

@@ -12,6 +12,8 @@ from gateway.loop import machine as machines
 from gateway.loop.cycle import Cycle
 from gateway.loop.machine import STANDSTILL_M_PER_S
 
+SILENT_PATIENCE_S = 0.25  #: without cyclic data (a silent CANopen link reads by SDO) samples are this old at most
+
 
 class Refused(Exception):
     """A command that is not carried out; nothing was changed."""
@@ -100,9 +102,9 @@ def not_ready(cycle: Cycle) -> list[str]:
 
 
 def _heard(cycle: Cycle, channel: Channel, index: int) -> bool:
-    """Whether a usable sample came within as many periods as a running line may miss."""
+    """Whether a usable sample came lately: within as many periods as a running line may miss, or SILENT_PATIENCE_S."""
     age_s = cycle.clock() - channel.time_s[index]  # NaN for one that was never heard
-    return bool(age_s < (cycle.limits.hold_periods + 1) * cycle.limits.period_s)
+    return bool(age_s < max((cycle.limits.hold_periods + 1) * cycle.limits.period_s, SILENT_PATIENCE_S))
 
 
 def _require_rest(cycle: Cycle) -> None:

@@ -29,6 +29,7 @@ def expire(connection: apsw.Connection, retention: Retention, wall_s: float) -> 
 
     Space is used again by what comes; what is more than that is given back to the disk.
     """
+    old: list[int] = []
     with connection:
         old = _oldest(connection, retention, wall_s)
         delete_blobs(connection, old)

@@ -249,8 +249,8 @@ def test_a_drive_without_heartbeats_is_not_fed_either() -> None:
         first.rpdos.clear()
         drives.drives[1].nmt.clear()
         node = link._nodes[0]  # noqa: SLF001
-        assert node.heard_s is not None
-        node.heard_s -= 10.0
+        assert node.station.heard_s is not None
+        node.station.heard_s -= 10.0
         write(link, DriveRequest.ENABLE, 10.0)
         await settle(drives)
         assert (first.nmt, first.rpdos) == ([0x80], [])

@@ -9,31 +9,9 @@ import pytest
 
 from drivers.modbus.link import ModbusLink
 from drivers.port import PrepareRefused
-from drivers.registry import build_links
-from gateway.core.signals import Inputs, Outputs, Quality
+from gateway.core.signals import Inputs, Quality
 from tests.protocol.driver_support import Registers, cycle, frame, line, until
-
-Body = Callable[[ModbusLink, Registers], Awaitable[None]]
-
-
-def bench(body: Body, n: int = 2, channels: int = 2) -> None:
-    async def run() -> None:
-        async with Registers(channels) as peer:
-            link = build_links(line(n, modbus_port=peer.port))[1]
-            assert isinstance(link, ModbusLink)
-            await link.open()
-            try:
-                await body(link, peer)
-            finally:
-                await link.close()
-
-    asyncio.run(run())
-
-
-def command(run: bool, speed_m_per_s: float, n: int = 2) -> Outputs:
-    outputs = Outputs(n)
-    outputs.run, outputs.speed_request_m_per_s = run, speed_m_per_s
-    return outputs
+from tests.protocol.modbus_support import bench, command, modbus_links, until_good
 
 
 def test_a_cycle_reads_si_in_one_request_a_device() -> None:
@@ -81,23 +59,56 @@ def test_the_command_is_written_with_a_life_counter_only_when_active() -> None:
         await link.prepare()
         assert peer.plc[14] == 100, "limits.watchdog_s in ms"
         peer.requests.clear()
-        link.write(command(True, -0.1))
+        await cycle(link, inputs)
+        assert {pdu[0] for _, pdu in peer.requests} == {3, 4}, "nothing is commanded yet"
+        peer.requests.clear()
         lives: list[int] = []
         for _ in range(3):
+            link.write(command(True, -0.1))
             await cycle(link, inputs)
             lives.append(peer.plc[13])
         assert lives == [1, 2, 3]
         assert peer.plc[10:13] == [1, 0xFFFE, 0x7960]  # run, -100 000 um/s
         written = [pdu for unit, pdu in peer.requests if unit == 2]
         assert written[0] == struct.pack(">BHHHHBHHHH", 23, 1, 4, 10, 4, 8, 1, 0xFFFE, 0x7960, 1)
+        link.write(command(True, 0.1))
         link.silence()
         peer.requests.clear()
         link.write(command(True, 0.1))
         await cycle(link, inputs)
         assert {pdu[0] for _, pdu in peer.requests} == {3, 4}
         await link.prepare()
+        peer.requests.clear()
         await cycle(link, inputs)
-        assert peer.plc[10:13] == [0, 0, 0], "nothing of an old command is left"
+        assert {pdu[0] for _, pdu in peer.requests} == {3, 4}, "nothing of an old command is left"
+
+    bench(body)
+
+
+def test_a_command_is_sent_with_the_next_cycle_or_never() -> None:
+    async def body(link: ModbusLink, peer: Registers) -> None:
+        inputs = Inputs(2)
+        await link.prepare()
+        link.write(command(True, 0.1))
+        await cycle(link, inputs)
+        peer.requests.clear()
+        await cycle(link, inputs)
+        assert 23 not in {pdu[0] for _, pdu in peer.requests}, "a loop that hangs does not go on commanding"
+
+        async def mute(head: bytes, unit: int, pdu: bytes) -> list[bytes] | None:
+            return []
+
+        peer.script = mute
+        link.write(command(True, 0.2))
+        await cycle(link, inputs, 0.0)
+        link.write(command(True, 0.3))
+        now_s = asyncio.get_running_loop().time()
+        link.trigger(now_s)  # the one before is still running
+        await link.collect(inputs, now_s)
+        peer.script = None
+        await until_good(link, inputs)
+        written = [struct.unpack(">i", pdu[12:16])[0] for _, pdu in peer.requests if pdu[0] == 23]
+        assert written == [200_000], "what could not be sent in its cycle is old"
 
     bench(body)
 
@@ -195,18 +206,10 @@ def test_an_answer_that_does_not_fit_is_a_lost_sample(script: Callable[..., Awai
         assert sorted(link.health.absent) == ["cell-1, cell-2", "plc"]
         # The device recovers: so does the link, on a new connection where the old one could not be trusted.
         peer.script = None
-        await _until_good(link, inputs)
+        await until_good(link, inputs)
         assert inputs.tension.value[0] == 99.0
 
     bench(body)
-
-
-async def _until_good(link: ModbusLink, inputs: Inputs) -> None:
-    inputs.tension.quality[:] = inputs.unwind_speed.quality[:] = Quality.STALE
-    async with asyncio.timeout(5.0):
-        while not (inputs.tension.good() and inputs.unwind_speed.good()):
-            await cycle(link, inputs, 0.01)
-            await asyncio.sleep(0)  # without a connection a cycle waits for nothing
 
 
 def test_after_half_an_answer_the_connection_is_made_anew() -> None:
@@ -217,7 +220,7 @@ def test_after_half_an_answer_the_connection_is_made_anew() -> None:
 
         async def halves(head: bytes, unit: int, pdu: bytes) -> list[bytes]:
             answer = frame(head, unit, peer.answer(unit, pdu))
-            if peer.connections > 1:
+            if unit == 2 or peer.connections > 2:
                 return [answer]
             before, held[:] = b"".join(held), [answer[20:]]
             return [before + answer[:20]]
@@ -226,9 +229,9 @@ def test_after_half_an_answer_the_connection_is_made_anew() -> None:
         peer.tension(1, 3.0)
         await cycle(link, inputs)
         assert list(inputs.tension.quality) == [Quality.STALE] * 2
-        await _until_good(link, inputs)
+        await until_good(link, inputs)
         assert inputs.tension.value[0] == 3.0
-        assert peer.connections == 2, "at once, not after some more lost samples"
+        assert peer.connections == 3, "at once, not after some more lost samples; the PLC keeps its own"
 
     bench(body)
 
@@ -237,13 +240,12 @@ def test_a_late_answer_never_passes_for_a_fresh_one() -> None:
     async def body(link: ModbusLink, peer: Registers) -> None:
         inputs = Inputs(2)
         release = asyncio.Event()
-        asked = asyncio.Event()
+        asked: list[int] = []
 
         async def late(head: bytes, unit: int, pdu: bytes) -> list[bytes]:
             answer = frame(head, unit, peer.answer(unit, pdu))
-            asked.set()
+            asked.append(unit)
             await release.wait()
-            peer.script = None
             return [answer]
 
         peer.tension(1, 1.0)
@@ -253,18 +255,19 @@ def test_a_late_answer_never_passes_for_a_fresh_one() -> None:
         loop = asyncio.get_running_loop()
         now_s = loop.time()
         link.trigger(now_s + 10.0)  # the exchange may last; the cycle does not wait for it
-        await asked.wait()
+        await until(lambda: len(asked) == 2)
         await link.collect(inputs, loop.time())
         assert list(inputs.tension.quality) == [Quality.STALE] * 2
         count = len(peer.requests)
         link.trigger(now_s + 10.01)  # still running: not doubled
+        peer.script = None
         release.set()
         await link.collect(inputs, loop.time() + 0.05)
         assert list(inputs.tension.quality) == [Quality.STALE] * 2 and inputs.tension.value[0] == 1.0
         await until(lambda: link.health.malformed == 2)  # both devices answered after their cycle
-        assert len(peer.requests) == count + 1, "the PLC's request of the first cycle, no other"
+        assert len(peer.requests) == count, "none is doubled"
         assert link.health.timeouts == 4
-        await _until_good(link, inputs)
+        await until_good(link, inputs)
         assert inputs.tension.value[0] == 2.0
 
     bench(body)
@@ -342,7 +345,7 @@ def test_a_tripped_plc_watchdog_and_an_impossible_speed_are_named() -> None:
     bench(body)
 
 
-def test_a_dead_unit_costs_the_other_one_cycle() -> None:
+def test_a_dead_unit_costs_the_other_nothing() -> None:
     async def body(link: ModbusLink, peer: Registers) -> None:
         inputs = Inputs(2)
         await cycle(link, inputs)
@@ -351,16 +354,16 @@ def test_a_dead_unit_costs_the_other_one_cycle() -> None:
             return [] if unit == 1 else None
 
         peer.script = amplifier_is_dead
-        await cycle(link, inputs)
+        before = link.health.timeouts
         for _ in range(3):
             await cycle(link, inputs)
-            assert inputs.plc.quality == Quality.GOOD
+            assert inputs.plc.quality == Quality.GOOD, "from the first cycle on"
             assert list(inputs.tension.quality) == [Quality.STALE] * 2
-        assert link.health.absent == ["cell-1, cell-2"]
-        await asyncio.sleep(0.1)  # a period: its last request is given up
+        assert link.health.absent == ["cell-1, cell-2"] and link.health.timeouts == before + 3
         async with asyncio.timeout(5.0):
-            await cycle(link, inputs, 60.0)  # an absent unit is asked, and not waited for
-        assert inputs.plc.quality == Quality.GOOD
+            for _ in range(10):
+                await cycle(link, inputs, 60.0)  # an absent unit is asked, and not waited for
+                assert inputs.plc.quality == Quality.GOOD
 
     bench(body)
 
@@ -382,8 +385,8 @@ def test_reconnects_by_itself_and_costs_no_time() -> None:
             assert loop.time() - begin_s < 1.0, "nothing is waited for on a lost connection"
         assert inputs.plc.quality == Quality.STALE and len(link.health.absent) == 2
         await peer.start()
-        await _until_good(link, inputs)
-        assert link.health.reconnects == 1 and link.health.absent == []
+        await until_good(link, inputs)
+        assert link.health.reconnects == 2 and link.health.absent == [], "one a unit"
 
     bench(body)
 
@@ -410,13 +413,14 @@ def test_a_peer_that_stops_and_goes_on_does_not_find_a_heap_of_requests() -> Non
             await asyncio.sleep(0.01)
         assert len(link.health.absent) == 2
         waiting = peer.connections - before  # each got one request, and waited alone for its answer
-        assert 1 <= waiting <= 6
-        await until(lambda: len(peer.requests) >= 1 + waiting)
+        assert 2 <= waiting <= 12, "six a unit"
+        await until(lambda: len(peer.requests) >= 2 + waiting)
         goes_on.set()
         await settle(peer)
         written = [pdu for _, pdu in peer.requests if pdu[0] == 23]
-        assert len(written) <= 3 and len(peer.requests) <= 3 + waiting, "0.3 s of requests, one a connection later"
-        await _until_good(link, inputs)
+        assert len(written) <= 3, "0.3 s of requests, then one a connection, which proves before it writes"
+        assert len(peer.requests) <= 6 + 2 * waiting
+        await until_good(link, inputs)
 
     bench(body)
 
@@ -468,7 +472,7 @@ def test_a_slow_device_is_proven_over_several_cycles() -> None:
 
         peer.script = slow
         await peer.start()
-        await _until_good(link, inputs)
+        await until_good(link, inputs)
 
     bench(body)
 
@@ -484,19 +488,23 @@ def test_a_plc_that_lost_its_watchdog_is_not_written_to_again() -> None:
             await cycle(link, inputs, 0.02)
             peer.plc[14] = watchdog_ms  # 0: it was restarted, its settings are the defaults
             await peer.start()
-            await _until_good(link, inputs)
-            # The watchdog is read, alone, before anything is written.
+            await until_good(link, inputs)
+            # Device and watchdog are read, alone, before anything is written.
             await until(lambda: (2, struct.pack(">BHH", 3, 14, 1)) in peer.requests)
             await cycle(link, inputs)
             peer.requests.clear()
+            link.write(command(True, 0.1))
             await cycle(link, inputs)
             functions = {pdu[0] for unit, pdu in peer.requests if unit == 2}
             assert functions == ({23} if written else {3})
             peer.requests.clear()
         assert "watchdog" in link.health.last_error
+        assert inputs.plc.quality == Quality.STALE and inputs.unwind_speed.good()
         await link.prepare()
+        link.write(command(True, 0.1))
         await cycle(link, inputs)
         assert peer.plc[14] == 100 and peer.requests[-1][1][0] == 23
+        assert inputs.plc.quality == Quality.GOOD
 
     bench(body)
 
@@ -505,15 +513,14 @@ def test_open_says_what_to_do_and_the_link_goes_on_trying() -> None:
     async def run() -> None:
         async with Registers() as peer:
             await peer.stop()
-            link = build_links(line(modbus_port=peer.port))[1]
+            (link,) = modbus_links(line(modbus_port=peer.port))
             with pytest.raises(OSError, match="check host and port"):
                 await link.open()
             with pytest.raises(PrepareRefused, match="no connection"):
                 await link.prepare()
             await peer.start()
             inputs = Inputs(2)
-            assert isinstance(link, ModbusLink)
-            await _until_good(link, inputs)
+            await until_good(link, inputs)
             await link.close()
             await link.close()
 
@@ -523,7 +530,7 @@ def test_open_says_what_to_do_and_the_link_goes_on_trying() -> None:
 def test_two_addresses_are_two_links() -> None:
     async def run() -> None:
         async with Registers() as amplifier, Registers() as plc:
-            links = build_links(line(modbus_port=amplifier.port, plc_port=plc.port))[1:]
+            links = modbus_links(line(modbus_port=amplifier.port, plc_port=plc.port))
             inputs = Inputs(2)
             for link in links:
                 await link.open()

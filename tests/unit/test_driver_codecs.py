@@ -25,8 +25,8 @@ def with_speed(unit: str, scale: float) -> DriveMap:
 
 def test_mapping_is_index_sub_and_bits() -> None:
     assert isinstance(CIA402, DriveMap)
-    assert mapping_entries(CIA402, CIA402.receive_pdo) == [0x60400010, 0x60710010, 0x60600008]
-    assert mapping_entries(CIA402, CIA402.transmit_pdo) == [0x60410010, 0x606C0020, 0x60770010]
+    assert mapping_entries(CIA402.objects_of(CIA402.receive_pdo)) == [0x60400010, 0x60710010, 0x60600008]
+    assert mapping_entries(CIA402.objects_of(CIA402.transmit_pdo)) == [0x60410010, 0x606C0020, 0x60770010]
 
 
 def test_transmit_pdo_by_hand() -> None:

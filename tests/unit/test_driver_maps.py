@@ -2,6 +2,7 @@
 
 import shutil
 from collections.abc import Callable
+from itertools import product
 from pathlib import Path
 from typing import get_args
 
@@ -18,10 +19,20 @@ from gateway.core.units import SI_PER_UNIT
 from tests.protocol.driver_support import line
 
 
-def test_the_shipped_maps_load() -> None:
-    assert map_names() == ["cia402-torque", "line-plc", "loadcell-amp"]
-    kinds = {name: type(load_map(MAPS / f"{name}.toml")) for name in map_names()}
-    assert kinds == {"cia402-torque": DriveMap, "line-plc": PlcMap, "loadcell-amp": LoadCellMap}
+def test_the_shipped_maps_load_and_each_is_for_a_role_on_its_wire() -> None:
+    loaded = {name: load_map(MAPS / f"{name}.toml") for name in map_names()}
+    assert {"cia402-torque": DriveMap, "line-plc": PlcMap, "loadcell-amp": LoadCellMap}.items() <= {
+        name: type(device) for name, device in loaded.items()
+    }.items()
+    kinds = {(device.protocol, device.role) for device in loaded.values()}
+    assert kinds == set(product(("canopen", "modbus-tcp", "opcua"), ("drive", "load-cell", "line-plc")))
+
+
+def test_what_was_never_tried_on_hardware_says_so() -> None:
+    ours = {"cia402-torque", "line-plc", "line-plc-can", "loadcell-amp"}
+    for name in map_names():
+        if name not in ours and not name.startswith("r2r-"):
+            assert "not tried on hardware" in (MAPS / f"{name}.toml").read_text(encoding="utf-8").lower(), name
 
 
 def test_units_go_by_the_names_of_the_vocabulary() -> None:
@@ -154,7 +165,7 @@ def test_unknown_and_unfitting_maps_are_refused_together() -> None:
 def test_a_watchdog_that_a_drive_cannot_do_is_refused() -> None:
     good = line()
     reasons = reasons_for(changed(limits=good.limits.model_copy(update={"watchdog_s": 0.005})))
-    assert len(reasons) == 2 and "10 to 200 ms" in reasons[0]
+    assert len(reasons) == 3 and "10 to 200 ms" in reasons[0] and "10 to 1000 ms" in reasons[2]
 
 
 def test_a_new_drive_is_a_map(tmp_path: Path) -> None:

@@ -5,8 +5,8 @@ import struct
 import pytest
 
 from drivers.canopen.configure import DriveSettings
+from drivers.canopen.drive import DriveNode
 from drivers.canopen.maps import DriveMap
-from drivers.canopen.node import DriveNode
 from drivers.device_map import MAPS, load_map
 from drivers.map_fields import Bit
 from gateway.core.signals import DriveRequest, DriveState
@@ -18,14 +18,14 @@ ENABLED, SWITCH_ON_DISABLED = 0x1237, 0x0250
 
 def node(device: DriveMap = CIA402) -> DriveNode:
     drive = DriveNode("drive-1", 0, device, DriveSettings(1, 80.0, 60.0, 0.1), radius_m=0.04)
-    drive.on_heartbeat(b"\x05", 0.0)
+    drive.station.on_heartbeat(b"\x05", 0.0)
     return drive
 
 
 def answer(drive: DriveNode, statusword: int) -> DriveState:
     drive.begin_sync()
-    drive.on_answer(struct.pack("<Hih", statusword, 0, 0))
-    drive.end_sync()
+    drive.on_answer(0x181, struct.pack("<Hih", statusword, 0, 0))
+    drive.station.end_sync()
     return drive.state(0.0)
 
 
@@ -33,7 +33,7 @@ def test_a_drive_that_ignores_its_target_is_not_enabled() -> None:
     drive = node()
     assert answer(drive, ENABLED) == DriveState.ENABLED
     assert answer(drive, ENABLED & ~(1 << 12)) == DriveState.READY
-    assert drive.command(DriveRequest.ENABLE, 8.0, drive.state(0.0))[:4] == struct.pack("<Hh", 0x0F, 0)
+    assert drive.payload(DriveRequest.ENABLE, 8.0, drive.state(0.0))[:4] == struct.pack("<Hh", 0x0F, 0)
     without = CIA402.model_copy(update={"follows_command": None})
     assert answer(node(without), ENABLED & ~(1 << 12)) == DriveState.ENABLED
     inverted = CIA402.model_copy(update={"follows_command": Bit(bit=12, inverted=True)})
@@ -49,7 +49,7 @@ def test_safe_torque_off_in_the_pdo() -> None:
     drive = node(CIA402.model_copy(update={"transmit_pdo": transmit, "objects": objects}))
     for inputs, state in ((1 << 16, DriveState.STO), (0, DriveState.OFF)):
         drive.begin_sync()
-        drive.on_answer(struct.pack("<HIhh", SWITCH_ON_DISABLED, inputs, 0, 0))
+        drive.on_answer(0x181, struct.pack("<HIhh", SWITCH_ON_DISABLED, inputs, 0, 0))
         assert drive.state(0.0) == state
 
 
@@ -58,7 +58,7 @@ def test_heartbeats_end_at_one_and_a_half_producer_times() -> None:
     answer(drive, ENABLED)
     assert drive.state(0.15) == DriveState.ENABLED
     assert drive.state(0.1501) == DriveState.ABSENT
-    drive.on_heartbeat(b"\x85", 0.2)  # bit 7 is no part of the state
+    drive.station.on_heartbeat(b"\x85", 0.2)  # bit 7 is no part of the state
     assert drive.state(0.3) == DriveState.ENABLED
 
 
@@ -67,7 +67,7 @@ def test_a_drive_without_torque_may_be_late_with_its_heartbeat() -> None:
     answer(drive, SWITCH_ON_DISABLED)
     assert drive.state(0.3) == DriveState.OFF
     assert drive.state(0.3001) == DriveState.ABSENT
-    drive.command(DriveRequest.ENABLE, 0.0, DriveState.OFF)
+    drive.payload(DriveRequest.ENABLE, 0.0, DriveState.OFF)
     assert drive.state(0.1501) == DriveState.ABSENT
 
 
@@ -79,10 +79,10 @@ def test_never_heard_is_absent() -> None:
 def test_an_emergency_ends_with_its_reset() -> None:
     drive = node()
     answer(drive, ENABLED)
-    drive.on_emergency(bytes.fromhex("5082 11 0000000000"))
+    drive.station.on_emergency(bytes.fromhex("5082 11 0000000000"))
     assert drive.state(0.0) == DriveState.FAULT and "8250h" in drive.trouble(0.0)
-    assert drive.command(DriveRequest.ENABLE, 8.0, DriveState.FAULT)[:4] == bytes(4)
-    drive.on_emergency(bytes(8))
+    assert drive.payload(DriveRequest.ENABLE, 8.0, DriveState.FAULT)[:4] == bytes(4)
+    drive.station.on_emergency(bytes(8))
     assert drive.state(0.0) == DriveState.ENABLED
 
 
@@ -90,13 +90,13 @@ def test_an_emergency_ends_with_its_reset() -> None:
 def test_wrong_lengths_are_refused(size: int) -> None:
     drive = node()
     with pytest.raises(ValueError, match="EMCY"):
-        drive.on_emergency(bytes(size))
+        drive.station.on_emergency(bytes(size))
     with pytest.raises(ValueError, match="heartbeat"):
-        drive.on_heartbeat(bytes(size), 0.0)
-    assert drive.emergency == drive.distrust == ""
+        drive.station.on_heartbeat(bytes(size), 0.0)
+    assert drive.station.emergency == drive.station.distrust == ""
 
 
 def test_before_the_first_answer_no_word_enables() -> None:
     drive = node()
     for request in DriveRequest:
-        assert drive.command(request, 8.0, DriveState.ENABLED)[:2] == bytes(2)
+        assert drive.payload(request, 8.0, DriveState.ENABLED)[:2] == bytes(2)

@@ -1,6 +1,7 @@
 """`init` and `check` as a person in a terminal meets them."""
 
 import json
+from itertools import product
 from pathlib import Path
 
 import pytest
@@ -132,4 +133,5 @@ def test_help_has_an_example(command: str) -> None:
 
 def test_every_shipped_map_has_a_role_that_the_line_knows() -> None:
     assert set(known_maps()) >= {"cia402-torque", "loadcell-amp", "line-plc"}
-    assert set(known_maps().values()) <= {("canopen", "drive"), ("modbus-tcp", "load-cell"), ("modbus-tcp", "line-plc")}
+    protocols, roles = ("canopen", "modbus-tcp", "opcua"), ("drive", "load-cell", "line-plc")
+    assert {(protocol, role) for protocol, role, _ in known_maps().values()} <= set(product(protocols, roles))

@@ -156,7 +156,7 @@ VALUES = [
         'protocol = "canopen"',
         'protocol = "profinet"',
         "buses[1].protocol",
-        '= "profinet": is none of the choices; allowed: "canopen", "modbus-tcp"',
+        '= "profinet": is none of the choices; allowed: "canopen", "modbus-tcp", "opcua"',
     ),
     ('protocol = "canopen"', 'protocol = "CANopn"', "buses[1].protocol", 'did you mean "canopen"?'),
     ("address = 1", "address = 0", "drives[1].address", "= 0: is too small; allowed: a whole number from 1 to 247"),
@@ -196,7 +196,7 @@ def test_a_wrong_value_is_named_in_plain_words(old: str, new: str, key: str, sai
     [
         ("torque_nm = 60.0  ", "limits.torque_nm", "[limits]", "a number above 0 Nm"),
         ("address = 3\n", "drives[3].address", "[[drives]]", "a whole number from 1 to 247"),
-        ('protocol = "modbus-tcp"', "buses[2].protocol", "[[buses]]", '"canopen", "modbus-tcp"'),
+        ('protocol = "modbus-tcp"', "buses[2].protocol", "[[buses]]", '"canopen", "modbus-tcp", "opcua"'),
         ("value = 0.95, ", "rollers[1].inertia_kg_m2.value", "inertia_kg_m2", "a number above 0 kg m2"),
         ('site = "demo"', "site", "", "lower-case letters"),
     ],

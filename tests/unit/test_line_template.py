@@ -14,9 +14,9 @@ from gateway.core.line_template import line_template
 
 DOCS = Path(__file__).parents[2] / "docs"
 MAPS = {
-    "cia402-torque": ("canopen", "drive"),
-    "loadcell-amp": ("modbus-tcp", "load-cell"),
-    "line-plc": ("modbus-tcp", "line-plc"),
+    "cia402-torque": ("canopen", "drive", ""),
+    "loadcell-amp": ("modbus-tcp", "load-cell", ""),
+    "line-plc": ("modbus-tcp", "line-plc", ""),
 }
 
 

@@ -1,0 +1,184 @@
+"""A drive as a node of the bus: what the gateway knows of it and commands it."""
+
+from drivers.canopen.configure import DriveSettings, drive_expected, drive_steps
+from drivers.canopen.maps import DriveMap
+from drivers.canopen.pdo import DriveSample, MalformedPdo, PdoCodec
+from drivers.canopen.sdo import SdoBus
+from drivers.canopen.station import Station
+from drivers.canopen.transaction import Step, differences, place, read_number
+from drivers.cia402 import DISABLE_VOLTAGE, PowerState, drive_state, power_state
+from drivers.power_stage import PowerStage
+from drivers.scaling import torque_per_count
+from gateway.core.signals import DriveState, Inputs, Outputs
+
+STO_POLL_S = 0.2  #: how often a drive that may not switch on is asked whether safe torque off is why
+ORDERS_IGNORED = 5  #: in a row; an order acts with the next SYNC, and shows in the answer to the one after it
+_RATED_TORQUE_TOLERANCE = 1e-3  #: of the line's figure; more would scale every torque wrongly
+_WITH_TORQUE = (DriveState.ENABLED, DriveState.STOPPING)
+
+
+class DriveNode:
+    """`index` is its roller - 1. A drive with a distrusted station is told to take torque off, whatever is asked."""
+
+    def __init__(self, name: str, index: int, device: DriveMap, settings: DriveSettings, radius_m: float) -> None:
+        self.station = Station(name, settings.node, device.heartbeat, watchdog=device.watchdog)
+        self.index = index
+        self.identity = device.identity
+        self.device = device
+        self.settings = settings
+        self.codec = PdoCodec(device, settings.rated_torque_nm, radius_m)
+        self.sample: DriveSample | None = None  #: the answer to the present SYNC
+        self.stage = PowerStage(device.follows_command)
+        self.answers = (device.transmit_pdo.cob_id + settings.node,)
+        self._receive_cob_id = device.receive_pdo.cob_id + settings.node
+        self._disobeyed = 0  #: orders in a row to take torque off, while it says that it has some
+        self._sto_asked_s = float("-inf")
+        self._ask_for_sto = (
+            device.objects.safe_torque_off is not None and "safe_torque_off" not in device.transmit_pdo.objects
+        )
+
+    # the cycle
+
+    def begin_sync(self) -> None:
+        self.sample = None
+        self.station.begin_sync()
+
+    def on_answer(self, cob_id: int, data: bytes | bytearray) -> None:
+        """The TPDO of the present SYNC. Raises MalformedPdo for a second one or a wrong length."""
+        if self.sample is not None:
+            raise MalformedPdo("a second answer to one SYNC")
+        sample = self.codec.decode(data)
+        self.sample = sample
+        self.station.on_frame()
+        self.stage.on_statusword(sample.statusword, sample.safe_torque_off)
+        if self.stage.fault_was_reset:
+            self.station.emergency = ""
+
+    def check_answer(self, cob_id: int, data: bytes | bytearray) -> None:
+        """Raises MalformedPdo."""
+        self.codec.decode(data)
+
+    def absent(self, now_s: float) -> bool:
+        return self.station.absent(now_s, self.stage.gives_torque)
+
+    def trouble(self, now_s: float) -> str:
+        return self.station.trouble(now_s, self.stage.gives_torque)
+
+    def state(self, now_s: float) -> DriveState:
+        if self.absent(now_s):
+            return DriveState.ABSENT
+        if self.station.distrust or self.station.emergency:
+            return DriveState.FAULT
+        return self.stage.state
+
+    def fill(self, inputs: Inputs, now_s: float, *, active: bool) -> list[str]:
+        """State, speed and torque."""
+        inputs.drive_state[self.index] = self.state(now_s)
+        sample = self.sample
+        if sample is not None:
+            inputs.speed.put(self.index, sample.speed_m_per_s, now_s)
+            inputs.torque.put(self.index, sample.torque_nm, now_s)
+        else:
+            inputs.speed.miss(self.index)
+            inputs.torque.miss(self.index)
+        return []
+
+    def command(self, outputs: Outputs, now_s: float) -> tuple[int, bytes]:
+        """Its RPDO. Raises ValueError when the torque cannot be commanded."""
+        request, torque_nm = int(outputs.drive_request[self.index]), float(outputs.torque_nm[self.index])
+        return self._receive_cob_id, self.payload(request, torque_nm, self.state(now_s))
+
+    def payload(self, request: int, torque_nm: float, state: DriveState) -> bytes:
+        """The RPDO towards `request`. A drive that is not trusted is told to take torque off.
+
+        Raises ValueError when the torque cannot be commanded; nothing may be sent then.
+        """
+        word, given_nm = self.stage.command(request, torque_nm, state, trusted=not self.station.distrust)
+        self._watch_obedience(word)
+        # Encoded also where it is not given: what cannot be commanded says that something is wrong.
+        self.codec.encode(word, torque_nm)
+        return self.codec.encode(word, given_nm)
+
+    def _watch_obedience(self, word: int) -> None:
+        """A drive that gets no RPDOs any more is stopped by its watchdog, unless that listens to our heartbeat."""
+        disobeys = word == DISABLE_VOLTAGE and self.stage.power is PowerState.OPERATION_ENABLED
+        self._disobeyed = self._disobeyed + 1 if disobeys else 0
+        if self.station.listens_to is not None and self._disobeyed > ORDERS_IGNORED and not self.station.distrust:
+            self.station.distrust = f"was told {self._disobeyed} times to take torque off and has not, arm again"
+
+    # by SDO
+
+    def reading_due(self, now_s: float, *, active: bool) -> bool:
+        blocked = self.stage.power is PowerState.SWITCH_ON_DISABLED
+        return active and blocked and self._ask_for_sto and now_s - self._sto_asked_s >= STO_POLL_S
+
+    async def read(self, sdo: SdoBus, now_s: float) -> list[str]:
+        """Whether safe torque off is why it may not switch on. Raises SdoFailed."""
+        self._sto_asked_s = now_s
+        self.stage.safe_torque_off = await self._read_safe_torque_off(sdo)
+        return []
+
+    async def confirm_stopped(self, sdo: SdoBus) -> bool:
+        """Disable voltage by SDO, which needs no SYNC, and its statusword as the receipt. Raises SdoFailed."""
+        controlword, statusword = self.device.objects.controlword, self.device.objects.statusword
+        word = DISABLE_VOLTAGE.to_bytes(2, "little")
+        await sdo.download(self.station.node, controlword.index, controlword.sub, word)
+        found = int(await read_number(sdo, self.station.node, statusword))
+        return (
+            drive_state(power_state(found)) not in _WITH_TORQUE and power_state(found) is not PowerState.FAULT_REACTION
+        )
+
+    async def check(self, sdo: SdoBus) -> list[str]:
+        """Off, and what its map and the line say of it. Raises SdoFailed."""
+        objects = self.device.objects
+        statusword = int(await read_number(sdo, self.station.node, objects.statusword))
+        reasons: list[str] = []
+        if drive_state(power_state(statusword)) in _WITH_TORQUE:
+            reasons.append(f"is still enabled (statusword {statusword:04X}h); take its torque off first")
+        reasons += await self._check_rated_torque(sdo) + await self._check_max_torque(sdo)
+        reasons += await differences(sdo, self.station.node, drive_expected(self.device, self.station.node))
+        self.stage.safe_torque_off = await self._read_safe_torque_off(sdo)
+        return reasons
+
+    def steps(self) -> list[Step]:
+        return drive_steps(self.device, self.settings)
+
+    def release_steps(self) -> list[Step]:
+        """A drive that waits for our heartbeat would go to fault."""
+        watchdog = self.device.watchdog
+        return [Step(watchdog.index, watchdog.sub, watchdog.type, 0)] if self.station.listens_to else []
+
+    async def _read_safe_torque_off(self, sdo: SdoBus) -> bool:
+        """Whether it says that safe torque off is active; False where its map knows no such object."""
+        entry = self.device.objects.safe_torque_off
+        return entry is not None and entry.is_set(int(await read_number(sdo, self.station.node, entry)))
+
+    async def _check_rated_torque(self, sdo: SdoBus) -> list[str]:
+        entry = self.device.objects.rated_torque
+        if entry is None:
+            return []
+        wanted_nm = self.settings.rated_torque_nm
+        found_nm = await read_number(sdo, self.station.node, entry) * torque_per_count(
+            entry.unit, entry.scale, wanted_nm
+        )
+        if abs(found_nm - wanted_nm) <= _RATED_TORQUE_TOLERANCE * wanted_nm:
+            return []
+        return [f"has a rated torque of {found_nm:g} Nm, the line says {wanted_nm:g} Nm; correct rated_torque_nm"]
+
+    async def _check_max_torque(self, sdo: SdoBus) -> list[str]:
+        entry, settings = self.device.objects.max_torque, self.settings
+        if entry is None or entry.writable:
+            return []
+        nm_per_count = torque_per_count(entry.unit, entry.scale, settings.rated_torque_nm)
+        found_nm = await read_number(sdo, self.station.node, entry) * nm_per_count
+        if found_nm + nm_per_count >= settings.torque_limit_nm:
+            return []
+        limit_nm = settings.torque_limit_nm
+        at = place(entry.index, entry.sub)
+        return [f"gives at most {found_nm:g} Nm ({at}), limits.torque_nm is {limit_nm:g}; lower the limit"]
+
+    def forget(self) -> None:
+        self.station.forget()
+        self.sample = None
+        self._disobeyed = 0
+        self.stage.forget()

@@ -1,0 +1,127 @@
+"""What every node on the bus has, whatever it does: NMT state, heartbeat, emergency, answers to SYNC. No I/O."""
+
+import struct
+
+from canopen.emcy import EmcyError
+
+from drivers.canopen.map_parts import HeartbeatObject, Watchdog
+from drivers.scaling import si_per_count
+
+HEARTBEATS_ALLOWED = 1.5  #: producer times without a heartbeat until a node that the line depends on counts as lost
+HEARTBEATS_ALLOWED_AT_REST = 3.0  #: the same while nothing moves by it
+ANSWERS_ALLOWED = 3  #: SYNCs in a row without an answer until a node counts as absent
+
+BOOT_UP, STOPPED, OPERATIONAL, PRE_OPERATIONAL = 0x00, 0x04, 0x05, 0x7F
+_NMT_NAMES = {STOPPED: "stopped", OPERATIONAL: "operational", PRE_OPERATIONAL: "pre-operational"}
+_EMCY = struct.Struct("<HB5s")
+
+
+class Station:
+    """One node. `frames` are the PDOs that it sends with every SYNC.
+
+    `distrust` is why it is not relied on until the next `prepare`, empty while there is no reason.
+    """
+
+    def __init__(
+        self, name: str, node: int, heartbeat: HeartbeatObject, frames: int = 1, watchdog: Watchdog | None = None
+    ) -> None:
+        self.name = name
+        self.node = node
+        self.fed = watchdog is not None  #: it has a watchdog that our commands feed
+        #: The number under which its watchdog expects our heartbeat; None: it expects receive PDOs, or nothing.
+        self.listens_to = watchdog.node if watchdog is not None and watchdog.kind == "heartbeat-consumer" else None
+        self.heartbeat_s = heartbeat.value * si_per_count(heartbeat.unit, 1.0)
+        self.nmt_state: int | None = None
+        self.heard_s: float | None = None
+        self.boot_ups = 0
+        self.supervised = False  #: must stay operational
+        self.emergency = ""
+        self.distrust = ""
+        self.dropped = False  #: was lost while supervised: not fed any more, so that its own watchdog can fire
+        self.missed = 0  #: SYNCs in a row that it did not answer in full
+        self.awaited = False  #: its answer to the present SYNC is waited for
+        self._frames = frames
+        self._came = 0  #: frames of the answer to the present SYNC
+        self._heard_again = False  #: it answered, though too late, while it was absent
+
+    # what arrives
+
+    def on_frame(self) -> None:
+        """A PDO of the answer to the present SYNC came and was understood."""
+        self._came += 1
+        if self.answered:
+            self.missed = 0
+
+    def on_late_frame(self) -> None:
+        """A PDO outside its cycle. Its sample is not used; who was absent is waited for again."""
+        self._heard_again = True
+
+    def on_heartbeat(self, data: bytes | bytearray, now_s: float) -> None:
+        """A heartbeat or boot-up message. Raises ValueError for a wrong length."""
+        if len(data) != 1:
+            raise ValueError(f"a heartbeat has 1 byte, this one {len(data)}")
+        self.nmt_state = data[0] & 0x7F
+        self.heard_s = now_s
+        self.boot_ups += self.nmt_state == BOOT_UP
+        if not self.supervised or self.dropped:
+            return
+        if self.nmt_state == BOOT_UP:
+            self.distrust = "restarted: its settings are lost, arm again"
+        elif self.nmt_state != OPERATIONAL:
+            self.distrust = f"left operational for {_NMT_NAMES.get(self.nmt_state, hex(self.nmt_state))}, arm again"
+
+    def heard(self, now_s: float) -> None:
+        """It showed life in another way than by its heartbeat."""
+        self.heard_s = now_s
+
+    def on_emergency(self, data: bytes | bytearray) -> None:
+        """An EMCY message; code 00xxh takes the last one back. Raises ValueError for a wrong length."""
+        if len(data) != _EMCY.size:
+            raise ValueError(f"an EMCY has 8 bytes, this one {len(data)}")
+        code, register, rest = _EMCY.unpack(data)
+        text = EmcyError(code, register, rest, 0.0).get_desc()
+        self.emergency = f"EMCY {code:04X}h {text}".rstrip() + f", error register {register:02X}h" if code >> 8 else ""
+
+    # the cycle
+
+    @property
+    def answered(self) -> bool:
+        """Whether the present SYNC is answered in full."""
+        return self._came >= self._frames
+
+    def begin_sync(self) -> None:
+        self._came = 0
+        self.awaited = self.missed < ANSWERS_ALLOWED or self._heard_again
+        self._heard_again = False
+
+    def end_sync(self) -> None:
+        self.missed += not self.answered
+
+    def heartbeat_lost(self, now_s: float, relied_on: bool) -> bool:
+        allowed = HEARTBEATS_ALLOWED if relied_on else HEARTBEATS_ALLOWED_AT_REST
+        return self.heard_s is None or now_s - self.heard_s > allowed * self.heartbeat_s
+
+    def absent(self, now_s: float, relied_on: bool) -> bool:
+        """Never heard, or lost. `relied_on`: something moves by it, so its heartbeats count strictly."""
+        return self.missed >= ANSWERS_ALLOWED or self.heartbeat_lost(now_s, relied_on)
+
+    def trouble(self, now_s: float, relied_on: bool) -> str:
+        """What is wrong with it, for a person; empty when nothing is."""
+        if self.heartbeat_lost(now_s, relied_on):
+            return "no heartbeat"
+        if self.missed >= ANSWERS_ALLOWED:
+            return f"no answer to {self.missed} SYNCs in a row"
+        return self.distrust or self.emergency
+
+    def drop(self, trouble: str) -> None:
+        """It is lost: not fed until the next `prepare`, or its watchdog stays quiet while nobody listens behind it."""
+        self.distrust = f"{trouble}; it was told to stop, arm again"
+        self.dropped = True
+
+    def forget(self) -> None:
+        """Nothing that was true of the node before counts any more, except that it was heard."""
+        self.supervised = False
+        self.missed = 0
+        self.distrust = ""
+        self.dropped = False
+        self._came = 0

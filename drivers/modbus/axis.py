@@ -1,0 +1,209 @@
+"""One drive, or one axis of a device with several, on Modbus: registers to SI and back, and its state. No I/O."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import floor
+
+from drivers.cia402 import DISABLE_VOLTAGE, drive_state, power_state
+from drivers.modbus.device import Check, Proofs, Setting, Standing, identity_check, register_block, watchdog_counts
+from drivers.modbus.maps import DriveMap, Register
+from drivers.modbus.plan import Wish
+from drivers.modbus.registers import Field, RegisterBlock
+from drivers.power_stage import PowerStage
+from drivers.scaling import speed_per_count, torque_per_count
+from gateway.core.line import Drive, Limits
+from gateway.core.signals import DriveState, Inputs, Outputs
+
+_LARGEST = {"i16": 2**15 - 1, "i32": 2**31 - 1, "f32": 3.4e38}  #: counts of a target torque, either way
+_RATED_TORQUE_TOLERANCE = 1e-3  #: of the line's figure; more would scale every torque wrongly
+
+
+@dataclass(frozen=True, slots=True)
+class AxisSettings:
+    """What a line asks of one drive."""
+
+    channel: int  #: axis of the device, from 1
+    rated_torque_nm: float
+    torque_limit_nm: float
+    watchdog_s: float
+    radius_m: float  #: nominal, of its roller
+
+
+def axis_settings(drive: Drive, limits: Limits, radius_m: float) -> AxisSettings:
+    return AxisSettings(drive.channel, drive.rated_torque_nm, limits.torque_nm, limits.watchdog_s, radius_m)
+
+
+class Axis:
+    """Raises ValueError when the line asks for what the drive cannot do."""
+
+    gives_torque = True
+
+    def __init__(self, name: str, index: int, device: DriveMap, settings: AxisSettings) -> None:
+        self.name = name
+        self._index = index  #: roller - 1
+        self._device = device
+        self._settings = settings
+        read, write, rated_nm = device.read, device.write, settings.rated_torque_nm
+        axes = device.axes
+        self._read_offset = (settings.channel - 1) * axes.read_stride if axes else 0
+        write_offset = (settings.channel - 1) * axes.write_stride if axes else 0
+        self._speed_scale = speed_per_count(read.speed.unit, read.speed.scale, settings.radius_m)
+        self._torque_scale = torque_per_count(read.torque.unit, read.torque.scale, rated_nm)
+        target = write.target_torque
+        self._counts_per_nm = 1.0 / torque_per_count(target.unit, target.scale, rated_nm)
+        self._whole_counts = target.type != "f32"
+        self._most_nm = _LARGEST[target.type] / self._counts_per_nm  #: either way
+        fields = [self._read_field(entry) for entry in (read.statusword, read.speed, read.torque)]
+        self._sto_at = self._error_at = -1
+        if read.safe_torque_off is not None:
+            self._sto_at = _place(fields, self._read_field(read.safe_torque_off))
+        if read.error_code is not None:
+            self._error_at = _place(fields, self._read_field(read.error_code))
+        self._write = self._block((write.controlword, write.target_torque), write_offset)
+        self.wish = Wish(name, fields, device.word_order, (self._write.address, self._write.count))
+        self.proofs = self._what_must_hold()
+        self.stage = PowerStage(device.follows_command)
+        self._state = DriveState.ABSENT
+        self._told = ""  #: the trouble that was told last; what lasts is told once
+
+    # what must hold of it
+
+    def _what_must_hold(self) -> Proofs:
+        device, settings = self._device, self._settings
+        identity = [identity_check(self.name, device.device_id, device)]
+        if device.axis_count is not None:
+            identity.append(Check(self._block([device.axis_count]), self._against_axis_count))
+        if device.rated_torque is not None:
+            identity.append(Check(self._block([device.rated_torque]), self._against_rated_torque))
+        maximum = self._block([device.max_torque])
+        counts = watchdog_counts(device.watchdog, settings.watchdog_s, "the drive")
+        watchdog = Setting(f"{self.name}: its communication watchdog", self._block([device.watchdog]), counts)
+        trust: list[Check] = []
+        written = [watchdog]
+        if device.max_torque.writable:
+            written.insert(0, Setting(f"{self.name}: its max torque", maximum, self._torque_limit_counts()))
+        else:
+            identity.append(Check(maximum, self._against_max_torque))
+        statusword = RegisterBlock([self._read_field(device.read.statusword)], device.word_order)
+        trust.append(Check(statusword, self._against_enabled))
+        return Proofs(identity, trust, written)
+
+    def _against_axis_count(self, found: float) -> list[str]:
+        channel = self._settings.channel
+        return [] if channel <= found else [f"{self.name}: channel {channel}, the device has {int(found)} axes"]
+
+    def _against_rated_torque(self, found: float) -> list[str]:
+        entry, wanted_nm = self._device.rated_torque, self._settings.rated_torque_nm
+        assert entry is not None
+        found_nm = found * torque_per_count(entry.unit, entry.scale, wanted_nm)
+        if abs(found_nm - wanted_nm) <= _RATED_TORQUE_TOLERANCE * wanted_nm:
+            return []
+        return [
+            f"{self.name}: has a rated torque of {found_nm:g} Nm, the line says {wanted_nm:g} Nm; "
+            "correct rated_torque_nm"
+        ]
+
+    def _against_max_torque(self, found: float) -> list[str]:
+        entry, settings = self._device.max_torque, self._settings
+        nm_per_count = torque_per_count(entry.unit, entry.scale, settings.rated_torque_nm)
+        found_nm = found * nm_per_count
+        if found_nm + nm_per_count >= settings.torque_limit_nm:
+            return []
+        return [
+            f"{self.name}: gives at most {found_nm:g} Nm, limits.torque_nm is {settings.torque_limit_nm:g}; "
+            "lower the limit"
+        ]
+
+    def _against_enabled(self, found: float) -> list[str]:
+        if drive_state(power_state(int(found))) not in (DriveState.ENABLED, DriveState.STOPPING):
+            return []
+        return [f"{self.name}: is still enabled (statusword {int(found):04X}h); take its torque off first"]
+
+    def _torque_limit_counts(self) -> int:
+        entry, limit_nm = self._device.max_torque, self._settings.torque_limit_nm
+        nm_per_count = torque_per_count(entry.unit, entry.scale, self._settings.rated_torque_nm)
+        counts = floor(limit_nm / nm_per_count + 1e-9)
+        try:
+            self._block([entry]).encode([counts])
+        except ValueError as error:
+            raise ValueError(f"limits.torque_nm = {limit_nm} Nm does not fit max_torque: {error}") from error
+        return counts
+
+    # the cycle
+
+    def fill(self, inputs: Inputs, numbers: Sequence[float] | None, standing: Standing, time_s: float) -> list[str]:
+        """State, speed and torque into `inputs`; returns what was wrong, once. Without an answer they are missed."""
+        index = self._index
+        if numbers is None:
+            inputs.speed.miss(index)
+            inputs.torque.miss(index)
+            self._state = self._state_unheard(standing)
+            inputs.drive_state[index] = self._state
+            return []
+        sto = self._device.read.safe_torque_off
+        active = sto.is_set(int(numbers[self._sto_at])) if sto is not None else None
+        self.stage.on_statusword(int(numbers[0]), active)
+        inputs.speed.put(index, numbers[1] * self._speed_scale, time_s)
+        inputs.torque.put(index, numbers[2] * self._torque_scale, time_s)
+        says = self.stage.state
+        self._state = DriveState.FAULT if standing.distrust else says
+        inputs.drive_state[index] = self._state
+        if says is not DriveState.FAULT:
+            self._told = ""
+            return []
+        return self._fault_told_once(numbers)
+
+    def _state_unheard(self, standing: Standing) -> DriveState:
+        if standing.absent or self.stage.power is None:  # lost, or never heard
+            return DriveState.ABSENT
+        return DriveState.FAULT if standing.distrust else self.stage.state
+
+    def _fault_told_once(self, numbers: Sequence[float]) -> list[str]:
+        trouble = f"{self.name}: fault, statusword {int(numbers[0]):04X}h"
+        if (entry := self._device.read.error_code) is not None:
+            code = int(numbers[self._error_at])
+            trouble += f", error code {code:#x}{_meaning(entry.texts, code)}"
+        if trouble == self._told:
+            return []
+        self._told = trouble
+        return [trouble]
+
+    def command(self, outputs: Outputs) -> list[int]:
+        """See `Device.command`."""
+        request = int(outputs.drive_request[self._index])
+        torque_nm = float(outputs.torque_nm[self._index])
+        # Checked also where it is not given: what cannot be commanded says that something is wrong.
+        if not -self._most_nm <= torque_nm <= self._most_nm:  # NaN, too
+            raise ValueError(f"torque {torque_nm} Nm does not fit the target torque register")
+        return self._encode(*self.stage.command(request, torque_nm, self._state, trusted=True))
+
+    def rest(self) -> list[int]:
+        return self._encode(DISABLE_VOLTAGE, 0.0)
+
+    def _encode(self, controlword: int, torque_nm: float) -> list[int]:
+        counts = torque_nm * self._counts_per_nm
+        return self._write.encode((controlword, round(counts) if self._whole_counts else counts))
+
+    def forget(self) -> None:
+        self.stage.forget()
+        self._told = ""
+
+    # registers
+
+    def _read_field(self, entry: Register) -> Field:
+        return entry.address - self._device.address_base + self._read_offset, entry.type
+
+    def _block(self, entries: Sequence[Register], offset: int = 0) -> RegisterBlock:
+        return register_block(entries, self._device, offset)
+
+
+def _place(fields: list[Field], field: Field) -> int:
+    """Where `field` is in `fields`; appended if it is not there yet (flags share registers)."""
+    if field not in fields:
+        fields.append(field)
+    return fields.index(field)
+
+
+def _meaning(texts: dict[str, str], code: int) -> str:
+    text = next((text for key, text in texts.items() if int(key, 0) == code), "")
+    return f" ({text})" if text else ""

@@ -1,0 +1,136 @@
+"""What stands behind one unit identifier: devices that are exchanged in one transaction. No I/O.
+
+A unit is written whole or not at all. Where one of its devices cannot be commanded, or one that gives torque was
+lost, nothing is written to any of them, so that every watchdog in it fires: there is no half of a transaction.
+"""
+
+from collections.abc import Sequence
+
+from drivers.modbus.device import Check, Device, Setting, Standing
+from drivers.modbus.plan import Plan
+from drivers.modbus.proof import Proof
+from gateway.core.signals import Inputs, Outputs
+
+Payloads = list[list[int]]  #: the registers of each of the plan's writes
+
+
+class Unit:
+    """`together`: it knows function 23. Raises ValueError when its devices do not go together."""
+
+    def __init__(self, address: int, read_function: int, devices: Sequence[Device], together: bool = True) -> None:
+        self.address = address
+        self.read_function = read_function
+        self.devices = devices
+        self.name = ", ".join(device.name for device in devices)
+        self.plan = Plan([device.wish for device in devices], together)
+        self.standing = Standing()
+        self.settings = _settings(devices)
+        proofs = [device.proofs for device in devices]
+        #: Before anything is believed. `prepare` proves it before there is torque; nobody would after a reconnection.
+        self.identity = self._proof([check for proof in proofs for check in proof.identity])
+        self.identity.confirm()
+        self.trust = self._proof([check for proof in proofs for check in proof.trust])
+        self.kept_settings = self._proof([_kept(setting) for setting in self.settings])
+        self.dropped = False  #: gave torque and was lost: nothing is written to it before the next `prepare`
+        self.commanded = False  #: something was written since it became active
+        self._gives_torque = any(device.gives_torque for device in devices)
+        self._writers = [device for device in devices if device.wish.write is not None]
+        self._payloads: Payloads | None = None
+
+    def _proof(self, checks: Sequence[Check]) -> Proof:
+        return Proof(self.name, self.address, self.read_function, checks)
+
+    def activate(self) -> None:
+        """Its settings are proven: from now on it is commanded."""
+        self.kept_settings.confirm()
+        self.standing.active = True
+        self.standing.missed = 0
+
+    def silence(self) -> None:
+        """Nothing is written from now on, and nothing of the last command is left."""
+        standing = self.standing
+        standing.active, standing.wrote, standing.distrust, standing.refused = False, False, "", ""
+        self.dropped = self.commanded = False
+        self._payloads = None
+        for device in self.devices:
+            device.forget()
+
+    def connection_lost(self) -> None:
+        """Whatever answers on the next connection has to prove itself; it may have been restarted, or another."""
+        self.identity.void()
+        self.kept_settings.void()
+        if not self.identity.complete:
+            self.standing.doubt = "not proven on this connection"
+
+    def command(self, outputs: Outputs) -> str:
+        """What the next transaction writes. Returns why that is nothing; empty when all is well."""
+        self._payloads = None
+        standing = self.standing
+        standing.refused = ""
+        if not standing.active or self.dropped or not self._writers:
+            return ""
+        registers: list[list[int]] = []
+        for device in self._writers:
+            try:
+                registers.append(device.command(outputs))
+            except ValueError as error:
+                standing.refused = f"{device.name}: {error}"
+                return standing.refused
+        self._payloads = self.plan.payloads(registers)
+        return ""
+
+    def take_payloads(self) -> Payloads | None:
+        """What was commanded last, once: a command that was not sent with the next cycle is never sent."""
+        payloads, self._payloads = self._payloads, None
+        return payloads
+
+    def rest_payloads(self) -> Payloads:
+        """No torque, no transport: what a unit is told that is left."""
+        return self.plan.payloads([device.rest() for device in self._writers])
+
+    def may_write(self) -> bool:
+        return self.standing.active and not self.dropped and self.identity.complete and self.kept_settings.complete
+
+    def distrust(self, reasons: Sequence[str]) -> None:
+        """It has not kept its settings. Who gives torque does not come back by itself."""
+        self.standing.distrust = "; ".join(reasons)
+        if self._gives_torque and reasons:
+            self._drop(self.standing.distrust)
+
+    def _drop(self, reason: str) -> None:
+        self.dropped = True
+        self.standing.distrust = f"{reason}; arm again"
+
+    def fill(self, inputs: Inputs, numbers: Sequence[Sequence[float]] | None, time_s: float) -> list[str]:
+        """What came in this cycle into `inputs`, device by device; returns what was wrong. None: no answer."""
+        standing = self.standing
+        standing.missed = 0 if numbers is not None else standing.missed + 1
+        if standing.absent and standing.active and self._gives_torque and not self.dropped:
+            self._drop(f"no answer in {standing.missed} cycles")
+        troubles: list[str] = []
+        for k, device in enumerate(self.devices):
+            troubles += device.fill(inputs, numbers[k] if numbers is not None else None, standing, time_s)
+        if mute := standing.distrust or standing.refused:
+            troubles.append(f"{self.name}: {mute}; it is not written to")
+        return troubles
+
+
+def _settings(devices: Sequence[Device]) -> list[Setting]:
+    """Those of all devices; one register that several of them want set is set once."""
+    settings: dict[tuple[int, int], Setting] = {}
+    for device in devices:
+        for setting in device.proofs.settings:
+            other = settings.setdefault((setting.register.address, setting.register.count), setting)
+            if other.counts != setting.counts:
+                raise ValueError(
+                    f"{setting.name} should be {setting.counts:g}, but in the same register "
+                    f"{other.name} should be {other.counts:g}"
+                )
+    return list(settings.values())
+
+
+def _kept(setting: Setting) -> Check:
+    def judge(found: float) -> list[str]:
+        return [] if found == setting.counts else [f"{setting.name} reads {found:g}, {setting.counts:g} was set"]
+
+    return Check(setting.register, judge)
