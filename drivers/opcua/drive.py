@@ -1,0 +1,240 @@
+"""One axis on OPC UA: what is asked of it and told to it each cycle, and which of its answers may be believed. No I/O.
+
+Its command carries a life counter; the axis takes its torque off when that stands still. So an axis that is lost, or
+that refuses a command, is not written to any more until the next `prepare`: its own watchdog takes the torque off.
+"""
+
+from dataclasses import dataclass
+
+from drivers.cia402 import DISABLE_VOLTAGE, drive_state, power_state
+from drivers.life import LifeCounter
+from drivers.opcua.maps import DriveMap
+from drivers.opcua.nodes import DeviceNodes, NodeTable, Reading, to_type
+from drivers.opcua.proof import Proof, Watchdog
+from drivers.opcua.status import describe, is_good
+from drivers.power_stage import PowerStage
+from drivers.scaling import speed_per_count, torque_per_count
+from gateway.core.signals import Channel, DriveState, Inputs, Outputs
+
+ANSWERS_ALLOWED = 3  #: cycles in a row without a usable answer until a device counts as absent
+_RATED_TORQUE_TOLERANCE = 1e-3  #: of the line's figure; more would scale every torque wrongly
+
+
+@dataclass(frozen=True, slots=True)
+class AxisSettings:
+    """What a line asks of one axis. `index` is roller - 1."""
+
+    name: str
+    index: int
+    address: int
+    channel: int
+    rated_torque_nm: float
+    torque_limit_nm: float
+    watchdog_s: float
+    radius_m: float
+
+
+class Axis:
+    """`distrust` is why it gets no torque until the next `prepare`, empty while there is no reason."""
+
+    def __init__(self, device: DriveMap, settings: AxisSettings, table: NodeTable) -> None:
+        self.name = settings.name
+        self.stage = PowerStage(device.follows_command)
+        self.missed = ANSWERS_ALLOWED  #: cycles in a row without a usable answer; nothing was heard yet
+        self.active = False  #: the link is not silent
+        self.distrust = ""
+        self._settings = settings
+        self._index = settings.index
+        entries = device.nodes
+        nodes = DeviceNodes(table, device.namespace, settings.address, settings.channel)
+        self.watchdog = Watchdog(device.watchdog, settings.watchdog_s, nodes)
+        self.proof = Proof(settings.name, device.identity, self.watchdog, nodes)
+        rated_nm = settings.rated_torque_nm
+        speed, torque, target = entries.speed, entries.torque, entries.target_torque
+        self._m_per_s_per_count = speed_per_count(speed.unit, speed.scale, settings.radius_m)
+        self._nm_per_count = torque_per_count(torque.unit, torque.scale, rated_nm)
+        self._target_nm_per_count = torque_per_count(target.unit, target.scale, rated_nm)
+        self._target_type = target.type
+        self._statusword = nodes.place(entries.statusword, entries.statusword.type)
+        self._sto, self._error_code = entries.safe_torque_off, entries.error_code
+        optional = [entry for entry in (entries.safe_torque_off, entries.error_code) if entry is not None]
+        cyclic = [entries.statusword, speed, torque, *optional]
+        self.reads = tuple(nodes.place(entry, entry.type) for entry in cyclic)  #: each cycle
+        command = (entries.controlword, target, entries.life)
+        self._command_nodes = tuple(nodes.place(entry, entry.type) for entry in command)
+        self._max_torque = entries.max_torque
+        self._rated_torque = entries.rated_torque
+        torques = [entry for entry in (entries.max_torque, entries.rated_torque) if entry is not None]
+        #: what `prepare` looks at: identity, watchdog, statusword, max torque, and rated torque where there is one
+        self.prepare_reads = (
+            *self.proof.nodes,
+            self._statusword,
+            *(nodes.place(entry, entry.type) for entry in torques),
+        )
+        self._life = LifeCounter()
+        self._command: tuple[int, float] | None = None  #: controlword and torque (counts) of this cycle
+        self._dropped = False  #: is not written to, so that its own watchdog can fire
+
+    # the cycle
+
+    @property
+    def state(self) -> DriveState:
+        if self.missed >= ANSWERS_ALLOWED:
+            return DriveState.ABSENT
+        return DriveState.FAULT if self.distrust else self.stage.state
+
+    def command(self, outputs: Outputs) -> None:
+        """What the next write says. Raises ValueError when the torque cannot be commanded; nothing is written then."""
+        self._command = None
+        if self.state == DriveState.ABSENT:
+            self._drop("it did not answer")
+        if self._dropped:
+            return
+        request, torque_nm = int(outputs.drive_request[self._index]), float(outputs.torque_nm[self._index])
+        # Converted also where it is not given: what cannot be commanded says that something is wrong.
+        self._torque_counts(torque_nm)
+        word, given_nm = self.stage.command(request, torque_nm, self.state, trusted=not self.distrust)
+        self._command = (word, self._torque_counts(given_nm))
+
+    def _torque_counts(self, torque_nm: float) -> float:
+        return to_type(torque_nm / self._target_nm_per_count, self._target_type)
+
+    def take_writes(self) -> list[tuple[int, float]]:
+        """The command that was handed over for this cycle, once."""
+        command, self._command = self._command, None
+        if command is None or not self._may_write():
+            return []
+        return list(zip(self._command_nodes, (*command, self._life.next()), strict=True))
+
+    def _may_write(self) -> bool:
+        return self.active and self.proof.proven and not self._dropped
+
+    def on_written(self, statuses: tuple[int, ...]) -> str:
+        """What became of the command; returns what was wrong."""
+        refused = [describe(status) for status in statuses if not is_good(status)]
+        if not refused:
+            return ""
+        self._drop(f"its command was refused ({', '.join(dict.fromkeys(refused))})")
+        return f"{self.name}: {self.distrust}"
+
+    def _drop(self, why: str) -> None:
+        """It cannot be commanded: a life counter that goes on would keep a watchdog fed that nobody listens behind."""
+        if not self._dropped:
+            self._dropped = True
+            self.distrust = f"{why}; it is not written to any more, so that its watchdog takes torque off; arm again"
+
+    def connection_lost(self) -> None:
+        """Whatever answers on the next connection has to prove itself before it is believed or written to."""
+        self.proof.void()
+
+    def fill(self, inputs: Inputs, time_s: float, readings: tuple[Reading, ...] | None) -> list[str]:
+        """Speed, torque and state into `inputs`; returns what was wrong. Without an answer they are missed."""
+        index = self._index
+        if self.active and self.proof.doubts and not self.distrust:
+            self._drop("; ".join(self.proof.doubts).removeprefix(f"{self.name}: "))
+        if readings is None or not self.proof.known:
+            self.missed += 1
+            inputs.speed.miss(index)
+            inputs.torque.miss(index)
+            inputs.drive_state[index] = self.state
+            return list(self.proof.doubts) if readings is not None else []
+        statusword, speed, torque, *optional = readings
+        if not statusword.good:  # nobody knows what the rest is worth
+            self.missed += 1
+            inputs.speed.reject(index)
+            inputs.torque.reject(index)
+            inputs.drive_state[index] = self.state
+            return [f"{self.name}: statusword: {statusword.trouble}"]
+        self.missed = 0
+        troubles = self._hear(int(statusword.value), optional)
+        troubles.append(self._put(inputs.speed, "speed", speed, self._m_per_s_per_count, time_s))
+        troubles.append(self._put(inputs.torque, "torque", torque, self._nm_per_count, time_s))
+        inputs.drive_state[index] = self.state
+        return [trouble for trouble in troubles if trouble]
+
+    def _hear(self, statusword: int, optional: list[Reading]) -> list[str]:
+        troubles: list[str] = []
+        safe_torque_off: bool | None = None
+        if self._sto is not None:
+            found = optional[0]
+            safe_torque_off = self._sto.is_set(found.value) if found.good else None
+            troubles += [] if found.good else [f"{self.name}: safe torque off: {found.trouble}"]
+        self.stage.on_statusword(statusword, safe_torque_off)
+        if self._error_code is not None and self.stage.state == DriveState.FAULT:
+            found = optional[-1]
+            troubles.append(f"{self.name}: fault {int(found.value):04X}h" if found.good else f"{self.name}: fault")
+        return troubles
+
+    def _put(self, channel: Channel, what: str, reading: Reading, si_per_count: float, time_s: float) -> str:
+        if not reading.good:
+            channel.reject(self._index)
+            return f"{self.name}: {what}: {reading.trouble}"
+        value = reading.value * si_per_count
+        channel.put(self._index, value, time_s)
+        return "" if abs(value) < float("inf") else f"{self.name}: {what} {value} is not finite"
+
+    # prepare and release
+
+    def activate(self) -> None:
+        """`prepare` has proven it."""
+        self.active = True
+        self.missed = 0
+        self.proof.confirm()
+
+    def forget(self) -> None:
+        """Nothing that was true of the drive before counts any more, except that it was heard."""
+        self.active = False
+        self.stage.forget()
+        self.distrust = ""
+        self._dropped = False
+        self._command = None
+        self._life.forget()
+
+    def against(self, readings: tuple[Reading, ...]) -> list[str]:
+        """What `prepare_reads` say against giving it torque."""
+        identity, watchdog, statusword, *torques = readings
+        if reasons := self.proof.against_identity(identity):
+            return reasons
+        reasons = [f"{self.name}: its watchdog cannot be read: {watchdog.trouble}"] if not watchdog.good else []
+        if not statusword.good:
+            reasons.append(f"{self.name}: its statusword cannot be read: {statusword.trouble}")
+        elif drive_state(power_state(int(statusword.value))) in (DriveState.ENABLED, DriveState.STOPPING):
+            word = int(statusword.value)
+            reasons.append(f"{self.name}: is still enabled (statusword {word:04X}h); take its torque off first")
+        reasons += self._against_max_torque(torques[0])
+        if self._rated_torque is not None:
+            reasons += self._against_rated_torque(torques[1])
+        return reasons
+
+    def _against_max_torque(self, found: Reading) -> list[str]:
+        if not found.good:
+            return [f"{self.name}: its max torque cannot be read: {found.trouble}"]
+        entry, limit_nm = self._max_torque, self._settings.torque_limit_nm
+        nm_per_count = torque_per_count(entry.unit, entry.scale, self._settings.rated_torque_nm)
+        found_nm = found.value * nm_per_count
+        rounding_nm = 1e-6 * limit_nm if entry.type in ("f32", "f64") else nm_per_count
+        if found_nm + rounding_nm >= limit_nm:
+            return []
+        return [f"{self.name}: gives at most {found_nm:g} Nm, limits.torque_nm is {limit_nm:g}; lower the limit"]
+
+    def _against_rated_torque(self, found: Reading) -> list[str]:
+        if not found.good:
+            return [f"{self.name}: its rated torque cannot be read: {found.trouble}"]
+        entry, wanted_nm = self._rated_torque, self._settings.rated_torque_nm
+        assert entry is not None
+        found_nm = found.value * torque_per_count(entry.unit, entry.scale, wanted_nm)
+        if abs(found_nm - wanted_nm) <= _RATED_TORQUE_TOLERANCE * wanted_nm:
+            return []
+        return [
+            f"{self.name}: has a rated torque of {found_nm:g} Nm, the line says {wanted_nm:g} Nm; "
+            "correct rated_torque_nm"
+        ]
+
+    def farewell(self) -> list[list[tuple[int, float]]]:
+        """Two writes. Torque off with the watchdog, so that it does not fire when nobody speaks any more; then the
+        watchdog as before: it counts from the next change of the life counter, which is far."""
+        if not self._may_write():
+            return []
+        off = (float(DISABLE_VOLTAGE), 0.0, float(self._life.next()))
+        first = [*zip(self._command_nodes, off, strict=True), (self.watchdog.node, 0.0)]
+        return [first, [(self.watchdog.node, float(self.watchdog.counts))]]

@@ -1,0 +1,250 @@
+"""Maps of OPC UA devices: which nodes mean what.
+
+A node is named by its identifier in the map's namespace, as servers print it without `ns=` and `s=`; `i=1234` is a
+numeric one. {address} and {channel} in it become those of the device in the line's file.
+"""
+
+import re
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from drivers.map_fields import (
+    Bit,
+    Bits,
+    Format,
+    Range,
+    SpeedUnit,
+    TensionUnit,
+    TimeUnit,
+    TorqueUnit,
+    WebSpeedUnit,
+    refuse_together,
+)
+from drivers.map_rules import bit_problems, fit_problems, range_problems
+from gateway.core.line import Name, Positive, Strict
+
+NumberType = Literal["u8", "i8", "u16", "i16", "u32", "i32", "f32", "f64"]
+CountType = Literal["u16", "u32"]  #: bits, codes and counts
+
+_NUMERIC = re.compile(r"i=(\d{1,10})")
+_NUMERIC_TEMPLATE = re.compile(r"i=(\d|\{address\}|\{channel\})+")
+_LARGEST_NUMERIC = 0xFFFFFFFF
+
+
+class NodeRef(Strict):
+    node: Annotated[str, Field(min_length=1, max_length=200)]
+
+    def identifier(self, address: int, channel: int) -> str:
+        """The node of one device. Raises ValueError for a numeric one that cannot be."""
+        text = self.node.replace("{address}", str(address)).replace("{channel}", str(channel))
+        numeric = _NUMERIC.fullmatch(text)
+        if text.startswith("i=") and (numeric is None or int(numeric[1]) > _LARGEST_NUMERIC):
+            raise ValueError(f"node {text!r}; allowed: i= and a number up to {_LARGEST_NUMERIC}, or a name")
+        return text
+
+    @model_validator(mode="after")
+    def _numeric(self) -> "NodeRef":
+        wrong = self.node.startswith("i=") and not _NUMERIC_TEMPLATE.fullmatch(self.node)
+        return refuse_together(self, [f"node: {self.node!r}; allowed: i= and a number, or a name"] if wrong else [])
+
+
+class Count(NodeRef):
+    type: CountType = "u16"
+
+
+class Identity(Count):
+    value: int  #: what a device of this type has there
+
+
+class Flag(NodeRef):
+    """Yes or no: a Boolean, or a bit of a word. `inverted`: true where false or 0 means yes."""
+
+    type: Literal["bool", "u16", "u32"] = "bool"
+    bit: Bits | None = None
+    inverted: bool = False
+
+    @model_validator(mode="after")
+    def _bit(self) -> "Flag":
+        if self.type == "bool":
+            problems = [] if self.bit is None else ["bit: a bool has none; allowed: no such key, or type u16 or u32"]
+        elif self.bit is None:
+            problems = [f"bit: is missing; a {self.type} needs it"]
+        else:
+            problems = bit_problems("", self.bit, self.type)
+        return refuse_together(self, [problem.removeprefix(".") for problem in problems])
+
+    def is_set(self, value: float) -> bool:
+        """What it says."""
+        return bool(int(value) >> (self.bit or 0) & 1) != self.inverted
+
+
+class Switch(NodeRef):
+    """A Boolean that is written."""
+
+    inverted: bool = False
+
+
+class Speed(NodeRef):
+    type: NumberType
+    unit: SpeedUnit
+    scale: Positive = 1.0
+
+
+class WebSpeed(NodeRef):
+    type: NumberType
+    unit: WebSpeedUnit
+    scale: Positive = 1.0
+    range: Range
+
+
+class Torque(NodeRef):
+    type: NumberType
+    unit: TorqueUnit
+    scale: Positive = 1.0
+
+
+class Tension(NodeRef):
+    type: NumberType
+    unit: TensionUnit
+    scale: Positive = 1.0
+
+
+class ChannelStatus(Count):
+    ok: int
+    texts: dict[str, str] = {}  #: what the other values mean; keys are the values
+
+
+class WatchdogNode(Count):
+    unit: TimeUnit
+    scale: Positive = 1.0
+    range: Range
+
+    def problems(self) -> list[str]:
+        written = range_problems("watchdog", self.range)
+        return written + fit_problems("watchdog", self.type, self.range, self.scale)
+
+
+class OpcUaMap(Strict):
+    """What every OPC UA device type states."""
+
+    format: Format
+    protocol: Literal["opcua"]
+    description: str
+    family: Name | None = None  #: devices of one family may share an address: they are instances of one machine
+    namespace: Annotated[str, Field(min_length=1, max_length=200)]  #: its URI
+    identity: Identity
+
+
+class DriveNodes(Strict):
+    statusword: Count
+    speed: Speed
+    torque: Torque
+    safe_torque_off: Flag | None = None
+    error_code: Count | None = None
+    rated_torque: Torque | None = None  #: compared with the line's file when it is there
+    max_torque: Torque
+    controlword: Count
+    target_torque: Torque
+    life: Count  #: moves with every command
+
+
+class DriveMap(OpcUaMap):
+    role: Literal["drive"]
+    follows_command: Bit | None = None  #: of the statusword: the target torque is followed, not ignored
+    nodes: DriveNodes
+    watchdog: WatchdogNode
+
+    @model_validator(mode="after")
+    def _layout(self) -> "DriveMap":
+        problems = _twice_problems({"identity": self.identity, "watchdog": self.watchdog} | _named("nodes", self.nodes))
+        problems += self.watchdog.problems()
+        if self.follows_command is not None:
+            problems += bit_problems("follows_command", self.follows_command.bit, self.nodes.statusword.type)
+        rated = self.nodes.rated_torque
+        if rated is not None and rated.unit == "rated torque":
+            problems.append("nodes.rated_torque.unit: 'rated torque' of itself says nothing; allowed: Nm, mNm")
+        return refuse_together(self, problems)
+
+
+class Channels(Strict):
+    count: Annotated[int, Field(ge=1)]
+    tension: Tension
+    status: ChannelStatus | None = None
+
+
+class LoadCellMap(OpcUaMap):
+    role: Literal["load-cell"]
+    channel_count: Count
+    sample_counter: Count  #: moves with every measurement
+    healthy: Flag
+    channels: Channels
+
+    @model_validator(mode="after")
+    def _layout(self) -> "LoadCellMap":
+        shared = {"identity": self.identity, "channel_count": self.channel_count}
+        shared |= {"sample_counter": self.sample_counter, "healthy": self.healthy}
+        problems = _twice_problems(shared | _named("channels", self.channels))
+        problems += [
+            f"{name}.node: {entry.node!r} names a channel; the amplifier has one of it"
+            for name, entry in shared.items()
+            if "{channel}" in entry.node
+        ]
+        problems += [
+            f"{name}.node: {entry.node!r} has no {{channel}}; every channel needs its own"
+            for name, entry in _named("channels", self.channels).items()
+            if "{channel}" not in entry.node
+        ]
+        return refuse_together(self, problems)
+
+
+class PlcRead(Strict):
+    permissive: Flag
+    emergency_stop: Flag  #: yes: the emergency stop circuit is open
+    running: Flag
+    watchdog_tripped: Flag
+    speed: WebSpeed
+    life_echo: Count
+
+
+class PlcWrite(Strict):
+    run: Switch
+    speed: WebSpeed
+    life: Count
+
+
+class PlcMap(OpcUaMap):
+    role: Literal["line-plc"]
+    read: PlcRead
+    write: PlcWrite
+    watchdog: WatchdogNode
+
+    @model_validator(mode="after")
+    def _layout(self) -> "PlcMap":
+        named = {"identity": self.identity, "watchdog": self.watchdog}
+        named |= _named("read", self.read) | _named("write", self.write)
+        problems = _twice_problems(named) + self.watchdog.problems()
+        problems += [
+            f"{name}.node: {entry.node!r} names a channel; a PLC has none"
+            for name, entry in named.items()
+            if "{channel}" in entry.node
+        ]
+        problems += range_problems("read.speed", self.read.speed.range)
+        problems += range_problems("write.speed", self.write.speed.range)
+        return refuse_together(self, problems)
+
+
+def _named(key: str, table: Strict) -> dict[str, NodeRef]:
+    return {f"{key}.{name}": entry for name, entry in table if isinstance(entry, NodeRef)}
+
+
+def _twice_problems(entries: dict[str, NodeRef]) -> list[str]:
+    """A node has one meaning; only flags may be bits of one word."""
+    problems: list[str] = []
+    taken: dict[str, tuple[str, NodeRef]] = {}
+    for name, entry in entries.items():
+        other_name, other = taken.setdefault(entry.node, (name, entry))
+        bits = isinstance(entry, Flag) and isinstance(other, Flag) and entry.type == other.type != "bool"
+        if other is not entry and not bits:
+            problems.append(f"{name}.node: {entry.node!r} is already {other_name}")
+    return problems

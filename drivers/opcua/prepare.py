@@ -1,0 +1,72 @@
+"""Whether the devices of a server may be trusted with torque: the right ones, off, watchdogs set and read back."""
+
+from collections.abc import Sequence
+from typing import Protocol
+
+from drivers.opcua.amplifier import Amplifier
+from drivers.opcua.drive import Axis
+from drivers.opcua.messages import Answer
+from drivers.opcua.plc import Plc
+from drivers.opcua.proof import Watchdog
+from drivers.opcua.status import describe, is_good
+
+Device = Axis | Amplifier | Plc
+
+
+class NoAnswer(Exception):
+    """The question was not answered; the text says why."""
+
+
+class Ask(Protocol):
+    """Write, then read, and wait for the answer. Raises NoAnswer."""
+
+    async def __call__(self, writes: tuple[tuple[int, float], ...], reads: tuple[int, ...]) -> Answer: ...
+
+
+async def prepare_devices(ask: Ask, devices: Sequence[Device]) -> list[str]:
+    """Check every device, set every watchdog and read it back. What speaks against it; it is undone then."""
+    reasons: list[str] = []
+    before: dict[Device, float] = {}
+    for device in devices:
+        try:
+            readings = (await ask((), device.prepare_reads)).readings
+        except NoAnswer as error:
+            return [*reasons, f"{device.name}: {error}"]
+        reasons += device.against(readings)
+        before[device] = readings[1].value  # of those that have one, the watchdog
+    if reasons:
+        return reasons
+    changed: list[Device] = []
+    for device in devices:
+        if device.watchdog is not None:
+            changed.append(device)  # one that does not answer may have been written all the same
+            try:
+                reasons += await _set_watchdog(ask, device.name, device.watchdog)
+            except NoAnswer as error:
+                reasons.append(f"{device.name}: its watchdog cannot be set: {error}")
+                break
+    if reasons:
+        for device in reversed(changed):
+            assert device.watchdog is not None
+            reasons += await _undo(ask, device.name, device.watchdog, before[device])
+    return reasons
+
+
+async def _set_watchdog(ask: Ask, name: str, watchdog: Watchdog) -> list[str]:
+    answer = await ask(((watchdog.node, float(watchdog.counts)),), (watchdog.node,))
+    status, found = answer.written[0], answer.readings[0]
+    if not is_good(status):
+        return [f"{name}: its watchdog cannot be set to {watchdog.counts}: {describe(status)}"]
+    if not found.good:
+        return [f"{name}: its watchdog cannot be read back: {found.trouble}"]
+    if found.value != watchdog.counts:
+        return [f"{name}: its watchdog was set to {watchdog.counts} and reads back {found.value:g}"]
+    return []
+
+
+async def _undo(ask: Ask, name: str, watchdog: Watchdog, before: float) -> list[str]:
+    try:
+        status = (await ask(((watchdog.node, before),), ())).written[0]
+    except NoAnswer as error:
+        return [f"{name}: its watchdog could not be restored: {error}"]
+    return [] if is_good(status) else [f"{name}: its watchdog could not be restored: {describe(status)}"]

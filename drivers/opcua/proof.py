@@ -1,0 +1,77 @@
+"""What a device has to show on every connection before it is believed and written to. No I/O.
+
+That it is the device that the map is for; and, while it is commanded, that its watchdog is still the one that was
+set: a server that was restarted has lost it.
+"""
+
+from math import floor
+
+from drivers.opcua.maps import Identity, WatchdogNode
+from drivers.opcua.nodes import DeviceNodes, Reading
+from drivers.scaling import si_per_count
+
+
+class Watchdog:
+    """The communication watchdog of a device: its node and the number that is written to it.
+
+    Raises ValueError when the device cannot do `watchdog_s`.
+    """
+
+    def __init__(self, entry: WatchdogNode, watchdog_s: float, nodes: DeviceNodes) -> None:
+        self.node = nodes.place(entry, entry.type)
+        self.counts = floor(watchdog_s / si_per_count(entry.unit, entry.scale) + 1e-9)
+        low, high = entry.range
+        if self.counts < 1 or not low <= self.counts * entry.scale <= high:
+            raise ValueError(
+                f"limits.watchdog_s = {watchdog_s} s is outside what it can do ({low:g} to {high:g} {entry.unit})"
+            )
+
+
+class Proof:
+    """`known`: it is the right device, and may be believed. `proven`: it may be written to as well, if it ever was.
+
+    `doubts` are why it is not, as far as it has been looked at.
+    """
+
+    def __init__(self, name: str, identity: Identity, watchdog: Watchdog | None, nodes: DeviceNodes) -> None:
+        self.name = name
+        self.nodes = (nodes.place(identity, identity.type), *((watchdog.node,) if watchdog else ()))  #: to be read
+        self.known = self.proven = False
+        self.doubts: list[str] = []
+        self._wanted = identity.value
+        self._watchdog = watchdog
+
+    def void(self) -> None:
+        """Nothing is proven any more: the connection was lost."""
+        self.known = self.proven = False
+        self.doubts = []
+
+    def judge(self, readings: tuple[Reading, ...], *, commanded: bool) -> None:
+        """The readings of `nodes` on this connection."""
+        self.doubts = self.against_identity(readings[0])
+        self.known = not self.doubts
+        if not self.doubts and commanded and self._watchdog is not None:
+            self.doubts = self.against_watchdog(readings[1])
+        self.proven = not self.doubts
+
+    def confirm(self) -> None:
+        """All of it was proven in another way."""
+        self.known = self.proven = True
+        self.doubts = []
+
+    def against_identity(self, found: Reading) -> list[str]:
+        if not found.good:
+            return [f"{self.name}: its device id cannot be read: {found.trouble}"]
+        if found.value != self._wanted:
+            return [
+                f"{self.name}: device id {int(found.value):#x}, its map says {self._wanted:#x}; "
+                "correct `map`, `address` or `channel`"
+            ]
+        return []
+
+    def against_watchdog(self, found: Reading) -> list[str]:
+        assert self._watchdog is not None
+        if found.good and found.value == self._watchdog.counts:
+            return []
+        says = f"reads {found.value:g}, {self._watchdog.counts} was set" if found.good else f"reads {found.trouble}"
+        return [f"{self.name}: its watchdog {says}"]

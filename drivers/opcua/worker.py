@@ -1,0 +1,77 @@
+"""The process that holds the OPC UA client: `python -m drivers.opcua.worker FD PARENT GENERATION PRIORITY PROCESSORS`.
+
+It exists so that nothing a server sends can take time, memory or the interpreter from the loop: memory is limited,
+its real-time priority lies below the loop's, it stays off the loop's processor, and it ends with the loop. It reads
+the plan from its socket, then questions, and answers each of them.
+"""
+
+import asyncio
+import ctypes
+import os
+import resource
+import signal
+import socket
+import sys
+from contextlib import suppress
+
+from drivers.opcua.messages import (
+    MAX_MESSAGE,
+    MAX_PLAN,
+    READY,
+    Answer,
+    Outcome,
+    Plan,
+    decode_question,
+    encode_answer,
+)
+
+ADDRESS_SPACE_BYTES = 512 << 20  #: eight times what the client needs; a hostile answer can ask for gigabytes
+DATA_BYTES = 256 << 20
+REAL_TIME_CPU_S = 0.5  #: of computing without a pause at real-time priority; then the kernel ends the process
+_PR_SET_PDEATHSIG = 1
+
+
+def main(arguments: list[str]) -> int:
+    fd, parent, generation, priority = map(int, arguments[:4])
+    _die_with(parent)
+    with suppress(OSError, ValueError):  # a processor may be gone, or not be ours
+        os.sched_setaffinity(0, {int(processor) for processor in arguments[4].split(",")})
+    for limit, most in ((resource.RLIMIT_AS, ADDRESS_SPACE_BYTES), (resource.RLIMIT_DATA, DATA_BYTES)):
+        resource.setrlimit(limit, (most, most))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    connection = socket.socket(fileno=fd)
+    return asyncio.run(_serve(connection, generation, priority))
+
+
+async def _serve(connection: socket.socket, generation: int, priority: int) -> int:
+    from drivers.opcua.engine import Engine  # half a second, which belongs to this process alone
+
+    connection.setblocking(False)
+    loop = asyncio.get_running_loop()
+    engine = Engine(Plan.from_json(await loop.sock_recv(connection, MAX_PLAN)), generation)
+    _become_real_time(priority)
+    await loop.sock_sendall(connection, encode_answer(Answer(READY, Outcome.DONE, 0)))
+    while message := await loop.sock_recv(connection, MAX_MESSAGE):
+        answer = encode_answer(await engine.answer(decode_question(message)))
+        with suppress(BlockingIOError):  # nobody takes answers: it will not be missed
+            connection.send(answer)
+    await engine.close()
+    return 0
+
+
+def _die_with(parent: int) -> None:
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != parent:  # it was gone before that took effect
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+def _become_real_time(priority: int) -> None:
+    """After the imports, which would hold a processor for long."""
+    soft = int(1e6 * REAL_TIME_CPU_S)
+    resource.setrlimit(resource.RLIMIT_RTTIME, (soft, soft))
+    with suppress(OSError):  # where it is not permitted, the loop has said so
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
