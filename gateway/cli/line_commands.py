@@ -3,9 +3,10 @@
 import json
 from collections.abc import Mapping
 from dataclasses import asdict
+from enum import StrEnum
 from pathlib import Path
 from shlex import quote
-from typing import Annotated, Any
+from typing import Annotated, Any, NoReturn
 
 import numpy as np
 import typer
@@ -19,22 +20,40 @@ from gateway.core.line_problem import LineRefused, Problem, printable
 from gateway.core.line_rules_process import recipe_torque
 from gateway.core.line_rules_wiring import devices
 from gateway.core.line_template import MOST_SPANS, line_template
+from gateway.core.line_template_wiring import Wiring
 
 REFUSED = 2  #: exit code; 1 is left to crashes
 _LARGEST_FILE_BYTES = 1_000_000
 _KINDS = {"drives": "drive", "load_cells": "load cell", "plc": "PLC"}
 
 
+class WireName(StrEnum):
+    """What a role can be wired to."""
+
+    CANOPEN = "canopen"
+    MODBUS_TCP = "modbus-tcp"
+    OPCUA = "opcua"
+    RACK = "rack"
+
+
 def init(
     spans: Annotated[int, typer.Option(min=1, max=MOST_SPANS, help="Number of spans, and of driven rollers.")] = 6,
     out: Annotated[Path, typer.Option(help="The file to write.")] = Path("line.toml"),
+    drives: Annotated[WireName, typer.Option(help="The wire of the drives.")] = WireName.CANOPEN,
+    load_cells: Annotated[WireName, typer.Option(help="The wire of the load cells.")] = WireName.MODBUS_TCP,
+    plc: Annotated[WireName, typer.Option(help="The wire of the line PLC.")] = WireName.MODBUS_TCP,
     force: Annotated[bool, typer.Option("--force", help="Overwrite the file if it exists.")] = False,
 ) -> None:
     """Write a commented line description to fill in. As written it describes the simulated demonstration line.
 
-    Example: r2rgate init --spans 4 --out coater.toml
+    "rack" is one Modbus TCP unit that carries drives, load cells and line control together.
+
+    Example: r2rgate init --spans 4 --plc opcua --out coater.toml
     """
-    text = line_template(spans, quote(out.name))
+    try:
+        text = line_template(spans, quote(out.name), Wiring(drives.value, load_cells.value, plc.value))
+    except ValueError as error:
+        _refuse(str(error))
     try:
         with out.open("w" if force else "x", encoding="utf-8") as file:
             file.write(text)
@@ -95,7 +114,7 @@ def _read(file: Path, source: str) -> str:
         raise LineRefused([Problem(source, line, "", "", "is not UTF-8 here: save the file as UTF-8")]) from None
 
 
-def _refuse(message: str) -> None:
+def _refuse(message: str) -> NoReturn:
     typer.echo(message, err=True)
     raise typer.Exit(REFUSED)
 

@@ -3,14 +3,17 @@
 import json
 import re
 import tomllib
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from gateway.core.line_file import check_line
+from gateway.cli.line_commands import known_maps
+from gateway.core.line_file import check_line, load_line
 from gateway.core.line_help import HELP, line_schema
 from gateway.core.line_template import line_template
+from gateway.core.line_template_wiring import MOST_SPANS_OF_RACK, Wire, Wiring
 
 DOCS = Path(__file__).parents[2] / "docs"
 MAPS = {
@@ -109,3 +112,18 @@ def test_the_example_has_the_structure_of_the_schema() -> None:
             assert re.search(node.get("pattern", ""), str(value))
 
     fits(tomllib.loads((DOCS / "examples/line.toml").read_text(encoding="utf-8")), published)
+
+
+@pytest.mark.parametrize("spans", [1, 8, 9, 14, 60])
+def test_every_mix_of_wires_is_valid_and_every_device_is_on_the_wire_asked_for(spans: int) -> None:
+    wires: tuple[Wire, ...] = ("canopen", "modbus-tcp", "opcua", "rack")
+    for drives, load_cells, plc in product(wires, wires, wires):
+        wiring = Wiring(drives, load_cells, plc)
+        if wiring.uses("rack") and spans > MOST_SPANS_OF_RACK:
+            with pytest.raises(ValueError, match="at most 14 spans"):
+                line_template(spans, wiring=wiring)
+            continue
+        line = load_line(line_template(spans, wiring=wiring), "line.toml", known_maps())
+        protocols = {bus.name: bus.protocol for bus in line.buses}
+        for wire, devices in ((drives, line.drives), (load_cells, line.load_cells), (plc, [line.plc])):
+            assert {protocols[device.bus] for device in devices} == {"modbus-tcp" if wire == "rack" else wire}
