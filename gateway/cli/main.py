@@ -6,7 +6,15 @@ from typing import Annotated, NoReturn
 import typer
 from pydantic import ValidationError
 
-from gateway.cli import fault_commands, line_commands, operate_commands, process_commands, status_commands
+from gateway.cli import (
+    doctor_commands,
+    fault_commands,
+    line_commands,
+    operate_commands,
+    process_commands,
+    scan_commands,
+    status_commands,
+)
 from gateway.cli.lifetime import follow_parent
 from gateway.cli.process_commands import REFUSED
 from gateway.core.line_problem import printable
@@ -24,6 +32,8 @@ ENGINEER, PROCESSES, LINE, EVIDENCE = "Engineer", "Processes", "Running the line
 
 app.command(rich_help_panel=ENGINEER)(line_commands.init)
 app.command(rich_help_panel=ENGINEER)(line_commands.check)
+app.add_typer(scan_commands.app, rich_help_panel=ENGINEER)
+app.command(rich_help_panel=ENGINEER)(doctor_commands.doctor)
 app.command(rich_help_panel=ENGINEER)(process_commands.design)
 app.command(rich_help_panel=PROCESSES)(process_commands.run)
 app.command(rich_help_panel=PROCESSES)(process_commands.loop)

@@ -1,0 +1,63 @@
+"""Whether this user may do what the processes of a line have to: write its folders, open its CAN interfaces."""
+
+import os
+import socket
+import stat
+from collections.abc import Iterator
+from pathlib import Path
+
+from gateway.cli.doctor_check import Check
+from gateway.cli.doctor_machine import existing
+from gateway.core.line import CanopenBus, Line
+
+ROOT = Path("/")
+_GROUP = "permissions"
+
+
+def permissions(line: Line, run_folder: Path, data_folder: Path, root: Path = ROOT) -> Iterator[Check]:
+    """`root` is where /sys is found."""
+    yield _folder("run folder", run_folder, private=True)
+    yield _folder("data folder", data_folder, private=False)
+    for bus in line.buses:
+        if isinstance(bus, CanopenBus) and bus.interface == "socketcan":
+            yield _can_interface(bus, root)
+
+
+def _folder(subject: str, folder: Path, *, private: bool) -> Check:
+    """It exists and may be written, or may be made. `private`: nobody else may put a socket into it."""
+    there = existing(folder)
+    wanted = "may be written by this user" + (", by no other" if private else "")
+    option = f"--{subject.split()[0]}-dir"
+    found = there.stat()
+    owner, mode = found.st_uid, stat.S_IMODE(found.st_mode)
+    measured = (
+        f"{folder}" + ("" if there == folder.absolute() else ", not made yet") + f" (owner {owner}, mode {mode:o})"
+    )
+    if not there.is_dir():
+        return Check(_GROUP, subject, "", "FAIL", f"{there} is a file", wanted, f"move it away, or use {option}")
+    if not os.access(there, os.W_OK | os.X_OK):
+        todo = f"`chown {os.geteuid()} {there}`, or choose another with {option}"
+        return Check(_GROUP, subject, "", "FAIL", f"{measured}: may not be written", wanted, todo)
+    made = there == folder.absolute()
+    if private and made and (owner not in (os.geteuid(), 0) or mode & (stat.S_IWGRP | stat.S_IWOTH)):
+        todo = f"`chmod 700 {folder}` as its owner, or choose another with {option}"
+        return Check(_GROUP, subject, "", "FAIL", f"{measured}: others may write it", wanted, todo)
+    return Check(_GROUP, subject, "", "OK", measured, wanted)
+
+
+def _can_interface(bus: CanopenBus, root: Path) -> Check:
+    subject, wanted = f"CAN {bus.channel}", f"up, {bus.bitrate_bit_per_s} bit/s"
+    try:
+        socket.socket(socket.AF_CAN, socket.SOCK_RAW | socket.SOCK_CLOEXEC, socket.CAN_RAW).close()
+    except OSError as error:
+        todo = "load the kernel's modules can and can_raw (`modprobe can_raw`)"
+        return Check(_GROUP, subject, "", "FAIL", f"no CAN socket: {error.strerror}", wanted, todo)
+    interface = root / "sys/class/net" / bus.channel
+    if not interface.exists():
+        return Check(
+            _GROUP, subject, "", "FAIL", "there is no such interface", wanted, "see `ip link`; is the card in?"
+        )
+    if not int((interface / "flags").read_text(), 16) & 1:  # IFF_UP
+        todo = f"`ip link set {bus.channel} up type can bitrate {bus.bitrate_bit_per_s}`"
+        return Check(_GROUP, subject, "", "FAIL", "it is down", wanted, todo)
+    return Check(_GROUP, subject, "", "OK", "up", wanted)
