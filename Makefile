@@ -6,7 +6,7 @@ RUN   := $(PY) -m gateway.cli
 export PYTHONDONTWRITEBYTECODE :=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup run test check format bench bench-stepped bench-wire bench-processes lock clean
+.PHONY: help setup run test system-test check format bench bench-stepped bench-wire bench-processes bench-cycle bench-faults bench-fuzz bench-soak lock clean
 
 help: ## this list
 	@echo "r2rgate: make TARGET"
@@ -22,6 +22,10 @@ run: setup ## set up, then the demonstration: simulated line, loop and gateway i
 
 test: setup ## set up, then all tests
 	@$(PY) -m pytest $(ARGS)
+
+system-test: setup ## a real CAN kernel and foreign protocol stacks; as root, installs Debian and npm packages (about 6 min)
+	@$(PY) -m tests.system.needs
+	@$(PY) -m pytest tests/system $(ARGS)
 
 check: setup ## lint, types, import contracts
 	@$(PY) -m ruff check .
@@ -44,6 +48,18 @@ bench-wire: setup ## the demonstration in real time, both laws, three seeds
 
 bench-processes: setup ## processes killed in mid-run, judged by the recorder
 	@$(PY) -m tests.bench.processes $(ARGS)
+
+bench-faults: setup ## every fault 200 times in virtual time, 5 times over the wires (ARGS="--injections 20 --wire 0")
+	@$(PY) -m tests.bench.faults $(ARGS)
+
+bench-fuzz: setup ## a million hostile frames through each decoder (ARGS="--frames 100000")
+	@$(PY) -m tests.bench.fuzz $(ARGS)
+
+bench-soak: setup ## an hour of a line on three wires, with something going wrong each minute (ARGS="--minutes 10")
+	@$(PY) -m tests.bench.soak $(ARGS)
+
+bench-cycle: setup ## how late the loop wakes beside cyclictest, what a cycle takes and costs; as root (about 40 min)
+	@$(PY) -m tests.bench.cycle $(ARGS)
 
 lock: setup ## requirements.lock anew from pyproject.toml (needs uv), hashes without any index address
 	uv pip compile -q --universal --generate-hashes --python-version 3.11 --extra dev \

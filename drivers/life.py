@@ -1,9 +1,10 @@
 """The life counter between gateway and PLC: it moves with every command, and so must the PLC's echo of it. No I/O.
 
-An interface that still answers for a dead PLC is found by it.
+An interface that still answers for a dead PLC is found by it, and one that counts by itself.
 """
 
-ECHOES_ALLOWED = 3  #: answers in a row with the same echo until the PLC counts as stale
+ECHOES_ALLOWED = 3  #: answers in a row without an echo of a new command until the PLC counts as stale
+COMMANDS_UNDER_WAY = 4  #: an echo is of one of the last commands
 
 
 class LifeCounter:
@@ -20,8 +21,9 @@ class LifeCounter:
         return self.value
 
     def stands_still(self, echo: float, *, moving: bool) -> bool:
-        """Whether the echo, as answered now, has stood still for too long. `moving`: commands are being sent."""
-        self._same = 0 if echo != self._echo or not moving else self._same + 1
+        """Whether no new command has been echoed for too long. `moving`: commands are being sent."""
+        ours = (self.value - int(echo)) & 0xFFFF <= COMMANDS_UNDER_WAY
+        self._same = 0 if (ours and echo != self._echo) or not moving else self._same + 1
         self._echo = echo
         return self._same >= ECHOES_ALLOWED
 

@@ -1,8 +1,10 @@
 """The power stage of a CiA 402 drive as the gateway knows and commands it, whatever carries the words. No I/O."""
 
-from drivers.cia402 import DISABLE_VOLTAGE, PowerState, controlword, drive_state, power_state
+from drivers.cia402 import DISABLE_VOLTAGE, QUICK_STOP, PowerState, controlword, drive_state, power_state
 from drivers.map_fields import Bit
 from gateway.core.signals import DriveRequest, DriveState
+
+ORDERS_IGNORED = 5  #: orders to take torque off, in a row, until an enabled drive counts as disobedient
 
 
 class PowerStage:
@@ -15,6 +17,7 @@ class PowerStage:
         self._follows = False
         self._controlword = DISABLE_VOLTAGE
         self._request = int(DriveRequest.OFF)
+        self._ignored = 0  #: orders to take torque off, in a row, to a drive that says it is enabled
 
     def on_statusword(self, statusword: int, safe_torque_off: bool | None) -> None:
         """What it says now; `safe_torque_off` is None where that is not told with the statusword."""
@@ -47,6 +50,11 @@ class PowerStage:
         in_fault = self.power is not None and drive_state(self.power) == DriveState.FAULT
         return self._request == DriveRequest.RESET_FAULT and not in_fault
 
+    @property
+    def disobeys(self) -> bool:
+        """Whether it was told to take torque off and has not: only its watchdog, unfed, can stop it."""
+        return self._ignored > ORDERS_IGNORED
+
     def command(self, request: int, torque_nm: float, state: DriveState, trusted: bool) -> tuple[int, float]:
         """Controlword and torque (Nm) towards `request`; `state` is what the whole drive counts as.
 
@@ -58,6 +66,9 @@ class PowerStage:
             self._controlword = DISABLE_VOLTAGE
         else:
             self._controlword = controlword(self.power, request, self._controlword)
+        # One that ramps down in a quick stop says so: it is not enabled any more.
+        ignores = self.power is PowerState.OPERATION_ENABLED and self._controlword in (DISABLE_VOLTAGE, QUICK_STOP)
+        self._ignored = self._ignored + 1 if ignores else 0
         follows = state == DriveState.ENABLED and request == DriveRequest.ENABLE
         return self._controlword, torque_nm if follows else 0.0
 
@@ -66,3 +77,4 @@ class PowerStage:
         self.power = None
         self._controlword = DISABLE_VOLTAGE
         self._request = int(DriveRequest.OFF)
+        self._ignored = 0

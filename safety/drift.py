@@ -7,7 +7,8 @@ At constant set-points the average of eq. roller_velocity_dynamics is
 with the true tensions. What is wrong in the model shifts rho_i by a constant. If cell k shows d_k too much, control
 keeps the shown value, and rho_i moves by R_i (d_{i+1} - d_i): a drift of cell k alone moves rho_{k-1}/R and rho_k/R
 by the same amount in opposite directions, which no change of one roller's friction does. (Roller 0 has no torque
-that is known here, so cell 1 is told from roller 1 alone, and at a higher threshold.)
+that is known here, so cell 1 is told from roller 1 alone, and at a higher threshold. A span without a cell leaves both
+of its rollers without a balance: the cells beside it are not watched.)
 """
 
 from dataclasses import dataclass, field

@@ -1,7 +1,10 @@
-"""Encoder jumps: a speed that no roller can have reached since its last sample is discarded. Pure.
+"""Speeds that cannot be true are discarded: rollers by their acceleration, v0 by its request. Pure.
 
-A roller of radius R and inertia J under the torque limit u and web tensions up to T_max is accelerated by at most
-R/J (u + R T_max) (eq. roller_velocity_dynamics without friction).
+A roller's acceleration is that of eq. roller_velocity_dynamics,
+
+    a_i = R_i/J_i (u_i + R_i (T_{i+1} - T_i)) - f_i/J_i v_i
+
+with the torque u that acted, or none if the drive has let go, and parameters anywhere in their tolerances.
 """
 
 from dataclasses import dataclass, field
@@ -13,43 +16,59 @@ from gateway.core.signals import CountArray, FloatArray, Inputs, Quality
 from safety.actions import Action, Finding
 
 NOISE_M_PER_S = 0.002  #: of two speed samples together, well above any usable encoder's
-MARGIN = 2.0  #: times what the nominal parameters allow; inertia and radius are not known better
 MEMORY_S = 1.0  #: a second jump within this time is no coincidence
+UNWINDER_MARGIN = 0.15  #: of the line's greatest speed: noise of v0, and how far it overshoots its request
 _GOOD = int(Quality.GOOD)
 
 
 @dataclass(frozen=True, slots=True)
 class JumpLimits:
-    """Per roller, shape (n,)."""
+    """Arrays (n,), each at the edge of its tolerance that allows more."""
 
-    acceleration_m_per_s2: FloatArray
+    radius_m: FloatArray
+    radius_per_inertia: FloatArray  #: R/J, 1/(kg m)
+    friction_rate_per_s: FloatArray  #: f/J
+    noise_m_per_s: FloatArray  #: two counts of the drive's speed included
+    tension_max_n: float
+    unwinder_m_per_s: float
     period_s: float
     memory_periods: int
 
 
-def jump_limits(line: Line) -> JumpLimits:
-    """What the rollers of `line` can do, at the edge of their tolerances."""
-    limits = line.limits
-    radius = np.array([r.radius_m.value * (1 + r.radius_m.tolerance) for r in line.rollers])
-    inertia = np.array([r.inertia_kg_m2.value * (1 - r.inertia_kg_m2.tolerance) for r in line.rollers])
-    period_s = line.control.period_s
-    most = MARGIN * radius / inertia * (limits.torque_nm + radius * limits.tension_max_n)
-    return JumpLimits(most, period_s, round(MEMORY_S / period_s))
+def jump_limits(line: Line, resolution_m_per_s: FloatArray | None = None) -> JumpLimits:
+    """What the rollers of `line` can do. `resolution_m_per_s` (n,) is what a count of each drive's speed is worth."""
+    rollers, period_s = line.rollers, line.control.period_s
+    radius = np.array([r.radius_m.value * (1 + r.radius_m.tolerance) for r in rollers])
+    inertia = np.array([r.inertia_kg_m2.value * (1 - r.inertia_kg_m2.tolerance) for r in rollers])
+    friction = np.array([r.friction_nms_per_rad.value * (1 + r.friction_nms_per_rad.tolerance) for r in rollers])
+    resolution = np.zeros(line.n) if resolution_m_per_s is None else resolution_m_per_s
+    return JumpLimits(
+        radius_m=radius,
+        radius_per_inertia=radius / inertia,
+        friction_rate_per_s=friction / inertia,
+        noise_m_per_s=NOISE_M_PER_S + 2.0 * resolution,
+        tension_max_n=line.limits.tension_max_n,
+        unwinder_m_per_s=UNWINDER_MARGIN * line.limits.speed_max_m_per_s,
+        period_s=period_s,
+        memory_periods=round(MEMORY_S / period_s),
+    )
 
 
 @dataclass(slots=True)
 class JumpState:
-    """The last believed speed (n,) in m/s, its age (n,) in periods, and how long a jump is remembered yet."""
+    """Last believed values, their ages in periods, and how long a jump is remembered yet; arrays (n,)."""
 
     speed_m_per_s: FloatArray = field(default_factory=lambda: np.zeros(0))
     age: CountArray = field(default_factory=lambda: np.zeros(0, np.int64))
     remembered: CountArray = field(default_factory=lambda: np.zeros(0, np.int64))
+    unwind_speed_m_per_s: float = np.nan
 
 
-def reject_jumps(limits: JumpLimits, state: JumpState, inputs: Inputs) -> list[Finding]:
+def reject_jumps(limits: JumpLimits, state: JumpState, inputs: Inputs, torque_nm: FloatArray) -> list[Finding]:
     """Mark speeds that jumped as BAD, with the last believed value; a second jump of a roller stops the line.
 
-    `state` is brought up to date. Without an earlier sample nothing is a jump.
+    `torque_nm` (n,) is the greatest that acted since the last sample, either way. `state` is brought up to date.
+    Without an earlier sample nothing is a jump.
     """
     speed = inputs.speed
     if len(state.age) != inputs.n:
@@ -57,11 +76,10 @@ def reject_jumps(limits: JumpLimits, state: JumpState, inputs: Inputs) -> list[F
         state.age = np.ones(inputs.n, np.int64)
         state.remembered = np.zeros(inputs.n, np.int64)
     good = speed.quality == _GOOD
-    reach = limits.acceleration_m_per_s2 * (state.age * limits.period_s) + NOISE_M_PER_S
     with np.errstate(invalid="ignore"):
-        jumped = good & (np.abs(speed.value - state.speed_m_per_s) > reach)  # False for NaN: no earlier sample
+        jumped = good & (np.abs(speed.value - state.speed_m_per_s) > _reach(limits, state, inputs, torque_nm))
     findings: list[Finding] = []
-    if jumped.any():
+    if jumped.any():  # False for NaN: no earlier sample
         findings = [_second(inputs, state, int(i)) for i in np.flatnonzero(jumped & (state.remembered > 0))]
         for i in np.flatnonzero(jumped):
             speed.reject(int(i))
@@ -72,6 +90,36 @@ def reject_jumps(limits: JumpLimits, state: JumpState, inputs: Inputs) -> list[F
     state.age = np.where(good, 1, state.age + 1)
     np.copyto(state.speed_m_per_s, speed.value, where=good)
     return findings
+
+
+def _reach(limits: JumpLimits, state: JumpState, inputs: Inputs, torque_nm: FloatArray) -> FloatArray:
+    """How far (m/s) each roller can have come since its last believed sample, (n,)."""
+    tension = np.where(inputs.tension.quality == _GOOD, np.abs(inputs.tension.value), limits.tension_max_n)
+    pull_n = np.maximum(tension, np.append(tension[1:], 0.0))  # the web may have let go on either side
+    drive = limits.radius_per_inertia * (np.abs(torque_nm) + limits.radius_m * pull_n)
+    brake = limits.friction_rate_per_s * np.abs(state.speed_m_per_s)
+    return (drive + brake) * (state.age * limits.period_s) + limits.noise_m_per_s
+
+
+def reject_unwinder(limits: JumpLimits, state: JumpState, inputs: Inputs, request_m_per_s: float) -> None:
+    """Mark a v0 as BAD that lies neither between standstill, its last value and its request, nor near them.
+
+    It may step: a PLC without a ramp does. While it is not asked for anything it may be moved by hand, so that this is
+    for a line under control.
+    """
+    unwind = inputs.unwind_speed
+    if unwind.quality[0] != _GOOD:
+        return
+    value, last = float(unwind.value[0]), state.unwind_speed_m_per_s
+    if np.isnan(last):
+        last = value
+    low = min(0.0, last, request_m_per_s) - limits.unwinder_m_per_s
+    high = max(0.0, last, request_m_per_s) + limits.unwinder_m_per_s
+    if low <= value <= high:
+        state.unwind_speed_m_per_s = value
+    else:
+        unwind.reject(0)
+        unwind.value[0] = last
 
 
 def _second(inputs: Inputs, state: JumpState, i: int) -> Finding:

@@ -77,10 +77,12 @@ def _web_rate(model, condition, state, elastic, speed, rate):
         if not condition.broken[i]:
             per_length, up, down = model.per_length_per_m[i], speed[i], speed[i + 1]
             rate[i] = tension_rate(model.stiffness_n[i], per_length, elastic[i], elastic[i + 1], up, down)
-            # A slack web is stretched by nobody: its arm only forgets.
-            is_slack = model.slack and state[i] + arm < 0.0
-            stiffness = 0.0 if is_slack else model.arm_stiffness_n[i]
-            rate[2 * n + i] = tension_rate(stiffness, per_length, arm_up, arm, up, down) - model.arm_rate_per_s * arm
+            # A slack web is stretched by nobody: its arm only forgets, and has the spring to move with it.
+            stiffness, forgets_per_s = model.arm_stiffness_n[i], model.arm_rate_per_s
+            if model.slack and state[i] + arm < 0.0:
+                forgets_per_s /= 1.0 + stiffness / model.stiffness_n[i]
+                stiffness = 0.0
+            rate[2 * n + i] = tension_rate(stiffness, per_length, arm_up, arm, up, down) - forgets_per_s * arm
         arm_up = arm
 
 
@@ -94,6 +96,12 @@ def _roller(model, state, i):
         inertia = model.reel_inertia_kg_m2 + model.reel_mass_kg_per_m2 * grown
         return radius, area / inertia, model.friction_nms_per_rad / inertia, radius / inertia
     return model.radius_m[i], model.web_gain[i], model.friction_rate_per_s[i], model.torque_gain[i]
+
+
+@_inlined
+def _bearing(condition, i):
+    """c of roller i+1."""
+    return condition.wear[VALUE, i] * condition.friction[VALUE, i]
 
 
 @_inlined
@@ -113,7 +121,7 @@ def _rate(model, condition, state, demand_nm, noise, direction, tension, elastic
     n = model.radius_m.size
     _web_rate(model, condition, state, elastic, speed, rate)
     for i in range(n):
-        w, m, bearing = state[n + i], state[3 * n + i], condition.bearing[VALUE, i]
+        w, m, bearing = state[n + i], state[3 * n + i], _bearing(condition, i)
         radius, web_gain, friction_rate, torque_gain = _roller(model, state, i)
         dry_nm = 0.0
         if model.breakaway_nm[i] > 0.0:
@@ -157,7 +165,7 @@ def _decide_motion(model, condition, state, tension, rho, direction):
             continue
         radius = _roller(model, state, i)[0]
         torque = radius * rho[i] * (tension[i + 2] - tension[i + 1]) + state[3 * n + i]
-        holds = abs(torque) <= condition.bearing[VALUE, i] * model.breakaway_nm[i]
+        holds = abs(torque) <= _bearing(condition, i) * model.breakaway_nm[i]
         direction[i] = 0.0 if holds else 1.0 if torque > 0.0 else -1.0
 
 
@@ -186,7 +194,8 @@ def _demand(model, state, held, demand_nm):
 
 @compiled
 def integrate_full(model, condition, state, inputs, noise, trace, web):
-    """As `physics.integrate`, for the full model: `state` (5n + 3,) and `condition.bearing` advance in place.
+    """As `physics.integrate`, for the full model: `state` (5n + 3,), wear and friction of the `condition` advance in
+    place.
 
     Row r of `trace` (m, 3n+1) becomes [T, v, m, v_0], tensions, the web's speeds, the drives' torques and the web's
     speed at the unwinder at the end of step r. `web` (2n,) becomes [T, v] at the end, also when there is no step.
@@ -199,7 +208,8 @@ def integrate_full(model, condition, state, inputs, noise, trace, web):
     _web(model, condition, state, held[n], tension, elastic, speed, rho)
     for r in range(noise.shape[0]):
         slew(inputs)
-        slew(condition.bearing)
+        slew(condition.wear)
+        slew(condition.friction)
         _demand(model, state, held, demand_nm)
         _decide_motion(model, condition, state, tension, rho, direction)
         for stage in range(4):

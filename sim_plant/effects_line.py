@@ -47,6 +47,13 @@ class FullLine:
         self._inputs[:2, index] = value
         self._state.torque_nm[index] = value
 
+    def follow_commands(self) -> None:
+        """Without lag a torque is where its command is at once, also for who looks before the next step."""
+        model, n = self._model, len(self.torque_nm)
+        if model.lag_rate_per_s == 0.0:
+            step, demand_nm = model.torque_step_nm, self._inputs[VALUE, :n]
+            self.torque_nm[:] = step * np.rint(demand_nm / step) if step > 0.0 else demand_nm
+
     def start_at_equilibrium(self, tension_n: FloatArray, unwind_speed_m_per_s: float) -> FloatArray:
         """Put the web at its rest point, round rollers supposed. Returns the torques (n,) that hold it."""
         spring, arm, speed = rest(self._model, tension_n, unwind_speed_m_per_s)
@@ -93,18 +100,19 @@ class FullLine:
         self._no_web_pushes()
 
     def set_friction_factor(self, roller: int, factor: float, rate_per_s: float = inf) -> None:
-        """All friction of a roller's bearing times `factor` of the plant's, reached at this rate (inf: at once)."""
+        """All friction of a roller's bearing times `factor`, beside its wear, reached at this rate (inf: at once)."""
         self._check("roller", roller)
         if not (isfinite(factor) and factor >= 0.0 and rate_per_s > 0.0):
             raise ValueError(f"friction factor of roller {roller} must be 0 or more, and its rate above 0")
-        bearing = self._condition.bearing[:, roller - 1]
-        bearing[TARGET], bearing[RATE] = factor, rate_per_s
+        friction = self._condition.friction[:, roller - 1]
+        friction[TARGET], friction[RATE] = factor, rate_per_s
         if rate_per_s == inf:
-            bearing[VALUE], bearing[RATE] = factor, 0.0
+            friction[VALUE], friction[RATE] = factor, 0.0
 
     def friction_factor(self, roller: int) -> float:
+        """c of a roller's bearing now: wear and what a fault has made of it."""
         self._check("roller", roller)
-        return float(self._condition.bearing[VALUE, roller - 1])
+        return float(self._bearing[roller - 1])
 
     def set_slip(self, roller: int, mu_factor: float) -> None:
         """The friction between web and roller is `mu_factor` of the plant's; below 1 the web may slip there.
@@ -128,7 +136,11 @@ class FullLine:
         model, w = self._model, surface_speed_m_per_s
         viscous = each(self._plant.rollers.friction_nms_per_rad, len(w)) * w / self.radius_m[1:]
         bend = (model.breakaway_nm - model.coulomb_nm) * np.exp(-((w / model.stribeck_speed_m_per_s) ** 2))
-        return self._condition.bearing[VALUE] * (viscous + np.sign(w) * (model.coulomb_nm + bend))
+        return self._bearing * (viscous + np.sign(w) * (model.coulomb_nm + bend))
+
+    @property
+    def _bearing(self) -> FloatArray:
+        return self._condition.wear[VALUE] * self._condition.friction[VALUE]
 
     def _clear(self, span: int) -> None:
         self._check("span", span)

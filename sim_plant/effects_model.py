@@ -14,11 +14,13 @@ a spring E A, and beside it a Maxwell arm of stiffness r E A and relaxation time
 both, what comes in and goes out carries both along, and the arm forgets:
 
     ds_i/dt = E A/L_i (v_i - v_{i-1}) + 1/L_i (e_{i-1} v_{i-1} - e_i v_i)
-    dq_i/dt = r E A/L_i (v_i - v_{i-1}) [0 while it is slack] + 1/L_i (q_{i-1} v_{i-1} - q_i v_i) - q_i/tau
+    dq_i/dt = r E A/L_i (v_i - v_{i-1}) + 1/L_i (q_{i-1} v_{i-1} - q_i v_i) - q_i/tau
     T_i = max(0, s_i + q_i)     with slack, T_i = s_i + q_i without, 0 when the web is broken;     e_i = T_i - q_i
 
 The web cannot push. s goes on below -q as the length beyond the span, -(s + q) L/(E A), that is to be taken up before
-tension comes back. A web that is broken has T = s = q = 0 until it is spliced.
+tension comes back. Meanwhile nobody stretches the web: its stress is zero, so that what the arm forgets the spring must
+give, and with d(s + q)/dt = 0 in the web itself the first term of dq_i/dt leaves -q_i/((1 + r) tau) in all: the creep
+recovery of the solid. A web that is broken has T = s = q = 0 until it is spliced.
 
 Rollers (Reid and Lin 1993, Brandenburg 1973), rho_i = 1 + epsilon_i cos(phi_i + phase_i) for an eccentric one:
 
@@ -102,7 +104,8 @@ class Model(NamedTuple):
 class Condition(NamedTuple):
     """What wear and faults change while the line runs."""
 
-    bearing: FloatArray  #: c: value, target and rate per second (3, n), as the inputs of `physics`
+    wear: FloatArray  #: c is wear * friction; each value, target and rate per second (3, n), as the inputs of `physics`
+    friction: FloatArray  #: what a fault makes of it
     grip: FloatArray  #: g (n,); NEVER_SLIPS where the web is held whatever comes
     broken: NDArray[np.bool_]  #: (n,)
 
@@ -146,12 +149,12 @@ def condition_of(plant: Plant) -> Condition:
     """The line as it is at the start: nothing broken, bearings new, and slip as the plant's file has it."""
     n, slip = plant.spans, plant.effects.slip
     rise = each(plant.effects.friction.rise_per_s, n)
-    bearing = np.ones((3, n))
-    bearing[TARGET], bearing[RATE] = np.where(rise > 0.0, np.inf, 1.0), rise
+    wear, friction = np.ones((3, n)), np.ones((3, n))
+    wear[TARGET], wear[RATE] = np.where(rise > 0.0, np.inf, 1.0), rise
     grip = np.full(n, NEVER_SLIPS)
     if slip.on:
         grip[:-1] = np.exp(each(slip.friction_coefficient, n) * each(slip.wrap_rad, n))[:-1]
-    return Condition(bearing, grip, np.zeros(n, dtype=np.bool_))
+    return Condition(wear, friction, grip, np.zeros(n, dtype=np.bool_))
 
 
 class State:

@@ -2,7 +2,8 @@
 
 Kinds of unsafe event, each counted once when it begins:
 
-torque-limit        a drive's torque lies beyond `torque_nm` of the plant's recorder limits (+ tolerance.torque_nm).
+torque-limit        a drive's torque, or the target torque that it is commanded, lies beyond `torque_nm` of the plant's
+                    recorder limits (+ tolerance.torque_nm). A drive that gives no more excuses nobody.
 torque-rate         between two SYNCs (or two commands, where these act at once) at which the drive was enabled, or
                     just became so, the torque it was made to give changed by more than
                     rate * (elapsed + tolerance.time_s) + tolerance.torque_nm. Torque that goes to zero because the
@@ -97,6 +98,7 @@ class Judge:
         self._tripped = np.zeros(n, dtype=np.bool_)
         self._inside_steps = np.zeros(n, dtype=np.int64)
         self._going_on = np.zeros((len(Kind), n), dtype=np.bool_)
+        self._asked_too_much = np.zeros(n, dtype=np.bool_)
         self._found = np.zeros((_MOST_FOUND, 4))
         self._last_torque_nm = np.zeros(n)
         self._last_sync_s = np.full(n, -np.inf)
@@ -109,6 +111,7 @@ class Judge:
             rows,
             self._bounds,
             self._may_give_torque,
+            self._asked_too_much,
             bool(self._enabled.all()),
             int(tension_kind),
             self._inside_steps,
@@ -120,6 +123,17 @@ class Judge:
             Finding(Kind(int(kind)), int(index), float(value), first + int(row))
             for kind, index, value, row in self._found[: min(found, _MOST_FOUND)]
         ]
+
+    def commanded(self, index: int, target_torque_nm: float) -> Finding | None:
+        """Judge the target torque that a drive is commanded, whatever it makes of it."""
+        limit_nm = self.limits.torque_nm + self.tolerance.torque_nm
+        too_much = abs(target_torque_nm) > limit_nm
+        self._asked_too_much[index] = too_much
+        if not too_much or self._going_on[Kind.TORQUE_LIMIT, index]:
+            return None
+        self._going_on[Kind.TORQUE_LIMIT, index] = True
+        self.counts[Kind.TORQUE_LIMIT] += 1
+        return Finding(Kind.TORQUE_LIMIT, index, abs(target_torque_nm), -1)
 
     def torque(self, index: int, torque_nm: float, now_s: float) -> Finding | None:
         """Judge the torque that a drive was made to give by the SYNC at `now_s`."""
@@ -199,7 +213,9 @@ def _begin(kind, index, value, row, number, going_on, counts, found):
 
 
 @_compiled
-def _judge_rows(rows, bounds, may_give_torque, all_enabled, tension_kind, inside_steps, going_on, counts, found):
+def _judge_rows(
+    rows, bounds, may_give_torque, asked_too_much, all_enabled, tension_kind, inside_steps, going_on, counts, found
+):
     """Fill `found` with [kind, index, value, row] of each event that begins in `rows`. Returns their number."""
     tension_min, tension_max, torque_max, torque_zero = bounds
     n = inside_steps.size
@@ -217,7 +233,7 @@ def _judge_rows(rows, bounds, may_give_torque, all_enabled, tension_kind, inside
                 inside_steps[i] = inside_steps[i] + 1 if inside and all_enabled else 0
 
             if torque <= torque_max:
-                going_on[_TORQUE_LIMIT, i] = False
+                going_on[_TORQUE_LIMIT, i] = going_on[_TORQUE_LIMIT, i] and asked_too_much[i]
             else:
                 number = _begin(_TORQUE_LIMIT, i, torque, row, number, going_on, counts, found)
 

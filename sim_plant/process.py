@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from sim_plant.faces.canopen_bus import FaceUnavailable
+from sim_plant.faults.control import SOCKET_FILE
 from sim_plant.faults.parse import parse_fault
 from sim_plant.plant import Plant, PlantRefused, load_plant
 from sim_plant.wired import Settings, WiredLine
@@ -42,19 +43,33 @@ def run_plant(
     """Run the line of a plant file until SIGTERM or SIGINT.
 
     Returns the exit code: 0, 2 when the line cannot run, 1 when the system failed it after it was ready. Why goes to
-    standard error. See `Settings`. `on_ready` is called once every wire is open; without it a line of JSON goes to
-    standard output.
+    standard error. See `Settings`; without `control` the socket for faults lies in the folder of the recording, and the
+    line goes on without it where it cannot be opened. `on_ready` is called once every wire is open; without it a line
+    of JSON goes to standard output.
     """
     try:
         planned = tuple(parse_fault(fault) for fault in faults)
-        settings = Settings(Path(record_folder), seed, scale, can_port, modbus_port, opcua_port, planned, control)
+        folder = Path(record_folder)
+        settings = Settings(
+            folder,
+            seed,
+            scale,
+            can_port,
+            modbus_port,
+            opcua_port,
+            planned,
+            control or folder / SOCKET_FILE,
+            control_is_optional=control is None,
+        )
         if not (isfinite(settings.scale) and settings.scale > 0.0):
             raise ValueError(f"the time scale must be finite and above 0, got {settings.scale}")
         plant = load_plant(plant_path)
     except PlantRefused as error:
         return _refused(f"{error.path} is not used", *error.reasons)
-    except (ValueError, OSError) as error:
+    except ValueError as error:
         return _refused(str(error))
+    except OSError as error:
+        return _refused(in_words(error))
     return asyncio.run(_run(plant, settings, on_ready or _print_ready))
 
 
@@ -76,14 +91,18 @@ async def _run(plant: Plant, settings: Settings, on_ready: Callable[[WiredLine],
         await line.open()
     except FileExistsError:
         return _refused(f"{settings.record_folder} already holds a recording: choose another folder, or remove it")
-    except (FaceUnavailable, ValueError, OSError) as error:
+    except (FaceUnavailable, ValueError) as error:
         return _refused(str(error))
+    except OSError as error:
+        return _refused(in_words(error))
+    if line.control_refused:
+        print(f"simulated line: goes on without a control socket: {line.control_refused}", file=sys.stderr)
     try:
         await _live(line, on_ready, stop)
         if broken:
             raise broken[0]
     except OSError as error:
-        print(f"simulated line: it has failed while it ran: {error}", file=sys.stderr)
+        print(f"simulated line: it has failed while it ran: {in_words(error)}", file=sys.stderr)
         return EXIT_FAILED
     return 0
 
@@ -117,6 +136,12 @@ def _refused(*reasons: str) -> int:
     return EXIT_REFUSED
 
 
+def in_words(error: OSError) -> str:
+    """What the system says, and of which file."""
+    why = error.strerror or str(error)
+    return f"{error.filename}: {why}" if error.filename else why
+
+
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser("sim_plant", description="Run the simulated line of a plant file on its wires.")
     parser.add_argument("plant", type=Path, help="PLANT.toml: the truth")
@@ -127,7 +152,9 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--modbus-port", type=int, help="in place of the plant's; 0 takes a free one")
     parser.add_argument("--opcua-port", type=int, help="in place of the plant's; 0 takes a free one")
     parser.add_argument("--fault", action="append", default=[], help="a fault by name, see docs/faults.md; repeatable")
-    parser.add_argument("--control", type=Path, help="socket for faults while the line runs")
+    parser.add_argument(
+        "--control", type=Path, help="socket for faults while the line runs (default: in the recording)"
+    )
     given = parser.parse_args(arguments)
     return run_plant(
         given.plant,

@@ -90,9 +90,14 @@ class Recorder:
         """A drive received a command."""
         what = {"controlword": controlword, "target_torque_nm": target_torque_nm, "mode": mode}
         self.note("command", now_s, roller=drive + 1, **what)
+        if (finding := self._judge.commanded(drive, target_torque_nm)) is not None:
+            self._unsafe(finding, now_s)
 
     def drive_state(self, drive: int, state: str, cause: str, now_s: float) -> None:
-        """A drive entered a CiA 402 state, because of a command, nmt, quick stop, watchdog, fault or sto."""
+        """A drive entered a CiA 402 state, because of a command, nmt, quick stop, watchdog, fault, sto or restart.
+
+        nmt is the master's command to leave operational: somebody's will. A restart is nobody's.
+        """
         before, self._states[drive] = self._states[drive], state
         gave_torque = before in ("OPERATION_ENABLED", "QUICK_STOP_ACTIVE")
         if state == "OPERATION_ENABLED":
@@ -122,6 +127,9 @@ class Recorder:
         findings = self._judge.torques(torque_nm, now_s)
         self._torque_nm[:] = torque_nm
         self.note("torques", now_s, commanded_nm=commanded_nm.tolist(), torque_nm=torque_nm.tolist())
+        for drive, target_nm in enumerate(commanded_nm):
+            if (finding := self._judge.commanded(drive, float(target_nm))) is not None:
+                self._unsafe(finding, now_s)
         for finding in findings:
             self._unsafe(finding, now_s)
 

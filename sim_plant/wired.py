@@ -2,7 +2,7 @@
 
 import asyncio
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -75,6 +75,7 @@ class Settings:
     opcua_port: int | None = None
     faults: tuple[Injection, ...] = ()
     control: Path | None = None
+    control_is_optional: bool = False  #: a line whose control socket cannot be opened goes on without
 
 
 class WiredLine:
@@ -93,7 +94,8 @@ class WiredLine:
         self.can_port = _port("the CAN port (--can-port)", settings.can_port, wires.canopen.port, 1)
         self.modbus_port = _port("the Modbus port (--modbus-port)", settings.modbus_port, wires.modbus.port, 0)
         self.opcua_port = _port("the OPC UA port (--opcua-port)", settings.opcua_port, wires.opcua.port, 0)
-        _compile(plant, any(fault.target.kind is Kind.WEB for fault in settings.faults))
+        may_leave_plain = settings.control is not None or any(f.target.kind is Kind.WEB for f in settings.faults)
+        _compile(plant, may_leave_plain)
         self.clock = clock or WorldClock(settings.scale)
         self.world = World(plant, settings.seed)
         self._folder_was_there = settings.record_folder.exists()
@@ -109,7 +111,7 @@ class WiredLine:
             self.world,
             self.recorder,
             (self.drives, self.amplifier, self.plc),
-            self.clock.now_s,
+            self._tcp_now_s,
             self._restart_node,
             settings.seed,
         )
@@ -117,23 +119,27 @@ class WiredLine:
         self.canopen: CanopenFace | None = None
         self.modbus: ModbusFace | None = None
         self.opcua: OpcUaFace | None = None
+        self.control_path: Path | None = None  #: None while the control socket is not open
+        self.control_refused = ""  #: why an optional one is not
         self._bus: OpenBus | None = None
         self._proxy: TcpProxy | None = None
 
     async def open(self) -> None:
-        """Open every wire and power the drives on. Raises FaceUnavailable; nothing is open or recorded then."""
+        """Open every wire and power the drives on. Raises FaceUnavailable; nothing is open or recorded then.
+
+        Faults without a time, or at 0, come as soon as there is a device to which they can happen.
+        """
         try:
-            for fault in self.settings.faults:
+            later = [fault for fault in self.settings.faults if fault.at_s]
+            for fault in later:
                 self.faults.injector.add(fault, 0.0)
             self._open_canopen()
             await self._open_modbus()
             await self._open_opcua()
-            if self.settings.control is not None:
-                await self.control.open(self.settings.control)
-        except ControlUnavailable as error:
-            await self.close()
-            self._discard_recording()
-            raise FaceUnavailable(str(error)) from error
+            for fault in self.settings.faults:
+                if fault not in later:
+                    self.faults.injector.add(replace(fault, at_s=None), self.faults.now_s())
+            await self._open_control()
         except BaseException:
             await self.close()
             self._discard_recording()
@@ -180,7 +186,10 @@ class WiredLine:
         }
 
     def ready(self) -> dict[str, Any]:
-        """What others need to know to talk to the line, as JSON. The port of a wire that is not open is null."""
+        """What others need to know to talk to the line, as JSON. The port of a wire that is not open is null.
+
+        `control` is the path of the control socket, null without one.
+        """
         return {
             "ready": True,
             "plant": self.plant.name,
@@ -188,6 +197,7 @@ class WiredLine:
             "can_port": self.can_port if self.canopen else None,
             "modbus_port": self.modbus_port if self.modbus else None,
             "opcua_port": self.opcua_port if self.opcua else None,
+            "control": None if self.control_path is None else str(self.control_path),
             "monotonic_start_s": self.clock.monotonic_start_s,
         }
 
@@ -250,13 +260,26 @@ class WiredLine:
         face = OpcUaFace(axes, amplifier, there.cells, plc, self._tcp_now_s)
         try:
             if self.settings.faults or self.settings.control:
-                self._proxy = TcpProxy(self.faults.opcua, OPC_UA, host, await face.open(host, 0))
+                self._proxy = TcpProxy(self.faults.opcua, OPC_UA, host, await face.open(host, 0), self.settings.scale)
                 self.opcua_port = await self._proxy.open(host, self.opcua_port)
             else:
                 self.opcua_port = await face.open(host, self.opcua_port)
         except OSError as error:
             raise _port_unavailable("OPC UA", host, self.opcua_port, error) from error
         self.opcua = face
+
+    async def _open_control(self) -> None:
+        path = self.settings.control
+        if path is None:
+            return
+        try:
+            await self.control.open(path)
+        except ControlUnavailable as error:
+            if not self.settings.control_is_optional:
+                raise FaceUnavailable(str(error)) from error
+            self.control_refused = str(error)
+        else:
+            self.control_path = path
 
     def _discard_recording(self) -> None:
         """Of a line that never lived: the next attempt may have the folder."""

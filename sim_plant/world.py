@@ -88,6 +88,7 @@ class World:
     def command_torques_nm(self, values: FloatArray) -> None:
         """What all drives are told from now on, shape (n,); those that lag give it later."""
         self._inputs[:2, : self.n] = values
+        self._follow_commands()
 
     def ramp_torque_nm(self, index: int, target: float, rate_nm_per_s: float) -> None:
         """Move the command to `target`, from now on, in every step by `rate_nm_per_s` at most (inf: at once)."""
@@ -206,8 +207,13 @@ class World:
         self._inputs[TARGET, column] = target
         if rate == inf:
             self._inputs[VALUE, column] = target
+            self._follow_commands()
         else:
             self._inputs[RATE, column] = rate
+
+    def _follow_commands(self) -> None:
+        if not isinstance(self._line, PlainLine):
+            self._line.follow_commands()
 
     def _integrate_to(self, to_s: float) -> None:
         last = floor(to_s * STEPS_PER_S + _GRID_TOLERANCE)

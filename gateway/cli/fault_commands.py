@@ -1,5 +1,6 @@
 """`r2rgate fault`: what can go wrong on a simulated line, and letting it go wrong while the line runs."""
 
+import asyncio
 import json
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
@@ -7,6 +8,7 @@ from typing import Annotated, Any, NoReturn
 import typer
 
 from gateway.core.line_problem import printable
+from gateway.mailbox.listener import living
 
 REFUSED, UNREACHABLE = 2, 3
 
@@ -16,11 +18,10 @@ app = typer.Typer(
     no_args_is_help=True,
 )
 
+_CONTROL = "Control socket of the simulated line, or the folder of its recording"
 Control = Annotated[
-    Path,
-    typer.Option(
-        "--control", help="Control socket of the simulated line, or the folder of its recording.", show_default=False
-    ),
+    Path | None,
+    typer.Option("--control", help=f"{_CONTROL}; not needed beside the only `r2rgate run --plant`."),
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print as JSON.")]
 
@@ -39,6 +40,7 @@ def list_faults(
     if control is not None:
         _print_acting(_ask(control, {"do": "list"}), as_json)
         return
+    from sim_plant.faults.page import parameter_words
     from sim_plant.faults.table import FAULTS
 
     if as_json:
@@ -47,7 +49,7 @@ def list_faults(
                 "fault": fault.name,
                 "of": [kind.value for kind in fault.kinds],
                 "does": fault.does,
-                "parameters": [parameter.name for parameter in fault.parameters],
+                "parameters": {p.name: parameter_words(p) for p in fault.parameters},
                 "lasts": fault.lasting.value,
                 "example": fault.example,
             }
@@ -57,13 +59,19 @@ def list_faults(
         return
     width = max(len(fault.name) for fault in FAULTS)
     for fault in FAULTS:
-        typer.echo(f"{fault.name:<{width}}  {fault.does}\n{'':<{width}}  {fault.example}")
+        typer.echo(f"{fault.name:<{width}}  {fault.does}")
+        for parameter in fault.parameters:
+            typer.echo(f"{'':<{width}}    {parameter.name}: {parameter_words(parameter)}")
+        typer.echo(f"{'':<{width}}  {fault.example}")
 
 
 @app.command()
 def inject(
-    fault: Annotated[str, typer.Argument(help="TARGET [NUMBER] FAULT [NAME=VALUE ...] [at SECONDS] [for SECONDS]")],
-    control: Control,
+    fault: Annotated[
+        list[str],
+        typer.Argument(help="In quotes: TARGET [NUMBER] FAULT [NAME=VALUE ...] [at SECONDS] [for SECONDS]"),
+    ],
+    control: Control = None,
     as_json: Json = False,
 ) -> None:
     """Let something go wrong on a simulated line that runs, at once or at a time of the line.
@@ -73,7 +81,7 @@ def inject(
     from sim_plant.faults.parse import FaultRefused, parse_fault
 
     try:
-        words = str(parse_fault(fault))
+        words = str(parse_fault(" ".join(fault)))
     except FaultRefused as refused:
         _refuse(str(refused), REFUSED)
     answer = _ask(control, {"do": "inject", "fault": words})
@@ -85,8 +93,8 @@ def inject(
 
 @app.command()
 def clear(
-    control: Control,
     number: Annotated[int | None, typer.Argument(help="Number of the fault; without it all of them.")] = None,
+    control: Control = None,
     as_json: Json = False,
 ) -> None:
     """End a fault that was injected, or all of them; what is still to come does not come.
@@ -113,10 +121,11 @@ def _print_acting(answer: dict[str, Any], as_json: bool) -> None:
         typer.echo(f"no faults, at {answer['time_s']:.3f} s of the line")
 
 
-def _ask(control: Path, request: dict[str, Any]) -> dict[str, Any]:
+def _ask(control: Path | None, request: dict[str, Any]) -> dict[str, Any]:
     """The answer of the line. Ends the command when it refuses or does not answer."""
     from sim_plant.faults.control import SOCKET_FILE, ControlUnavailable, ask
 
+    control = control or _only_line()
     path = control / SOCKET_FILE if control.is_dir() else control
     try:
         answer = ask(path, request)
@@ -125,6 +134,25 @@ def _ask(control: Path, request: dict[str, Any]) -> dict[str, Any]:
     if not answer["ok"]:
         _refuse(f"refused: {printable(str(answer.get('reason', 'no reason given')))}", REFUSED)
     return answer
+
+
+def _only_line() -> Path:
+    """The control socket of the simulated line beside the gateway that `r2rgate status` would find."""
+    from gateway.cli.status_commands import ask_status, choose_run_folder
+    from gateway.mailbox.port import Unreachable
+    from sim_plant.faults.control import SOCKET_FILE
+
+    folder = choose_run_folder(None)
+    way_out = "name its recording with --control"
+    try:
+        data = Path(asyncio.run(ask_status(folder)).historian.path).parent
+    except Unreachable as error:
+        _refuse(f"{folder}: {error}; {way_out}", UNREACHABLE)
+    found = [path for path in sorted(data.glob(f"recording-*/{SOCKET_FILE}")) if living(path)]
+    if len(found) != 1:
+        count = "no simulated line" if not found else f"{len(found)} simulated lines"
+        _refuse(f"{count} with a control socket in {data}; {way_out}", UNREACHABLE)
+    return found[0]
 
 
 def _refuse(text: str, code: int) -> NoReturn:

@@ -29,6 +29,7 @@ def misfits(line: Line, file: Path, plant: Plant, plant_file: Path) -> list[str]
         found.append(f"{file} has {_spans(line.n)}, {plant_file} has {_spans(plant.spans)}")
     buses = {bus.name: bus for bus in line.buses}
     wires: dict[tuple[str, str], list[str]] = {}
+    keys: dict[tuple[str, str], list[str]] = {}
     seats: list[str] = []
     for item in [*line.drives, *line.load_cells, line.plc]:
         number = _number(item)
@@ -36,11 +37,16 @@ def misfits(line: Line, file: Path, plant: Plant, plant_file: Path) -> list[str]
             continue  # told above
         expected, offered = _expected(item, buses[item.bus]), _offered(plant, item, number)
         if expected.wire != offered.wire:
-            wires.setdefault((expected.wire, offered.wire), []).append(item.name)
+            pair = expected.wire, offered.wire
+            wires.setdefault(pair, []).append(item.name)
+            keys.setdefault(pair, []).extend(_keys(item, buses[item.bus], plant, number))
         elif (expected.address, expected.channel) != (offered.address, offered.channel):
             seats.append(f"{file} has {item.name} at {expected}, {plant_file} at {offered}")
-    for (expected, offered), names in wires.items():
-        found.append(f"{file} has {_listed(names)} on {expected}, {plant_file} on {offered}")
+    for pair, names in wires.items():
+        change = " and ".join(dict.fromkeys(keys[pair]))
+        found.append(
+            f"{file} has {_listed(names)} on {pair[0]}, {plant_file} on {pair[1]} (for the plant to fit: {change})"
+        )
     return found + seats[:3] + ([f"and {len(seats) - 3} more devices at other addresses"] if len(seats) > 3 else [])
 
 
@@ -60,11 +66,7 @@ def _expected(item: Drive | LoadCell | LinePlc, bus: Bus) -> Seat:
 
 def _offered(plant: Plant, item: Drive | LoadCell | LinePlc, number: int) -> Seat:
     wires = plant.wires
-    if isinstance(item, LinePlc):
-        wire = wires.plc
-    else:
-        each = wires.drives if isinstance(item, Drive) else wires.load_cells
-        wire = each if isinstance(each, str) else each[number - 1]
+    wire = _wire(plant, item, number)
     can, modbus = wires.canopen, wires.modbus
     if wire == "opcua":
         return Seat(f"OPC UA port {wires.opcua.port}", None, number)
@@ -74,6 +76,33 @@ def _offered(plant: Plant, item: Drive | LoadCell | LinePlc, number: int) -> Sea
         port = can.port if can.interface == "udp_multicast" else None
         return Seat(_can(can.interface, can.channel, port), *_own_seat(item, number, plant, wire))
     return Seat(f"Modbus TCP port {modbus.port}", *_own_seat(item, number, plant, wire))
+
+
+def _wire(plant: Plant, item: Drive | LoadCell | LinePlc, number: int) -> Wire:
+    wires = plant.wires
+    if isinstance(item, LinePlc):
+        return wires.plc
+    each = wires.drives if isinstance(item, Drive) else wires.load_cells
+    return each if isinstance(each, str) else each[number - 1]
+
+
+def _keys(item: Drive | LoadCell | LinePlc, bus: Bus, plant: Plant, number: int) -> list[str]:
+    """What the plant's file needs so that it has the device on this bus."""
+    role = "drives" if isinstance(item, Drive) else "load_cells" if isinstance(item, LoadCell) else "plc"
+    if isinstance(bus, CanopenBus):
+        port = "" if bus.port is None else f" port = {bus.port}"
+        word, key = "canopen", f'[wires.canopen] interface = "{bus.interface}" channel = "{bus.channel}"{port}'
+    elif isinstance(bus, ModbusTcpBus):
+        word, key = "rack" if "rack" in item.map else "modbus-tcp", f"[wires.modbus] port = {bus.port}"
+    else:
+        word, key = "opcua", f"[wires.opcua] port = {urlsplit(bus.endpoint).port or 4840}"
+    if _wire(plant, item, number) == word:
+        return [key]
+    changed = [f'[wires] {role} = "{word}"']
+    as_it_would_be = plant.model_copy(update={"wires": plant.wires.model_copy(update={role: word})})
+    if _offered(as_it_would_be, item, number).wire != _expected(item, bus).wire:
+        changed.append(key)
+    return changed
 
 
 def _own_seat(item: Drive | LoadCell | LinePlc, number: int, plant: Plant, wire: Wire) -> tuple[int, int]:

@@ -38,7 +38,8 @@ def read_line(file: Path) -> Line:
         for problem in refused.problems:
             typer.echo(str(problem), err=True)
     except (OSError, UnicodeDecodeError) as error:
-        typer.echo(f"{file}: {error}", err=True)
+        why = error.strerror if isinstance(error, OSError) else error
+        typer.echo(f"{file} cannot be read: {why}; r2rgate init writes a line.toml", err=True)
     raise typer.Exit(REFUSED)
 
 
@@ -139,9 +140,13 @@ def sim(
     modbus_port: Annotated[int | None, typer.Option(help="In place of the plant's; 0 takes a free one.")] = None,
     opcua_port: Annotated[int | None, typer.Option(help="In place of the plant's; 0 takes a free one.")] = None,
     fault: Annotated[
-        list[str] | None, typer.Option(help="Something that goes wrong, as `r2rgate fault list` shows; repeatable.")
+        list[str] | None,
+        typer.Option(help="Something that goes wrong, in quotes, as `r2rgate fault list` shows; repeatable."),
     ] = None,
-    control: Annotated[Path | None, typer.Option(help="Socket for `r2rgate fault` while the line runs.")] = None,
+    control: Annotated[
+        Path | None,
+        typer.Option(help="Socket for `r2rgate fault` while the line runs; control.sock in --record, if not told."),
+    ] = None,
     priority: Annotated[
         int,
         typer.Option(min=0, max=90, help="Real-time priority, where permitted: devices do not wait for a computer."),

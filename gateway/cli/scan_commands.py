@@ -4,6 +4,7 @@ import json
 import sys
 from collections.abc import Mapping
 from dataclasses import asdict
+from ipaddress import ip_address
 from math import isfinite
 from typing import Annotated, Any, Literal, NoReturn, TypeVar, get_args
 
@@ -64,6 +65,8 @@ def canopen(
         _refuse(f"--bitrate {bitrate}; allowed: {', '.join(map(str, _BITRATES))}")
     if port is not None and interface != "udp_multicast":
         _refuse(f"--port is of udp_multicast; {interface} has none")
+    if interface == "udp_multicast" and not _is_multicast(channel):
+        _refuse(f"--channel {printable(channel)} is no multicast group, which udp_multicast needs; as 239.74.163.2")
     _require_no_loop(other_bus)
     config = CanopenBus.model_validate(
         {
@@ -101,6 +104,15 @@ def canopen(
     else:
         _print(can_scan(where, bitrate, found))
     if not found.nodes and not found.listening.frames:
+        if interface != "socketcan":
+            _nothing(
+                f"nobody on {where}: is the simulated line running, on this channel"
+                + (
+                    " and in this process, beyond which virtual does not reach?"
+                    if interface == "virtual"
+                    else " and port?"
+                )
+            )
         _nothing(
             f"nobody on {where}: is the device on, is this its bit rate ({bitrate} bit/s), is the cable plugged and "
             "terminated at both ends (60 ohms between CAN-H and CAN-L), is the interface up (`ip -details link`)?"
@@ -108,6 +120,7 @@ def canopen(
     raise typer.Exit(0 if found.nodes else NOTHING_FOUND)
 
 
+@app.command("modbus-tcp", hidden=True)
 @app.command()
 def modbus(
     host: Annotated[str, typer.Argument(help="Name or address.")],
@@ -134,6 +147,9 @@ def modbus(
     from drivers.modbus.scan import FUNCTIONS, registers, scan, usual_float
 
     numbers = _numbers(units)
+    name, colon, last = host.partition(":")
+    if colon and last.isdecimal():
+        _refuse(f"{printable(host)}: say the port by itself: {printable(name)} --port {last}")
     _require_no_loop(other_bus)
     if register is None:
         with progress() as tell:
@@ -214,6 +230,13 @@ def _maps_of(kind: type[M]) -> Mapping[str, M]:
     """The maps of one protocol by name. Raises MapRefused for one that is broken."""
     maps = {name: load_map(MAPS / f"{name}.toml") for name in map_names()}
     return {name: device for name, device in maps.items() if isinstance(device, kind)}
+
+
+def _is_multicast(channel: str) -> bool:
+    try:
+        return ip_address(channel).is_multicast
+    except ValueError:
+        return False
 
 
 def _numbers(units: str) -> list[int]:

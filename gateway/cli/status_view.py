@@ -1,5 +1,6 @@
 """The status of a line on a terminal, for the technician who stands before it. Pure: a status in, a renderable out."""
 
+import textwrap
 import time
 
 from rich.console import Group, RenderableType
@@ -21,6 +22,7 @@ DRIVE_STYLE = {"ENABLED": "green", "READY": "cyan", "OFF": "", "STOPPING": "yell
 GOOD_ERROR, POOR_ERROR = 0.05, 0.20  # of the set-point: where a tension is shown green, and where red
 FIXED_LINES = 12  # everything but spans and events
 LEAST_EVENTS = 3
+_CLOCK_WIDTH = 8
 
 
 def render(status: GatewayStatus, width: int, height: int | None = None) -> RenderableType:
@@ -35,7 +37,7 @@ def render(status: GatewayStatus, width: int, height: int | None = None) -> Rend
     parts: list[RenderableType] = [_head(status), Text(), _spans(spans, status.limits, width)]
     if len(spans) < len(status.spans):
         parts.append(Text(f"  and {len(status.spans) - len(spans)} more spans, none in greater need", style="dim"))
-    parts += [Text(), _health(status), Text(), _events(status, events)]
+    parts += [Text(), _health(status), Text(), _events(status, events, width, height is None)]
     return Group(*parts)
 
 
@@ -159,14 +161,26 @@ def _buses(buses: list[BusReport]) -> Text:
     return Text("; ".join(words) or "not known", "bold red" if absent else "")
 
 
-def _events(status: GatewayStatus, count: int) -> RenderableType:
+def _events(status: GatewayStatus, room: int, width: int, whole: bool) -> RenderableType:
+    """Events on `room` lines, a line each. The newest change of state may say why the line has stopped: it takes the
+    lines that it needs, on a screen (not `whole`) as far as the least number of events is seen.
+    """
     grid = Table.grid(padding=(0, 2))
-    grid.add_column(style="dim", no_wrap=True, min_width=8)
+    grid.add_column(style="dim", no_wrap=True, min_width=_CLOCK_WIDTH)
     grid.add_column(no_wrap=True, overflow="ellipsis")
-    newest_first = status.events[::-1][:count]
-    for event in newest_first:
-        grid.add_row(_clock_time(event.wall_s), Text(event.text))
-    return grid if newest_first else Text("no events yet", style="dim")
+    told = next((event for event in reversed(status.events) if event.kind == "state"), None)
+    for event in reversed(status.events):
+        if room <= 0:
+            break
+        lines = [event.text]
+        if event is told:
+            most = None if whole else max(1, room - LEAST_EVENTS + 1)
+            lines = textwrap.wrap(event.text, max(20, width - _CLOCK_WIDTH - 2)) or lines
+            if most is not None and len(lines) > most:
+                lines = [*lines[: most - 1], " ".join(lines[most - 1 :])]
+        grid.add_row(_clock_time(event.wall_s), Text("\n".join(lines)))
+        room -= 1 if whole else len(lines)
+    return grid if status.events else Text("no events yet", style="dim")
 
 
 def _spread(spread: Spread | None) -> str:

@@ -4,12 +4,14 @@ A child that ends is started again, with growing pauses; the loop comes back SIL
 cannot mend (a refused file, a line that runs already) ends all of it, with that child's exit code.
 """
 
+import json
 import signal
 import sys
 import time
 from collections.abc import Sequence
 from contextlib import nullcontext
 from pathlib import Path
+from shlex import quote
 from types import FrameType
 
 from rich.console import Console, Group, RenderableType
@@ -90,6 +92,8 @@ def _tend(children: Sequence[Child], notices: "Notices") -> Exit | None:
         if ended is None:
             if child.name == "loop" and not child.ended:
                 notices.hear(child.said(), now_s)
+            elif child.name == "sim":
+                notices.hear_of_sim(child.said())
         elif ended.is_final:
             final = final or ended
         else:
@@ -111,6 +115,17 @@ class Notices:
         self._start_s = start_s
         self._notes: list[str] = []
         self._exits: dict[str, Exit] = {}
+        self._faults = ""
+
+    def hear_of_sim(self, said: list[str]) -> None:
+        """What the simulated line has said since its start: where faults can be asked of it."""
+        control = _control(said)
+        if control is None:
+            return
+        text = f'let something go wrong: r2rgate fault inject --control {quote(control)} "load-cell 3 nan for 0.2"'
+        if text != self._faults:
+            self._faults = text
+            self._print([text])
 
     def hear(self, said: list[str], now_s: float) -> None:
         """What the loop has said since its start, all of it every time."""
@@ -126,7 +141,7 @@ class Notices:
 
     def lines(self, now_s: float) -> list[str]:
         """What stands above the status now."""
-        notes = [*self._opening, *(f"loop: {text}" for text in self._notes)]
+        notes = [*self._opening, *(f"loop: {text}" for text in self._notes), *([self._faults] if self._faults else [])]
         shown = notes if now_s - self._start_s <= NOTES_S else []
         for ended in self._exits.values():
             ago_s = now_s - ended.at_s
@@ -139,6 +154,15 @@ class Notices:
         if not self._console.is_terminal:
             for text in lines:
                 print(text, file=sys.stderr, flush=True)
+
+
+def _control(said: list[str]) -> str | None:
+    """The folder or socket that the ready line of the simulated line names; None without one."""
+    for text in said:
+        if text.startswith('{"ready"'):
+            socket = json.loads(text).get("control")
+            return socket and str(Path(socket).parent)
+    return None
 
 
 def _screen(console: Console, notices: Notices, run_folder: Path, data_folder: Path) -> RenderableType:

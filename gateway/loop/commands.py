@@ -78,9 +78,15 @@ async def prepare_to_arm(cycle: Cycle) -> Reply | None:
 
 
 async def release(cycle: Cycle) -> None:
-    """No link sends any more, and no device waits for it."""
+    """No link sends any more, and no device waits for it. One that fails keeps no other from it; then raises."""
+    failure: Exception | None = None
     for link in cycle.links:
-        await link.release()
+        try:
+            await link.release()
+        except Exception as error:
+            failure = error
+    if failure is not None:
+        raise failure
 
 
 def not_ready(cycle: Cycle) -> list[str]:

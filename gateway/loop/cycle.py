@@ -116,7 +116,9 @@ class Cycle:
     def _check(self, tick: Tick) -> Assessment:
         phase = self.machine.phase
         supervision = SUPERVISION[phase]
-        jumps = self.watch.reject_jumps(self.inputs)
+        jumps = self.watch.reject_jumps(self.inputs, self.outputs.torque_nm)
+        if supervision.feedback:
+            self.watch.reject_unwinder(self.inputs, self.outputs.speed_request_m_per_s)
         if phase in WITH_TORQUE:
             self.torque_path.lost |= self.inputs.drive_state != _ENABLED
         late, self._envelope = check_timing(self.limits, self._envelope, tick.skipped)

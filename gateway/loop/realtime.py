@@ -4,7 +4,8 @@ import ctypes
 import gc
 import os
 
-_MCL_CURRENT_AND_FUTURE = 3
+# Current and future pages, each from its first use on: locking what is only reserved would treble the memory.
+_MCL_USED = 1 | 2 | 4
 
 
 def become_punctual(cpu: int | None, priority: int) -> tuple[list[str], list[str]]:
@@ -25,7 +26,7 @@ def become_punctual(cpu: int | None, priority: int) -> tuple[list[str], list[str
             granted.append(f"pinned to processor {wanted}")
         except OSError:
             refused.append(f"not pinned: processor {wanted} is not among {processors}")
-    if ctypes.CDLL(None).mlockall(_MCL_CURRENT_AND_FUTURE) == 0:
+    if ctypes.CDLL(None).mlockall(_MCL_USED) == 0:
         granted.append("memory locked")
     else:
         refused.append("memory not locked: needs CAP_IPC_LOCK or a higher memlock limit (ulimit -l)")

@@ -5,7 +5,7 @@ from collections import deque
 
 from gateway.core.messages import Arm, Command, MalformedMessage, Reply, Stop, parse_command
 from gateway.core.states import LoopState, Phase
-from gateway.loop.commands import carry_out, prepare_to_arm
+from gateway.loop.commands import carry_out, prepare_to_arm, release
 from gateway.loop.cycle import Cycle
 from gateway.loop.pacer import Tick
 
@@ -55,6 +55,7 @@ class Runner:
     async def submit(self, command: Command) -> Reply:
         """Do `command` at the next boundary between periods; the reply says what was done, or why not."""
         if isinstance(command, Stop):  # whatever else waits, and also into an arming
+            self._refuse_waiting_arms()
             await self._cancel_arming()
             return await self._at_boundary(command)
         if self._ending:
@@ -80,6 +81,8 @@ class Runner:
         finally:
             self._arming = None
         reply = refusal or await self._at_boundary(command)
+        if refusal is None and not reply.ok:  # proven, and then stopped or refused: nothing stays active
+            await release(self.cycle)
         while reply.ok and self.cycle.machine.phase is Phase.ARMING:
             await self._passed.wait()
         if not reply.ok:
@@ -92,6 +95,13 @@ class Runner:
         if self._arming is not None:
             self._arming.cancel()
             await asyncio.wait([self._arming])
+
+    def _refuse_waiting_arms(self) -> None:
+        """An arming that has proven everything and waits for its period is stopped like one that is under way."""
+        for waiting in [waiting for waiting in self._waiting if isinstance(waiting[0], Arm)]:
+            self._waiting.remove(waiting)
+            if not waiting[1].done():
+                waiting[1].set_result(self._refused("not armed: it was stopped"))
 
     def _refused(self, text: str) -> Reply:
         return Reply(ok=False, state=self.cycle.machine.state.name, text=text)

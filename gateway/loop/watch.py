@@ -8,30 +8,39 @@ from gateway.core.signals import BoolArray, FloatArray, Inputs
 from gateway.loop.setpoints import Setpoints
 from safety.actions import Action, Finding
 from safety.drift import DriftState, drift_limits, restart, watch_balance
-from safety.jumps import JumpState, jump_limits, reject_jumps
+from safety.jumps import JumpState, jump_limits, reject_jumps, reject_unwinder
 from safety.stuck import StuckState, find_stuck, stuck_limits
 
+CREEPING = 0.02  #: of the greatest speed; below it torques say nothing about load cells
 SATURATED_S = 2.0  #: at a limit, net of the time away from it, until proposals are blocked
 
 
 class Watch:
     """`doubts` is what blocks proposals now; `stuck` (n,) are the spans whose load cell stands still."""
 
-    def __init__(self, line: Line) -> None:
+    def __init__(self, line: Line, speed_resolution_m_per_s: FloatArray | None = None) -> None:
         self.doubts = Doubt.NONE
         self.stuck: BoolArray = np.zeros(line.n, np.bool_)
         self._cells = {cell.span: cell.name for cell in line.load_cells}
-        self._jump_limits, self._jumps = jump_limits(line), JumpState()
+        self._jump_limits, self._jumps = jump_limits(line, speed_resolution_m_per_s), JumpState()
+        self._applied_nm: FloatArray = np.zeros(line.n)
         self._stuck_limits, self._stuck = stuck_limits(line), StuckState()
         self._drift_limits, self._drift = drift_limits(line), DriftState()
+        self._creeping_m_per_s = CREEPING * line.limits.speed_max_m_per_s
         self._saturated = 0  # periods, up and down
         self._saturated_periods = max(1, round(SATURATED_S / line.control.period_s))
         self._setpoints: tuple[FloatArray, float] | None = None
         restart(self._drift_limits, self._drift)
 
-    def reject_jumps(self, inputs: Inputs) -> list[Finding]:
-        """Discard speeds that cannot be true; what stops the line."""
-        return reject_jumps(self._jump_limits, self._jumps, inputs)
+    def reject_jumps(self, inputs: Inputs, applied_nm: FloatArray) -> list[Finding]:
+        """Discard roller speeds that cannot be true; what stops the line. `applied_nm` (n,) acts from now on."""
+        acted_nm = np.maximum(np.abs(applied_nm), np.abs(self._applied_nm))
+        self._applied_nm = applied_nm
+        return reject_jumps(self._jump_limits, self._jumps, inputs, acted_nm)
+
+    def reject_unwinder(self, inputs: Inputs, request_m_per_s: float) -> None:
+        """Discard a v0 that cannot be true. `request_m_per_s` is what the PLC was asked for last."""
+        reject_unwinder(self._jump_limits, self._jumps, inputs, request_m_per_s)
 
     def find_stuck(self, inputs: Inputs) -> list[Finding]:
         """Load cells that stand still while the line is controlled: what stops the line."""
@@ -46,7 +55,8 @@ class Watch:
         count = self._saturated + 1 if saturated else self._saturated - 1
         self._saturated = min(max(count, 0), self._saturated_periods)
         now = (setpoints.tension_n, setpoints.speed_m_per_s)
-        if self.stuck.any() or self._setpoints is None or self._moved(now):
+        creeping = now[1] < self._creeping_m_per_s  # dry friction holds what it likes at standstill
+        if creeping or self.stuck.any() or self._setpoints is None or self._moved(now):
             restart(self._drift_limits, self._drift)
         else:
             watch_balance(self._drift_limits, self._drift, inputs.tension.value, inputs.speed.value, applied_nm)

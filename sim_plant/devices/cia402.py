@@ -14,6 +14,8 @@ REMOTE = 1 << 9
 INTERNAL_LIMIT = 1 << 11
 FOLLOWS_COMMAND = 1 << 12  #: in a cyclic synchronous mode: the target value is followed, not ignored
 
+MAKERS_OWN = 1 << 14 | 1 << 15  #: set for reasons of its own; whoever compares whole words is wrong
+
 FAULT_RESET = 1 << 7  #: bit of the controlword
 
 

@@ -59,7 +59,7 @@ class Drive:
         self._machine = Machine()
         self._mode = 0
         self._limited = False
-        self._sto = False
+        self._sto: set[str] = set()  #: who demands that the torque is safely off
         self._operational = False
         self._staged: _Command | None = None
         self._watchdog = world.timer(self._watchdog_expired)
@@ -77,7 +77,7 @@ class Drive:
     @property
     def sto(self) -> bool:
         """Whether the torque is safely off (60FDh bit 16)."""
-        return self._sto
+        return bool(self._sto)
 
     @property
     def operational(self) -> bool:
@@ -89,10 +89,16 @@ class Drive:
         if value == self._operational:
             return
         self._operational = value
-        self._staged = None
-        self._watchdog.due_s = inf
+        self._forget_command()
         if not value:
             self._enter(cia402.without_power(self._machine), "nmt", self._world.now_s)
+
+    def lose_power(self, now_s: float) -> None:
+        """The supply fails for an instant, which nobody has told the drive: it is no longer operational."""
+        self._world.advance(now_s)
+        self._operational = False
+        self._forget_command()
+        self._enter(cia402.without_power(self._machine), "restart", now_s)
 
     def receive(
         self, controlword: int, target_torque_nm: float, mode: int, now_s: float, *, alive: bool = True
@@ -132,7 +138,7 @@ class Drive:
     @property
     def statusword(self) -> int:
         enabled = self.state is State.OPERATION_ENABLED
-        word = int(self.state)
+        word = int(self.state) | cia402.MAKERS_OWN
         word |= 0 if self._sto else cia402.VOLTAGE_ENABLED
         word |= cia402.REMOTE if self._operational else 0
         word |= cia402.INTERNAL_LIMIT if enabled and self._limited else 0
@@ -160,14 +166,25 @@ class Drive:
         """The encoder shows the speed again."""
         self.encoder.heal()
 
-    def set_sto(self, active: bool, now_s: float) -> None:
-        """The safe torque off input. Released, the drive stays in SWITCH ON DISABLED until it is told otherwise."""
+    def set_sto(self, active: bool, now_s: float, source: str = "drive") -> None:
+        """The safe torque off input. It is active as long as one `source` (contact of its circuit) demands it.
+
+        Released, the drive stays in SWITCH ON DISABLED until it is told otherwise.
+        """
         self._world.advance(now_s)
-        if active != self._sto:
-            self._sto = active
-            self._recorder.note("sto", now_s, roller=self.index + 1, active=active)
+        before = self.sto
+        if active:
+            self._sto.add(source)
+        else:
+            self._sto.discard(source)
+        if self.sto != before:
+            self._recorder.note("sto", now_s, roller=self.index + 1, active=self.sto)
         if active:
             self._enter(cia402.without_power(self._machine), "sto", now_s)
+
+    def _forget_command(self) -> None:
+        self._staged = None
+        self._watchdog.due_s = inf
 
     def _latch(self, command: _Command, now_s: float) -> None:
         step = cia402.step_without_power if self._sto else cia402.step
@@ -204,7 +221,8 @@ class Drive:
         self._enter(cia402.quick_stop_done(self._machine), "quick stop", now_s)
 
     def _watchdog_expired(self, now_s: float) -> None:
-        if self.watchdog_is_dead:
+        # In FAULT there is no torque to take off, and the code of the first fault says what went wrong.
+        if self.watchdog_is_dead or self.state is State.FAULT:
             return
         self._recorder.note("watchdog", now_s, roller=self.index + 1, watchdog_s=self.watchdog_s)
         self._fail(WATCHDOG_ERROR, "watchdog", now_s)

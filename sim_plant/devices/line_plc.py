@@ -11,6 +11,8 @@ from sim_plant.devices.drive import Drive
 from sim_plant.recorder import Recorder
 from sim_plant.world import World
 
+_EMERGENCY_STOP = "emergency stop"
+
 
 @dataclass(frozen=True, slots=True)
 class LinePlcStatus:
@@ -24,7 +26,7 @@ class LinePlcStatus:
 
 class LinePlc:
     """`ramp_m_per_s2` is how fast v0 moves (inf: at once). With `drives`, an emergency stop takes their torque off
-    safely (STO) after `sto_delay_s`, and its release gives it back.
+    safely (STO) after `sto_delay_s`, and its release gives it back, unless a drive has a reason of its own.
 
     After a loss of the permissive, an emergency stop or a tripped watchdog the unwinder starts again only on a new
     rising edge of the run bit: nothing restarts because a button was released.
@@ -80,7 +82,7 @@ class LinePlc:
         self._sto.due_s = now_s + self._sto_delay_s if value else inf
         if not value:
             for drive in self._drives:
-                drive.set_sto(False, now_s)
+                drive.set_sto(False, now_s, _EMERGENCY_STOP)
 
     def freeze(self, now_s: float) -> None:
         """Its program stands still: it shows what it shows now, and does nothing of what it is told."""
@@ -153,4 +155,4 @@ class LinePlc:
 
     def _sto_due(self, now_s: float) -> None:
         for drive in self._drives:
-            drive.set_sto(True, now_s)
+            drive.set_sto(True, now_s, _EMERGENCY_STOP)

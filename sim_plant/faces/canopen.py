@@ -95,7 +95,7 @@ class CanopenFace:
 
     def restart(self, node_id: int, now_s: float) -> None:
         """One node loses its power for an instant, and boots. Raises KeyError when there is none."""
-        self._by_node[node_id].boot(now_s)
+        self._by_node[node_id].restart(now_s)
         self._route()
 
     def attach(self, loop: asyncio.AbstractEventLoop, time_scale: float = 1.0) -> None:
@@ -224,7 +224,7 @@ class CanopenFace:
         if self.faults is None or message.arbitration_id in self._own:
             act(frame, 0.0)
         else:
-            self.faults.carry(Direction.TO_DEVICE, node_of(*frame), frame, act, self._later)
+            self.faults.carry(Direction.TO_DEVICE, node_of(*frame), frame, act, self._later, now_s)
 
     def _dispatch(self, can_id: int, data: bytearray, now_s: float) -> bool:
         """False when the frame is for a node but cannot be used."""

@@ -115,6 +115,9 @@ class CellDevice:
     def set_operational(self, operational: bool, now_s: float) -> None:
         """It measures in every state."""
 
+    def lose_power(self, now_s: float) -> None:
+        """It has nothing to lose."""
+
     def command(self, values: Mapping[Key, int], now_s: float) -> bool:
         return False
 

@@ -69,6 +69,9 @@ class DriveDevice:
         self._drive.poll(now_s)
         self._drive.operational = operational
 
+    def lose_power(self, now_s: float) -> None:
+        self._drive.lose_power(now_s)
+
     def command(self, values: Mapping[Key, int], now_s: float) -> bool:
         target_torque_nm = values[_TARGET_TORQUE] * 1e-3 * self._drive.rated_torque_nm
         self._drive.receive(values[_CONTROLWORD], target_torque_nm, values[_MODE], now_s)

@@ -83,6 +83,10 @@ class Device(Protocol):
         """Only while operational it takes commands, and is asked to `sync`."""
         ...
 
+    def lose_power(self, now_s: float) -> None:
+        """As leaving operational, but by nobody's will."""
+        ...
+
     def command(self, values: Mapping[Key, int], now_s: float) -> bool:
         """Hold a command until the next `sync`. False when it cannot be used."""
         ...
@@ -137,6 +141,11 @@ class Node:
         self._set_heartbeat(self.objects.default(0x1017))
         self.network.send_message(0x700 + self.node_id, b"\0")
         self._enter(PRE_OPERATIONAL)
+
+    def restart(self, now_s: float) -> None:
+        """The power fails for an instant."""
+        self.device.lose_power(now_s)
+        self.boot(now_s)
 
     def on_nmt(self, command: int, now_s: float) -> bool:
         """An NMT command for this node. False when there is no such command."""

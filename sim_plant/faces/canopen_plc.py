@@ -67,6 +67,9 @@ class PlcDevice:
         if not operational:
             self._plc.command(False, self._request_m_per_s, self._status.life_echo, now_s)
 
+    def lose_power(self, now_s: float) -> None:
+        self.set_operational(False, now_s)
+
     def command(self, values: Mapping[Key, int], now_s: float) -> bool:
         if values[_COMMAND] & ~RUN_BIT:
             return False

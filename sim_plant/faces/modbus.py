@@ -149,7 +149,7 @@ class _Connection(asyncio.BufferedProtocol):
                 answer = self._face.answer(taken, now_s + delay_s)
                 faults.carry(Direction.FROM_DEVICE, frame.unit, answer, self._write, self._later)
 
-        faults.carry(Direction.TO_DEVICE, frame.unit, encode_frame(frame), act, self._later)
+        faults.carry(Direction.TO_DEVICE, frame.unit, encode_frame(frame), act, self._later, now_s)
 
     def _write(self, answer: bytes, delay_s: float) -> None:
         if self._transport is not None and not self._transport.is_closing():

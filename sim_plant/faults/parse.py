@@ -95,9 +95,16 @@ def shown(value: Value) -> str:
     return str(int(value)) if abs(value) < 1e15 and value == int(value) else repr(value)
 
 
+def ranged(parameter: Number) -> str:
+    """What is allowed, with its unit."""
+    return f"{shown(parameter.lowest)} to {shown(parameter.highest)} {parameter.unit}".rstrip()
+
+
 def _target(words: list[str]) -> tuple[Target, list[str]]:
     word, rest = words[0], words[1:]
     allowed = [kind.value for kind in Kind if kind is not Kind.WIRE] + list(WIRES)
+    if word == "rack":
+        raise FaultRefused("a rack is met by its unit, modbus-tcp 3 as a rule, or by a device in it, such as drive 2")
     if word not in allowed:
         raise _unknown("target", word, allowed)
     kind = Kind.WIRE if word in WIRES else Kind(word)
@@ -172,15 +179,13 @@ def _value(parameter: Number | Choice, text: str | None, fault: Fault) -> Value:
     if text is None:
         if parameter.default is None:
             example = f"for example: {fault.example}"
-            raise FaultRefused(
-                f"{fault.name} needs {parameter.name} ({parameter.unit}), {_range(parameter)}; {example}"
-            )
+            raise FaultRefused(f"{fault.name} needs {parameter.name}=, {ranged(parameter)}; {example}")
         return parameter.default
     value = _number(text)
     if value is None or not parameter.lowest <= value <= parameter.highest:
-        raise FaultRefused(f"{fault.name}: {parameter.name}={text}; allowed: {_range(parameter)} {parameter.unit}")
+        raise FaultRefused(f"{fault.name}: {parameter.name}={text}; allowed: {ranged(parameter)}")
     if parameter.whole and value != int(value):
-        raise FaultRefused(f"{fault.name}: {parameter.name}={text}; allowed: whole numbers ({parameter.unit})")
+        raise FaultRefused(f"{fault.name}: {parameter.name}={text}; allowed: whole numbers")
     return value
 
 
@@ -197,10 +202,6 @@ def _number(text: str) -> float | None:
 
 def _is_integer(word: str) -> bool:
     return word.isascii() and word.removeprefix("-").isdigit()
-
-
-def _range(parameter: Number) -> str:
-    return f"{shown(parameter.lowest)} to {shown(parameter.highest)}"
 
 
 def _names(kind: Kind) -> str:

@@ -39,11 +39,14 @@ OPC_UA = Framing(opcua_frames.HEADER, opcua_frames.size_of, lambda _: 0)
 class TcpProxy:
     """Every connection to it becomes one to `host` and `port`; one that cannot be made is closed at once.
 
-    It takes `faults.on_disconnect`.
+    It takes `faults.on_disconnect`. The delays of faults are shortened by `time_scale`.
     """
 
-    def __init__(self, faults: WireFaults[bytes], framing: Framing, host: str, port: int) -> None:
+    def __init__(
+        self, faults: WireFaults[bytes], framing: Framing, host: str, port: int, time_scale: float = 1.0
+    ) -> None:
         self.faults = faults
+        self.time_scale = time_scale
         self.framing = framing
         self._host = host
         self._port = port
@@ -154,11 +157,12 @@ class _End(asyncio.Protocol):
         if not self._framer.framed:
             self._send(data)
             return
-        faults, address_of = self._link.proxy.faults, self._link.proxy.framing.address_of
+        proxy = self._link.proxy
+        address_of = proxy.framing.address_of
         now_s = asyncio.get_running_loop().time()
         for frame in self._framer.feed(data):
-            for delay_s, after in faults.pass_(self._direction, address_of(frame), frame):
-                self._late.put(now_s + delay_s, after)
+            for delay_s, after in proxy.faults.pass_(self._direction, address_of(frame), frame):
+                self._late.put(now_s + delay_s / proxy.time_scale, after)
         if not self._framer.framed:
             self._late.put(now_s, self._framer.rest())
         self._send_due()

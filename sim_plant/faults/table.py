@@ -40,7 +40,10 @@ class Lasting(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Number:
-    """A parameter in `unit` between `lowest` and `highest`, both allowed. Without a default it must be given."""
+    """A parameter in `unit` between `lowest` and `highest`, both allowed. Without a default it must be given.
+
+    A pure number has no unit.
+    """
 
     name: str
     unit: str
@@ -79,7 +82,7 @@ BOTH, TO_DEVICE, FROM_DEVICE = "both", "to-device", "from-device"
 
 _WHICH = Choice("direction", (BOTH, TO_DEVICE, FROM_DEVICE))
 _WHICH_FROM = Choice("direction", (FROM_DEVICE, TO_DEVICE, BOTH))
-_PROBABILITY = Number("probability", "1", 0.0, 1.0, 1.0)
+_PROBABILITY = Number("probability", "", 0.0, 1.0, 1.0)
 _COUNT = Number("count", "frames", 1, 1e9, inf, whole=True)
 _DICE = (_PROBABILITY, _COUNT)
 
@@ -259,20 +262,25 @@ FAULTS = (
         "plc plc-freeze at 5 for 0.5",
     ),
     # Web.
-    Fault("web-break", _WEB, "The web of a span tears; cleared, it is threaded again.", "web 4 web-break at 5"),
+    Fault(
+        "web-break",
+        _WEB,
+        "The web of a span tears, which counts as tension-band; cleared, it is threaded again.",
+        "web 4 web-break at 5",
+    ),
     Fault(
         "slip",
         _WEB,
         "The friction between web and roller is so many times what it was; the last roller, a nip or reel, holds.",
         "web 2 slip factor=0.1 at 5 for 2",
-        parameters=(Number("factor", "1", 0.0, 1.0),),
+        parameters=(Number("factor", "", 0.0, 1.0),),
     ),
     Fault(
         "friction-rise",
         _WEB,
-        "The bearing of a roller has so many times its friction.",
+        "The bearing of a roller has so many times its friction, beside its wear.",
         "web 4 friction-rise factor=5 at 5",
-        parameters=(Number("factor", "1", 1.0, 1e4),),
+        parameters=(Number("factor", "", 1.0, 1e4),),
     ),
     Fault(
         "slack",

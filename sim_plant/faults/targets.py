@@ -107,6 +107,7 @@ class FaultyLine:
         """The faults of the wire that a target is met on, and its address there (None: all). Raises FaultRefused."""
         if target.kind is Kind.WIRE:
             wire, address = target.wire, target.number
+            self._check_address(wire, address)
         else:
             place = self.places.get(key_of(target))
             if place is None:
@@ -116,6 +117,18 @@ class FaultyLine:
             there = ", ".join(self.wires) or "none"
             raise FaultRefused(f"this line has no wire {wire}; allowed: {there}")
         return self.wires[wire], address
+
+    def _check_address(self, wire: str, address: int | None) -> None:
+        """Raises FaultRefused for an address on this wire that nobody has."""
+        there: dict[int, list[str]] = {}
+        for (kind, number), place in self.places.items():
+            if place.wire == wire and place.address is not None:
+                there.setdefault(place.address, []).append(f"{kind} {number}" if number else kind)
+        if address is None or wire not in self.wires or address in there:
+            return
+        # Several devices at one address are channels of one amplifier, or in one rack.
+        listed = ", ".join(f"{a} ({d[0] if len(d) == 1 else f'{d[0]} to {d[-1]}'})" for a, d in sorted(there.items()))
+        raise FaultRefused(f"{wire} {address}: nobody has this address; there are {listed or 'none'}")
 
 
 def key_of(target: Target) -> tuple[str, int]:

@@ -24,8 +24,9 @@ class WireFaults(Generic[F]):
     """
 
     def __init__(self, kind: FrameKind[F], seed: int = 0) -> None:
-        self.before_request: Callable[[], object] = _nothing
-        """Called before each frame towards a device, so that time can bring and take faults before it acts."""
+        self.before_request: Callable[[float | None], object] = _no_time
+        """Called before each frame towards a device with the time at which it came (None: now), so that time can bring
+        and take faults before it acts. It must not go beyond: the device lives in the time of its frames."""
         self.on_disconnect: Callable[[], object] = _nothing  #: called when connections are to be broken off
         self._kind = kind
         self._seed = seed
@@ -71,18 +72,22 @@ class WireFaults(Generic[F]):
         frame: F,
         deliver: Callable[[F, float], object],
         later: Callable[[float, Callable[[], object]], object],
+        arrived_s: float | None = None,
     ) -> None:
         """`pass_`, and `deliver` (frame, delay in s) what goes on: at once, or by `later` (delay in s, call)."""
-        for delay_s, after in self.pass_(direction, address, frame):
+        for delay_s, after in self.pass_(direction, address, frame, arrived_s):
             if delay_s > 0.0:
                 later(delay_s, partial(deliver, after, delay_s))
             else:
                 deliver(after, 0.0)
 
-    def pass_(self, direction: Direction, address: int, frame: F) -> Passed[F]:
-        """What goes on in place of a frame: (delay in s, frame), in this order where the delays are equal."""
+    def pass_(self, direction: Direction, address: int, frame: F, arrived_s: float | None = None) -> Passed[F]:
+        """What goes on in place of a frame: (delay in s, frame), in this order where the delays are equal.
+
+        `arrived_s` is the world time at which a frame towards a device came in; None is now.
+        """
         if direction is Direction.TO_DEVICE:
-            self.before_request()
+            self.before_request(arrived_s)
         way = (direction, address)
         waiting = self._left.pop(way, []) if self._left else []
         passing: Passed[F] = [(0.0, held) for held in waiting]
@@ -124,3 +129,6 @@ class _Active(Generic[F]):
 
 
 def _nothing() -> None: ...
+
+
+def _no_time(arrived_s: float | None) -> None: ...

@@ -22,7 +22,8 @@ class WiredFaults:
     """The faults of a line, for `wired.WiredLine`. Faces ask `canopen` and `modbus` for every frame; `opcua` is for
     a proxy in front of the server.
 
-    `restart_node` (node, time) boots a CANopen node. `seed` is that of the dice.
+    `clock` gives world time, with every frame that came before dealt with. `restart_node` (node, time) boots a CANopen
+    node. `seed` is that of the dice.
     """
 
     def __init__(
@@ -41,7 +42,7 @@ class WiredFaults:
         self._world = world
         self._clock = clock
         for faults in (self.canopen, self.modbus, self.opcua):
-            faults.before_request = self.now_s
+            faults.before_request = self._live_until
         places = places_of(plant)
         used = {place.wire for place in places.values()}
         wires = {"canopen": self.canopen, "modbus-tcp": self.modbus, "opcua": self.opcua}
@@ -67,6 +68,10 @@ class WiredFaults:
         now_s = self._clock()
         self._world.advance(now_s)
         return now_s
+
+    def _live_until(self, arrived_s: float | None) -> None:
+        """No further than the frame: a line that is late would let its watchdogs bark at commands that wait."""
+        self._world.advance(self._clock() if arrived_s is None else arrived_s)
 
 
 def places_of(plant: Plant) -> dict[tuple[str, int], Place]:

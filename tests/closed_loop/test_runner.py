@@ -148,3 +148,30 @@ def test_a_cycle_that_breaks_tells_every_drive_to_take_torque_off(monkeypatch):
         assert not np.any(enabled)
 
     asyncio.run(story())
+
+
+def test_a_stop_between_the_proofs_and_the_arming_period_is_not_lost(monkeypatch):
+    released = []
+    release = MemoryLink.release
+
+    async def counted(self):
+        released.append(self)
+        await release(self)
+
+    async def story():
+        told = Story(stepped())
+        await told.periods(3)
+        monkeypatch.setattr(MemoryLink, "release", counted)
+        arming = told.order(Arm())
+        for _ in range(20):  # the proofs are done, no period has passed
+            await asyncio.sleep(0)
+        stop = told.order(Stop())
+        for _ in range(5):
+            await asyncio.sleep(0)
+        await told.periods(3)
+        assert (await stop).ok
+        reply = await arming
+        assert not reply.ok and "stopped" in reply.text
+        assert told.loop.cycle.machine.phase is Phase.SILENT and released, "nothing stays active"
+
+    asyncio.run(story())

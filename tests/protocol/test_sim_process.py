@@ -26,6 +26,7 @@ from sim_plant.faces.canopen import CanopenFace
 from sim_plant.faces.canopen_bus import FaceUnavailable, open_bus
 from sim_plant.faces.canopen_sdo import EDS_PATH
 from sim_plant.faces.tcp_stamp import Stamp
+from sim_plant.faults.control import SOCKET_FILE, ask
 from sim_plant.plant import PlantRefused, load_plant, plant_of
 from sim_plant.process import main, run_plant
 from sim_plant.recorder import read_recording
@@ -294,6 +295,20 @@ def test_a_killed_process_leaves_a_recording(line: Line, master: canopen.Network
     assert not recording.of_kind("end") and not (line.folder / "summary.json").exists()
 
 
+def test_faults_can_be_asked_for_without_planning_them(line: Line) -> None:
+    control = Path(line.ready["control"])
+    assert control.name == SOCKET_FILE
+    answer = ask(control, {"do": "inject", "fault": "plc permissive-lost"})
+    assert answer["ok"], answer
+
+
+def test_a_fault_from_the_start_waits_for_its_device(tmp_path: Path) -> None:
+    line = Line(tmp_path / "recording", "--fault", "drive 2 restart", "--fault", "drive 3 restart at 0")
+    assert line.end(signal.SIGTERM)[0] == 0
+    injected = read_recording(tmp_path / "recording").of_kind("fault-injected")
+    assert [event["fault"] for event in injected] == ["drive 2 restart", "drive 3 restart"]
+
+
 def test_ends_on_an_interrupt_too(line: Line) -> None:
     code, errors = line.end(signal.SIGINT)
     assert code == 0 and "Traceback" not in errors
@@ -337,7 +352,7 @@ def test_a_line_that_the_system_fails_in_mid_run_was_not_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert failing_line(tmp_path, monkeypatch, OSError(28, "No space left on device")) == 1
-    assert "failed while it ran: [Errno 28] No space left on device" in capsys.readouterr().err
+    assert "failed while it ran: No space left on device" in capsys.readouterr().err
     assert (tmp_path / "recording" / "summary.json").exists()
 
 

@@ -5,11 +5,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.core.signals import Inputs, Quality
+from gateway.core.signals import FloatArray, Inputs, Quality
 from safety.actions import Action
 from safety.drift import DRIFT_ALONE_N, DRIFT_N, DriftState, drift_limits, drift_of, restart, watch_balance
-from safety.jumps import NOISE_M_PER_S, JumpState, jump_limits, reject_jumps
-from safety.stuck import StuckLimits, StuckState, find_stuck
+from safety.jumps import NOISE_M_PER_S, JumpState, jump_limits, reject_jumps, reject_unwinder
+from safety.stuck import LEARNT_CHANGES, StuckLimits, StuckState, find_stuck
 from tests.closed_loop.conftest import demo_line
 
 LINE = demo_line()
@@ -21,13 +21,31 @@ def speeds(inputs: Inputs, values: list[float]) -> Inputs:
     return inputs
 
 
-def jumping(values: list[float]) -> tuple[list[int], Inputs, list[int]]:
+TORQUE_NM = np.full(6, 10.0)
+
+
+def reach_m_per_s(speed_m_per_s: float, periods: int = 1) -> float:
+    """Of roller 2 at 10 Nm with 30 N on either side: R and f at their upper, J at its lower edge."""
+    radius, inertia, friction = 0.04 * 1.2, 0.95 * 0.7, 10.0 * 1.75
+    acceleration = radius / inertia * (10.0 + radius * 30.0) + friction / inertia * speed_m_per_s
+    return acceleration * 0.01 * periods + NOISE_M_PER_S
+
+
+def at_30_n() -> Inputs:
+    inputs = Inputs(6)
+    for i in range(6):
+        inputs.tension.put(i, 30.0, 0.0)
+    return inputs
+
+
+def jumping(values: list[float], torque_nm: FloatArray = TORQUE_NM) -> tuple[list[int], Inputs, list[int]]:
     """What is found, and the periods in which roller 2's sample was discarded, for its speeds in turn."""
-    state, inputs = JumpState(), Inputs(6)
+    state, inputs = JumpState(), at_30_n()
     discarded: list[int] = []
     found: list[int] = []
     for k, value in enumerate(values):
-        findings = reject_jumps(jump_limits(LINE), state, speeds(inputs, [0.05, value, 0.05, 0.05, 0.05, 0.05]))
+        samples = speeds(inputs, [0.05, value, 0.05, 0.05, 0.05, 0.05])
+        findings = reject_jumps(jump_limits(LINE), state, samples, torque_nm)
         if inputs.speed.quality[1] == Quality.BAD:
             discarded.append(k)
         found += [k] * len(findings)
@@ -36,9 +54,9 @@ def jumping(values: list[float]) -> tuple[list[int], Inputs, list[int]]:
 
 
 def test_a_speed_jump_is_discarded_and_a_second_one_stops_the_line() -> None:
-    found, inputs, discarded = jumping([0.05, 0.05, 0.5, 0.05])
+    found, inputs, discarded = jumping([0.05, 0.05, 0.1, 0.05])
     assert (found, discarded) == ([], [2]) and inputs.speed.value[1] == 0.05
-    found, inputs, discarded = jumping([0.05, 0.05, 0.5, 0.5])
+    found, inputs, discarded = jumping([0.05, 0.05, 0.1, 0.1])
     assert (found, discarded) == ([3], [2, 3])
     assert inputs.speed.value[1] == 0.05, "the last believed value stays"
 
@@ -49,24 +67,55 @@ def test_two_jumps_far_apart_are_two_spikes() -> None:
 
 
 def test_what_a_roller_can_do_is_no_jump() -> None:
-    reach = float(jump_limits(LINE).acceleration_m_per_s2[1]) * 0.01
-    assert jumping([0.0, reach + 0.99 * NOISE_M_PER_S])[2] == []
-    assert jumping([0.0, reach + 1.01 * NOISE_M_PER_S])[2] == [1]
+    assert jumping([0.05, 0.05 + 0.999 * reach_m_per_s(0.05)])[2] == []
+    assert jumping([0.05, 0.05 + 1.001 * reach_m_per_s(0.05)])[2] == [1]
+
+
+def test_a_coarse_encoder_may_show_the_next_count() -> None:
+    resolution = np.full(6, 0.016)
+    state, inputs = JumpState(), at_30_n()
+    limits = jump_limits(LINE, resolution)
+    for k in range(10):
+        assert reject_jumps(limits, state, speeds(inputs, [0.016 * (k % 3)] * 6), np.zeros(6)) == []
+        assert inputs.speed.good()
 
 
 def test_after_missed_samples_a_roller_may_have_come_further() -> None:
-    limits, state, inputs = jump_limits(LINE), JumpState(), Inputs(6)
-    reach = float(limits.acceleration_m_per_s2[1]) * 0.01
-    reject_jumps(limits, state, speeds(inputs, [0.0] * 6))
+    limits, state, inputs = jump_limits(LINE), JumpState(), at_30_n()
+    reject_jumps(limits, state, speeds(inputs, [0.0] * 6), TORQUE_NM)
     for _ in range(2):
         for i in range(6):
             inputs.speed.miss(i)
-        assert reject_jumps(limits, state, inputs) == []
-    reject_jumps(limits, state, speeds(inputs, [0.0, 2.9 * reach, 0.0, 0.0, 0.0, 0.0]))
+        assert reject_jumps(limits, state, inputs, TORQUE_NM) == []
+    reject_jumps(limits, state, speeds(inputs, [0.0, 0.99 * reach_m_per_s(0.0, 3), 0.0, 0.0, 0.0, 0.0]), TORQUE_NM)
     assert inputs.speed.good()
 
 
-STUCK = StuckLimits(np.array([True, True, False]), stuck_s=0.05, stuck_periods=5)
+@pytest.mark.parametrize(
+    ("last", "asked", "value", "believed"),
+    [
+        (0.01, 0.10, 0.10, True),  # a PLC that steps
+        (0.01, 0.10, 0.117, True),  # and overshoots
+        (0.01, 0.10, 0.119, False),
+        (0.10, 0.10, 0.0, True),  # a PLC that stops the transport at once
+        (0.10, 0.10, -0.019, False),
+        (0.05, 0.05, 0.069, False),
+        (0.05, 0.05, 0.067, True),
+    ],
+)
+def test_v0_lies_between_standstill_its_last_value_and_its_request(
+    last: float, asked: float, value: float, believed: bool
+) -> None:
+    limits, state, inputs = jump_limits(LINE), JumpState(), Inputs(6)
+    inputs.unwind_speed.put(0, last, 0.0)
+    reject_unwinder(limits, state, inputs, last)
+    inputs.unwind_speed.put(0, value, 0.01)
+    reject_unwinder(limits, state, inputs, asked)
+    assert (inputs.unwind_speed.quality[0] == Quality.GOOD) == believed
+    assert inputs.unwind_speed.value[0] == (value if believed else last)
+
+
+STUCK = StuckLimits(np.array([True, True, False]), stuck_periods=5)
 
 
 def stuck_after(tensions: list[tuple[float, float, float]], alive: bool = True) -> tuple[StuckState, list[str]]:
@@ -80,16 +129,38 @@ def stuck_after(tensions: list[tuple[float, float, float]], alive: bool = True) 
     return state, texts
 
 
+def noisy(count: int) -> list[tuple[float, float, float]]:
+    """Fine cells: 0.01 N a count, noise of 0.1 N."""
+    samples = np.round(np.random.default_rng(2).normal(30.0, 0.1, (count, 3)) / 0.01) * 0.01
+    return [(float(a), float(b), float(c)) for a, b, c in samples]
+
+
 def test_a_cell_that_stands_still_while_rollers_move_is_stuck_after_its_time() -> None:
-    changing = [(30.0 + 0.1 * k, 30.0, 30.0) for k in range(6)]
-    assert not stuck_after(changing[:5])[0].stuck.any()
-    state, texts = stuck_after(changing[:6])
+    still = [(40.0 + 0.1 * k, 31.0, 30.0 + 0.1 * k) for k in range(6)]
+    assert not stuck_after(noisy(300) + still[:5])[0].stuck.any()
+    state, texts = stuck_after(noisy(300) + still)
     assert list(state.stuck) == [False, True, False], "span 3 is not controlled by its cell"
     assert len(texts) == 1 and "span 2" in texts[0]
 
 
+def test_a_cell_is_judged_only_after_it_has_been_learnt() -> None:
+    assert not stuck_after(noisy(LEARNT_CHANGES - 5) + [(30.0, 30.0, 30.0)] * 50)[0].stuck.any()
+
+
+@pytest.mark.parametrize("noise_n", [0.02, 0.03, 0.05])
+def test_a_healthy_cell_with_a_coarse_resolution_is_not_stuck(noise_n: float) -> None:
+    """0.1 N a count, a filter of 10 Hz: the same count may come for seconds."""
+    rng, filtered = np.random.default_rng(1), np.zeros(3)
+    tensions: list[tuple[float, float, float]] = []
+    for noise in rng.normal(0.0, noise_n, (30_000, 3)):
+        filtered += 0.47 * (noise - filtered)
+        one, two, three = np.round((30.0 + filtered) / 0.1) * 0.1
+        tensions.append((one, two, three))
+    assert stuck_after(tensions)[1] == [], "five minutes"
+
+
 def test_a_line_on_which_nothing_moves_tells_nothing() -> None:
-    assert not stuck_after([(30.0, 30.0, 30.0)] * 50, alive=False)[0].stuck.any()
+    assert not stuck_after(noisy(300) + [(30.0, 30.0, 30.0)] * 200, alive=False)[0].stuck.any()
 
 
 @given(

@@ -1,5 +1,6 @@
 """`run` and what it looks after: what it says of a child that ends, when it gives up, and what it refuses at once."""
 
+import io
 import os
 import signal
 import subprocess
@@ -12,12 +13,14 @@ from rich.console import Console
 from typer.testing import CliRunner
 
 from gateway.cli import tended
+from gateway.cli.line_commands import known_maps
 from gateway.cli.main import app
 from gateway.cli.plant_fit import misfits
 from gateway.cli.tended import FIRST_PAUSE_S, LAST_LINES, LONGEST_PAUSE_S, Child, Exit
 from gateway.cli.together import EXIT_S, NOTES_S, Notices, new_recording, run_together
 from gateway.core.line_file import load_line
 from gateway.core.line_template import line_template
+from gateway.core.line_template_wiring import Wiring
 from gateway.mailbox.listener import Listener
 from gateway.mailbox.paths import LOOP_SOCKET
 from sim_plant.plant import load_plant
@@ -196,16 +199,21 @@ def test_a_plant_that_does_not_fit_is_named_with_the_line() -> None:
     other = load_line(TEXT.replace("43113", "43114").replace("5020", "5021"), "line.toml")
     assert misfits(other, file, plant, PLANT) == [
         "line.toml has drive-1 to drive-6 on udp_multicast 239.74.163.2 port 43114, "
-        f"{PLANT} on udp_multicast 239.74.163.2 port 43113",
-        f"line.toml has load-cell-1 to line-plc on Modbus TCP port 5021, {PLANT} on Modbus TCP port 5020",
+        f"{PLANT} on udp_multicast 239.74.163.2 port 43113 (for the plant to fit: [wires.canopen] "
+        'interface = "udp_multicast" channel = "239.74.163.2" port = 43114)',
+        f"line.toml has load-cell-1 to line-plc on Modbus TCP port 5021, {PLANT} on Modbus TCP port 5020 "
+        "(for the plant to fit: [wires.modbus] port = 5021)",
     ]
-    found = misfits(load_line(line_template(48), "line.toml"), file, plant, PLANT)
-    assert found == [f"line.toml has 48 spans, {PLANT} has 6 spans"]
-    moved = load_line(TEXT.replace("address = 3\n", "address = 7\n"), "line.toml")
-    wire = "udp_multicast 239.74.163.2 port 43113"
-    assert misfits(moved, file, plant, PLANT) == [
-        f"line.toml has drive-3 at {wire} address 7, {PLANT} at {wire} address 3"
+    opcua = load_line(line_template(6, "line.toml", Wiring(plc="opcua")), "line.toml")
+    assert misfits(opcua, file, plant, PLANT) == [
+        f"line.toml has line-plc on OPC UA port 4840, {PLANT} on Modbus TCP port 5020 "
+        '(for the plant to fit: [wires] plc = "opcua")'
     ]
+    mixed = PLANT.with_name("mixed.toml")
+    assert misfits(opcua, file, load_plant(mixed), mixed) == []
+    text = line_template(6, "line.toml", Wiring(drives="rack", load_cells="rack", plc="rack"))
+    found = misfits(load_line(text, "line.toml", known_maps()), file, plant, PLANT)
+    assert '(for the plant to fit: [wires] drives = "rack")' in found[0]
 
 
 @pytest.fixture
@@ -278,3 +286,16 @@ def test_a_controller_that_does_not_fit_ends_run_with_the_loops_sentence(line_fi
     assert "loop has ended with exit code 2" in result.stderr
     assert "it is for 1 span, the line has 6" in result.stderr
     assert controller.read_bytes() == before
+
+
+def test_run_says_how_faults_are_asked_of_its_simulated_line(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    notices = Notices(Console(file=io.StringIO()), 100.0)
+    notices.hear_of_sim(["warming up"])
+    for _ in range(2):
+        notices.hear_of_sim(['{"ready": true, "control": "/data/a line/recording-1/control.sock"}'])
+    notices.hear_of_sim(['{"ready": true, "control": null}'])
+    said = capsys.readouterr().err
+    assert said.count("fault inject --control '/data/a line/recording-1'") == 1
+    assert notices.lines(101.0) == said.splitlines()

@@ -80,17 +80,17 @@ def test_a_command_is_latched_once(bench: Bench) -> None:
 
 
 def test_the_statusword_says_what_the_drive_does(bench: Bench) -> None:
-    assert bench.command(0x00, 5.0, 0.0).statusword == 0x0250
-    assert bench.command(SHUTDOWN, 5.0, 0.0).statusword == 0x0231
-    assert bench.command(0x07, 5.0, 0.0).statusword == 0x0233
-    assert bench.command(ENABLE, 5.0, 0.0).statusword == 0x1237
-    assert bench.command(ENABLE, 5.0, 0.0, mode=0).statusword == 0x0237  # the target is not followed
+    assert bench.command(0x00, 5.0, 0.0).statusword == 0xC250
+    assert bench.command(SHUTDOWN, 5.0, 0.0).statusword == 0xC231
+    assert bench.command(0x07, 5.0, 0.0).statusword == 0xC233
+    assert bench.command(ENABLE, 5.0, 0.0).statusword == 0xD237
+    assert bench.command(ENABLE, 5.0, 0.0, mode=0).statusword == 0xC237  # the target is not followed
     limited = bench.command(ENABLE, -75.0, 0.0)
-    assert (limited.statusword, limited.torque_nm) == (0x1A37, -60.0)
+    assert (limited.statusword, limited.torque_nm) == (0xDA37, -60.0)
     bench.drive.fault(0x2310, 0.0)
-    assert bench.drive.statusword == 0x0218
+    assert bench.drive.statusword == 0xC218
     bench.drive.operational = False
-    assert bench.drive.statusword == 0x0018
+    assert bench.drive.statusword == 0xC018
 
 
 @pytest.mark.parametrize("mode", [0, 1, 4, 9])
@@ -207,7 +207,7 @@ def test_sto_takes_torque_off_and_refuses_enabling(enabled: Bench) -> None:
     assert enabled.world.torque_nm[0] == 0.0
     for word in (SHUTDOWN, 0x07, ENABLE):
         enabled.command(word, 5.0, 0.020)
-        assert enabled.drive.statusword == 0x0240
+        assert enabled.drive.statusword == 0xC240
     enabled.drive.set_sto(False, 0.030)
     assert enabled.command(ENABLE, 5.0, 0.040).torque_nm == 0.0
     enabled.command(SHUTDOWN, 0.0, 0.050)
@@ -418,3 +418,22 @@ def test_an_emergency_stop_makes_the_drives_safe_after_its_delay(enabled: Bench)
     assert enabled.drive.sto and enabled.world.torque_nm[0] == 0.0
     plc.emergency_stop = False
     assert not enabled.drive.sto and enabled.drive.state is State.SWITCH_ON_DISABLED
+
+
+def test_sto_is_active_as_long_as_one_source_demands_it(enabled: Bench) -> None:
+    enabled.drive.set_sto(True, 0.010)
+    enabled.drive.set_sto(True, 0.020, "emergency stop")
+    enabled.drive.set_sto(False, 0.030, "emergency stop")
+    assert enabled.drive.sto
+    enabled.drive.set_sto(False, 0.040)
+    assert not enabled.drive.sto
+    assert [event["active"] for event in enabled.recorder.recording().of_kind("sto")] == [True, False]
+
+
+def test_a_drive_in_fault_is_not_failed_again_by_its_watchdog(enabled: Bench) -> None:
+    enabled.drive.watchdog_s = 0.05
+    enabled.command(ENABLE, 5.0, 0.010)
+    enabled.drive.fault(0x2310, 0.020)
+    enabled.drive.poll(0.2)
+    assert (enabled.drive.error_code, enabled.emergencies) == (0x2310, [0x2310])
+    assert not enabled.recorder.recording().of_kind("watchdog")

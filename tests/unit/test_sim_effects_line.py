@@ -1,5 +1,6 @@
 """The full model as a whole: nothing changes until an effect is on, and faults change what they say."""
 
+from math import exp, inf
 from pathlib import Path
 
 import numpy as np
@@ -182,3 +183,34 @@ def test_radii_are_those_of_the_file_as_long_as_nothing_is_wound() -> None:
     world.set_unwind_speed(1.0)
     world.advance(5.0)
     assert world.use_full_line().radius_m.tolist() == pytest.approx([0.3, RADIUS_M, RADIUS_M], rel=1e-15)
+
+
+def test_a_friction_that_came_and_went_leaves_the_wear() -> None:
+    world = World(plant(effects={"friction": {"rise_per_s": 0.1}}), 0)
+    world.advance(1.0)
+    world.set_friction_factor(1, 5.0)
+    assert world.use_full_line().friction_factor(1) == pytest.approx(5.5)
+    world.advance(2.0)
+    world.set_friction_factor(1, 1.0)
+    world.advance(3.0)
+    assert world.use_full_line().friction_factor(1) == pytest.approx(1.3)
+
+
+@pytest.mark.parametrize("step_nm", [0.0, 0.5])
+def test_without_lag_a_torque_is_there_before_the_next_step(step_nm: float) -> None:
+    world = World(plant(drives={"torque_step_nm": step_nm}), 0)
+    world.use_full_line()
+    world.ramp_torque_nm(0, 5.2, inf)
+    assert world.torque_nm[0] == (5.2 if step_nm == 0.0 else 5.0)
+    lagging = World(plant(drives={"torque_lag_s": 0.01}), 0)
+    lagging.ramp_torque_nm(0, 5.2, inf)
+    assert lagging.torque_nm[0] == 0.0
+
+
+def test_the_creep_of_a_slack_web_recovers_with_the_time_of_the_whole_solid() -> None:
+    world = World(plant(effects={"relaxation": {"stiffness_share": 1.0, "time_s": 1.0}}), 0)
+    world.slacken_web(1, 0.01)
+    arm_n = world.use_full_line()._state.arm_n  # noqa: SLF001 - nobody outside sees the arm
+    arm_n[0] = -10.0
+    world.advance(1.0)
+    assert arm_n[0] == pytest.approx(-10.0 * exp(-0.5))  # tau (1 + r) = 2 s

@@ -208,9 +208,18 @@ def test_a_disconnected_wire_says_so_and_passes_nothing():
     assert not faults.disconnected
 
 
+def test_time_comes_as_far_as_the_frame_and_no_further():
+    faults, seen = WireFaults(MbapFrames()), []
+    faults.before_request = seen.append
+    for way in (TO, FROM):
+        faults.carry(way, 1, mbap(1, 1, b"\3"), lambda frame, delay_s: None, lambda delay_s, call: None, 12.5)
+    faults.pass_(TO, 1, mbap(1, 1, b"\3"))
+    assert seen == [12.5, None]
+
+
 def test_time_can_bring_a_fault_before_the_request_that_it_meets():
     faults = WireFaults(CanFrames())
-    faults.before_request = lambda: faults.begin(parse_fault("canopen mute"), None)
+    faults.before_request = lambda _: faults.begin(parse_fault("canopen mute"), None)
     assert faults.pass_(FROM, 1, (0x181, b"")) == [(0.0, (0x181, b""))]
     assert faults.pass_(TO, 1, (0x201, b"")) == []
 

@@ -260,15 +260,20 @@ def test_a_device_by_its_name_is_an_address_on_its_wire():
     assert [(event["number"], event["frames"]) for event in cleared] == [(number, 2)]
 
 
+def test_an_address_that_nobody_has_is_refused_with_those_that_are_there():
+    with pytest.raises(FaultRefused, match=r"canopen 77: nobody has this address; there are 2 \(drive 2\)"):
+        WiredRig().inject("canopen 77 mute")
+
+
 def test_a_wire_by_its_name_is_every_address_or_one():
     rig = WiredRig()
     rig.inject("canopen drop for 1")
-    rig.inject("canopen 1 duplicate at 2")
+    rig.inject("canopen 2 duplicate at 2")
     assert not rig.passes(1) and not rig.passes(2)
     rig.world.advance(2.0)
     frame = (0x181, b"x")
-    assert rig.canopen.pass_(Direction.FROM_DEVICE, 1, frame) == [(0.0, frame)] * 2
-    assert rig.canopen.pass_(Direction.FROM_DEVICE, 2, (0x182, b"x")) == [(0.0, (0x182, b"x"))]
+    assert rig.canopen.pass_(Direction.FROM_DEVICE, 2, frame) == [(0.0, frame)] * 2
+    assert rig.canopen.pass_(Direction.FROM_DEVICE, 1, (0x181, b"x")) == [(0.0, (0x181, b"x"))]
 
 
 @pytest.mark.parametrize(

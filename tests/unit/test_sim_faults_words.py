@@ -106,7 +106,7 @@ def test_numbers_may_be_hexadecimal():
         ("opcua 1 mute", "has no numbers"),
         ("canopen 128 mute", "from 1 to 127"),
         ("modbus-tcp 256 mute", "from 0 to 255"),
-        ("load-cell 2 drift", "needs rate_n_per_s (N/s), -10000 to 10000"),
+        ("load-cell 2 drift", "needs rate_n_per_s=, -10000 to 10000 N/s"),
         ("load-cell 2 drift rate_n_per_s=nan", "allowed: -10000 to 10000 N/s"),
         ("load-cell 2 drift rate_n_per_s=1_0", "allowed: -10000 to 10000 N/s"),
         ("load-cell 2 drift rate=1", "Did you mean rate_n_per_s?"),

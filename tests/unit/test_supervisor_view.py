@@ -57,6 +57,16 @@ def test_it_fits_the_screen_and_shows_the_newest_events(width: int, height: int,
     assert (shown == spans) != any(f"and {spans - shown} more spans" in line for line in lines)
 
 
+def test_the_reason_of_the_newest_state_is_told_to_its_end() -> None:
+    bench = Bench(6)
+    bench.run_loop(100, spans=6)
+    bench.say("state", "STOP: " + "the reason goes on " * 10 + "to its end")
+    bench.say("note", "and something else " * 20)
+    lines = text_of(bench.gateway.status(), 80)
+    assert any(line.endswith("to its end") for line in lines) and max(map(len, lines)) <= 80
+    assert sum("something else" in line for line in lines) == 1
+
+
 def test_the_span_that_needs_a_look_is_shown_among_many() -> None:
     drive_state = np.full(60, 3, np.int8)
     drive_state[57] = 5
