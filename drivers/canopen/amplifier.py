@@ -7,13 +7,13 @@ by SDO then: an operator sees tensions before anything is armed.
 from dataclasses import dataclass, field
 
 from drivers.canopen.configure import cell_expected, cell_steps
-from drivers.canopen.maps import COB_ID_STEP, LoadCellMap
+from drivers.canopen.counts import end_values, n_per_count
+from drivers.canopen.map_cell import COB_ID_STEP, LoadCellMap
 from drivers.canopen.pdo import MalformedPdo, PdoLayout
 from drivers.canopen.prepare import check_identity
 from drivers.canopen.sdo import SdoBus
 from drivers.canopen.station import Station
 from drivers.canopen.transaction import Step, differences, read_number
-from drivers.scaling import si_per_count
 from gateway.core.line import LoadCell
 from gateway.core.signals import Inputs, Outputs
 
@@ -46,7 +46,9 @@ class AmplifierNode:
     def __init__(self, device: LoadCellMap, cells: list[LoadCell]) -> None:
         node = cells[0].address
         self.identity = device.identity
+        self.watchdog, self.defies, self.shows_torque = None, "", False  # it is not commanded
         self._device = device
+        self._ends = end_values(device.objects.tension.type)
         pdos, each = device.transmit_pdos, device.transmit_pdos.channels_each
         tensions = [k for k, name in enumerate(pdos.objects) if name == "tension"]
         statuses = [k for k, name in enumerate(pdos.objects) if name == "status"]
@@ -132,6 +134,9 @@ class AmplifierNode:
         if status is not None and code is not None and code != status.ok:
             inputs.tension.reject(item.span - 1)
             return f"{item.name}: {status.texts.get(str(code), f'channel status {code}')}"
+        if counts in self._ends:
+            inputs.tension.reject(item.span - 1)
+            return f"{item.name}: {counts:g}, the end of what its object can say: saturated"
         tension_n = float("nan") if cell.n_per_count is None else counts * cell.n_per_count
         if not -item.capacity_n <= tension_n <= item.capacity_n:  # NaN and infinity, too
             inputs.tension.reject(item.span - 1)
@@ -203,7 +208,10 @@ class AmplifierNode:
                 return [f"{cell.item.name}: is set to unit {found:#010x}, its map says {unit.value:#010x}"]
         if tension.digits is not None:
             digits = int(await read_number(sdo, self.station.node, tension.digits.of_channel(cell.item.channel)))
-        cell.n_per_count = si_per_count(tension.unit, tension.scale) * 10.0**-digits
+        try:
+            cell.n_per_count = n_per_count(self._device, cell.item, digits)
+        except ValueError as error:
+            return [f"{cell.item.name}: {error}"]
         return []
 
     def steps(self) -> list[Step]:

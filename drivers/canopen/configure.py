@@ -74,8 +74,7 @@ def drive_steps(device: DriveMap, settings: DriveSettings) -> list[Step]:
     steps += [_write(option, option.value) for option in device.options.present() if option.writable]
     if objects.max_torque is not None and objects.max_torque.writable:
         steps.append(_write(objects.max_torque, torque_limit_counts(device, settings)))
-    steps.append(heartbeat_step(device.heartbeat))
-    steps.append(_write(device.watchdog, watchdog_counts(device.watchdog, settings.watchdog_s)))
+    steps += [heartbeat_step(device.heartbeat), watchdog_step(device.watchdog, settings.watchdog_s)]
     return steps + [pdo_on(pdo, settings.node) for pdo in pdos]
 
 
@@ -94,7 +93,7 @@ def plc_steps(device: PlcMap, node: int, watchdog_s: float) -> list[Step]:
     steps = [pdo_off(pdo, node) for pdo in pdos]
     for pdo in pdos:
         steps += mapping_steps(pdo, device.objects_of(pdo))
-    steps += [heartbeat_step(device.heartbeat), _write(device.watchdog, watchdog_counts(device.watchdog, watchdog_s))]
+    steps += [heartbeat_step(device.heartbeat), watchdog_step(device.watchdog, watchdog_s)]
     return steps + [pdo_on(pdo, node) for pdo in pdos]
 
 
@@ -121,6 +120,11 @@ def cell_expected(device: LoadCellMap, node: int, pdos: list[int]) -> list[Expec
 
 def heartbeat_step(heartbeat: HeartbeatObject) -> Step:
     return _write(heartbeat, round(heartbeat.value / heartbeat.scale))
+
+
+def watchdog_step(watchdog: Watchdog, watchdog_s: float) -> Step:
+    """Raises ValueError when the device cannot do it."""
+    return _write(watchdog, watchdog_counts(watchdog, watchdog_s))
 
 
 def _write(entry: CanObject, value: int) -> Step:

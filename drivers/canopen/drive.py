@@ -1,20 +1,21 @@
 """A drive as a node of the bus: what the gateway knows of it and commands it."""
 
-from drivers.canopen.configure import DriveSettings, drive_expected, drive_steps
-from drivers.canopen.maps import DriveMap
-from drivers.canopen.pdo import DriveSample, MalformedPdo, PdoCodec
+from dataclasses import replace
+
+from drivers.canopen.configure import DriveSettings, drive_expected, drive_steps, watchdog_step
+from drivers.canopen.map_drive import DriveMap
+from drivers.canopen.pdo import DriveSample, MalformedPdo, PdoCodec, speed_resolution_m_per_s
 from drivers.canopen.sdo import SdoBus
 from drivers.canopen.station import Station
 from drivers.canopen.transaction import Step, differences, place, read_number
-from drivers.cia402 import DISABLE_VOLTAGE, PowerState, drive_state, power_state
-from drivers.power_stage import PowerStage
+from drivers.cia402 import DISABLE_VOLTAGE, PowerState, power_state
+from drivers.power_stage import ORDERS_IGNORED, PowerStage
 from drivers.scaling import torque_per_count
 from gateway.core.signals import DriveState, Inputs, Outputs
 
 STO_POLL_S = 0.2  #: how often a drive that may not switch on is asked whether safe torque off is why
-ORDERS_IGNORED = 5  #: in a row; an order acts with the next SYNC, and shows in the answer to the one after it
 _RATED_TORQUE_TOLERANCE = 1e-3  #: of the line's figure; more would scale every torque wrongly
-_WITH_TORQUE = (DriveState.ENABLED, DriveState.STOPPING)
+_WITH_TORQUE = (PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE, PowerState.FAULT_REACTION)
 
 
 class DriveNode:
@@ -26,12 +27,13 @@ class DriveNode:
         self.identity = device.identity
         self.device = device
         self.settings = settings
+        self.watchdog = watchdog_step(device.watchdog, settings.watchdog_s)
         self.codec = PdoCodec(device, settings.rated_torque_nm, radius_m)
+        self.speed_resolution_m_per_s = speed_resolution_m_per_s(device, radius_m)
         self.sample: DriveSample | None = None  #: the answer to the present SYNC
         self.stage = PowerStage(device.follows_command)
         self.answers = (device.transmit_pdo.cob_id + settings.node,)
         self._receive_cob_id = device.receive_pdo.cob_id + settings.node
-        self._disobeyed = 0  #: orders in a row to take torque off, while it says that it has some
         self._sto_asked_s = float("-inf")
         self._ask_for_sto = (
             device.objects.safe_torque_off is not None and "safe_torque_off" not in device.transmit_pdo.objects
@@ -64,6 +66,14 @@ class DriveNode:
     def trouble(self, now_s: float) -> str:
         return self.station.trouble(now_s, self.stage.gives_torque)
 
+    @property
+    def defies(self) -> str:
+        return f"ignored {ORDERS_IGNORED} orders to take its torque off" if self.stage.disobeys else ""
+
+    @property
+    def shows_torque(self) -> bool:
+        return self.sample is not None and self.stage.power in _WITH_TORQUE
+
     def state(self, now_s: float) -> DriveState:
         if self.absent(now_s):
             return DriveState.ABSENT
@@ -94,17 +104,9 @@ class DriveNode:
         Raises ValueError when the torque cannot be commanded; nothing may be sent then.
         """
         word, given_nm = self.stage.command(request, torque_nm, state, trusted=not self.station.distrust)
-        self._watch_obedience(word)
         # Encoded also where it is not given: what cannot be commanded says that something is wrong.
         self.codec.encode(word, torque_nm)
         return self.codec.encode(word, given_nm)
-
-    def _watch_obedience(self, word: int) -> None:
-        """A drive that gets no RPDOs any more is stopped by its watchdog, unless that listens to our heartbeat."""
-        disobeys = word == DISABLE_VOLTAGE and self.stage.power is PowerState.OPERATION_ENABLED
-        self._disobeyed = self._disobeyed + 1 if disobeys else 0
-        if self.station.listens_to is not None and self._disobeyed > ORDERS_IGNORED and not self.station.distrust:
-            self.station.distrust = f"was told {self._disobeyed} times to take torque off and has not, arm again"
 
     # by SDO
 
@@ -124,16 +126,14 @@ class DriveNode:
         word = DISABLE_VOLTAGE.to_bytes(2, "little")
         await sdo.download(self.station.node, controlword.index, controlword.sub, word)
         found = int(await read_number(sdo, self.station.node, statusword))
-        return (
-            drive_state(power_state(found)) not in _WITH_TORQUE and power_state(found) is not PowerState.FAULT_REACTION
-        )
+        return power_state(found) not in _WITH_TORQUE
 
     async def check(self, sdo: SdoBus) -> list[str]:
         """Off, and what its map and the line say of it. Raises SdoFailed."""
         objects = self.device.objects
         statusword = int(await read_number(sdo, self.station.node, objects.statusword))
         reasons: list[str] = []
-        if drive_state(power_state(statusword)) in _WITH_TORQUE:
+        if power_state(statusword) in _WITH_TORQUE:
             reasons.append(f"is still enabled (statusword {statusword:04X}h); take its torque off first")
         reasons += await self._check_rated_torque(sdo) + await self._check_max_torque(sdo)
         reasons += await differences(sdo, self.station.node, drive_expected(self.device, self.station.node))
@@ -145,8 +145,7 @@ class DriveNode:
 
     def release_steps(self) -> list[Step]:
         """A drive that waits for our heartbeat would go to fault."""
-        watchdog = self.device.watchdog
-        return [Step(watchdog.index, watchdog.sub, watchdog.type, 0)] if self.station.listens_to else []
+        return [replace(self.watchdog, value=0)] if self.station.listens_to is not None else []
 
     async def _read_safe_torque_off(self, sdo: SdoBus) -> bool:
         """Whether it says that safe torque off is active; False where its map knows no such object."""
@@ -180,5 +179,4 @@ class DriveNode:
     def forget(self) -> None:
         self.station.forget()
         self.sample = None
-        self._disobeyed = 0
         self.stage.forget()

@@ -2,7 +2,8 @@
 
 It leaves from the link's `write` only, at most a third of the watchdog time apart: a loop that hangs stops it. But all
 drives that listen share it, so it cannot be withheld from one of them, as an RPDO can. It is withheld from all, in
-every cycle in which one of them was not given its command, until that one has confirmed by SDO that its torque is off.
+every cycle in which one of them was not given its command, until that one has confirmed by SDO that its torque is off:
+since it was dropped, and since it was last seen with torque.
 
 A drive that is deaf to SYNC, or was restarted, confirms within milliseconds, and the others notice nothing. One that is
 dead or mute never does: then every drive that listens loses its torque within the watchdog time. That is no controlled

@@ -11,6 +11,7 @@ from dataclasses import replace
 from canopen.emcy import EmcyError
 
 from drivers.canopen.configure import cell_expected, drive_expected, plc_expected
+from drivers.canopen.counts import end_values, n_per_count
 from drivers.canopen.map_parts import CanIdentity, CanObject
 from drivers.canopen.maps import CanMap, DriveMap, LoadCellMap, PlcMap
 from drivers.canopen.reading_bus import ReadingBus
@@ -216,8 +217,10 @@ class _Inspector:
         if digits.value is None:
             problems.append(digits.trouble)
         elif not problems:
-            tension = objects.tension
-            self._n_per_count = si_per_count(tension.unit, tension.scale) * 10.0**-digits.value
+            try:
+                self._n_per_count = n_per_count(device, item, int(digits.value))
+            except ValueError as error:
+                problems.append(str(error))
         pdo = (item.channel - 1) // device.transmit_pdos.channels_each
         problems += await self._differences(cell_expected(device, self._node, [pdo]))
         return replace(facts, differences=tuple(problems))
@@ -238,6 +241,8 @@ class _Inspector:
                 text = status.texts.get(str(int(code.value)), f"channel status {int(code.value)}")
                 return CellSample(Number(None, text), counter)
         counts = await self._number(objects.tension.of_channel(item.channel))
+        if counts.value in end_values(objects.tension.type):
+            return CellSample(Number(None, f"{counts.value:g}, the end of what its object can say: saturated"), counter)
         return CellSample(counts.scaled(self._n_per_count), counter)
 
     async def _number(self, entry: CanObject) -> Number:

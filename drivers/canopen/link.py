@@ -5,13 +5,6 @@ answer counts for the SYNC after which it arrives, once: what comes twice, or af
 discarded and counted. What is in the socket before the next SYNC is read before it, so that an answer that is
 late within its period cannot pass for a fresh one. One that comes a whole period late can: SYNC has no counter.
 
-A node that is no longer heard may still hear: every RPDO would renew its watchdog, although it may act on none of them
-(they act at SYNC). So it is told once to leave operational, which takes torque off (or run away) without a SYNC, and
-gets no RPDO until the next `prepare`: if it does not hear the one, its watchdog fires for want of the other.
-
-Drives whose watchdog is a heartbeat consumer share one heartbeat, which cannot be withheld from one of them: see
-`heartbeat`.
-
 A silent link sends no SYNC and writes nothing. What no node says by itself (tensions, the PLC's status) it asks for by
 SDO then, one transfer at a time per node: a dead one costs the others nothing.
 """
@@ -20,18 +13,18 @@ import asyncio
 from collections.abc import Callable, Sequence
 
 from drivers.canopen.bus import CanBus
+from drivers.canopen.feed import Feed
 from drivers.canopen.heartbeat import HEARTBEAT, HeartbeatProducer
 from drivers.canopen.node import Node
 from drivers.canopen.prepare import check_nodes, configure_nodes, undo_all
 from drivers.canopen.questions import Questions
 from drivers.canopen.sdo import SdoBus, SdoFailed
-from drivers.canopen.station import OPERATIONAL
+from drivers.canopen.station import ENTER_PRE_OPERATIONAL, OPERATIONAL, START, nmt_frame
 from drivers.port import PrepareRefused
 from gateway.core.line import CanopenBus
 from gateway.core.signals import Inputs, LinkHealth, Outputs
 
-NMT, SYNC, EMERGENCY = 0x000, 0x080, 0x080  #: COB-IDs, the last of node 0
-START, ENTER_PRE_OPERATIONAL = 0x01, 0x80  #: NMT commands
+SYNC, EMERGENCY = 0x080, 0x080  #: COB-IDs, the last of node 0
 START_HEARTBEATS = 3  #: producer times within which a started node must say that it is operational
 
 Handler = Callable[[Node, int, bytes | bytearray, float], None]
@@ -47,15 +40,15 @@ class CanopenLink:
         self.name = config.name
         self.health = LinkHealth()
         self._nodes = nodes
-        self._heartbeat = heartbeat
         self._handlers: dict[int, tuple[Handler, Node]] = {}
         for node in nodes:
             for cob_id in node.answers:
                 self._handlers[cob_id] = (self._on_answer, node)
             self._handlers[HEARTBEAT + node.station.node] = (self._on_heartbeat, node)
             self._handlers[EMERGENCY + node.station.node] = (self._on_emergency, node)
-        self._sdo = SdoBus(self._send_sdo, [node.station.node for node in nodes])
-        self._questions = Questions(self._sdo, self.health)
+        self._sdo = SdoBus(self._send, [node.station.node for node in nodes])
+        self._questions = Questions(self._sdo, nodes, self.health, self._on_altered)
+        self._feed = Feed(nodes, heartbeat, self._questions, self._send, self.health)
         self._sdo_responses = set(self._sdo.response_cob_ids())
         self._bus = CanBus(config, {*self._handlers, *self._sdo_responses}, self._on_frame, self._discard)
         self._active = False
@@ -64,7 +57,6 @@ class CanopenLink:
         self._awaited = 0  #: nodes whose answer `collect` still waits for
         self._answered: asyncio.Future[None] | None = None
         self._heartbeat_came = asyncio.Event()
-        self._told: set[int] = set()  #: dropped nodes whose order to leave operational was sent
         self._prepared = False  #: the nodes wait for us: they were prepared, and not released since
 
     async def open(self) -> None:
@@ -119,27 +111,29 @@ class CanopenLink:
             f"{station.name}: restarted while it was configured" for station in stations if station.boot_ups
         ]
 
-    def _command_nmt(self, command: int, node: Node) -> bool:
-        return self._bus.send(NMT, bytes((command, node.station.node)))
+    def _command_nmt(self, command: int, node: Node) -> None:
+        self._bus.send(*nmt_frame(command, node.station.node))
 
-    def _send_sdo(self, cob_id: int, data: bytes) -> bool:
+    def _send(self, cob_id: int, data: bytes) -> bool:
         return self._bus.send(cob_id, data)
+
+    def _on_altered(self, node: Node, trouble: str) -> None:
+        self._feed.drop(node, trouble)
 
     def silence(self) -> None:
         """Nothing is sent from now on that changes a node. What the nodes said is forgotten with it."""
         self._active = False
         self._sync_open = False
-        self._told.clear()
         self._questions.stop()
-        if self._heartbeat is not None:
-            self._heartbeat.forget()
+        self._feed.forget()
         for node in self._nodes:
             node.forget()
 
     async def release(self) -> None:
         """The nodes leave operational: torque off, and their deadline monitoring ends without a fault.
 
-        A consumer of our heartbeat is told by SDO to wait for it no more.
+        A consumer of our heartbeat is told by SDO to wait for it no more, once it has confirmed that its torque is off.
+        The watchdog of one that does not is left to fire.
         """
         self.silence()
         await self._leave_operational()
@@ -152,11 +146,17 @@ class CanopenLink:
             await asyncio.gather(*(self._let_go(node) for node in self._nodes))
 
     async def _let_go(self, node: Node) -> None:
-        for step in node.release_steps():
-            try:
+        steps = node.release_steps()
+        if not steps:
+            return
+        try:
+            trouble = "" if await node.confirm_stopped(self._sdo) else "still says that it has torque"
+            for step in [] if trouble else steps:
                 await self._sdo.download(node.station.node, step.index, step.sub, step.bytes_after(b""))
-            except SdoFailed as error:  # its watchdog fires then, and it is in fault when it is armed again
-                self.health.last_error = f"{node.station.name}: {error}"
+        except SdoFailed as error:
+            trouble = str(error)
+        if trouble:
+            self.health.last_error = f"{node.station.name}: {trouble}; its watchdog was left on and fires"
 
     # the cycle
 
@@ -210,43 +210,10 @@ class CanopenLink:
             self.health.last_error = self._bus.gone
 
     def write(self, outputs: Outputs) -> None:
-        """One RPDO for each node that takes commands and is there, and the heartbeat when all that need it have one.
-
-        What cannot be commanded is not sent: the watchdog has the last word.
-        """
-        if not self._active:
-            return
-        fed = [self._command(node, outputs) for node in self._nodes]
-        heartbeat = self._heartbeat
-        if heartbeat is not None and all(fed) and heartbeat.due(self._sync_s):
-            if self._bus.send(heartbeat.cob_id, heartbeat.payload):
-                heartbeat.sent(self._sync_s)
-
-    def _command(self, node: Node, outputs: Outputs) -> bool:
-        """Whether the node may hear the heartbeat: it was given its command, or has no torque, or needs neither."""
-        station = node.station
-        if not station.fed:
-            return True
-        if not station.dropped and node.absent(self._sync_s):
-            station.drop(node.trouble(self._sync_s))
-        if not station.dropped:
-            sent = self._send_command(node, outputs)
-        else:
-            sent = False
-            # Told once; again only where the bus did not take it.
-            if station.node not in self._told and self._command_nmt(ENTER_PRE_OPERATIONAL, node):
-                self._told.add(station.node)
-        if station.listens_to is None:
-            return True
-        return self._questions.has_confirmed(node) if station.distrust else sent
-
-    def _send_command(self, node: Node, outputs: Outputs) -> bool:
-        try:
-            frame = node.command(outputs, self._sync_s)
-        except ValueError as error:
-            self._discard(f"{node.station.name}: {error}")
-            return False
-        return frame is not None and self._bus.send(*frame)
+        """The commands, and the heartbeat. Then, in the rest of the period, a watchdog is read if it is time for it."""
+        if self._active:
+            self._feed.give(outputs, self._sync_s)
+            self._questions.verify(self._sync_s)
 
     # what arrives
 
@@ -305,3 +272,4 @@ class CanopenLink:
         self.silence()
         await self._questions.close()
         await self._bus.close()
+        await self._sdo.close()

@@ -5,11 +5,12 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from drivers.map_fields import Range, SpeedUnit, TimeUnit, TorqueUnit, WebSpeedUnit
+from drivers.map_fields import Format, Range, SpeedUnit, TimeUnit, TorqueUnit, WebSpeedUnit
 from drivers.map_rules import BYTES, fit_problems, range_problems, type_problems
 from gateway.core.line import Positive, Strict
 
 MAX_PDO_BYTES = 8
+UNSIGNED = ("u8", "u16", "u32")  #: of objects that carry bits, codes or counts
 
 Index = Annotated[int, Field(ge=0x1000, le=0xFFFF)]
 Node = Annotated[int, Field(ge=1, le=127)]
@@ -72,6 +73,16 @@ class CanIdentity(Strict):
 
     vendor_id: Annotated[int, Field(ge=0, le=0xFFFFFFFF)]
     product_code: Annotated[int, Field(ge=0, le=0xFFFFFFFF)]
+
+
+class CanMap(Strict):
+    """What every CANopen device type states."""
+
+    format: Format
+    protocol: Literal["canopen"]
+    description: str
+    identity: CanIdentity
+    heartbeat: HeartbeatObject
 
 
 class Pdo(Strict):

@@ -16,6 +16,11 @@ class Node(Protocol):
     identity: CanIdentity
     answers: tuple[int, ...]  #: COB-IDs of the PDOs that it sends with every SYNC, as many as its station expects
 
+    @property
+    def watchdog(self) -> Step | None:
+        """The object that has to stay as `prepare` writes it; None: nothing moves by this node."""
+        ...
+
     def on_answer(self, cob_id: int, data: bytes | bytearray) -> None:
         """A PDO of the answer to the present SYNC. Raises ValueError for a second one or one that does not fit."""
         ...
@@ -41,6 +46,16 @@ class Node(Protocol):
 
     def trouble(self, now_s: float) -> str:
         """What is wrong with it, for a person; empty when nothing is."""
+        ...
+
+    @property
+    def defies(self) -> str:
+        """How it defies its commands, so that only its watchdog can stop it; empty while it does not."""
+        ...
+
+    @property
+    def shows_torque(self) -> bool:
+        """Whether its answer to the present SYNC says that it has torque, or may have some."""
         ...
 
     def command(self, outputs: Outputs, now_s: float) -> tuple[int, bytes] | None:

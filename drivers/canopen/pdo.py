@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from math import isfinite
 from typing import Any
 
+from drivers.canopen.map_drive import DriveMap
 from drivers.canopen.map_parts import CanObject
-from drivers.canopen.maps import DriveMap
 from drivers.map_rules import BYTES
 from drivers.scaling import speed_per_count, torque_per_count
 
@@ -39,6 +39,12 @@ def mapping_entries(objects: Sequence[CanObject]) -> list[int]:
 def type_code(kind: str) -> str:
     """The struct code of an object's type, little-endian: how SDO carries it, too."""
     return "<" + _CODE[kind]
+
+
+def speed_resolution_m_per_s(device: DriveMap, radius_m: float) -> float:
+    """The web speed that one count of a drive's speed object is worth; 0 for a float, which has no such steps."""
+    speed = device.objects.speed
+    return 0.0 if speed.type == "f32" else speed_per_count(speed.unit, speed.scale, radius_m)
 
 
 class PdoLayout:

@@ -8,8 +8,8 @@ While the link is silent the status is asked for by SDO, and nothing is written.
 from dataclasses import dataclass
 from math import isfinite
 
-from drivers.canopen.configure import plc_expected, plc_steps
-from drivers.canopen.maps import PlcMap
+from drivers.canopen.configure import plc_expected, plc_steps, watchdog_step
+from drivers.canopen.map_plc import PlcMap
 from drivers.canopen.pdo import MalformedPdo, PdoLayout
 from drivers.canopen.prepare import check_identity
 from drivers.canopen.sdo import SdoBus
@@ -36,6 +36,8 @@ class PlcNode:
         self.identity = device.identity
         self._device = device
         self._steps = plc_steps(device, plc.address, watchdog_s)
+        self.watchdog = watchdog_step(device.watchdog, watchdog_s)
+        self.defies, self.shows_torque = "", False  # its echo and its watchdog answer for it
         self._read_scale = si_per_count(device.read.speed.unit, device.read.speed.scale)
         self._write_scale = si_per_count(device.write.speed.unit, device.write.speed.scale)
         self._transmit = PdoLayout(device.objects_of(device.transmit_pdo))

@@ -1,33 +1,70 @@
 """What is asked of the nodes by SDO beside the cycle: one question at a time each, in tasks of their own."""
 
 import asyncio
-from collections.abc import Coroutine
-from typing import Any
+from collections.abc import Callable, Coroutine, Sequence
+from typing import Any, TypeVar
 
 from drivers.canopen.node import Node
 from drivers.canopen.sdo import SdoBus, SdoFailed, SdoSilent
+from drivers.canopen.transaction import Step
 from gateway.core.signals import LinkHealth
+
+VERIFY_S = 1.0  #: in which every watchdog is read once
+READINGS = 2  #: that show another value than was set, one after the other, until a watchdog counts as altered
+
+T = TypeVar("T")
 
 
 class Questions:
-    def __init__(self, sdo: SdoBus, health: LinkHealth) -> None:
+    """`on_altered(node, trouble)` is called when a watchdog is not what `prepare` has set it to."""
+
+    def __init__(
+        self, sdo: SdoBus, nodes: Sequence[Node], health: LinkHealth, on_altered: Callable[[Node, str], None]
+    ) -> None:
         self._sdo = sdo
         self._health = health
+        self._on_altered = on_altered
         self._tasks: dict[int, asyncio.Task[None]] = {}  #: by node
         self._ending: set[asyncio.Task[None]] = set()
         self._stopped: set[int] = set()
+        self._guarded = [(node, node.watchdog) for node in nodes if node.watchdog is not None]
+        self._turn = 0  #: of `_guarded`, whose watchdog is read next
+        self._verify_s = float("-inf")  #: when
+        self._verifying: asyncio.Task[None] | None = None
 
     def ask(self, node: Node, now_s: float, *, active: bool) -> None:
         """Ask for what no PDO brings, if it is time for it. `active`: the link commands the nodes."""
         if node.station.node not in self._tasks and node.reading_due(now_s, active=active):
             self._start(node, self._read(node, now_s, silent=not active))
 
+    def verify(self, now_s: float) -> None:
+        """Ask the next node whether its watchdog still is what was set, if it is time for it: one after the other.
+
+        Called at the end of a cycle, so that neither the frames nor the thread that waits for them meet its answers.
+        """
+        if now_s < self._verify_s or not self._guarded or not (self._verifying is None or self._verifying.done()):
+            return
+        node, watchdog = self._guarded[self._turn]
+        if not node.station.distrust:
+            if node.station.node in self._tasks:
+                return  # it is asked something else: in the next cycle
+            self._verifying = self._start(node, self._verify(node, watchdog))
+        self._turn = (self._turn + 1) % len(self._guarded)
+        self._verify_s = now_s + VERIFY_S / len(self._guarded)
+
     def has_confirmed(self, node: Node) -> bool:
-        """Whether the node has said by SDO that its torque is off, since `stop`. If not, it is asked to."""
+        """Whether the node has said by SDO that its torque is off, since it was doubted. If not, it is asked to."""
         confirmed = node.station.node in self._stopped
         if not confirmed and node.station.node not in self._tasks:
             self._start(node, self._confirm_stopped(node))
         return confirmed
+
+    def doubt(self, node: Node) -> None:
+        """What the node has confirmed counts no more, nor what it is about to answer."""
+        self._stopped.discard(node.station.node)
+        task = self._tasks.pop(node.station.node, None)
+        if task is not None and task is not asyncio.current_task():
+            task.cancel()
 
     def stop(self) -> None:
         """Drop what is under way: its answer would belong to another time. What was confirmed does not count more."""
@@ -35,12 +72,13 @@ class Questions:
             task.cancel()
         self._tasks.clear()
         self._stopped.clear()
+        self._verify_s = float("-inf")
 
     async def close(self) -> None:
         self.stop()
         await asyncio.gather(*self._ending, return_exceptions=True)
 
-    def _start(self, node: Node, question: Coroutine[Any, Any, None]) -> None:
+    def _start(self, node: Node, question: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
         task = asyncio.get_running_loop().create_task(question)
         self._tasks[node.station.node] = task
         self._ending.add(task)
@@ -51,21 +89,37 @@ class Questions:
                 del self._tasks[node.station.node]
 
         task.add_done_callback(over)
+        return task
 
     async def _read(self, node: Node, now_s: float, *, silent: bool) -> None:
+        reasons = await self._answer(node, node.read(self._sdo, now_s))
+        if reasons:
+            self._health.last_error = f"{node.station.name}: {'; '.join(reasons)}"
+        elif reasons is not None and silent:
+            node.station.heard(now_s)  # a sign of life: its heartbeat may be off until `prepare` sets it
+
+    async def _verify(self, node: Node, watchdog: Step) -> None:
+        """A node that does not answer is not judged: that is for its PDOs and heartbeats."""
+        wanted = found = watchdog.bytes_after(b"")
+        for _ in range(READINGS):
+            question = self._sdo.upload(node.station.node, watchdog.index, watchdog.sub, len(wanted))
+            found = await self._answer(node, question)
+            if found is None or found == wanted:
+                return
+        was, now = (int.from_bytes(data, "little") for data in (wanted, found))
+        self._on_altered(node, f"its watchdog, {watchdog.name}, was set to {was:#x} and is {now:#x}")
+
+    async def _answer(self, node: Node, question: Coroutine[Any, Any, T]) -> T | None:
+        """None, and why in `health`, where there is no answer."""
         try:
-            reasons = await node.read(self._sdo, now_s)
+            return await question
         except SdoSilent as error:
             self._health.timeouts += 1
             self._health.last_error = f"{node.station.name}: {error}"
         except SdoFailed as error:
             self._health.malformed += 1
             self._health.last_error = f"{node.station.name}: {error}"
-        else:
-            if reasons:
-                self._health.last_error = f"{node.station.name}: {'; '.join(reasons)}"
-            elif silent:
-                node.station.heard(now_s)  # a sign of life: its heartbeat may be off until `prepare` sets it
+        return None
 
     async def _confirm_stopped(self, node: Node) -> None:
         try:

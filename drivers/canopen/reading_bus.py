@@ -73,6 +73,7 @@ class ReadingBus:
     async def close(self) -> None:
         """Release the interface. Idempotent."""
         await self._bus.close()
+        await self.sdo.close()
 
     def _send(self, cob_id: int, data: bytes) -> bool:
         if not (_upload_only(cob_id, data) and self._asking):

@@ -1,17 +1,20 @@
 """Service data on one CAN bus: the canopen library's SDO client, fed from our own reader.
 
-The library waits in a worker thread, so a transfer never costs the loop time. It is given SDO frames only: if it
-saw PDOs it would keep their last values, and on interfaces that echo, its own commands.
+The library waits in a worker thread, so a transfer never costs the loop time; the threads are the bus's own, so that
+nodes that do not answer hold up nothing else. It is given SDO frames only: if it saw PDOs it would keep their last
+values, and on interfaces that echo, its own commands.
 """
 
 import asyncio
 import logging
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 
 import canopen
 from canopen.sdo.client import SdoClient
 
 SDO_TIMEOUT_S = 0.2
+THREADS = 8  #: nodes that are asked at the same time
 
 # A failed transfer is reported by whoever asked for it; the library need not print it as well.
 logging.getLogger("canopen").addHandler(logging.NullHandler())
@@ -50,6 +53,8 @@ class SdoBus:
         self._network = _Network(send)
         self._clients: dict[int, SdoClient] = {}
         self._one_at_a_time: dict[int, asyncio.Lock] = {}
+        self._threads: ThreadPoolExecutor | None = None  #: from the first transfer to `close`
+        self._under_way: set[asyncio.Future[bytes | None]] = set()
         for node in nodes:
             client = _Client(_REQUEST + node, _RESPONSE + node, canopen.ObjectDictionary())
             client.network = self._network
@@ -80,10 +85,14 @@ class SdoBus:
     async def _run(self, node: int, index: int, sub: int, transfer: Callable[[SdoClient], bytes | None]) -> bytes:
         lock = self._one_at_a_time[node]
         await lock.acquire()
-        work = asyncio.ensure_future(asyncio.to_thread(transfer, self._clients[node]))
+        self._threads = self._threads or ThreadPoolExecutor(THREADS, thread_name_prefix="sdo")
+        loop = asyncio.get_running_loop()
+        work: asyncio.Future[bytes | None] = loop.run_in_executor(self._threads, transfer, self._clients[node])
+        self._under_way.add(work)
 
         def over(done: asyncio.Future[bytes | None]) -> None:
             lock.release()
+            self._under_way.discard(done)
             if not done.cancelled():
                 done.exception()  # whoever asked may have gone; that is no error of the loop's
 
@@ -96,3 +105,11 @@ class SdoBus:
             raise SdoFailed(f"object {index:04X}h sub {sub}: the device aborted: {error}") from error
         except canopen.SdoCommunicationError as error:
             raise SdoSilent(f"object {index:04X}h sub {sub}: {error}") from error
+
+    async def close(self) -> None:
+        """End the threads, after what is under way: a timeout at most where nothing is received more. Idempotent."""
+        while self._under_way:
+            await asyncio.wait(self._under_way)
+        threads, self._threads = self._threads, None
+        if threads is not None:
+            threads.shutdown()

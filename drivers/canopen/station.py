@@ -12,8 +12,15 @@ HEARTBEATS_ALLOWED_AT_REST = 3.0  #: the same while nothing moves by it
 ANSWERS_ALLOWED = 3  #: SYNCs in a row without an answer until a node counts as absent
 
 BOOT_UP, STOPPED, OPERATIONAL, PRE_OPERATIONAL = 0x00, 0x04, 0x05, 0x7F
+START, ENTER_PRE_OPERATIONAL = 0x01, 0x80  #: NMT commands
+_NMT = 0x000  #: COB-ID
 _NMT_NAMES = {STOPPED: "stopped", OPERATIONAL: "operational", PRE_OPERATIONAL: "pre-operational"}
 _EMCY = struct.Struct("<HB5s")
+
+
+def nmt_frame(command: int, node: int) -> tuple[int, bytes]:
+    """COB-ID and payload of an NMT command."""
+    return _NMT, bytes((command, node))
 
 
 class Station:
@@ -114,7 +121,7 @@ class Station:
         return self.distrust or self.emergency
 
     def drop(self, trouble: str) -> None:
-        """It is lost: not fed until the next `prepare`, or its watchdog stays quiet while nobody listens behind it."""
+        """It is lost, or cannot be relied on: not fed until the next `prepare`, so that its watchdog fires."""
         self.distrust = f"{trouble}; it was told to stop, arm again"
         self.dropped = True
 

@@ -83,6 +83,9 @@ class Amplifier:
     def rest(self) -> list[int]:
         return []
 
+    def disobeys(self) -> str:
+        return ""
+
     def forget(self) -> None:
         """What it measures is true whether it is commanded or not."""
 

@@ -5,7 +5,17 @@ from dataclasses import dataclass
 from math import floor
 
 from drivers.cia402 import DISABLE_VOLTAGE, drive_state, power_state
-from drivers.modbus.device import Check, Proofs, Setting, Standing, identity_check, register_block, watchdog_counts
+from drivers.modbus.device import (
+    WATCHDOG_OFF,
+    Check,
+    Proofs,
+    Setting,
+    Standing,
+    identity_check,
+    register_block,
+    watchdog_counts,
+)
+from drivers.modbus.frozen import FrozenAnswers
 from drivers.modbus.maps import DriveMap, Register
 from drivers.modbus.plan import Wish
 from drivers.modbus.registers import Field, RegisterBlock
@@ -64,6 +74,8 @@ class Axis:
         self.proofs = self._what_must_hold()
         self.stage = PowerStage(device.follows_command)
         self._state = DriveState.ABSENT
+        self._commanded_nm = 0.0
+        self._frozen = FrozenAnswers(self._torque_scale)
         self._told = ""  #: the trouble that was told last; what lasts is told once
 
     # what must hold of it
@@ -77,7 +89,8 @@ class Axis:
             identity.append(Check(self._block([device.rated_torque]), self._against_rated_torque))
         maximum = self._block([device.max_torque])
         counts = watchdog_counts(device.watchdog, settings.watchdog_s, "the drive")
-        watchdog = Setting(f"{self.name}: its communication watchdog", self._block([device.watchdog]), counts)
+        name = f"{self.name}: its communication watchdog"
+        watchdog = Setting(name, self._block([device.watchdog]), counts, WATCHDOG_OFF)
         trust: list[Check] = []
         written = [watchdog]
         if device.max_torque.writable:
@@ -135,23 +148,35 @@ class Axis:
         """State, speed and torque into `inputs`; returns what was wrong, once. Without an answer they are missed."""
         index = self._index
         if numbers is None:
-            inputs.speed.miss(index)
-            inputs.torque.miss(index)
-            self._state = self._state_unheard(standing)
-            inputs.drive_state[index] = self._state
+            self._miss(inputs, standing)
             return []
+        if self._frozen.after(numbers, self._commanded_nm, following=standing.wrote and self._follows):
+            self._miss(inputs, standing)
+            return [f"{self.name}: answers, but nothing that it says moves while its torque command does"]
         sto = self._device.read.safe_torque_off
         active = sto.is_set(int(numbers[self._sto_at])) if sto is not None else None
         self.stage.on_statusword(int(numbers[0]), active)
         inputs.speed.put(index, numbers[1] * self._speed_scale, time_s)
         inputs.torque.put(index, numbers[2] * self._torque_scale, time_s)
         says = self.stage.state
-        self._state = DriveState.FAULT if standing.distrust else says
+        # One that disobeys is shown as it is: whoever reads FAULT takes torque for off.
+        self._state = DriveState.FAULT if standing.distrust and not self.stage.disobeys else says
         inputs.drive_state[index] = self._state
         if says is not DriveState.FAULT:
             self._told = ""
             return []
         return self._fault_told_once(numbers)
+
+    def _miss(self, inputs: Inputs, standing: Standing) -> None:
+        inputs.speed.miss(self._index)
+        inputs.torque.miss(self._index)
+        self._state = self._state_unheard(standing)
+        inputs.drive_state[self._index] = self._state
+
+    @property
+    def _follows(self) -> bool:
+        """Whether it said at last that it follows its torque command."""
+        return self.stage.state is DriveState.ENABLED
 
     def _state_unheard(self, standing: Standing) -> DriveState:
         if standing.absent or self.stage.power is None:  # lost, or never heard
@@ -175,7 +200,8 @@ class Axis:
         # Checked also where it is not given: what cannot be commanded says that something is wrong.
         if not -self._most_nm <= torque_nm <= self._most_nm:  # NaN, too
             raise ValueError(f"torque {torque_nm} Nm does not fit the target torque register")
-        return self._encode(*self.stage.command(request, torque_nm, self._state, trusted=True))
+        controlword, self._commanded_nm = self.stage.command(request, torque_nm, self._state, trusted=True)
+        return self._encode(controlword, self._commanded_nm)
 
     def rest(self) -> list[int]:
         return self._encode(DISABLE_VOLTAGE, 0.0)
@@ -184,8 +210,15 @@ class Axis:
         counts = torque_nm * self._counts_per_nm
         return self._write.encode((controlword, round(counts) if self._whole_counts else counts))
 
+    def disobeys(self) -> str:
+        if not self.stage.disobeys:
+            return ""
+        return f"{self.name}: is told to take torque off and stays enabled; only its watchdog can stop it"
+
     def forget(self) -> None:
         self.stage.forget()
+        self._frozen.forget()
+        self._commanded_nm = 0.0
         self._told = ""
 
     # registers

@@ -22,7 +22,11 @@ logging.getLogger("pymodbus").addHandler(logging.NullHandler())
 
 
 class ModbusFailed(Exception):
-    """No usable answer; the text says why."""
+    """No usable answer; the text says why. `exception_code` is what the device refused it with, where it did."""
+
+    def __init__(self, text: str, exception_code: int | None = None) -> None:
+        super().__init__(text)
+        self.exception_code = exception_code
 
 
 class ModbusTimeout(ModbusFailed):
@@ -35,6 +39,7 @@ class ModbusConnection:
     def __init__(self, host: str, port: int) -> None:
         self.where = f"{host}:{port}"
         self.answers = 0  #: on this connection, of whatever content
+        self.number = 0  #: of this connection; every attempt to make one counts
         self._host, self._port = host, port
         self._client: AsyncModbusTcpClient | None = None
 
@@ -46,6 +51,7 @@ class ModbusConnection:
         """Try once, afresh: nothing of an earlier connection is left that could be mistaken for an answer."""
         self.close()
         self.answers = 0
+        self.number += 1
         self._client = AsyncModbusTcpClient(
             self._host, port=self._port, timeout=CONNECT_TIMEOUT_S, retries=0, reconnect_delay=0
         )
@@ -114,7 +120,8 @@ class ModbusConnection:
         if self._client is not None and answer.transaction_id != self._client.ctx.request_transaction_id:
             raise ModbusFailed(f"answer to transaction {answer.transaction_id}")  # pymodbus takes a 0 for any
         if answer.isError():
-            raise ModbusFailed(f"exception {answer.exception_code} to function {function}")
+            code = answer.exception_code
+            raise ModbusFailed(f"exception {code} to function {function}", code)
         if answer.function_code != function:
             raise ModbusFailed(f"answer of function {answer.function_code} to function {function}")
         return answer

@@ -35,6 +35,20 @@ class Setting:
     name: str
     register: RegisterBlock
     counts: float
+    off: float | None = None  #: of a watchdog: the value with which it waits for nobody
+
+    @property
+    def wish(self) -> Wish:
+        """To read it with a transaction."""
+        return Wish(self.name, self.register.fields, self.register.word_order)
+
+    @property
+    def kept(self) -> Check:
+        """That it still is what it was set to."""
+        return Check(self.register, self.against)
+
+    def against(self, found: float) -> list[str]:
+        return [] if found == self.counts else [f"{self.name} reads {found:g}, {self.counts:g} was set"]
 
 
 @dataclass(slots=True)
@@ -45,7 +59,7 @@ class Standing:
     wrote: bool = False  #: the transaction of this cycle carried a command
     missed: int = 0  #: cycles in a row without an answer
     doubt: str = ""  #: why nothing of it is believed
-    distrust: str = ""  #: why nothing is written to it although it is active; stays until that is mended
+    distrust: str = ""  #: why it is not commanded although it is active; stays until that is mended
     refused: str = ""  #: the same for what it was commanded in this cycle
 
     @property
@@ -86,9 +100,16 @@ class Device(Protocol):
         """The same for a device that is left: no torque, no transport."""
         ...
 
+    def disobeys(self) -> str:
+        """Why it is fed no longer: it was told to take torque off, and has not. Empty when all is well."""
+        ...
+
     def forget(self) -> None:
         """The link is silent: what it was told and what it said of its state counts no more."""
         ...
+
+
+WATCHDOG_OFF = 0  #: counts
 
 
 def watchdog_counts(watchdog: TimeRegister, watchdog_s: float, what: str) -> int:

@@ -49,13 +49,15 @@ class ModbusLink:
         if reasons:
             raise PrepareRefused(reasons)
         for session in self._sessions:
-            reasons += await session.configure()
+            reasons += await session.settings.configure()
+        if not reasons:
+            reasons = [reason for session in self._sessions for reason in session.lost_since_check()]
         if reasons:
             for session in reversed(self._sessions):
-                reasons += await session.undo()
+                reasons += await session.settings.undo()
             raise PrepareRefused(reasons)
         for session in self._sessions:
-            session.unit.activate()
+            session.activate()
 
     def silence(self) -> None:
         """Nothing is written from now on; reading goes on."""

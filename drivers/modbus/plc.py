@@ -8,7 +8,15 @@ from collections.abc import Sequence
 from math import isfinite
 
 from drivers.life import LifeCounter
-from drivers.modbus.device import Proofs, Setting, Standing, identity_check, register_block, watchdog_counts
+from drivers.modbus.device import (
+    WATCHDOG_OFF,
+    Proofs,
+    Setting,
+    Standing,
+    identity_check,
+    register_block,
+    watchdog_counts,
+)
 from drivers.modbus.maps import PlcMap
 from drivers.modbus.plan import Wish
 from drivers.scaling import si_per_count
@@ -33,9 +41,10 @@ class Plc:
         fields = [(entry.address - device.address_base, entry.type) for entry in entries]
         self.wish = Wish(self.name, fields, device.word_order, (self._write.address, self._write.count))
         counts = watchdog_counts(device.watchdog, watchdog_s, "the PLC")
+        watchdog = register_block([device.watchdog], device)
         self.proofs = Proofs(
             [identity_check(self.name, device.device_id, device)],
-            settings=[Setting(f"{self.name}: its command watchdog", register_block([device.watchdog], device), counts)],
+            settings=[Setting(f"{self.name}: its command watchdog", watchdog, counts, WATCHDOG_OFF)],
         )
         self._life = LifeCounter()
 
@@ -89,6 +98,9 @@ class Plc:
         inputs.unwind_speed.miss(0)
         if inputs.plc.quality != Quality.MISSING:
             inputs.plc.quality = Quality.STALE
+
+    def disobeys(self) -> str:
+        return ""
 
     def forget(self) -> None:
         self._life.forget()

@@ -21,6 +21,8 @@ class RegisterBlock:
 
     def __init__(self, fields: Sequence[Field], word_order: str) -> None:
         order = sorted(range(len(fields)), key=lambda k: fields[k][0])
+        self.fields = fields
+        self.word_order = word_order
         self.address = fields[order[0]][0]
         code = ">"
         at = self.address

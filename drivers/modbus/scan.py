@@ -4,7 +4,6 @@ A unit that answers with an exception is there; one whose gateway says that nobo
 """
 
 import asyncio
-import re
 import struct
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -78,10 +77,9 @@ async def _ask(connection: ModbusConnection, unit: int, function: int) -> str:
     except ModbusTimeout:
         return "no answer"
     except ModbusFailed as error:
-        code = exception_code(error)
-        if code in _NOBODY_BEHIND:
+        if error.exception_code in _NOBODY_BEHIND:
             return "no answer"
-        return "no" if code == _ILLEGAL_FUNCTION else str(error)
+        return "no" if error.exception_code == _ILLEGAL_FUNCTION else str(error)
     return "yes"
 
 
@@ -111,7 +109,7 @@ async def registers(
     """
     connection = ModbusConnection(host, port)
     addresses = range(max(0, register - 1), min(register + count + 1, 65536))
-    said: list[str] = []
+    said: list[ModbusFailed] = []
     try:
         if not await connection.connect():
             raise ModbusTimeout(f"no connection to {host}:{port}")
@@ -122,26 +120,27 @@ async def registers(
                 return function, [row for k in range(register, register + count) for row in _rows(k, words)]
     finally:
         connection.close()
-    raise ModbusFailed("; ".join(dict.fromkeys(said)))
+    codes = {error.exception_code for error in said}
+    raise ModbusFailed("; ".join(dict.fromkeys(map(str, said))), codes.pop() if len(codes) == 1 else None)
 
 
 async def _read_words(
     connection: ModbusConnection, function: int, unit: int, addresses: range
-) -> tuple[dict[int, int], list[str]]:
+) -> tuple[dict[int, int], list[ModbusFailed]]:
     """What could be read, by address on the wire, and what was said where nothing could.
 
     Together where the device lets it, so that the halves of a number belong to one instant; otherwise one by one.
     """
     words: dict[int, int] = {}
-    said: list[str] = []
+    said: list[ModbusFailed] = []
     for part in [addresses, *([address] for address in addresses)]:
         try:
             numbers = await connection.read(function, unit, part[0], len(part), _deadline_s())
         except ModbusTimeout as error:
-            said.append(f"function {function}: {error}")
+            said.append(ModbusTimeout(f"function {function}: {error}"))
             break
         except ModbusFailed as error:
-            said.append(str(error))
+            said.append(error)
             continue
         words |= zip(part, numbers, strict=True)
         if len(part) > 1:
@@ -196,8 +195,7 @@ def usual_float(row: Row, value: int | float | None) -> bool:
 
 def exception_code(error: ModbusFailed) -> int | None:
     """The Modbus exception that a failure tells of; None when it was another."""
-    found = re.match(r"exception (\d+) ", str(error))
-    return int(found[1]) if found else None
+    return error.exception_code
 
 
 def _deadline_s() -> float:

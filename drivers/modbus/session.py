@@ -10,15 +10,17 @@ import asyncio
 from collections.abc import Callable
 
 from drivers.modbus.client import ModbusConnection, ModbusFailed, ModbusTimeout
-from drivers.modbus.device import ANSWERS_ALLOWED, Setting
+from drivers.modbus.device import ANSWERS_ALLOWED
 from drivers.modbus.plan import Request
+from drivers.modbus.settings import REQUEST_TIMEOUT_S, SettingsWriter
 from drivers.modbus.unit import Payloads, Unit
 from gateway.core.signals import Inputs, LinkHealth
 
 EXCHANGE_SHARE = 0.8  #: of a period; what has not come by then leaves room for the next request
-REQUEST_TIMEOUT_S = 0.5  #: of `prepare`
 LEAVE_TIMEOUT_S = 0.2
 MUTE_S = 0.3  #: without any answer, until the connection is dropped
+LOOK_S = 1.0  #: until every setting that no cycle reads was looked at again
+LOOK_PATIENCE_S = 5.0  #: until a cycle is given up for it, of a device that is too slow for more than the cycles
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.1, 2.0  #: between attempts to connect
 
 
@@ -36,6 +38,7 @@ class Session:
     ) -> None:
         self.unit = unit
         self._connection = ModbusConnection(host, port)
+        self.settings = SettingsWriter(unit, self._connection)
         self._period_s = period_s
         self._health = health
         self._on_done = on_done
@@ -48,7 +51,9 @@ class Session:
         self._connecting: asyncio.Task[None] | None = None
         self._retry_s = float("-inf")
         self._pause_s = FIRST_PAUSE_S
-        self._before: list[tuple[Setting, float]] = []  #: what `configure` has changed
+        self._checked_on = 0  #: number of the connection on which the unit was checked
+        self._look_s = 0.0  #: when the next setting is looked at
+        self._looks = 0
 
     @property
     def where(self) -> str:
@@ -57,6 +62,8 @@ class Session:
     async def connect(self) -> bool:
         """Try once."""
         self._mute = 0
+        if self._connection.number:
+            self.unit.connection_lost()
         return await self._connection.connect()
 
     # proving the unit
@@ -72,6 +79,7 @@ class Session:
         """What speaks against the unit before anything is written. Reads only."""
         unit, reasons = self.unit, list[str]()
         unit.identity.void()
+        self._checked_on = self._connection.number
         try:
             for proof in (unit.identity, unit.trust):
                 for k in range(len(proof.groups)):
@@ -80,57 +88,22 @@ class Session:
                         return reasons  # another device: what else it says means nothing
         except ModbusTimeout as error:
             return [*reasons, self._in_words(error)]
+        reasons = reasons or self.lost_since_check()
         if not reasons:
             unit.identity.confirm()
             unit.standing.doubt = ""
         return reasons
 
-    async def configure(self) -> list[str]:
-        """Write every setting and read it back. Returns the first that fails; `undo` takes back what was written."""
-        self._before.clear()
-        for setting in self.unit.settings:
-            if reason := await self._set(setting):
-                return [reason]
-        return []
+    def lost_since_check(self) -> list[str]:
+        """What speaks against a unit that may be another, or was restarted, since it was checked."""
+        if self._connection.connected and self._connection.number == self._checked_on:
+            return []
+        return [f"{self.unit.name}: the connection was lost meanwhile; arm again"]
 
-    async def _set(self, setting: Setting) -> str:
-        try:
-            before = await self._read(setting)
-            try:
-                await self._write(setting, setting.counts)
-            except ModbusTimeout:
-                self._before.append((setting, before))  # it may have been written all the same
-                raise
-            self._before.append((setting, before))
-            found = await self._read(setting)
-        except (ModbusFailed, ValueError) as error:
-            return f"{setting.name} cannot be set: {error}"
-        if found == setting.counts:
-            return ""
-        return f"{setting.name} was set to {setting.counts:g} and reads back {found:g}"
-
-    async def undo(self) -> list[str]:
-        """Write back what was there before `configure`, the last first; returns what could not be restored."""
-        failures: list[str] = []
-        while self._before:
-            setting, before = self._before.pop()
-            try:
-                await self._write(setting, before)
-            except (ModbusFailed, ValueError) as error:
-                failures.append(f"{setting.name} was not restored: {error}")
-        return failures
-
-    async def _read(self, setting: Setting) -> float:
-        block, unit = setting.register, self.unit
-        deadline_s = _now_s() + REQUEST_TIMEOUT_S
-        return block.decode(
-            await self._connection.read(unit.read_function, unit.address, block.address, block.count, deadline_s)
-        )[0]
-
-    async def _write(self, setting: Setting, counts: float) -> None:
-        block = setting.register
-        deadline_s = _now_s() + REQUEST_TIMEOUT_S
-        await self._connection.write(self.unit.address, block.address, block.encode([counts]), deadline_s)
+    def activate(self) -> None:
+        """Its settings are proven: from now on it is commanded."""
+        self.unit.activate()
+        self._look_s = _now_s() + LOOK_S
 
     async def leave(self) -> None:
         """Tell a unit that was commanded to rest, and restore its settings: nobody will feed its watchdog any more.
@@ -142,25 +115,27 @@ class Session:
         unit = self.unit
         lost, commanded = unit.dropped, unit.commanded
         unit.silence()
-        if lost or not self._before:
-            self._before.clear()
+        if lost or not self.settings.written:
+            self.settings.forget()
             return
         try:
+            unit.require_proven()
             if commanded:
                 await self._rest()
             for k in range(len(unit.trust.groups)):
                 if reasons := await unit.trust.judge(k, self._connection, _now_s() + LEAVE_TIMEOUT_S):
                     raise ModbusFailed("; ".join(reasons))
-            failures = await self.undo()
+            failures = await self.settings.undo()
             if commanded and not failures:
                 await self._rest()  # a watchdog that was changed counts from the next command: only now it is off
         except (ModbusFailed, ValueError) as error:
             failures = [f"{unit.name}: left with its watchdog on: {error}"]
-            self._before.clear()
+            self.settings.forget()
         for failure in failures:
             self._discard(failure)
 
     async def _rest(self) -> None:
+        self.unit.require_proven()
         await self._transact(self.unit.plan.read_write, self.unit.rest_payloads(), _now_s() + LEAVE_TIMEOUT_S)
 
     # the cycle
@@ -200,6 +175,7 @@ class Session:
         if self._connection.answers > answers:
             self._mute = 0
             self._pause_s = FIRST_PAUSE_S
+            await self._look(deadline_s)
             return
         self._mute += 1
         if self._mute * self._period_s >= MUTE_S or not answers:
@@ -215,10 +191,41 @@ class Session:
             standing.doubt = ""
         if standing.active and not unit.dropped and not unit.kept_settings.complete:
             unit.distrust(await unit.kept_settings.go_on(self._connection, deadline_s))
-        if payloads is None or not unit.may_write():
-            return await self._transact(unit.plan.read_only, [], deadline_s)
-        standing.wrote = unit.commanded = True
-        return await self._transact(unit.plan.read_write, payloads, deadline_s)
+        active = standing.active  # what is read now was sent after the settings were
+        if (rest := unit.take_rest()) is not None:
+            numbers = await self._transact(unit.plan.read_write, rest, deadline_s)
+        elif payloads is None or not unit.may_write() or self._old():
+            numbers = await self._transact(unit.plan.read_only, [], deadline_s)
+        else:
+            standing.wrote = unit.commanded = True
+            numbers = await self._transact(unit.plan.read_write, payloads, deadline_s)
+        return unit.take_settings(numbers, judged=active and standing.active)
+
+    def _old(self) -> bool:
+        """Whether the command of this exchange is over: the proofs before it took longer than its period."""
+        return _now_s() >= self._sent_s + self._period_s
+
+    async def _look(self, deadline_s: float) -> None:
+        """Read one of the settings that no cycle reads, when it is due and there is as much time as the cycle took.
+
+        A device for which there never is gives up one cycle for it now and then.
+        """
+        unit, now_s = self.unit, _now_s()
+        groups = len(unit.unseen_settings.groups)
+        if not groups or now_s < self._look_s or not unit.may_write():
+            return
+        if now_s + (now_s - self._sent_s) > deadline_s:
+            if now_s < self._look_s + LOOK_PATIENCE_S:
+                return
+            deadline_s = now_s + self._period_s
+        self._look_s = now_s + LOOK_S / groups
+        self._looks += 1
+        try:
+            reasons = await unit.unseen_settings.judge(self._looks % groups, self._connection, deadline_s)
+        except ModbusTimeout as error:
+            reasons = [str(error)]
+        if reasons and unit.standing.active:
+            unit.doubt_settings()
 
     async def _transact(self, requests: list[Request], payloads: Payloads, deadline_s: float) -> list[list[float]]:
         connection, unit = self._connection, self.unit
@@ -249,7 +256,6 @@ class Session:
         if now_s >= self._retry_s and (self._connecting is None or self._connecting.done()):
             self._retry_s = now_s + self._pause_s
             self._pause_s = min(2.0 * self._pause_s, LONGEST_PAUSE_S)
-            self.unit.connection_lost()
             self._connecting = asyncio.create_task(self._connect_again())
 
     async def _connect_again(self) -> None:

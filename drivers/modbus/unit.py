@@ -1,15 +1,20 @@
 """What stands behind one unit identifier: devices that are exchanged in one transaction. No I/O.
 
 A unit is written whole or not at all. Where one of its devices cannot be commanded, or one that gives torque was
-lost, nothing is written to any of them, so that every watchdog in it fires: there is no half of a transaction.
+lost, nothing is written to any of them, so that every watchdog in it fires: there is no half of a transaction. Where a
+watchdog itself may be off all of them are told to rest first: left alone they might follow their last command for ever.
 """
 
 from collections.abc import Sequence
 
+from drivers.modbus.client import ModbusFailed
 from drivers.modbus.device import Check, Device, Setting, Standing
-from drivers.modbus.plan import Plan
+from drivers.modbus.plan import Plan, Wish
 from drivers.modbus.proof import Proof
+from drivers.modbus.registers import spans
 from gateway.core.signals import Inputs, Outputs
+
+RESTS = 5  #: cycles in which a unit that has not kept its settings is told to rest; some may not arrive
 
 Payloads = list[list[int]]  #: the registers of each of the plan's writes
 
@@ -22,17 +27,22 @@ class Unit:
         self.read_function = read_function
         self.devices = devices
         self.name = ", ".join(device.name for device in devices)
-        self.plan = Plan([device.wish for device in devices], together)
         self.standing = Standing()
         self.settings = _settings(devices)
+        wishes = [device.wish for device in devices]
+        self._seen = _in_reach(wishes, self.settings)  #: those that every cycle reads
+        self.plan = Plan([*wishes, *(setting.wish for setting in self._seen)], together)
         proofs = [device.proofs for device in devices]
         #: Before anything is believed. `prepare` proves it before there is torque; nobody would after a reconnection.
         self.identity = self._proof([check for proof in proofs for check in proof.identity])
         self.identity.confirm()
         self.trust = self._proof([check for proof in proofs for check in proof.trust])
-        self.kept_settings = self._proof([_kept(setting) for setting in self.settings])
+        self.kept_settings = self._proof([setting.kept for setting in self.settings])
+        #: The settings that no cycle reads.
+        self.unseen_settings = self._proof([setting.kept for setting in self.settings if setting not in self._seen])
         self.dropped = False  #: gave torque and was lost: nothing is written to it before the next `prepare`
         self.commanded = False  #: something was written since it became active
+        self._rests = 0  #: that are left
         self._gives_torque = any(device.gives_torque for device in devices)
         self._writers = [device for device in devices if device.wish.write is not None]
         self._payloads: Payloads | None = None
@@ -45,12 +55,14 @@ class Unit:
         self.kept_settings.confirm()
         self.standing.active = True
         self.standing.missed = 0
+        self.standing.distrust, self.dropped, self._rests = "", False, 0
 
     def silence(self) -> None:
         """Nothing is written from now on, and nothing of the last command is left."""
         standing = self.standing
         standing.active, standing.wrote, standing.distrust, standing.refused = False, False, "", ""
         self.dropped = self.commanded = False
+        self._rests = 0
         self._payloads = None
         for device in self.devices:
             device.forget()
@@ -88,11 +100,37 @@ class Unit:
         """No torque, no transport: what a unit is told that is left."""
         return self.plan.payloads([device.rest() for device in self._writers])
 
+    def require_proven(self) -> None:
+        """Raises ModbusFailed when what answers on this connection may be another device."""
+        if not self.identity.complete:
+            raise ModbusFailed("its identity is not proven on this connection")
+
+    def take_rest(self) -> Payloads | None:
+        """What is written now to a unit that has not kept its settings, a few times."""
+        if not self._rests:
+            return None
+        self._rests -= 1
+        return self.rest_payloads()
+
     def may_write(self) -> bool:
         return self.standing.active and not self.dropped and self.identity.complete and self.kept_settings.complete
 
+    def take_settings(self, numbers: list[list[float]], *, judged: bool) -> list[list[float]]:
+        """What a transaction has read, without the settings in it. Where `judged`, one that changed is in doubt."""
+        count = len(self.devices)
+        found = zip(self._seen, numbers[count:], strict=True)
+        if judged and any(setting.against(number) for setting, (number,) in found):
+            self.doubt_settings()
+        return numbers[:count]
+
+    def doubt_settings(self) -> None:
+        """They are proven again before anything else is written: a single answer may have been damaged."""
+        self.kept_settings.void()
+
     def distrust(self, reasons: Sequence[str]) -> None:
-        """It has not kept its settings. Who gives torque does not come back by itself."""
+        """It has not kept its settings; none: it has. Who gives torque does not come back by itself."""
+        if reasons and not self.standing.distrust:
+            self._rests = RESTS
         self.standing.distrust = "; ".join(reasons)
         if self._gives_torque and reasons:
             self._drop(self.standing.distrust)
@@ -110,6 +148,8 @@ class Unit:
         troubles: list[str] = []
         for k, device in enumerate(self.devices):
             troubles += device.fill(inputs, numbers[k] if numbers is not None else None, standing, time_s)
+            if not self.dropped and (reason := device.disobeys()):
+                self._drop(reason)
         if mute := standing.distrust or standing.refused:
             troubles.append(f"{self.name}: {mute}; it is not written to")
         return troubles
@@ -129,8 +169,13 @@ def _settings(devices: Sequence[Device]) -> list[Setting]:
     return list(settings.values())
 
 
-def _kept(setting: Setting) -> Check:
-    def judge(found: float) -> list[str]:
-        return [] if found == setting.counts else [f"{setting.name} reads {found:g}, {setting.counts:g} was set"]
-
-    return Check(setting.register, judge)
+def _in_reach(wishes: Sequence[Wish], settings: Sequence[Setting]) -> list[Setting]:
+    """The settings that can be read together with what the devices wish, without one request more."""
+    fields = [field for wish in wishes for field in wish.reads]
+    requests = len(spans(fields))
+    found: list[Setting] = []
+    for setting in settings:
+        if len(spans([*fields, *setting.wish.reads])) == requests:
+            fields.extend(setting.wish.reads)
+            found.append(setting)
+    return found

@@ -1,9 +1,9 @@
 """A load-cell amplifier on OPC UA: what is asked of it each cycle, and which of its answers may be believed. No I/O."""
 
-from drivers.opcua.drive import ANSWERS_ALLOWED
 from drivers.opcua.maps import LoadCellMap
 from drivers.opcua.nodes import DeviceNodes, NodeTable, Reading
-from drivers.opcua.proof import Proof
+from drivers.opcua.proof import ANSWERS_ALLOWED, Proof
+from drivers.opcua.source_time import STANDS_STILL, SourceTime
 from drivers.scaling import si_per_count
 from gateway.core.line import LoadCell
 from gateway.core.signals import Inputs, Outputs
@@ -34,14 +34,12 @@ class Amplifier:
         )
         self.prepare_reads = (*self.proof.nodes, nodes.place(device.channel_count, device.channel_count.type))
         self._counter: float | None = None
+        self._sampled = {cell.name: SourceTime(device.source_time) for cell in cells}  #: tensions
 
     def command(self, outputs: Outputs) -> None:
         """There is nothing to say to it."""
 
     def take_writes(self) -> list[tuple[int, float]]:
-        return []
-
-    def farewell(self) -> list[list[tuple[int, float]]]:
         return []
 
     def on_written(self, statuses: tuple[int, ...]) -> str:
@@ -102,6 +100,9 @@ class Amplifier:
 
     def _fill_cell(self, inputs: Inputs, time_s: float, cell: LoadCell, readings: tuple[Reading, ...]) -> str:
         tension_n = readings[0].value * self._n_per_count
+        if self._sampled[cell.name].stands_still(readings[0].source_us):
+            inputs.tension.miss(cell.span - 1)
+            return f"{cell.name}: {STANDS_STILL}"
         trouble = self._against_status(readings) or readings[0].trouble
         if not trouble and not -cell.capacity_n <= tension_n <= cell.capacity_n:  # NaN and infinity, too
             trouble = f"{tension_n:g} N is beyond its capacity of {cell.capacity_n:g} N"

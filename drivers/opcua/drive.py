@@ -1,23 +1,36 @@
 """One axis on OPC UA: what is asked of it and told to it each cycle, and which of its answers may be believed. No I/O.
 
-Its command carries a life counter; the axis takes its torque off when that stands still. So an axis that is lost, or
-that refuses a command, is not written to any more until the next `prepare`: its own watchdog takes the torque off.
+Its command carries a life counter; the axis takes its torque off when that stands still. So an axis that is lost, that
+refuses a command or does not obey is not written to any more until the next `prepare`: its own watchdog takes torque
+off. One whose watchdog is found to be another than was set would keep its torque in silence: it is told to take it
+off, without a life counter.
 """
 
 from dataclasses import dataclass
 
-from drivers.cia402 import DISABLE_VOLTAGE, drive_state, power_state
+from drivers.cia402 import DISABLE_VOLTAGE, PowerState, power_state
 from drivers.life import LifeCounter
 from drivers.opcua.maps import DriveMap
 from drivers.opcua.nodes import DeviceNodes, NodeTable, Reading, to_type
-from drivers.opcua.proof import Proof, Watchdog
-from drivers.opcua.status import describe, is_good
+from drivers.opcua.proof import ANSWERS_ALLOWED, Proof, Watchdog
+from drivers.opcua.source_time import STANDS_STILL, SourceTime
+from drivers.opcua.status import describe, is_done
 from drivers.power_stage import PowerStage
 from drivers.scaling import speed_per_count, torque_per_count
 from gateway.core.signals import Channel, DriveState, Inputs, Outputs
 
-ANSWERS_ALLOWED = 3  #: cycles in a row without a usable answer until a device counts as absent
 _RATED_TORQUE_TOLERANCE = 1e-3  #: of the line's figure; more would scale every torque wrongly
+_TORQUE_ON = (PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE, PowerState.FAULT_REACTION)
+_TORQUE_OFF = (
+    PowerState.SWITCH_ON_DISABLED,
+    PowerState.READY_TO_SWITCH_ON,
+    PowerState.SWITCHED_ON,
+    PowerState.FAULT,
+)
+_FAULT = 0x08  #: the bits 0 to 3 and 6 of a fault; a combination that the profile does not know only counts as one
+_WATCHED = 3  #: readings whose source time stamps have to move: statusword, speed, torque
+_LEFT_ALONE = "it is not written to any more, so that its watchdog takes torque off"
+_TOLD_OFF = "it is told to take torque off"
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +48,7 @@ class AxisSettings:
 
 
 class Axis:
-    """`distrust` is why it gets no torque until the next `prepare`, empty while there is no reason."""
+    """`distrust` is why it is not commanded until the next `prepare`, empty while there is no reason."""
 
     def __init__(self, device: DriveMap, settings: AxisSettings, table: NodeTable) -> None:
         self.name = settings.name
@@ -55,7 +68,7 @@ class Axis:
         self._nm_per_count = torque_per_count(torque.unit, torque.scale, rated_nm)
         self._target_nm_per_count = torque_per_count(target.unit, target.scale, rated_nm)
         self._target_type = target.type
-        self._statusword = nodes.place(entries.statusword, entries.statusword.type)
+        self.statusword = nodes.place(entries.statusword, entries.statusword.type)
         self._sto, self._error_code = entries.safe_torque_off, entries.error_code
         optional = [entry for entry in (entries.safe_torque_off, entries.error_code) if entry is not None]
         cyclic = [entries.statusword, speed, torque, *optional]
@@ -68,12 +81,13 @@ class Axis:
         #: what `prepare` looks at: identity, watchdog, statusword, max torque, and rated torque where there is one
         self.prepare_reads = (
             *self.proof.nodes,
-            self._statusword,
+            self.statusword,
             *(nodes.place(entry, entry.type) for entry in torques),
         )
         self._life = LifeCounter()
         self._command: tuple[int, float] | None = None  #: controlword and torque (counts) of this cycle
-        self._dropped = False  #: is not written to, so that its own watchdog can fire
+        self._refused = False  #: a command; while the server refuses a part of a Write, it may do nothing of it
+        self._sampled = [SourceTime(device.source_time) for _ in range(_WATCHED)]
 
     # the cycle
 
@@ -88,12 +102,15 @@ class Axis:
         self._command = None
         if self.state == DriveState.ABSENT:
             self._drop("it did not answer")
-        if self._dropped:
+        if self.distrust:
             return
         request, torque_nm = int(outputs.drive_request[self._index]), float(outputs.torque_nm[self._index])
         # Converted also where it is not given: what cannot be commanded says that something is wrong.
         self._torque_counts(torque_nm)
-        word, given_nm = self.stage.command(request, torque_nm, self.state, trusted=not self.distrust)
+        word, given_nm = self.stage.command(request, torque_nm, self.state, trusted=True)
+        if self.stage.disobeys:
+            self._drop("it was told to take torque off and has not")
+            return
         self._command = (word, self._torque_counts(given_nm))
 
     def _torque_counts(self, torque_nm: float) -> float:
@@ -102,26 +119,33 @@ class Axis:
     def take_writes(self) -> list[tuple[int, float]]:
         """The command that was handed over for this cycle, once."""
         command, self._command = self._command, None
-        if command is None or not self._may_write():
+        if self._tells_off() and self.stage.power in _TORQUE_ON:
+            return list(zip(self._command_nodes[:2], (float(DISABLE_VOLTAGE), 0.0), strict=True))
+        if command is None or not self.may_write:
             return []
         return list(zip(self._command_nodes, (*command, self._life.next()), strict=True))
 
-    def _may_write(self) -> bool:
-        return self.active and self.proof.proven and not self._dropped
+    @property
+    def may_write(self) -> bool:
+        """Whether it is commanded; one that is not is left to its watchdog."""
+        return self.active and self.proof.proven and not self.distrust
+
+    def _tells_off(self) -> bool:
+        return self.active and self.proof.unguarded and not self._refused
 
     def on_written(self, statuses: tuple[int, ...]) -> str:
         """What became of the command; returns what was wrong."""
-        refused = [describe(status) for status in statuses if not is_good(status)]
+        refused = [describe(status) for status in statuses if not is_done(status)]
         if not refused:
             return ""
+        self._refused = True
         self._drop(f"its command was refused ({', '.join(dict.fromkeys(refused))})")
         return f"{self.name}: {self.distrust}"
 
     def _drop(self, why: str) -> None:
         """It cannot be commanded: a life counter that goes on would keep a watchdog fed that nobody listens behind."""
-        if not self._dropped:
-            self._dropped = True
-            self.distrust = f"{why}; it is not written to any more, so that its watchdog takes torque off; arm again"
+        if not self.distrust:
+            self.distrust = f"{why}; {_TOLD_OFF if self._tells_off() else _LEFT_ALONE}; arm again"
 
     def connection_lost(self) -> None:
         """Whatever answers on the next connection has to prove itself before it is believed or written to."""
@@ -130,15 +154,17 @@ class Axis:
     def fill(self, inputs: Inputs, time_s: float, readings: tuple[Reading, ...] | None) -> list[str]:
         """Speed, torque and state into `inputs`; returns what was wrong. Without an answer they are missed."""
         index = self._index
-        if self.active and self.proof.doubts and not self.distrust:
+        if self.active and self.proof.doubts:
             self._drop("; ".join(self.proof.doubts).removeprefix(f"{self.name}: "))
         if readings is None or not self.proof.known:
-            self.missed += 1
-            inputs.speed.miss(index)
-            inputs.torque.miss(index)
-            inputs.drive_state[index] = self.state
+            self._miss(inputs)
             return list(self.proof.doubts) if readings is not None else []
         statusword, speed, torque, *optional = readings
+        watched = zip(self._sampled, (statusword, speed, torque), strict=True)
+        old_status, old_speed, old_torque = [sampled.stands_still(of.source_us) for sampled, of in watched]
+        if old_status:
+            self._miss(inputs)
+            return [f"{self.name}: statusword: {STANDS_STILL}"]
         if not statusword.good:  # nobody knows what the rest is worth
             self.missed += 1
             inputs.speed.reject(index)
@@ -146,11 +172,25 @@ class Axis:
             inputs.drive_state[index] = self.state
             return [f"{self.name}: statusword: {statusword.trouble}"]
         self.missed = 0
-        troubles = self._hear(int(statusword.value), optional)
-        troubles.append(self._put(inputs.speed, "speed", speed, self._m_per_s_per_count, time_s))
-        troubles.append(self._put(inputs.torque, "torque", torque, self._nm_per_count, time_s))
+        troubles = [f"{self.name}: {self.distrust}"] if self.distrust else []
+        troubles += self._hear(int(statusword.value), optional)
+        for channel, what, reading, si_per_count, is_old in (
+            (inputs.speed, "speed", speed, self._m_per_s_per_count, old_speed),
+            (inputs.torque, "torque", torque, self._nm_per_count, old_torque),
+        ):
+            if is_old:
+                channel.miss(index)
+                troubles.append(f"{self.name}: {what}: {STANDS_STILL}")
+            else:
+                troubles.append(self._put(channel, what, reading, si_per_count, time_s))
         inputs.drive_state[index] = self.state
         return [trouble for trouble in troubles if trouble]
+
+    def _miss(self, inputs: Inputs) -> None:
+        self.missed += 1
+        inputs.speed.miss(self._index)
+        inputs.torque.miss(self._index)
+        inputs.drive_state[self._index] = self.state
 
     def _hear(self, statusword: int, optional: list[Reading]) -> list[str]:
         troubles: list[str] = []
@@ -186,7 +226,7 @@ class Axis:
         self.active = False
         self.stage.forget()
         self.distrust = ""
-        self._dropped = False
+        self._refused = False
         self._command = None
         self._life.forget()
 
@@ -198,8 +238,7 @@ class Axis:
         reasons = [f"{self.name}: its watchdog cannot be read: {watchdog.trouble}"] if not watchdog.good else []
         if not statusword.good:
             reasons.append(f"{self.name}: its statusword cannot be read: {statusword.trouble}")
-        elif drive_state(power_state(int(statusword.value))) in (DriveState.ENABLED, DriveState.STOPPING):
-            word = int(statusword.value)
+        elif power_state(word := int(statusword.value)) in _TORQUE_ON:
             reasons.append(f"{self.name}: is still enabled (statusword {word:04X}h); take its torque off first")
         reasons += self._against_max_torque(torques[0])
         if self._rated_torque is not None:
@@ -230,11 +269,15 @@ class Axis:
             "correct rated_torque_nm"
         ]
 
-    def farewell(self) -> list[list[tuple[int, float]]]:
-        """Two writes. Torque off with the watchdog, so that it does not fire when nobody speaks any more; then the
-        watchdog as before: it counts from the next change of the life counter, which is far."""
-        if not self._may_write():
-            return []
-        off = (float(DISABLE_VOLTAGE), 0.0, float(self._life.next()))
-        first = [*zip(self._command_nodes, off, strict=True), (self.watchdog.node, 0.0)]
-        return [first, [(self.watchdog.node, float(self.watchdog.counts))]]
+    def farewell(self) -> list[tuple[int, float]]:
+        """A last command: torque off."""
+        return list(zip(self._command_nodes, (float(DISABLE_VOLTAGE), 0.0, float(self._life.next())), strict=True))
+
+    def against_off(self, statusword: Reading) -> str:
+        """What speaks against its torque being off; empty when it says that it is."""
+        if not statusword.good:
+            return f"its statusword cannot be read: {statusword.trouble}"
+        word = int(statusword.value)
+        if (power := power_state(word)) in _TORQUE_OFF and (power is not PowerState.FAULT or word & 0x4F == _FAULT):
+            return ""
+        return f"was told to take torque off and does not say that it is (statusword {word:04X}h)"

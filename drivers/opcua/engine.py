@@ -12,6 +12,7 @@ import re
 import socket
 import struct
 from collections.abc import Sequence
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -27,13 +28,14 @@ from cryptography import x509
 
 from drivers.opcua.messages import Answer, Outcome, Plan, Question
 from drivers.opcua.nodes import Node, Reading
-from drivers.opcua.status import BAD_TYPE_MISMATCH, is_good
+from drivers.opcua.status import BAD_TYPE_MISMATCH, describe, is_good
 
 CONNECT_TIMEOUT_S = 2.0  #: per request while connecting
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.1, 2.0  #: between attempts to connect
 CLOSE_TIMEOUT_S = 0.5
 SESSION_TIMEOUT_MS = 30_000  #: how long a server keeps the session of an engine that was killed
 READ_VARIANTS = 8  #: prepared read requests that are kept
+_EPOCH, _MICROSECOND = datetime(1601, 1, 1, tzinfo=UTC), timedelta(microseconds=1)
 _NO_PROBES_S = 1e9  #: asyncua's own health check reads beside the cycle: the cycle itself is the check
 
 _TYPES = {
@@ -191,7 +193,7 @@ class Engine:
             if len(self._reads) >= READ_VARIANTS:
                 self._reads.clear()
             parameters = ua.ReadParameters()
-            parameters.TimestampsToReturn = ua.TimestampsToReturn.Neither
+            parameters.TimestampsToReturn = ua.TimestampsToReturn.Source
             parameters.NodesToRead = [ua.ReadValueId(self._node_ids[place], AttributeIds.Value) for place in places]
             self._reads[places] = parameters
         return parameters
@@ -204,7 +206,10 @@ class Engine:
         response = struct_from_binary(answer, await protocol.send_request(request))
         if response.TypeId != type_id:  # asyncua would take any message for the one it waits for
             raise Misfit(f"the server answered with {response.TypeId.to_string()}, not {answer.__name__}")
-        response.ResponseHeader.ServiceResult.check()
+        result = response.ResponseHeader.ServiceResult
+        result.check()
+        if result.value != 0:  # put off, or done in part
+            raise Misfit(f"the server answered {describe(result.value)}")
         if len(response.Results) != count:
             raise Misfit(f"{len(response.Results)} results, asked for {count}")
         return response
@@ -222,10 +227,16 @@ def _data_value(number: float, kind: str) -> ua.DataValue:
 def _reading(value: ua.DataValue, kind: str) -> Reading:
     """A value of another type than the map says counts as bad, whatever its status."""
     status = 0 if value.StatusCode is None else value.StatusCode.value
+    stamp = value.SourceTimestamp
+    source_us = 0 if stamp is None else _microseconds(stamp)
     variant = value.Value
     if variant is None or variant.VariantType is not _TYPES[kind] or variant.is_array or variant.Value is None:
-        return Reading(BAD_TYPE_MISMATCH if is_good(status) else status, 0.0)
-    return Reading(status, float(variant.Value))
+        return Reading(BAD_TYPE_MISMATCH if is_good(status) else status, 0.0, source_us)
+    return Reading(status, float(variant.Value), source_us)
+
+
+def _microseconds(stamp: datetime) -> int:
+    return (stamp - _EPOCH) // _MICROSECOND
 
 
 def _node_ids(nodes: list[Node], served: list[str]) -> list[ua.NodeId]:

@@ -9,11 +9,13 @@ import asyncio
 from collections.abc import Sequence
 
 from drivers.opcua.channel import Channel
-from drivers.opcua.drive import ANSWERS_ALLOWED
+from drivers.opcua.drive import Axis
 from drivers.opcua.messages import Answer, Outcome, Question
 from drivers.opcua.nodes import Reading
-from drivers.opcua.prepare import Device, NoAnswer, prepare_devices
-from drivers.opcua.status import BAD_TRANSACTION_FAILED, describe, is_good
+from drivers.opcua.prepare import Device, NoAnswer, prepare_devices, restore
+from drivers.opcua.proof import ANSWERS_ALLOWED
+from drivers.opcua.release import release_axes
+from drivers.opcua.status import BAD_TRANSACTION_FAILED, is_done
 from drivers.port import PrepareRefused
 from gateway.core.signals import Inputs, LinkHealth, Outputs
 
@@ -21,6 +23,7 @@ ANSWER_TIMEOUT_S = 0.3  #: without an answer the connection is dropped
 PREPARE_TIMEOUT_S = 0.5  #: per question
 CONNECT_PATIENCE_S = 3.0  #: for a connection, where one is waited for
 START_PATIENCE_S = 20.0  #: for the engine, on a busy machine
+PROOF_PERIOD_S = 1.0  #: between two looks at what proves the devices
 HUNG_S = 1.0  #: past a question's deadline, until an engine that should have said something is ended
 
 
@@ -34,6 +37,10 @@ class OpcUaLink:
         self._devices = list(devices)
         self._channel = channel
         self._period_s = period_s
+        self._noted: dict[Device, float] = {}  #: watchdogs before a `prepare` that has not come to an end, counts
+        self._noted_on = 0  #: the connection of that
+        self._questions_per_proof = max(1, round(PROOF_PERIOD_S / period_s))
+        self._unproven = 0  #: questions of cycles since the last that asked for every proof
         self._number = 0  #: of the last question
         self._asked: Question | None = None  #: not answered yet
         self._idle = asyncio.Event()
@@ -68,7 +75,10 @@ class OpcUaLink:
             why = f"no connection to {self._endpoint}: {error}"
             raise PrepareRefused([f"{device.name}: {why}" for device in self._devices]) from error
         connection = self._connection
-        reasons = await prepare_devices(self._ask, self._devices)
+        if self._noted_on != connection:  # they are of devices that may be others now
+            self._noted.clear()
+        self._noted_on = connection
+        reasons = await prepare_devices(self._ask, self._devices, self._noted)
         if not reasons and self._connection != connection:
             reasons = [f"bus {self.name}: the connection was lost meanwhile; arm again"]
         if reasons:
@@ -82,16 +92,20 @@ class OpcUaLink:
             device.forget()
 
     async def release(self) -> None:
-        """Drives that are written to take their torque off, and their supervision ends without a fault."""
-        farewells = [writes for device in self._devices if (writes := device.farewell())]
+        """Drives that are written to take their torque off; of those that have, supervision ends without a fault.
+
+        What an arming that was cancelled has left half-way is undone.
+        """
+        axes = [device for device in self._devices if isinstance(device, Axis) and device.may_write]
         self.silence()
-        try:
-            for together in zip(*farewells, strict=True):
-                answer = await self._ask(tuple(write for of_device in together for write in of_device), ())
-                if refused := [describe(status) for status in answer.written if not is_good(status)]:
-                    raise NoAnswer(refused[0])
-        except NoAnswer as error:
-            self.health.last_error = f"bus {self.name}: the drives were not released: {error}"
+        troubles = await release_axes(self._ask, axes)
+        if self._noted_on == self._connection:
+            troubles += await restore(self._ask, self._noted)
+        elif names := ", ".join(device.name for device in self._noted):
+            troubles.append(f"connected anew since an arming was cancelled: the watchdogs of {names} stay as they are")
+        self._noted.clear()
+        if troubles:
+            self.health.last_error = f"bus {self.name}: {'; '.join(troubles)}"
 
     # the cycle
 
@@ -106,7 +120,8 @@ class OpcUaLink:
             if now_s > self._asked.deadline_s + HUNG_S:
                 self._channel.give_up("the OPC UA process does not answer")
             return
-        self._proving = [not device.proof.proven for device in self._devices]
+        proves_all = self._unproven + 1 >= self._questions_per_proof
+        self._proving = [proves_all or device.proof.due for device in self._devices]
         self._writing = [len(of_device) for of_device in writes]
         reads = tuple(
             place
@@ -115,6 +130,7 @@ class OpcUaLink:
         )
         flat = tuple(write for of_device in writes for write in of_device)
         if self._send(flat, reads, now_s + self._period_s, now_s + ANSWER_TIMEOUT_S):
+            self._unproven = 0 if proves_all else self._unproven + 1
             self._open = self._cyclic = self._number
             self._complete.clear()
 
@@ -226,7 +242,7 @@ class OpcUaLink:
 
     def _take_written(self, written: tuple[int, ...]) -> None:
         """A refusal is heard whenever it comes. Where one is to blame, those that it took with it are not."""
-        if any(not is_good(status) and status != BAD_TRANSACTION_FAILED for status in written):
+        if any(not is_done(status) and status != BAD_TRANSACTION_FAILED for status in written):
             written = tuple(0 if status == BAD_TRANSACTION_FAILED else status for status in written)
         at = 0
         for device, count in zip(self._devices, self._writing, strict=True):

@@ -26,6 +26,8 @@ from gateway.core.line import Name, Positive, Strict
 
 NumberType = Literal["u8", "i8", "u16", "i16", "u32", "i32", "f32", "f64"]
 CountType = Literal["u16", "u32"]  #: bits, codes and counts
+#: What a source time stamp is of: of each measurement, changed or not, or of the value's last change.
+SourceTimeKind = Literal["sample", "change"]
 
 _NUMERIC = re.compile(r"i=(\d{1,10})")
 _NUMERIC_TEMPLATE = re.compile(r"i=(\d|\{address\}|\{channel\})+")
@@ -151,6 +153,7 @@ class DriveNodes(Strict):
 
 class DriveMap(OpcUaMap):
     role: Literal["drive"]
+    source_time: SourceTimeKind = "sample"
     follows_command: Bit | None = None  #: of the statusword: the target torque is followed, not ignored
     nodes: DriveNodes
     watchdog: WatchdogNode
@@ -175,6 +178,7 @@ class Channels(Strict):
 
 class LoadCellMap(OpcUaMap):
     role: Literal["load-cell"]
+    source_time: SourceTimeKind = "sample"
     channel_count: Count
     sample_counter: Count  #: moves with every measurement
     healthy: Flag

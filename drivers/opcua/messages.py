@@ -19,7 +19,7 @@ READY = 0  #: the number of the one message that answers nothing: the engine is 
 _QUESTION = struct.Struct("<QQdd?HH")
 _WRITE = struct.Struct("<Hd")
 _ANSWER = struct.Struct("<QBQHH")
-_READING = struct.Struct("<Id")
+_READING = struct.Struct("<Idq")
 
 
 class Plan(NamedTuple):

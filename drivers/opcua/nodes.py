@@ -30,10 +30,14 @@ class Node(NamedTuple):
 
 
 class Reading(NamedTuple):
-    """What a read said of one node: an OPC UA StatusCode and, where that is not bad, its value."""
+    """What a read said of one node: an OPC UA StatusCode and, where that is not bad, its value.
+
+    `source_us` is the source time stamp in microseconds since 1601 (UTC), 0 where the server gives none.
+    """
 
     status: int
     value: float
+    source_us: int = 0
 
     @property
     def good(self) -> bool:

@@ -1,17 +1,18 @@
 """The line PLC on OPC UA: what is told to it and asked of it each cycle, and what of it may be believed. No I/O.
 
 The command carries a life counter that moves with every cycle; the PLC's own watchdog ramps the line down when it
-stops. The PLC's echo of it is watched the same way: a server that still answers for a dead PLC is found by it.
+stops. The PLC's echo of it is watched the same way: a server that still answers for a dead PLC is found by it. So a PLC
+that is not relied on is not written to, except when its watchdog is found to be another than was set: silence would
+leave it running then, and it is told to stop, without a life counter.
 """
 
 from math import isfinite
 
 from drivers.life import LifeCounter
-from drivers.opcua.drive import ANSWERS_ALLOWED
 from drivers.opcua.maps import PlcMap
 from drivers.opcua.nodes import DeviceNodes, NodeTable, Reading, to_type
-from drivers.opcua.proof import Proof, Watchdog
-from drivers.opcua.status import describe, is_good
+from drivers.opcua.proof import ANSWERS_ALLOWED, Proof, Watchdog
+from drivers.opcua.status import describe, is_done
 from drivers.scaling import si_per_count
 from gateway.core.line import LinePlc
 from gateway.core.signals import Inputs, Outputs, Quality
@@ -45,7 +46,8 @@ class Plc:
         self._life = LifeCounter()
         self._command: tuple[float, float] | None = None  #: run and speed (counts) of this cycle
         self._unsaid = ""  #: why there is no command
-        self._wrote = False  #: in this cycle
+        self._wrote = False  #: in this cycle, with a life counter
+        self._runs = False  #: as it said last
 
     def _may_write(self) -> bool:
         return self.active and self.proof.proven and not self.refusal
@@ -68,21 +70,19 @@ class Plc:
         """The command that was handed over for this cycle, once."""
         command, self._command = self._command, None
         self._wrote = command is not None and self._may_write()
+        if self.active and self.proof.unguarded and self._runs and not self.refusal:
+            return list(zip(self._command_nodes[:2], (float(self._device.write.run.inverted), 0.0), strict=True))
         if command is None or not self._wrote:
             return []
         return list(zip(self._command_nodes, (*command, self._life.next()), strict=True))
 
     def on_written(self, statuses: tuple[int, ...]) -> str:
         """What became of the command; returns what was wrong."""
-        refused = [describe(status) for status in statuses if not is_good(status)]
+        refused = [describe(status) for status in statuses if not is_done(status)]
         if not refused:
             return ""
         self.refusal = f"{self.name}: its command was refused ({', '.join(dict.fromkeys(refused))})"
         return self.refusal
-
-    def farewell(self) -> list[list[tuple[int, float]]]:
-        """Its watchdog does not run while transport is off: nothing is left to say."""
-        return []
 
     def connection_lost(self) -> None:
         """A PLC that was restarted has lost its watchdog: it is not written to before that is read back."""
@@ -138,11 +138,13 @@ class Plc:
         entries = (read.permissive, read.emergency_stop, read.running, read.watchdog_tripped)
         said = [entry.is_set(reading.value) for entry, reading in zip(entries, flags, strict=True)]
         plc.permissive, plc.emergency_stop, plc.running, tripped = said
+        self._runs = plc.running
         troubles = [f"{self.name}: its command watchdog has tripped"] if tripped else []
         if mute:
             unsaid = f"{self.name}: {self._unsaid or 'it has yet to prove itself'}"
             why = "; ".join(self.proof.doubts) or self.refusal or unsaid
-            troubles.append(f"{why}; it is not written to")
+            told = "told to stop" if self.proof.unguarded and not self.refusal else "not written to"
+            troubles.append(f"{why}; it is {told}")
         return troubles
 
     def _fill_speed(self, inputs: Inputs, time_s: float, speed: Reading) -> str:

@@ -8,7 +8,7 @@ from drivers.opcua.drive import Axis
 from drivers.opcua.messages import Answer
 from drivers.opcua.plc import Plc
 from drivers.opcua.proof import Watchdog
-from drivers.opcua.status import describe, is_good
+from drivers.opcua.status import describe, is_done
 
 Device = Axis | Amplifier | Plc
 
@@ -23,8 +23,12 @@ class Ask(Protocol):
     async def __call__(self, writes: tuple[tuple[int, float], ...], reads: tuple[int, ...]) -> Answer: ...
 
 
-async def prepare_devices(ask: Ask, devices: Sequence[Device]) -> list[str]:
-    """Check every device, set every watchdog and read it back. What speaks against it; it is undone then."""
+async def prepare_devices(ask: Ask, devices: Sequence[Device], noted: dict[Device, float]) -> list[str]:
+    """Check every device, set every watchdog and read it back. What speaks against it; it is undone then.
+
+    What a watchdog was before it was written is in `noted` (counts) while it may have to be restored: also when this
+    is cancelled half-way.
+    """
     reasons: list[str] = []
     before: dict[Device, float] = {}
     for device in devices:
@@ -36,26 +40,35 @@ async def prepare_devices(ask: Ask, devices: Sequence[Device]) -> list[str]:
         before[device] = readings[1].value  # of those that have one, the watchdog
     if reasons:
         return reasons
-    changed: list[Device] = []
     for device in devices:
         if device.watchdog is not None:
-            changed.append(device)  # one that does not answer may have been written all the same
+            # Before the write: one that does not answer may have been written all the same.
+            noted.setdefault(device, before[device])
             try:
                 reasons += await _set_watchdog(ask, device.name, device.watchdog)
             except NoAnswer as error:
                 reasons.append(f"{device.name}: its watchdog cannot be set: {error}")
                 break
     if reasons:
-        for device in reversed(changed):
-            assert device.watchdog is not None
-            reasons += await _undo(ask, device.name, device.watchdog, before[device])
+        return reasons + await restore(ask, noted)
+    noted.clear()
+    return []
+
+
+async def restore(ask: Ask, noted: dict[Device, float]) -> list[str]:
+    """Set the watchdogs to what they were; the last that was written is the first. What went wrong."""
+    reasons: list[str] = []
+    for device in reversed(list(noted)):
+        assert device.watchdog is not None
+        reasons += await _undo(ask, device.name, device.watchdog, noted[device])
+        del noted[device]  # not before: it may be cancelled, too
     return reasons
 
 
 async def _set_watchdog(ask: Ask, name: str, watchdog: Watchdog) -> list[str]:
     answer = await ask(((watchdog.node, float(watchdog.counts)),), (watchdog.node,))
     status, found = answer.written[0], answer.readings[0]
-    if not is_good(status):
+    if not is_done(status):
         return [f"{name}: its watchdog cannot be set to {watchdog.counts}: {describe(status)}"]
     if not found.good:
         return [f"{name}: its watchdog cannot be read back: {found.trouble}"]
@@ -69,4 +82,4 @@ async def _undo(ask: Ask, name: str, watchdog: Watchdog, before: float) -> list[
         status = (await ask(((watchdog.node, before),), ())).written[0]
     except NoAnswer as error:
         return [f"{name}: its watchdog could not be restored: {error}"]
-    return [] if is_good(status) else [f"{name}: its watchdog could not be restored: {describe(status)}"]
+    return [] if is_done(status) else [f"{name}: its watchdog could not be restored: {describe(status)}"]

@@ -1,23 +1,23 @@
-"""The engine in a process of its own, seen from the loop: started, watched, asked, ended. Loads no OPC UA library."""
+"""The engine in a process of its own, seen from the loop: started, watched, asked, ended. Loads no OPC UA library.
+
+The loop does not start it itself, see `spawner`.
+"""
 
 import asyncio
 import os
-import signal
 import socket
-import sys
 from collections.abc import Callable
 from contextlib import suppress
 
 from drivers.opcua.messages import MAX_MESSAGE, READY, Answer, Outcome, Plan, Question, decode_answer, encode_question
+from drivers.opcua.spawner import CLOSE_TIMEOUT_S, kill_child, spawn
 
 START_TIMEOUT_S = 30.0  #: until a process that has not said that it is ready is ended
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.1, 10.0  #: between a process's end and the next start
-CLOSE_TIMEOUT_S = 1.5  #: for an ordered end
 MESSAGES_PER_WAKEUP = 8  #: there is one answer a question; more would be a fault
 _PRIORITY_BELOW_LOOP = 5
-_SOCKET_FD = 3  #: of the worker's end, in the worker
-#: They go to all processes of a terminal or a service at once. The loop still needs its devices then, to stop the line.
-_NOT_FOR_WORKERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+_END_WORKER = b"end"  #: a request to the spawner; any other is a generation, and brings a socket
+_SPAWNER_TIMEOUT_S = CLOSE_TIMEOUT_S + 1.0  #: for the spawner's end after the worker's
 
 
 def processors_without(loop_cpu: int | None) -> list[int]:
@@ -32,32 +32,31 @@ class ProcessChannel:
 
     def __init__(self, plan: Plan, loop_cpu: int | None, loop_priority: int) -> None:
         self.up = asyncio.Event()
-        self.pid: int | None = None  #: of the worker that runs now
+        self.pid: int | None = None  #: of the spawner, parent of the worker
         self._plan = plan.to_json()
         self._loop_cpu = loop_cpu
         self._priority = max(1, loop_priority - _PRIORITY_BELOW_LOOP)
-        self._processors: list[int] = []
-        self._socket: socket.socket | None = None
+        self._control: socket.socket | None = None  #: to the spawner
+        self._socket: socket.socket | None = None  #: to the worker
         self._loop: asyncio.AbstractEventLoop | None = None
         self._generation = 0
         self._started_s = 0.0
         self._start_again_s: float | None = None
         self._pause_s = FIRST_PAUSE_S
-        self._ended: set[int] = set()  #: killed, and not yet reaped
         self._on_answer: Callable[[Answer], None] = lambda answer: None
         self._on_lost: Callable[[str], None] = lambda why: None
 
     def start(self, on_answer: Callable[[Answer], None], on_lost: Callable[[str], None]) -> None:
-        """Start the first worker; before the loop pins itself, so that the other processors are known."""
+        """Start spawner and first worker. Before the loop becomes real-time, and knows its processors."""
         self._on_answer, self._on_lost = on_answer, on_lost
         self._loop = asyncio.get_running_loop()
-        if self.pid is None:
-            self._processors = self._processors or processors_without(self._loop_cpu)
+        if self._control is None:
+            self._start_spawner()
+        if self._socket is None:
             self._begin(self._loop.time())
 
     def tend(self, now_s: float) -> None:
-        self._reap()
-        if self.pid is not None and not self.up.is_set() and now_s - self._started_s > START_TIMEOUT_S:
+        if self._socket is not None and not self.up.is_set() and now_s - self._started_s > START_TIMEOUT_S:
             self.give_up(f"the OPC UA process was not ready within {START_TIMEOUT_S:g} s")
         if self._start_again_s is not None and now_s >= self._start_again_s:
             try:
@@ -81,16 +80,16 @@ class ProcessChannel:
         self._lose(why)
 
     async def close(self) -> None:
-        """Let the worker end its session, then end it."""
+        """Let the worker end its session, and the spawner end it if it does not."""
         self._start_again_s = None
-        pid, self.pid = self.pid, None
         self._hang_up()
+        control, self._control = self._control, None
+        if control is not None:
+            control.close()
+        pid, self.pid = self.pid, None
         if pid is not None:
             await _ended_in_time(pid)
-            self._kill(pid)
-        for ended in self._ended:
-            await _ended_in_time(ended)
-        self._reap()
+            kill_child(pid)
 
     def _begin(self, now_s: float) -> None:
         """Raises OSError; it is tried again then."""
@@ -100,27 +99,30 @@ class ProcessChannel:
             self._start_later(now_s)
             raise OSError(f"the OPC UA process cannot be started: {error}") from error
 
+    def _start_spawner(self) -> None:
+        """Raises OSError."""
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        ours.setblocking(False)
+        processors = ",".join(map(str, processors_without(self._loop_cpu)))
+        try:
+            arguments = (str(os.getpid()), str(self._priority), processors)
+            self.pid = spawn("drivers.opcua.spawner", theirs.fileno(), *arguments)
+        except OSError as error:
+            ours.close()
+            raise OSError(f"the process that starts the OPC UA process cannot be started: {error}") from error
+        finally:
+            theirs.close()
+        self._control = ours
+
     def _spawn(self, now_s: float) -> None:
+        if self._control is None:
+            raise OSError("there is nobody to start it")
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         ours.setblocking(False)
         self._generation += 1
-        numbers = (_SOCKET_FD, os.getpid(), self._generation, self._priority)
-        processors = ",".join(map(str, self._processors))
-        command = [sys.executable, "-P", "-m", "drivers.opcua.worker", *map(str, numbers), processors]
         try:
             ours.send(self._plan)
-            # Not as a real-time process: from within the loop it would start up at the loop's own priority.
-            self.pid = os.posix_spawn(
-                sys.executable,
-                command,
-                os.environ,
-                file_actions=[
-                    (os.POSIX_SPAWN_DUP2, theirs.fileno(), _SOCKET_FD),
-                    *((os.POSIX_SPAWN_OPEN, fd, os.devnull, os.O_RDWR, 0) for fd in range(3)),
-                ],
-                setsigmask=_NOT_FOR_WORKERS,
-                scheduler=(os.SCHED_OTHER, os.sched_param(0)),
-            )
+            socket.send_fds(self._control, [str(self._generation).encode()], [theirs.fileno()])
         except OSError:
             ours.close()
             raise
@@ -162,10 +164,10 @@ class ProcessChannel:
 
     def _lose(self, why: str) -> None:
         """End the worker, whatever it is doing, and start another after a pause."""
-        pid, self.pid = self.pid, None
         self._hang_up()
-        if pid is not None:
-            self._kill(pid)
+        if self._control is not None:
+            with suppress(OSError):  # a spawner that is gone has taken its worker with it
+                self._control.send(_END_WORKER)
         assert self._loop is not None
         self._start_later(self._loop.time())
         self._on_lost(why)
@@ -182,14 +184,6 @@ class ProcessChannel:
             self._loop.remove_reader(connection)
             connection.close()
 
-    def _kill(self, pid: int) -> None:
-        with suppress(ProcessLookupError):
-            os.kill(pid, signal.SIGKILL)
-        self._ended.add(pid)
-
-    def _reap(self) -> None:
-        self._ended -= {pid for pid in self._ended if os.waitpid(pid, os.WNOHANG)[0] == pid}
-
 
 async def _ended_in_time(pid: int) -> None:
     """Wait for a child to end by itself, for so long. It is not reaped."""
@@ -198,7 +192,7 @@ async def _ended_in_time(pid: int) -> None:
     handle = os.pidfd_open(pid)
     loop.add_reader(handle, ended.set)
     try:
-        async with asyncio.timeout(CLOSE_TIMEOUT_S):
+        async with asyncio.timeout(_SPAWNER_TIMEOUT_S):
             await ended.wait()
     except TimeoutError:
         pass

@@ -1,7 +1,8 @@
 """What a device has to show on every connection before it is believed and written to. No I/O.
 
 That it is the device that the map is for; and, while it is commanded, that its watchdog is still the one that was
-set: a server that was restarted has lost it.
+set: a server that was restarted has lost it. It is asked again now and then on a connection that stays: devices can be
+restarted, exchanged or set behind a server that goes on.
 """
 
 from math import floor
@@ -9,6 +10,8 @@ from math import floor
 from drivers.opcua.maps import Identity, WatchdogNode
 from drivers.opcua.nodes import DeviceNodes, Reading
 from drivers.scaling import si_per_count
+
+ANSWERS_ALLOWED = 3  #: cycles in a row without a usable answer until a device counts as absent
 
 
 class Watchdog:
@@ -19,6 +22,7 @@ class Watchdog:
 
     def __init__(self, entry: WatchdogNode, watchdog_s: float, nodes: DeviceNodes) -> None:
         self.node = nodes.place(entry, entry.type)
+        self.time_s = watchdog_s
         self.counts = floor(watchdog_s / si_per_count(entry.unit, entry.scale) + 1e-9)
         low, high = entry.range
         if self.counts < 1 or not low <= self.counts * entry.scale <= high:
@@ -30,34 +34,49 @@ class Watchdog:
 class Proof:
     """`known`: it is the right device, and may be believed. `proven`: it may be written to as well, if it ever was.
 
-    `doubts` are why it is not, as far as it has been looked at.
+    `doubts` are why it is not, as far as it has been looked at. `unguarded`: it is the right one, but what was read of
+    its watchdog is not what was set, so that silence would not stop it.
     """
 
     def __init__(self, name: str, identity: Identity, watchdog: Watchdog | None, nodes: DeviceNodes) -> None:
         self.name = name
         self.nodes = (nodes.place(identity, identity.type), *((watchdog.node,) if watchdog else ()))  #: to be read
-        self.known = self.proven = False
+        self.known = self.proven = self.unguarded = False
         self.doubts: list[str] = []
+        self._unread = 0  #: answers in a row without a usable one, since it was proven
         self._wanted = identity.value
         self._watchdog = watchdog
 
+    @property
+    def due(self) -> bool:
+        """Whether it has to be asked with the next question."""
+        return not self.proven or self._unread > 0
+
     def void(self) -> None:
         """Nothing is proven any more: the connection was lost."""
-        self.known = self.proven = False
-        self.doubts = []
+        self._set(known=False, proven=False)
 
     def judge(self, readings: tuple[Reading, ...], *, commanded: bool) -> None:
-        """The readings of `nodes` on this connection."""
+        """The readings of `nodes` on this connection. One that was proven may miss as many as any other reading."""
+        self._unread = 0 if all(reading.good for reading in readings) else self._unread + 1
+        if self.proven and 0 < self._unread < ANSWERS_ALLOWED:
+            return
         self.doubts = self.against_identity(readings[0])
         self.known = not self.doubts
+        self.unguarded = False
         if not self.doubts and commanded and self._watchdog is not None:
             self.doubts = self.against_watchdog(readings[1])
+            self.unguarded = bool(self.doubts) and readings[1].good
         self.proven = not self.doubts
 
     def confirm(self) -> None:
         """All of it was proven in another way."""
-        self.known = self.proven = True
+        self._set(known=True, proven=True)
+
+    def _set(self, *, known: bool, proven: bool) -> None:
+        self.known, self.proven, self.unguarded = known, proven, False
         self.doubts = []
+        self._unread = 0
 
     def against_identity(self, found: Reading) -> list[str]:
         if not found.good:

@@ -1,9 +1,23 @@
-"""OPC UA StatusCodes in words (OPC 10000-4, 7.39; numbers of OPC 10000-6, annex A). No I/O."""
+"""OPC UA StatusCodes: which of them are a success, and in words (OPC 10000-4, 7.39; numbers of OPC 10000-6, annex A).
+
+No I/O.
+"""
 
 BAD_TYPE_MISMATCH = 0x80740000
 BAD_TRANSACTION_FAILED = 0x80F10000  #: nothing is wrong with this one, but another of the request was refused
 
+# The lower half of a StatusCode (OPC 10000-4, 7.39.1). Of what stands beside a value (info type "DataValue"), overflow
+# belongs to the queue of a subscription and the historian bits to a history read: of a Read they say nothing. Limit
+# bits say that the value is not what was measured, structure and semantics that the map may be wrong.
+_INFO_OF_VALUE = 0x0400
+_SAYS_NOTHING = 0x0080 | 0x001F
+_LIMITS = ("", "at its low limit", "at its high limit", "constant")
+
 _NAMES = {
+    0x002E0000: "GoodCompletesAsynchronously",
+    0x002F0000: "GoodOverload",
+    0x00300000: "GoodClamped",
+    0x00960000: "GoodLocalOverride",
     0x80010000: "BadUnexpectedError",
     0x80020000: "BadInternalError",
     0x80030000: "BadOutOfMemory",
@@ -40,11 +54,18 @@ _SEVERITIES = ("Good", "Uncertain", "Bad", "Bad")
 
 
 def is_good(status: int) -> bool:
-    """Whether a value with this StatusCode may be used; an uncertain one may not."""
-    return status >> 30 == 0
+    """Whether a value with this StatusCode is what was measured: Good and nothing else, without limit bits."""
+    return status == 0 or status & ~_SAYS_NOTHING == _INFO_OF_VALUE
+
+
+def is_done(status: int) -> bool:
+    """Whether a write has been done as it was asked: not clamped, not put off."""
+    return status == 0
 
 
 def describe(status: int) -> str:
-    """The name of a StatusCode, or its severity and number."""
+    """The name of a StatusCode, or its severity and number, and the limit that its value is at."""
     code = status & 0xFFFF0000  # the rest are flags
-    return _NAMES.get(code) or f"{_SEVERITIES[status >> 30 & 3]} (status {status:08X}h)"
+    name = _NAMES.get(code) or f"{_SEVERITIES[status >> 30 & 3]} (status {status:08X}h)"
+    limit = _LIMITS[status >> 8 & 3] if status & 0x0C00 == _INFO_OF_VALUE else ""
+    return f"{name}, {limit}" if limit else name

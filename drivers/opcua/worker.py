@@ -1,15 +1,13 @@
-"""The process that holds the OPC UA client: `python -m drivers.opcua.worker FD PARENT GENERATION PRIORITY PROCESSORS`.
+"""The process that holds the OPC UA client: `python -m drivers.opcua.worker FD PARENT GENERATION PRIORITY`.
 
 It exists so that nothing a server sends can take time, memory or the interpreter from the loop: memory is limited,
-its real-time priority lies below the loop's, it stays off the loop's processor, and it ends with the loop. It reads
-the plan from its socket, then questions, and answers each of them.
+its real-time priority lies below the loop's, it stays off the loop's processor (as the spawner, its parent, does), and
+it ends with the loop. It reads the plan from its socket, then questions, and answers each of them.
 """
 
 import asyncio
-import ctypes
 import os
 import resource
-import signal
 import socket
 import sys
 from contextlib import suppress
@@ -24,18 +22,16 @@ from drivers.opcua.messages import (
     decode_question,
     encode_answer,
 )
+from drivers.opcua.spawner import die_with
 
 ADDRESS_SPACE_BYTES = 512 << 20  #: eight times what the client needs; a hostile answer can ask for gigabytes
 DATA_BYTES = 256 << 20
 REAL_TIME_CPU_S = 0.5  #: of computing without a pause at real-time priority; then the kernel ends the process
-_PR_SET_PDEATHSIG = 1
 
 
 def main(arguments: list[str]) -> int:
     fd, parent, generation, priority = map(int, arguments[:4])
-    _die_with(parent)
-    with suppress(OSError, ValueError):  # a processor may be gone, or not be ours
-        os.sched_setaffinity(0, {int(processor) for processor in arguments[4].split(",")})
+    die_with(parent)
     for limit, most in ((resource.RLIMIT_AS, ADDRESS_SPACE_BYTES), (resource.RLIMIT_DATA, DATA_BYTES)):
         resource.setrlimit(limit, (most, most))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
@@ -57,12 +53,6 @@ async def _serve(connection: socket.socket, generation: int, priority: int) -> i
             connection.send(answer)
     await engine.close()
     return 0
-
-
-def _die_with(parent: int) -> None:
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != parent:  # it was gone before that took effect
-        os.kill(os.getpid(), signal.SIGKILL)
 
 
 def _become_real_time(priority: int) -> None:

@@ -9,6 +9,7 @@ import logging
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,7 @@ from gateway.core.signals import DriveRequest, Inputs, Outputs
 from tests.protocol import driver_support
 
 NAMESPACE = "urn:r2rgate:devices"
+EPOCH = datetime(1601, 1, 1, tzinfo=UTC)
 GOOD, OUT_OF_RANGE, TYPE_MISMATCH = 0, ua.StatusCodes.BadOutOfRange, ua.StatusCodes.BadTypeMismatch
 U16, U32, F64, BOOL = (getattr(ua.VariantType, name) for name in ("UInt16", "UInt32", "Double", "Boolean"))
 AFTER = {0x00: 0x0250, 0x06: 0x0231, 0x07: 0x0233, 0x0F: 0x1237, 0x02: 0x0217}  #: controlword: statusword
@@ -76,6 +78,9 @@ class Devices:
         self.bystander = GOOD  #: the StatusCode of a write that is right, but not done because another is refused
         self.stubborn: set[str] = set()  #: writes are confirmed, and not done
         self.counts = self.echoes = True
+        self.stamps = True  #: reads bring source time stamps
+        self.frozen: set[str] = set()  #: nodes whose source time stamps stand still
+        self.deaf: set[str] = set()  #: axes that ignore their controlword
         self.writes: list[dict[str, Any]] = []
         self.reads = 0
 
@@ -92,7 +97,14 @@ class Devices:
         if node not in self.nodes:
             return ua.DataValue(StatusCode=ua.StatusCode(ua.StatusCodes.BadNodeIdUnknown))
         kind, value = self.nodes[node]
-        return ua.DataValue(ua.Variant(value, kind), StatusCode=ua.StatusCode(self.status.get(node, GOOD)))
+        source_us = self.source_us(node)
+        stamp = EPOCH + timedelta(microseconds=source_us) if source_us else None
+        status = ua.StatusCode(self.status.get(node, GOOD))
+        return ua.DataValue(ua.Variant(value, kind), StatusCode=status, SourceTimestamp=stamp)
+
+    def source_us(self, node: str) -> int:
+        """Microseconds since 1601; a read every millisecond."""
+        return self.stamps * (13_000_000_000_000_000 + 1000 * (0 if node in self.frozen else self.reads))
 
     def begin_read(self) -> None:
         self.reads += 1
@@ -125,7 +137,7 @@ class Devices:
             self.set("Line.LifeEcho", value)
         if node == "Line.Run":
             self.set("Line.Running", value)
-        if node.endswith(".Controlword"):
+        if node.endswith(".Controlword") and node.split(".")[0] not in self.deaf:
             self.set(node.replace("Controlword", "Statusword"), AFTER[value])
 
 

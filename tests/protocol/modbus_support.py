@@ -10,7 +10,7 @@ from drivers.modbus.build import build
 from drivers.modbus.link import ModbusLink
 from drivers.wiring import Wired
 from gateway.core.line import Line, ModbusTcpBus
-from gateway.core.signals import DriveRequest, Inputs, Outputs, Quality
+from gateway.core.signals import DriveRequest, DriveState, Inputs, Outputs, Quality
 from tests.protocol.driver_support import (
     ENABLED,
     FAULT,
@@ -23,9 +23,11 @@ from tests.protocol.driver_support import (
     cycle,
     frame,
     line,
+    until,
 )
 
 Body = Callable[[ModbusLink, Registers], Awaitable[None]]
+DriveBody = Callable[[ModbusLink, list["ModbusDrive"], Registers], Awaitable[None]]
 
 
 def modbus_links(of_line: Line, folder: Path = MAPS) -> list[ModbusLink]:
@@ -89,6 +91,7 @@ class Power:
 
     def __init__(self) -> None:
         self.statusword = SWITCH_ON_DISABLED
+        self.torque = 0  #: that it shows
         self.commands: list[tuple[int, int]] = []
         self.obeys = True
 
@@ -98,6 +101,7 @@ class Power:
             off = controlword == 0 and self.statusword != FAULT
             after = SWITCH_ON_DISABLED if off else _STEPS.get((self.statusword, controlword))
             self.statusword = after or self.statusword
+            self.torque = torque if self.statusword == ENABLED else 0
 
 
 class Holding:
@@ -165,6 +169,8 @@ class ModbusDrive(Holding):
 
     def before_read(self) -> None:
         self.registers[1] = self.power.statusword
+        if self.power.statusword == ENABLED:
+            self.number(4, ">h", self.power.torque)
 
 
 class Rack(Holding):
@@ -189,6 +195,8 @@ class Rack(Holding):
         self.registers[6] = (self.registers[6] + 1) & 0xFFFF
         for k, power in enumerate(self.powers):
             self.registers[8 + 8 * k] = power.statusword
+            if power.statusword == ENABLED:
+                self.number(11 + 8 * k, ">h", power.torque)
 
 
 def drives_line(n: int, port: int) -> Line:
@@ -216,3 +224,47 @@ def torques(request: DriveRequest, *torque_nm: float) -> Outputs:
     outputs.drive_request[:] = request
     outputs.torque_nm[:] = torque_nm
     return outputs
+
+
+def drive_bench(body: DriveBody) -> None:
+    """`body` with the link, two drives (units 11 and 12), and the server, which also plays amplifier and PLC."""
+
+    async def run() -> None:
+        async with Registers() as peer:
+            drives = [ModbusDrive(), ModbusDrive()]
+
+            async def play(head: bytes, unit: int, pdu: bytes) -> list[bytes] | None:
+                return await drives[unit - 11].script(head, unit, pdu) if unit > 10 else None
+
+            peer.script = play
+            (link,) = modbus_links(drives_line(2, peer.port))
+            await link.open()
+            try:
+                await body(link, drives, peer)
+            finally:
+                await link.close()
+
+    asyncio.run(run())
+
+
+async def enabled(link: ModbusLink, inputs: Inputs, torque_nm: float = 8.0) -> None:
+    """Armed, and cycles until both drives follow their torque."""
+    await link.prepare()
+    inputs.drive_state[:] = DriveState.OFF
+    async with asyncio.timeout(5.0):
+        while not (inputs.drive_state == DriveState.ENABLED).all():
+            link.write(torques(DriveRequest.ENABLE, torque_nm, torque_nm))
+            await cycle(link, inputs)
+    link.write(torques(DriveRequest.ENABLE, torque_nm, torque_nm))
+    await cycle(link, inputs)
+
+
+async def interrupt(link: ModbusLink, peer: Registers, inputs: Inputs, meanwhile: Callable[[], None]) -> None:
+    """All connections are lost and made again within one cycle."""
+    before = link.health.reconnects
+    await peer.stop()
+    meanwhile()
+    await peer.start()
+    peer.requests.clear()
+    await cycle(link, inputs)
+    await until(lambda: link.health.reconnects == before + 4)

@@ -14,6 +14,7 @@ import pytest
 
 from drivers.canopen.link import CanopenLink
 from drivers.port import PrepareRefused
+from drivers.power_stage import ORDERS_IGNORED
 from drivers.registry import build_links
 from gateway.core.signals import DriveRequest, DriveState, Inputs, Outputs, Quality
 from tests.protocol.driver_support import (
@@ -450,6 +451,40 @@ def test_safe_torque_off_is_asked_for_while_a_drive_may_not_switch_on() -> None:
         assert inputs.drive_state[1] == DriveState.ENABLED
         first.statusword = READY
         await cycle(link, inputs)
+        assert inputs.drive_state[0] == DriveState.READY
+
+    bench(body)
+
+
+def test_a_drive_that_ignores_its_orders_is_dropped() -> None:
+    """Its watchdog has to fire, so nothing may renew it."""
+
+    async def body(link: CanopenLink, drives: Drives, first: Drive, second: Drive) -> None:
+        inputs = Inputs(2)
+        await link.prepare()
+        first.statusword = second.statusword = ENABLED
+        await cycle(link, inputs)
+        write(link, DriveRequest.ENABLE, 10.0)
+        second.statusword = SWITCH_ON_DISABLED
+        for _ in range(ORDERS_IGNORED + 1):
+            await cycle(link, inputs)
+            write(link, DriveRequest.OFF)
+        await settle(drives)
+        assert first.nmt == [0x80, 0x01] and len(first.rpdos) == ORDERS_IGNORED + 2
+        first.rpdos.clear()
+        for _ in range(3):
+            await cycle(link, inputs)
+            write(link, DriveRequest.OFF)
+        await settle(drives)
+        assert (first.nmt, first.rpdos) == ([0x80, 0x01, 0x80], []), "told once, and fed no more"
+        assert second.nmt == [0x80, 0x01] and second.rpdos
+        await cycle(link, inputs)
+        assert list(inputs.drive_state) == [DriveState.FAULT, DriveState.OFF]
+        first.statusword = READY
+        await link.prepare()
+        await cycle(link, inputs)
+        write(link, DriveRequest.OFF)
+        await until(lambda: bool(first.rpdos))
         assert inputs.drive_state[0] == DriveState.READY
 
     bench(body)

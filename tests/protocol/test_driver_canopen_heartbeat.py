@@ -116,8 +116,8 @@ def write(link: CanopenLink, *torque_nm: float) -> None:
 
 def forget_the_last_heartbeat(link: CanopenLink) -> None:
     """The next one is due, whatever the clock says."""
-    assert link._heartbeat is not None  # noqa: SLF001
-    link._heartbeat.forget()  # noqa: SLF001
+    assert link._feed._heartbeat is not None  # noqa: SLF001
+    link._feed._heartbeat.forget()  # noqa: SLF001
 
 
 def test_the_watchdog_is_an_entry_of_1016h_and_its_reaction_is_set() -> None:
@@ -301,20 +301,77 @@ def test_a_command_that_is_refused_stops_the_heartbeat(torque_nm: float) -> None
 
 
 def test_a_drive_that_does_not_take_its_torque_off_is_not_kept_alive() -> None:
-    """It hears the heartbeat, and none of its RPDOs."""
+    """It hears the heartbeat, and heeds none of its orders."""
 
     async def body(link: CanopenLink, bus: Bus, first: Epos, second: Epos) -> None:
         inputs, outputs = Inputs(2), Outputs(2)
         await enabled(link, bus, inputs, first, second)
-        for _ in range(12):
+        second.statusword = SWITCH_ON_DISABLED
+        async with asyncio.timeout(5.0):
+            while first.nmt[-1] != 0x80 or not first.rpdos:
+                await cycle(link, inputs)
+                link.write(outputs)
+                await bus.settle()
+        bus.heartbeats.clear()
+        first.rpdos.clear()
+        async with asyncio.timeout(5.0):
+            while (0x6040, 0, bytes(2)) not in first.writes:
+                forget_the_last_heartbeat(link)
+                await cycle(link, inputs)
+                link.write(outputs)
+                await bus.settle()
+        await cycle(link, inputs)
+        assert bus.heartbeats == first.rpdos == [] and list(inputs.drive_state) == [DriveState.FAULT, DriveState.OFF]
+        assert first.nmt.count(0x80) == second.nmt.count(0x80) + 1, "told once"
+        assert (0x6040, 0, bytes(2)) not in second.writes and second.rpdos, "the other is commanded as before"
+
+    bench(body)
+
+
+def test_what_a_drive_has_confirmed_counts_until_it_shows_torque_again() -> None:
+    async def body(link: CanopenLink, bus: Bus, first: Epos, second: Epos) -> None:
+        inputs = Inputs(2)
+        await enabled(link, bus, inputs, first, second)
+
+        async def turn() -> None:
+            bus.heartbeats.clear()
             forget_the_last_heartbeat(link)
             await cycle(link, inputs)
-            second.statusword = SWITCH_ON_DISABLED
-            bus.heartbeats.clear()
-            link.write(outputs)
+            write(link, 0.25)
             await bus.settle()
-        assert bus.heartbeats == [] and inputs.drive_state[0] == DriveState.FAULT
-        assert (0x6040, 0, bytes(2)) in first.writes and second.writes.count((0x6040, 0, bytes(2))) == 0
+
+        bus.heartbeat(1, 0)
+        first.statusword = SWITCH_ON_DISABLED
+        await turn()
+        assert not bus.heartbeats, "restarted"
+        async with asyncio.timeout(5.0):
+            while not bus.heartbeats:
+                await turn()
+        first.statusword = ENABLED
+        for _ in range(4):
+            await turn()
+            assert not bus.heartbeats, "what it has confirmed before is over"
+        first.statusword = SWITCH_ON_DISABLED
+        async with asyncio.timeout(5.0):
+            while not bus.heartbeats:
+                await turn()
+
+    bench(body)
+
+
+@pytest.mark.parametrize("mute", [True, False])
+def test_release_leaves_the_watchdog_to_a_drive_that_does_not_confirm(mute: bool) -> None:
+    async def body(link: CanopenLink, bus: Bus, first: Epos, second: Epos) -> None:
+        inputs = Inputs(2)
+        await enabled(link, bus, inputs, first, second)
+        first.sdo_answers = not mute
+        second.statusword = SWITCH_ON_DISABLED
+        await link.release()
+        await bus.settle()
+        assert first.objects[0x1016, 1] == bytes.fromhex("6400 7F00") and second.objects[0x1016, 1] == bytes(4)
+        assert first.nmt[-1] == second.nmt[-1] == 0x80 and bus.heartbeats == []
+        assert link.health.last_error.startswith("drive-1: ")
+        assert link.health.last_error.endswith("its watchdog was left on and fires")
 
     bench(body)
 

@@ -8,6 +8,7 @@ from math import inf, nan
 
 import pytest
 
+from drivers.canopen import questions
 from drivers.canopen.link import CanopenLink
 from drivers.port import PrepareRefused
 from drivers.registry import LinksRefused, build_links
@@ -308,6 +309,9 @@ def refusal(arrange: Callable[[Bus], None]) -> list[str]:
         ("amplifier", (0x1800, 2), b"\xff", ["1800h sub 2", "0xff"]),
         ("amplifier", (0x2131, 0), b"\x02", ["cell-3: channel 3, the amplifier has 2"]),
         ("amplifier", (0x6131, 2), struct.pack("<I", 0x00470000), ["cell-2", "unit 0x00470000"]),
+        ("amplifier", (0x6132, 1), b"\x07", ["cell-1", "7 decimal digits; allowed: 0 to 6"]),
+        ("amplifier", (0x6132, 3), b"\xc8", ["cell-3", "200 decimal digits; allowed: 0 to 6"]),
+        ("amplifier", (0x6132, 2), b"\x03", ["cell-2: can say 32.767 N at most, its capacity_n is 100"]),
         ("amplifier", (0x2132, 0), b"\x00", ["not healthy"]),
         ("amplifier", (0x1018, 2), struct.pack("<I", 0x402), ["product 0x402", "0x404"]),
         ("plc", (0x1600, 3), struct.pack("<I", 0x20010210), ["plc", "1600h sub 3"]),
@@ -372,6 +376,9 @@ def test_a_tension_that_the_amplifier_doubts_is_bad() -> None:
         bus.amplifier.counts = [1100, 10_001, -10_001, 0]
         await cycle(link, inputs)
         assert qualities(inputs) == [GOOD, BAD, BAD] and "capacity of 100 N" in link.health.last_error
+        bus.amplifier.counts = [1100, 0x7FFF, -0x8000, 0]
+        await cycle(link, inputs)
+        assert qualities(inputs) == [GOOD, BAD, BAD] and "cell-3: -32768, the end" in link.health.last_error
         bus.amplifier.counts = [1100, 2000, 3000, 0]
         bus.send(0x080 + AMPLIFIER, bytes.fromhex("01FF 81 0000000000"))
         await cycle(link, inputs)
@@ -575,6 +582,25 @@ def test_a_plc_that_was_restarted_is_not_commanded() -> None:
         await link.prepare()
         await commanded(link, bus, inputs)
         assert inputs.plc.quality == Quality.GOOD and bus.plc.rpdos
+
+    bench(body)
+
+
+def test_a_plc_whose_watchdog_was_altered_is_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(questions, "VERIFY_S", 0.0)
+
+    async def body(link: CanopenLink, bus: Bus) -> None:
+        inputs = Inputs(SPANS)
+        await link.prepare()
+        await commanded(link, bus, inputs)
+        bus.plc.objects[0x2002, 0] = bytes(2)
+        async with asyncio.timeout(5.0):
+            while bus.plc.nmt[-1] != 0x80:
+                await commanded(link, bus, inputs)
+        assert link.health.last_error.startswith("plc: its watchdog, object 2002h sub 0, was set to 0x64 and is 0x0;")
+        bus.plc.rpdos.clear()
+        await commanded(link, bus, inputs)
+        assert bus.plc.rpdos == [] and inputs.plc.quality == Quality.STALE and bus.first.nmt[-1] == 0x01
 
     bench(body)
 

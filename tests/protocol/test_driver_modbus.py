@@ -28,8 +28,8 @@ def test_a_cycle_reads_si_in_one_request_a_device() -> None:
         assert inputs.unwind_speed.value[0] == pytest.approx(-0.03) and inputs.unwind_speed.good()
         plc = inputs.plc
         assert (plc.quality, plc.permissive, plc.emergency_stop, plc.running) == (Quality.GOOD, True, False, False)
-        # Registers 2 (status) to 22 (status of channel 2) by function 4; registers 1 to 4 by function 3.
-        assert peer.requests == [(1, struct.pack(">BHH", 4, 2, 21)), (2, struct.pack(">BHH", 3, 1, 4))]
+        # Registers 2 (status) to 22 (status of channel 2) by function 4; 1 to 4, and the watchdog in 14, by function 3.
+        assert peer.requests == [(1, struct.pack(">BHH", 4, 2, 21)), (2, struct.pack(">BHH", 3, 1, 14))]
         peer.plc[1] = 0b0100
         await cycle(link, inputs)
         assert (plc.permissive, plc.emergency_stop, plc.running) == (False, True, True)
@@ -70,7 +70,7 @@ def test_the_command_is_written_with_a_life_counter_only_when_active() -> None:
         assert lives == [1, 2, 3]
         assert peer.plc[10:13] == [1, 0xFFFE, 0x7960]  # run, -100 000 um/s
         written = [pdu for unit, pdu in peer.requests if unit == 2]
-        assert written[0] == struct.pack(">BHHHHBHHHH", 23, 1, 4, 10, 4, 8, 1, 0xFFFE, 0x7960, 1)
+        assert written[0] == struct.pack(">BHHHHBHHHH", 23, 1, 14, 10, 4, 8, 1, 0xFFFE, 0x7960, 1)
         link.write(command(True, 0.1))
         link.silence()
         peer.requests.clear()
@@ -495,9 +495,14 @@ def test_a_plc_that_lost_its_watchdog_is_not_written_to_again() -> None:
             peer.requests.clear()
             link.write(command(True, 0.1))
             await cycle(link, inputs)
-            functions = {pdu[0] for unit, pdu in peer.requests if unit == 2}
-            assert functions == ({23} if written else {3})
+            runs = {pdu[11] for unit, pdu in peer.requests if unit == 2 and pdu[0] == 23}
+            assert runs == {int(written)}, "without its watchdog it is told to take transport off"
             peer.requests.clear()
+        for _ in range(5):
+            peer.requests.clear()
+            link.write(command(True, 0.1))
+            await cycle(link, inputs)
+        assert {pdu[0] for unit, pdu in peer.requests if unit == 2} == {3}, "and left alone then"
         assert "watchdog" in link.health.last_error
         assert inputs.plc.quality == Quality.STALE and inputs.unwind_speed.good()
         await link.prepare()

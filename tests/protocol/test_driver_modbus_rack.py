@@ -3,7 +3,7 @@
 import asyncio
 import struct
 from collections.abc import Awaitable, Callable
-from math import nan
+from math import inf, nan
 
 import pytest
 
@@ -204,6 +204,68 @@ def test_a_refused_watchdog_undoes_the_other() -> None:
             with pytest.raises(PrepareRefused, match="watchdog cannot be set: exception 3"):
                 await link.prepare()
             assert rack.registers[300:302] == [40, 50]
+
+    rack_bench(body)
+
+
+async def period(link: ModbusLink, inputs: Inputs) -> None:
+    """A cycle and the time that is left of its period, in which settings are looked at."""
+    end_s = asyncio.get_running_loop().time() + 0.1
+    link.write(outputs(inputs.n))
+    await cycle(link, inputs)
+    await asyncio.sleep(end_s - asyncio.get_running_loop().time())
+
+
+def test_settings_out_of_reach_are_looked_at_beside_the_cycle(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("drivers.modbus.session.LOOK_S", 0.0)
+
+    async def body(link: ModbusLink, rack: Rack, peer: Registers) -> None:
+        inputs = Inputs(3)
+        await link.prepare()
+        async with asyncio.timeout(5.0):
+            while not (inputs.drive_state == DriveState.ENABLED).all():
+                await period(link, inputs)
+        for looked in ((300, 300), (301, 301)):
+            rack.reads.clear()
+            async with asyncio.timeout(5.0):
+                while looked not in rack.reads:
+                    await period(link, inputs)
+        assert (inputs.drive_state == DriveState.ENABLED).all() and inputs.plc.quality == Quality.GOOD
+        rack.registers[301] = 1000
+        async with asyncio.timeout(5.0):
+            while inputs.drive_state[0] != DriveState.FAULT:
+                await period(link, inputs)
+        assert "its communication watchdog reads 1000, 100 was set; arm again" in link.health.last_error
+        assert all(power.commands[-1] == (0x00, 0) for power in rack.powers), "told to rest, all of them"
+        assert rack.registers[200] == 0 and inputs.plc.quality == Quality.STALE
+
+    rack_bench(body)
+
+
+@pytest.mark.parametrize(("patience_s", "looks"), [(inf, False), (0.0, True)])
+def test_a_slow_rack_gives_up_a_cycle_for_its_settings_only_now_and_then(
+    monkeypatch: pytest.MonkeyPatch, patience_s: float, looks: bool
+) -> None:
+    monkeypatch.setattr("drivers.modbus.session.LOOK_S", 0.0)
+    monkeypatch.setattr("drivers.modbus.session.LOOK_PATIENCE_S", patience_s)
+
+    async def body(link: ModbusLink, rack: Rack, peer: Registers) -> None:
+        inputs = Inputs(3)
+        await link.prepare()
+
+        async def slow(head: bytes, unit: int, pdu: bytes) -> list[bytes]:
+            if pdu[0] == 23:
+                await asyncio.sleep(0.05)  # half a period
+            return await rack.script(head, unit, pdu)
+
+        peer.script = slow
+        rack.reads.clear()
+        for _ in range(10):
+            await period(link, inputs)
+        async with asyncio.timeout(5.0):
+            while looks and (300, 300) not in rack.reads:
+                await period(link, inputs)
+        assert looks or not {(300, 300), (301, 301)} & {*rack.reads}
 
     rack_bench(body)
 

@@ -370,13 +370,15 @@ def test_release_takes_torque_off_and_ends_supervision(server: DeviceServer) -> 
     async def scene(rig: Rig) -> None:
         await rig.enable()
         await rig.link.release()
-        off, supervised = devices.writes[-2:]
-        last = {k: devices.value(f"Axis{k}.Life") for k in (1, 2)}
+        off, unsupervised, supervised = devices.writes[-3:]
+        last = {k: devices.value(f"Axis{k}.Life") - 1 for k in (1, 2)}
         assert off == {
             f"Axis{k}.{name}": value
             for k in (1, 2)
-            for name, value in (("Controlword", 0), ("TargetTorque", 0.0), ("Life", last[k]), ("Watchdog", 0))
+            for name, value in (("Controlword", 0), ("TargetTorque", 0.0), ("Life", last[k]))
         }
+        lives = {f"Axis{k}.Life": last[k] + 1 for k in (1, 2)}
+        assert unsupervised == {**off, **lives, "Axis1.Watchdog": 0, "Axis2.Watchdog": 0}
         assert supervised == {"Axis1.Watchdog": 100, "Axis2.Watchdog": 100}
         devices.writes.clear()
         for _ in range(3):

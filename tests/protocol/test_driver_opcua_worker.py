@@ -85,9 +85,19 @@ def channel_of(rig: Rig) -> ProcessChannel:
 
 
 def worker_of(rig: Rig) -> int:
-    pid = channel_of(rig).pid
-    assert pid is not None
+    spawner = channel_of(rig).pid
+    assert spawner is not None
+    (pid,) = children(spawner)
     return pid
+
+
+def children(pid: int) -> list[int]:
+    """Processes that it has started and that have not ended."""
+    found: list[int] = []
+    for path in Path("/proc").glob("[0-9]*"):
+        if of_process(int(path.name), "status", r"PPid:\s+(\d+)") == pid and is_running(int(path.name)):
+            found.append(int(path.name))
+    return found
 
 
 def of_process(pid: int, file: str, pattern: str) -> int:
@@ -146,7 +156,8 @@ def test_a_worker_that_is_killed_is_replaced_and_nothing_is_written_meanwhile(se
             await rig.until(rig.inputs.tension.good)
             for _ in range(5):
                 await rig.cycle()
-            assert devices.writes == []  # the line's watchdog is not the one that was set, the drives were lost
+            # The line's watchdog is not the one that was set: it is told to stop. The drives were lost: nothing.
+            assert devices.writes == [{"Line.Run": False, "Line.SpeedRequest": 0.0}]
             assert rig.inputs.plc.quality == Quality.STALE
             assert worker_of(rig) != before and not is_running(before)
             devices.set("Line.Watchdog", 100)
@@ -192,8 +203,8 @@ def test_a_worker_dies_with_its_parent(server: DeviceServer) -> None:
     )
     with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE) as parent:
         assert parent.stdout is not None
-        pid = int(parent.stdout.readline())
-        assert is_running(pid)
+        spawner = int(parent.stdout.readline())
+        (pid,) = children(spawner)
         handle = os.pidfd_open(pid)
         parent.kill()
         try:
@@ -268,7 +279,7 @@ def test_a_hostile_server_only_makes_the_link_miss(answers: list[bytes], monkeyp
         opening = asyncio.create_task(rig.link.open())
         most = 0
         try:
-            await until(lambda: channel_of(rig).pid is not None)
+            await until(lambda: channel_of(rig).pid is not None and children(channel_of(rig).pid or 0) != [])
             first = worker_of(rig)
             while not opening.done():
                 most = max(most, address_space_bytes(first))
@@ -366,7 +377,37 @@ def test_a_plan_that_fits_no_message_is_no_crash() -> None:
         channel = ProcessChannel(plan, None, 60)
         with pytest.raises(OSError, match="cannot be started"):
             channel.start(lambda answer: None, lambda why: None)
-        assert channel.pid is None
         await channel.close()
+        assert channel.pid is None
 
     asyncio.run(scene())
+
+
+def test_a_worker_that_hangs_is_ended_before_there_is_another_and_the_spawner_starts_it(server: DeviceServer) -> None:
+    """The loop starts no process: that would hold it up until the new one runs."""
+    rig = Rig(link_with_worker(line(server.endpoint)))
+
+    async def scene(rig: Rig) -> None:
+        spawner, hung = channel_of(rig).pid, worker_of(rig)
+        assert children(os.getpid()).count(hung) == 0
+        os.kill(hung, signal.SIGSTOP)
+        channel_of(rig).give_up("for the test")
+        await rig.until(channel_of(rig).up.is_set)
+        assert not is_running(hung)
+        assert channel_of(rig).pid == spawner and worker_of(rig) != hung
+
+    run(rig, scene)
+
+
+def test_a_spawner_that_dies_takes_the_worker_along_and_is_said(server: DeviceServer) -> None:
+    rig = Rig(link_with_worker(line(server.endpoint)))
+
+    async def scene(rig: Rig) -> None:
+        worker, spawner = worker_of(rig), channel_of(rig).pid
+        assert spawner is not None
+        os.kill(spawner, signal.SIGKILL)
+        await rig.until(lambda: "the OPC UA process cannot be started" in rig.link.health.last_error)
+        assert not is_running(worker)
+        await rig.until(lambda: len(rig.link.health.absent) == 4)
+
+    run(rig, scene)

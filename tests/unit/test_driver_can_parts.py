@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from drivers.canopen.amplifier import AmplifierNode
 from drivers.canopen.can_errors import error_text, is_bus_off
 from drivers.canopen.configure import DriveSettings, cell_expected, drive_expected, drive_steps
+from drivers.canopen.counts import end_values, n_per_count
 from drivers.canopen.map_parts import CanObject, HeartbeatObject
 from drivers.canopen.maps import DriveMap, LoadCellMap, PlcMap
 from drivers.canopen.pdo import MalformedPdo, PdoLayout, mapping_entries
@@ -177,6 +178,52 @@ def test_a_fixed_mapping_of_a_drive_is_compared() -> None:
     places = [(entry.index, entry.sub, entry.value) for entry in drive_expected(fixed, 1)]
     assert places[:3] == [(0x1800, 1, 0x181), (0x1800, 2, 1), (0x1A00, 0, 3)]
     assert drive_expected(device, 1) == []
+
+
+def cell(capacity_n: float = 100.0) -> LoadCell:
+    return LoadCell(name="c", bus="b", map=CELL, address=20, channel=1, span=1, capacity_n=capacity_n)
+
+
+@pytest.mark.parametrize(
+    ("kind", "ends"),
+    [
+        ("i8", (-128, 127)),
+        ("u8", (255,)),
+        ("i16", (-0x8000, 0x7FFF)),
+        ("u16", (0xFFFF,)),
+        ("i32", (-(2**31), 2**31 - 1)),
+        ("u32", (2**32 - 1,)),
+        ("f32", ()),
+    ],
+)
+def test_where_a_type_ends(kind: str, ends: tuple[int, ...]) -> None:
+    assert end_values(kind) == ends
+
+
+@pytest.mark.parametrize("counts", [0x7FFF, -0x8000])
+def test_a_saturated_channel_is_no_tension_whatever_its_capacity(counts: int) -> None:
+    amplifier, inputs = AmplifierNode(cell_map(), [cell(capacity_n=327.67)]), Inputs(1)
+    amplifier.station.on_heartbeat(b"\x05", 0.0)
+    amplifier._cells[0].n_per_count = n_per_count(cell_map(), cell(327.67), 2)  # noqa: SLF001
+    for value, counter, quality in ((counts, 1, Quality.BAD), (0x7FFE, 2, Quality.GOOD)):
+        amplifier.begin_sync()
+        amplifier.on_answer(0x180 + 20, struct.pack("<hBhBH", value, 0, 0, 1, counter))
+        troubles = amplifier.fill(inputs, 0.0, active=True)
+        assert inputs.tension.quality[0] == quality and bool(troubles) == (quality == Quality.BAD)
+    assert inputs.tension.value[0] == pytest.approx(327.66)
+
+
+def test_digits_and_full_scale() -> None:
+    device = cell_map()
+    assert [n_per_count(device, cell(0.03), digits) for digits in (0, 2, 6)] == pytest.approx([1.0, 0.01, 1e-6])
+    assert n_per_count(device, cell(327.67), 2) == 0.01
+    with pytest.raises(ValueError, match=r"can say 327\.67 N at most, its capacity_n is 327\.68"):
+        n_per_count(device, cell(327.68), 2)
+    for digits in (-1, 7, 200):
+        with pytest.raises(ValueError, match=f"{digits} decimal digits; allowed: 0 to 6"):
+            n_per_count(device, cell(), digits)
+    objects = device.objects.model_copy(update={"tension": device.objects.tension.model_copy(update={"type": "f32"})})
+    assert n_per_count(device.model_copy(update={"objects": objects}), cell(1e9), 0) == 1.0, "a float has no end"
 
 
 # the PLC's bytes

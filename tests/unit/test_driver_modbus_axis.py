@@ -4,6 +4,7 @@ import struct
 from collections.abc import Callable
 from math import pi
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -19,7 +20,7 @@ SINGLE, RACK = (load_map(MAPS / f"{name}.toml") for name in ("r2r-drive-modbus",
 SETTINGS = AxisSettings(channel=1, rated_torque_nm=80.0, torque_limit_nm=60.0, watchdog_s=0.1, radius_m=0.04)
 
 
-def axis(device: object = SINGLE, **settings: float) -> Axis:
+def axis(device: object = SINGLE, **settings: Any) -> Axis:
     assert isinstance(device, DriveMap)
     values = {name: getattr(SETTINGS, name) for name in SETTINGS.__slots__} | settings
     return Axis("drive-1", 0, device, AxisSettings(**values))

@@ -1,6 +1,7 @@
 """One drive's state from frames and times, without a bus."""
 
 import struct
+from math import pi
 
 import pytest
 
@@ -9,6 +10,7 @@ from drivers.canopen.drive import DriveNode
 from drivers.canopen.maps import DriveMap
 from drivers.device_map import MAPS, load_map
 from drivers.map_fields import Bit
+from drivers.power_stage import ORDERS_IGNORED
 from gateway.core.signals import DriveRequest, DriveState
 
 CIA402 = load_map(MAPS / "cia402-torque.toml")
@@ -100,3 +102,34 @@ def test_before_the_first_answer_no_word_enables() -> None:
     drive = node()
     for request in DriveRequest:
         assert drive.payload(request, 8.0, DriveState.ENABLED)[:2] == bytes(2)
+
+
+def test_a_drive_that_ignores_its_orders_defies() -> None:
+    drive = node()
+    for _ in range(ORDERS_IGNORED + 1):
+        answer(drive, ENABLED)
+        assert drive.shows_torque and not drive.defies
+        drive.payload(DriveRequest.OFF, 0.0, drive.state(0.0))
+    assert f"ignored {ORDERS_IGNORED} orders" in drive.defies
+    drive.forget()
+    assert not drive.defies and not drive.shows_torque
+
+
+def test_no_answer_shows_no_torque() -> None:
+    drive = node()
+    answer(drive, ENABLED)
+    drive.begin_sync()
+    assert not drive.shows_torque, "what it said before may be over"
+
+
+def test_the_speed_that_a_count_is_worth() -> None:
+    assert node().speed_resolution_m_per_s == pytest.approx(1e-6)
+    for update, resolution in (
+        ({"unit": "rpm", "scale": 1.0}, 2 * pi / 60 * 0.04),
+        ({"unit": "m/min", "scale": 0.1}, 0.1 / 60),
+        ({"type": "f32"}, 0.0),
+    ):
+        speed = CIA402.objects.speed.model_copy(update=update)
+        objects = CIA402.objects.model_copy(update={"speed": speed})
+        found = node(CIA402.model_copy(update={"objects": objects})).speed_resolution_m_per_s
+        assert found == pytest.approx(resolution)

@@ -20,7 +20,8 @@ from drivers.opcua.messages import (
     encode_question,
 )
 from drivers.opcua.nodes import Node, NodeTable, Reading, to_type
-from drivers.opcua.status import describe, is_good
+from drivers.opcua.source_time import SourceTime
+from drivers.opcua.status import describe, is_done, is_good
 
 u16 = st.integers(0, 0xFFFF)
 u32 = st.integers(0, 0xFFFFFFFF)
@@ -42,7 +43,7 @@ answers = st.builds(
     st.sampled_from(Outcome),
     u64,
     st.lists(u32, max_size=200).map(tuple),
-    st.lists(st.builds(Reading, u32, number), max_size=800).map(tuple),
+    st.lists(st.builds(Reading, u32, number, st.integers(0, (1 << 63) - 1)), max_size=800).map(tuple),
     st.text(st.characters(codec="ascii"), max_size=MAX_TEXT),
 )
 
@@ -122,8 +123,18 @@ def test_a_float_is_bounded_by_its_width() -> None:
     ("status", "good", "text"),
     [
         (0, True, "Good"),
-        (0x00A70000, True, "Good"),
-        (0x3FFFFFFF, True, "Good"),
+        (0x00000400, True, "Good"),  # of a value
+        (0x00000480, True, "Good"),  # overflow, of a queue
+        (0x0000041F, True, "Good"),  # historian bits
+        (0x00000080, False, "Good (status 00000080h)"),  # of nothing: no such thing
+        (0x00000500, False, "Good (status 00000500h), at its low limit"),
+        (0x00000600, False, "Good (status 00000600h), at its high limit"),
+        (0x00000780, False, "Good (status 00000780h), constant"),
+        (0x00000420, False, "Good (status 00000420h)"),  # reserved
+        (0x00004000, False, "Good (status 00004000h)"),  # semantics changed
+        (0x00008400, False, "Good (status 00008400h)"),  # structure changed
+        (0x00960000, False, "GoodLocalOverride"),
+        (0x3FFFFFFF, False, "Good"),
         (0x40000000, False, "Uncertain"),
         (0x40930000, False, "UncertainSensorNotAccurate"),
         (0x808C0000, False, "BadSensorFailure"),
@@ -131,9 +142,25 @@ def test_a_float_is_bounded_by_its_width() -> None:
         (0xFFFFFFFF, False, "Bad"),
     ],
 )
-def test_only_good_is_good(status: int, good: bool, text: str) -> None:
+def test_only_what_was_measured_is_good(status: int, good: bool, text: str) -> None:
     assert is_good(status) is good
     assert describe(status).startswith(text)
+
+
+@pytest.mark.parametrize("status", [0x00300000, 0x002E0000, 0x00000400, 0x40000000, 0x803B0000])
+def test_a_write_that_was_clamped_or_put_off_is_not_done(status: int) -> None:
+    assert is_done(0) and not is_done(status)
+
+
+def test_a_source_time_stamp_that_does_not_move_is_found_after_three_answers() -> None:
+    source = SourceTime("sample")
+    assert [source.stands_still(us) for us in (5, 5, 5, 5, 5, 6, 6, 4)] == [False] * 3 + [True] * 2 + [False] * 3
+
+
+def test_without_source_time_stamps_or_with_those_of_changes_nothing_is_concluded() -> None:
+    assert not any(SourceTime("sample").stands_still(0) for _ in range(9))
+    source = SourceTime("change")
+    assert not any(source.stands_still(7) for _ in range(9))
 
 
 def test_the_loops_side_loads_no_opc_ua_library() -> None:

@@ -33,6 +33,8 @@ class ScriptedChannel:
         self.waits = False
         self.questions: list[Question] = []
         self.given_up: list[str] = []
+        self._heard: tuple[str, Callable[[], object]] | None = None
+        self._later: tuple[int, Callable[[], object]] | None = None
         self._nodes = [node.identifier for node in plan.nodes]
         self._on_answer: Callable[[Answer], None] = lambda answer: None
         self._on_lost: Callable[[str], None] = lambda why: None
@@ -45,6 +47,8 @@ class ScriptedChannel:
 
     def ask(self, question: Question) -> bool:
         self.questions.append(question)
+        if self._heard is not None and self._heard[0] in self.names(question)[0]:
+            self._heard[1]()
         if not self.waits:
             asyncio.get_running_loop().call_soon(self.answer, question)
         return True
@@ -59,6 +63,17 @@ class ScriptedChannel:
         """What a question writes and reads."""
         return {self._nodes[place] for place, _ in question.writes}, {self._nodes[place] for place in question.reads}
 
+    def names_of(self, place: int) -> list[str]:
+        return [self._nodes[place]]
+
+    def on_write(self, node: str, act: Callable[[], object]) -> None:
+        """Do `act` when a question comes that writes `node`."""
+        self._heard = (node, act)
+
+    def after_reads(self, count: int, act: Callable[[], object]) -> None:
+        """Do `act` when so many questions from now on have been answered."""
+        self._later = (len(self.questions) + count, act)
+
     def answer(self, question: Question, outcome: Outcome = Outcome.DONE) -> None:
         if outcome is not Outcome.DONE:
             self._on_answer(Answer(question.number, outcome, self.connection, text="scripted"))
@@ -68,8 +83,15 @@ class ScriptedChannel:
         for node, number in writes:
             self.devices.act(node, number)
         self.devices.begin_read()
-        readings = tuple(Reading(0, float(self.devices.value(self._nodes[place]))) for place in question.reads)
+        nodes = [self._nodes[place] for place in question.reads]
+        readings = tuple(
+            Reading(self.devices.status.get(node, 0), float(self.devices.value(node)), self.devices.source_us(node))
+            for node in nodes
+        )
         self._on_answer(Answer(question.number, outcome, self.connection, tuple(written), readings))
+        if self._later is not None and len(self.questions) >= self._later[0]:
+            self._later[1]()
+            self._later = None
 
 
 class Rig:

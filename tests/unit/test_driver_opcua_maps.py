@@ -32,6 +32,8 @@ MISTAKES = [
     ("drive", "bit = 12", "bit = 16", "follows_command.bit: 16 is not in a u16; allowed: 0 to 15"),
     ("drive", "range = [10, 1000]", "range = [10, 70000]", "watchdog.range: [10.0, 70000.0] does not fit a u16"),
     ("drive", "range = [10, 1000]", "range = [1000, 10]", "watchdog.range: [1000.0, 10.0] must rise"),
+    ("drive", "format = 1", "format = 1\nsource_time = 'changed'", "source_time: 'changed'; allowed: sample, change"),
+    ("plc", "format = 1", "format = 1\nsource_time = 'change'", "source_time: unknown key"),
     ("drive", "[watchdog]", "[watchdogs]", "watchdog: is missing"),
     ("drive", 'Axis{channel}.Life"', 'Axis{channel}.Life", typ = "u16"', "nodes.life.typ: unknown key; allowed: node"),
     ("drive", '"Axis{channel}.Life"', '""', "nodes.life.node"),

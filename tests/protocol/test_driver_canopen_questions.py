@@ -1,0 +1,145 @@
+"""What the CANopen link asks by SDO beside the cycle: whether watchdogs are still set; and in whose threads."""
+
+import asyncio
+import struct
+import threading
+
+import pytest
+
+from drivers.canopen import questions
+from drivers.canopen.link import CanopenLink
+from drivers.canopen.sdo import SdoSilent
+from gateway.core.signals import DriveRequest, DriveState, Inputs
+from tests.protocol.driver_support import ENABLED, Drive, Drives, cycle, until
+from tests.protocol.test_driver_canopen import bench, settle, write
+
+UPLOAD, ABORT = 0x40, 0x80  #: first byte of an SDO request
+
+
+async def dropped(link: CanopenLink, drives: Drives, inputs: Inputs) -> None:
+    """Cycles until a drive was told to leave operational."""
+    async with asyncio.timeout(5.0):
+        while all(drive.nmt[-1] == 0x01 for drive in drives.drives.values()):
+            await cycle(link, inputs)
+            write(link, DriveRequest.ENABLE, 10.0)
+            await settle(drives)
+
+
+@pytest.mark.parametrize("value", [0, 200])
+def test_a_watchdog_that_was_altered_drops_its_drive(value: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(questions, "VERIFY_S", 0.0)
+
+    async def body(link: CanopenLink, drives: Drives, first: Drive, second: Drive) -> None:
+        inputs = Inputs(2)
+        await link.prepare()
+        first.statusword = second.statusword = ENABLED
+        second.objects[0x1400, 5] = struct.pack("<H", value)
+        await dropped(link, drives, inputs)
+        assert link.health.last_error.startswith("drive-2: its watchdog, object 1400h sub 5, was set to 0x64 and is ")
+        assert f"is {value:#x};" in link.health.last_error
+        first.rpdos.clear()
+        second.rpdos.clear()
+        await cycle(link, inputs)
+        write(link, DriveRequest.ENABLE, 10.0)
+        await settle(drives)
+        assert (first.nmt[-1], second.nmt[-1], second.rpdos) == (0x01, 0x80, []) and first.rpdos
+        assert list(inputs.drive_state) == [DriveState.ENABLED, DriveState.FAULT]
+
+    bench(body)
+
+
+def test_watchdogs_are_read_one_after_the_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With drives that do not answer: the next one waits for the end, and none of them is judged by it."""
+    monkeypatch.setattr(questions, "VERIFY_S", 0.0)
+
+    async def body(link: CanopenLink, drives: Drives, first: Drive, second: Drive) -> None:
+        inputs = Inputs(2)
+        await link.prepare()
+        first.statusword = second.statusword = ENABLED
+        first.sdo_answers = second.sdo_answers = False
+        drives.frames.clear()
+        async with asyncio.timeout(10.0):
+            while len(asked(drives)) < 6:
+                await cycle(link, inputs)
+                write(link, DriveRequest.ENABLE, 10.0)
+                await settle(drives)
+        assert {data[1:4] for _, data in asked(drives) if data[0] == UPLOAD} == {b"\x00\x14\x05"}
+        turns = [(cob_id, data[0]) for cob_id, data in asked(drives)[:6]]
+        assert turns == [(cob_id, command) for cob_id in (0x601, 0x602, 0x601) for command in (UPLOAD, ABORT)]
+        assert first.nmt == second.nmt == [0x80, 0x01] and first.rpdos and second.rpdos
+        assert list(inputs.drive_state) == [DriveState.ENABLED] * 2
+
+    bench(body)
+
+
+def asked(drives: Drives) -> list[tuple[int, bytes]]:
+    return [(cob_id, data) for cob_id, data in drives.frames if cob_id in (0x601, 0x602)]
+
+
+def test_one_wrong_reading_of_a_watchdog_is_not_enough(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(questions, "VERIFY_S", 0.0)
+
+    async def body(link: CanopenLink, drives: Drives, first: Drive, second: Drive) -> None:
+        inputs = Inputs(2)
+        await link.prepare()
+        answer, lies = first.sdo, [0]
+
+        def lie_now_and_then(request: bytes) -> bytes | None:
+            answered = answer(request)
+            if request[1:4] != bytes.fromhex("001405") or answered is None:
+                return answered
+            lies.append(1 - lies[-1])
+            return answered[:4] + bytes(4) if lies[-1] else answered
+
+        first.sdo = lie_now_and_then
+        async with asyncio.timeout(5.0):
+            while len(lies) < 9:
+                await cycle(link, inputs)
+                write(link, DriveRequest.OFF)
+                await settle(drives)
+        assert first.nmt == [0x80, 0x01]
+
+    bench(body)
+
+
+def test_each_watchdog_is_read_once_a_second() -> None:
+    async def body(link: CanopenLink, drives: Drives, first: Drive, second: Drive) -> None:
+        await link.prepare()
+        seen: list[tuple[float, int]] = []
+        drives.frames.clear()
+        for now_s in (0.0, 0.25, 0.5, 0.75, 1.0, 1.25, 1.5):
+            link._questions.verify(now_s)  # noqa: SLF001
+            task = link._questions._verifying  # noqa: SLF001
+            assert task is not None
+            await task
+            seen += [(now_s, cob_id) for cob_id, _ in asked(drives)]
+            drives.frames.clear()
+        assert seen == [(0.0, 0x601), (0.5, 0x602), (1.0, 0x601), (1.5, 0x602)]
+
+    bench(body)
+
+
+# SDO has threads of its own
+
+
+def test_a_silent_link_needs_no_thread_of_the_loops() -> None:
+    async def body(link: CanopenLink, drives: Drives, first: Drive, second: Drive) -> None:
+        release = threading.Event()
+        loop = asyncio.get_running_loop()
+        hold = [loop.run_in_executor(None, release.wait, 10.0) for _ in range(64)]
+        try:
+            async with asyncio.timeout(5.0):
+                await link.prepare()
+        finally:
+            release.set()
+            await asyncio.gather(*hold)
+        assert any(thread.name.startswith("sdo") for thread in threading.enumerate())
+        first.sdo_answers = False
+        asking = asyncio.create_task(link._sdo.upload(1, 0x6041, 0, 2))  # noqa: SLF001
+        await until(lambda: any(data[1:3] == b"\x41\x60" for _, data in asked(drives)[-1:]))
+        await link.close()
+        assert not any(thread.name.startswith("sdo") for thread in threading.enumerate()), "closed with the link"
+        with pytest.raises(SdoSilent):
+            await asking
+
+    bench(body)
