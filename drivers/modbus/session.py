@@ -119,7 +119,6 @@ class Session:
             self.settings.forget()
             return
         try:
-            unit.require_proven()
             if commanded:
                 await self._rest()
             for k in range(len(unit.trust.groups)):

@@ -55,6 +55,30 @@ def test_a_drive_whose_connection_was_lost_while_arming_is_not_armed(function: i
     drive_bench(body)
 
 
+def test_an_identity_read_on_an_earlier_connection_confirms_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    read, lost = ModbusConnection.read, list[int]()
+
+    async def loses(
+        self: ModbusConnection, function: int, unit: int, address: int, count: int, deadline_s: float
+    ) -> list[int]:
+        registers = await read(self, function, unit, address, count, deadline_s)
+        if (unit, address, count) == (11, 1, 1) and not lost:  # the statusword: the last proof
+            lost.append(unit)
+            await self.connect()
+        return registers
+
+    async def body(link: ModbusLink, drives: list[ModbusDrive], peer: Registers) -> None:
+        monkeypatch.setattr(ModbusConnection, "read", loses)
+        with pytest.raises(PrepareRefused, match="drive-1: the connection was lost meanwhile"):
+            await link.prepare()
+        assert lost
+        peer.requests.clear()
+        await cycle(link, Inputs(2))
+        assert (11, struct.pack(">BHH", 3, 0, 1)) in peer.requests, "it is asked again who it is"
+
+    drive_bench(body)
+
+
 def test_a_drive_that_ignores_orders_to_take_torque_off_is_fed_no_longer() -> None:
     async def body(link: ModbusLink, drives: list[ModbusDrive], peer: Registers) -> None:
         inputs = Inputs(2)
@@ -189,16 +213,18 @@ def test_a_setting_is_restored_when_arming_was_cancelled_while_it_was_written() 
     drive_bench(body)
 
 
-def test_another_device_in_the_place_of_a_drive_is_left_alone_by_release() -> None:
+@pytest.mark.parametrize("commanded", [True, False])
+def test_another_device_in_the_place_of_a_drive_is_left_alone_by_release(commanded: bool) -> None:
     async def body(link: ModbusLink, drives: list[ModbusDrive], peer: Registers) -> None:
         inputs = Inputs(2)
-        await enabled(link, inputs)
+        await (enabled(link, inputs) if commanded else link.prepare())
+        await cycle(link, inputs)
         await interrupt(link, peer, inputs, lambda: drives[0].registers.__setitem__(0, 0x7777))
         await cycle(link, inputs)
         before = len(drives[0].writes)
         await link.release()
         assert len(drives[0].writes) == before
-        assert "drive-1: left with its watchdog on: its identity is not proven" in link.health.last_error
+        assert "drive-1" in link.health.last_error and "its identity is not proven" in link.health.last_error
         assert drives[1].registers[23] == 0
 
     drive_bench(body)
