@@ -76,7 +76,8 @@ def unpack(payload: bytes) -> Frame:
     expected = _HEADER.size + n * (4 * len(FLOAT_FIELDS) + len(BYTE_FIELDS))
     if len(payload) != expected:
         raise MalformedFrame(f"{len(payload)} bytes, a frame of {n} spans has {expected}")
-    floats = np.frombuffer(payload, "<f4", n * len(FLOAT_FIELDS), _HEADER.size).astype(np.float64).reshape(-1, n)
+    with np.errstate(invalid="ignore"):  # a signalling NaN becomes a quiet one
+        floats = np.frombuffer(payload, "<f4", n * len(FLOAT_FIELDS), _HEADER.size).astype(np.float64).reshape(-1, n)
     octets: IntArray = np.frombuffer(payload, np.int8, n * len(BYTE_FIELDS), expected - n * len(BYTE_FIELDS))
     return Frame(
         sequence, time_s, lateness, cycle, missed, unwind, setpoint, state, bool(saturated), held, doubts,

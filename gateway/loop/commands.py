@@ -78,13 +78,16 @@ async def prepare_to_arm(cycle: Cycle) -> Reply | None:
 
 
 async def release(cycle: Cycle) -> None:
-    """No link sends any more, and no device waits for it. One that fails keeps no other from it; then raises."""
+    """No link sends any more, and no device waits for it. One that fails keeps no other from it.
+
+    Raises the first failure, after all have been released.
+    """
     failure: Exception | None = None
     for link in cycle.links:
         try:
             await link.release()
         except Exception as error:
-            failure = error
+            failure = failure or error
     if failure is not None:
         raise failure
 

@@ -36,5 +36,5 @@ def bound_decoder() -> None:
             raise NotEnoughData(f"{size} bytes cannot be read")
         return read(self, size)
 
-    setattr(Buffer, "read", bounded_read)  # noqa: B010
-    setattr(ua_binary.Primitives1, "Null", _NullArrays())  # noqa: B010
+    setattr(Buffer, "read", bounded_read)  # noqa: B010 (asyncua declares neither as replaceable)
+    setattr(ua_binary.Primitives1, "Null", _NullArrays())  # noqa: B010 (asyncua declares neither as replaceable)

@@ -68,7 +68,7 @@ class Sockets(BinaryServer):
         cast(asyncio.Server, self._server).close()
         for client in self.clients:
             cast(asyncio.Transport, client.transport).abort()
-        while self.clients:  # noqa: ASYNC110
+        while self.clients:  # noqa: ASYNC110 (asyncua has no event for it)
             await asyncio.sleep(0)  # they are told of their end in the next turn of the loop
         await super().stop()
 

@@ -198,7 +198,7 @@ class Stack(InternalServer):
     async def load_standard_address_space(self, shelf_file: Path | None = None) -> None:
         nodes = _standard_nodes()
         with _uncollected():
-            for node_id in nodes.keys():  # noqa: SIM118
+            for node_id in nodes.keys():  # noqa: SIM118 (an address space has keys, but cannot be iterated)
                 self.aspace[node_id] = _copy(nodes[node_id])
 
     def create_session(self, name: str, user: User = _NOBODY, external: bool = False) -> InternalSession:

@@ -41,9 +41,10 @@ def saturation(number: int) -> Injection:
     loop = start(stepped(seed=1 + number))
     assert loop.command(SetSpeed(speed_m_per_s=0.12)).ok
     loop.step(1000 + dice.randrange(100))
-    rollers, plant = loop.line.limits, loop.plant
+    friction, radius = loop.plant.rollers.friction_nms_per_rad, loop.plant.rollers.radius_m
+    assert isinstance(friction, float) and isinstance(radius, float), "S_real has the same rollers everywhere"
     roller = dice.randint(1, 6)
-    at_limit = rollers.torque_nm / (plant.rollers.friction_nms_per_rad / plant.rollers.radius_m * 0.12)  # type: ignore[operator]
+    at_limit = loop.line.limits.torque_nm / (friction / radius * 0.12)
     fault = f"web {roller} friction-rise factor={at_limit + dice.uniform(0.005, 0.02):.4f}"
     begin_s = _inject(loop, fault)
     saturated_s = None
