@@ -15,8 +15,8 @@ from gateway.core.signals import BoolArray, CountArray, FloatArray, Inputs, Qual
 from safety.actions import Action, Finding
 
 COUNTS = 3.0  #: that a usual change of a fine cell spans; the same value 60 times in a row is then beyond chance
-LEARNT_CHANGES = 50  #: until a cell is judged
-MEMORY = 0.99  #: of the usual size of a change, per change
+LEARNT_CHANGES = 20  #: until a cell is judged
+REMEMBERED = 100.0  #: changes that the usual size of a change is the mean of, about; of fewer while there are fewer
 _GOOD = int(Quality.GOOD)
 
 
@@ -65,7 +65,8 @@ def find_stuck(limits: StuckLimits, state: StuckState, inputs: Inputs) -> list[F
     alive = bool((speed.value != state.speed_m_per_s).any())
     state.changes += changed
     state.smallest_n = np.where(changed, np.minimum(state.smallest_n, size_n), state.smallest_n)
-    state.usual_n = np.where(changed, MEMORY * state.usual_n + (1.0 - MEMORY) * size_n, state.usual_n)
+    weight = 1.0 / np.clip(state.changes, 1.0, REMEMBERED)
+    state.usual_n = np.where(changed, state.usual_n + weight * (size_n - state.usual_n), state.usual_n)
     state.same = np.where(changed, 0, state.same + (fresh & limits.measured & alive))
     fine = (state.changes >= LEARNT_CHANGES) & (state.usual_n >= COUNTS * state.smallest_n)
     state.stuck = fine & (state.same >= limits.stuck_periods)
