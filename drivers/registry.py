@@ -2,14 +2,18 @@
 
 from pathlib import Path
 
+import numpy as np
+
 from drivers.canopen import build as canopen
 from drivers.device_map import MAPS, DeviceMap, MapRefused, load_map, map_names
 from drivers.modbus import build as modbus
 from drivers.opcua import build as opcua
 from drivers.port import Link
+from drivers.scaling import speed_step
 from drivers.wiring import Builder, Wired
 from gateway.core.line import Drive, Line, LinePlc, LoadCell
 from gateway.core.nearest import nearest
+from gateway.core.signals import FloatArray
 
 BUILDERS: dict[str, Builder] = {"canopen": canopen.build, "modbus-tcp": modbus.build, "opcua": opcua.build}
 
@@ -38,6 +42,16 @@ def build_links(line: Line, folder: Path = MAPS) -> list[Link]:
     if reasons:
         raise LinksRefused(reasons)
     return links
+
+
+def speed_steps_m_per_s(line: Line, folder: Path = MAPS) -> FloatArray:
+    """What one count of each drive's speed is worth (n,), for a line that `build_links` takes."""
+    steps = np.zeros(line.n)
+    for wired in _Lookup(line, folder).devices()[0]:
+        if isinstance(wired.item, Drive) and wired.device.role == "drive":
+            speed, i = wired.device.speed, wired.item.roller - 1
+            steps[i] = speed_step(speed.type, speed.unit, speed.scale, line.rollers[i].radius_m.value)
+    return steps
 
 
 class _Lookup:

@@ -3,6 +3,7 @@
 from gateway.core.units import SI_PER_UNIT
 
 _ANGULAR = {"rad/s", "rpm", "mrpm"}
+_FLOATS = {"f32", "f64"}
 
 
 def si_per_count(unit: str, scale: float) -> float:
@@ -14,6 +15,11 @@ def speed_per_count(unit: str, scale: float, radius_m: float) -> float:
     """m/s of web per count. An angular speed is converted with the roller's nominal radius."""
     linear = si_per_count(unit, scale)
     return linear * radius_m if unit in _ANGULAR else linear
+
+
+def speed_step(kind: str, unit: str, scale: float, radius_m: float) -> float:
+    """m/s of web that a number of type `kind` moves by at least; 0 for a float, which has no such steps."""
+    return 0.0 if kind in _FLOATS else speed_per_count(unit, scale, radius_m)
 
 
 def torque_per_count(unit: str, scale: float, rated_torque_nm: float) -> float:

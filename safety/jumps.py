@@ -35,18 +35,17 @@ class JumpLimits:
     memory_periods: int
 
 
-def jump_limits(line: Line, resolution_m_per_s: FloatArray | None = None) -> JumpLimits:
-    """What the rollers of `line` can do. `resolution_m_per_s` (n,) is what a count of each drive's speed is worth."""
+def jump_limits(line: Line, speed_steps_m_per_s: FloatArray) -> JumpLimits:
+    """What the rollers of `line` can do. `speed_steps_m_per_s` (n,) is what a count of each drive's speed is worth."""
     rollers, period_s = line.rollers, line.control.period_s
     radius = np.array([r.radius_m.value * (1 + r.radius_m.tolerance) for r in rollers])
     inertia = np.array([r.inertia_kg_m2.value * (1 - r.inertia_kg_m2.tolerance) for r in rollers])
     friction = np.array([r.friction_nms_per_rad.value * (1 + r.friction_nms_per_rad.tolerance) for r in rollers])
-    resolution = np.zeros(line.n) if resolution_m_per_s is None else resolution_m_per_s
     return JumpLimits(
         radius_m=radius,
         radius_per_inertia=radius / inertia,
         friction_rate_per_s=friction / inertia,
-        noise_m_per_s=NOISE_M_PER_S + 2.0 * resolution,
+        noise_m_per_s=NOISE_M_PER_S + 2.0 * speed_steps_m_per_s,
         tension_max_n=line.limits.tension_max_n,
         unwinder_m_per_s=UNWINDER_MARGIN * line.limits.speed_max_m_per_s,
         period_s=period_s,

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 from drivers.canopen.configure import DriveSettings, drive_expected, drive_steps, watchdog_step
 from drivers.canopen.map_drive import DriveMap
-from drivers.canopen.pdo import DriveSample, MalformedPdo, PdoCodec, speed_resolution_m_per_s
+from drivers.canopen.pdo import DriveSample, MalformedPdo, PdoCodec
 from drivers.canopen.sdo import SdoBus
 from drivers.canopen.station import Station
 from drivers.canopen.transaction import Step, differences, place, read_number
@@ -29,7 +29,6 @@ class DriveNode:
         self.settings = settings
         self.watchdog = watchdog_step(device.watchdog, settings.watchdog_s)
         self.codec = PdoCodec(device, settings.rated_torque_nm, radius_m)
-        self.speed_resolution_m_per_s = speed_resolution_m_per_s(device, radius_m)
         self.sample: DriveSample | None = None  #: the answer to the present SYNC
         self.stage = PowerStage(device.follows_command)
         self.answers = (device.transmit_pdo.cob_id + settings.node,)

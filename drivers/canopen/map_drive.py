@@ -80,6 +80,11 @@ class DriveMap(CanMap):
         """The objects of a PDO in mapping order."""
         return [getattr(self.objects, name) for name in pdo.objects]
 
+    @property
+    def speed(self) -> SpeedObject:
+        """The roller's."""
+        return self.objects.speed
+
     @model_validator(mode="after")
     def _layout(self) -> "DriveMap":
         entries = dict(self.objects)

@@ -41,12 +41,6 @@ def type_code(kind: str) -> str:
     return "<" + _CODE[kind]
 
 
-def speed_resolution_m_per_s(device: DriveMap, radius_m: float) -> float:
-    """The web speed that one count of a drive's speed object is worth; 0 for a float, which has no such steps."""
-    speed = device.objects.speed
-    return 0.0 if speed.type == "f32" else speed_per_count(speed.unit, speed.scale, radius_m)
-
-
 class PdoLayout:
     """The numbers of one PDO in mapping order."""
 

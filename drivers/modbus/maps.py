@@ -250,6 +250,11 @@ class DriveMap(ModbusMap):
     max_torque: MaxTorque
     watchdog: TimeRegister
 
+    @property
+    def speed(self) -> RollerSpeed:
+        """The roller's."""
+        return self.read.speed
+
     @model_validator(mode="after")
     def _layout(self) -> "DriveMap":
         read, write = _register_fields("read", self.read), _register_fields("write", self.write)

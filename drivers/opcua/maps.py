@@ -158,6 +158,11 @@ class DriveMap(OpcUaMap):
     nodes: DriveNodes
     watchdog: WatchdogNode
 
+    @property
+    def speed(self) -> Speed:
+        """The roller's."""
+        return self.nodes.speed
+
     @model_validator(mode="after")
     def _layout(self) -> "DriveMap":
         problems = _twice_problems({"identity": self.identity, "watchdog": self.watchdog} | _named("nodes", self.nodes))

@@ -30,6 +30,7 @@ class Punctuality:
     processors: list[int]
     locked_kb: int
     refused: list[str]
+    sleepy: str  #: why processors may sleep between periods, or nothing
     ticks: int
     skipped: int  #: periods that went by unused
     p50_s: float
@@ -116,6 +117,12 @@ def _granted(line: Line, found: Punctuality) -> Iterator[Check]:
         todo = "run as the service does (LimitMEMLOCK=), or raise memlock in /etc/security/limits.d"
         yield Check(_GROUP, "memory", "", "warning", f"not locked{_memory_limit()}", "locked", todo)
 
+    if not found.sleepy:
+        yield Check(_GROUP, "sleep states", "", "OK", "processors stay awake", "awake")
+    else:
+        todo = "let the service's user write there (a udev rule, or a group), or forbid deep states in the BIOS"
+        yield Check(_GROUP, "sleep states", "", "warning", found.sleepy, "awake", todo)
+
 
 def _memory_limit() -> str:
     import resource
@@ -129,12 +136,13 @@ def _memory_limit() -> str:
 
 async def _measure_here(period_s: float, seconds: float, cpu: int | None, priority: int) -> Punctuality:
     from gateway.loop.pacer import TimerPacer
-    from gateway.loop.realtime import become_punctual, freeze_collector
+    from gateway.loop.realtime import become_punctual, freeze_collector, stay_awake
 
     late_s: list[float] = []
     skipped = 0
     freeze_collector()
     _, refused = become_punctual(cpu, priority)
+    sleepy = stay_awake()
     fifo = os.sched_getscheduler(0) == os.SCHED_FIFO
     given = os.sched_getparam(0).sched_priority if fifo else 0
     processors = sorted(os.sched_getaffinity(0))
@@ -150,9 +158,8 @@ async def _measure_here(period_s: float, seconds: float, cpu: int | None, priori
         pacer.close()
         if fifo:  # what follows is no loop's work
             os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-    return Punctuality(
-        given, processors, locked_kb, refused, len(late_s), skipped, *percentiles(late_s, (0.5, 0.99)), max(late_s)
-    )
+    p50_s, p99_s = percentiles(late_s, (0.5, 0.99))
+    return Punctuality(given, processors, locked_kb, refused, sleepy, len(late_s), skipped, p50_s, p99_s, max(late_s))
 
 
 def percentiles(values: Sequence[float], shares: tuple[float, float]) -> tuple[float, float]:

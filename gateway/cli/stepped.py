@@ -22,6 +22,7 @@ from gateway.loop.commands import carry_out, prepare_to_arm
 from gateway.loop.cycle import Cycle
 from gateway.loop.machine import Machine
 from gateway.loop.pacer import Tick
+from gateway.loop.watch import Watch
 from safety.actions import Finding
 from sim_plant.plant import Plant
 from sim_plant.stepped import SteppedLine
@@ -46,7 +47,9 @@ class SteppedLoop:
         self.periods = 0
         self.truth = SteppedLine(self.plant, self.seed, self.line.control.latency_s)
         link = MemoryLink(self.line, self.truth)
-        self.cycle = Cycle(self.line, make_law(self.config), [link], lambda: self.now_s, self._record, self._announce)
+        watch = Watch(self.line, np.zeros(self.line.n))  # the memory link carries floats
+        law = make_law(self.config)
+        self.cycle = Cycle(self.line, law, [link], watch, lambda: self.now_s, self._record, self._announce)
         _finish(link.open())
 
     def begin_in_production(self, tension_n: FloatArray, unwind_speed_m_per_s: float) -> None:

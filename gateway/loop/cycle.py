@@ -67,6 +67,7 @@ class Cycle:
         line: Line,
         law: Law[Any],
         links: list[Link],
+        watch: Watch,
         clock: Callable[[], float],
         record: Callable[[Frame], None],
         announce: Callable[[Machine, Machine, list[Finding]], None],
@@ -80,7 +81,7 @@ class Cycle:
         self.outputs = Outputs(line.n)
         self.setpoints = Setpoints(line.recipes[0])
         self.account = Account()
-        self.watch = Watch(line)
+        self.watch = watch
         self.clock = clock
         self._record = record
         self._announce = announce

@@ -7,7 +7,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from drivers.port import Link
-from drivers.registry import build_links
+from drivers.registry import build_links, speed_steps_m_per_s
 from gateway.control.laws import make_law
 from gateway.core.controller import LqiConfig, PidConfig, config_hash
 from gateway.core.line import Line
@@ -17,9 +17,10 @@ from gateway.core.topics import LOOP_BUSES, LOOP_COMMAND, LOOP_EVENT, LOOP_TELEM
 from gateway.loop.commands import release
 from gateway.loop.cycle import Cycle
 from gateway.loop.pacer import TimerPacer, monotonic
-from gateway.loop.realtime import become_punctual, freeze_collector
+from gateway.loop.realtime import become_punctual, freeze_collector, stay_awake
 from gateway.loop.runner import Runner
 from gateway.loop.voice import Voice
+from gateway.loop.watch import Watch
 from gateway.mailbox.paths import GATEWAY_SOCKET, LOOP_SOCKET
 from gateway.mailbox.unix import UnixMailbox
 
@@ -42,7 +43,8 @@ async def _main(line: Line, config: LqiConfig | PidConfig, run_folder: Path, say
     mailbox.connect({LOOP_TELEMETRY, LOOP_EVENT, LOOP_BUSES}, run_folder / GATEWAY_SOCKET)
     links = build_links(line)
     voice = Voice(mailbox, links, line.control.period_s)
-    cycle = Cycle(line, make_law(config), links, monotonic, voice.record, voice.announce)
+    watch = Watch(line, speed_steps_m_per_s(line))
+    cycle = Cycle(line, make_law(config), links, watch, monotonic, voice.record, voice.announce)
     runner = Runner(cycle)
     ending = asyncio.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
@@ -57,6 +59,8 @@ async def _main(line: Line, config: LqiConfig | PidConfig, run_folder: Path, say
         freeze_collector()
         # Last: what starts up must not take a processor from another line's loop.
         granted, refused = become_punctual(line.control.cpu, line.control.priority)
+        sleepy = stay_awake()
+        (refused if sleepy else granted).append(sleepy or "processors stay awake")
         for sentence in ["; ".join(granted) or "no real-time help granted", *refused]:
             say(sentence)
         await _run_until(runner, line, ending)

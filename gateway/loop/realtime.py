@@ -3,9 +3,11 @@
 import ctypes
 import gc
 import os
+import struct
 
 # Current and future pages, each from its first use on: locking what is only reserved would treble the memory.
 _MCL_USED = 1 | 2 | 4
+_LATENCY_REQUEST = "/dev/cpu_dma_latency"
 
 
 def become_punctual(cpu: int | None, priority: int) -> tuple[list[str], list[str]]:
@@ -31,6 +33,20 @@ def become_punctual(cpu: int | None, priority: int) -> tuple[list[str], list[str
     else:
         refused.append("memory not locked: needs CAP_IPC_LOCK or a higher memlock limit (ulimit -l)")
     return granted, refused
+
+
+def stay_awake() -> str:
+    """Keep every processor out of sleep states that it takes time to wake from; returns why not, or nothing.
+
+    Linux, PM quality of service: the request holds while the descriptor is open, that is until this process ends. On
+    a virtual machine a processor that never halts need not wait for its host either.
+    """
+    try:
+        request = os.open(_LATENCY_REQUEST, os.O_WRONLY)
+        os.write(request, struct.pack("i", 0))  # microseconds
+    except OSError as error:
+        return f"processors may sleep between periods: {_LATENCY_REQUEST}: {error.strerror}"
+    return ""
 
 
 def freeze_collector() -> None:

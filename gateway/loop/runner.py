@@ -5,10 +5,11 @@ from collections import deque
 
 from gateway.core.messages import Arm, Command, MalformedMessage, Reply, Stop, parse_command
 from gateway.core.states import LoopState, Phase
-from gateway.loop.commands import carry_out, prepare_to_arm, release
+from gateway.loop.commands import carry_out, not_ready, prepare_to_arm, release
 from gateway.loop.cycle import Cycle
 from gateway.loop.pacer import Tick
 
+HEARD_AGAIN_S = 1.0  #: for devices that were lost to tell what speaks against arming, or that nothing does
 MAX_WAITING = 32  #: commands between two periods; more are refused, but for a stop
 
 Answer = asyncio.Future[Reply]
@@ -72,7 +73,7 @@ class Runner:
     async def _arm(self, command: Arm) -> Reply:
         if self._arming is not None:
             return self._refused("arming is under way")
-        self._arming = asyncio.create_task(prepare_to_arm(self.cycle))
+        self._arming = asyncio.create_task(self._prove())
         try:
             await asyncio.wait([self._arming])
             if self._arming.cancelled():
@@ -90,6 +91,20 @@ class Runner:
         if self.cycle.machine.state is not LoopState.READY:
             return self._refused(f"not armed: {self.cycle.machine.reason}")
         return reply.model_copy(update={"state": self.cycle.machine.state.name})
+
+    async def _prove(self) -> Reply | None:
+        """As `prepare_to_arm`, for devices that have come back, too.
+
+        A link that commands leaves a device alone that was lost; a silent one asks for what it can. So one that has
+        nothing to tell after a stop is given the chance to be heard first.
+        """
+        cycle = self.cycle
+        if cycle.machine.phase is Phase.OFF and not_ready(cycle):
+            await release(cycle)
+            given_up_s = cycle.clock() + HEARD_AGAIN_S
+            while not_ready(cycle) and cycle.clock() < given_up_s:
+                await self._passed.wait()
+        return await prepare_to_arm(cycle)
 
     async def _cancel_arming(self) -> None:
         if self._arming is not None:

@@ -16,13 +16,16 @@ SATURATED_S = 2.0  #: at a limit, net of the time away from it, until proposals 
 
 
 class Watch:
-    """`doubts` is what blocks proposals now; `stuck` (n,) are the spans whose load cell stands still."""
+    """`doubts` is what blocks proposals now; `stuck` (n,) are the spans whose load cell stands still.
 
-    def __init__(self, line: Line, speed_resolution_m_per_s: FloatArray | None = None) -> None:
+    `speed_steps_m_per_s` (n,) is what a count of each drive's speed is worth.
+    """
+
+    def __init__(self, line: Line, speed_steps_m_per_s: FloatArray) -> None:
         self.doubts = Doubt.NONE
         self.stuck: BoolArray = np.zeros(line.n, np.bool_)
         self._cells = {cell.span: cell.name for cell in line.load_cells}
-        self._jump_limits, self._jumps = jump_limits(line, speed_resolution_m_per_s), JumpState()
+        self._jump_limits, self._jumps = jump_limits(line, speed_steps_m_per_s), JumpState()
         self._applied_nm: FloatArray = np.zeros(line.n)
         self._stuck_limits, self._stuck = stuck_limits(line), StuckState()
         self._drift_limits, self._drift = drift_limits(line), DriftState()

@@ -17,7 +17,7 @@ from typing import Any, Self, TypeVar
 import numpy as np
 
 from drivers.port import Link
-from drivers.registry import build_links
+from drivers.registry import build_links, speed_steps_m_per_s
 from gateway.cli.children import free_udp_port
 from gateway.control.design import design_lqi, task_of
 from gateway.control.laws import make_law
@@ -31,6 +31,7 @@ from gateway.loop.cycle import Cycle
 from gateway.loop.machine import Machine
 from gateway.loop.pacer import Tick
 from gateway.loop.runner import Runner
+from gateway.loop.watch import Watch
 from safety.actions import Finding
 from sim_plant.faces.canopen_bus import FaceUnavailable
 from sim_plant.plant import Plant
@@ -255,7 +256,8 @@ class VirtualLine:
 
     def _new_cycle(self) -> None:
         clock = asyncio.get_running_loop().time
-        self.cycle = Cycle(self.line, make_law(self._config), self.links, clock, self._record, self._announce)
+        watch, law = Watch(self.line, speed_steps_m_per_s(self.line)), make_law(self._config)
+        self.cycle = Cycle(self.line, law, self.links, watch, clock, self._record, self._announce)
         self.runner = Runner(self.cycle)
 
     async def _periods(self, count: int) -> None:

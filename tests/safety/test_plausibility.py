@@ -45,7 +45,7 @@ def jumping(values: list[float], torque_nm: FloatArray = TORQUE_NM) -> tuple[lis
     found: list[int] = []
     for k, value in enumerate(values):
         samples = speeds(inputs, [0.05, value, 0.05, 0.05, 0.05, 0.05])
-        findings = reject_jumps(jump_limits(LINE), state, samples, torque_nm)
+        findings = reject_jumps(jump_limits(LINE, np.zeros(6)), state, samples, torque_nm)
         if inputs.speed.quality[1] == Quality.BAD:
             discarded.append(k)
         found += [k] * len(findings)
@@ -81,7 +81,7 @@ def test_a_coarse_encoder_may_show_the_next_count() -> None:
 
 
 def test_after_missed_samples_a_roller_may_have_come_further() -> None:
-    limits, state, inputs = jump_limits(LINE), JumpState(), at_30_n()
+    limits, state, inputs = jump_limits(LINE, np.zeros(6)), JumpState(), at_30_n()
     reject_jumps(limits, state, speeds(inputs, [0.0] * 6), TORQUE_NM)
     for _ in range(2):
         for i in range(6):
@@ -106,7 +106,7 @@ def test_after_missed_samples_a_roller_may_have_come_further() -> None:
 def test_v0_lies_between_standstill_its_last_value_and_its_request(
     last: float, asked: float, value: float, believed: bool
 ) -> None:
-    limits, state, inputs = jump_limits(LINE), JumpState(), Inputs(6)
+    limits, state, inputs = jump_limits(LINE, np.zeros(6)), JumpState(), Inputs(6)
     inputs.unwind_speed.put(0, last, 0.0)
     reject_unwinder(limits, state, inputs, last)
     inputs.unwind_speed.put(0, value, 0.01)

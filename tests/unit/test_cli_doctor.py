@@ -174,11 +174,13 @@ def test_percentiles() -> None:
 
 
 def test_what_was_not_granted_is_told_with_what_to_do() -> None:
-    refused = Punctuality(0, [0, 1], 0, ["no real-time priority: needs CAP_SYS_NICE"], 100, 0, 0.0, 0.0, 0.0)
+    refused = Punctuality(
+        0, [0, 1], 0, ["no real-time priority: needs CAP_SYS_NICE"], "not permitted", 100, 0, 0.0, 0.0, 0.0
+    )
     checks = list(judged(line(), refused))
-    assert [check.verdict for check in checks] == ["warning", "warning", "warning", "OK"]
-    assert all(check.todo for check in checks[:3])
-    granted = Punctuality(60, [1], 40_000, [], 100, 0, 0.0, 0.0, 0.0)
+    assert [check.verdict for check in checks] == ["warning", "warning", "warning", "warning", "OK"]
+    assert all(check.todo for check in checks[:4])
+    granted = Punctuality(60, [1], 40_000, [], "", 100, 0, 0.0, 0.0, 0.0)
     assert {check.verdict for check in judged(line(), granted)} == {"OK"}
 
 

@@ -1,7 +1,6 @@
 """One drive's state from frames and times, without a bus."""
 
 import struct
-from math import pi
 
 import pytest
 
@@ -120,16 +119,3 @@ def test_no_answer_shows_no_torque() -> None:
     answer(drive, ENABLED)
     drive.begin_sync()
     assert not drive.shows_torque, "what it said before may be over"
-
-
-def test_the_speed_that_a_count_is_worth() -> None:
-    assert node().speed_resolution_m_per_s == pytest.approx(1e-6)
-    for update, resolution in (
-        ({"unit": "rpm", "scale": 1.0}, 2 * pi / 60 * 0.04),
-        ({"unit": "m/min", "scale": 0.1}, 0.1 / 60),
-        ({"type": "f32"}, 0.0),
-    ):
-        speed = CIA402.objects.speed.model_copy(update=update)
-        objects = CIA402.objects.model_copy(update={"speed": speed})
-        found = node(CIA402.model_copy(update={"objects": objects})).speed_resolution_m_per_s
-        assert found == pytest.approx(resolution)
