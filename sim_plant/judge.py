@@ -48,6 +48,7 @@ class Kind(IntEnum):
 
 UNSAFE = tuple(kind for kind in Kind if kind is not Kind.TENSION_AFTER_TRIP)
 _TORQUE_LIMIT, _TORQUE_NOT_ENABLED = int(Kind.TORQUE_LIMIT), int(Kind.TORQUE_NOT_ENABLED)
+_TENSION_BAND, _TENSION_AFTER_TRIP = int(Kind.TENSION_BAND), int(Kind.TENSION_AFTER_TRIP)
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,19 +107,20 @@ class Judge:
 
     def rows(self, first: int, rows: FloatArray) -> list[Finding]:
         """Judge a piece of trace (m, 3n+1), as `physics.integrate` fills it, whose first row is step `first`."""
-        tension_kind = Kind.TENSION_AFTER_TRIP if self._tripped.any() else Kind.TENSION_BAND
         found = _judge_rows(
             rows,
             self._bounds,
+            self._enabled,
             self._may_give_torque,
+            self._tripped,
             self._asked_too_much,
-            bool(self._enabled.all()),
-            int(tension_kind),
             self._inside_steps,
             self._going_on,
             self.counts,
             self._found,
         )
+        if not found:
+            return []
         return [
             Finding(Kind(int(kind)), int(index), float(value), first + int(row))
             for kind, index, value, row in self._found[: min(found, _MOST_FOUND)]
@@ -213,11 +215,11 @@ def _begin(kind, index, value, row, number, going_on, counts, found):
 
 
 @_compiled
-def _judge_rows(
-    rows, bounds, may_give_torque, asked_too_much, all_enabled, tension_kind, inside_steps, going_on, counts, found
-):
+def _judge_rows(rows, bounds, enabled, may_give_torque, tripped, asked_too_much, inside_steps, going_on, counts, found):
     """Fill `found` with [kind, index, value, row] of each event that begins in `rows`. Returns their number."""
     tension_min, tension_max, torque_max, torque_zero = bounds
+    tension_kind = _TENSION_AFTER_TRIP if tripped.any() else _TENSION_BAND
+    all_enabled = enabled.all()
     n = inside_steps.size
     number = 0
     for row in range(rows.shape[0]):

@@ -15,8 +15,8 @@ from sim_plant.devices.line_plc import LinePlc
 from sim_plant.faces.build import canopen_face, modbus_units
 from sim_plant.faces.canopen import CanopenFace
 from sim_plant.faces.canopen_bus import FaceUnavailable, OpenBus, explain, open_bus
+from sim_plant.faces.kernel_stamp import Stamp
 from sim_plant.faces.modbus import ModbusFace
-from sim_plant.faces.tcp_stamp import Stamp
 from sim_plant.faults.control import ControlServer, ControlUnavailable
 from sim_plant.faults.parse import Injection
 from sim_plant.faults.proxy import OPC_UA, TcpProxy
@@ -129,6 +129,7 @@ class WiredLine:
 
         Faults without a time, or at 0, come as soon as there is a device to which they can happen.
         """
+        self.recorder.defer(asyncio.get_running_loop().call_soon)
         try:
             later = [fault for fault in self.settings.faults if fault.at_s]
             for fault in later:
@@ -151,6 +152,7 @@ class WiredLine:
         while not stop.is_set():
             self._pump()
             self.world.advance(self.clock.now_s())
+            self.world.draw_ahead()
             if self.canopen is not None:
                 self.canopen.poll()
             await asyncio.sleep(tick_s)

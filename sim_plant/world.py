@@ -1,6 +1,7 @@
 """The simulated line in time: state, noise and inputs on a grid of 1 ms. Whoever owns a clock calls `advance`."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from math import floor, inf
 
 import numpy as np
@@ -12,16 +13,40 @@ from sim_plant.plant import Plant
 
 _BLOCK = 1024  #: steps for which noise is drawn, and trace is kept, at a time
 _GRID_TOLERANCE = 1e-6  #: of a step: 0.57 s is step 570, though 0.57 * 1000 is a little less
+_WELL_BEFORE_S = 2.0 * _GRID_TOLERANCE * STEP_S  #: so much before a time, it has not come by any reckoning
 
 
 class Timer:
-    """Something of a device that happens at a time: set `due_s` (inf is never), `action(due_s)` is called then."""
+    """Something of a device that happens at a time: set `due_s` (inf is never), `action(due_s)` is called then.
 
-    __slots__ = ("action", "due_s")
+    `sooner` is told every time that is set.
+    """
 
-    def __init__(self, action: Callable[[float], None]) -> None:
+    __slots__ = ("_due_s", "_sooner", "action")
+
+    def __init__(self, action: Callable[[float], None], sooner: Callable[[float], None]) -> None:
         self.action = action
-        self.due_s = inf
+        self._due_s = inf
+        self._sooner = sooner
+
+    @property
+    def due_s(self) -> float:
+        return self._due_s
+
+    @due_s.setter
+    def due_s(self, value: float) -> None:
+        self._due_s = value
+        self._sooner(value)
+
+
+@dataclass(frozen=True, slots=True)
+class _Noise:
+    """That of one block of steps, each kind from its own stream; shapes (_BLOCK, n), of the unwinder (_BLOCK,)."""
+
+    process: FloatArray
+    tension_n: FloatArray
+    speed_m_per_s: FloatArray
+    unwind_m_per_s: FloatArray
 
 
 class World:
@@ -44,6 +69,7 @@ class World:
         self._line = PlainLine(plant.parameters(), self._inputs) if plant.is_plain else FullLine(plant, self._inputs)
         self._trace = np.empty((_BLOCK, 3 * self.n + 1))
         self._timers: list[Timer] = []
+        self._still_until_s = 0.0  #: before this no step ends and no timer is due: nothing to do for `advance`
         process, tension, speed, unwind, walk = np.random.SeedSequence(seed).spawn(5)
         self._process_stream = np.random.default_rng(process)
         self._sensor_streams = [np.random.default_rng(s) for s in (tension, speed, unwind)]
@@ -52,8 +78,9 @@ class World:
         if not sensors.load_cells_are_ideal:
             self._load_cells = LoadCells(sensors, self.n, np.random.default_rng(walk))
         self._speed_step_m_per_s = sensors.speed_step_m_per_s
+        self._next_noise: _Noise | None = None
         self._look_at_line()
-        self._draw_noise()
+        self._begin_block()
 
     @property
     def now_s(self) -> float:
@@ -67,19 +94,29 @@ class World:
 
     def advance(self, to_s: float) -> None:
         """Integrate the whole steps up to `to_s`; timers that are due by then act at their own times, in order."""
+        if to_s < self._still_until_s:  # every frame and every value asks
+            return
         while True:
             due = min(self._timers, key=lambda timer: timer.due_s, default=None)
-            if due is None or due.due_s > to_s + _GRID_TOLERANCE * STEP_S:
+            due_s = inf if due is None else due.due_s
+            if due is None or due_s > to_s + _GRID_TOLERANCE * STEP_S:
                 break
-            due_s, due.due_s = due.due_s, inf
+            due.due_s = inf
             self._integrate_to(due_s)
             due.action(due_s)
         self._integrate_to(to_s)
+        self._still_until_s = min(due_s, (self.steps + 1) * STEP_S) - _WELL_BEFORE_S
 
     def timer(self, action: Callable[[float], None]) -> Timer:
-        timer = Timer(action)
+        timer = Timer(action, self._heed)
         self._timers.append(timer)
         return timer
+
+    def draw_ahead(self) -> None:
+        """Have the noise of the next block ready: otherwise the step with which it begins takes longer. Changes
+        nothing else."""
+        if self._next_noise is None:
+            self._next_noise = self._drawn()
 
     def set_torque_nm(self, index: int, value: float) -> None:
         """The torque of roller `index` + 1 from now on, whatever lag its drive has: also when its power goes off."""
@@ -172,28 +209,28 @@ class World:
         """What the load cell of span `index` + 1 shows now."""
         if self._load_cells is not None:
             return float(self.measure_tensions_n()[index])
-        return float(self.tension_n[index] + self._tension_noise_n[self.steps % _BLOCK, index])
+        return float(self.tension_n[index] + self._noise.tension_n[self.steps % _BLOCK, index])
 
     def measure_speed_m_per_s(self, index: int) -> float:
         """What the encoder of roller `index` + 1 shows now."""
         if self._speed_step_m_per_s > 0.0:
             return float(self.measure_speeds_m_per_s()[index])
-        return float(self.surface_speed_m_per_s[index] + self._speed_noise_m_per_s[self.steps % _BLOCK, index])
+        return float(self.surface_speed_m_per_s[index] + self._noise.speed_m_per_s[self.steps % _BLOCK, index])
 
     def measure_unwind_speed_m_per_s(self) -> float:
-        shown = self.unwind_speed_m_per_s + self._unwind_noise_m_per_s[self.steps % _BLOCK]
+        shown = self.unwind_speed_m_per_s + self._noise.unwind_m_per_s[self.steps % _BLOCK]
         return float(quantised(shown, self._speed_step_m_per_s))
 
     def measure_tensions_n(self) -> FloatArray:
         """All load cells, shape (n,)."""
         row = self.steps % _BLOCK
         if self._load_cells is not None:
-            return self._load_cells.reading_n(row, self.now_s, self._tension_noise_n[row])
-        return self.tension_n + self._tension_noise_n[row]
+            return self._load_cells.reading_n(row, self.now_s, self._noise.tension_n[row])
+        return self.tension_n + self._noise.tension_n[row]
 
     def measure_speeds_m_per_s(self) -> FloatArray:
         """All encoders, shape (n,): the surface speed of a round roller, apart from slip and eccentricity."""
-        shown = self.surface_speed_m_per_s + self._speed_noise_m_per_s[self.steps % _BLOCK]
+        shown = self.surface_speed_m_per_s + self._noise.speed_m_per_s[self.steps % _BLOCK]
         return quantised(shown, self._speed_step_m_per_s)
 
     def _look_at_line(self) -> None:
@@ -211,6 +248,10 @@ class World:
         else:
             self._inputs[RATE, column] = rate
 
+    def _heed(self, due_s: float) -> None:
+        """A timer has been set."""
+        self._still_until_s = min(self._still_until_s, due_s - _WELL_BEFORE_S)
+
     def _follow_commands(self) -> None:
         if not isinstance(self._line, PlainLine):
             self._line.follow_commands()
@@ -221,23 +262,29 @@ class World:
             begin = self.steps % _BLOCK
             end = min(_BLOCK, begin + last - self.steps)
             rows = self._trace[begin:end]
-            self._line.advance(self._process_noise[begin:end], rows)
+            self._line.advance(self._noise.process[begin:end], rows)
             if self._load_cells is not None:
                 self._load_cells.follow(rows)
             first = self.steps + 1
             self.steps += end - begin
             if end == _BLOCK:
-                self._draw_noise()
+                self._begin_block()
             if self.on_rows is not None:
                 self.on_rows(first, rows)
 
-    def _draw_noise(self) -> None:
-        """Noise for the steps of the next block, each kind from its own stream."""
-        sensors = self.plant.sensors
-        tension, speed, unwind = self._sensor_streams
-        self._process_noise = self._process_stream.standard_normal((_BLOCK, self.n))
-        self._tension_noise_n = sensors.tension_noise_n * tension.standard_normal((_BLOCK, self.n))
-        self._speed_noise_m_per_s = sensors.speed_noise_m_per_s * speed.standard_normal((_BLOCK, self.n))
-        self._unwind_noise_m_per_s = sensors.speed_noise_m_per_s * unwind.standard_normal(_BLOCK)
+    def _begin_block(self) -> None:
+        self._noise = self._next_noise or self._drawn()
+        self._next_noise = None
         if self._load_cells is not None:
             self._load_cells.draw(_BLOCK)
+
+    def _drawn(self) -> _Noise:
+        """The noise of the steps that come after those that have been drawn."""
+        sensors = self.plant.sensors
+        tension, speed, unwind = self._sensor_streams
+        return _Noise(
+            process=self._process_stream.standard_normal((_BLOCK, self.n)),
+            tension_n=sensors.tension_noise_n * tension.standard_normal((_BLOCK, self.n)),
+            speed_m_per_s=sensors.speed_noise_m_per_s * speed.standard_normal((_BLOCK, self.n)),
+            unwind_m_per_s=sensors.speed_noise_m_per_s * unwind.standard_normal(_BLOCK),
+        )

@@ -3,8 +3,8 @@
 Source: CiA 402-2 (IEC 61800-7-201), device control. Numbers in comments are the transitions of its state diagram.
 """
 
-from dataclasses import dataclass
-from enum import Enum, IntEnum
+from enum import IntEnum, auto
+from typing import NamedTuple
 
 CYCLIC_SYNCHRONOUS_TORQUE = 10  #: modes of operation 6060h
 
@@ -32,17 +32,16 @@ class State(IntEnum):
     FAULT = 0x08
 
 
-class Command(Enum):
-    DISABLE_VOLTAGE = "disable voltage"
-    QUICK_STOP = "quick stop"
-    SHUTDOWN = "shutdown"
-    SWITCH_ON = "switch on"  #: from operation enabled the same bits are "disable operation"
-    ENABLE_OPERATION = "enable operation"
-    NONE = "none"
+class Command(IntEnum):
+    DISABLE_VOLTAGE = auto()
+    QUICK_STOP = auto()
+    SHUTDOWN = auto()
+    SWITCH_ON = auto()  #: from operation enabled the same bits are "disable operation"
+    ENABLE_OPERATION = auto()
+    NONE = auto()
 
 
-@dataclass(frozen=True, slots=True)
-class Machine:
+class Machine(NamedTuple):
     """Where a drive stands. The last controlword is kept because fault reset is an edge."""
 
     state: State = State.SWITCH_ON_DISABLED

@@ -4,8 +4,8 @@ All times are world time in seconds. Bytes, object numbers and NMT belong to the
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from math import inf, isfinite
+from typing import NamedTuple
 
 from sim_plant.devices import cia402
 from sim_plant.devices.cia402 import Machine, State
@@ -17,8 +17,7 @@ WATCHDOG_ERROR = 0x8250  #: RPDO deadline missed
 QUICK_STOP_TIME_S = 0.1  #: the quick stop ramp takes this long from rated torque to zero
 
 
-@dataclass(frozen=True, slots=True)
-class DriveSample:
+class DriveSample(NamedTuple):
     """What the drive tells at a SYNC."""
 
     statusword: int
@@ -26,8 +25,7 @@ class DriveSample:
     torque_nm: float
 
 
-@dataclass(frozen=True, slots=True)
-class _Command:
+class _Command(NamedTuple):
     controlword: int
     target_torque_nm: float
     mode: int
@@ -119,12 +117,16 @@ class Drive:
 
     def sync(self, now_s: float) -> DriveSample:
         """Let what is staged act from now on, then sample."""
+        self.act(now_s)
+        return self.sample(now_s)
+
+    def act(self, now_s: float) -> None:
+        """Let what is staged act from now on."""
         self._world.advance(now_s)
         command, self._staged = self._staged, None
         if command is not None:
             self._latch(command, now_s)
         self._recorder.synced(self.index, self._world.torque_command_nm(self.index), now_s)
-        return self.sample(now_s)
 
     def sample(self, now_s: float) -> DriveSample:
         """What the drive shows now. To the recorder it is not there: only a command is."""

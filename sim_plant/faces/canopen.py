@@ -146,11 +146,10 @@ class CanopenFace:
 
     def send(self, can_id: int, data: bytes) -> None:
         """One frame to the bus, at once or over the wire."""
-        message = can.Message(arbitration_id=can_id, is_extended_id=False, data=data)
         if self.wire is None:
-            self._put(message)
+            self._put((can_id, bytes(data)))
             return
-        message.is_rx = False
+        message = can.Message(arbitration_id=can_id, is_extended_id=False, data=data, is_rx=False)
         if self._carried_s is not None:
             self.wire.request(message, self._carried_s)
         else:
@@ -174,7 +173,7 @@ class CanopenFace:
             return
         for message, carried_s in self.wire.through(self.clock()):
             if not message.is_rx:
-                self._put(message)
+                self._put((message.arbitration_id, bytes(message.data)))
                 continue
             self._carried_s = carried_s
             self._act(message, carried_s)
@@ -190,20 +189,16 @@ class CanopenFace:
         if self._wake_in is not None and next_s < inf:
             self._timer = self._wake_in(max(0.0, next_s - self.clock()))
 
-    def _put(self, message: can.Message) -> None:
+    def _put(self, frame: CanFrame) -> None:
         if self.faults is None:
-            self._send(message)
-            return
-        frame = message.arbitration_id, bytes(message.data)
-        self.faults.carry(Direction.FROM_DEVICE, node_of(*frame), frame, self._send_frame, self._later)
+            self._send(frame, 0.0)
+        else:
+            self.faults.carry(Direction.FROM_DEVICE, node_of(*frame), frame, self._send, self._later)
 
-    def _send_frame(self, frame: CanFrame, delay_s: float) -> None:
-        self._send(can.Message(arbitration_id=frame[0], is_extended_id=False, data=frame[1]))
-
-    def _send(self, message: can.Message) -> None:
+    def _send(self, frame: CanFrame, delay_s: float) -> None:
         """An error is kept and counted: a node cannot do more about its bus either."""
         try:
-            self.bus.send(message)
+            self.bus.send(can.Message(arbitration_id=frame[0], is_extended_id=False, data=frame[1]))
         except can.CanError as error:
             if self.send_error is None:
                 log.warning("CAN: cannot send: %s", error)

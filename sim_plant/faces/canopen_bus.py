@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import can
 
+from sim_plant.faces.canopen_multicast import MulticastBus
+
 
 class FaceUnavailable(Exception):
     """A wire of the simulated line cannot be opened. The text says why and what to do."""
@@ -36,7 +38,7 @@ def open_bus(interface: str, channel: str, port: int) -> OpenBus:
             raise FaceUnavailable(f"the CAN bus {interface}:{channel} cannot be opened: {error}") from error
     guard = _guard(channel, port)
     try:
-        return OpenBus(can.Bus(channel, interface, port=port, hop_limit=0, fd=False, ignore_config=True), guard)
+        return OpenBus(MulticastBus(channel, port), guard)
     except (can.CanError, OSError, ValueError, ImportError) as error:
         guard.close()
         raise FaceUnavailable(explain(channel, port, error)) from error

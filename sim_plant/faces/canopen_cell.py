@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Collection, Mapping
 from functools import cache, partial
-from math import isfinite
+from math import isfinite, nan
 
 from canopen.objectdictionary import ObjectDictionary
 
@@ -79,6 +79,7 @@ class CellDevice:
         self._digits = digits
         self._channels = min(CHANNELS, amplifier.channels - first_span + 1)
         self._now_s = 0.0
+        self._measured_n: dict[int, float] = {}  #: by span, at that time
         self._told_unhealthy = False
         channels = range(1, CHANNELS + 1)
         self.values: Mapping[Key, str] = {
@@ -126,6 +127,7 @@ class CellDevice:
 
     def poll(self, now_s: float) -> None:
         self._now_s = now_s
+        self._measured_n.clear()
         unhealthy = not self._amplifier.healthy
         if unhealthy != self._told_unhealthy:
             self._told_unhealthy = unhealthy
@@ -136,8 +138,11 @@ class CellDevice:
         if channel > self._channels:
             return 0.0
         span = self._first_span + channel - 1
-        connected = span in self._cells and self._amplifier.status(span) is not ChannelStatus.WIRE_BREAK
-        return self._amplifier.tension_n(span, self._now_s) if connected else float("nan")
+        if span not in self._cells or self._amplifier.status(span) is ChannelStatus.WIRE_BREAK:
+            return nan
+        if span not in self._measured_n:  # status and counts of a channel are of one measurement
+            self._measured_n[span] = self._amplifier.tension_n(span, self._now_s)
+        return self._measured_n[span]
 
     def _status(self, channel: int) -> int:
         if channel > self._channels or not self._amplifier.healthy:

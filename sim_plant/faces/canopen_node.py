@@ -186,9 +186,10 @@ class Node:
             return
         self._now_s = now_s
         self.device.sync(now_s)
+        readers = self.objects.readers
         for tpdo in self.tpdos:
             if tpdo.valid:
-                values = [self.objects.value(key) for key in tpdo.fields]
+                values = [readers[key]() for key in tpdo.fields]
                 self.network.send_message(tpdo.can_id, tpdo.layout.pack(*values))
 
     def on_sdo(self, data: bytes | bytearray, now_s: float) -> bool:

@@ -56,10 +56,6 @@ class Objects:
         assert variable.default is not None, f"the dictionary gives {index:04X}h sub {subindex} no default"
         return variable.default + self.node_id * variable.relative
 
-    def value(self, key: Key) -> float:
-        """The number that a PDO carries: as an SDO reads it."""
-        return self.readers[key]()
-
     def forget(self) -> None:
         """Back to the defaults."""
         self._stored.clear()

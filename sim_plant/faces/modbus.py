@@ -5,6 +5,7 @@ import logging
 from collections.abc import Callable, Mapping
 from typing import cast
 
+from sim_plant.faces.kernel_stamp import ArrivalStamps, Stamp
 from sim_plant.faces.modbus_codec import (
     TARGET_SILENT,
     Frame,
@@ -15,7 +16,6 @@ from sim_plant.faces.modbus_codec import (
     exception_answer,
     take_frames,
 )
-from sim_plant.faces.tcp_stamp import ArrivalStamps, Stamp
 from sim_plant.faults.frames import Direction
 from sim_plant.faults.wire_faults import WireFaults
 

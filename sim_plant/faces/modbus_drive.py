@@ -1,7 +1,7 @@
 """The drive of one roller on Modbus, as docs/devices/r2r-drive-modbus.md describes it."""
 
 import struct
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from sim_plant.devices.cia402 import CYCLIC_SYNCHRONOUS_TORQUE, State
 from sim_plant.devices.drive import Drive
@@ -26,8 +26,7 @@ _HEAD = struct.Struct(">HHihHH6x")
 _SETTINGS = struct.Struct(">HH16xIHH")
 
 
-@dataclass(frozen=True, slots=True)
-class AxisReading:
+class AxisReading(NamedTuple):
     """What a drive shows, as numbers of the wire."""
 
     statusword: int
@@ -53,7 +52,7 @@ class ModbusAxis:
         per_mille = torque_word - (torque_word >> 15 << 16)
         target_torque_nm = per_mille * 1e-3 * drive.rated_torque_nm
         drive.receive(controlword, target_torque_nm, CYCLIC_SYNCHRONOUS_TORQUE, now_s)
-        drive.sync(now_s)
+        drive.act(now_s)
         if before is State.FAULT and drive.state is not State.FAULT:
             # A fault reset ends the supervision until the next command; so does an interruption of operation, and
             # there is no torque then that it could take off.

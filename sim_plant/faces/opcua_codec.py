@@ -8,6 +8,7 @@ Layouts: OPC UA part 6, 5.2 (binary encoding); part 4, 5.11.2 (Read), 5.11.4 (Wr
 import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from sim_plant.faces.opcua_nodes import Device, Kind, Scalar, Status, Variable
 
@@ -39,6 +40,21 @@ _VALUES = {
 _TIME = struct.Struct("<q")
 
 
+# Of a request, behind the session's token: time, handle, diagnostics, audit entry; then timeout, additional header.
+_REQUEST_HEAD = struct.Struct("<qIIi")
+_REQUEST_TAIL = struct.Struct("<I3s")
+_NO_HEADER = bytes(3)
+_NODE_SIZES = {0: 2, 1: 4, 2: 7, 4: 19}  #: by encoding of a node id: two bytes, four bytes, numeric, GUID
+_COUNTED_NODES = (3, 5)  #: strings, byte strings
+
+
+class Header(NamedTuple):
+    """Of a request: its handle, and where its parameters begin."""
+
+    handle: int
+    end: int
+
+
 @dataclass(frozen=True, slots=True)
 class ReadPlan:
     """What one Read asks for. Clients ask for the same again and again, so it is worth keeping."""
@@ -48,13 +64,29 @@ class ReadPlan:
     stamps: int  #: mask of the time stamps that are wanted
 
 
-@dataclass(frozen=True, slots=True)
-class WrittenValue:
+class WrittenValue(NamedTuple):
     """A value as it came: `kind` is the number of its data type."""
 
     variable: Variable
     kind: int
     value: Scalar
+
+
+def parse_header(message: bytes, at: int) -> Header | None:
+    """The header of a request, behind the type of the service. None unless it is a plain one."""
+    try:
+        size = _NODE_SIZES.get(message[at])
+        if message[at] in _COUNTED_NODES:
+            size = _STRING_NODE.size + _STRING_NODE.unpack_from(message, at)[2]
+        if size is None or size < 0:
+            return None
+        at += size
+        _, handle, _, audit = _REQUEST_HEAD.unpack_from(message, at)
+        at += _REQUEST_HEAD.size + max(audit, 0)
+        _, additional = _REQUEST_TAIL.unpack_from(message, at)
+    except (struct.error, IndexError):
+        return None
+    return Header(handle, at + _REQUEST_TAIL.size) if additional == _NO_HEADER else None
 
 
 def plan_read(body: bytes, variables: Mapping[str, Variable], namespace: int) -> ReadPlan | None:

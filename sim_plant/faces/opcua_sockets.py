@@ -5,6 +5,7 @@ came on, and no other.
 """
 
 import asyncio
+import struct
 import time
 from typing import Any, Protocol, cast
 
@@ -17,6 +18,8 @@ from asyncua.server.uaprocessor import UaProcessor
 from asyncua.ua.ua_binary import uatcp_to_binary
 from asyncua.ua.uaerrors import UaStatusCodeError
 
+from sim_plant.faces.opcua_codec import parse_header
+
 MAX_CHUNK = 65_535  #: bytes
 MAX_CHUNKS = 4
 MAX_MESSAGE = 262_144  #: bytes
@@ -25,6 +28,8 @@ ua: Any = asyncua_ua  #: what it declares of its values and what they are differ
 
 _READ = ua.ObjectIds.ReadRequest_Encoding_DefaultBinary
 _WRITE = ua.ObjectIds.WriteRequest_Encoding_DefaultBinary
+#: Of a whole message without security: kind, size, channel, token, sequence number, request id, type of the service.
+_MESSAGE = struct.Struct("<4s5IBBH")
 _SERVICES = frozenset(
     getattr(ua.ObjectIds, f"{name}Request_Encoding_DefaultBinary")
     for name in (
@@ -82,6 +87,7 @@ class _Connection(OPCUAProtocol):
     """One client. Refuses a message that says it is too large before it has come."""
 
     shortcut: Shortcut
+    _busy = False  #: the stack is at a message
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         super().connection_made(transport)
@@ -93,6 +99,12 @@ class _Connection(OPCUAProtocol):
         transport = self.transport
         if transport is None or transport.is_closing():
             return
+        if isinstance(self.processor, _Processor) and not (self._buffer or self._busy or self.messages.qsize()):
+            try:
+                data = self.processor.answer_at_once(data)
+            except Exception:  # the line has failed: the event loop has been told, and will end it
+                self._refuse()
+                return
         super().data_received(data)
         announced = int.from_bytes(self._buffer[4:8], "little")  # of the message whose end has not come yet
         if transport.is_closing():
@@ -112,11 +124,14 @@ class _Connection(OPCUAProtocol):
             self.transport.resume_reading()
 
     async def _process_one_msg(self, header: Any, buf: Buffer) -> bool:
+        self._busy = True
         try:
             alive = await super()._process_one_msg(header, buf)
         except Exception:
             self._refuse()  # a broken chunk or header: nothing that follows can be understood
             raise
+        finally:
+            self._busy = False
         if not alive and header.MessageType != ua.MessageType.SecureClose:
             self._refuse()
         return alive
@@ -128,7 +143,7 @@ class _Connection(OPCUAProtocol):
 
 
 class _Processor(UaProcessor):
-    """Offers a closed list of services, and lets the shortcut answer what it can."""
+    """Lets the shortcut answer what it can, and offers a closed list of services for the rest."""
 
     def __init__(
         self, server: InternalServer, shortcut: Shortcut, transport: asyncio.Transport, limits: TransportLimits
@@ -136,13 +151,53 @@ class _Processor(UaProcessor):
         super().__init__(server, transport, limits)
         self._shortcut = shortcut
 
+    def answer_at_once(self, data: bytes) -> bytes:
+        """Answer what the shortcut can of the messages that begin `data`; the rest is for the stack."""
+        answers: list[bytes] = []
+        at = 0
+        while end := self._answer(data, at, answers):
+            at = end
+        if answers:
+            self._transport.write(b"".join(answers))
+        return data[at:]
+
+    def _answer(self, data: bytes, at: int, answers: list[bytes]) -> int:
+        """Where the message at `at` ends, if it has been answered; otherwise 0, and nothing has happened."""
+        session = self.session
+        if len(data) - at < _MESSAGE.size or session is None or not session.is_activated():
+            return 0
+        kind, size, channel, token, sequence, request, encoding, namespace, service = _MESSAGE.unpack_from(data, at)
+        if (kind, encoding, namespace) != (b"MSGF", 1, 0) or service not in (_READ, _WRITE):
+            return 0
+        if not self._is_next(channel, token, sequence):
+            return 0
+        end = at + size
+        header = parse_header(data, at + _MESSAGE.size) if size <= MAX_CHUNK and end <= len(data) else None
+        if header is None or header.end > end:
+            return 0
+        answer = self._shortcut.answer_read if service == _READ else self._shortcut.answer_write
+        response = answer(data[header.end : end], header.handle)
+        if response is None:
+            return 0
+        self._connection._peer_sequence_number = sequence  # noqa: SLF001
+        self._shortcut.requests += 1
+        session.touch()
+        self.session_last_activity = time.monotonic()
+        answers.append(self._connection.message_to_binary(response, request_id=request))
+        return end
+
+    def _is_next(self, channel: int, token: int, sequence: int) -> bool:
+        """Whether a message is the next one on this channel. What is not, is for the stack to judge."""
+        ours = self._connection
+        known, last = ours.security_token, ours._peer_sequence_number  # noqa: SLF001
+        in_order = last is not None and sequence == last + 1 and not ours._incoming_parts  # noqa: SLF001
+        return in_order and (channel, token) == (known.ChannelId, known.TokenId)
+
     async def _process_message(self, typeid: Any, requesthdr: Any, seqhdr: Any, body: Buffer) -> bool:
         self._shortcut.requests += 1
         service = typeid.Identifier
         if typeid.NamespaceIndex or service not in _SERVICES or not self._connection.is_open():
             raise ServiceError(ua.StatusCodes.BadServiceUnsupported)
-        if service in (_READ, _WRITE) and self._answered(service, requesthdr, seqhdr, body):
-            return True
         if service == ua.ObjectIds.CreateSessionRequest_Encoding_DefaultBinary:
             await self._end_session()
         try:
@@ -152,19 +207,6 @@ class _Processor(UaProcessor):
         except Exception as error:
             self._shortcut.malformed += 1
             raise ServiceError(ua.StatusCodes.BadDecodingError) from error
-
-    def _answered(self, service: int, requesthdr: Any, seqhdr: Any, body: Buffer) -> bool:
-        session = self.session
-        if session is None or not session.is_activated():
-            return False
-        answer = self._shortcut.answer_read if service == _READ else self._shortcut.answer_write
-        response = answer(body.copy().read(len(body)), requesthdr.RequestHandle)
-        if response is None:
-            return False
-        session.touch()
-        self.session_last_activity = time.monotonic()
-        self._transport.write(self._connection.message_to_binary(response, request_id=seqhdr.RequestId))
-        return True
 
     def _should_close_session_on_transport_loss(self) -> bool:
         """Always: the sessions of clients that died would keep others out until they time out."""

@@ -14,7 +14,10 @@ from sim_plant.faults.targets import FaultyLine
 class Timer(Protocol):
     """As `world.Timer`: the action it was made with is called at `due_s`."""
 
-    due_s: float
+    @property
+    def due_s(self) -> float: ...
+    @due_s.setter
+    def due_s(self, value: float) -> None: ...
 
 
 class Note(Protocol):

@@ -75,7 +75,12 @@ class WireFaults(Generic[F]):
         arrived_s: float | None = None,
     ) -> None:
         """`pass_`, and `deliver` (frame, delay in s) what goes on: at once, or by `later` (delay in s, call)."""
-        for delay_s, after in self.pass_(direction, address, frame, arrived_s):
+        if direction is Direction.TO_DEVICE:
+            self.before_request(arrived_s)
+        if not (self._active or self._left):  # as nearly always
+            deliver(frame, 0.0)
+            return
+        for delay_s, after in self._passing(direction, address, frame):
             if delay_s > 0.0:
                 later(delay_s, partial(deliver, after, delay_s))
             else:
@@ -88,8 +93,11 @@ class WireFaults(Generic[F]):
         """
         if direction is Direction.TO_DEVICE:
             self.before_request(arrived_s)
+        return self._passing(direction, address, frame)
+
+    def _passing(self, direction: Direction, address: int, frame: F) -> Passed[F]:
         way = (direction, address)
-        waiting = self._left.pop(way, []) if self._left else []
+        waiting = self._left.pop(way, [])
         passing: Passed[F] = [(0.0, held) for held in waiting]
         passing.append((0.0, frame))
         for active in self._active.values():

@@ -14,11 +14,11 @@ from pymodbus.client import AsyncModbusTcpClient
 from sim_plant.devices.amplifier import Amplifier, ChannelStatus
 from sim_plant.devices.drive import Drive
 from sim_plant.devices.line_plc import LinePlc
+from sim_plant.faces.kernel_stamp import Stamp
 from sim_plant.faces.modbus import ModbusFace
 from sim_plant.faces.modbus_drive import DriveRegisters, ModbusAxis
 from sim_plant.faces.modbus_rack import RackRegisters
 from sim_plant.faces.modbus_units import AmplifierRegisters, PlcRegisters
-from sim_plant.faces.tcp_stamp import Stamp
 from sim_plant.plant import load_plant
 from sim_plant.recorder import Recorder
 from sim_plant.world import World

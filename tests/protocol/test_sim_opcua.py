@@ -218,6 +218,81 @@ def test_the_bytes_and_the_stack_say_the_same() -> None:
     on_bench(test)
 
 
+class Held:
+    """What a client sends, kept back until `send`."""
+
+    def __init__(self, peer: Peer) -> None:
+        self._protocol: Any = peer.client.uaclient.protocol
+        self._write = self._protocol.transport.write
+        self._protocol.transport.write = self._keep
+        self._new = asyncio.Semaphore(0)
+        self.kept = b""
+
+    def _keep(self, message: bytes) -> None:
+        self.kept += message
+        self._new.release()
+
+    async def one_more(self) -> None:
+        await self._new.acquire()
+
+    def send(self, times: int = 1) -> None:
+        """All in one piece; what comes later goes at once."""
+        self._protocol.transport.write = self._write
+        self._write(times * self.kept)
+
+
+def test_requests_in_one_piece_are_answered_in_their_order() -> None:
+    """Also where asyncua has to answer one that stands between two that need it not."""
+
+    async def test(bench: Bench) -> None:
+        async with bench.peer() as peer:
+            held = Held(peer)
+            answered: list[str] = []
+            life, clock = peer.node("Axis1.Life"), ua.NodeId(ua.ObjectIds.Server_ServerStatus_State)
+
+            async def ask(name: str, request: Awaitable[Any]) -> Any:
+                answer = await request
+                answered.append(name)
+                return answer
+
+            async def read(*nodes: ua.NodeId) -> list[Any]:
+                data = await peer.client.uaclient.read_attributes(list(nodes), ua.AttributeIds.Value)
+                return [value.Value.Value for value in data]
+
+            async with asyncio.TaskGroup() as group:
+                tasks: list[asyncio.Task[Any]] = []
+                for name, request in (
+                    ("write", peer.write({"Axis1.Life": 5})),
+                    ("read", read(life)),
+                    ("stack", read(clock, life)),
+                    ("write again", peer.write({"Axis1.Life": 6})),
+                    ("read again", read(life)),
+                ):
+                    tasks.append(group.create_task(ask(name, request)))
+                    await held.one_more()
+                held.send()
+            assert [task.result() for task in tasks] == [[0], [5], [ua.ServerState.Running, 5], [0], [6]]
+            assert answered == ["write", "read", "stack", "write again", "read again"]
+
+    on_bench(test)
+
+
+def test_a_request_that_comes_twice_ends_the_connection_and_acts_once() -> None:
+    async def test(bench: Bench) -> None:
+        async with bench.peer() as peer:
+            held = Held(peer)
+            writing = asyncio.create_task(peer.write({"Axis1.Life": 5}))
+            await held.one_more()
+            requests = bench.face.requests
+            held.send(times=2)
+            await asyncio.gather(writing, return_exceptions=True)
+        assert (bench.face.requests, bench.face.malformed) == (requests + 1, 1)
+        async with bench.peer() as peer:
+            assert await peer.read("Axis1.Life") == 5
+
+    on_bench(test)
+
+
 def test_one_read_is_one_instant() -> None:
     async def test(bench: Bench) -> None:
         asked = 0
@@ -616,7 +691,7 @@ def test_a_device_that_fails_is_not_hidden() -> None:
 
         async with bench.peer() as peer:
             bench.face.clock = broken
-            with pytest.raises(ua.UaError):
+            with pytest.raises(ConnectionError):
                 await peer.read("Axis1.Torque")
             bench.face.clock = lambda: bench.now_s
         assert [type(context["exception"]) for context in told] == [ArithmeticError]

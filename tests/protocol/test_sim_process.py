@@ -25,7 +25,7 @@ from pymodbus.client import ModbusTcpClient
 from sim_plant.faces.canopen import CanopenFace
 from sim_plant.faces.canopen_bus import FaceUnavailable, open_bus
 from sim_plant.faces.canopen_sdo import EDS_PATH
-from sim_plant.faces.tcp_stamp import Stamp
+from sim_plant.faces.kernel_stamp import Stamp
 from sim_plant.faults.control import SOCKET_FILE, ask
 from sim_plant.plant import PlantRefused, load_plant, plant_of
 from sim_plant.process import main, run_plant
@@ -465,7 +465,7 @@ def test_without_a_multicast_route_it_says_how_to_add_one(monkeypatch: pytest.Mo
         except OSError as error:
             raise can.CanInitializationError("could not create or configure socket") from error
 
-    monkeypatch.setattr(canopen_bus.can, "Bus", no_route)
+    monkeypatch.setattr(canopen_bus, "MulticastBus", no_route)
     port = free_port()
     for _ in range(2):  # nothing is held after a failure
         with pytest.raises(canopen_bus.FaceUnavailable, match=re.escape("ip route add 239.0.0.0/8 dev lo")):

@@ -5,7 +5,7 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -213,6 +213,66 @@ def test_in_memory_it_notes_commands_and_what_acted() -> None:
     assert not recording.torque_nm[:10, 1].any() and (recording.torque_nm[10:, 1] == 3.0).all()
     assert np.array_equal(recording.tension_n[-1], world.tension_n)
     assert np.array_equal(recording.speed_m_per_s[-1], world.speed_m_per_s)
+
+
+def tell(recorder: Recorder, world: World, told: np.random.Generator, step: int) -> None:
+    """One thing of a random story, much of it unsafe."""
+    drive, torque_nm, now_s = int(told.integers(N)), float(told.choice([0.0, 5.0, 70.0])), step * 1e-3
+    kind = told.integers(6)
+    if kind == 0:
+        recorder.command(drive, 0x0F, torque_nm, 10, now_s)
+    elif kind == 1:
+        recorder.synced(drive, torque_nm, now_s)
+    elif kind == 2:
+        recorder.note(str(told.choice(["plc_command", "sto"])), now_s, active=True)
+    elif kind == 3:
+        states = [("OPERATION_ENABLED", "command"), ("FAULT", "fault"), ("QUICK_STOP_ACTIVE", "command")]
+        recorder.drive_state(drive, *states[told.choice(3, p=[0.8, 0.1, 0.1])], now_s)
+    else:
+        rows = np.zeros((int(told.integers(1, 300)), 3 * N + 1))
+        rows[:, :N] = told.choice([1.0, 30.0], p=[0.2, 0.8])
+        rows[:, 2 * N : 3 * N] = torque_nm
+        assert world.on_rows is not None
+        world.on_rows(step, rows)
+        rows[:] = np.nan  # the world writes over them
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_what_waits_is_recorded_as_what_does_not(seed: int) -> None:
+    told, order = np.random.default_rng(seed), np.random.default_rng(seed + 1000)
+    worlds = [World(PLANT, seed=1) for _ in range(2)]
+    at_once, waiting = (Recorder(world) for world in worlds)
+    later: list[Callable[[], None]] = []
+    waiting.defer(later.append)
+    step = 1
+    for _ in range(200):
+        state = told.bit_generator.state
+        tell(at_once, worlds[0], told, step)
+        told.bit_generator.state = state
+        tell(waiting, worlds[1], told, step)
+        step += 300
+        while later and order.random() < 0.3:
+            later.pop()()
+    assert waiting.counts == at_once.counts and at_once.unsafe_total > 0
+    recordings = at_once.recording(), waiting.recording()
+    assert recordings[1].events == recordings[0].events
+    for name in ("time_s", "tension_n", "torque_nm"):
+        assert np.array_equal(getattr(recordings[1], name), getattr(recordings[0], name)), name
+
+
+def test_only_what_comes_every_cycle_waits(tmp_path: Path) -> None:
+    world = World(PLANT, seed=1)
+    recorder = Recorder.to_folder(tmp_path, world, monotonic_start_s=0.0)
+    recorder.defer(lambda settle: None)  # never
+    recorder.command(0, 0x0F, 1.0, 10, 0.0)
+    recorder.synced(0, 1.0, 0.0)
+    world.advance(0.010)
+    assert [event["kind"] for event in read_recording(tmp_path).events] == ["recording"]
+    recorder.drive_state(0, "FAULT", "watchdog", 0.010)
+    found = read_recording(tmp_path)
+    assert [event["kind"] for event in found.events] == ["recording", "command", "torque", "drive_state"]
+    assert len(found.time_s) == 10
+    recorder.close()
 
 
 @pytest.fixture

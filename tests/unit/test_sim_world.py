@@ -46,7 +46,7 @@ def test_at_equilibrium_it_stays_there() -> None:
 @example(calls=[1.023, 1.024, 1.025, 2.047, 2.048], seed=1)  # around the ends of the blocks of noise
 @given(calls=st.lists(st.floats(0.0, 3.0), max_size=60), seed=st.integers(0, 2**32))
 def test_the_pattern_of_calls_changes_nothing(calls: list[float], seed: int) -> None:
-    """Whole or in pieces, forwards and (ignored) backwards, across the blocks in which noise is drawn."""
+    """Whole or in pieces, forwards and (ignored) backwards, across the blocks in which noise is drawn, ahead or not."""
     changes = {0.5: 10.0, 1.7: -3.0}  # torque of roller 2, at these times
     worlds = World(PLANT, seed), World(PLANT, seed)
     for world, stops in zip(worlds, ([], calls), strict=True):
@@ -56,6 +56,7 @@ def test_the_pattern_of_calls_changes_nothing(calls: list[float], seed: int) -> 
             for stop in stops:
                 if stop <= time_s and (stop >= begin or world.now_s >= begin):
                     world.advance(stop)
+                    world.draw_ahead()
             world.advance(time_s)
             world.set_torque_nm(1, torque_nm)
             begin = time_s
@@ -158,6 +159,25 @@ def test_timers_act_at_their_own_time_and_in_order() -> None:
     world.advance(1.0)
     assert acted == [("early", 0.010, 10), ("late", 0.0204, 20)]
     assert world.steps == 1000
+
+
+def test_a_timer_that_is_set_within_a_millisecond_acts_in_it() -> None:
+    world = World(PLANT, seed=1)
+    acted: list[float] = []
+    timers = [world.timer(acted.append) for _ in range(2)]
+    timers[0].due_s = 0.0109
+    world.advance(0.0102)
+    timers[1].due_s = 0.0105
+    world.advance(0.0104)
+    assert acted == []
+    world.advance(0.0106)
+    assert acted == [0.0105]
+    timers[1].due_s = 0.001  # has passed: at once
+    world.advance(0.0106)
+    assert acted == [0.0105, 0.001]
+    timers[0].due_s = 0.0108  # sooner
+    world.advance(0.0108)
+    assert acted == [0.0105, 0.001, 0.0108] and world.steps == 10
 
 
 def test_sixty_spans() -> None:

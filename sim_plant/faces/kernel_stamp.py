@@ -1,7 +1,7 @@
-"""When the kernel took what came in on a TCP connection: a process that is late to read it does not change that.
+"""When the kernel took what came in on a socket: a process that is late to read it does not change that.
 
-What lies there together has one stamp: the kernel joins what comes before it is read. A client that waits for its
-answer before it asks again is not concerned.
+What lies on a TCP connection together has one stamp: the kernel joins what comes before it is read. A client that
+waits for its answer before it asks again is not concerned.
 """
 
 import socket
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 _TIMESTAMP_NS = 35  #: SO_TIMESTAMPNS and its SCM_TIMESTAMPNS on Linux; `socket` does not name them
 _TIMESPEC = struct.Struct("@ll")
-_SPACE = socket.CMSG_SPACE(_TIMESPEC.size)
+STAMP_SPACE = socket.CMSG_SPACE(_TIMESPEC.size)  #: bytes of ancillary data that hold a stamp
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,6 +19,15 @@ class Stamp:
     """When something came in."""
 
     timestamp: float  #: wall clock, s; named as that of a CAN frame
+
+
+def stamp_of(ancillary: list[tuple[int, int, bytes]]) -> Stamp | None:
+    """The stamp in what `recvmsg` gives beside the data, where the socket has been told to stamp (SO_TIMESTAMPNS)."""
+    for level, kind, data in ancillary:
+        if (level, kind) == (socket.SOL_SOCKET, _TIMESTAMP_NS):
+            seconds, nanoseconds = _TIMESPEC.unpack(data[: _TIMESPEC.size])
+            return Stamp(seconds + nanoseconds * 1e-9)
+    return None
 
 
 class ArrivalStamps:
@@ -32,14 +41,10 @@ class ArrivalStamps:
     def next(self) -> Stamp | None:
         """When the byte that will be read next came in; None when the kernel has no stamp of it."""
         try:
-            _, stamps, _, _ = self._socket.recvmsg(1, _SPACE, socket.MSG_PEEK)
+            _, stamps, _, _ = self._socket.recvmsg(1, STAMP_SPACE, socket.MSG_PEEK)
         except OSError:  # nothing there, or the connection is broken: whoever reads it will be told
             return None
-        for level, kind, data in stamps:
-            if (level, kind) == (socket.SOL_SOCKET, _TIMESTAMP_NS):
-                seconds, nanoseconds = _TIMESPEC.unpack(data[: _TIMESPEC.size])
-                return Stamp(seconds + nanoseconds * 1e-9)
-        return None
+        return stamp_of(stamps)
 
     def close(self) -> None:
         self._socket.close()
