@@ -17,7 +17,7 @@ import numpy as np
 
 from gateway.core.line import Line
 from gateway.core.signals import FloatArray
-from gateway.core.web_model import WebModel, nominal_model
+from gateway.core.web_model import WebModel, equilibrium_torque, nominal_model
 
 BLOCK_S = 1.0  #: averages are taken over blocks of this length
 WINDOW_BLOCKS = 10  #: of the moving average, and of the reference
@@ -44,7 +44,8 @@ def drift_limits(line: Line) -> DriftLimits:
 class DriftState:
     settling: int = 0  #: periods until blocks count
     in_block: int = 0  #: periods summed so far
-    sum_nm: FloatArray = field(default_factory=lambda: np.zeros(0))  #: of rho (n,) over the block
+    #: (3, n), over the block: torques, speeds and tensions
+    sums: FloatArray = field(default_factory=lambda: np.zeros((3, 0)))
     blocks_nm: list[FloatArray] = field(default_factory=list[FloatArray])  #: the last averages, the newest at the end
     reference_nm: FloatArray | None = None  #: (n,)
     drift_n: FloatArray = field(default_factory=lambda: np.zeros(0))  #: (n,), of each cell, as far as it is told
@@ -56,7 +57,7 @@ def restart(limits: DriftLimits, state: DriftState) -> None:
     state.in_block = 0
     state.blocks_nm = []
     state.reference_nm = None
-    state.sum_nm = np.zeros(limits.model.n)
+    state.sums = np.zeros((3, limits.model.n))
 
 
 def watch_balance(
@@ -66,16 +67,19 @@ def watch_balance(
     if state.settling > 0:
         state.settling -= 1
         return
-    model = limits.model
-    downstream = np.append(tension_n[1:], model.tension_after_n)
-    friction = model.friction_nms_per_rad / model.radius_m * speed_m_per_s
-    state.sum_nm += torque_nm - friction + model.radius_m * (downstream - tension_n)
+    state.sums += (torque_nm, speed_m_per_s, tension_n)
     state.in_block += 1
     if state.in_block >= limits.block_periods:
-        state.blocks_nm.append(state.sum_nm / state.in_block)
+        # rho is linear: its average is that of the averages.
+        state.blocks_nm.append(balance_nm(limits.model, *(state.sums / state.in_block)))
         state.in_block = 0
-        state.sum_nm = np.zeros(model.n)
+        state.sums.fill(0.0)
         _judge(limits, state)
+
+
+def balance_nm(model: WebModel, torque_nm: FloatArray, speed_m_per_s: FloatArray, tension_n: FloatArray) -> FloatArray:
+    """rho (n,), from averages (n,)."""
+    return torque_nm - equilibrium_torque(model, tension_n, speed_m_per_s)
 
 
 def _judge(limits: DriftLimits, state: DriftState) -> None:

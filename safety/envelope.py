@@ -4,17 +4,20 @@ It trusts nobody: neither the sensors (quality, staleness, band, speed), nor the
 the law (finite, limits), nor the computer (overruns).
 """
 
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from math import inf, isfinite
 
 import numpy as np
 
-from gateway.core.signals import BoolArray, DriveState, FloatArray, Inputs, IntArray, Quality
+from gateway.core.signals import Channel, DriveState, FloatArray, Inputs, Quality
 from safety.actions import Action, Finding
 from safety.limits import EnvelopeLimits
 
 PARTING_M_PER_S = 0.001  #: by which the roller behind a break runs ahead; ten times a good encoder's noise
 PARTING = 0.03  #: the same as a fraction of the speed; an elastic web stretches by less
-_GOOD = int(Quality.GOOD)  # numpy compares with plain integers several times as fast as with members of an enum
+MOST_COUNTED = 100  #: periods outside a limit; counts of more say nothing new
+_GOOD = int(Quality.GOOD)  # plain integers compare several times as fast as members of an enum
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,9 +43,9 @@ class EnvelopeState:
     plc_missing: int = 0
     overruns: int = 0  #: in which at least one period was skipped
     stopped: int = 0  #: in which the PLC gave no transport
-    #: (n,), outside the tension band; and over the speed
-    outside: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int8))
-    fast: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int8))
+    #: (n,), outside the tension band; and over the speed. Empty: none is
+    outside: Sequence[int] = ()
+    fast: Sequence[int] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,8 +70,8 @@ def check_inputs(
         plc_missing=state.plc_missing + 1 if inputs.plc.quality != Quality.GOOD else 0,
         overruns=state.overruns,
         stopped=state.stopped + 1 if supervision.transport and not inputs.plc.running else 0,
-        outside=_count(state.outside, _outside_band(limits, inputs, supervision), inputs.tension.quality),
-        fast=_count(state.fast, _too_fast(limits, inputs, supervision), inputs.speed.quality),
+        outside=_count(state.outside, _outside_band(limits, inputs, supervision), inputs.tension),
+        fast=_count(state.fast, _too_fast(limits, inputs, supervision), inputs.speed),
     )
     plc_lost = after.plc_missing >= limits.hold_periods
     findings = _signal_findings(limits, after, missing) if supervision.feedback else []
@@ -86,6 +89,8 @@ def check_inputs(
 
 def check_timing(limits: EnvelopeLimits, state: EnvelopeState, skipped: int) -> tuple[list[Finding], EnvelopeState]:
     """Overruns: `skipped` periods went by before this one. Skipped, never caught up; too many stop the line."""
+    if not skipped and not state.overruns:
+        return [], state
     overruns = state.overruns + 1 if skipped else 0
     findings: list[Finding] = []
     if overruns >= limits.overruns_in_a_row or skipped > limits.skipped_periods:
@@ -102,7 +107,7 @@ def check_timing(limits: EnvelopeLimits, state: EnvelopeState, skipped: int) -> 
 
 def check_torque(asked_nm: FloatArray) -> list[Finding]:
     """Whether a law's answer may be used at all. Limits are not its concern: `limit_torque` applies them."""
-    if np.isfinite(asked_nm).all():
+    if all(map(isfinite, asked_nm.tolist())):
         return []
     rollers = ", ".join(str(i + 1) for i in np.flatnonzero(~np.isfinite(asked_nm)))
     return [Finding("finite torque", Action.TORQUE_OFF, f"the control law gave no finite torque for roller {rollers}")]
@@ -120,7 +125,8 @@ def limit_torque(limits: EnvelopeLimits, asked_nm: FloatArray, applied_nm: Float
 
 
 def _missing_signals(limits: EnvelopeLimits, inputs: Inputs) -> list[str]:
-    if inputs.speed.good() and inputs.unwind_speed.good() and not (inputs.tension.quality * limits.measured).any():
+    tensions_good = inputs.tension.good() or not (inputs.tension.quality * limits.measured).any()
+    if tensions_good and inputs.speed.good() and inputs.unwind_speed.good():
         return []
     tensions = [i + 1 for i in range(inputs.n) if limits.measured[i] and inputs.tension.quality[i]]
     speeds = [i + 1 for i in range(inputs.n) if inputs.speed.quality[i]]
@@ -168,30 +174,33 @@ def _plc_findings(limits: EnvelopeLimits, state: EnvelopeState, inputs: Inputs) 
 def _drive_findings(inputs: Inputs, supervision: Supervision) -> list[Finding]:
     if supervision.drives is None:
         return []
-    wrong = np.flatnonzero(inputs.drive_state != int(supervision.drives))
-    if not wrong.size:
+    wanted = int(supervision.drives)
+    wrong = [(i, state) for i, state in enumerate(inputs.drive_state.tolist()) if state != wanted]
+    if not wrong:
         return []
-    texts = [f"{i + 1} {DriveState(int(inputs.drive_state[i])).name}" for i in wrong]
+    texts = [f"{i + 1} {DriveState(state).name}" for i, state in wrong]
     text = f"drives that are not {supervision.drives.name}: {', '.join(texts)}: read their fault"
     return [Finding("drives", Action.STOP, text)]
 
 
-def _count(before: IntArray, now: BoolArray, quality: IntArray) -> IntArray:
+def _count(before: Sequence[int], now: list[bool], channel: Channel) -> Sequence[int]:
     """Periods in a row for which `now` (n,) holds. A sample that did not come says nothing: the count stays."""
-    if len(before) != len(now):
-        before = np.zeros(len(now), np.int8)
-    return np.where(quality == _GOOD, np.where(now, np.minimum(before + 1, 100), 0), before).astype(np.int8)
+    if not any(now) and not any(before):
+        return ()
+    return [
+        (min(count + 1, MOST_COUNTED) if holds else 0) if quality == _GOOD else count
+        for count, holds, quality in zip(before or [0] * len(now), now, channel.quality.tolist(), strict=True)
+    ]
 
 
-def _beyond(count: IntArray, limits: EnvelopeLimits) -> list[int]:
-    return [int(i) for i in np.flatnonzero(count >= limits.band_periods)]
+def _beyond(counts: Sequence[int], limits: EnvelopeLimits) -> list[int]:
+    return [i for i, count in enumerate(counts) if count >= limits.band_periods]
 
 
-def _outside_band(limits: EnvelopeLimits, inputs: Inputs, supervision: Supervision) -> BoolArray:
-    value = inputs.tension.value
-    with np.errstate(invalid="ignore"):  # a channel that was never heard is NaN, and of no GOOD quality
-        outside = value > limits.tension_max_n
-        return outside | (value < limits.tension_min_n) if supervision.tension_floor else outside
+def _outside_band(limits: EnvelopeLimits, inputs: Inputs, supervision: Supervision) -> list[bool]:
+    low, high = limits.tension_min_n if supervision.tension_floor else -inf, limits.tension_max_n
+    # A channel that was never heard is NaN, neither above nor below, and of no GOOD quality.
+    return [tension_n > high or tension_n < low for tension_n in inputs.tension.value.tolist()]
 
 
 def _out_of_band(limits: EnvelopeLimits, span: int, inputs: Inputs) -> Finding:
@@ -218,11 +227,11 @@ def _roller_limit(limits: EnvelopeLimits, supervision: Supervision) -> float:
     return factor * limits.speed_max_m_per_s
 
 
-def _too_fast(limits: EnvelopeLimits, inputs: Inputs, supervision: Supervision) -> BoolArray:
+def _too_fast(limits: EnvelopeLimits, inputs: Inputs, supervision: Supervision) -> list[bool]:
     if not supervision.feedback:
-        return np.zeros(inputs.n, dtype=np.bool_)
-    with np.errstate(invalid="ignore"):
-        return np.abs(inputs.speed.value) > _roller_limit(limits, supervision)
+        return [False] * inputs.n
+    limit = _roller_limit(limits, supervision)
+    return [abs(speed) > limit for speed in inputs.speed.value.tolist()]
 
 
 def _speed_findings(limits: EnvelopeLimits, state: EnvelopeState, inputs: Inputs) -> list[Finding]:
@@ -236,9 +245,8 @@ def _speed_findings(limits: EnvelopeLimits, state: EnvelopeState, inputs: Inputs
         )
         for i in _beyond(state.fast, limits)
     ]
-    unwind = inputs.unwind_speed
-    greatest = limits.unwinder_overspeed * limits.speed_max_m_per_s
-    if unwind.quality[0] == Quality.GOOD and abs(unwind.value[0]) > greatest:
-        text = f"the unwinder runs at {unwind.value[0]:.4f} m/s, allowed is {limits.speed_max_m_per_s:g} m/s"
+    speed, greatest = inputs.unwind_speed.value.item(0), limits.unwinder_overspeed * limits.speed_max_m_per_s
+    if abs(speed) > greatest and inputs.unwind_speed.good():
+        text = f"the unwinder runs at {speed:.4f} m/s, allowed is {limits.speed_max_m_per_s:g} m/s"
         findings.append(Finding("overspeed", Action.STOP, text))
     return findings

@@ -6,11 +6,10 @@ way. Only reversals teach that there is jitter: in a ramp a coarse speed changes
 """
 
 from dataclasses import dataclass, field
-
-import numpy as np
+from math import nan
 
 from gateway.core.line import Line
-from gateway.core.signals import CountArray, FloatArray, Inputs, Quality
+from gateway.core.signals import Inputs, Quality
 from safety.actions import Action, Finding
 
 REPEATS = 7  #: of one sample until a drive counts as frozen: by chance once in decades, at one in RARE
@@ -22,14 +21,37 @@ _GOOD = int(Quality.GOOD)
 
 
 @dataclass(slots=True)
-class FrozenState:
-    """Arrays (n,)."""
+class Encoder:
+    """What is known of the speed of one drive."""
 
-    speed_m_per_s: FloatArray = field(default_factory=lambda: np.zeros(0))  #: last sample
-    change_m_per_s: FloatArray = field(default_factory=lambda: np.zeros(0))  #: the last one that was not zero
-    reversals: CountArray = field(default_factory=lambda: np.zeros(0, np.int64))  #: changes against the one before
-    repeats: CountArray = field(default_factory=lambda: np.zeros(0, np.int64))  #: samples like it, of runs that ended
-    same: CountArray = field(default_factory=lambda: np.zeros(0, np.int64))  #: repeats in a row
+    speed_m_per_s: float = nan  #: last sample
+    change_m_per_s: float = 0.0  #: the last one that was not zero
+    reversals: int = 0  #: changes against the one before
+    repeats: int = 0  #: in runs that have ended: before, a run may be the fault
+    same: int = 0  #: repeats in a row
+
+    def sample(self, speed_m_per_s: float, turning: bool) -> None:
+        """One that has come. `turning`: it is fast enough to be judged, and learnt from."""
+        change = speed_m_per_s - self.speed_m_per_s
+        self.speed_m_per_s = speed_m_per_s
+        if change == 0.0 and turning:
+            self.same += 1
+            return
+        self.repeats += self.same
+        self.same = 0
+        if change != 0.0:
+            self.reversals += turning and change * self.change_m_per_s < 0.0
+            self.change_m_per_s = change
+        if self.reversals > REMEMBERED_REVERSALS:
+            self.reversals, self.repeats = self.reversals // 2, self.repeats // 2
+
+    def frozen(self) -> bool:
+        return self.same >= REPEATS and self.reversals >= LEARNT_REVERSALS and RARE * self.repeats <= self.reversals
+
+
+@dataclass(slots=True)
+class FrozenState:
+    encoders: list[Encoder] = field(default_factory=list[Encoder])  #: one per roller
 
 
 def turning_m_per_s(line: Line) -> float:
@@ -39,32 +61,21 @@ def turning_m_per_s(line: Line) -> float:
 
 def find_frozen(turning_from_m_per_s: float, state: FrozenState, inputs: Inputs) -> list[Finding]:
     """Drives whose samples stand still while their rollers turn. Brings `state` up to date."""
-    speed = inputs.speed
-    if len(state.same) != inputs.n:
-        state.speed_m_per_s = np.full(inputs.n, np.nan)
-        state.change_m_per_s = np.zeros(inputs.n)
-        state.reversals, state.repeats, state.same = (np.zeros(inputs.n, np.int64) for _ in range(3))
-    fresh = speed.quality == _GOOD
-    told = fresh & (np.abs(speed.value) > turning_from_m_per_s)
-    change = speed.value - state.speed_m_per_s  # NaN at first
-    repeated, changed = told & (change == 0.0), fresh & (change != 0.0)
-    state.reversals += told & (change * state.change_m_per_s < 0.0)
-    # A run of repeats teaches how usual they are when it has ended: before, it may be the fault.
-    state.repeats += np.where(changed, state.same, 0)
-    old = state.reversals > REMEMBERED_REVERSALS
-    state.reversals[old] //= 2
-    state.repeats[old] //= 2
-    state.same = np.where(repeated, state.same + 1, np.where(fresh, 0, state.same))
-    np.copyto(state.change_m_per_s, change, where=changed)
-    rare = (state.reversals >= LEARNT_REVERSALS) & (RARE * state.repeats <= state.reversals)
-    frozen = rare & (state.same >= REPEATS)
-    np.copyto(state.speed_m_per_s, speed.value, where=fresh)
-    return [_finding(inputs, state, int(i)) for i in np.flatnonzero(frozen)] if frozen.any() else []
+    if len(state.encoders) != inputs.n:
+        state.encoders = [Encoder() for _ in range(inputs.n)]
+    findings: list[Finding] = []
+    speeds, qualities = inputs.speed.value.tolist(), inputs.speed.quality.tolist()
+    for i, (encoder, speed_m_per_s, quality) in enumerate(zip(state.encoders, speeds, qualities, strict=True)):
+        if quality == _GOOD:
+            encoder.sample(speed_m_per_s, abs(speed_m_per_s) > turning_from_m_per_s)
+        if encoder.frozen():
+            findings.append(_finding(encoder, i))
+    return findings
 
 
-def _finding(inputs: Inputs, state: FrozenState, i: int) -> Finding:
+def _finding(encoder: Encoder, i: int) -> Finding:
     text = (
-        f"the drive of roller {i + 1} has shown {inputs.speed.value[i]:.6f} m/s {state.same[i] + 1} times in a row: "
+        f"the drive of roller {i + 1} has shown {encoder.speed_m_per_s:.6f} m/s {encoder.same + 1} times in a row: "
         "its samples are frozen; restart the drive, and check what lies between"
     )
     return Finding("drive frozen", Action.STOP, text)

@@ -7,7 +7,9 @@ A roller's acceleration is that of eq. roller_velocity_dynamics,
 with the torque u that acted, or none if the drive has let go, and parameters anywhere in their tolerances.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from math import isnan
 
 import numpy as np
 
@@ -55,49 +57,63 @@ def jump_limits(line: Line, speed_steps_m_per_s: FloatArray) -> JumpLimits:
 
 @dataclass(slots=True)
 class JumpState:
-    """Last believed values, their ages in periods, and how long a jump is remembered yet; arrays (n,)."""
+    """Last believed values, and the periods of the last believed value and of the last jump; arrays (n,).
 
+    Periods are counted from 1.
+    """
+
+    period: int = 0
     speed_m_per_s: FloatArray = field(default_factory=lambda: np.zeros(0))
-    age: CountArray = field(default_factory=lambda: np.zeros(0, np.int64))
-    remembered: CountArray = field(default_factory=lambda: np.zeros(0, np.int64))
+    believed: CountArray = field(default_factory=lambda: np.zeros(0, np.int64))
+    jumped: CountArray = field(default_factory=lambda: np.zeros(0, np.int64))
     unwind_speed_m_per_s: float = np.nan
 
 
-def reject_jumps(limits: JumpLimits, state: JumpState, inputs: Inputs, torque_nm: FloatArray) -> list[Finding]:
+def reject_jumps(
+    limits: JumpLimits, state: JumpState, inputs: Inputs, torques_nm: Sequence[FloatArray]
+) -> list[Finding]:
     """Mark speeds that jumped as BAD, with the last believed value; a second jump of a roller stops the line.
 
-    `torque_nm` (n,) is the greatest that acted since the last sample, either way. `state` is brought up to date.
-    Without an earlier sample nothing is a jump.
+    `torques_nm` are all torques (n,) that have acted since the last sample. `state` is brought up to date. Without an
+    earlier sample nothing is a jump.
     """
     speed = inputs.speed
-    if len(state.age) != inputs.n:
+    if len(state.believed) != inputs.n:
         state.speed_m_per_s = np.full(inputs.n, np.nan)
-        state.age = np.ones(inputs.n, np.int64)
-        state.remembered = np.zeros(inputs.n, np.int64)
+        state.believed = np.full(inputs.n, state.period)
+        state.jumped = np.full(inputs.n, state.period - limits.memory_periods)
+    state.period += 1
+    change = np.abs(speed.value - state.speed_m_per_s)  # NaN without an earlier sample: not greater than anything
+    if speed.good() and not np.count_nonzero(change > limits.noise_m_per_s):  # within noise whatever torque acted
+        state.believed.fill(state.period)
+        state.speed_m_per_s[:] = speed.value
+        return []
     good = speed.quality == _GOOD
     with np.errstate(invalid="ignore"):
-        jumped = good & (np.abs(speed.value - state.speed_m_per_s) > _reach(limits, state, inputs, torque_nm))
+        jumped = good & (change > _reach(limits, state, inputs, torques_nm))
     findings: list[Finding] = []
-    if jumped.any():  # False for NaN: no earlier sample
-        findings = [_second(inputs, state, int(i)) for i in np.flatnonzero(jumped & (state.remembered > 0))]
+    if jumped.any():
+        again = jumped & (state.period - state.jumped <= limits.memory_periods)
+        findings = [_second(inputs, state, int(i)) for i in np.flatnonzero(again)]
         for i in np.flatnonzero(jumped):
             speed.reject(int(i))
             speed.value[i] = state.speed_m_per_s[i]
-        state.remembered[jumped] = limits.memory_periods
+        state.jumped[jumped] = state.period
         good = good & ~jumped
-    state.remembered = np.maximum(state.remembered - ~jumped, 0)
-    state.age = np.where(good, 1, state.age + 1)
-    np.copyto(state.speed_m_per_s, speed.value, where=good)
+    state.believed[good] = state.period
+    state.speed_m_per_s[good] = speed.value[good]
     return findings
 
 
-def _reach(limits: JumpLimits, state: JumpState, inputs: Inputs, torque_nm: FloatArray) -> FloatArray:
-    """How far (m/s) each roller can have come since its last believed sample, (n,)."""
+def _reach(limits: JumpLimits, state: JumpState, inputs: Inputs, torques_nm: Sequence[FloatArray]) -> FloatArray:
+    """How far (m/s) each roller can have come since its last believed sample, (n,); at least the noise."""
     tension = np.where(inputs.tension.quality == _GOOD, np.abs(inputs.tension.value), limits.tension_max_n)
-    pull_n = np.maximum(tension, np.append(tension[1:], 0.0))  # the web may have let go on either side
-    drive = limits.radius_per_inertia * (np.abs(torque_nm) + limits.radius_m * pull_n)
+    pull_n = np.maximum(tension, np.concatenate((tension[1:], (0.0,))))  # the web may have let go on either side
+    torque_nm: FloatArray = np.max(np.abs(torques_nm), axis=0)
+    drive = limits.radius_per_inertia * (torque_nm + limits.radius_m * pull_n)
     brake = limits.friction_rate_per_s * np.abs(state.speed_m_per_s)
-    return (drive + brake) * (state.age * limits.period_s) + limits.noise_m_per_s
+    elapsed_s = (state.period - state.believed) * limits.period_s
+    return (drive + brake) * elapsed_s + limits.noise_m_per_s
 
 
 def reject_unwinder(limits: JumpLimits, state: JumpState, inputs: Inputs, request_m_per_s: float) -> None:
@@ -107,10 +123,10 @@ def reject_unwinder(limits: JumpLimits, state: JumpState, inputs: Inputs, reques
     for a line under control.
     """
     unwind = inputs.unwind_speed
-    if unwind.quality[0] != _GOOD:
+    if not unwind.good():
         return
-    value, last = float(unwind.value[0]), state.unwind_speed_m_per_s
-    if np.isnan(last):
+    value, last = unwind.value.item(0), state.unwind_speed_m_per_s
+    if isnan(last):
         last = value
     low = min(0.0, last, request_m_per_s) - limits.unwinder_m_per_s
     high = max(0.0, last, request_m_per_s) + limits.unwinder_m_per_s

@@ -6,12 +6,12 @@ learnt from its own changes: their usual size against the smallest one.
 """
 
 from dataclasses import dataclass, field
-from math import floor
+from math import floor, inf
 
 import numpy as np
 
 from gateway.core.line import Line
-from gateway.core.signals import BoolArray, CountArray, FloatArray, Inputs, Quality
+from gateway.core.signals import BoolArray, Inputs, Quality
 from safety.actions import Action, Finding
 
 COUNTS = 3.0  #: that a usual change of a fine cell spans; the same value 60 times in a row is then beyond chance
@@ -34,16 +34,32 @@ def stuck_limits(line: Line) -> StuckLimits:
 
 
 @dataclass(slots=True)
-class StuckState:
-    """Last samples, counts and shares, each of shape (n,)."""
+class Cell:
+    """What is known of one load cell."""
 
-    tension_n: FloatArray = field(default_factory=lambda: np.zeros(0))
-    speed_m_per_s: FloatArray = field(default_factory=lambda: np.zeros(0))
-    same: CountArray = field(default_factory=lambda: np.zeros(0, np.int64))  #: samples without a change, in a row
-    changes: CountArray = field(default_factory=lambda: np.zeros(0, np.int64))  #: seen so far
-    smallest_n: FloatArray = field(default_factory=lambda: np.zeros(0))  #: change
-    usual_n: FloatArray = field(default_factory=lambda: np.zeros(0))  #: size of a change
-    stuck: BoolArray = field(default_factory=lambda: np.zeros(0, np.bool_))
+    tension_n: float  #: last sample; NaN before the first
+    same: int = 0  #: samples without a change, in a row
+    changes: int = 0  #: seen so far
+    smallest_n: float = inf  #: change
+    usual_n: float = 0.0  #: size of a change
+
+    def change(self, size_n: float) -> None:
+        """The value has changed by `size_n`, either way."""
+        self.same = 0
+        self.changes += 1
+        self.smallest_n = min(self.smallest_n, size_n)
+        self.usual_n += (size_n - self.usual_n) / min(self.changes, REMEMBERED)
+
+    def fine(self) -> bool:
+        """Whether its noise is known to span several counts, so that it never shows one value for long."""
+        return self.changes >= LEARNT_CHANGES and self.usual_n >= COUNTS * self.smallest_n
+
+
+@dataclass(slots=True)
+class StuckState:
+    cells: list[Cell] = field(default_factory=list[Cell])  #: one per span
+    speed_m_per_s: list[float] = field(default_factory=list[float])  #: last samples, one per roller
+    stuck: BoolArray = field(default_factory=lambda: np.zeros(0, np.bool_))  #: (n,)
 
 
 def find_stuck(limits: StuckLimits, state: StuckState, inputs: Inputs) -> list[Finding]:
@@ -52,32 +68,34 @@ def find_stuck(limits: StuckLimits, state: StuckState, inputs: Inputs) -> list[F
     A cell that stays at one value counts only while some roller's speed changes: a line on which nothing at all
     moves tells nothing.
     """
-    tension, speed = inputs.tension, inputs.speed
-    if len(state.same) != inputs.n:
-        state.tension_n, state.speed_m_per_s = tension.value.copy(), speed.value.copy()
-        state.same, state.changes = np.zeros(inputs.n, np.int64), np.zeros(inputs.n, np.int64)
-        state.smallest_n, state.usual_n = np.full(inputs.n, np.inf), np.zeros(inputs.n)
+    tensions, qualities = inputs.tension.value.tolist(), inputs.tension.quality.tolist()
+    before, state.speed_m_per_s = state.speed_m_per_s, inputs.speed.value.tolist()
+    if len(state.cells) != inputs.n:
+        state.cells = [Cell(tension_n) for tension_n in tensions]
         state.stuck = np.zeros(inputs.n, np.bool_)
         return []
-    fresh = tension.quality == _GOOD
-    size_n = np.abs(tension.value - state.tension_n)  # NaN for a cell that was never heard
-    changed = fresh & (size_n > 0.0)
-    alive = bool((speed.value != state.speed_m_per_s).any())
-    state.changes += changed
-    state.smallest_n = np.where(changed, np.minimum(state.smallest_n, size_n), state.smallest_n)
-    weight = 1.0 / np.clip(state.changes, 1.0, REMEMBERED)
-    state.usual_n = np.where(changed, state.usual_n + weight * (size_n - state.usual_n), state.usual_n)
-    state.same = np.where(changed, 0, state.same + (fresh & limits.measured & alive))
-    fine = (state.changes >= LEARNT_CHANGES) & (state.usual_n >= COUNTS * state.smallest_n)
-    state.stuck = fine & (state.same >= limits.stuck_periods)
-    np.copyto(state.tension_n, tension.value, where=fresh)
-    state.speed_m_per_s[:] = speed.value
-    return [_finding(state, int(i)) for i in np.flatnonzero(state.stuck)]
+    alive = state.speed_m_per_s != before
+    stuck: list[int] = []
+    # Plain numbers: for a handful of cells a loop takes less than arrays do.
+    for i, (cell, tension_n, quality) in enumerate(zip(state.cells, tensions, qualities, strict=True)):
+        if quality == _GOOD:
+            size_n = abs(tension_n - cell.tension_n)
+            if size_n > 0.0:
+                cell.change(size_n)
+            elif alive and limits.measured[i]:
+                cell.same += 1
+            cell.tension_n = tension_n
+        if cell.same >= limits.stuck_periods and cell.fine():
+            stuck.append(i)
+    if stuck or np.count_nonzero(state.stuck):
+        state.stuck = np.zeros(inputs.n, np.bool_)
+        state.stuck[stuck] = True
+    return [_finding(state.cells[i], i) for i in stuck]
 
 
-def _finding(state: StuckState, i: int) -> Finding:
+def _finding(cell: Cell, i: int) -> Finding:
     text = (
-        f"the load cell of span {i + 1} has shown {state.tension_n[i]:.2f} N {state.same[i]} times in a row while "
+        f"the load cell of span {i + 1} has shown {cell.tension_n:.2f} N {cell.same} times in a row while "
         "rollers move: check it, its amplifier and its cable"
     )
     return Finding("load cell stuck", Action.STOP, text)

@@ -11,7 +11,7 @@ import numpy as np
 
 from gateway.core.controller import Feedforward
 from gateway.core.signals import FloatArray
-from gateway.core.web_model import WebModel, equilibrium_torque, reference_speeds
+from gateway.core.web_model import WebModel, speed_ratios, web_torque
 
 
 @dataclass(slots=True)
@@ -70,13 +70,16 @@ class Deviation:
             tension_after_n=feedforward.tension_after_n,
         )
         self._draw = np.array(draw_spans, dtype=np.intp)
+        self._setpoints = b""  #: that the next three belong to: set-points move rarely, the unwinder always
+        self._speed_ratios: FloatArray = ones
+        self._friction_nm_s_per_m: FloatArray = ones
+        self._web_torque_nm: FloatArray = ones
 
     def errors(
         self, measured: Measured, setpoint_n: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Tension error, speed error, controlled error and equilibrium torque, (n,) each."""
-        reference = reference_speeds(self._model, setpoint_n, measured.unwind_speed_m_per_s)
-        torque = equilibrium_torque(self._model, setpoint_n, reference)
+        reference, torque = self._equilibrium(setpoint_n, measured.unwind_speed_m_per_s)
         tension_error = measured.tension_n - setpoint_n
         speed_error = measured.speed_m_per_s - reference
         controlled = tension_error
@@ -85,3 +88,14 @@ class Deviation:
             controlled = tension_error.copy()
             controlled[self._draw] = speed_error[self._draw]
         return tension_error, speed_error, controlled, torque
+
+    def _equilibrium(self, setpoint_n: FloatArray, unwind_speed_m_per_s: float) -> tuple[FloatArray, FloatArray]:
+        """Reference speeds and torques, (n,) each: `reference_speeds` and `equilibrium_torque` of the model."""
+        model, setpoints = self._model, setpoint_n.tobytes()
+        if setpoints != self._setpoints:
+            self._speed_ratios = speed_ratios(model, setpoint_n)
+            self._friction_nm_s_per_m = model.friction_nms_per_rad * self._speed_ratios / model.radius_m
+            self._web_torque_nm = web_torque(model, setpoint_n)
+            self._setpoints = setpoints
+        reference = unwind_speed_m_per_s * self._speed_ratios
+        return reference, unwind_speed_m_per_s * self._friction_nm_s_per_m - self._web_torque_nm

@@ -21,12 +21,13 @@ class Lqi:
     def __init__(self, config: LqiConfig) -> None:
         self.n = config.n
         self.config = config
-        self._gain_state = np.array(config.gain_state)
-        self._gain_input = np.array(config.gain_input).reshape(self.n, -1)
-        self._gain_integral = np.array(config.gain_integral)
-        self._integral_of_torque = np.linalg.inv(self._gain_integral)
+        gain_input = np.array(config.gain_input).reshape(self.n, -1)
+        gain_integral = np.array(config.gain_integral)
+        self._gain = np.hstack((config.gain_state, gain_integral, gain_input))  # one product a period
+        self._integral_of_torque = np.linalg.inv(gain_integral)
+        self._taken_back = config.antiwindup * self._integral_of_torque
         self._deviation = Deviation(config.feedforward, config.draw_spans)
-        self._periods_in_flight = self._gain_input.shape[1] // self.n
+        self._periods_in_flight = gain_input.shape[1] // self.n
 
     def engage(self, measured: Measured, tension_setpoint_n: FloatArray, applied_nm: FloatArray) -> LqiState:
         in_flight = np.tile(applied_nm, (self._periods_in_flight, 1))
@@ -36,14 +37,14 @@ class Lqi:
 
     def ask(self, state: LqiState, measured: Measured, tension_setpoint_n: FloatArray) -> Decision:
         tension_error, speed_error, controlled, equilibrium = self._deviation.errors(measured, tension_setpoint_n)
-        torque = equilibrium - self._gain_state @ np.concatenate((tension_error, speed_error))
-        torque -= self._gain_integral @ state.integral
-        torque -= self._gain_input @ (state.in_flight_nm - equilibrium).ravel()
-        return Decision(torque, tension_error, controlled)
+        in_flight = (state.in_flight_nm - equilibrium).ravel()
+        deviation = np.concatenate((tension_error, speed_error, state.integral, in_flight))
+        return Decision(equilibrium - self._gain.dot(deviation), tension_error, controlled)
 
     def commit(self, state: LqiState, decision: Decision, applied_nm: FloatArray) -> LqiState:
         # Back-calculation: a share of the torque that the actuators did not give is taken back from the integrals.
-        excess = self._integral_of_torque @ (decision.torque_nm - applied_nm)
-        integral = state.integral + self.config.period_s * decision.controlled_error + self.config.antiwindup * excess
-        in_flight = np.concatenate((applied_nm[None, :], state.in_flight_nm[:-1]))[: self._periods_in_flight]
+        excess = self._taken_back.dot(decision.torque_nm - applied_nm)
+        integral = state.integral + self.config.period_s * decision.controlled_error + excess
+        in_flight = np.empty_like(state.in_flight_nm)
+        in_flight[:1], in_flight[1:] = applied_nm, state.in_flight_nm[:-1]
         return LqiState(integral, in_flight)

@@ -22,9 +22,8 @@ class Pid:
     def __init__(self, config: PidConfig) -> None:
         self.n = config.n
         self.config = config
-        self._proportional = np.array(config.gain_proportional)
-        self._integral = np.array(config.gain_integral)
-        self._derivative = np.array(config.gain_derivative)
+        self._gain = np.hstack((config.gain_proportional, config.gain_derivative))  # one product a period
+        self._integral = config.period_s * np.array(config.gain_integral)
         self._deviation = Deviation(config.feedforward, config.draw_spans)
         # First-order filter, backward Euler: rate_k = a rate_{k-1} + (e_k - e_{k-1}) / (tau + h)
         self._rate_decay = config.derivative_filter_s / (config.derivative_filter_s + config.period_s)
@@ -39,13 +38,12 @@ class Pid:
     def ask(self, state: PidState, measured: Measured, tension_setpoint_n: FloatArray) -> Decision:
         tension_error, speed_error, controlled, equilibrium = self._deviation.errors(measured, tension_setpoint_n)
         # The paper's e is reference minus measurement; `Deviation` gives measurement minus reference.
-        torque = equilibrium - self._proportional @ np.concatenate((tension_error, speed_error))
-        torque += state.integral_nm
-        torque -= self._derivative @ self._rate(state, tension_error)
+        deviation = np.concatenate((tension_error, speed_error, self._rate(state, tension_error)))
+        torque = equilibrium + state.integral_nm - self._gain.dot(deviation)
         return Decision(torque, tension_error, controlled)
 
     def commit(self, state: PidState, decision: Decision, applied_nm: FloatArray) -> PidState:
-        integral = state.integral_nm - self.config.period_s * (self._integral @ decision.controlled_error)
+        integral = state.integral_nm - self._integral.dot(decision.controlled_error)
         integral -= self.config.antiwindup * (decision.torque_nm - applied_nm)
         return PidState(integral, decision.tension_error_n, self._rate(state, decision.tension_error_n))
 

@@ -78,7 +78,7 @@ class Channel:
 
     def good(self) -> bool:
         """Whether every sample of the channel is GOOD."""
-        return not self.quality.any()
+        return not any(self.quality.tobytes())  # GOOD is 0; `any` of numpy takes ten times as long for a few
 
 
 @dataclass(slots=True)

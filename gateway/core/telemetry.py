@@ -12,6 +12,7 @@ from gateway.core.signals import FloatArray, IntArray
 
 VERSION = 2
 _HEADER = struct.Struct("<HHIdffIffBBHB")
+_FLOAT = np.dtype("<f4")
 FLOAT_FIELDS = ("tension_n", "tension_setpoint_n", "speed_m_per_s", "torque_nm", "torque_actual_nm")
 BYTE_FIELDS = ("tension_quality", "drive_state")
 
@@ -61,7 +62,8 @@ def pack(frame: Frame) -> bytes:
         min(frame.held, 0xFFFF),
         frame.doubts,
     )
-    floats = np.concatenate([getattr(frame, name) for name in FLOAT_FIELDS]).astype("<f4").tobytes()
+    fields = [getattr(frame, name) for name in FLOAT_FIELDS]
+    floats = np.concatenate(fields, dtype=_FLOAT, casting="same_kind").tobytes()
     return header + floats + frame.tension_quality.tobytes() + frame.drive_state.tobytes()
 
 

@@ -48,16 +48,26 @@ def nominal_model(line: Line) -> WebModel:
 
 def reference_speeds(model: WebModel, tension_n: FloatArray, unwind_speed_m_per_s: float) -> FloatArray:
     """Speeds v_1 .. v_n (m/s) that keep the tensions (N): the recursion of eq. reference_velocity."""
+    return unwind_speed_m_per_s * speed_ratios(model, tension_n)
+
+
+def speed_ratios(model: WebModel, tension_n: FloatArray) -> FloatArray:
+    """The same per unwinder speed: v_i / v_0, (n,)."""
     upstream = np.concatenate(([model.tension_before_n], tension_n[:-1]))
     ratios: FloatArray = (model.stiffness_n - upstream) / (model.stiffness_n - tension_n)
-    return unwind_speed_m_per_s * np.cumprod(ratios, dtype=np.float64)
+    return np.cumprod(ratios, dtype=np.float64)
 
 
 def equilibrium_torque(model: WebModel, tension_n: FloatArray, speed_m_per_s: FloatArray) -> FloatArray:
     """Torques u_1 .. u_n (Nm) at which the rollers keep their speeds: dv_i/dt = 0."""
-    downstream = np.concatenate((tension_n[1:], [model.tension_after_n]))
     friction = model.friction_nms_per_rad * speed_m_per_s / model.radius_m
-    return friction - model.radius_m * (downstream - tension_n)
+    return friction - web_torque(model, tension_n)
+
+
+def web_torque(model: WebModel, tension_n: FloatArray) -> FloatArray:
+    """Torques (n,) in Nm that the web exerts on the rollers, driving them: R_i (T_{i+1} - T_i)."""
+    downstream = np.concatenate((tension_n[1:], [model.tension_after_n]))
+    return model.radius_m * (downstream - tension_n)
 
 
 def linearise(

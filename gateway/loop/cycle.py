@@ -10,7 +10,7 @@ from drivers.port import Link
 from gateway.control.law import Law, Measured
 from gateway.core.line import Line
 from gateway.core.signals import BoolArray, DriveRequest, DriveState, FloatArray, Inputs, Outputs, Quality
-from gateway.core.states import LoopState, Phase
+from gateway.core.states import Phase
 from gateway.core.telemetry import Frame
 from gateway.loop import machine as machines
 from gateway.loop.machine import Machine, Observation, Times
@@ -95,8 +95,11 @@ class Cycle:
         await self._read(tick)
         seen = self._check(tick)
         self._step_machine(seen, tick.now_s)
+        before_nm = self.outputs.torque_nm
         torque_nm, saturated = self._torque(seen, tick)
         self._write(torque_nm)
+        if self.machine.phase in CONTROLLED and seen.usable:  # only blocks proposals: after the commands are out
+            self._alarm(self.watch.controlled(self.inputs, self.setpoints, before_nm, saturated))
         self._frame(tick, saturated)
 
     def change(self, machine: Machine) -> None:
@@ -135,6 +138,8 @@ class Cycle:
 
     def _step_machine(self, seen: Assessment, now_s: float) -> None:
         phase = self.machine.phase
+        if phase in machines.LASTING and not seen.findings:
+            return
         observation = Observation(
             action=most_severe(seen.findings),
             reason="; ".join(finding.text for finding in seen.findings if finding.action >= Action.STOP),
@@ -181,13 +186,11 @@ class Cycle:
         # It is latched at the next tick: after a late wake-up that is less than a period from the last.
         interval_s = tick.due_s + self.limits.period_s - self._latched_s
         try:
-            torque_nm, saturated = self.torque_path.control(self._estimate(), self.setpoints, applied_nm, interval_s)
+            return self.torque_path.control(self._estimate(), self.setpoints, applied_nm, interval_s)
         except LawFailed as failed:
             off = machines.torque_off(self.machine, tick.now_s, failed.finding.text)
             self._move_to(off, [failed.finding])
             return self._torque(seen, tick)
-        self._alarm(self.watch.controlled(self.inputs, self.setpoints, applied_nm, saturated))
-        return torque_nm, saturated
 
     def _estimate(self) -> Measured:
         # The measured values as they are; a law with an observer takes its place here.
@@ -195,10 +198,9 @@ class Cycle:
         return Measured(inputs.tension.value, inputs.speed.value, float(inputs.unwind_speed.value[0]))
 
     def _advance_setpoints(self) -> None:
-        moves = self.line.moves
-        goal = self.setpoints.speed_target_m_per_s if self.machine.phase is Phase.RUNNING else 0.0
-        stopping = self.machine.state is LoopState.STOP
-        rate = moves.stop_rate_m_per_s2 if stopping else moves.speed_rate_m_per_s2
+        moves, phase = self.line.moves, self.machine.phase
+        goal = self.setpoints.speed_target_m_per_s if phase is Phase.RUNNING else 0.0
+        rate = moves.stop_rate_m_per_s2 if phase is Phase.SLOWING else moves.speed_rate_m_per_s2
         self.setpoints.advance(moves, self.limits.period_s, goal, rate)
 
     def _write(self, torque_nm: FloatArray) -> None:
@@ -217,7 +219,7 @@ class Cycle:
         states, phase = self.inputs.drive_state, self.machine.phase
         off, enable = int(DriveRequest.OFF), int(DriveRequest.ENABLE)
         if phase in WITH_TORQUE:
-            return np.where(self.torque_path.lost, off, enable)
+            return np.where(self.torque_path.lost, off, enable) if self.torque_path.any_lost() else enable
         if phase is Phase.ENABLING:
             return enable
         if phase is Phase.READY:
@@ -241,6 +243,9 @@ class Cycle:
 
     def _frame(self, tick: Tick, saturated: bool) -> None:
         inputs, account = self.inputs, self.account
+        quality = inputs.tension.quality
+        if self.watch.any_stuck():
+            quality = np.where(self.watch.stuck, _BAD, quality).astype(np.int8)
         account.skipped += tick.skipped
         account.sequence += 1
         self._record(
@@ -261,7 +266,7 @@ class Cycle:
                 speed_m_per_s=inputs.speed.value,
                 torque_nm=self.outputs.torque_nm,
                 torque_actual_nm=inputs.torque.value,
-                tension_quality=np.where(self.watch.stuck, _BAD, inputs.tension.quality).astype(np.int8),
+                tension_quality=quality,
                 drive_state=inputs.drive_state,
             )
         )
@@ -270,4 +275,4 @@ class Cycle:
 def standing(inputs: Inputs) -> bool:
     """Whether the unwinder is known to stand still."""
     unwind = inputs.unwind_speed
-    return unwind.quality[0] == Quality.GOOD and abs(float(unwind.value[0])) <= machines.STANDSTILL_M_PER_S
+    return unwind.good() and abs(unwind.value.item(0)) <= machines.STANDSTILL_M_PER_S

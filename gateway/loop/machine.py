@@ -17,6 +17,8 @@ ARMING_TIME_S = 2.0  #: a drive that is not ready by then refuses the arming
 ENABLING_TIME_S = 2.0
 STEADY_TIME_S = 0.5  #: all tensions inside their band for this long: the web is tensioned
 STANDSTILL_M_PER_S = 0.002
+#: Only a command or a finding leads out of these.
+LASTING = (Phase.SILENT, Phase.READY, Phase.RUNNING, Phase.HOLDING, Phase.OFF)
 
 
 @dataclass(frozen=True, slots=True)

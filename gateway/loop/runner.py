@@ -34,7 +34,7 @@ class Runner:
                 answer.set_result(reply)
         await self.cycle.period(tick)
         self._passed.set()
-        self._passed = asyncio.Event()
+        self._passed.clear()  # whoever waited goes on all the same
 
     async def end(self) -> None:
         """From now on the line is being stopped, and no other command is taken. Periods must go on until it rests."""

@@ -52,14 +52,19 @@ class Setpoints:
 
     def advance(self, moves: Moves, period_s: float, speed_goal_m_per_s: float, speed_rate_m_per_s2: float) -> None:
         """Move on by one period: tensions towards their targets, speed towards `speed_goal_m_per_s`."""
-        reach = moves.tension_rate_n_per_s * period_s
-        self.tension_n = self.tension_n + np.clip(self.tension_target_n - self.tension_n, -reach, reach)
+        if not self._there():
+            reach = moves.tension_rate_n_per_s * period_s
+            self.tension_n = self.tension_n + np.clip(self.tension_target_n - self.tension_n, -reach, reach)
         reach = speed_rate_m_per_s2 * period_s
         self.speed_m_per_s += max(-reach, min(reach, speed_goal_m_per_s - self.speed_m_per_s))
 
     def followed_by(self, tension_n: FloatArray, measured: FloatArray) -> bool:
         """Whether every set-point is where it shall be and every measured tension (n,) is near it."""
-        if not (self.tension_n == self.tension_target_n).all():
+        if not self._there():
             return False
         near = np.abs(tension_n - self.tension_n) <= NEAR * self.tension_n
         return bool(near[measured > 0].all())
+
+    def _there(self) -> bool:
+        """Whether every tension's set-point has reached its target."""
+        return not np.count_nonzero(self.tension_n != self.tension_target_n)

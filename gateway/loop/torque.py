@@ -31,6 +31,10 @@ class TorquePath:
         self._moves = moves
         self._state: Any = None  #: None while the law is not engaged
 
+    def any_lost(self) -> bool:
+        """Whether a drive is lost."""
+        return any(self.lost.tobytes())
+
     def disengage(self) -> None:
         """The next `control` engages anew, from what is measured then."""
         self._state = None
@@ -42,7 +46,8 @@ class TorquePath:
 
         `applied_nm` (n,) is that of the period before. A drive that was lost gives nothing, and the law is told so.
         """
-        applied_nm = np.where(self.lost, 0.0, applied_nm)
+        if self.any_lost():
+            applied_nm = np.where(self.lost, 0.0, applied_nm)
         if self._state is None:
             setpoints.begin_at(np.where(self._limits.measured > 0, measured.tension_n, 0.0))
             self._state = self.law.engage(measured, setpoints.tension_n, applied_nm)
@@ -52,7 +57,7 @@ class TorquePath:
         torque_nm = limit_torque(self._limits, decision.torque_nm, applied_nm, interval_s)
         torque_nm[self.lost] = 0.0
         self._state = self.law.commit(self._state, decision, torque_nm)
-        return torque_nm, bool((torque_nm != decision.torque_nm).any())
+        return torque_nm, bool(np.count_nonzero(torque_nm != decision.torque_nm))
 
     def unload(self, applied_nm: FloatArray) -> FloatArray:
         """A period's way from `applied_nm` (n,) to zero."""

@@ -8,6 +8,7 @@ from gateway.core.signals import BoolArray, FloatArray, Inputs
 from gateway.loop.setpoints import Setpoints
 from safety.actions import Action, Finding
 from safety.drift import DriftState, drift_limits, restart, watch_balance
+from safety.frozen import FrozenState, find_frozen, turning_m_per_s
 from safety.jumps import JumpState, jump_limits, reject_jumps, reject_unwinder
 from safety.stuck import StuckState, find_stuck, stuck_limits
 
@@ -28,16 +29,18 @@ class Watch:
         self._jump_limits, self._jumps = jump_limits(line, speed_steps_m_per_s), JumpState()
         self._applied_nm: FloatArray = np.zeros(line.n)
         self._stuck_limits, self._stuck = stuck_limits(line), StuckState()
+        self._turning_m_per_s, self._frozen = turning_m_per_s(line), FrozenState()
         self._drift_limits, self._drift = drift_limits(line), DriftState()
         self._creeping_m_per_s = CREEPING * line.limits.speed_max_m_per_s
         self._saturated = 0  # periods, up and down
         self._saturated_periods = max(1, round(SATURATED_S / line.control.period_s))
-        self._setpoints: tuple[FloatArray, float] | None = None
+        self._setpoints: tuple[bytes, float] | None = None  #: of the period before; None while control is off
+        self._drifts = False  #: a cell has been told to drift
         restart(self._drift_limits, self._drift)
 
     def reject_jumps(self, inputs: Inputs, applied_nm: FloatArray) -> list[Finding]:
         """Discard roller speeds that cannot be true; what stops the line. `applied_nm` (n,) acts from now on."""
-        acted_nm = np.maximum(np.abs(applied_nm), np.abs(self._applied_nm))
+        acted_nm = (applied_nm, self._applied_nm)
         self._applied_nm = applied_nm
         return reject_jumps(self._jump_limits, self._jumps, inputs, acted_nm)
 
@@ -46,10 +49,10 @@ class Watch:
         reject_unwinder(self._jump_limits, self._jumps, inputs, request_m_per_s)
 
     def find_stuck(self, inputs: Inputs) -> list[Finding]:
-        """Load cells that stand still while the line is controlled: what stops the line."""
+        """Load cells and drives whose samples stand still while the line is controlled: what stops the line."""
         findings = find_stuck(self._stuck_limits, self._stuck, inputs)
         self.stuck = self._stuck.stuck
-        return findings
+        return findings + find_frozen(self._turning_m_per_s, self._frozen, inputs)
 
     def controlled(
         self, inputs: Inputs, setpoints: Setpoints, applied_nm: FloatArray, saturated: bool
@@ -57,13 +60,12 @@ class Watch:
         """A period under control; `applied_nm` (n,) acted while the samples were taken. Returns what is to be told."""
         count = self._saturated + 1 if saturated else self._saturated - 1
         self._saturated = min(max(count, 0), self._saturated_periods)
-        now = (setpoints.tension_n, setpoints.speed_m_per_s)
-        creeping = now[1] < self._creeping_m_per_s  # dry friction holds what it likes at standstill
-        if creeping or self.stuck.any() or self._setpoints is None or self._moved(now):
+        before, self._setpoints = self._setpoints, (setpoints.tension_n.tobytes(), setpoints.speed_m_per_s)
+        creeping = setpoints.speed_m_per_s < self._creeping_m_per_s  # dry friction holds what it likes at standstill
+        if creeping or self.any_stuck() or self._setpoints != before:
             restart(self._drift_limits, self._drift)
         else:
             watch_balance(self._drift_limits, self._drift, inputs.tension.value, inputs.speed.value, applied_nm)
-        self._setpoints = now
         return self._tell(self._doubts())
 
     def off(self) -> None:
@@ -72,28 +74,30 @@ class Watch:
             return
         self._setpoints = None
         self._saturated = 0
-        self._stuck = StuckState()
+        self._stuck, self._frozen = StuckState(), FrozenState()
         self._drift = DriftState()
         restart(self._drift_limits, self._drift)
 
     def armed(self) -> list[Finding]:
         """A person arms: everything begins anew. Returns what is to be told."""
         self.stuck = np.zeros_like(self.stuck)
+        self._drifts = False
         return self._tell(Doubt.NONE)
 
-    def _moved(self, now: tuple[FloatArray, float]) -> bool:
-        assert self._setpoints is not None
-        before_n, before_m_per_s = self._setpoints
-        return before_m_per_s != now[1] or not np.array_equal(before_n, now[0])
+    def any_stuck(self) -> bool:
+        """Whether a load cell stands still."""
+        return any(self.stuck.tobytes())
 
     def _doubts(self) -> Doubt:
         doubts = Doubt.NONE
-        if self._saturated >= self._saturated_periods or (self.doubts & Doubt.SATURATED and self._saturated > 0):
+        lasting = self._saturated > 0 and Doubt.SATURATED in self.doubts
+        if self._saturated >= self._saturated_periods or lasting:
             doubts |= Doubt.SATURATED
-        if self.stuck.any():
+        if self.any_stuck():
             doubts |= Doubt.CELL_STUCK
         # It stays until somebody arms: a zero is checked at standstill, and a new set-point only hides it.
-        if self._drift.drift_n.any() or self.doubts & Doubt.CELL_DRIFTS:
+        self._drifts = self._drifts or bool(np.count_nonzero(self._drift.drift_n))
+        if self._drifts:
             doubts |= Doubt.CELL_DRIFTS
         return doubts
 

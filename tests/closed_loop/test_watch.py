@@ -122,6 +122,15 @@ def test_steps_of_set_points_raise_no_doubt(running, change):
     assert running.cycle.machine.state is LoopState.RUN
 
 
+def test_the_balance_is_averaged_anew_after_a_step_of_a_tension(running, monkeypatch):
+    """A cell that jumps together with its set-point: nothing tells from which moment on the balance is another one."""
+    running.step(2500)
+    assert running.command(SetTension(span=3, tension_n=30.0, step=True)).ok
+    lying(running, monkeypatch, with_tension(2, lambda true_n, _: true_n + 4.0))
+    running.step(3000)
+    assert Doubt.CELL_DRIFTS not in running.cycle.watch.doubts
+
+
 def test_slack_and_a_broken_web_are_told_apart_and_both_take_torque_off(running, monkeypatch):
     running.step(300)
     lying(running, monkeypatch, with_tension(3, lambda _, __: 0.5))  # what a dead load cell shows

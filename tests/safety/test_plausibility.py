@@ -45,7 +45,7 @@ def jumping(values: list[float], torque_nm: FloatArray = TORQUE_NM) -> tuple[lis
     found: list[int] = []
     for k, value in enumerate(values):
         samples = speeds(inputs, [0.05, value, 0.05, 0.05, 0.05, 0.05])
-        findings = reject_jumps(jump_limits(LINE, np.zeros(6)), state, samples, torque_nm)
+        findings = reject_jumps(jump_limits(LINE, np.zeros(6)), state, samples, [torque_nm])
         if inputs.speed.quality[1] == Quality.BAD:
             discarded.append(k)
         found += [k] * len(findings)
@@ -66,6 +66,37 @@ def test_two_jumps_far_apart_are_two_spikes() -> None:
     assert jumping([0.05, 0.5, *[0.05] * 98, 0.5, 0.05])[0] == [100]
 
 
+@given(
+    torque_nm=st.lists(st.floats(-60.0, 60.0), min_size=2, max_size=2),
+    tension_n=st.floats(-10.0, 100.0),
+    change=st.floats(-1.0, 1.0),
+)
+def test_noise_is_no_jump_whatever_acts(torque_nm: list[float], tension_n: float, change: float) -> None:
+    limits, state, inputs = jump_limits(LINE, np.zeros(6)), JumpState(), Inputs(6)
+    for i in range(6):
+        inputs.tension.put(i, tension_n, 0.0)
+    acted_nm = [np.full(6, torque) for torque in torque_nm]
+    reject_jumps(limits, state, speeds(inputs, [0.05] * 6), acted_nm)
+    others = 0.05 + 1.01 * NOISE_M_PER_S  # beyond noise, so that every roller is judged by what it can do
+    inputs.tension.miss(5)
+    for i, speed in enumerate([0.05 + change * NOISE_M_PER_S, *[0.05] * 4, others]):
+        inputs.speed.put(i, speed, 0.0)
+    reject_jumps(limits, state, inputs, acted_nm)
+    assert inputs.speed.good()
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_the_greater_of_two_torques_has_acted(order: int) -> None:
+    limits, inputs = jump_limits(LINE, np.zeros(6)), at_30_n()
+    for share, good in ((0.999, True), (1.001, False)):
+        state = JumpState()
+        acted_nm = [TORQUE_NM, -0.5 * TORQUE_NM][::order]
+        reject_jumps(limits, state, speeds(inputs, [0.05] * 6), acted_nm)
+        reached = 0.05 + share * reach_m_per_s(0.05)
+        reject_jumps(limits, state, speeds(inputs, [0.05, reached, 0.05, 0.05, 0.05, 0.05]), acted_nm)
+        assert inputs.speed.good() == good
+
+
 def test_what_a_roller_can_do_is_no_jump() -> None:
     assert jumping([0.05, 0.05 + 0.999 * reach_m_per_s(0.05)])[2] == []
     assert jumping([0.05, 0.05 + 1.001 * reach_m_per_s(0.05)])[2] == [1]
@@ -76,18 +107,18 @@ def test_a_coarse_encoder_may_show_the_next_count() -> None:
     state, inputs = JumpState(), at_30_n()
     limits = jump_limits(LINE, resolution)
     for k in range(10):
-        assert reject_jumps(limits, state, speeds(inputs, [0.016 * (k % 3)] * 6), np.zeros(6)) == []
+        assert reject_jumps(limits, state, speeds(inputs, [0.016 * (k % 3)] * 6), [np.zeros(6)]) == []
         assert inputs.speed.good()
 
 
 def test_after_missed_samples_a_roller_may_have_come_further() -> None:
     limits, state, inputs = jump_limits(LINE, np.zeros(6)), JumpState(), at_30_n()
-    reject_jumps(limits, state, speeds(inputs, [0.0] * 6), TORQUE_NM)
+    reject_jumps(limits, state, speeds(inputs, [0.0] * 6), [TORQUE_NM])
     for _ in range(2):
         for i in range(6):
             inputs.speed.miss(i)
-        assert reject_jumps(limits, state, inputs, TORQUE_NM) == []
-    reject_jumps(limits, state, speeds(inputs, [0.0, 0.99 * reach_m_per_s(0.0, 3), 0.0, 0.0, 0.0, 0.0]), TORQUE_NM)
+        assert reject_jumps(limits, state, inputs, [TORQUE_NM]) == []
+    reject_jumps(limits, state, speeds(inputs, [0.0, 0.99 * reach_m_per_s(0.0, 3), 0.0, 0.0, 0.0, 0.0]), [TORQUE_NM])
     assert inputs.speed.good()
 
 
@@ -157,6 +188,20 @@ def test_a_healthy_cell_with_a_coarse_resolution_is_not_stuck(noise_n: float) ->
         one, two, three = np.round((30.0 + filtered) / 0.1) * 0.1
         tensions.append((one, two, three))
     assert stuck_after(tensions)[1] == [], "five minutes"
+
+
+def test_a_sample_that_did_not_come_tells_nothing_of_its_cell() -> None:
+    state, inputs = StuckState(), Inputs(3)
+    values = noisy(300) + [(31.0, 31.0, 31.0)] * 12
+    for k, row in enumerate(values):
+        for i, value in enumerate(row):
+            inputs.speed.put(i, 0.05 + 1e-4 * (k % 2), 0.0)
+            if k >= 300 and k % 2:
+                inputs.tension.miss(i)
+            else:
+                inputs.tension.put(i, value, 0.0)
+        find_stuck(STUCK, state, inputs)
+        assert list(state.stuck) == [k >= 310, k >= 310, False], "every other sample: the sixth like it is the eleventh"
 
 
 def test_a_line_on_which_nothing_moves_tells_nothing() -> None:

@@ -61,6 +61,20 @@ def test_reference_speeds_and_torques_are_an_equilibrium(values, n, unwind):
     assert np.abs(derivative(theta, np.concatenate((tension, speed)), torque, unwind)).max() < 1e-9
 
 
+@pytest.mark.parametrize("design", [design_lqi, design_pid])
+def test_set_points_that_move_in_place_move_the_equilibrium(design):
+    """What belongs to the set-points is kept from period to period."""
+    setpoint, none = np.array([28.0, 36.0, 20.0]), np.zeros(3)
+    kept = make_law(design(task(3)))
+    for moved_n in (0.0, 5.0, 0.0, -5.0):
+        setpoint[1] = 36.0 + moved_n
+        measured = Measured(np.array([28.5, 35.0, 20.0]), np.array([0.05, 0.051, 0.049]), 0.05)
+        anew = make_law(design(task(3)))
+        asked = [law.ask(law.engage(measured, setpoint, none), measured, setpoint) for law in (kept, anew)]
+        assert (asked[0].torque_nm == asked[1].torque_nm).all()
+        assert (asked[0].tension_error_n == measured.tension_n - setpoint).all()
+
+
 def test_linearisation_is_the_derivative_of_the_equations():
     theta = model()
     tension, unwind = np.array([28.0, 36, 20, 40, 24, 32]), 0.05

@@ -7,7 +7,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gateway.core.states import STATE_OF, LoopState, Phase
-from gateway.loop.machine import ARMING_TIME_S, Machine, Observation, Times, advance, stop, to_phase, torque_off
+from gateway.loop.machine import (
+    ARMING_TIME_S,
+    LASTING,
+    Machine,
+    Observation,
+    Times,
+    advance,
+    stop,
+    to_phase,
+    torque_off,
+)
 from safety.actions import Action
 
 TIMES = Times(tensioning_s=20.0, stop_s=10.0)
@@ -47,6 +57,19 @@ def test_a_drive_that_does_not_become_ready_refuses_the_arming():
     assert after(Phase.ARMING, unready, ARMING_TIME_S).phase is Phase.ARMING
     refused = after(Phase.ARMING, unready, ARMING_TIME_S + 0.01)
     assert refused.phase is Phase.OFF and "drive-3 STO" in refused.reason
+
+
+@pytest.mark.parametrize("phase", LASTING)
+@given(seen=st.builds(replace, st.just(FINE), **{name: st.booleans() for name in ("tensioned", "standstill")}))
+def test_nothing_but_a_finding_leads_out_of_a_lasting_phase(phase, seen):
+    idle = replace(seen, plc_answers=False, feedback=False, torque_zero=True, not_ready="x", not_enabled="x")
+    for observation in (seen, idle):
+        assert after(phase, observation, 1e6) == Machine(phase)
+
+
+@pytest.mark.parametrize("phase", [phase for phase in Phase if phase not in LASTING])
+def test_every_other_phase_ends_by_itself(phase):
+    assert after(phase, replace(FINE, torque_zero=True), 1e6) != Machine(phase)
 
 
 def test_a_web_that_cannot_be_tensioned_stops_the_line():
