@@ -4,20 +4,20 @@ A statusword and what is wanted give the next controlword, one transition at a t
 from a fault, and acknowledges a fault only when that is asked for, with a rising edge of bit 7.
 """
 
-from enum import Enum
+from enum import IntEnum
 
 from gateway.core.signals import DriveRequest, DriveState
 
 
-class PowerState(Enum):
-    NOT_READY = 0
-    SWITCH_ON_DISABLED = 1
-    READY_TO_SWITCH_ON = 2
-    SWITCHED_ON = 3
-    OPERATION_ENABLED = 4
-    QUICK_STOP_ACTIVE = 5
-    FAULT_REACTION = 6
-    FAULT = 7
+class PowerState(IntEnum):
+    NOT_READY = 1  # none of them is 0, which would count as false
+    SWITCH_ON_DISABLED = 2
+    READY_TO_SWITCH_ON = 3
+    SWITCHED_ON = 4
+    OPERATION_ENABLED = 5
+    QUICK_STOP_ACTIVE = 6
+    FAULT_REACTION = 7
+    FAULT = 8
 
 
 DISABLE_VOLTAGE = 0x0000

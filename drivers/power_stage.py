@@ -4,6 +4,10 @@ from drivers.cia402 import DISABLE_VOLTAGE, QUICK_STOP, PowerState, controlword,
 from drivers.map_fields import Bit
 from gateway.core.signals import DriveRequest, DriveState
 
+# An enumeration's member takes as long to look up as several comparisons (Python 3.11), and there are many drives.
+_ENABLED_POWER, _ENABLED, _FAULT = PowerState.OPERATION_ENABLED, DriveState.ENABLED, DriveState.FAULT
+_ENABLE, _RESET_FAULT = DriveRequest.ENABLE, DriveRequest.RESET_FAULT
+_IN_FAULT = (PowerState.FAULT_REACTION, PowerState.FAULT)
 ORDERS_IGNORED = 5  #: orders to take torque off, in a row, until an enabled drive counts as disobedient
 
 
@@ -12,7 +16,8 @@ class PowerStage:
 
     def __init__(self, follows_command: Bit | None) -> None:
         self.power: PowerState | None = None  #: None: it has not said
-        self.safe_torque_off = False
+        self.state = DriveState.OFF  #: what it counts as
+        self._safe_torque_off = False
         self._follows_command = follows_command
         self._follows = False
         self._controlword = DISABLE_VOLTAGE
@@ -25,30 +30,34 @@ class PowerStage:
         bit = self._follows_command
         self._follows = bit is None or bit.is_set(statusword)
         if safe_torque_off is not None:
-            self.safe_torque_off = safe_torque_off
+            self._safe_torque_off = safe_torque_off
         elif self.power is not PowerState.SWITCH_ON_DISABLED:
-            self.safe_torque_off = False  # what was told before is over
+            self._safe_torque_off = False  # what was told before is over
+        self.state = self._state_now()
 
-    @property
-    def state(self) -> DriveState:
+    def on_safe_torque_off(self, active: bool) -> None:
+        """What it says of it where that is not told with the statusword."""
+        self._safe_torque_off = active
+        self.state = self._state_now()
+
+    def _state_now(self) -> DriveState:
         if self.power is None:
             return DriveState.OFF
-        if self.safe_torque_off and self.power is PowerState.SWITCH_ON_DISABLED:
-            return DriveState.STO
-        if self.power is PowerState.OPERATION_ENABLED and not self._follows:
+        if self._safe_torque_off and self.power not in _IN_FAULT:
+            return DriveState.STO  # no torque, whatever else it says
+        if self.power is _ENABLED_POWER and not self._follows:
             return DriveState.READY  # no torque, whatever is commanded
         return drive_state(self.power)
 
     @property
     def gives_torque(self) -> bool:
         """Whether it may give torque now, as it says or as it is asked."""
-        return self._request == DriveRequest.ENABLE or self.power is PowerState.OPERATION_ENABLED
+        return self._request == _ENABLE or self.power is _ENABLED_POWER
 
     @property
     def fault_was_reset(self) -> bool:
         """Whether a reset was asked for and it is in no fault now."""
-        in_fault = self.power is not None and drive_state(self.power) == DriveState.FAULT
-        return self._request == DriveRequest.RESET_FAULT and not in_fault
+        return self._request == _RESET_FAULT and self.power not in _IN_FAULT
 
     @property
     def disobeys(self) -> bool:
@@ -61,20 +70,21 @@ class PowerStage:
         A drive that is not trusted, or counts as in fault before its statusword shows it, is told to take torque off.
         """
         self._request = request
-        in_fault = state == DriveState.FAULT and request != DriveRequest.RESET_FAULT
+        in_fault = state == _FAULT and request != _RESET_FAULT
         if not trusted or in_fault or self.power is None:
             self._controlword = DISABLE_VOLTAGE
         else:
             self._controlword = controlword(self.power, request, self._controlword)
         # One that ramps down in a quick stop says so: it is not enabled any more.
-        ignores = self.power is PowerState.OPERATION_ENABLED and self._controlword in (DISABLE_VOLTAGE, QUICK_STOP)
+        ignores = self.power is _ENABLED_POWER and self._controlword in (DISABLE_VOLTAGE, QUICK_STOP)
         self._ignored = self._ignored + 1 if ignores else 0
-        follows = state == DriveState.ENABLED and request == DriveRequest.ENABLE
+        follows = state == _ENABLED and request == _ENABLE
         return self._controlword, torque_nm if follows else 0.0
 
     def forget(self) -> None:
         """Nothing that it said or was told before counts any more."""
         self.power = None
+        self.state = DriveState.OFF
         self._controlword = DISABLE_VOLTAGE
         self._request = int(DriveRequest.OFF)
         self._ignored = 0

@@ -1,8 +1,7 @@
 """One CAN bus: a python-can interface whose frames the running event loop reads. The clock of arrivals is here.
 
-python-can's own notifier is not used: it loses errors and can leave readers behind. Interfaces with a file
-descriptor (socketcan, udp_multicast) are read by the loop itself; those without (virtual) by one thread that
-only fetches.
+python-can's own notifier is not used: it loses errors and can leave readers behind. How frames go through the
+interface is said in `wire`.
 
 An interface that is gone is not read any more, and is opened again beside the cycle, with growing pauses. Frames are
 lost meanwhile, and nothing else is done about them: whoever waits for them sees that they do not come.
@@ -10,25 +9,22 @@ lost meanwhile, and nothing else is done about them: whoever waits for them sees
 
 import asyncio
 import errno
-import threading
-from collections import deque
 from collections.abc import Callable, Collection
 from typing import Any
 
 import can
 
 from drivers.canopen.can_errors import error_text, is_bus_off
+from drivers.canopen.wire import FAILURES, Wire, wire_of
 from gateway.core.line import CanopenBus
 
 FRAMES_PER_WAKEUP = 256  #: a flooded bus does not hold the loop
 MOST_FRAMES_WAITING = 4096  #: several times what a socket's buffer holds
-THREAD_POLL_S = 0.02  #: how soon the fetching thread notices that the bus is closed
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.1, 2.0  #: between attempts to open it again
 FAILURES_ALLOWED = 64  #: in a row, of one direction, without a cause that the system names, until it counts as gone
 FILTERS_ALLOWED = 512  #: CAN_RAW_FILTER_MAX of Linux
 
 FrameHandler = Callable[[int, bytes | bytearray, float], None]
-_FAILURES = (can.CanError, OSError, ValueError)
 
 
 class CanBus:
@@ -51,11 +47,8 @@ class CanBus:
         self._on_frame = on_frame
         self._on_error = on_error
         self._bus: can.BusABC | None = None
+        self._wire: Wire | None = None  #: as long as the bus is open
         self._loop: asyncio.AbstractEventLoop | None = None
-        self._fileno = -1
-        self._thread: threading.Thread | None = None
-        self._fetched: deque[can.Message | Exception] = deque()
-        self._closing = threading.Event()
         self._failures = {"receive": 0, "send": 0}  #: in a row
         self._reopening: asyncio.Task[None] | None = None
         self._retry_s = float("-inf")
@@ -66,24 +59,20 @@ class CanBus:
         if self._bus is not None:
             return
         config = self._config
+        bus: can.BusABC | None = None
         try:
-            self._bus = can.Bus(ignore_config=True, **self._options())
+            bus = can.Bus(ignore_config=True, **self._options())
+            wire = wire_of(config, bus)
         except (can.CanError, OSError, ValueError, ImportError) as error:
+            if bus is not None:
+                bus.shutdown()
             where = f"{config.interface} {config.channel}"
             raise OSError(f"bus {config.name}: cannot open {where}: {error}; {_advice(config, error)}") from error
         self.gone = ""
         self._failures = {"receive": 0, "send": 0}
         self._loop = asyncio.get_running_loop()
-        try:
-            self._fileno = self._bus.fileno()
-        except NotImplementedError:
-            self._fileno = -1
-        if self._fileno >= 0:
-            self._loop.add_reader(self._fileno, self.drain)
-        else:
-            self._closing.clear()
-            self._thread = threading.Thread(target=self._fetch, name=f"can-{config.name}", daemon=True)
-            self._thread.start()
+        self._bus, self._wire = bus, wire
+        wire.read_with(self.drain)
 
     def _options(self) -> dict[str, Any]:
         config = self._config
@@ -101,12 +90,12 @@ class CanBus:
 
     def send(self, cob_id: int, data: bytes) -> bool:
         """Hand a frame to the interface without waiting. False, and `on_error`, when it did not take it."""
-        if self._bus is None or self.gone:
+        wire = self._wire
+        if wire is None or self.gone:
             return False
-        message = can.Message(arbitration_id=cob_id, data=data, is_extended_id=False)
         try:
-            self._bus.send(message, timeout=0)
-        except _FAILURES as error:
+            wire.send(cob_id, data)
+        except FAILURES as error:
             self._on_error(f"COB-ID {cob_id:03X}h not sent: {error}")
             # A full buffer is no end: a bus without a device on it fills it, too.
             self._failed("send", error, final=_cause(error) not in (None, errno.ENOBUFS, errno.EAGAIN))
@@ -123,34 +112,35 @@ class CanBus:
         self._drain(MOST_FRAMES_WAITING)
 
     def _drain(self, most: int) -> None:
-        if self._loop is None or self.gone:
+        wire = self._wire
+        if self._loop is None or wire is None or self.gone:
             return
         now_s = self._loop.time()
         for _ in range(most):
             try:
-                message = self._receive()
-            except _FAILURES as error:
+                received = wire.receive()
+            except FAILURES as error:
                 self._on_error(f"frame discarded: {error}")
                 self._failed("receive", error, final=_cause(error) is not None)
                 if self.gone:
                     return
                 continue
-            if message is None:
+            if received is None:
                 return
             self._failures["receive"] = 0
-            self._take(message, now_s)
+            if isinstance(received, tuple):
+                self._pause_s = FIRST_PAUSE_S  # it is heard: not the open interface, but a frame says so
+                self._on_frame(received[0], received[1], now_s)
+            elif received.is_error_frame:
+                self._on_error_frame(received)
             if self.gone:
                 return
 
-    def _take(self, message: can.Message, now_s: float) -> None:
-        if message.is_error_frame:
-            text = error_text(message.arbitration_id, message.data)
-            self._on_error(text)
-            if is_bus_off(message.arbitration_id):
-                self._give_up(text)
-        elif not (message.is_extended_id or message.is_remote_frame or message.is_fd):
-            self._pause_s = FIRST_PAUSE_S  # it is heard: not the open interface, but a frame says so
-            self._on_frame(message.arbitration_id, message.data, now_s)
+    def _on_error_frame(self, frame: can.Message) -> None:
+        text = error_text(frame.arbitration_id, frame.data)
+        self._on_error(text)
+        if is_bus_off(frame.arbitration_id):
+            self._give_up(text)
 
     def _failed(self, direction: str, error: Exception, final: bool) -> None:
         self._failures[direction] += 1
@@ -160,14 +150,9 @@ class CanBus:
     def _give_up(self, reason: str) -> None:
         """Leave the interface alone until it is opened again. Called in the loop, or by a transfer in its thread."""
         self.gone = self.gone or f"bus {self._config.name}: {reason}"
-        if self._loop is not None:
-            self._loop.call_soon_threadsafe(self._stop_reading, self._bus)
-
-    def _stop_reading(self, bus: can.BusABC | None) -> None:
-        """Of `bus`, unless another has taken its place."""
-        if bus is self._bus and self._loop is not None and self._fileno >= 0:
-            self._loop.remove_reader(self._fileno)
-            self._fileno = -1
+        wire = self._wire
+        if self._loop is not None and wire is not None:
+            self._loop.call_soon_threadsafe(wire.stop_reading)
 
     def tend(self, now_s: float) -> None:
         """Called in every cycle: an interface that is gone is opened again when it is time, beside the cycle."""
@@ -197,30 +182,6 @@ class CanBus:
         self.open()
         self.reopened += 1
 
-    def _receive(self) -> can.Message | None:
-        if self._fileno >= 0:
-            return self._bus.recv(timeout=0) if self._bus is not None else None
-        if not self._fetched:
-            return None
-        fetched = self._fetched.popleft()
-        if isinstance(fetched, Exception):
-            raise fetched
-        return fetched
-
-    def _fetch(self) -> None:
-        """The thread of an interface without a file descriptor."""
-        bus, loop = self._bus, self._loop
-        assert bus is not None and loop is not None
-        while not self._closing.is_set():
-            try:
-                fetched: can.Message | Exception | None = bus.recv(timeout=THREAD_POLL_S)
-            except _FAILURES as error:
-                fetched = error
-                self._closing.wait(THREAD_POLL_S)
-            if fetched is not None and not self._closing.is_set():
-                self._fetched.append(fetched)
-                loop.call_soon_threadsafe(self.drain)
-
     async def close(self) -> None:
         """Stop reading and release the interface. Idempotent."""
         reopening, self._reopening = self._reopening, None
@@ -231,18 +192,14 @@ class CanBus:
         self.gone = ""
 
     async def _release(self) -> None:
-        self._stop_reading(self._bus)
+        wire, self._wire = self._wire, None
         bus, self._bus = self._bus, None
-        if bus is None:
-            return
-        thread, self._thread = self._thread, None
         try:
-            if thread is not None:
-                self._closing.set()
-                await asyncio.to_thread(thread.join)
+            if wire is not None:
+                await wire.close()
         finally:
-            self._fetched.clear()
-            bus.shutdown()
+            if bus is not None:
+                bus.shutdown()
 
 
 def _cause(error: BaseException) -> int | None:

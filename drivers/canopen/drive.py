@@ -103,8 +103,9 @@ class DriveNode:
         Raises ValueError when the torque cannot be commanded; nothing may be sent then.
         """
         word, given_nm = self.stage.command(request, torque_nm, state, trusted=not self.station.distrust)
-        # Encoded also where it is not given: what cannot be commanded says that something is wrong.
-        self.codec.encode(word, torque_nm)
+        if given_nm != torque_nm:
+            # Encoded also where it is not given: what cannot be commanded says that something is wrong.
+            self.codec.encode(word, torque_nm)
         return self.codec.encode(word, given_nm)
 
     # by SDO
@@ -116,7 +117,7 @@ class DriveNode:
     async def read(self, sdo: SdoBus, now_s: float) -> list[str]:
         """Whether safe torque off is why it may not switch on. Raises SdoFailed."""
         self._sto_asked_s = now_s
-        self.stage.safe_torque_off = await self._read_safe_torque_off(sdo)
+        self.stage.on_safe_torque_off(await self._read_safe_torque_off(sdo))
         return []
 
     async def confirm_stopped(self, sdo: SdoBus) -> bool:
@@ -136,7 +137,7 @@ class DriveNode:
             reasons.append(f"is still enabled (statusword {statusword:04X}h); take its torque off first")
         reasons += await self._check_rated_torque(sdo) + await self._check_max_torque(sdo)
         reasons += await differences(sdo, self.station.node, drive_expected(self.device, self.station.node))
-        self.stage.safe_torque_off = await self._read_safe_torque_off(sdo)
+        self.stage.on_safe_torque_off(await self._read_safe_torque_off(sdo))
         return reasons
 
     def steps(self) -> list[Step]:

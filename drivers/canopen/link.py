@@ -165,32 +165,43 @@ class CanopenLink:
         self._sync_open = False
         self._bus.drain_all()
         self._sync_s = now_s
+        if self._active:
+            self._bus.send(SYNC, b"")  # first: nothing is read before the nodes expect answers to it
+            self._begin_sync()
+        else:
+            self._ask()
         self._bus.tend(now_s)
+
+    def _ask(self) -> None:
         for node in self._nodes:
-            self._questions.ask(node, now_s, active=self._active)
-        if not self._active:
-            return
+            self._questions.ask(node, self._sync_s, active=self._active)
+
+    def _begin_sync(self) -> None:
+        self._awaited = 0
         for node in self._nodes:
             node.begin_sync()
-        self._awaited = sum(node.station.awaited for node in self._nodes)
+            self._awaited += node.station.awaited
         self._answered = asyncio.get_running_loop().create_future()
         self._sync_open = True
-        self._bus.send(SYNC, b"")
 
     async def collect(self, inputs: Inputs, deadline_s: float) -> None:
         """The answers to this SYNC. Nodes that are absent already are heard, but not waited for."""
         if self._sync_open:
             self._bus.drain()
             if self._awaited > 0 and self._answered is not None:
+                over = asyncio.get_running_loop().call_at(deadline_s, self._wait_no_longer)
                 try:
-                    async with asyncio.timeout_at(deadline_s):
-                        await self._answered
-                except TimeoutError:
-                    pass
+                    await self._answered
+                finally:
+                    over.cancel()
             self._sync_open = False
             for node in self._nodes:
                 node.station.end_sync()
         self._fill(inputs)
+
+    def _wait_no_longer(self) -> None:
+        if self._answered is not None and not self._answered.done():
+            self._answered.set_result(None)
 
     def _fill(self, inputs: Inputs) -> None:
         absent: list[str] = []
@@ -210,9 +221,10 @@ class CanopenLink:
             self.health.last_error = self._bus.gone
 
     def write(self, outputs: Outputs) -> None:
-        """The commands, and the heartbeat. Then, in the rest of the period, a watchdog is read if it is time for it."""
+        """The commands, and the heartbeat. Then what it is time to ask by SDO, in the rest of the period."""
         if self._active:
             self._feed.give(outputs, self._sync_s)
+            self._ask()
             self._questions.verify(self._sync_s)
 
     # what arrives
@@ -241,8 +253,8 @@ class CanopenLink:
         if self._sync_open and station.awaited and station.answered:
             station.awaited = False
             self._awaited -= 1
-            if self._awaited == 0 and self._answered is not None and not self._answered.done():
-                self._answered.set_result(None)
+            if self._awaited == 0:
+                self._wait_no_longer()
 
     def _on_heartbeat(self, node: Node, cob_id: int, data: bytes | bytearray, now_s: float) -> None:
         try:

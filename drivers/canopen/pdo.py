@@ -5,9 +5,8 @@ Objects follow one another in mapping order, little-endian, without gaps (CiA 30
 
 import struct
 from collections.abc import Sequence
-from dataclasses import dataclass
 from math import isfinite
-from typing import Any
+from typing import Any, NamedTuple
 
 from drivers.canopen.map_drive import DriveMap
 from drivers.canopen.map_parts import CanObject
@@ -21,8 +20,7 @@ class MalformedPdo(ValueError):
     """A frame that is not the PDO that was mapped; the text says why."""
 
 
-@dataclass(slots=True, frozen=True)
-class DriveSample:
+class DriveSample(NamedTuple):
     """What a drive says at a SYNC."""
 
     statusword: int

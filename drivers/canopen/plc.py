@@ -5,8 +5,8 @@ stops. The PLC's echo of it is watched the same way: a CAN controller that still
 While the link is silent the status is asked for by SDO, and nothing is written.
 """
 
-from dataclasses import dataclass
 from math import isfinite
+from typing import NamedTuple
 
 from drivers.canopen.configure import plc_expected, plc_steps, watchdog_step
 from drivers.canopen.map_plc import PlcMap
@@ -21,8 +21,7 @@ from gateway.core.line import LinePlc
 from gateway.core.signals import Inputs, Outputs, Quality
 
 
-@dataclass(slots=True, frozen=True)
-class _Status:
+class _Status(NamedTuple):
     word: int
     speed: float  #: of the unwinder, in counts
     echo: int
@@ -42,6 +41,10 @@ class PlcNode:
         self._write_scale = si_per_count(device.write.speed.unit, device.write.speed.scale)
         self._transmit = PdoLayout(device.objects_of(device.transmit_pdo))
         self._receive = PdoLayout(device.objects_of(device.receive_pdo))
+        names = device.transmit_pdo.objects
+        self._status_at, self._speed_at, self._echo_at = (
+            names.index(name) for name in ("status", "speed", "life_echo")
+        )
         self.answers = (device.transmit_pdo.cob_id + plc.address,)
         self._receive_cob_id = device.receive_pdo.cob_id + plc.address
         self._life = LifeCounter()
@@ -70,8 +73,8 @@ class PlcNode:
         self._decode(data)
 
     def _decode(self, data: bytes | bytearray) -> _Status:
-        fields = dict(zip(self._device.transmit_pdo.objects, self._transmit.decode(data), strict=True))
-        return _Status(int(fields["status"]), fields["speed"], int(fields["life_echo"]))
+        fields = self._transmit.decode(data)
+        return _Status(int(fields[self._status_at]), fields[self._speed_at], int(fields[self._echo_at]))
 
     def absent(self, now_s: float) -> bool:
         return self.station.absent(now_s, self._runs)

@@ -40,7 +40,7 @@ class Questions:
     def verify(self, now_s: float) -> None:
         """Ask the next node whether its watchdog still is what was set, if it is time for it: one after the other.
 
-        Called at the end of a cycle, so that neither the frames nor the thread that waits for them meet its answers.
+        Called at the end of a cycle, so that its frames do not come among the answers.
         """
         if now_s < self._verify_s or not self._guarded or not (self._verifying is None or self._verifying.done()):
             return

@@ -38,6 +38,8 @@ class Station:
         #: The number under which its watchdog expects our heartbeat; None: it expects receive PDOs, or nothing.
         self.listens_to = watchdog.node if watchdog is not None and watchdog.kind == "heartbeat-consumer" else None
         self.heartbeat_s = heartbeat.value * si_per_count(heartbeat.unit, 1.0)
+        self._patience_s = HEARTBEATS_ALLOWED * self.heartbeat_s
+        self._patience_at_rest_s = HEARTBEATS_ALLOWED_AT_REST * self.heartbeat_s
         self.nmt_state: int | None = None
         self.heard_s: float | None = None
         self.boot_ups = 0
@@ -105,8 +107,8 @@ class Station:
         self.missed += not self.answered
 
     def heartbeat_lost(self, now_s: float, relied_on: bool) -> bool:
-        allowed = HEARTBEATS_ALLOWED if relied_on else HEARTBEATS_ALLOWED_AT_REST
-        return self.heard_s is None or now_s - self.heard_s > allowed * self.heartbeat_s
+        patience_s = self._patience_s if relied_on else self._patience_at_rest_s
+        return self.heard_s is None or now_s - self.heard_s > patience_s
 
     def absent(self, now_s: float, relied_on: bool) -> bool:
         """Never heard, or lost. `relied_on`: something moves by it, so its heartbeats count strictly."""

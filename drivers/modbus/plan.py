@@ -5,6 +5,7 @@ one device writes is never torn apart. Where a read and a write are left they go
 writes first.
 """
 
+import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -25,11 +26,10 @@ class Request:
 
 @dataclass(frozen=True, slots=True)
 class _Part:
-    """What one read holds of a device: the fields `places`, from register `start` of the answer to the `read`-th."""
+    """What one read holds of a device: the fields `places`, from byte `start` of the registers of the `read`-th."""
 
     read: int
     start: int
-    end: int
     block: RegisterBlock
     places: tuple[int, ...]
 
@@ -72,26 +72,32 @@ class Plan:
 
     def _part(self, wish: Wish, read: int, places: list[int]) -> _Part:
         block = RegisterBlock([wish.reads[k] for k in places], wish.word_order)
-        start = block.address - self.reads[read][0]
-        return _Part(read, start, start + block.count, block, tuple(places))
+        return _Part(read, 2 * (block.address - self.reads[read][0]), block, tuple(places))
 
     def decode(self, answers: Sequence[Sequence[int]]) -> list[list[float]]:
         """The numbers of every wish, in the order of its `reads`, from the registers of every read.
 
         Raises ValueError where an answer has another length than was asked for.
         """
-        for (_, count), registers in zip(self.reads, answers, strict=True):
-            if len(registers) != count:
-                raise ValueError(f"{len(registers)} registers, asked for {count}")
+        try:
+            return self.decode_bytes([struct.pack(f">{len(registers)}H", *registers) for registers in answers])
+        except struct.error as error:
+            raise ValueError(f"no registers: {error}") from error
+
+    def decode_bytes(self, answers: Sequence[bytes]) -> list[list[float]]:
+        """The same from registers as they come on the wire."""
+        for (_, count), data in zip(self.reads, answers, strict=True):
+            if len(data) != 2 * count:
+                raise ValueError(f"{len(data) // 2} registers, asked for {count}")
         return [self._numbers(parts, answers) for parts in self._parts]
 
-    def _numbers(self, parts: tuple[_Part, ...], answers: Sequence[Sequence[int]]) -> list[float]:
+    def _numbers(self, parts: tuple[_Part, ...], answers: Sequence[bytes]) -> list[float]:
         if len(parts) == 1:
             part = parts[0]
-            return part.block.decode(answers[part.read][part.start : part.end])
+            return part.block.decode_bytes(answers[part.read], part.start)
         numbers: dict[int, float] = {}
         for part in parts:
-            found = part.block.decode(answers[part.read][part.start : part.end])
+            found = part.block.decode_bytes(answers[part.read], part.start)
             numbers.update(zip(part.places, found, strict=True))
         return [numbers[k] for k in range(len(numbers))]
 

@@ -46,9 +46,16 @@ class RegisterBlock:
         if len(registers) != self.count:
             raise ValueError(f"{len(registers)} registers, asked for {self.count}")
         try:
-            numbers = self._fields.unpack(self._registers.pack(*self._in_order(registers)))
+            return self.decode_bytes(self._registers.pack(*registers), 0)
         except struct.error as error:
             raise ValueError(f"no registers: {error}") from error
+
+    def decode_bytes(self, data: bytes, at: int) -> list[float]:
+        """The same from registers as they come on the wire, of which the block's own begin at byte `at`."""
+        if self._swapped:
+            registers = self._in_order(self._registers.unpack_from(data, at))
+            data, at = self._registers.pack(*registers), 0
+        numbers = self._fields.unpack_from(data, at)
         return list(numbers) if self._in_address_order else [numbers[position] for position in self._position]
 
     def encode(self, numbers: Sequence[float]) -> list[int]:

@@ -193,10 +193,5 @@ def usual_float(row: Row, value: int | float | None) -> bool:
     return isinstance(value, float) and row.reading.startswith("f32") and isfinite(value) and low <= abs(value) <= high
 
 
-def exception_code(error: ModbusFailed) -> int | None:
-    """The Modbus exception that a failure tells of; None when it was another."""
-    return error.exception_code
-
-
 def _deadline_s() -> float:
     return asyncio.get_running_loop().time() + REQUEST_TIMEOUT_S

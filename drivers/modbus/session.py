@@ -4,6 +4,9 @@ A unit has a connection to itself so that one that is dead, slow or lies cannot 
 request that is still running when the next cycle begins is not doubled: that cycle's samples are lost, and counted. A
 connection on which nothing answers any more is dropped, with all that waits in it, and a lost one is made again
 beside the cycle, with growing pauses; the first request on it is sent alone.
+
+Where there is nothing to prove and one request is enough, as in nearly every cycle, it leaves at once. Everything else
+takes a task: proofs, several requests, and what is asked beside the cycle.
 """
 
 import asyncio
@@ -11,6 +14,7 @@ from collections.abc import Callable
 
 from drivers.modbus.client import ModbusConnection, ModbusFailed, ModbusTimeout
 from drivers.modbus.device import ANSWERS_ALLOWED
+from drivers.modbus.looks import Looks
 from drivers.modbus.plan import Request
 from drivers.modbus.settings import REQUEST_TIMEOUT_S, SettingsWriter
 from drivers.modbus.unit import Payloads, Unit
@@ -19,8 +23,6 @@ from gateway.core.signals import Inputs, LinkHealth
 EXCHANGE_SHARE = 0.8  #: of a period; what has not come by then leaves room for the next request
 LEAVE_TIMEOUT_S = 0.2
 MUTE_S = 0.3  #: without any answer, until the connection is dropped
-LOOK_S = 1.0  #: until every setting that no cycle reads was looked at again
-LOOK_PATIENCE_S = 5.0  #: until a cycle is given up for it, of a device that is too slow for more than the cycles
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.1, 2.0  #: between attempts to connect
 
 
@@ -43,6 +45,10 @@ class Session:
         self._health = health
         self._on_done = on_done
         self._task: asyncio.Task[None] | None = None
+        self._at_once = False  #: an exchange without a task is under way
+        self._judged = False  #: the settings that it reads were proven before
+        self._answers = 0  #: on the connection before this exchange
+        self._deadline_s = 0.0  #: of this exchange
         self._open = False  #: the cycle in which the exchange began still takes its answer
         self._sent_s = 0.0
         self._numbers: list[list[float]] | None = None  #: of this cycle
@@ -52,8 +58,7 @@ class Session:
         self._retry_s = float("-inf")
         self._pause_s = FIRST_PAUSE_S
         self._checked_on = 0  #: number of the connection on which the unit was checked
-        self._look_s = 0.0  #: when the next setting is looked at
-        self._looks = 0
+        self._looks = Looks(unit, period_s)
 
     @property
     def where(self) -> str:
@@ -62,6 +67,7 @@ class Session:
     async def connect(self) -> bool:
         """Try once."""
         self._mute = 0
+        self._at_once = False
         if self._connection.number:
             self.unit.connection_lost()
         return await self._connection.connect()
@@ -103,7 +109,7 @@ class Session:
     def activate(self) -> None:
         """Its settings are proven: from now on it is commanded."""
         self.unit.activate()
-        self._look_s = _now_s() + LOOK_S
+        self._looks.begin(_now_s())
 
     async def leave(self) -> None:
         """Tell a unit that was commanded to rest, and restore its settings: nobody will feed its watchdog any more.
@@ -112,6 +118,7 @@ class Session:
         """
         if self._task is not None and not self._task.done():
             await asyncio.wait([self._task])  # it may carry the last command
+        await self._connection.until_free()
         unit = self.unit
         lost, commanded = unit.dropped, unit.commanded
         unit.silence()
@@ -143,41 +150,78 @@ class Session:
         """Send what this cycle asks and commands; whether the answer is worth waiting for."""
         self._numbers = None
         payloads = self.unit.take_payloads()
-        if self._task is not None and not self._task.done():
+        if self._at_once or (self._task is not None and not self._task.done()):
             return False
         self.unit.standing.wrote = False
         if not self._connection.connected:
             self._reconnect(now_s)
             return False
         self._sent_s, self._open = now_s, True
-        patience_s = EXCHANGE_SHARE * self._period_s if self._connection.answers else MUTE_S
-        self._task = asyncio.create_task(self._exchange(payloads, now_s + patience_s))
+        self._answers = self._connection.answers
+        self._deadline_s = now_s + (EXCHANGE_SHARE * self._period_s if self._answers else MUTE_S)
+        if not self._begin_at_once(payloads):
+            self._task = asyncio.create_task(self._exchange(payloads))
         return self._unanswered < ANSWERS_ALLOWED  # who is absent is asked, and not waited for
 
-    async def _exchange(self, payloads: Payloads | None, deadline_s: float) -> None:
-        answers = self._connection.answers
+    def _begin_at_once(self, payloads: Payloads | None) -> bool:
+        """Whether all of this exchange is one request that has left."""
+        unit = self.unit
+        writes = payloads is not None and unit.may_write()
+        request = unit.writes_at_once if writes else unit.reads_at_once
+        if request is None or not unit.settled:
+            return False
+        data = request.encode(payloads[0] if writes and payloads else ())
+        begun = self._connection.begin(unit.address, data, request.registers_read, self._deadline_s, self._take_answer)
+        if begun:
+            self._at_once, self._judged = True, unit.standing.active
+            unit.standing.wrote = writes
+            unit.commanded |= writes
+        return begun
+
+    def _take_answer(self, answer: bytes | ModbusFailed) -> None:
+        self._at_once = False
+        if isinstance(answer, bytes):
+            numbers = self.unit.plan.decode_bytes((answer,))
+            judged = self._judged and self.unit.standing.active
+            self._conclude(self.unit.take_settings(numbers, judged=judged))
+        else:
+            self._conclude(answer)
+        if (until_s := self._time_to_look()) is not None:
+            self._task = asyncio.create_task(self._look(until_s))
+
+    async def _exchange(self, payloads: Payloads | None) -> None:
         try:
-            numbers = await self._ask(payloads, deadline_s)
-            self._unanswered = 0
-            if self._open:
-                self._numbers = numbers
-            else:
-                self._discard(f"{self.unit.name}: an answer after its cycle")
-        except ModbusTimeout as error:
-            self._unanswered += 1
-            self._health.last_error = f"{self.unit.name}: {error}"
+            outcome = await self._ask(payloads, self._deadline_s)
         except (ModbusFailed, ValueError) as error:
-            self._unanswered = 0
-            self._discard(f"{self.unit.name}: {error}")
-        finally:
+            outcome = error
+        except BaseException:
             self._on_done(self)
-        if self._connection.answers > answers:
+            raise
+        self._conclude(outcome)
+        if (until_s := self._time_to_look()) is not None:
+            await self._look(until_s)
+
+    def _conclude(self, outcome: list[list[float]] | Exception) -> None:
+        """The exchange has ended: with the numbers of every device, or without."""
+        if isinstance(outcome, ModbusTimeout):
+            self._unanswered += 1
+            self._health.last_error = f"{self.unit.name}: {outcome}"
+        elif isinstance(outcome, Exception):
+            self._unanswered = 0
+            self._discard(f"{self.unit.name}: {outcome}")
+        elif self._open:
+            self._unanswered = 0
+            self._numbers = outcome
+        else:
+            self._unanswered = 0
+            self._discard(f"{self.unit.name}: an answer after its cycle")
+        self._on_done(self)
+        if self._connection.answers > self._answers:
             self._mute = 0
             self._pause_s = FIRST_PAUSE_S
-            await self._look(deadline_s)
             return
         self._mute += 1
-        if self._mute * self._period_s >= MUTE_S or not answers:
+        if self._mute * self._period_s >= MUTE_S or not self._answers:
             self._connection.close()
 
     async def _ask(self, payloads: Payloads | None, deadline_s: float) -> list[list[float]]:
@@ -204,23 +248,15 @@ class Session:
         """Whether the command of this exchange is over: the proofs before it took longer than its period."""
         return _now_s() >= self._sent_s + self._period_s
 
-    async def _look(self, deadline_s: float) -> None:
-        """Read one of the settings that no cycle reads, when it is due and there is as much time as the cycle took.
+    def _time_to_look(self) -> float | None:
+        """Until when a setting may be read that no cycle reads, where that is due and something was answered."""
+        return None if self._mute else self._looks.until_s(_now_s(), self._sent_s, self._deadline_s)
 
-        A device for which there never is gives up one cycle for it now and then.
-        """
-        unit, now_s = self.unit, _now_s()
-        groups = len(unit.unseen_settings.groups)
-        if not groups or now_s < self._look_s or not unit.may_write():
-            return
-        if now_s + (now_s - self._sent_s) > deadline_s:
-            if now_s < self._look_s + LOOK_PATIENCE_S:
-                return
-            deadline_s = now_s + self._period_s
-        self._look_s = now_s + LOOK_S / groups
-        self._looks += 1
+    async def _look(self, until_s: float) -> None:
+        unit = self.unit
+        group = self._looks.next_group(_now_s())
         try:
-            reasons = await unit.unseen_settings.judge(self._looks % groups, self._connection, deadline_s)
+            reasons = await unit.unseen_settings.judge(group, self._connection, until_s)
         except ModbusTimeout as error:
             reasons = [str(error)]
         if reasons and unit.standing.active:
@@ -273,6 +309,7 @@ class Session:
     async def close(self) -> None:
         """Drop the connection. Idempotent."""
         self.unit.silence()
+        self._at_once = False
         await _cancel(self._task)
         await _cancel(self._connecting)
         self._task = self._connecting = None

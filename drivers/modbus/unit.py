@@ -8,6 +8,7 @@ watchdog itself may be off all of them are told to rest first: left alone they m
 from collections.abc import Sequence
 
 from drivers.modbus.client import ModbusFailed
+from drivers.modbus.cyclic import only
 from drivers.modbus.device import Check, Device, Setting, Standing
 from drivers.modbus.plan import Plan, Wish
 from drivers.modbus.proof import Proof
@@ -32,6 +33,9 @@ class Unit:
         wishes = [device.wish for device in devices]
         self._seen = _in_reach(wishes, self.settings)  #: those that every cycle reads
         self.plan = Plan([*wishes, *(setting.wish for setting in self._seen)], together)
+        #: The one request of a cycle that reads, and of one that writes too; None where it takes several.
+        self.reads_at_once = only(self.plan.read_only, read_function)
+        self.writes_at_once = only(self.plan.read_write, read_function)
         proofs = [device.proofs for device in devices]
         #: Before anything is believed. `prepare` proves it before there is torque; nobody would after a reconnection.
         self.identity = self._proof([check for proof in proofs for check in proof.identity])
@@ -111,6 +115,12 @@ class Unit:
             return None
         self._rests -= 1
         return self.rest_payloads()
+
+    @property
+    def settled(self) -> bool:
+        """Whether there is nothing to prove, and nothing to tell it, before a cycle's reading and writing."""
+        proven = self.kept_settings.complete or self.dropped or not self.standing.active
+        return proven and self.identity.complete and not self._rests
 
     def may_write(self) -> bool:
         return self.standing.active and not self.dropped and self.identity.complete and self.kept_settings.complete

@@ -1,7 +1,7 @@
 """Drives, load-cell amplifiers and the line PLC behind one OPC UA server, behind the driver port.
 
 The client does not live here but at the other end of a channel (see `channel`). A cycle asks it one question: write
-the commands of the cycle before, then read everything; what has come by the deadline counts. There is one question
+the commands of the cycle before, and read everything; what has come by the deadline counts. There is one question
 at a time: while one is not answered, no other is asked, its cycle is missed and its commands are never written.
 """
 

@@ -44,7 +44,8 @@ class Plan(NamedTuple):
 
 
 class Question(NamedTuple):
-    """Write these, then read those; nodes are places in the plan.
+    """Write these and read those; nodes are places in the plan. Both are sent at once, in this order, and a server may
+    do them in any: what has to be read after a write is another question.
 
     Nothing is written on another connection than `connection`, nor from `write_by_s` on: what was true of the
     devices may not be any more. `patient`: without a connection, wait for one.
@@ -85,7 +86,7 @@ def encode_question(question: Question) -> bytes:
     """Raises ValueError when it is too long."""
     number, connection, write_by_s, deadline_s, patient, writes, reads = question
     head = _QUESTION.pack(number, connection, write_by_s, deadline_s, patient, len(writes), len(reads))
-    body = b"".join(_WRITE.pack(*write) for write in writes)
+    body = b"".join([_WRITE.pack(*write) for write in writes])
     return _bounded(head + body + struct.pack(f"<{len(reads)}H", *reads))
 
 
@@ -107,7 +108,7 @@ def encode_answer(answer: Answer) -> bytes:
     """Raises ValueError when it is too long. A text is cut."""
     written, readings = answer.written, answer.readings
     head = _ANSWER.pack(answer.number, answer.outcome, answer.connection, len(written), len(readings))
-    body = struct.pack(f"<{len(written)}I", *written) + b"".join(_READING.pack(*reading) for reading in readings)
+    body = struct.pack(f"<{len(written)}I", *written) + b"".join([_READING.pack(*reading) for reading in readings])
     return _bounded(head + body + answer.text.encode()[:MAX_TEXT])
 
 

@@ -18,7 +18,7 @@ class NoAnswer(Exception):
 
 
 class Ask(Protocol):
-    """Write, then read, and wait for the answer. Raises NoAnswer."""
+    """Write and read, and wait for both answers. Raises NoAnswer. What has to be read after the write, ask for then."""
 
     async def __call__(self, writes: tuple[tuple[int, float], ...], reads: tuple[int, ...]) -> Answer: ...
 
@@ -66,10 +66,10 @@ async def restore(ask: Ask, noted: dict[Device, float]) -> list[str]:
 
 
 async def _set_watchdog(ask: Ask, name: str, watchdog: Watchdog) -> list[str]:
-    answer = await ask(((watchdog.node, float(watchdog.counts)),), (watchdog.node,))
-    status, found = answer.written[0], answer.readings[0]
+    status = (await ask(((watchdog.node, float(watchdog.counts)),), ())).written[0]
     if not is_done(status):
         return [f"{name}: its watchdog cannot be set to {watchdog.counts}: {describe(status)}"]
+    found = (await ask((), (watchdog.node,))).readings[0]
     if not found.good:
         return [f"{name}: its watchdog cannot be read back: {found.trouble}"]
     if found.value != watchdog.counts:

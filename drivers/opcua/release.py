@@ -44,10 +44,10 @@ async def _tell_off(ask: Ask, axes: list[Axis]) -> tuple[dict[Axis, Reading], li
     troubles: list[str] = []
     while axes:
         writes = [axis.farewell() for axis in axes]
-        answer = await ask(_flat(writes), tuple(axis.statusword for axis in axes))
-        refusals = _refusals(axes, writes, answer.written)
+        refusals = _refusals(axes, writes, (await ask(_flat(writes), ())).written)
         if not refusals:
-            return dict(zip(axes, answer.readings, strict=True)), troubles
+            readings = (await ask((), tuple(axis.statusword for axis in axes))).readings
+            return dict(zip(axes, readings, strict=True)), troubles
         for axis, status in refusals.items():
             why = f"its last command was refused ({describe(status)})"
             troubles.append(f"{axis.name}: {why}; it is left to its watchdog")

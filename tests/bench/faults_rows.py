@@ -46,6 +46,7 @@ class Row:
     variants: tuple[Variant, ...]
     harms_web: bool = False  #: the fault itself takes the tension out of its band
     pause_periods: int = 25  #: until the next injection may come, when the line runs on
+    settle_periods: int = 30  #: after a start, before the first injection
 
 
 T = 0.01
@@ -141,6 +142,7 @@ ROWS = (
             Variant("plc freeze", ("plc freeze for 0.5",)),
             Variant("plc plc-freeze", ("plc plc-freeze for 0.5",)),
         ),
+        settle_periods=400,  # the rule for drives has to know their jitter first
     ),
     Row(
         "cell-once", "a load cell without a number, or out of range, in one period", Wanted.HOLD, "same cycle", T,

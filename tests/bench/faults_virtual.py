@@ -24,7 +24,6 @@ from tests.bench.lines import AMPLIFIER_NODE, PLC_NODE
 from tests.closed_loop.virtual_line import VirtualLine
 
 CHANNEL = "239.74.163.2"
-SETTLE_PERIODS = 30  #: after a start, before the first injection
 OBSERVED_PERIODS = 130  #: of a fault that should stop the line, until it counts as unseen
 UNIT = {"load-cell": 1, "plc": 2}
 
@@ -59,10 +58,10 @@ class Bench:
         self._listen()
         self._refuse()
 
-    def begin(self) -> None:
-        """From rest to production. Raises AssertionError when it cannot."""
+    def begin(self, row: Row) -> None:
+        """From rest to production, ready for `row`. Raises AssertionError when it cannot."""
         self.line.begin_in_production()
-        self.line.step(SETTLE_PERIODS + self.dice.randrange(10))
+        self.line.step(row.settle_periods + self.dice.randrange(10))
 
     def inject(self, row: Row, variant: Variant) -> Injection:
         """One fault, and what comes of it; the line is at rest, or runs on, afterwards."""
@@ -251,11 +250,11 @@ def _node(variant: Variant, values: dict[str, Any]) -> int:
 
 
 @contextmanager
-def bench_line(seed: int, wiring: str = DEMO) -> Iterator[Bench]:
-    """A line in production."""
+def bench_line(seed: int, row: Row, wiring: str = DEMO) -> Iterator[Bench]:
+    """A line in production, ready for `row`."""
     with virtual_line(wiring, seed) as line:
         bench = Bench(line, Random(seed))
-        bench.begin()
+        bench.begin(row)
         yield bench
 
 
@@ -277,7 +276,7 @@ def injections(row: Row, numbers: list[int], wiring: str = DEMO) -> list[Injecti
     results: list[Injection] = []
     left = list(numbers)
     while left:
-        with bench_line(1 + left[0], wiring) as bench:
+        with bench_line(1 + left[0], row, wiring) as bench:
             while left:
                 number = left.pop(0)
                 bench.dice.seed(f"{row.id}/{number}")
@@ -286,7 +285,7 @@ def injections(row: Row, numbers: list[int], wiring: str = DEMO) -> list[Injecti
                     bench.line.step(row.pause_periods)
                     continue
                 try:
-                    bench.begin()
+                    bench.begin(row)
                 except AssertionError:  # some faults leave nothing to go on with
                     break
     return results

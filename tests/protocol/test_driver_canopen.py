@@ -291,18 +291,14 @@ def test_all_that_waits_is_read_before_a_sync() -> None:
         await link.prepare()
         await cycle(link, inputs)
         first.on_sync = lambda drive: []
-        others = [can.Message(arbitration_id=0x555, is_extended_id=False)] * 300
+        others = [(0x555, b"")] * 300
         link._bus._drain(1 << 16)  # noqa: SLF001
-        link._bus._receive = iter([*others, tpdo_of(first), None, None, None]).__next__  # noqa: SLF001
+        wire: Any = link._bus._wire  # noqa: SLF001
+        wire.receive = iter([*others, (0x181, first.tpdo()), None, None, None]).__next__
         link.trigger(asyncio.get_running_loop().time())
         assert link.health.malformed == 1, "the old answer is found behind all the others, before the SYNC"
-        del link._bus._receive  # noqa: SLF001
 
     bench(body)
-
-
-def tpdo_of(drive: Drive) -> can.Message:
-    return can.Message(arbitration_id=0x180 + drive.node, data=drive.tpdo(), is_extended_id=False)
 
 
 def test_the_answer_of_an_absent_drive_does_not_stand_in_for_another() -> None:
@@ -335,7 +331,8 @@ def test_the_answer_of_an_absent_drive_does_not_stand_in_for_another() -> None:
 
 def test_frames_stay_on_this_machine() -> None:
     async def body(link: CanopenLink, drives: Drives, first: Drive, second: Drive) -> None:
-        descriptor = link._bus._fileno  # noqa: SLF001
+        assert link._bus._bus is not None  # noqa: SLF001
+        descriptor = link._bus._bus.fileno()  # noqa: SLF001
         with socket.socket(fileno=os.dup(descriptor)) as interface:
             assert interface.getsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL) == 0
 
@@ -446,8 +443,10 @@ def test_safe_torque_off_is_asked_for_while_a_drive_may_not_switch_on() -> None:
         await cycle(link, inputs)
         first.objects[0x60FD, 0] = struct.pack("<I", 1 << 16)
         first.statusword = SWITCH_ON_DISABLED & ~0x10
-        while inputs.drive_state[0] != DriveState.STO:
-            await cycle(link, inputs)
+        async with asyncio.timeout(5.0):
+            while inputs.drive_state[0] != DriveState.STO:
+                await cycle(link, inputs)
+                link.write(Outputs(2))
         assert inputs.drive_state[1] == DriveState.ENABLED
         first.statusword = READY
         await cycle(link, inputs)

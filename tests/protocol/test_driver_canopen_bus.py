@@ -48,9 +48,9 @@ def write(link: CanopenLink) -> None:
     link.write(outputs)
 
 
-def interface(link: CanopenLink) -> Any:
-    """python-can's own object."""
-    return link._bus._bus  # noqa: SLF001
+def wire(link: CanopenLink) -> Any:
+    """Through which the frames go."""
+    return link._bus._wire  # noqa: SLF001
 
 
 async def turn(link: CanopenLink, inputs: Inputs) -> None:
@@ -84,7 +84,7 @@ def test_a_dead_receiver_is_missed_in_the_same_cycle_and_opened_again(kind: str,
             failures.append(error)
             raise error
 
-        interface(link).recv = recv
+        wire(link).receive = recv
         await turn(link, inputs)
         assert list(inputs.speed.quality) == [Quality.STALE] * 2
         async with asyncio.timeout(10.0):
@@ -104,8 +104,8 @@ def test_three_missed_periods_drop_the_drives_and_they_are_told_when_the_bus_is_
         inputs = Inputs(2)
         first.statusword = second.statusword = ENABLED
         await cycle(link, inputs)
-        real = interface(link).recv
-        interface(link).recv = interface(link).send = raises(DOWN)
+        real = wire(link).receive
+        wire(link).receive = wire(link).send = raises(DOWN)
         drives.heartbeat(1)  # something arrives, and cannot be read
         await until(lambda: bool(link._bus.gone))  # noqa: SLF001
         link._bus._retry_s = float("inf")  # noqa: SLF001
@@ -131,7 +131,7 @@ def test_three_missed_periods_drop_the_drives_and_they_are_told_when_the_bus_is_
 
 def test_the_pauses_between_attempts_grow(monkeypatch: pytest.MonkeyPatch) -> None:
     async def body(link: CanopenLink, drives: Drives, first: Drive, second: Drive) -> None:
-        interface(link).recv = raises(DOWN)
+        wire(link).receive = raises(DOWN)
         drives.heartbeat(1)
         await until(lambda: bool(link._bus.gone))  # noqa: SLF001
         attempts: list[float] = []
@@ -162,7 +162,7 @@ def test_the_pauses_between_attempts_grow(monkeypatch: pytest.MonkeyPatch) -> No
 
 def test_prepare_opens_a_bus_that_is_gone() -> None:
     async def body(link: CanopenLink, drives: Drives, first: Drive, second: Drive) -> None:
-        interface(link).recv = raises(DOWN)
+        wire(link).receive = raises(DOWN)
         drives.heartbeat(1)
         await until(lambda: bool(link._bus.gone))  # noqa: SLF001
         await link.prepare()
@@ -182,7 +182,7 @@ def test_error_frames_are_told_and_bus_off_opens_the_bus_again() -> None:
         inputs = Inputs(2)
         await cycle(link, inputs)
         frames: list[can.Message | None] = [error_frame(0x004, bytes([0, 0x20, 0, 0, 0, 0, 0, 0])), None]
-        link._bus._receive = lambda: frames.pop(0)  # noqa: SLF001
+        wire(link).receive = lambda: frames.pop(0)
         link._bus.drain()  # noqa: SLF001
         assert link.health.last_error == "CAN error: controller: error passive, sending"
         assert not link._bus.gone and link.health.malformed == 1  # noqa: SLF001
@@ -190,7 +190,6 @@ def test_error_frames_are_told_and_bus_off_opens_the_bus_again() -> None:
         link._bus.drain()  # noqa: SLF001
         assert len(frames) == 2, "nothing more is read"
         assert "bus-off" in link._bus.gone and "termination" in link._bus.gone  # noqa: SLF001
-        del link._bus._receive  # noqa: SLF001
         async with asyncio.timeout(5.0):
             while not (link.health.reconnects and inputs.speed.good()):
                 await turn(link, inputs)
@@ -204,7 +203,7 @@ def test_a_sender_that_is_full_for_long_is_opened_again() -> None:
 
     async def body(link: CanopenLink, drives: Drives, first: Drive, second: Drive) -> None:
         inputs = Inputs(2)
-        interface(link).send = raises(can.CanOperationError("Transmit buffer full"))
+        wire(link).send = raises(can.CanOperationError("Transmit buffer full"))
         sends = 0
         while not link._bus.gone:  # noqa: SLF001
             link._bus.send(0x080, b"")  # noqa: SLF001

@@ -119,10 +119,10 @@ def test_each_watchdog_is_read_once_a_second() -> None:
     bench(body)
 
 
-# SDO has threads of its own
+# SDO and threads
 
 
-def test_a_silent_link_needs_no_thread_of_the_loops() -> None:
+def test_sdo_needs_no_thread_and_ends_with_the_link() -> None:
     async def body(link: CanopenLink, drives: Drives, first: Drive, second: Drive) -> None:
         release = threading.Event()
         loop = asyncio.get_running_loop()
@@ -133,13 +133,77 @@ def test_a_silent_link_needs_no_thread_of_the_loops() -> None:
         finally:
             release.set()
             await asyncio.gather(*hold)
-        assert any(thread.name.startswith("sdo") for thread in threading.enumerate())
+        assert not any(thread.name.startswith("sdo") for thread in threading.enumerate())
         first.sdo_answers = False
         asking = asyncio.create_task(link._sdo.upload(1, 0x6041, 0, 2))  # noqa: SLF001
         await until(lambda: any(data[1:3] == b"\x41\x60" for _, data in asked(drives)[-1:]))
         await link.close()
-        assert not any(thread.name.startswith("sdo") for thread in threading.enumerate()), "closed with the link"
         with pytest.raises(SdoSilent):
             await asking
+
+    bench(body)
+
+
+NAME = b"a name of 23 characters"
+HEAD = bytes.fromhex("081000")  #: of 1008h sub 0
+
+
+def in_segments(request: bytes, left: list[bytes]) -> bytes | None:
+    """The server's side of an upload of `NAME` (CiA 301, 7.2.4.3.6); `left` are the segments to come."""
+    if request[0] == 0x40:
+        left[:] = [NAME[k : k + 7] for k in range(0, len(NAME), 7)]
+        return b"\x41" + request[1:4] + struct.pack("<I", len(NAME))
+    if request[0] & 0xE0 != 0x60:
+        return None
+    segment = left.pop(0)
+    return bytes((request[0] & 0x10 | (7 - len(segment)) << 1 | (not left),)) + segment.ljust(7, b"\0")
+
+
+@pytest.mark.parametrize("size", [256, 4], ids=["as a text", "though four bytes were expected"])
+def test_what_comes_in_segments_is_read_in_a_thread_of_the_buss_own(size: int) -> None:
+    async def body(link: CanopenLink, drives: Drives, first: Drive, second: Drive) -> None:
+        left: list[bytes] = []
+        first.sdo = lambda request: in_segments(request, left)
+        assert await link._sdo.upload(1, 0x1008, 0, size) == NAME  # noqa: SLF001
+        assert any(thread.name.startswith("sdo") for thread in threading.enumerate())
+        aborts = [data for _, data in asked(drives) if data[0] == ABORT]
+        assert [data[1:4] for data in aborts] == ([] if size > 4 else [HEAD]), "the short transfer is ended first"
+        await link.close()
+        assert not any(thread.name.startswith("sdo") for thread in threading.enumerate()), "closed with the link"
+
+    bench(body)
+
+
+@pytest.mark.parametrize("answer", ["4B100000", "4B416001", "20416000", "60406100", "60416001"])
+def test_an_answer_to_another_question_is_none(answer: str) -> None:
+    async def body(link: CanopenLink, drives: Drives, first: Drive, second: Drive) -> None:
+        first.sdo = lambda request: bytes.fromhex(answer).ljust(8, b"\0")
+        with pytest.raises(SdoSilent):
+            await link._sdo.upload(1, 0x6041, 0, 2)  # noqa: SLF001
+        with pytest.raises(SdoSilent):
+            await link._sdo.download(1, 0x6041, 0, b"\1\2")  # noqa: SLF001
+
+    bench(body)
+
+
+def test_an_answer_that_nobody_waits_for_any_more_is_not_the_next_ones() -> None:
+    async def body(link: CanopenLink, drives: Drives, first: Drive, second: Drive) -> None:
+        answer, held = first.sdo, [False]
+
+        def hold(request: bytes) -> bytes | None:
+            held[0] = True
+            return None
+
+        first.sdo = hold
+        asking = asyncio.create_task(link._sdo.upload(1, 0x6041, 0, 2))  # noqa: SLF001
+        await until(lambda: held[0])
+        asking.cancel()
+        await asyncio.wait([asking])
+        first.sdo, first.statusword = answer, 0x1237
+        following = asyncio.create_task(link._sdo.upload(1, 0x6041, 0, 2))  # noqa: SLF001
+        drives.frames.clear()
+        await asyncio.sleep(0)
+        drives.send(0x581, bytes.fromhex("4B41600050020000"))  # late, to the one that was given up
+        assert await following == b"\x37\x12"
 
     bench(body)

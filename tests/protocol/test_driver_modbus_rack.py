@@ -217,7 +217,7 @@ async def period(link: ModbusLink, inputs: Inputs) -> None:
 
 
 def test_settings_out_of_reach_are_looked_at_beside_the_cycle(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("drivers.modbus.session.LOOK_S", 0.0)
+    monkeypatch.setattr("drivers.modbus.looks.LOOK_S", 0.0)
 
     async def body(link: ModbusLink, rack: Rack, peer: Registers) -> None:
         inputs = Inputs(3)
@@ -246,8 +246,8 @@ def test_settings_out_of_reach_are_looked_at_beside_the_cycle(monkeypatch: pytes
 def test_a_slow_rack_gives_up_a_cycle_for_its_settings_only_now_and_then(
     monkeypatch: pytest.MonkeyPatch, patience_s: float, looks: bool
 ) -> None:
-    monkeypatch.setattr("drivers.modbus.session.LOOK_S", 0.0)
-    monkeypatch.setattr("drivers.modbus.session.LOOK_PATIENCE_S", patience_s)
+    monkeypatch.setattr("drivers.modbus.looks.LOOK_S", 0.0)
+    monkeypatch.setattr("drivers.modbus.looks.LOOK_PATIENCE_S", patience_s)
 
     async def body(link: ModbusLink, rack: Rack, peer: Registers) -> None:
         inputs = Inputs(3)

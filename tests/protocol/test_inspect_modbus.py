@@ -11,7 +11,7 @@ from drivers.inspection import BusFacts
 from drivers.modbus.client import ModbusFailed
 from drivers.modbus.inspect import inspect
 from drivers.modbus.maps import ModbusMap
-from drivers.modbus.scan import exception_code, registers, scan, usual_float
+from drivers.modbus.scan import registers, scan, usual_float
 from drivers.wiring import Wired
 from gateway.core.line import ModbusTcpBus
 from tests.protocol.driver_support import FAULT, Registers, frame, line
@@ -171,7 +171,7 @@ def test_the_code_of_an_exception_is_read_from_what_the_client_says() -> None:
     async def body(peer: Registers) -> None:
         with pytest.raises(ModbusFailed) as failed:
             await registers("127.0.0.1", peer.port, 2, 4000, 1, [3])
-        assert exception_code(failed.value) == 2
+        assert failed.value.exception_code == 2
 
     bench(body)
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.system.uml import GuestFailed, Outcome, run_in_guest
+from tests.system.uml import KERNEL, GuestFailed, Outcome, run_in_guest
 
 LIMIT_S = 900.0  #: a boot and six lines; five minutes on a quiet machine
 FOLDER = Path("out/system/vcan")  #: what it left, for whoever must find out why
@@ -52,23 +52,23 @@ def test_the_guest_hands_back_output_and_exit_code_and_leaves_no_process(tmp_pat
     outcome = run_in_guest(["sh", "-c", "uname -r; ip -brief link show lo; echo said >&2; exit 7"], tmp_path, 60.0)
     assert outcome.code == 7
     assert "said" in outcome.output and "lo " in outcome.output
-    assert not guests(tmp_path)
+    assert not guests()
 
 
 def test_a_guest_that_hangs_is_ended(tmp_path: Path) -> None:
     with pytest.raises(GuestFailed, match="longer than 8 s"):
         run_in_guest(["sleep", "1000"], tmp_path, 8.0)
-    assert not guests(tmp_path)
+    assert not guests()
 
 
-def guests(share: Path) -> list[str]:
-    """Command lines of processes that belong to the guest with this folder."""
+def guests() -> list[str]:
+    """Command lines of processes that belong to a guest of this process's user."""
     found: list[str] = []
     for path in Path("/proc").glob("[0-9]*/cmdline"):
         try:
             words = path.read_bytes().replace(b"\0", b" ").decode(errors="replace")
         except OSError:  # it has ended meanwhile
             continue
-        if f"share={share}" in words:
+        if words.startswith(KERNEL) or f"/{KERNEL} " in words:
             found.append(words)
     return found

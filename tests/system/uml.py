@@ -9,6 +9,7 @@ import shlex
 import shutil
 import signal
 import subprocess
+import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -43,22 +44,30 @@ def run_in_guest(
         (share / name).unlink(missing_ok=True)
     words = " ".join(shlex.quote(str(word)) for word in command)
     given = "".join(f"export {key}={shlex.quote(value)}\n" for key, value in (environment or {}).items())
-    (share / "command").write_text(f"{given}cd {shlex.quote(os.getcwd())} && exec {words}\n")
+    (share / "command").write_text(f"{given}exec {words}\n")
     kernel = shutil.which(KERNEL)
     if kernel is None:
         raise GuestFailed(f"{KERNEL} is missing: install the Debian package user-mode-linux")
-    arguments = [
-        f"mem={MEMORY_MB}M", "rootfstype=hostfs", "rootflags=/", "ro", f"init={INIT}", f"share={share}", "quiet",
-        "con=null", "con0=null,fd:1", "ssl=null", f"uml_dir={share}/",
-    ]  # fmt: skip
-    console = share / "console"
-    with console.open("wb") as sink:
+    with tempfile.TemporaryDirectory(prefix="guest-") as links:
+        folder = Path(links)
+        (folder / "share").symlink_to(share)
+        (folder / "here").symlink_to(Path.cwd())
+        shutil.copy(INIT, folder / "init")
+        arguments = [
+            f"mem={MEMORY_MB}M", "rootfstype=hostfs", "rootflags=/", "ro", f"init={folder / 'init'}", f"links={folder}",
+            "quiet", "con=null", "con0=null,fd:1", "ssl=null", f"uml_dir={folder}/",
+        ]  # fmt: skip
+        _boot([*PUNCTUAL, kernel, *arguments], share, limit_s)
+    if not (share / "code").is_file():
+        raise GuestFailed(f"the guest ended without a result\n{_last_words(share)}")
+    return Outcome(int((share / "code").read_text()), (share / "output").read_text(errors="replace"))
+
+
+def _boot(command: list[str], share: Path, limit_s: float) -> None:
+    """Until the guest halts. Raises GuestFailed."""
+    with (share / "console").open("wb") as sink:
         guest = subprocess.Popen(
-            [*PUNCTUAL, kernel, *arguments],
-            stdin=subprocess.DEVNULL,
-            stdout=sink,
-            stderr=subprocess.STDOUT,
-            start_new_session=True,
+            command, stdin=subprocess.DEVNULL, stdout=sink, stderr=subprocess.STDOUT, start_new_session=True
         )
         try:
             guest.wait(limit_s)
@@ -66,9 +75,6 @@ def run_in_guest(
             raise GuestFailed(f"the guest took longer than {limit_s:g} s\n{_last_words(share)}") from None
         finally:
             _end(guest)
-    if not (share / "code").is_file():
-        raise GuestFailed(f"the guest ended without a result\n{_last_words(share)}")
-    return Outcome(int((share / "code").read_text()), (share / "output").read_text(errors="replace"))
 
 
 def _end(guest: subprocess.Popen[bytes]) -> None:

@@ -83,6 +83,14 @@ def test_states() -> None:
     assert heard(of, 0x1237, 0, 0, 0, 0, standing=distrusted).drive_state[0] == DriveState.FAULT
 
 
+@pytest.mark.parametrize("statusword", [0x1237, 0x0231, 0x0233, 0x0217, 0x0250])
+def test_safe_torque_off_is_no_torque_whatever_the_statusword_says(statusword: int) -> None:
+    of = axis()
+    assert heard(of, statusword, 0, 0, 1, 0).drive_state[0] == DriveState.STO
+    assert of.command(wanted(DriveRequest.ENABLE, 8.0))[1] == 0
+    assert heard(of, 0x0218, 0, 0, 1, 0).drive_state[0] == DriveState.FAULT
+
+
 def test_a_fault_is_told_once_with_its_code() -> None:
     of, standing = axis(), Standing(active=True)
     inputs = Inputs(1)

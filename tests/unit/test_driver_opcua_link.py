@@ -1,12 +1,10 @@
 """The OPC UA link on a scripted channel: what it asks when, and what an answer at the wrong moment does. No server."""
 
 import asyncio
-from collections.abc import Awaitable, Callable
-from types import SimpleNamespace
-from typing import Any
+from collections.abc import Awaitable, Callable, Sequence
+from typing import cast
 
 from asyncua import ua
-from asyncua.client.ua_client import UaClientState
 from asyncua.ua.ua_binary import struct_to_binary
 
 from drivers.device_map import MAPS, load_map
@@ -15,6 +13,8 @@ from drivers.opcua.engine import Engine
 from drivers.opcua.link import ANSWER_TIMEOUT_S, HUNG_S, OpcUaLink
 from drivers.opcua.messages import Answer, Outcome, Plan, Question
 from drivers.opcua.nodes import Node, Reading
+from drivers.opcua.services import Request, Services
+from drivers.opcua.session import Session
 from drivers.opcua.status import BAD_TRANSACTION_FAILED
 from drivers.wiring import Wired
 from gateway.core.signals import DriveRequest, DriveState, Inputs, Outputs, Quality
@@ -276,28 +276,63 @@ def test_a_cancelled_prepare_leaves_the_link_usable() -> None:
     run(scene)
 
 
+class ScriptedSession:
+    """Answers the requests of an engine, in order; those beyond are not answered."""
+
+    is_open = True
+
+    def __init__(self, *answers: bytes) -> None:
+        self._answers = answers
+        self.dropped = False
+        self.asked: list[asyncio.Future[bytes]] = []
+
+    def ask(self, requests: Sequence[Request]) -> list[asyncio.Future[bytes]]:
+        self.asked = [asyncio.get_running_loop().create_future() for _ in requests]
+        for future, answer in zip(self.asked, self._answers, strict=False):
+            future.set_result(answer)
+        return self.asked
+
+    async def drop(self) -> None:
+        self.dropped = True
+
+
+async def ask_engine(session: ScriptedSession, writes: tuple[tuple[int, float], ...]) -> Answer:
+    """The answer to a question that also reads a node."""
+    engine = Engine(Plan("opc.tcp://h:1", "none", "", "", "", [Node("urn:x", "A", "u16")]), 0)
+    engine._session, engine._services = cast(Session, session), Services([b"\0\1"], ["u16"])  # noqa: SLF001
+    deadline_s = asyncio.get_running_loop().time() + 0.05
+    return await engine.answer(Question(1, 0, deadline_s, deadline_s, False, writes, (0,)))
+
+
+READ = struct_to_binary(ua.ReadResponse(Results=[ua.DataValue(ua.Variant(7, ua.VariantType.UInt16), StatusCode=None)]))
+WRITTEN = struct_to_binary(ua.WriteResponse(Results=[ua.StatusCode(REFUSED)]))
+
+
 def test_an_answer_of_another_service_is_no_answer() -> None:
-    """asyncua would read a Read's answer from whatever message carries the number of the request."""
-
-    class Protocol:
-        transport = None
-
-        async def send_request(self, request: Any) -> Any:
-            response = ua.WriteResponse()
-            response.Results = [ua.StatusCode(0)]
-            return ua.utils.Buffer(struct_to_binary(response))
-
-    async def disconnect() -> None: ...
-
     async def scene() -> None:
-        engine = Engine(Plan("opc.tcp://h:1", "none", "", "", "", [Node("urn:x", "A", "u16")]), 1)
-        client: Any = SimpleNamespace(
-            state=UaClientState.CONNECTED, uaclient=SimpleNamespace(protocol=Protocol()), disconnect=disconnect
-        )
-        engine._client, engine._node_ids = client, [ua.NodeId("A", 2)]  # noqa: SLF001
-        deadline_s = asyncio.get_running_loop().time() + 5.0
-        answer = await engine.answer(Question(1, 0, deadline_s, deadline_s, False, (), (0,)))
-        assert answer.outcome is Outcome.FAILED
+        session = ScriptedSession(WRITTEN)
+        answer = await ask_engine(session, ())
+        assert (answer.outcome, session.dropped) == (Outcome.FAILED, True)
         assert "not ReadResponse" in answer.text
+
+    asyncio.run(scene())
+
+
+def test_write_and_read_are_sent_at_once_and_both_answered() -> None:
+    async def scene() -> None:
+        session = ScriptedSession(WRITTEN, READ)
+        answer = await ask_engine(session, ((0, 1.0),))
+        assert answer == Answer(1, Outcome.DONE, 0, (REFUSED,), (Reading(0, 7.0),))
+        assert len(session.asked) == 2
+
+    asyncio.run(scene())
+
+
+def test_what_was_written_is_told_though_the_read_is_not_answered() -> None:
+    async def scene() -> None:
+        session = ScriptedSession(WRITTEN)
+        answer = await ask_engine(session, ((0, 1.0),))
+        assert answer == Answer(1, Outcome.FAILED, 0, (REFUSED,), text="no answer in time")
+        assert session.dropped and session.asked[1].cancelled()
 
     asyncio.run(scene())
