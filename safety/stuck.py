@@ -2,7 +2,8 @@
 
 A cell whose noise spans several of its counts never shows one value for long. One with a coarse resolution, or a
 long filter, may: it shows the same count again and again, and nothing can be told this way. Which kind a cell is, is
-learnt from its own changes: their usual size against the smallest one.
+learnt from its own changes: their usual size against the smallest one. Only changes that reverse teach it: in a ramp of
+the set-point a coarse cell changes by several counts with every sample, too.
 """
 
 from dataclasses import dataclass, field
@@ -15,8 +16,8 @@ from gateway.core.signals import BoolArray, Inputs, Quality
 from safety.actions import Action, Finding
 
 COUNTS = 3.0  #: that a usual change of a fine cell spans; the same value 60 times in a row is then beyond chance
-LEARNT_CHANGES = 20  #: until a cell is judged
-REMEMBERED = 100.0  #: changes that the usual size of a change is the mean of, about; of fewer while there are fewer
+LEARNT_REVERSALS = 20  #: until a cell is judged
+REMEMBERED = 100.0  #: reversals that the usual size of a change is the mean of, about; of fewer while there are fewer
 _GOOD = int(Quality.GOOD)
 
 
@@ -39,20 +40,23 @@ class Cell:
 
     tension_n: float  #: last sample; NaN before the first
     same: int = 0  #: samples without a change, in a row
-    changes: int = 0  #: seen so far
-    smallest_n: float = inf  #: change
-    usual_n: float = 0.0  #: size of a change
+    change_n: float = 0.0  #: the last one
+    reversals: int = 0  #: changes against the one before
+    smallest_n: float = inf  #: of their sizes
+    usual_n: float = 0.0  #: of their sizes
 
-    def change(self, size_n: float) -> None:
-        """The value has changed by `size_n`, either way."""
+    def change(self, change_n: float) -> None:
+        """The value has changed."""
         self.same = 0
-        self.changes += 1
-        self.smallest_n = min(self.smallest_n, size_n)
-        self.usual_n += (size_n - self.usual_n) / min(self.changes, REMEMBERED)
+        if change_n * self.change_n < 0.0:
+            self.reversals += 1
+            self.smallest_n = min(self.smallest_n, abs(change_n))
+            self.usual_n += (abs(change_n) - self.usual_n) / min(self.reversals, REMEMBERED)
+        self.change_n = change_n
 
     def fine(self) -> bool:
         """Whether its noise is known to span several counts, so that it never shows one value for long."""
-        return self.changes >= LEARNT_CHANGES and self.usual_n >= COUNTS * self.smallest_n
+        return self.reversals >= LEARNT_REVERSALS and self.usual_n >= COUNTS * self.smallest_n
 
 
 @dataclass(slots=True)
@@ -79,9 +83,9 @@ def find_stuck(limits: StuckLimits, state: StuckState, inputs: Inputs) -> list[F
     # Plain numbers: for a handful of cells a loop takes less than arrays do.
     for i, (cell, tension_n, quality) in enumerate(zip(state.cells, tensions, qualities, strict=True)):
         if quality == _GOOD:
-            size_n = abs(tension_n - cell.tension_n)
-            if size_n > 0.0:
-                cell.change(size_n)
+            change_n = tension_n - cell.tension_n  # NaN after the first sample of all
+            if change_n != 0.0:
+                cell.change(change_n)
             elif alive and limits.measured[i]:
                 cell.same += 1
             cell.tension_n = tension_n

@@ -98,6 +98,8 @@ class Recorder:
                 self._waiting.popleft()()
         finally:
             self._settling = False
+            if self._waiting and self._later is not None:  # one has failed: the others are not forgotten
+                self._later(self.settle)
 
     # What the devices tell. `drive` counts from 0, as their arrays do.
 

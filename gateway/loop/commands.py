@@ -94,20 +94,36 @@ async def release(cycle: Cycle) -> None:
 
 def not_ready(cycle: Cycle) -> list[str]:
     """What speaks against arming, as far as the samples tell. One that is late is no reason to send a person away."""
-    inputs, reasons = cycle.inputs, []
-    # v0 comes in the same answer. A PLC that answers but lost its watchdog is not GOOD either: arming proves it anew.
-    if not _heard(cycle, inputs.unwind_speed, 0) or inputs.plc.quality not in (Quality.GOOD, Quality.STALE):
-        reasons.append(f"the line PLC ({cycle.line.plc.name}) gives no usable answer")
-    elif inputs.plc.emergency_stop:
-        reasons.append("the emergency stop circuit is open: release it")
-    elif not inputs.plc.permissive:
-        reasons.append("the line PLC gives no permissive")
-    elif abs(inputs.unwind_speed.value[0]) > STANDSTILL_M_PER_S:
-        reasons.append(f"the unwinder turns at {inputs.unwind_speed.value[0]:.4f} m/s: wait for standstill")
+    return forbidden(cycle) + unheard(cycle)
+
+
+def forbidden(cycle: Cycle) -> list[str]:
+    """What the line PLC says against arming, as far as it has been heard."""
+    inputs = cycle.inputs
+    if not _plc_heard(cycle):
+        return []
+    if inputs.plc.emergency_stop:
+        return ["the emergency stop circuit is open: release it"]
+    if not inputs.plc.permissive:
+        return ["the line PLC gives no permissive"]
+    if abs(inputs.unwind_speed.value[0]) > STANDSTILL_M_PER_S:
+        return [f"the unwinder turns at {inputs.unwind_speed.value[0]:.4f} m/s: wait for standstill"]
+    return []
+
+
+def unheard(cycle: Cycle) -> list[str]:
+    """Devices without a usable sample lately."""
+    reasons = [] if _plc_heard(cycle) else [f"the line PLC ({cycle.line.plc.name}) gives no usable answer"]
     for cell in cycle.line.load_cells:
-        if not _heard(cycle, inputs.tension, cell.span - 1):
+        if not _heard(cycle, cycle.inputs.tension, cell.span - 1):
             reasons.append(f"load cell {cell.name} (span {cell.span}) gives no usable value")
     return reasons
+
+
+def _plc_heard(cycle: Cycle) -> bool:
+    # v0 comes in the same answer. A PLC that answers but lost its watchdog is not GOOD either: arming proves it anew.
+    inputs = cycle.inputs
+    return _heard(cycle, inputs.unwind_speed, 0) and inputs.plc.quality in (Quality.GOOD, Quality.STALE)
 
 
 def _heard(cycle: Cycle, channel: Channel, index: int) -> bool:

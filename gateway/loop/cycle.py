@@ -98,9 +98,14 @@ class Cycle:
         before_nm = self.outputs.torque_nm
         torque_nm, saturated = self._torque(seen, tick)
         self._write(torque_nm)
+        cycle_s = self.clock() - tick.now_s
         if self.machine.phase in CONTROLLED and seen.usable:  # only blocks proposals: after the commands are out
             self._alarm(self.watch.controlled(self.inputs, self.setpoints, before_nm, saturated))
-        self._frame(tick, saturated)
+        self._frame(tick, saturated, cycle_s)
+
+    def any_enabled(self) -> bool:
+        """Whether a drive says that it is enabled."""
+        return _ENABLED in self.inputs.drive_state.tolist()
 
     def change(self, machine: Machine) -> None:
         """Take over what a command decided. Between two periods only."""
@@ -241,7 +246,7 @@ class Cycle:
             self._alarm([Finding("drive stays on", Action.TORQUE_OFF, text)])
         return self._still_on >= STILL_ON_PERIODS
 
-    def _frame(self, tick: Tick, saturated: bool) -> None:
+    def _frame(self, tick: Tick, saturated: bool, cycle_s: float) -> None:
         inputs, account = self.inputs, self.account
         quality = inputs.tension.quality
         if self.watch.any_stuck():
@@ -253,7 +258,7 @@ class Cycle:
                 sequence=account.sequence,
                 time_s=tick.due_s,
                 lateness_s=tick.now_s - tick.due_s,
-                cycle_s=self.clock() - tick.now_s,
+                cycle_s=cycle_s,
                 missed=account.skipped,
                 unwind_speed_m_per_s=float(inputs.unwind_speed.value[0]),
                 speed_setpoint_m_per_s=self.setpoints.speed_m_per_s,

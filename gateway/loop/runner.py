@@ -5,7 +5,7 @@ from collections import deque
 
 from gateway.core.messages import Arm, Command, MalformedMessage, Reply, Stop, parse_command
 from gateway.core.states import LoopState, Phase
-from gateway.loop.commands import carry_out, not_ready, prepare_to_arm, release
+from gateway.loop.commands import carry_out, forbidden, prepare_to_arm, release, unheard
 from gateway.loop.cycle import Cycle
 from gateway.loop.pacer import Tick
 
@@ -79,11 +79,11 @@ class Runner:
             if self._arming.cancelled():
                 return self._refused("not armed: it was stopped")
             refusal = self._arming.result()
-        finally:
+            reply = refusal or await self._at_boundary(command)
+            if refusal is None and not reply.ok:  # proven, and then stopped or refused: nothing stays active
+                await release(self.cycle)
+        finally:  # only now: a second arming would prove, and then release, what this one has armed
             self._arming = None
-        reply = refusal or await self._at_boundary(command)
-        if refusal is None and not reply.ok:  # proven, and then stopped or refused: nothing stays active
-            await release(self.cycle)
         while reply.ok and self.cycle.machine.phase is Phase.ARMING:
             await self._passed.wait()
         if not reply.ok:
@@ -96,14 +96,19 @@ class Runner:
         """As `prepare_to_arm`, for devices that have come back, too.
 
         A link that commands leaves a device alone that was lost; a silent one asks for what it can. So one that has
-        nothing to tell after a stop is given the chance to be heard first.
+        nothing to tell after a stop is given the chance to be heard first. What the line PLC says against arming
+        needs no waiting for, and a drive that stays enabled is not left without its orders.
         """
         cycle = self.cycle
-        if cycle.machine.phase is Phase.OFF and not_ready(cycle):
-            await release(cycle)
-            given_up_s = cycle.clock() + HEARD_AGAIN_S
-            while not_ready(cycle) and cycle.clock() < given_up_s:
-                await self._passed.wait()
+        if cycle.machine.phase is Phase.OFF and unheard(cycle) and not forbidden(cycle) and not cycle.any_enabled():
+            try:
+                await release(cycle)
+                given_up_s = cycle.clock() + HEARD_AGAIN_S
+                while unheard(cycle) and cycle.clock() < given_up_s:
+                    await self._passed.wait()
+            except BaseException:  # a stop, or a link that failed
+                await release(cycle)
+                raise
         return await prepare_to_arm(cycle)
 
     async def _cancel_arming(self) -> None:

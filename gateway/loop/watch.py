@@ -6,9 +6,9 @@ from gateway.core.doubts import Doubt
 from gateway.core.line import Line
 from gateway.core.signals import BoolArray, FloatArray, Inputs
 from gateway.loop.setpoints import Setpoints
+from safety import frozen
 from safety.actions import Action, Finding
 from safety.drift import DriftState, drift_limits, restart, watch_balance
-from safety.frozen import FrozenState, find_frozen, turning_m_per_s
 from safety.jumps import JumpState, jump_limits, reject_jumps, reject_unwinder
 from safety.stuck import StuckState, find_stuck, stuck_limits
 
@@ -29,7 +29,7 @@ class Watch:
         self._jump_limits, self._jumps = jump_limits(line, speed_steps_m_per_s), JumpState()
         self._applied_nm: FloatArray = np.zeros(line.n)
         self._stuck_limits, self._stuck = stuck_limits(line), StuckState()
-        self._turning_m_per_s, self._frozen = turning_m_per_s(line), FrozenState()
+        self._turning_m_per_s, self._frozen = frozen.turning_m_per_s(line), frozen.FrozenState()
         self._drift_limits, self._drift = drift_limits(line), DriftState()
         self._creeping_m_per_s = CREEPING * line.limits.speed_max_m_per_s
         self._saturated = 0  # periods, up and down
@@ -52,7 +52,7 @@ class Watch:
         """Load cells and drives whose samples stand still while the line is controlled: what stops the line."""
         findings = find_stuck(self._stuck_limits, self._stuck, inputs)
         self.stuck = self._stuck.stuck
-        return findings + find_frozen(self._turning_m_per_s, self._frozen, inputs)
+        return findings + frozen.find_frozen(self._turning_m_per_s, self._frozen, inputs)
 
     def controlled(
         self, inputs: Inputs, setpoints: Setpoints, applied_nm: FloatArray, saturated: bool
@@ -74,7 +74,8 @@ class Watch:
             return
         self._setpoints = None
         self._saturated = 0
-        self._stuck, self._frozen = StuckState(), FrozenState()
+        self._stuck = StuckState()
+        frozen.restart(self._frozen)
         self._drift = DriftState()
         restart(self._drift_limits, self._drift)
 

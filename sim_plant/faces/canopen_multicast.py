@@ -1,7 +1,7 @@
 """python-can's `udp_multicast` for devices that answer at once: a frame costs one call of the system, in or out.
 
 python-can asks before each frame whether there is one. And a group hands every sender its own frames again: here they
-are dropped before they are decoded.
+are dropped before they are decoded, where a frame is not waited for.
 """
 
 import socket
@@ -52,7 +52,7 @@ class MulticastBus(UdpMulticastBus):
                 came_s = 0.0 if stamp is None else stamp.timestamp
                 message = unpack_message(datagram, replace={"timestamp": came_s}, check=True)
             except Exception as error:  # msgpack and Message raise whatever comes of what is in it
-                raise can.CanOperationError(f"a datagram that is no frame: {error}") from error
+                raise can.CanOperationError("a datagram that is no frame") from error
             if not message.is_fd:
                 return message, False
 

@@ -30,6 +30,8 @@ PATIENCE_S = 0.5  #: for one cycle's answers
 SPANS = 6
 CONTROLWORDS = (0x06, 0x07, 0x0F)  #: shutdown, switch on, enable operation; the last is kept
 TORQUES_PER_MILLE = (20, 21)  #: in turn, so that every cycle changes the torque
+ENABLED_MASK, ENABLED = 0x6F, 0x27  #: of the statusword: operation enabled
+STATUSWORD_AT = 8  #: register of the rack
 CST = 10  #: mode cyclic synchronous torque
 PAUSE_S = 1e-3  #: between the last answer and the commands, as a controller computes meanwhile
 
@@ -54,13 +56,17 @@ class CanClient:
         self._socket.settimeout(PATIENCE_S)
         self._sync = _packed(SYNC, b"")
         self._send(_packed(NMT, bytes((1, 0))))  # all nodes operational
+        self.statusword = 0  #: of drive 1, in its last answer
 
     def cycle(self, number: int) -> float:
         began_s = time.perf_counter()
         self._send(self._sync)
         missing = set(ANSWERS)
         while missing:
-            missing.discard(msgpack.unpackb(self._socket.recv(4096))["arbitration_id"])
+            frame = msgpack.unpackb(self._socket.recv(4096))
+            missing.discard(frame["arbitration_id"])
+            if frame["arbitration_id"] == TPDO + 1:
+                self.statusword = int.from_bytes(frame["data"][:2], "little")
         took_s = time.perf_counter() - began_s
         time.sleep(PAUSE_S)
         for frame in self._commands(number):
@@ -90,6 +96,7 @@ class RackClient:
     def __init__(self, port: int) -> None:
         self._socket = socket.create_connection(("127.0.0.1", port), PATIENCE_S)
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self.statusword = 0  #: of axis 1, in its last answer
 
     def cycle(self, number: int) -> float:
         commands = self._COMMANDS.pack(0, 0, number & 0xFFFF, *_command(number) * SPANS)
@@ -102,7 +109,9 @@ class RackClient:
         answer = b""
         while len(answer) < 9 + 2 * self._READ_COUNT:
             answer += self._socket.recv(4096)
-        return time.perf_counter() - began_s
+        took_s = time.perf_counter() - began_s
+        self.statusword = int.from_bytes(answer[9 + 2 * STATUSWORD_AT :][:2], "big")
+        return took_s
 
     def close(self) -> None:
         self._socket.close()
@@ -136,6 +145,7 @@ def answers_us(kind: str, ports: Ports, for_s: float) -> NDArray[np.float64]:
             due_s = max(due_s + PERIOD_S, time.perf_counter())
             time.sleep(max(0.0, due_s - time.perf_counter()))
             taken_s.append(client.cycle(number))
+        assert client.statusword & ENABLED_MASK == ENABLED, f"the drives are not enabled: {client.statusword:#06x}"
     return 1e6 * np.array(taken_s[settling:])
 
 

@@ -4,7 +4,7 @@ The whole cycle over the in-memory link, engaged in production. The simulated li
 the timing. Three ways:
 
     hot     period after period: what the code costs
-    evicted each after 32 MB of other memory has been touched: what it costs with nothing of it in the caches
+    evicted each after 96 MB of other memory has been touched: what it costs with little of it in the caches
     paced   each at its tick of the loop's own timer, after idling: what it costs in real time
 
 `read` is the in-memory link, in place of a driver. `total` is a bit more than its parts: the timing of the parts, the
@@ -44,7 +44,7 @@ from sim_plant.stepped import Sample, SteppedLine
 
 SECTIONS = {"_read": "read", "_check": "check", "_step_machine": "machine", "_torque": "torque", "_write": "write"}
 ROWS = (*SECTIONS.values(), "frame", "publish", "total")
-TOUCHED = np.zeros(32 << 20, np.uint8)
+TOUCHED = np.zeros(96 << 20, np.uint8)
 SETTLING = 1000  #: periods before anything is counted: set-points reached, counts learnt, allocators warm
 
 

@@ -135,7 +135,7 @@ ROWS = (
         (Variant("drive one-way", ("drive {roller} one-way direction=from-device for 0.5",)),),
     ),
     Row(
-        "frozen", "old answers again and again, correctly framed", Wanted.STOP, "3 T", 3 * T,
+        "frozen", "old answers again and again, correctly framed; 4 s after the start", Wanted.STOP, "3 T", 3 * T,
         (
             Variant("drive freeze", ("drive {roller} freeze for 0.5",)),
             Variant("load-cell freeze", ("load-cell {span} freeze for 0.5",)),
@@ -161,7 +161,7 @@ ROWS = (
     ),
     Row(
         "cell-stuck", "a load cell that stands still", Wanted.STOP, "1 s", 1.0,
-        (Variant("stuck", ("load-cell {span} stuck",)),),
+        (Variant("stuck", ("load-cell {span} stuck",)),), settle_periods=60,  # the rule has to know the cell's noise
     ),
     Row(
         "encoder-once", "an encoder jumps in one sample", Wanted.HOLD, "same cycle", T,

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 
+import can
 import pytest
 
 from gateway.core.states import LoopState, Phase
@@ -43,15 +44,28 @@ def test_what_was_lost_on_canopen_and_came_back_is_armed_and_started_again(nodes
         assert line.step_until(Phase.RUNNING, line.line.limits.tensioning_time_s), line.cycle.machine.reason
 
 
-def test_an_emergency_stop_still_refuses_and_leaves_the_links_silent() -> None:
+def test_what_the_line_plc_says_refuses_at_once_and_touches_no_link() -> None:
+    """An arming that waited for the circuit to close would arm by closing it."""
     with virtual_line("canopen", seed=1) as line:
         line.begin_in_production()
         line.truth.plc.emergency_stop = True
         assert line.step_until(Phase.OFF, line.line.longest_stop_s)
+        face, orders = line.truth.canopen, []
+        assert face is not None
+        take = face.take
+
+        def tap(message: can.Message) -> None:
+            if message.arbitration_id == 0:
+                orders.append(message)
+            take(message)
+
+        face.take = tap
+        asked_s = line.now_s
         refused = line.arm()
         assert not refused.ok and "emergency stop" in refused.reasons[0]
+        assert line.now_s - asked_s <= 3 * line.period_s
+        line.truth.plc.emergency_stop = False
+        line.step(150)
         assert line.cycle.machine.state is LoopState.STOP
-        line.step(10)
-        sent = len(line.recording().of_kind("command"))
-        line.step(20)
-        assert len(line.recording().of_kind("command")) == sent
+        assert not orders
+        assert line.arm().ok and orders

@@ -8,6 +8,7 @@ import pytest
 from drivers.memory import MemoryLink
 from gateway.core.messages import Arm, SetSpeed, SetTension, Start, Stop
 from gateway.core.states import LoopState, Phase
+from gateway.loop.machine import Machine
 from gateway.loop.pacer import Tick
 from gateway.loop.process import _run_until
 from gateway.loop.runner import MAX_WAITING, Runner
@@ -78,6 +79,50 @@ def test_a_stop_goes_into_an_arming_and_nothing_is_left_half_way(monkeypatch):
         assert told.loop.cycle.machine.state is LoopState.SILENT and len(released) == 1
         monkeypatch.undo()
         assert (await told.until(told.order(Arm()))).state == "READY"
+
+    asyncio.run(story())
+
+
+def test_a_second_arming_waits_for_nothing_and_releases_nothing(monkeypatch):
+    released = []
+
+    async def release(self):
+        released.append(self)
+
+    async def story():
+        told = Story(stepped())
+        await told.periods(3)
+        monkeypatch.setattr(MemoryLink, "release", release)
+        first = told.order(Arm())
+        for _ in range(10):  # it is proven, and waits for its period
+            await asyncio.sleep(0)
+        second = told.order(Arm())
+        assert "under way" in (await told.until(second)).text
+        assert (await told.until(first)).state == "READY" and not released
+
+    asyncio.run(story())
+
+
+def test_a_stop_while_devices_are_given_time_to_come_back_leaves_every_link_released(monkeypatch):
+    released = []
+
+    async def release(self):
+        released.append(self)
+        if len(released) == 1:
+            await asyncio.Event().wait()
+
+    async def story():
+        told = Story(stepped())
+        await told.periods(3)
+        cycle = told.loop.cycle
+        cycle.machine = Machine(Phase.OFF)
+        cycle.inputs.tension.time_s[:] = np.nan
+        monkeypatch.setattr(MemoryLink, "release", release)
+        arming = told.order(Arm())
+        for _ in range(10):
+            await asyncio.sleep(0)
+        assert (await told.until(told.order(Stop()))).ok
+        assert "stopped" in (await told.until(arming)).text and len(released) == 2
 
     asyncio.run(story())
 

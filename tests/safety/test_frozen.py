@@ -6,17 +6,25 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from gateway.core.signals import Inputs
-from safety.frozen import REPEATS, FrozenState, find_frozen
+from safety.frozen import REPEATS, FrozenState, find_frozen, restart
 
 TURNING_FROM_M_PER_S = 0.002
 COUNT_M_PER_S = 1e-6
+LINE_M_PER_S = 0.05
 
 
-def texts_of(speeds_m_per_s: np.ndarray, state: FrozenState | None = None, missed: frozenset[int] = frozenset()):
+def texts_of(
+    speeds_m_per_s: np.ndarray,
+    state: FrozenState | None = None,
+    missed: frozenset[int] = frozenset(),
+    line_m_per_s: float | np.ndarray = LINE_M_PER_S,
+) -> list[list[str]]:
     """What is said of each period; `speeds_m_per_s` is (periods, 3); in `missed` periods no drive answers."""
     state, inputs = state or FrozenState(), Inputs(3)
+    unwinder = np.broadcast_to(line_m_per_s, len(speeds_m_per_s))
     told: list[list[str]] = []
     for k, speeds in enumerate(speeds_m_per_s):
+        inputs.unwind_speed.put(0, float(unwinder[k]), 0.0)
         for i, speed in enumerate(speeds):
             inputs.speed.miss(i) if k in missed else inputs.speed.put(i, float(speed), 0.0)
         told.append([finding.text for finding in find_frozen(TURNING_FROM_M_PER_S, state, inputs)])
@@ -24,8 +32,15 @@ def texts_of(speeds_m_per_s: np.ndarray, state: FrozenState | None = None, misse
 
 
 def turning(count: int, seed: int = 1, noise_m_per_s: float = 1e-4, step_m_per_s: float = COUNT_M_PER_S) -> np.ndarray:
-    speeds = np.random.default_rng(seed).normal(0.05, noise_m_per_s, (count, 3))
+    speeds = np.random.default_rng(seed).normal(LINE_M_PER_S, noise_m_per_s, (count, 3))
     return np.round(speeds / step_m_per_s) * step_m_per_s
+
+
+def frozen_run(speed_m_per_s: float = LINE_M_PER_S) -> np.ndarray:
+    """One sample and its repeats, of roller 2; the others turn."""
+    speeds = turning(1 + REPEATS, seed=9)
+    speeds[:, 1] = speed_m_per_s
+    return speeds
 
 
 @given(seed=st.integers(0, 1000), roller=st.integers(0, 2), before=st.integers(300, 500))
@@ -46,6 +61,21 @@ def test_samples_that_do_not_come_neither_count_nor_excuse() -> None:
     assert not any(told[:-1]) and told[-1]
 
 
+def test_a_drive_that_shows_standstill_while_the_line_runs_is_frozen_too() -> None:
+    state = FrozenState()
+    assert not any(texts_of(turning(300), state))
+    assert texts_of(frozen_run(0.0), state)[-1]
+
+
+def test_what_was_learnt_stays_over_a_stop_and_samples_do_not() -> None:
+    state = FrozenState()
+    speeds = np.vstack((turning(300), frozen_run()[:-1]))
+    assert not any(texts_of(speeds, state))
+    restart(state)
+    assert not any(texts_of(frozen_run()[:-1], state))
+    assert texts_of(frozen_run()[:1], state)[-1]
+
+
 @pytest.mark.parametrize("step_m_per_s", [2e-5, 1e-4, 1e-3])
 def test_a_coarse_encoder_is_never_frozen(step_m_per_s: float) -> None:
     """Noise of one tenth of a millimetre per second; five minutes."""
@@ -56,21 +86,23 @@ def test_a_fine_encoder_is_never_frozen_while_it_turns() -> None:
     assert not any(texts_of(turning(30_000)))
 
 
-def test_rollers_that_stand_show_what_they_like() -> None:
-    assert not any(texts_of(np.vstack((turning(300), np.zeros((500, 3)), np.full((500, 3), 0.001)))))
-
-
-def test_a_drive_that_turns_to_a_coarse_speed_is_learnt_anew() -> None:
-    """Short runs of repeats are no fault, and teach that there are such."""
+def test_rollers_of_a_line_that_stands_show_what_they_like() -> None:
     state = FrozenState()
     assert not any(texts_of(turning(300), state))
-    coarse = np.repeat(turning(300, seed=2), 3, axis=0)  # each sample three times
-    assert not any(texts_of(coarse, state))
-    assert not any(texts_of(np.full((50, 3), coarse[-1]), state))
+    assert not any(texts_of(np.zeros((500, 3)), state, line_m_per_s=0.0))
+    assert not any(texts_of(np.full((500, 3), 0.001), state, line_m_per_s=0.001))
+
+
+@pytest.mark.parametrize("counts", [0.3, 0.5, 1.0])
+def test_jitter_that_shrinks_with_the_speed_is_learnt_for_each_speed(counts: float) -> None:
+    state = FrozenState()
+    assert not any(texts_of(turning(6000, noise_m_per_s=20 * COUNT_M_PER_S), state))
+    slower = turning(6000, seed=2, noise_m_per_s=counts * COUNT_M_PER_S)
+    assert not any(texts_of(slower, state, line_m_per_s=0.25 * LINE_M_PER_S))
 
 
 @pytest.mark.parametrize("counts", [1, 3, 20])
 def test_a_ramp_does_not_teach_that_a_coarse_speed_jitters(counts: int) -> None:
     ramp = 0.02 + counts * COUNT_M_PER_S * np.arange(2000)
-    steady = np.full(500, ramp[-1])
-    assert not any(texts_of(np.repeat(np.concatenate((ramp, steady))[:, None], 3, axis=1)))
+    speeds = np.repeat(np.concatenate((ramp, np.full(500, ramp[-1])))[:, None], 3, axis=1)
+    assert not any(texts_of(speeds, line_m_per_s=speeds[:, 0]))

@@ -9,7 +9,7 @@ from gateway.core.signals import FloatArray, Inputs, Quality
 from safety.actions import Action
 from safety.drift import DRIFT_ALONE_N, DRIFT_N, DriftState, drift_limits, drift_of, restart, watch_balance
 from safety.jumps import NOISE_M_PER_S, JumpState, jump_limits, reject_jumps, reject_unwinder
-from safety.stuck import LEARNT_CHANGES, StuckLimits, StuckState, find_stuck
+from safety.stuck import LEARNT_REVERSALS, StuckLimits, StuckState, find_stuck
 from tests.closed_loop.conftest import demo_line
 
 LINE = demo_line()
@@ -175,7 +175,7 @@ def test_a_cell_that_stands_still_while_rollers_move_is_stuck_after_its_time() -
 
 
 def test_a_cell_is_judged_only_after_it_has_been_learnt() -> None:
-    assert not stuck_after(noisy(LEARNT_CHANGES - 5) + [(30.0, 30.0, 30.0)] * 50)[0].stuck.any()
+    assert not stuck_after(noisy(LEARNT_REVERSALS - 5) + [(30.0, 30.0, 30.0)] * 50)[0].stuck.any()
 
 
 @pytest.mark.parametrize("noise_n", [0.02, 0.03, 0.05])
@@ -202,6 +202,16 @@ def test_a_sample_that_did_not_come_tells_nothing_of_its_cell() -> None:
                 inputs.tension.put(i, value, 0.0)
         find_stuck(STUCK, state, inputs)
         assert list(state.stuck) == [k >= 310, k >= 310, False], "every other sample: the sixth like it is the eleventh"
+
+
+@pytest.mark.parametrize(("count_n", "step_n"), [(0.02, 5.0), (0.01, 2.0), (0.02, 10.0), (0.1, 20.0)])
+def test_a_ramp_does_not_teach_that_a_quiet_coarse_cell_is_fine(count_n: float, step_n: float) -> None:
+    """The set-point moves by 20 N/s; then the cell shows one count for long."""
+    rng = np.random.default_rng(3)
+    true_n = 30.0 + np.minimum(0.2 * np.arange(2000), step_n)
+    for _ in range(3):
+        cells = np.round((true_n[:, None] + rng.normal(0.0, 0.1 * count_n, (2000, 3))) / count_n) * count_n
+        assert stuck_after([(float(a), float(b), float(c)) for a, b, c in cells])[1] == []
 
 
 def test_a_line_on_which_nothing_moves_tells_nothing() -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.system.uml import KERNEL, GuestFailed, Outcome, run_in_guest
+from tests.system.uml import LINKS, GuestFailed, Outcome, run_in_guest
 
 LIMIT_S = 900.0  #: a boot and six lines; five minutes on a quiet machine
 FOLDER = Path("out/system/vcan")  #: what it left, for whoever must find out why
@@ -62,13 +62,13 @@ def test_a_guest_that_hangs_is_ended(tmp_path: Path) -> None:
 
 
 def guests() -> list[str]:
-    """Command lines of processes that belong to a guest of this process's user."""
+    """Command lines of processes that belong to a guest of ours."""
     found: list[str] = []
     for path in Path("/proc").glob("[0-9]*/cmdline"):
         try:
             words = path.read_bytes().replace(b"\0", b" ").decode(errors="replace")
         except OSError:  # it has ended meanwhile
             continue
-        if words.startswith(KERNEL) or f"/{KERNEL} " in words:
+        if f"/{LINKS}-{os.getpid()}-" in words:
             found.append(words)
     return found

@@ -17,6 +17,7 @@ from pathlib import Path
 KERNEL = "linux.uml"
 INIT = Path(__file__).parent / "guest_init.sh"
 MEMORY_MB = 1536
+LINKS = "r2rgate-guest"  #: begins the name of a guest's folder of links, before the number of this process
 #: A host that is busy must not look like a line that stalls. Below the loops of other lines on this host.
 PUNCTUAL = ("chrt", "--fifo", "10")
 
@@ -48,7 +49,7 @@ def run_in_guest(
     kernel = shutil.which(KERNEL)
     if kernel is None:
         raise GuestFailed(f"{KERNEL} is missing: install the Debian package user-mode-linux")
-    with tempfile.TemporaryDirectory(prefix="guest-") as links:
+    with tempfile.TemporaryDirectory(prefix=f"{LINKS}-{os.getpid()}-") as links:
         folder = Path(links)
         (folder / "share").symlink_to(share)
         (folder / "here").symlink_to(Path.cwd())
