@@ -36,9 +36,14 @@ class PowerStage:
         self.state = self._state_now()
 
     def on_safe_torque_off(self, active: bool) -> None:
-        """What it says of it where that is not told with the statusword."""
-        self._safe_torque_off = active
-        self.state = self._state_now()
+        """What it said when asked, where that is not told with the statusword.
+
+        The answer is older than the statusword, and was asked for because it might not switch on: of a drive that
+        has gone on meanwhile it says nothing.
+        """
+        if self.power is None or self.power is PowerState.SWITCH_ON_DISABLED:
+            self._safe_torque_off = active
+            self.state = self._state_now()
 
     def _state_now(self) -> DriveState:
         if self.power is None:
@@ -75,7 +80,8 @@ class PowerStage:
             self._controlword = DISABLE_VOLTAGE
         else:
             self._controlword = controlword(self.power, request, self._controlword)
-        # One that ramps down in a quick stop says so: it is not enabled any more.
+        # One that ramps down in a quick stop says so: it is not enabled any more. The statusword is asked and not
+        # `state`, in which a wrong safe torque off flag hides 'operation enabled': such a drive is caught only here.
         ignores = self.power is _ENABLED_POWER and self._controlword in (DISABLE_VOLTAGE, QUICK_STOP)
         self._ignored = self._ignored + 1 if ignores else 0
         follows = state == _ENABLED and request == _ENABLE

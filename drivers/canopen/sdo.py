@@ -88,6 +88,9 @@ class SdoBus:
         if node in self._long:
             self._network.notify(cob_id, bytearray(data), now_s)
         elif (waiting := self._waiting.get(node)) is not None and not waiting.done():
+            if data[0] & (_COMMAND | _EXPEDITED) == _UPLOAD_ANSWER:
+                # In segments, for which nobody will ask. Now: with the result the node is free for the next request.
+                self._send(_REQUEST + node, bytes((_ABORT,)) + data[1:4] + _NO_SEGMENTS)
             waiting.set_result(bytes(data))
 
     async def upload(self, node: int, index: int, sub: int, size: int) -> bytes:
@@ -116,7 +119,6 @@ class SdoBus:
         if answered & _COMMAND != _UPLOAD_ANSWER:
             raise SdoSilent(f"object {index:04X}h sub {sub}: Unexpected response 0x{answered:02X}")
         if not answered & _EXPEDITED:
-            self._send(_REQUEST + node, _TRANSFER.pack(_ABORT, index, sub, _NO_SEGMENTS))
             return None
         return data[: _EXPEDITED_BYTES - (answered >> 2 & 3)] if answered & _SIZED else data
 

@@ -152,6 +152,7 @@ _FLAGS = (
 _KEYS = {"timestamp", "arbitration_id", "channel", "dlc", "data", *_FLAGS}
 _PLAIN = (False,) * len(_FLAGS)
 _flags = itemgetter(*_FLAGS)
+_NO_FRAME = "a datagram that is no frame"
 
 
 def packed(cob_id: int, data: bytes) -> bytes:
@@ -180,9 +181,11 @@ def unpacked(datagram: bytes) -> Frame | can.Message:
         fields = msgpack.unpackb(datagram, raw=False)
         if _is_plain(fields):
             return fields["arbitration_id"], fields["data"]
-        return unpack_message(datagram, replace={"timestamp": 0.0}, check=True)
-    except Exception as error:  # msgpack and Message raise whatever comes of what is in it
-        raise ValueError(f"a datagram that is no frame: {error}") from error
+        if _may_be_message(fields):
+            return unpack_message(datagram, replace={"timestamp": 0.0}, check=True)
+    except Exception as error:  # msgpack and Message raise whatever comes of what is in it, in the peer's words
+        raise ValueError(_NO_FRAME) from error
+    raise ValueError(_NO_FRAME)
 
 
 def _is_plain(fields: Any) -> bool:
@@ -191,6 +194,11 @@ def _is_plain(fields: Any) -> bool:
         return False
     cob_id, data = fields["arbitration_id"], fields["data"]
     return type(cob_id) is int and 0 <= cob_id <= LARGEST_ID and type(data) is bytes and fields["dlc"] == len(data) <= 8
+
+
+def _may_be_message(fields: Any) -> bool:
+    """Whether python-can may look at it: a Message takes a number for data as that many bytes, and makes them."""
+    return type(fields) is dict and type(fields.get("data")) in (bytes, type(None))
 
 
 class FetchedWire:

@@ -72,6 +72,11 @@ class ModbusConnection:
     def connected(self) -> bool:
         return self._client is not None and self._client.connected
 
+    @property
+    def under_way(self) -> bool:
+        """Whether a request of a cycle is."""
+        return self._begun is not None
+
     async def connect(self) -> bool:
         """Try once, afresh: nothing of an earlier connection is left that could be mistaken for an answer."""
         self.close()
@@ -130,8 +135,9 @@ class ModbusConnection:
         if self._client is None or not self._client.connected:
             raise ModbusTimeout("not connected")
         # pymodbus forgets what came unasked. After whole frames (an answer came twice) the stream is as it was;
-        # the rest of half a frame would be taken for the beginning of the next.
-        if not _whole_frames(self._client.ctx.recv_buffer):
+        # the rest of half a frame would be taken for the beginning of the next. What comes for a request of a cycle
+        # was asked for, also while half of it is there.
+        if self._begun is None and not _whole_frames(self._client.ctx.recv_buffer):
             self.close()
             raise ModbusTimeout("connection dropped: half a frame came unasked")
         return self._client
@@ -239,8 +245,11 @@ class ModbusConnection:
             self._free.set()
 
     def _drop_half_a_frame(self) -> None:
-        """After half an answer the stream cannot be trusted any more; a merely late one is told by its number."""
-        if self._client is not None and self._client.ctx.recv_buffer:
+        """After half an answer the stream cannot be trusted any more; a merely late one is told by its number.
+
+        While a request of a cycle is under way it may be half of its answer, which has until that request's deadline.
+        """
+        if self._begun is None and self._client is not None and self._client.ctx.recv_buffer:
             self.close()
 
 

@@ -45,7 +45,6 @@ class Session:
         self._health = health
         self._on_done = on_done
         self._task: asyncio.Task[None] | None = None
-        self._at_once = False  #: an exchange without a task is under way
         self._judged = False  #: the settings that it reads were proven before
         self._answers = 0  #: on the connection before this exchange
         self._deadline_s = 0.0  #: of this exchange
@@ -67,7 +66,6 @@ class Session:
     async def connect(self) -> bool:
         """Try once."""
         self._mute = 0
-        self._at_once = False
         if self._connection.number:
             self.unit.connection_lost()
         return await self._connection.connect()
@@ -116,9 +114,10 @@ class Session:
 
         Where it does not obey, or was lost, its watchdog is left as it is, and fires.
         """
-        if self._task is not None and not self._task.done():
-            await asyncio.wait([self._task])  # it may carry the last command
+        # Either may carry the last command; the end of a request may begin a look, so that the task comes second.
         await self._connection.until_free()
+        if self._task is not None and not self._task.done():
+            await asyncio.wait([self._task])
         unit = self.unit
         lost, commanded = unit.dropped, unit.commanded
         unit.silence()
@@ -150,7 +149,7 @@ class Session:
         """Send what this cycle asks and commands; whether the answer is worth waiting for."""
         self._numbers = None
         payloads = self.unit.take_payloads()
-        if self._at_once or (self._task is not None and not self._task.done()):
+        if self._connection.under_way or (self._task is not None and not self._task.done()):
             return False
         self.unit.standing.wrote = False
         if not self._connection.connected:
@@ -173,19 +172,22 @@ class Session:
         data = request.encode(payloads[0] if writes and payloads else ())
         begun = self._connection.begin(unit.address, data, request.registers_read, self._deadline_s, self._take_answer)
         if begun:
-            self._at_once, self._judged = True, unit.standing.active
+            self._judged = unit.standing.active
             unit.standing.wrote = writes
             unit.commanded |= writes
         return begun
 
     def _take_answer(self, answer: bytes | ModbusFailed) -> None:
-        self._at_once = False
+        outcome: list[list[float]] | Exception
         if isinstance(answer, bytes):
-            numbers = self.unit.plan.decode_bytes((answer,))
-            judged = self._judged and self.unit.standing.active
-            self._conclude(self.unit.take_settings(numbers, judged=judged))
+            try:
+                numbers = self.unit.plan.decode_bytes((answer,))
+                outcome = self.unit.take_settings(numbers, judged=self._judged and self.unit.standing.active)
+            except ValueError as error:
+                outcome = error
         else:
-            self._conclude(answer)
+            outcome = answer
+        self._conclude(outcome)
         if (until_s := self._time_to_look()) is not None:
             self._task = asyncio.create_task(self._look(until_s))
 
@@ -309,7 +311,6 @@ class Session:
     async def close(self) -> None:
         """Drop the connection. Idempotent."""
         self.unit.silence()
-        self._at_once = False
         await _cancel(self._task)
         await _cancel(self._connecting)
         self._task = self._connecting = None

@@ -181,15 +181,22 @@ class OpcUaLink:
         return True
 
     async def _ask(
-        self, writes: tuple[tuple[int, float], ...], reads: tuple[int, ...], patience_s: float = PREPARE_TIMEOUT_S
+        self,
+        writes: tuple[tuple[int, float], ...],
+        reads: tuple[int, ...],
+        patience_s: float = PREPARE_TIMEOUT_S,
+        *,
+        connection: int | None = None,
     ) -> Answer:
-        """A question beside the cycle, whose own have to wait meanwhile. Raises NoAnswer."""
+        """A question beside the cycle, whose own have to wait meanwhile; see `prepare.Ask`. Raises NoAnswer."""
         try:
             async with asyncio.timeout(ANSWER_TIMEOUT_S + HUNG_S):
                 while not self._idle.is_set():  # the cycle may be faster again
                     await self._idle.wait()
         except TimeoutError as error:
             raise NoAnswer("the OPC UA process does not answer") from error
+        if connection not in (None, self._connection):
+            raise NoAnswer("connected anew meanwhile")
         deadline_s = asyncio.get_running_loop().time() + patience_s
         patient = not (writes or reads)
         waiter: asyncio.Future[Answer] = asyncio.get_running_loop().create_future()
@@ -205,6 +212,8 @@ class OpcUaLink:
             self._waiter = None
         if answer.outcome is not Outcome.DONE:
             raise NoAnswer(answer.text)
+        if connection not in (None, answer.connection):
+            raise NoAnswer("connected anew meanwhile")
         return answer
 
     async def _ask_patiently(self, start_patience_s: float) -> None:

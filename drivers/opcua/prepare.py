@@ -18,9 +18,14 @@ class NoAnswer(Exception):
 
 
 class Ask(Protocol):
-    """Write and read, and wait for both answers. Raises NoAnswer. What has to be read after the write, ask for then."""
+    """Write and read, and wait for both answers. Raises NoAnswer. What has to be read after the write, ask for then.
 
-    async def __call__(self, writes: tuple[tuple[int, float], ...], reads: tuple[int, ...]) -> Answer: ...
+    Given the `connection` of an earlier answer, nothing is written on another, and an answer from another is none.
+    """
+
+    async def __call__(
+        self, writes: tuple[tuple[int, float], ...], reads: tuple[int, ...], *, connection: int | None = None
+    ) -> Answer: ...
 
 
 async def prepare_devices(ask: Ask, devices: Sequence[Device], noted: dict[Device, float]) -> list[str]:

@@ -195,7 +195,8 @@ async def _build_info(client: Client) -> dict[str, str]:
 
 
 async def _fitting(endpoint: str, namespaces: tuple[str, ...], maps: Mapping[str, OpcUaMap]) -> tuple[MapFit, ...]:
-    """Asked as the driver asks: a device id of another type is none."""
+    """Asked as the driver asks: a device id of another type is none. Raises ScanFailed, also for an answer that the
+    driver does not take."""
     of_server = {name: device for name, device in maps.items() if device.namespace in namespaces}
     nodes: list[Node] = []
     asked: list[tuple[str, int]] = []

@@ -1,14 +1,16 @@
 """The bytes of Read and Write, said and heard by a client (OPC 10000-6, 5.2; OPC 10000-4, 5.11.2 and 5.11.4). No I/O.
 
 A general decoder takes a millisecond for what a line reads in a cycle, and a hostile server can keep it busy for as
-long as it likes. This one knows one value after the other, and its work is bounded by the bytes that came. An answer
-that holds what nobody asks for here (diagnostics, an additional header, structures) is none.
+long as it likes. This one knows one value after the other, and its work is bounded by the bytes that came. A value
+of another type is stepped over (`extent`). An answer that holds what nobody asks for here (diagnostics, an additional
+header), or a value that can hold others, is none.
 """
 
 import struct
 import time
 from collections.abc import Sequence
 
+from drivers.opcua.extent import behind_variant
 from drivers.opcua.nodes import Reading
 from drivers.opcua.status import BAD_TYPE_MISMATCH, describe, is_good
 
@@ -24,8 +26,10 @@ _EPOCH_TICKS = 116_444_736_000_000_000  #: 1970 in 100 ns since 1601
 # Type (a four-byte node id), then: time, handle, no diagnostics wanted, no audit entry, timeout, no additional header.
 _TYPE = struct.Struct("<BBH")
 _REQUEST = struct.Struct("<qIIiI3x")
-# Type, time, handle, result, no diagnostics, no strings of them, no additional header.
-_ANSWER = struct.Struct("<BBHqIIBi3s")
+# Namespace and number of an answer's type, by the encoding of its node id: a server may choose the longer one.
+_ANSWER_TYPES = {1: struct.Struct("<xBH"), 2: struct.Struct("<xHI")}
+# Behind it: time, handle, result, no diagnostics, no strings of them, no additional header.
+_ANSWER = struct.Struct("<qIIBi3s")
 _NO_HEADER = bytes(3)
 _READ_HEAD = struct.Struct("<dIi")  #: of any age, time stamps, count
 _READ_TAIL = struct.pack("<IiHi", _VALUE, -1, 0, -1)  #: of the whole value, in the default encoding
@@ -33,7 +37,7 @@ _WRITE_TAIL = struct.Struct("<IiBB")  #: attribute, whole value, nothing but a v
 _COUNT = struct.Struct("<i")
 _STATUS = struct.Struct("<I")
 _TIME = struct.Struct("<q")
-_NOTHING = (_COUNT.pack(0), _COUNT.pack(-1))  #: no diagnostics
+_NOTHING = (_COUNT.pack(0), _COUNT.pack(-1))  #: no diagnostics, as most servers say it
 
 _HAS_VALUE, _HAS_STATUS, _HAS_SOURCE, _HAS_SERVER = 1, 2, 4, 8  #: bits of a DataValue's mask
 _HAS_SOURCE_PS, _HAS_SERVER_PS = 16, 32
@@ -51,9 +55,6 @@ _TYPES = {
     "f64": (11, struct.Struct("<d")),
 }
 _FLOATS = ("f32", "f64")
-_SIZES = {0: 0, 1: 1, 2: 1, 3: 1, 4: 2, 5: 2, 6: 4, 7: 4, 8: 8, 9: 8, 10: 4, 11: 8, 13: 8, 14: 16, 19: 4}
-_STRINGS = (12, 15, 16)  #: a length, then as many bytes
-_ARRAY, _DIMENSIONS = 0x80, 0x40
 
 
 class Misfit(Exception):
@@ -102,7 +103,10 @@ class Services:
         return request
 
     def write(self, writes: Sequence[tuple[int, float]]) -> Request:
-        """A Write of all these, each number in its node's type. Raises struct.error for one that does not fit."""
+        """A Write of all these, each number in its node's type.
+
+        Raises struct.error, ValueError or OverflowError for one that does not fit or is not finite.
+        """
         parts = [_COUNT.pack(len(writes))]
         for place, number in writes:
             parts.append(self._write_items[place])
@@ -114,15 +118,17 @@ class Services:
 
         A value of another type than the map says counts as bad, whatever its status.
         """
+        readings: list[Reading] = []
         try:
             at = _results(answer, READ_ANSWER, len(places))
-            readings: list[Reading] = []
             for place in places:
                 reading, at = _reading(answer, at, *self._types[place])
                 readings.append(reading)
         except (struct.error, IndexError) as error:
             raise Misfit("the server's answer is cut short") from error
-        _check_end(answer, at)
+        except ValueError as error:
+            raise Misfit(f"the server answered with {error}, result {len(readings) + 1} of {len(places)}") from error
+        _check_end(answer, at, len(places))
         return tuple(readings)
 
 
@@ -131,34 +137,48 @@ def statuses(answer: bytes, count: int) -> tuple[int, ...]:
     try:
         at = _results(answer, WRITE_ANSWER, count)
         found = struct.unpack_from(f"<{count}I", answer, at)
-    except struct.error as error:
+    except (struct.error, IndexError) as error:
         raise Misfit("the server's answer is cut short") from error
-    _check_end(answer, at + 4 * count)
+    _check_end(answer, at + 4 * count, count)
     return found
 
 
 def _results(answer: bytes, wanted: int, count: int) -> int:
-    """Where the results begin in an answer of this type, with so many of them. Raises Misfit and struct.error."""
-    encoding, namespace, kind, _, _, result, diagnostics, strings, additional = _ANSWER.unpack_from(answer)
-    if (encoding, namespace) != (1, 0) or kind not in (wanted, _FAULT):
-        raise Misfit(f"the server answered with {answer[: _TYPE.size].hex()} (i={kind}), not {_NAMES[wanted]}")
+    """Where the results begin in an answer of this type, with so many of them.
+
+    Raises Misfit, struct.error, IndexError.
+    """
+    layout = _ANSWER_TYPES.get(answer[0])
+    if layout is None:
+        raise Misfit(f"the server answered with {answer[: _TYPE.size].hex()}, not {_NAMES[wanted]}")
+    namespace, kind = layout.unpack_from(answer)
+    if namespace != 0 or kind not in (wanted, _FAULT):
+        raise Misfit(f"the server answered with {answer[: layout.size].hex()} (i={kind}), not {_NAMES[wanted]}")
+    at = layout.size
+    _, _, result, diagnostics, strings, additional = _ANSWER.unpack_from(answer, at)
+    at += _ANSWER.size
     if result != 0 or kind == _FAULT:  # refused, put off, or done in part
         raise Misfit(f"the server answered {describe(result)}")
     if diagnostics or strings > 0 or additional != _NO_HEADER:
         raise Misfit("the server answered with diagnostics or an additional header, which nobody asked for")
-    [found] = _COUNT.unpack_from(answer, _ANSWER.size)
+    [found] = _COUNT.unpack_from(answer, at)
     if found != count:
         raise Misfit(f"{found} results, asked for {count}")
-    return _ANSWER.size + _COUNT.size
+    return at + _COUNT.size
 
 
-def _check_end(answer: bytes, at: int) -> None:
-    if answer[at:] not in _NOTHING:
+def _check_end(answer: bytes, at: int, count: int) -> None:
+    """Nothing but diagnostics that say nothing: none, or an empty one (a mask of 0) for each result. Raises Misfit."""
+    rest = answer[at:]
+    if rest not in _NOTHING and rest != _COUNT.pack(count) + bytes(count):
         raise Misfit("the server's answer does not end with its results")
 
 
 def _reading(answer: bytes, at: int, number: int, layout: struct.Struct) -> tuple[Reading, int]:
-    """The DataValue at `at`, of a node of this type, and where it ends. Raises Misfit, struct.error, IndexError."""
+    """The DataValue at `at`, of a node of this type, and where it ends.
+
+    Raises struct.error, IndexError, and ValueError for a value whose end is not known.
+    """
     mask = answer[at]
     at += 1
     value: float | None = None
@@ -169,7 +189,7 @@ def _reading(answer: bytes, at: int, number: int, layout: struct.Struct) -> tupl
             [value] = layout.unpack_from(answer, at)
             at += layout.size
         else:
-            at = _behind(answer, at, kind)
+            at = behind_variant(answer, at, kind)
     status = source_us = 0
     if mask & _HAS_STATUS:
         [status] = _STATUS.unpack_from(answer, at)
@@ -182,24 +202,3 @@ def _reading(answer: bytes, at: int, number: int, layout: struct.Struct) -> tupl
     if value is None:
         return Reading(BAD_TYPE_MISMATCH if is_good(status) else status, 0.0, source_us), at
     return Reading(status, float(value), source_us), at
-
-
-def _behind(answer: bytes, at: int, kind: int) -> int:
-    """Where a Variant of another type ends. Raises Misfit for one that has no simple length, and struct.error."""
-    number, count = kind & ~(_ARRAY | _DIMENSIONS), 1
-    if kind & _ARRAY:
-        [count] = _COUNT.unpack_from(answer, at)
-        at += _COUNT.size
-    if number in _STRINGS:
-        for _ in range(count):
-            at = _behind_counted(answer, at, 1)
-    elif number in _SIZES:
-        at += max(count, 0) * _SIZES[number]
-    else:
-        raise Misfit(f"the server answered with a value of the built-in type {number}")
-    return _behind_counted(answer, at, _COUNT.size) if kind & _DIMENSIONS else at
-
-
-def _behind_counted(answer: bytes, at: int, size: int) -> int:
-    """Where something ends that says how many times `size` bytes it has; -1 is none. Raises struct.error."""
-    return at + _COUNT.size + max(_COUNT.unpack_from(answer, at)[0], 0) * size

@@ -1,4 +1,4 @@
-"""The one file that knows asyncua's client: a connection to a server with its channel and session, and requests on it.
+"""A connection to a server with its channel and session, and requests on it, by asyncua's client.
 
 asyncua connects, secures and cuts messages into chunks. What the messages say is known elsewhere (`services`); when to
 connect again is decided there, too, and nothing is subscribed to.

@@ -53,7 +53,10 @@ async def _serve(connection: socket.socket, generation: int, priority: int) -> i
     questions: asyncio.Queue[bytes] = asyncio.Queue()
 
     def hear() -> None:
-        message = connection.recv(MAX_MESSAGE)
+        try:
+            message = connection.recv(MAX_MESSAGE)
+        except OSError:  # the loop has gone and left an answer unread
+            message = b""
         if not message:
             loop.remove_reader(connection)
         questions.put_nowait(message)

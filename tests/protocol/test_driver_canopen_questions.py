@@ -8,7 +8,7 @@ import pytest
 
 from drivers.canopen import questions
 from drivers.canopen.link import CanopenLink
-from drivers.canopen.sdo import SdoSilent
+from drivers.canopen.sdo import SdoBus, SdoSilent
 from gateway.core.signals import DriveRequest, DriveState, Inputs
 from tests.protocol.driver_support import ENABLED, Drive, Drives, cycle, until
 from tests.protocol.test_driver_canopen import bench, settle, write
@@ -172,6 +172,32 @@ def test_what_comes_in_segments_is_read_in_a_thread_of_the_buss_own(size: int) -
         assert not any(thread.name.startswith("sdo") for thread in threading.enumerate()), "closed with the link"
 
     bench(body)
+
+
+def test_a_transfer_in_segments_is_ended_before_the_next_request_to_its_node() -> None:
+    sent: list[bytes] = []
+
+    async def scene() -> None:
+        loop = asyncio.get_running_loop()
+
+        def send(cob_id: int, data: bytes) -> bool:
+            sent.append(data)
+            if data[0] == UPLOAD:
+                answer = "4108100017000000" if data[1:4] == HEAD else "4B41600037120000"
+                loop.call_soon(bus.on_frame, 0x581, bytes.fromhex(answer), 0.0)
+            return True
+
+        bus = SdoBus(send, [1])
+        long = asyncio.create_task(bus.upload(1, 0x1008, 0, 4))
+        following = asyncio.create_task(bus.upload(1, 0x6041, 0, 2))
+        assert await following == b"\x37\x12"
+        long.cancel()
+        await asyncio.wait([long])
+        await bus.close()
+
+    asyncio.run(scene())
+    assert [data[0] for data in sent[:3]] == [UPLOAD, ABORT, UPLOAD]
+    assert sent[1] == b"\x80" + HEAD + struct.pack("<I", 0x08000000)
 
 
 @pytest.mark.parametrize("answer", ["4B100000", "4B416001", "20416000", "60406100", "60416001"])

@@ -52,7 +52,7 @@ def test_what_is_no_plain_data_frame_stays_a_message(message: can.Message) -> No
 WRONG = {
     "arbitration_id": [0x800, -1, "385", 1.5, None],
     "dlc": [9, 3, -1, "1"],
-    "data": [bytes(9), "text", 7, None],
+    "data": [bytes(9), "text", None],
     "is_fd": [True],
     "bitrate_switch": [True],
     "error_state_indicator": [True],
@@ -85,6 +85,20 @@ def test_a_datagram_is_taken_where_python_can_takes_it(datagram: bytes) -> None:
     if isinstance(found, tuple):
         found = data_frame(found[0], bytes(found[1]))
     assert found.equals(wanted, check_channel=False)
+
+
+@pytest.mark.parametrize("data", [1, 1_000_000_000, [1, 2], True, {}])
+def test_data_that_is_no_bytes_never_gets_as_far_as_a_message(data: object, monkeypatch: pytest.MonkeyPatch) -> None:
+    """python-can takes a number for that many bytes: a short datagram would cost gigabytes."""
+    monkeypatch.setattr("drivers.canopen.wire.unpack_message", lambda *_, **__: pytest.fail("a message was made"))
+    with pytest.raises(ValueError, match="^a datagram that is no frame$"):
+        unpacked(msgpack.packb(msgpack.unpackb(packed(0x181, b"")) | {"data": data}))
+
+
+def test_a_datagram_that_is_no_frame_is_not_quoted() -> None:
+    """Its text goes to logs and terminals."""
+    with pytest.raises(ValueError, match="^a datagram that is no frame$"):
+        unpacked(msgpack.packb(msgpack.unpackb(packed(0x181, b"")) | {"\x1b[2J\nFAKE " + "A" * 3000: 1}))
 
 
 def test_what_is_sent_and_received_meets_python_can() -> None:

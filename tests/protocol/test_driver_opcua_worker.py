@@ -3,7 +3,9 @@
 import asyncio
 import os
 import re
+import select
 import signal
+import socket
 import subprocess
 import sys
 from collections.abc import Awaitable, Callable, Iterator
@@ -212,6 +214,20 @@ def test_a_worker_dies_with_its_parent(server: DeviceServer) -> None:
         finally:
             os.close(handle)
     assert signalled
+
+
+def test_a_worker_whose_loop_closed_with_an_answer_unread_ends_in_silence() -> None:
+    """The kernel says "connection reset" then, and not that the other side has ended."""
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    arguments = [str(number) for number in (theirs.fileno(), os.getpid(), 1, 1)]
+    program = [sys.executable, "-m", "drivers.opcua.worker", *arguments]
+    with ours, subprocess.Popen(program, pass_fds=[theirs.fileno()], stderr=subprocess.PIPE) as worker:
+        theirs.close()
+        ours.send(Plan("opc.tcp://127.0.0.1:1", "none", "", "", "", []).to_json())
+        assert select.select([ours], [], [], 60.0)[0], "it says that it is ready"
+        ours.close()
+        _, said = worker.communicate(timeout=60.0)
+    assert (worker.returncode, said) == (0, b"")
 
 
 async def _readable(handle: int) -> bool:

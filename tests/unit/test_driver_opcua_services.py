@@ -1,6 +1,7 @@
 """The bytes of Read and Write as the client says and hears them; asyncua's codec is the other side."""
 
 import struct
+import uuid
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
@@ -104,6 +105,14 @@ def test_readings_are_what_a_server_says(said: list[tuple[tuple[int, Any], int |
     )
 
 
+NODE_IDS = [
+    ua.NodeId(1, 0),
+    ua.NodeId(300, 5),
+    ua.NodeId(70_000, 5),
+    ua.NodeId("a", 5),
+    ua.NodeId(b"abc", 5),
+    ua.NodeId(uuid.UUID(int=7), 5),
+]
 OTHERS = [
     ua.Variant(None, V.Null),
     ua.Variant("12.0", V.String),
@@ -116,6 +125,18 @@ OTHERS = [
     ua.Variant([], V.Double),
     ua.Variant(["a", None, "b"], V.String),
     ua.Variant([[1.0, 2.0], [3.0, 4.0]], V.Double, Dimensions=[2, 2]),
+    ua.Variant(ua.LocalizedText("auf", "de"), V.LocalizedText),
+    ua.Variant(ua.LocalizedText("auf"), V.LocalizedText),
+    ua.Variant(ua.LocalizedText(), V.LocalizedText),
+    ua.Variant([ua.LocalizedText("auf"), ua.LocalizedText(None, "de")], V.LocalizedText),
+    ua.Variant(ua.QualifiedName("a", 1), V.QualifiedName),
+    ua.Variant([ua.QualifiedName("a", 1), ua.QualifiedName(None, 0)], V.QualifiedName),
+    ua.Variant(NODE_IDS, V.NodeId),
+    *(ua.Variant(node, V.NodeId) for node in NODE_IDS),
+    ua.Variant(ua.ExpandedNodeId("a", 3, NamespaceUri="urn:x", ServerIndex=4), V.ExpandedNodeId),
+    ua.Variant(ua.Range(1.0, 2.0), V.ExtensionObject),
+    ua.Variant(None, V.ExtensionObject),
+    ua.Variant([ua.Range(1.0, 2.0), ua.EUInformation("urn:x", 7)], V.ExtensionObject),
 ]
 
 
@@ -144,7 +165,6 @@ def test_what_does_not_fit_the_question_is_no_answer() -> None:
     fault.ResponseHeader.ServiceResult = ua.StatusCode(ua.StatusCodes.BadSessionIdInvalid)
     put_off = ua.ReadResponse(Results=[double(1.0)])
     put_off.ResponseHeader.ServiceResult = ua.StatusCode(ua.StatusCodes.GoodCompletesAsynchronously)
-    structure = answer_of([ua.DataValue(ua.Variant(ua.QualifiedName("a", 1), V.QualifiedName))])
     for answer, why in (
         (written, "not ReadResponse"),
         (struct_to_binary(fault), "the server answered Bad"),
@@ -153,7 +173,8 @@ def test_what_does_not_fit_the_question_is_no_answer() -> None:
         (answer_of([double(1.0)] * 2), "2 results, asked for 1"),
         (good + b"\x00", "does not end with its results"),
         (good[:24] + b"\x01" + good[25:], "which nobody asked for"),
-        (structure, "built-in type 20"),
+        (b"\x03" + good[1:], "answered with 0300.*, not ReadResponse"),
+        (b"\x01\x01" + good[2:], "not ReadResponse"),
         (b"", "cut short"),
     ):
         with pytest.raises(Misfit, match=why):
@@ -162,7 +183,73 @@ def test_what_does_not_fit_the_question_is_no_answer() -> None:
         statuses(good, 1)
     with pytest.raises(Misfit, match="cut short"):
         statuses(written[:-6], 1)
+    with pytest.raises(Misfit, match="cut short"):
+        statuses(b"", 1)
     assert statuses(written, 1) == (0,)
+
+
+@pytest.mark.parametrize(
+    ("value", "why"),
+    [
+        (ua.Variant([ua.Variant(1.0, V.Double)], V.Variant), "built-in type 24"),
+        (ua.Variant(ua.DataValue(ua.Variant(1.0, V.Double)), V.DataValue), "built-in type 23"),
+        (ua.Variant(ua.DiagnosticInfo(), V.DiagnosticInfo), "built-in type 25"),
+    ],
+)
+def test_a_value_that_can_hold_others_is_refused_with_its_place(value: ua.Variant, why: str) -> None:
+    answer = answer_of([double(1.0), ua.DataValue(value, StatusCode=None), double(3.0)])
+    with pytest.raises(Misfit, match=f"{why}, result 2 of 3"):
+        services().readings(answer, (KINDS.index("f64"),) * 3)
+
+
+@pytest.mark.parametrize(
+    ("body", "why"),
+    [
+        (b"\x11\x06\x00", "a node id with the encoding 0x06"),
+        (b"\x16\x00\x00\x03", "an ExtensionObject with the encoding 3"),
+        (b"\x3f", "built-in type 63"),
+        (b"\x96\xff\xff\xff\x7f\x00\x00\x07", "an ExtensionObject with the encoding 7"),
+    ],
+)
+def test_an_encoding_that_does_not_exist_is_refused_with_its_place(body: bytes, why: str) -> None:
+    head = answer_of([double(1.0)])[:-13]  # without type and number, and what comes behind
+    with pytest.raises(Misfit, match=f"{why}, result 1 of 1"):
+        services().readings(head + body, (KINDS.index("f64"),))
+
+
+@pytest.mark.parametrize("number", range(26, 32))
+def test_a_type_that_is_not_assigned_yet_is_a_string_of_bytes(number: int) -> None:
+    place = KINDS.index("f64")
+    answer = answer_of([ua.DataValue(ua.Variant(b"12", V.ByteString), StatusCode=None), double(3.0)])
+    at = answer.index(b"\x0f\x02\x00\x00\x0012")
+    found = services().readings(answer[:at] + bytes((number,)) + answer[at + 1 :], (place, place))
+    assert [reading.status for reading in found] == [BAD_TYPE_MISMATCH, 0]
+
+
+def in_numeric_encoding(answer: bytes) -> bytes:
+    """With the id of its type in seven bytes instead of four."""
+    return b"\x02" + struct.pack("<HI", answer[1], int.from_bytes(answer[2:4], "little")) + answer[4:]
+
+
+def test_the_type_of_an_answer_comes_in_any_encoding() -> None:
+    place = KINDS.index("f64")
+    good, written = answer_of([double(1.0)]), struct_to_binary(ua.WriteResponse(Results=[ua.StatusCode(0)]))
+    assert services().readings(in_numeric_encoding(good), (place,)) == (Reading(0, 1.0),)
+    assert statuses(in_numeric_encoding(written), 1) == (0,)
+    with pytest.raises(Misfit, match="not ReadResponse"):
+        services().readings(in_numeric_encoding(written), (place,))
+
+
+def test_diagnostics_that_say_nothing_are_none() -> None:
+    place = KINDS.index("f64")
+    read = ua.ReadResponse(Results=[double(1.0), double(2.0)], DiagnosticInfos=[ua.DiagnosticInfo()] * 2)
+    write = ua.WriteResponse(Results=[ua.StatusCode(0)] * 2, DiagnosticInfos=[ua.DiagnosticInfo()] * 2)
+    assert [reading.value for reading in services().readings(struct_to_binary(read), (place,) * 2)] == [1.0, 2.0]
+    assert statuses(struct_to_binary(write), 2) == (0, 0)
+    for wrong in ([ua.DiagnosticInfo()], [ua.DiagnosticInfo(), ua.DiagnosticInfo(SymbolicId=ua.Int32(1))]):
+        read.DiagnosticInfos = wrong
+        with pytest.raises(Misfit, match="does not end with its results"):
+            services().readings(struct_to_binary(read), (place,) * 2)
 
 
 @pytest.mark.parametrize("kind", range(256))

@@ -144,6 +144,36 @@ def test_a_watchdog_that_cannot_be_switched_off_is_said() -> None:
     run(scene)
 
 
+@pytest.mark.parametrize("answered", [1, 2], ids=["before the look", "behind the look"])
+def test_no_watchdog_is_switched_off_on_another_connection_than_the_last_command(answered: int) -> None:
+    """Whoever is connected there now may never have heard that command, though he says that he is off."""
+
+    async def scene(rig: Rig) -> None:
+        def connect_anew() -> None:
+            rig.channel.connection += 1
+            rig.link.trigger(asyncio.get_running_loop().time())  # a cycle may be the first to see it
+
+        rig.channel.after_reads(answered, connect_anew)
+        [only] = await released(rig)
+        assert LAST_WORDS <= set(only)
+        assert rig.channel.devices.value("Axis1.Watchdog") == rig.channel.devices.value("Axis2.Watchdog") == 100
+        assert "not released, their watchdogs take torque off: connected anew" in rig.link.health.last_error
+
+    run(scene)
+
+
+def test_a_look_on_another_connection_is_none() -> None:
+    async def scene(rig: Rig) -> None:
+        def connect_anew() -> None:
+            rig.channel.connection += 1
+
+        rig.channel.after_reads(1, connect_anew)
+        assert len(await released(rig)) == 1
+        assert "connected anew" in rig.link.health.last_error
+
+    run(scene)
+
+
 # proof on a connection that stays
 
 
