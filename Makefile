@@ -38,7 +38,7 @@ format: setup ## format the code
 	@$(PY) -m ruff format .
 	@$(PY) -m ruff check --fix .
 
-bench: bench-stepped bench-wire bench-processes ## every benchmark (about 10 min)
+bench: bench-stepped bench-wire bench-processes ## the figures of the README (about 7 min)
 
 bench-stepped: setup ## both cases in stepped time: RMSE against the goals, speed against real time
 	@$(PY) -m tests.bench.stepped $(ARGS)
