@@ -24,7 +24,13 @@ def demo(folder: Path) -> subprocess.Popen[str]:
         stderr=subprocess.STDOUT,
         text=True,
         start_new_session=True,
+        preexec_fn=heed_ctrl_c,
     )
+
+
+def heed_ctrl_c() -> None:
+    """Whoever runs the tests in the background lets them ignore it, and all their children."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def until_running(process: subprocess.Popen[str]) -> None:
