@@ -11,12 +11,13 @@ import time
 from pathlib import Path
 
 PEERS = Path(__file__).parent / "peers"
-#: A command that shows whether the Debian package is there.
+#: A command that shows whether the Debian packages are there.
 PACKAGES = {
     "linux.uml": "user-mode-linux",
     "ip": "iproute2",
     "candump": "can-utils",
     "insmod": "kmod",
+    "cc": "gcc libc6-dev",
     "node": "nodejs",
     "npm": "npm",
 }
@@ -37,7 +38,7 @@ def _debian_packages() -> None:
         return
     if shutil.which("apt-get") is None:
         _fail(f"missing, and there is no apt-get to install them with: {_listed(missing)}")
-    names = [PACKAGES[command] for command in missing]
+    names = [name for command in missing for name in PACKAGES[command].split()]
     print(f"installing {' '.join(names)}", flush=True)
     install = ["apt-get", "install", "-y", "--no-install-recommends", *names]
     said = ""

@@ -16,6 +16,7 @@ from pathlib import Path
 
 KERNEL = "linux.uml"
 INIT = Path(__file__).parent / "guest_init.sh"
+XSTATE = Path(__file__).parent / "xstate.c"
 MEMORY_MB = 1536
 LINKS = "r2rgate-guest"  #: begins the name of a guest's folder of links, before the number of this process
 #: A host that is busy must not look like a line that stalls. Below the loops of other lines on this host.
@@ -54,22 +55,34 @@ def run_in_guest(
         (folder / "share").symlink_to(share)
         (folder / "here").symlink_to(Path.cwd())
         shutil.copy(INIT, folder / "init")
+        xstate = _compiled(XSTATE, folder / "xstate.so")
         arguments = [
             f"mem={MEMORY_MB}M", "rootfstype=hostfs", "rootflags=/", "ro", f"init={folder / 'init'}", f"links={folder}",
             "quiet", "con=null", "con0=null,fd:1", "ssl=null", f"uml_dir={folder}/",
         ]  # fmt: skip
-        _boot([*PUNCTUAL, kernel, *arguments], share, limit_s)
+        _boot([*PUNCTUAL, kernel, *arguments], share, limit_s, xstate)
     if not (share / "code").is_file():
         raise GuestFailed(f"the guest ended without a result\n{_last_words(share)}")
     return Outcome(int((share / "code").read_text()), (share / "output").read_text(errors="replace"))
 
 
-def _boot(command: list[str], share: Path, limit_s: float) -> None:
+def _compiled(source: Path, library: Path) -> Path:
+    """Raises GuestFailed."""
+    done = subprocess.run(
+        ["cc", "-O2", "-shared", "-fPIC", "-o", library, source], capture_output=True, text=True, check=False
+    )
+    if done.returncode != 0:
+        raise GuestFailed(f"{source.name} does not compile: {done.stderr}")
+    return library
+
+
+def _boot(command: list[str], share: Path, limit_s: float, preloaded: Path) -> None:
     """Until the guest halts. Raises GuestFailed."""
     with (share / "console").open("wb") as sink:
         guest = subprocess.Popen(
-            command, stdin=subprocess.DEVNULL, stdout=sink, stderr=subprocess.STDOUT, start_new_session=True
-        )
+            command, stdin=subprocess.DEVNULL, stdout=sink, stderr=subprocess.STDOUT, start_new_session=True,
+            env=os.environ | {"LD_PRELOAD": str(preloaded)},
+        )  # fmt: skip
         try:
             guest.wait(limit_s)
         except subprocess.TimeoutExpired:
