@@ -88,10 +88,10 @@ class SdoBus:
         if node in self._long:
             self._network.notify(cob_id, bytearray(data), now_s)
         elif (waiting := self._waiting.get(node)) is not None and not waiting.done():
-            if data[0] & (_COMMAND | _EXPEDITED) == _UPLOAD_ANSWER:
-                # In segments, for which nobody will ask. Now: with the result the node is free for the next request.
-                self._send(_REQUEST + node, bytes((_ABORT,)) + data[1:4] + _NO_SEGMENTS)
             waiting.set_result(bytes(data))
+            if data[0] & (_COMMAND | _EXPEDITED) == _UPLOAD_ANSWER:
+                # In segments, for which nobody will ask. Now: the next request goes out when this has returned.
+                self._send(_REQUEST + node, bytes((_ABORT,)) + data[1:4] + _NO_SEGMENTS)
 
     async def upload(self, node: int, index: int, sub: int, size: int) -> bytes:
         """The `size` bytes of an object, or as many as came. Raises SdoFailed.
