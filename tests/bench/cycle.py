@@ -17,7 +17,7 @@ from gateway.core.line_template import line_template
 from tests.bench.figures import Bench
 from tests.bench.floor import lateness_us, overruns, require_cyclictest
 from tests.bench.lines import UDP_MULTICAST, WIRINGS, CanWire
-from tests.bench.slices import Disturbance, Slice, loop_cpu, loop_slice
+from tests.bench.slices import Disturbance, NotRun, Slice, loop_cpu, loop_slice
 
 KINDS = ("canopen", "modbus", "opcua", "mixed")
 SLICE_S = 20.0
@@ -43,6 +43,7 @@ class Cell:
     kind: str
     rate_hz: int
     slices: list[Slice] = field(default_factory=list[Slice])
+    not_run: list[str] = field(default_factory=list[str])  #: slices for which the line did not come to run, and why
     floor_us: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, dtype=np.int64))
 
     @property
@@ -69,7 +70,11 @@ class Cell:
         return max(map(value, self.slices))
 
     def run(self, for_s: float, can: CanWire = UDP_MULTICAST, disturbance: Disturbance = "none") -> None:
-        self.slices.append(loop_slice(self.kind, self.period_s, for_s, can, disturbance))
+        try:
+            self.slices.append(loop_slice(self.kind, self.period_s, for_s, can, disturbance))
+        except NotRun as error:
+            self.not_run.append(str(error))
+            print(f"NOT RUN: {error}", flush=True)
 
     def run_floor(self, for_s: float) -> None:
         found = lateness_us(loop_cpu(), PRIORITY, self.period_s, for_s)
@@ -132,7 +137,9 @@ def main() -> None:
     periods = sum(cell.periods for cell in everything)
     bench.figure("unsafe_events", sum(one.unsafe for cell in everything for one in cell.slices), "", periods)
     bench.figure("stops", sum(len(one.stops) for cell in everything for one in cell.slices), "", periods)
-    bench.tables["cells"] = [cell.row() for cell in cells]
+    bench.figure("slices_not_run", sum(len(cell.not_run) for cell in everything), "", periods)
+    bench.tables["not_run"] = [text for cell in everything for text in cell.not_run]
+    bench.tables["cells"] = [cell.row() for cell in cells if cell.slices]
     bench.finish()
 
 
@@ -144,11 +151,16 @@ def undisturbed(bench: Bench, settings: Settings) -> list[Cell]:
             cell.run_floor(settings.slice_s)
             cell.run(settings.slice_s)
         told(cell)
+    every, cells = cells, [cell for cell in cells if cell.slices]
+    if not cells:
+        raise SystemExit("no line came to run")
     worst = max(cells, key=lambda cell: p99(cell.lateness_us) / p99(cell.floor_us))
     bench.figure("lateness_p99_us", max(p99(cell.lateness_us) for cell in cells), "us", worst.periods)
     bench.figure("lateness_p99_to_floor", p99(worst.lateness_us) / p99(worst.floor_us), "x", worst.periods)
     for kind in settings.kinds:
         of_kind = [cell for cell in cells if cell.kind == kind]
+        if not of_kind:
+            continue
         slowest = max(of_kind, key=lambda cell: p99(cell.cycle_us))
         bench.figure(f"cycle_p99_{kind}_us", p99(slowest.cycle_us), "us", slowest.periods)
     beyond = sum(max(0, cell.missed - overruns(cell.floor_us, cell.period_s)) for cell in cells)
@@ -159,7 +171,7 @@ def undisturbed(bench: Bench, settings: Settings) -> list[Cell]:
     bench.figure("rss_with_helpers_mb", with_helpers, "MB", slices)
     bench.figure("cpu_share", max(cell.worst(lambda one: one.cpu_share) for cell in cells), "cpus", slices)
     bench.figure("first_cycle_s", max(cell.worst(lambda one: one.first_cycle_s) for cell in cells), "s", slices)
-    return cells
+    return every
 
 
 def disturbances(bench: Bench, settings: Settings) -> list[Cell]:
@@ -175,6 +187,8 @@ def disturbances(bench: Bench, settings: Settings) -> list[Cell]:
         every += cells.values()
         quiet = cells["none"]
         for disturbance, cell in cells.items():
+            if not (cell.slices and quiet.slices):
+                continue
             told(cell, disturbance)
             rows.append({"disturbance": disturbance, **cell.row()})
             if cell is not quiet:
@@ -182,7 +196,7 @@ def disturbances(bench: Bench, settings: Settings) -> list[Cell]:
                 for what in ("lateness_us", "cycle_us"):
                     ratio = p99(getattr(cell, what)) / p99(getattr(quiet, what))
                     ratios.setdefault(f"{name}_{what[:-3]}_p99_ratio", []).append(ratio)
-    periods = min(cell.periods for cell in every)
+    periods = min((cell.periods for cell in every if cell.slices), default=0)
     for name, found in ratios.items():
         bench.figure(name, max(found), "x", periods)
     bench.tables["disturbed"] = rows
@@ -196,14 +210,18 @@ def wire_time(bench: Bench, settings: Settings) -> list[Cell]:
     ]
     for cell in cells:
         cell.run(settings.slice_s, CanWire(wire_time=True))
+        if not cell.slices:
+            continue
         told(cell, "wire time")
         bench.figure(f"wire_time_cycle_p99_{cell.kind}_us", p99(cell.cycle_us), "us", cell.periods)
-    bench.tables["wire_time"] = [cell.row() for cell in cells]
+    bench.tables["wire_time"] = [cell.row() for cell in cells if cell.slices]
     return cells
 
 
 def told(cell: Cell, what: str = "") -> None:
     """One line for whoever waits."""
+    if not cell.slices:
+        return
     floor = f", floor {p99(cell.floor_us):.0f}" if cell.floor_us.size else ""
     print(
         f"{cell.kind} {cell.rate_hz} Hz {what}: p99 of lateness {p99(cell.lateness_us):.0f} us{floor}, "

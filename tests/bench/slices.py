@@ -39,10 +39,14 @@ class Slice:
     stops: list[str]  #: why the line did not come to run at once, or stopped
 
 
+class NotRun(Exception):
+    """A line did not come to run here; the text says which, and why."""
+
+
 def loop_slice(
     kind: str, period_s: float, for_s: float, can: CanWire = UDP_MULTICAST, disturbance: Disturbance = "none"
 ) -> Slice:
-    """Run a line of that kind. Raises SystemExit where it cannot be run, or not with real-time priority."""
+    """Run a line of that kind. Raises NotRun, and SystemExit where a loop gets no real-time priority."""
     with tempfile.TemporaryDirectory() as folder, LiveLine(Path(folder), period_s) as line:
         try:
             line.start(WIRINGS[kind], can)
@@ -50,7 +54,7 @@ def loop_slice(
             line.run()
             return _measure(line, for_s, disturbance)
         except (ChildFailed, LineStalls, TimeoutError) as error:
-            raise SystemExit(f"{kind}, {1 / period_s:g} Hz: {error}") from error
+            raise NotRun(f"{kind}, {1 / period_s:g} Hz: {error}") from error
 
 
 def _measure(line: LiveLine, for_s: float, disturbance: Disturbance) -> Slice:
