@@ -86,6 +86,7 @@ class Drives(Strict):
 
 class Plc(Strict):
     speed_ramp_m_per_s2: SpeedRamp = "step"  #: how fast v0 follows its request
+    speed_interpolation_s: NonNegative = 0.0  #: in which v0 goes straight to each new request; 0: not at all
 
 
 class RecorderLimits(Strict):

@@ -46,6 +46,7 @@ class SteppedLine:
         self.world = World(plant, seed)
         self.recorder = Recorder(self.world, EXACT)
         self.plc = LinePlc(self.world, self.recorder, inf if ramp == "step" else ramp)
+        self.plc.interpolation_s = plant.plc.speed_interpolation_s
         self.amplifier = Amplifier(self.world)
         self.encoders = [Misreading() for _ in range(plant.spans)]
         self._latency_s = latency_s

@@ -106,6 +106,7 @@ class WiredLine:
         self.amplifier = Amplifier(self.world)
         ramp = plant.plc.speed_ramp_m_per_s2
         self.plc = LinePlc(self.world, self.recorder, inf if ramp == "step" else ramp, self.drives)
+        self.plc.interpolation_s = plant.plc.speed_interpolation_s
         self.faults = WiredFaults(
             plant,
             self.world,

@@ -1,10 +1,11 @@
 """The two cases of the benchmark: what the line does before, what changes at 1 s, how long it is watched."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gateway.core.messages import Command, SetSpeed, SetTension
+from gateway.control.reference import MinimumJerk
+from gateway.core.messages import SetSpeed, SetTension
 from gateway.core.signals import FloatArray
 
 CHANGE_AT_S = 1.0
@@ -18,14 +19,35 @@ class Case:
     description: str
     tension_n: tuple[float, ...]  #: before the change, one per span
     unwind_speed_m_per_s: float  #: before the change
-    change: Command  #: a literal step, made at once
+    change: SetTension | SetSpeed  #: a literal step, made at once, unless `move_s` says otherwise
+    move_s: float = 0.0  #: that the change takes along a minimum-jerk curve; 0: it is a step
 
     def setpoints_n(self, time_s: FloatArray) -> FloatArray:
         """Set-points (k, n) in N at `time_s` (k,), counted from the start of the case."""
         setpoints = np.tile(np.array(self.tension_n), (len(time_s), 1))
         if isinstance(self.change, SetTension):
-            setpoints[time_s >= CHANGE_AT_S, self.change.span - 1] = self.change.tension_n
+            i, end_n = self.change.span - 1, self.change.tension_n
+            if self.move_s:
+                begin_n = self.tension_n[i]
+                curve = MinimumJerk(np.array([begin_n]))
+                curve.move(0, end_n, MinimumJerk.PEAK * abs(end_n - begin_n) / self.move_s, CHANGE_AT_S)
+                after = time_s >= CHANGE_AT_S
+                setpoints[after, i] = [curve.at(t)[0, 0] for t in time_s[after].tolist()]
+            else:
+                setpoints[time_s >= CHANGE_AT_S, i] = end_n
         return setpoints
+
+    @property
+    def size(self) -> float:
+        """Of the change, in N or m/s."""
+        if isinstance(self.change, SetTension):
+            return abs(self.change.tension_n - self.tension_n[self.change.span - 1])
+        return abs(self.change.speed_m_per_s - self.unwind_speed_m_per_s)
+
+    def moved_over(self, move_s: float) -> "Case":
+        """The same, along a minimum-jerk curve of so many seconds."""
+        change = self.change.model_copy(update={"step": False})
+        return replace(self, change=change, move_s=move_s)
 
 
 TENSION = Case(

@@ -19,7 +19,7 @@ from gateway.cli.demo_progress import Progress
 from gateway.cli.line_commands import known_maps
 from gateway.cli.operate_commands import request
 from gateway.cli.status_commands import parse_status
-from gateway.core.controller import LqiConfig, PidConfig, canonical
+from gateway.core.controller import Controller, canonical
 from gateway.core.line import Line
 from gateway.core.line_file import load_line
 from gateway.core.line_template import line_template
@@ -49,7 +49,7 @@ class Setup:
 
     out: Path
     line: Line
-    config: LqiConfig | PidConfig
+    config: Controller
     seed: int
 
 

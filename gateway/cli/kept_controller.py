@@ -18,6 +18,7 @@ CONTROLLER, SOURCE = "controller.json", "controller.source.json"
 def source_hash(line: Line) -> str:
     """SHA-256 of what a design is made from: timing, limits, web, rollers, spans and the design point; not names."""
     source: dict[str, Any] = {
+        "design": 2,  #: what designs are like; raised when they change
         "period_s": line.control.period_s,
         "latency_s": line.control.latency_s,
         "limits": line.limits.model_dump(),
@@ -61,11 +62,14 @@ def kept_controller(line: Line, folder: Path) -> tuple[Path, str]:
 
 
 def _hash_of(path: Path) -> str:
-    """The hash of the configuration at `path`; "" where there is none or it cannot be used."""
+    """The hash of the configuration at `path`, as it is written where it cannot be read; "" where there is none."""
     try:
-        return config_hash(parse_controller(path.read_bytes()))
-    except (FileNotFoundError, ControllerRefused):
+        payload = path.read_bytes()
+        return config_hash(parse_controller(payload))
+    except FileNotFoundError:
         return ""
+    except ControllerRefused:  # of another version of the format, say; what `run` has written it still knows
+        return hashlib.sha256(payload).hexdigest()
 
 
 def _source(path: Path) -> dict[str, Any]:

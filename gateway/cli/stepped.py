@@ -11,7 +11,7 @@ import numpy as np
 from drivers.memory import MemoryLink
 from gateway.cli.cases import CHANGE_AT_S, DURATION_S, Case
 from gateway.control.laws import make_law
-from gateway.core.controller import LqiConfig, PidConfig
+from gateway.core.controller import Controller
 from gateway.core.line import Line, Recipe
 from gateway.core.messages import Arm, Command, Reply
 from gateway.core.metrics import rmse_n, rmse_per_span_n
@@ -35,7 +35,7 @@ class SteppedLoop:
     """A loop and a simulated line that share a clock which only `step` moves."""
 
     line: Line
-    config: LqiConfig | PidConfig
+    config: Controller
     plant: Plant
     seed: int = 0
     frames: list[bytes] = field(default_factory=list[bytes])
@@ -61,7 +61,7 @@ class SteppedLoop:
         cycle.outputs.torque_nm = torque.copy()
         recipe = Recipe(name="production", tension_n=tension_n.tolist(), speed_m_per_s=unwind_speed_m_per_s)
         cycle.setpoints.aim_at(recipe)
-        cycle.setpoints.speed_m_per_s = unwind_speed_m_per_s
+        cycle.setpoints.begin_at_speed(unwind_speed_m_per_s)
 
     def arm(self) -> Reply:
         """As the operator's `arm`, without waiting for the drives: step on until READY."""
@@ -111,7 +111,7 @@ class SteppedResult:
     time_s: FloatArray  #: (k,)
 
 
-def run_case(line: Line, config: LqiConfig | PidConfig, plant: Plant, case: Case, seed: int) -> SteppedResult:
+def run_case(line: Line, config: Controller, plant: Plant, case: Case, seed: int) -> SteppedResult:
     """The case from the plant's own equilibrium on, over its whole duration."""
     loop = SteppedLoop(line, config, plant, seed)
     loop.begin_in_production(np.array(case.tension_n), case.unwind_speed_m_per_s)

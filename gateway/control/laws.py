@@ -3,15 +3,26 @@
 from typing import Any
 
 from gateway.control.law import Law
+from gateway.control.lqg import Lqg
 from gateway.control.lqi import Lqi
+from gateway.control.lqr import Lqr
 from gateway.control.pid import Pid
-from gateway.core.controller import LqiConfig, PidConfig
+from gateway.core.controller import Controller
+from gateway.core.controller_laws import LqgConfig, LqiConfig, LqrConfig, MpcConfig, PidConfig
 
 
-def make_law(config: LqiConfig | PidConfig) -> Law[Any]:
+def make_law(config: Controller) -> Law[Any]:
     """The law that `config` describes."""
     match config:
-        case LqiConfig():
-            return Lqi(config)
         case PidConfig():
             return Pid(config)
+        case LqrConfig():
+            return Lqr(config)
+        case LqiConfig():
+            return Lqi(config)
+        case LqgConfig():
+            return Lqg(config)
+        case MpcConfig():
+            from gateway.control.mpc import Mpc  # 25 MB of solver, for those who use it
+
+            return Mpc(config)

@@ -4,8 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gateway.control.law import Decision, Deviation, Measured
-from gateway.core.controller import PidConfig
+from gateway.control.deviation import Deviation, Measured
+from gateway.control.law import Decision
+from gateway.control.reference import Reference
+from gateway.core.controller_laws import PidConfig
 from gateway.core.signals import FloatArray
 
 
@@ -24,28 +26,28 @@ class Pid:
         self.config = config
         self._gain = np.hstack((config.gain_proportional, config.gain_derivative))  # one product a period
         self._integral = config.period_s * np.array(config.gain_integral)
-        self._deviation = Deviation(config.feedforward, config.draw_spans)
+        self._deviation = Deviation(config.feedforward, config.draw_spans, config.period_s, config.latency_s)
         # First-order filter, backward Euler: rate_k = a rate_{k-1} + (e_k - e_{k-1}) / (tau + h)
         self._rate_decay = config.derivative_filter_s / (config.derivative_filter_s + config.period_s)
         self._rate_gain = 1.0 / (config.derivative_filter_s + config.period_s)
 
-    def engage(self, measured: Measured, tension_setpoint_n: FloatArray, applied_nm: FloatArray) -> PidState:
-        error = self._deviation.errors(measured, tension_setpoint_n)[0]
+    def engage(self, measured: Measured, reference: Reference, applied_nm: FloatArray) -> PidState:
+        error = self._deviation.errors(measured, reference).tension_n
         state = PidState(np.zeros(self.n), error, np.zeros(self.n))
-        asked = self.ask(state, measured, tension_setpoint_n).torque_nm
+        asked = self.ask(state, measured, reference).torque_nm
         return PidState(applied_nm - asked, error, np.zeros(self.n))
 
-    def ask(self, state: PidState, measured: Measured, tension_setpoint_n: FloatArray) -> Decision:
-        tension_error, speed_error, controlled, equilibrium = self._deviation.errors(measured, tension_setpoint_n)
+    def ask(self, state: PidState, measured: Measured, reference: Reference) -> Decision:
+        errors = self._deviation.errors(measured, reference)
         # The paper's e is reference minus measurement; `Deviation` gives measurement minus reference.
-        deviation = np.concatenate((tension_error, speed_error, self._rate(state, tension_error)))
-        torque = equilibrium + state.integral_nm - self._gain.dot(deviation)
-        return Decision(torque, tension_error, controlled)
+        deviation = np.concatenate((errors.tension_n, errors.speed_m_per_s, self._rate(state, errors.tension_n)))
+        return Decision(errors.torque_nm + state.integral_nm - self._gain.dot(deviation), errors)
 
     def commit(self, state: PidState, decision: Decision, applied_nm: FloatArray) -> PidState:
-        integral = state.integral_nm - self._integral.dot(decision.controlled_error)
+        errors = decision.errors
+        integral = state.integral_nm - self._integral.dot(errors.controlled)
         integral -= self.config.antiwindup * (decision.torque_nm - applied_nm)
-        return PidState(integral, decision.tension_error_n, self._rate(state, decision.tension_error_n))
+        return PidState(integral, errors.tension_n, self._rate(state, errors.tension_n))
 
     def _rate(self, state: PidState, tension_error_n: FloatArray) -> FloatArray:
         return self._rate_decay * state.error_rate_n_per_s + self._rate_gain * (tension_error_n - state.tension_error_n)

@@ -55,6 +55,7 @@ class Limits(Strict):
 class Moves(Strict):
     """How set-points move when nobody asks for a step."""
 
+    shape: Literal["ramp", "minimum-jerk"] = "ramp"  #: of minimum jerk, the rates are the greatest on the way
     tension_rate_n_per_s: Positive = 20.0
     speed_rate_m_per_s2: Positive = 0.05
     stop_rate_m_per_s2: Positive = 0.1  #: the controlled stop
@@ -135,7 +136,8 @@ class LoadCell(Device):
 
 
 class LinePlc(Device):
-    pass
+    #: From a request to the speed that the unwinder has; without this key: one period, after which it is written.
+    speed_lag_s: Annotated[float, Field(ge=0.0, le=2.0)] | None = None
 
 
 class Recipe(Strict):

@@ -54,6 +54,7 @@ HELP: dict[str, dict[str, str]] = {
         "tensioning_time_s": "after start every span must reach its tension within this time",
     },
     "Moves": {
+        "shape": '"ramp", or "minimum-jerk": smooth, with feed-forward; the rates are then the greatest on the way',
         "tension_rate_n_per_s": "ramp of tension set-points",
         "speed_rate_m_per_s2": "ramp of the speed set-point",
         "stop_rate_m_per_s2": "ramp of a controlled stop",
@@ -117,7 +118,11 @@ HELP: dict[str, dict[str, str]] = {
         "channel": "channel of the amplifier",
         "capacity_n": "a reading beyond it is not believed",
     },
-    "LinePlc": {**_DEVICE, "address": "Modbus unit"},
+    "LinePlc": {
+        **_DEVICE,
+        "address": "Modbus unit",
+        "speed_lag_s": "from a speed request to the unwinder's speed; without this key: one period",
+    },
     "History": {
         "keep_days": "of telemetry: about 0.7 GB a day for six spans at 100 Hz",
         "keep_gb": "largest size, of telemetry and events together",

@@ -144,7 +144,7 @@ def _plc(wiring: Wiring, can: str) -> str:
         "rack": _wired("io", "r2r-rack-plc", _RACK_UNIT),
         "opcua": _wired("server", "r2r-opcua-plc", 1),
     }
-    return table("plc", "LinePlc", {"name": '"line-plc"', **wired[wiring.plc]})
+    return table("plc", "LinePlc", {"name": '"line-plc"', **wired[wiring.plc], "speed_lag_s": "#0.02"})
 
 
 def _wired(bus: str, device: str, address: int, channel: int | None = None) -> Values:

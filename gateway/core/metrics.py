@@ -1,8 +1,20 @@
-"""What a run was worth, from sampled trajectories."""
+"""What a run was worth, from sampled trajectories: the paper's metrics as written, and beside them the corrected ones.
+
+Tensions and set-points (k, n) in N, torques (k, n) in Nm, evenly sampled at `time_s` (k,). y_inf, which the paper
+leaves open, is the set-point at the end. As written, settling time counts from the start of the run and overshoot takes
+the greatest tension against the level of all; corrected, both are per span, from the change, overshoot in the direction
+of the set-point's step and relative to its size (to the set-point itself where it does not step).
+"""
+
+from dataclasses import dataclass
+from math import inf
 
 import numpy as np
 
 from gateway.core.signals import FloatArray
+
+BAND = 0.02  #: of y_inf, within which a tension has settled
+CONVERGED = (0.05, 20.0, 2.0)  #: RMSE per set-point, overshoot in %, settling time in s (eq. convergence_criteria)
 
 
 def rmse_n(tension_n: FloatArray, setpoint_n: FloatArray) -> float:
@@ -14,3 +26,103 @@ def rmse_n(tension_n: FloatArray, setpoint_n: FloatArray) -> float:
 def rmse_per_span_n(tension_n: FloatArray, setpoint_n: FloatArray) -> FloatArray:
     """Root mean square error of each span, (n,) in N. Their root sum of squares is `rmse_n`."""
     return np.sqrt(np.mean((tension_n - setpoint_n) ** 2, axis=0, dtype=np.float64))
+
+
+def settling_time_paper_s(time_s: FloatArray, tension_n: FloatArray, setpoint_n: FloatArray) -> float:
+    """Eq. settling_time: from the start of the run until ||y - y_inf|| stays within 2 % of ||y_inf||; inf: never."""
+    final = setpoint_n[-1]
+    outside = np.linalg.norm(tension_n - final, axis=1) > BAND * np.linalg.norm(final)
+    return _since(time_s, outside) + float(time_s[0])
+
+
+def settling_time_s(time_s: FloatArray, tension_n: FloatArray, setpoint_n: FloatArray, changed_s: float) -> FloatArray:
+    """Per span (n,), from the change at `changed_s` until it stays within 2 % of its set-point; inf: never."""
+    after = time_s >= changed_s
+    final = setpoint_n[-1]
+    outside = np.abs(tension_n[after] - final) > BAND * final
+    return np.array([_since(time_s[after], column) for column in outside.T])
+
+
+def overshoot_paper_pct(tension_n: FloatArray, setpoint_n: FloatArray) -> float:
+    """Eq. overshoot: the greatest tension of each span against y_inf, in norms."""
+    final = setpoint_n[-1]
+    return float(100.0 * np.linalg.norm(tension_n.max(axis=0) - final) / np.linalg.norm(final))
+
+
+def overshoot_pct(time_s: FloatArray, tension_n: FloatArray, setpoint_n: FloatArray, changed_s: float) -> FloatArray:
+    """Per span (n,), of the step's size, in its direction; of the set-point, either way, where it does not step."""
+    step: FloatArray = setpoint_n[-1] - setpoint_n[0]
+    error: FloatArray = tension_n[time_s >= changed_s] - setpoint_n[-1]
+    beyond = np.where(step == 0.0, np.abs(error), np.sign(step) * error).max(axis=0)
+    return 100.0 * np.maximum(beyond, 0.0) / np.where(step == 0.0, setpoint_n[-1], np.abs(step))
+
+
+def effort_n2m2s(time_s: FloatArray, torque_nm: FloatArray) -> float:
+    """Eq. control_effort: the integral of u'u over the run, torques held from sample to sample."""
+    return float(np.sum(torque_nm[:-1] ** 2 * np.diff(time_s)[:, None]))
+
+
+@dataclass(frozen=True)
+class Performance:
+    """P = [RMSE, OS, t_s] of a run (as corrected, of the worst span), and what else S weighs."""
+
+    rmse_n: float
+    overshoot_pct: float
+    settling_s: float
+    effort_n2m2s: float
+    robustness_n: float  #: R
+    compute_s: float  #: C_comp, per step
+
+    def vector(self) -> FloatArray:
+        """[e_RMSE, t_s, OS, U_total, R, C_comp], the order of eq. performance_score."""
+        return np.array(
+            [self.rmse_n, self.settling_s, self.overshoot_pct, self.effort_n2m2s, self.robustness_n, self.compute_s]
+        )
+
+
+@dataclass(frozen=True)
+class ScoreWeights:
+    """w of eq. performance_score, each per the unit of its metric: what a line's priorities say."""
+
+    rmse_per_n: float = 1.0
+    settling_per_s: float = 0.2
+    overshoot_per_pct: float = 0.01
+    effort_per_n2m2s: float = 1e-5
+    robustness_per_n: float = 0.02
+    compute_per_s: float = 100.0
+
+    def vector(self) -> FloatArray:
+        """In the order of `Performance.vector`."""
+        return np.array(
+            [
+                self.rmse_per_n, self.settling_per_s, self.overshoot_per_pct, self.effort_per_n2m2s,
+                self.robustness_per_n, self.compute_per_s,
+            ]
+        )  # fmt: skip
+
+
+def score(found: Performance, weights: ScoreWeights) -> float:
+    """S = w . [six metrics]; inf where one of them is."""
+    return float(weights.vector() @ found.vector()) if np.isfinite(found.vector()).all() else inf
+
+
+def converged(
+    time_s: FloatArray, tension_n: FloatArray, setpoint_n: FloatArray, changed_s: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """RMSE per set-point, overshoot in % and settling time in s of each span (n,), for `CONVERGED` (window: from the
+    change on)."""
+    after = time_s >= changed_s
+    relative = rmse_per_span_n(tension_n[after], setpoint_n[after]) / setpoint_n[-1]
+    return (
+        relative,
+        overshoot_pct(time_s, tension_n, setpoint_n, changed_s),
+        settling_time_s(time_s, tension_n, setpoint_n, changed_s),
+    )
+
+
+def _since(time_s: FloatArray, outside: FloatArray) -> float:
+    """Seconds from the first sample to the one behind the last that is `outside` (k,)."""
+    found = np.flatnonzero(outside)
+    if not len(found):
+        return 0.0
+    return float(time_s[found[-1] + 1] - time_s[0]) if found[-1] + 1 < len(time_s) else inf

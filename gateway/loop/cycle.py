@@ -75,7 +75,7 @@ class Cycle:
         self.line = line
         self.links = links
         self.limits = envelope_limits(line)
-        self.torque_path = TorquePath(law, self.limits, line.moves)
+        self.torque_path = TorquePath(law, self.limits, line)
         self.machine = Machine(since_s=clock())
         self.inputs = Inputs(line.n)
         self.outputs = Outputs(line.n)
@@ -213,7 +213,7 @@ class Cycle:
         outputs.torque_nm = torque_nm
         outputs.drive_request[:] = self._requests()
         if phase not in CONTROLLED:
-            self.setpoints.speed_m_per_s = 0.0
+            self.setpoints.begin_at_speed(0.0)
         outputs.speed_request_m_per_s = self.setpoints.speed_m_per_s
         outputs.run = phase in CONTROLLED
         for link in self.links:

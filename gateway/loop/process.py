@@ -9,7 +9,7 @@ from pathlib import Path
 from drivers.port import Link
 from drivers.registry import build_links, speed_steps_m_per_s
 from gateway.control.laws import make_law
-from gateway.core.controller import LqiConfig, PidConfig, config_hash
+from gateway.core.controller import Controller, config_hash
 from gateway.core.line import Line
 from gateway.core.signals import Outputs
 from gateway.core.states import Phase
@@ -27,7 +27,7 @@ from gateway.mailbox.unix import UnixMailbox
 RESTING_PERIODS = 5
 
 
-def run_loop(line: Line, config: LqiConfig | PidConfig, run_folder: Path, say: Callable[[str], None]) -> None:
+def run_loop(line: Line, config: Controller, run_folder: Path, say: Callable[[str], None]) -> None:
     """Run until SIGTERM or SIGINT, which stop the line first.
 
     Raises AlreadyRunning before anything is sent, CannotListen, PathTooLong, and LinksRefused
@@ -36,7 +36,7 @@ def run_loop(line: Line, config: LqiConfig | PidConfig, run_folder: Path, say: C
     asyncio.run(_main(line, config, run_folder, say))
 
 
-async def _main(line: Line, config: LqiConfig | PidConfig, run_folder: Path, say: Callable[[str], None]) -> None:
+async def _main(line: Line, config: Controller, run_folder: Path, say: Callable[[str], None]) -> None:
     mailbox = UnixMailbox()
     # First the socket, whose lock makes this the only loop of the line; only then are the buses touched.
     await mailbox.listen(run_folder / LOOP_SOCKET)

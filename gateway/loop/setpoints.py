@@ -1,14 +1,34 @@
 """Set-points on their way: where they are now, where they shall be, and how fast they may move. Pure."""
 
+from dataclasses import dataclass
 from math import inf
 
 import numpy as np
 
+from gateway.control.reference import MinimumJerk, Motion, Reference, Steady
 from gateway.core.line import Moves, Recipe
 from gateway.core.signals import FloatArray
 
 STEP_PAUSE_S = 2.0  #: between two steps of one quantity, so that they do not add up to one that is larger than allowed
+LEAST_MOVE_S = 0.2  #: that a minimum-jerk move takes, however small
+THERE = 0.02  #: a tension this near its set-point, as a fraction, need not be brought to it: that is noise
 NEAR = 0.2  #: a tension this near its set-point, as a fraction, has followed it
+
+
+@dataclass(frozen=True, slots=True)
+class OnTheWay:
+    """A reference whose set-points are moving, or the line's speed is."""
+
+    tension_n: FloatArray
+    curve: MinimumJerk  #: tensions (n,), then the speed
+    now_s: float  #: on the curve
+    speed_lag_s: float  #: from the speed that is asked for to that which the unwinder has
+    moving: bool = True
+
+    def ahead(self, time_s: float) -> Motion:
+        tension, rate, acceleration = self.curve.at(self.now_s + time_s)[:, :-1]
+        now, then = (self.curve.at(self.now_s - self.speed_lag_s + t)[:, -1] for t in (0.0, time_s))
+        return Motion(tension, rate, acceleration, float(then[1]), float(then[0] - now[0]))
 
 
 class Setpoints:
@@ -23,6 +43,8 @@ class Setpoints:
         self.speed_target_m_per_s = recipe.speed_m_per_s  #: what the operator wants while the line runs
         self._tension_stepped_s: FloatArray = np.full(n, -inf)
         self._speed_stepped_s = -inf
+        self._curve = MinimumJerk(np.zeros(n + 1))
+        self._time_s = 0.0  #: on the curve
 
     def aim_at(self, recipe: Recipe) -> None:
         """The recipe's set-points become the targets."""
@@ -32,16 +54,33 @@ class Setpoints:
 
     def begin_at(self, tension_n: FloatArray) -> None:
         """Start from what is measured, so that nothing jumps when control takes over. Targets stay."""
-        self.tension_n = np.minimum(np.maximum(tension_n, 0.0), self.tension_target_n)
+        target = self.tension_target_n
+        there = np.abs(tension_n - target) <= THERE * target
+        self.tension_n = np.where(there, target, np.minimum(np.maximum(tension_n, 0.0), target))
+        for i, value in enumerate(self.tension_n.tolist()):
+            self._curve.put(i, value)
+
+    def reference(self, speed_lag_s: float) -> Reference:
+        """What control is told; `speed_lag_s` is from a speed that is asked for to that which the unwinder has."""
+        if not self._curve.moving(self._time_s - speed_lag_s):
+            return Steady(self.tension_n)
+        return OnTheWay(self.tension_n, self._curve, self._time_s, speed_lag_s)
 
     def step_tension(self, span: int, tension_n: float, now_s: float) -> None:
         """Make a change at once. Span from 0."""
         self.tension_n[span] = self.tension_target_n[span] = tension_n
+        self._curve.put(span, tension_n)
         self._tension_stepped_s[span] = now_s
 
     def step_speed(self, speed_m_per_s: float, now_s: float) -> None:
-        self.speed_m_per_s = self.speed_target_m_per_s = speed_m_per_s
+        self.begin_at_speed(speed_m_per_s)
+        self.speed_target_m_per_s = speed_m_per_s
         self._speed_stepped_s = now_s
+
+    def begin_at_speed(self, speed_m_per_s: float) -> None:
+        """It is what is asked of the line PLC from now on. The target stays."""
+        self.speed_m_per_s = speed_m_per_s
+        self._curve.put(len(self.tension_n), speed_m_per_s)
 
     def tension_step_pause_s(self, span: int, now_s: float) -> float:
         """Seconds until another step of this tension may be made; not positive when it may be made now."""
@@ -52,11 +91,34 @@ class Setpoints:
 
     def advance(self, moves: Moves, period_s: float, speed_goal_m_per_s: float, speed_rate_m_per_s2: float) -> None:
         """Move on by one period: tensions towards their targets, speed towards `speed_goal_m_per_s`."""
+        self._time_s += period_s
+        if moves.shape == "minimum-jerk":
+            self._advance_smoothly(moves, period_s, speed_goal_m_per_s, speed_rate_m_per_s2)
+            return
         if not self._there():
             reach = moves.tension_rate_n_per_s * period_s
             self.tension_n = self.tension_n + np.clip(self.tension_target_n - self.tension_n, -reach, reach)
-        reach = speed_rate_m_per_s2 * period_s
-        self.speed_m_per_s += max(-reach, min(reach, speed_goal_m_per_s - self.speed_m_per_s))
+        self._ramp_speed(period_s, speed_goal_m_per_s, speed_rate_m_per_s2)
+
+    def _advance_smoothly(self, moves: Moves, period_s: float, speed_goal_m_per_s: float, rate_m_per_s2: float) -> None:
+        n = len(self.tension_n)  # a curve begins where the set-point is now: it has moved a period from now
+        for i in np.flatnonzero(self.tension_target_n != self._curve.target[:n]):
+            self._curve.move(
+                int(i), float(self.tension_target_n[i]), moves.tension_rate_n_per_s, self._time_s, LEAST_MOVE_S
+            )
+        if speed_goal_m_per_s == self.speed_target_m_per_s:  # a stop does not wait for a curve to bend
+            if speed_goal_m_per_s != self._curve.target[n]:
+                self._curve.move(n, speed_goal_m_per_s, rate_m_per_s2, self._time_s, LEAST_MOVE_S)
+            self.speed_m_per_s = float(self._curve.at(self._time_s)[0, n])
+        else:
+            self._ramp_speed(period_s, speed_goal_m_per_s, rate_m_per_s2)
+            self._curve.put(n, self.speed_m_per_s)
+        if not self._there():
+            self.tension_n = self._curve.at(self._time_s)[0, :n]
+
+    def _ramp_speed(self, period_s: float, goal_m_per_s: float, rate_m_per_s2: float) -> None:
+        reach = rate_m_per_s2 * period_s
+        self.speed_m_per_s += max(-reach, min(reach, goal_m_per_s - self.speed_m_per_s))
 
     def followed_by(self, tension_n: FloatArray, measured: FloatArray) -> bool:
         """Whether every set-point is where it shall be and every measured tension (n,) is near it."""

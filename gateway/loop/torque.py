@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from gateway.control.law import Law, Measured
-from gateway.core.line import Moves
+from gateway.core.line import Line
 from gateway.core.signals import BoolArray, FloatArray
 from gateway.loop.setpoints import Setpoints
 from safety.actions import Finding
@@ -24,11 +24,12 @@ class LawFailed(Exception):
 class TorquePath:
     """A law, its state, and the drives that it has lost."""
 
-    def __init__(self, law: Law[Any], limits: EnvelopeLimits, moves: Moves) -> None:
+    def __init__(self, law: Law[Any], limits: EnvelopeLimits, line: Line) -> None:
         self.law = law
         self.lost: BoolArray = np.zeros(law.n, dtype=np.bool_)  #: drives that left by themselves: off until armed
         self._limits = limits
-        self._moves = moves
+        self._moves = line.moves
+        self._speed_lag_s = line.control.period_s if line.plc.speed_lag_s is None else line.plc.speed_lag_s
         self._state: Any = None  #: None while the law is not engaged
 
     def any_lost(self) -> bool:
@@ -50,8 +51,8 @@ class TorquePath:
             applied_nm = np.where(self.lost, 0.0, applied_nm)
         if self._state is None:
             setpoints.begin_at(np.where(self._limits.measured > 0, measured.tension_n, 0.0))
-            self._state = self.law.engage(measured, setpoints.tension_n, applied_nm)
-        decision = self.law.ask(self._state, measured, setpoints.tension_n)
+            self._state = self.law.engage(measured, setpoints.reference(self._speed_lag_s), applied_nm)
+        decision = self.law.ask(self._state, measured, setpoints.reference(self._speed_lag_s))
         for finding in check_torque(decision.torque_nm):
             raise LawFailed(finding)
         torque_nm = limit_torque(self._limits, decision.torque_nm, applied_nm, interval_s)

@@ -40,6 +40,7 @@ class LinePlc:
         drives: Sequence[Drive] = (),
         sto_delay_s: float = 0.5,
     ) -> None:
+        self.interpolation_s = 0.0  #: in which v0 goes straight to each new request, as fast as its ramp lets it
         self.watchdog_is_dead = False  #: it takes its setting, and never acts on it
         self._frozen: LinePlcStatus | None = None
         self.watchdog_s = 0.0  #: v0 ramps to zero this long after the life counter's last change; 0 is off
@@ -144,7 +145,10 @@ class LinePlc:
 
     def _drive_unwinder(self) -> None:
         target = self._request_m_per_s if self._running else 0.0
-        self._world.ramp_unwind_speed(target, self._ramp_m_per_s2)
+        rate = self._ramp_m_per_s2
+        if self.interpolation_s > 0.0 and self._running:
+            rate = min(rate, abs(target - self._world.unwind_speed_m_per_s) / self.interpolation_s)
+        self._world.ramp_unwind_speed(target, rate)
 
     def _watchdog_expired(self, now_s: float) -> None:
         if self.watchdog_is_dead:

@@ -101,7 +101,7 @@ class Subject:
         self.cycle.machine = Machine(Phase.RUNNING)
         self.cycle.outputs.torque_nm = torque_nm.copy()
         self.cycle.setpoints.aim_at(recipe.model_copy(update={"speed_m_per_s": 0.05}))
-        self.cycle.setpoints.speed_m_per_s = 0.05
+        self.cycle.setpoints.begin_at_speed(0.05)
 
     async def prepare(self) -> None:
         await self._link.open()

@@ -21,7 +21,7 @@ from drivers.registry import build_links, speed_steps_m_per_s
 from gateway.cli.children import free_udp_port
 from gateway.control.design import design_lqi, task_of
 from gateway.control.laws import make_law
-from gateway.core.controller import LqiConfig, PidConfig
+from gateway.core.controller import Controller
 from gateway.core.line import Bus, Line, OpcUaBus, Recipe
 from gateway.core.messages import Arm, Command, Reply, Start
 from gateway.core.signals import DriveRequest, FloatArray
@@ -113,7 +113,7 @@ class VirtualLine:
         self,
         line: Line | None = None,
         plant: Plant | None = None,
-        config: LqiConfig | PidConfig | None = None,
+        config: Controller | None = None,
         seed: int = 1,
         folder: Path | None = None,
         build: Callable[[Line], list[Link]] = build_links,
@@ -279,7 +279,8 @@ class VirtualLine:
         cycle, outputs = self.cycle, self.cycle.outputs
         cycle.machine = Machine(Phase.RUNNING, self.now_s)
         cycle.setpoints.aim_at(Recipe(name="production", tension_n=tension_n.tolist(), speed_m_per_s=speed_m_per_s))
-        cycle.setpoints.speed_m_per_s = outputs.speed_request_m_per_s = speed_m_per_s
+        cycle.setpoints.begin_at_speed(speed_m_per_s)
+        outputs.speed_request_m_per_s = speed_m_per_s
         outputs.torque_nm = torque_nm.copy()
         outputs.drive_request[:] = DriveRequest.ENABLE
         outputs.run = True

@@ -9,9 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-from gateway.control.design import DesignTask, LqiWeights, design_lqi, design_pid, sampled
+from gateway.control.design import DesignTask, LqiWeights, design_lqi, design_pid
+from gateway.control.design.sampling import sampled
 from gateway.control.law import Measured
 from gateway.control.laws import make_law
+from gateway.control.reference import Steady
 from gateway.core.controller import ControllerRefused, canonical, config_hash, parse_controller
 from gateway.core.web_model import WebModel, equilibrium_torque, linearise, reference_speeds
 
@@ -70,9 +72,11 @@ def test_set_points_that_move_in_place_move_the_equilibrium(design):
         setpoint[1] = 36.0 + moved_n
         measured = Measured(np.array([28.5, 35.0, 20.0]), np.array([0.05, 0.051, 0.049]), 0.05)
         anew = make_law(design(task(3)))
-        asked = [law.ask(law.engage(measured, setpoint, none), measured, setpoint) for law in (kept, anew)]
+        asked = [
+            law.ask(law.engage(measured, Steady(setpoint), none), measured, Steady(setpoint)) for law in (kept, anew)
+        ]
         assert (asked[0].torque_nm == asked[1].torque_nm).all()
-        assert (asked[0].tension_error_n == measured.tension_n - setpoint).all()
+        assert (asked[0].errors.tension_n == measured.tension_n - setpoint).all()
 
 
 def test_linearisation_is_the_derivative_of_the_equations():
@@ -127,12 +131,12 @@ def run(config, theta, unwind=0.05, seconds=4.0, latency_steps=1, start_error=2.
     state = np.concatenate((setpoint + start_error, speed))
     in_flight = [torque] * latency_steps
     measured = Measured(state[:n].copy(), state[n:].copy(), unwind)
-    law_state, rows = law.engage(measured, setpoint, torque), []
+    law_state, rows = law.engage(measured, Steady(setpoint), torque), []
     for _ in range(round(seconds / h)):
         measured = Measured(state[:n].copy(), state[n:].copy(), unwind)
         for i in config.draw_spans:
             measured.tension_n[i] = np.nan
-        decision = law.ask(law_state, measured, setpoint)
+        decision = law.ask(law_state, measured, Steady(setpoint))
         law_state = law.commit(law_state, decision, decision.torque_nm)
         in_flight.append(decision.torque_nm)
         u = in_flight.pop(0)
@@ -170,7 +174,7 @@ def test_engaging_is_bumpless_and_saturation_does_not_wind_up(values, design, st
     config = design(task(3, **values))
     law = make_law(config)
     measured = Measured(np.array(data.draw(st.lists(st.floats(0, 60), min_size=3, max_size=3))), np.full(3, 0.05), 0.05)
-    setpoint, applied = np.full(3, 30.0), np.full(3, start)
+    setpoint, applied = Steady(np.full(3, 30.0)), np.full(3, start)
     state = law.engage(measured, setpoint, applied)
     first = law.ask(state, measured, setpoint)
     assert np.allclose(first.torque_nm, applied, atol=1e-6)
@@ -197,7 +201,7 @@ def test_configurations_survive_the_round_trip_and_hash_their_content():
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
-        (b'"kind":"lqi"', b'"kind":"lqr"'),
+        (b'"kind":"lqi"', b'"kind":"lqx"'),
         (b'"period_s":0.01', b'"period_s":NaN'),
         (b'"period_s":0.01', b'"period_s":true'),
         (b'"antiwindup":0.4', b'"antiwindup":0.4,"gain":1'),

@@ -1,0 +1,63 @@
+"""The conditions under which control is compared: period, latency, limits, and how set-points move."""
+
+from dataclasses import dataclass
+
+from gateway.cli.cases import Case
+from gateway.control.reference import MinimumJerk
+from gateway.core.line import Line
+from gateway.core.messages import SetTension
+from sim_plant.plant import Plant
+
+
+@dataclass(frozen=True)
+class Tier:
+    name: str
+    title: str
+    period_s: float
+    latency_s: float
+    torque_nm: float
+    torque_rate_nm_per_s: float
+    move_s: float = 0.0  #: of the change, along a minimum-jerk curve; 0: a literal step
+
+    def case(self, case: Case) -> Case:
+        """The case as this tier moves."""
+        return case.moved_over(self.move_s) if self.move_s else case
+
+    def line(self, line: Line, case: Case) -> Line:
+        """`line` under these conditions."""
+        control = {"period_s": self.period_s, "latency_s": self.latency_s}
+        limits = {"torque_nm": self.torque_nm, "torque_rate_nm_per_s": self.torque_rate_nm_per_s}
+        moves: dict[str, object] = {}
+        moved: dict[str, object] = {}
+        if self.move_s:
+            name = "tension_rate_n_per_s" if isinstance(case.change, SetTension) else "speed_rate_m_per_s2"
+            moves = {"shape": "minimum-jerk", name: MinimumJerk.PEAK * case.size / self.move_s}
+            # The speed is written a period later, and the unwinder's drive interpolates to it over another.
+            moved = {"plc": line.plc.model_copy(update={"speed_lag_s": 2.0 * self.period_s})}
+        return line.model_copy(
+            update={
+                **moved,
+                "control": line.control.model_copy(update=control),
+                "limits": line.limits.model_copy(update=limits),
+                "moves": line.moves.model_copy(update=moves),
+            }
+        )
+
+    def plant(self, plant: Plant) -> Plant:
+        """`plant` with drives that give what this tier allows, and a recorder that judges by it."""
+        drives = {"rated_torque_nm": self.torque_nm, "max_torque_nm": self.torque_nm}
+        judged = {"torque_nm": self.torque_nm, "torque_rate_nm_per_s": self.torque_rate_nm_per_s}
+        return plant.model_copy(
+            update={
+                "drives": plant.drives.model_copy(update=drives),
+                "recorder": plant.recorder.model_copy(update=judged),
+                "plc": plant.plc.model_copy(update={"speed_interpolation_s": self.period_s if self.move_s else 0.0}),
+            }
+        )
+
+
+PAPER = Tier("P", "1 ms, no latency, literal step, 500 Nm", 0.001, 0.0, 500.0, 1e5)
+A = Tier("A", "10 ms and 10 ms latency, literal step, 60 Nm", 0.010, 0.010, 60.0, 1000.0)
+A_FAST = Tier("A-fast", "2 ms and 4 ms latency, literal step, 60 Nm", 0.002, 0.004, 60.0, 1000.0)
+B = Tier("B", "10 ms and 10 ms latency, 0.5 s minimum-jerk move, 60 Nm", 0.010, 0.010, 60.0, 1000.0, 0.5)
+TIERS = {tier.name: tier for tier in (PAPER, A, A_FAST, B)}

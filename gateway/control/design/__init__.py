@@ -1,0 +1,27 @@
+"""From what is believed about the web to controller configurations. Design time only: the loop never imports this."""
+
+from gateway.control.design.lq import LqgWeights, LqiWeights, LqWeights, design_lqg, design_lqi, design_lqr
+from gateway.control.design.margins import Margins, margins, require_margin
+from gateway.control.design.mpc import MpcWeights, design_mpc
+from gateway.control.design.pid import design_pid
+from gateway.control.design.task import DesignLimits, DesignRefused, DesignTask, Noise, task_of
+
+__all__ = [
+    "DesignLimits",
+    "DesignRefused",
+    "DesignTask",
+    "LqWeights",
+    "LqgWeights",
+    "LqiWeights",
+    "Margins",
+    "MpcWeights",
+    "Noise",
+    "design_lqg",
+    "design_lqi",
+    "design_lqr",
+    "design_mpc",
+    "design_pid",
+    "margins",
+    "require_margin",
+    "task_of",
+]

@@ -1,0 +1,96 @@
+"""How far a loop is from trouble: delay, decay, and what noise does to the torque. All on the sampled linear loop."""
+
+from dataclasses import dataclass
+from math import inf, log
+
+import numpy as np
+from scipy.linalg import solve_discrete_lyapunov
+
+from gateway.control.design.sampling import Sampled, with_dead_time
+from gateway.control.design.task import DesignRefused, DesignTask, linear
+from gateway.control.linear_form import LinearForm, linear_form
+from gateway.core.controller import Controller
+from gateway.core.signals import FloatArray
+
+LEAST_DELAY_MARGIN_S = 0.004
+DELAY_STEP_S = 0.0005
+MOST_DELAY_S = 0.05  #: beyond which nobody looks
+
+
+@dataclass(frozen=True)
+class Margins:
+    """Of a loop on the model that it was asked about."""
+
+    spectral_radius: float  #: of one period
+    decay_per_s: float  #: rate of the slowest mode; not above 0: unstable
+    delay_margin_s: float  #: beyond the latency; `MOST_DELAY_S` stands for that and more
+    chatter_nm: float  #: root mean square of the change of torque from period to period under noise, of the worst drive
+    noise_floor_n: float  #: root of the mean squared 2-norm of the tension errors that noise leaves
+
+
+def margins(config: Controller, task: DesignTask) -> Margins:
+    """Margins of `config` on the model, noise and latency of `task`."""
+    form, (A, B) = linear_form(config), linear(task)
+
+    def radius(extra_s: float) -> float:
+        plant = with_dead_time(A, B, task.period_s, task.latency_s + extra_s)
+        return float(np.abs(np.linalg.eigvals(closed_loop(form, plant))).max())
+
+    now = radius(0.0)
+    if not now < 1.0:
+        return Margins(now, -log(now) / task.period_s, 0.0, inf, inf)
+    tolerated = 0.0
+    for step in range(1, round(MOST_DELAY_S / DELAY_STEP_S) + 1):
+        if not radius(step * DELAY_STEP_S) < 1.0:
+            break
+        tolerated = step * DELAY_STEP_S
+    chatter, floor = _noise(form, with_dead_time(A, B, task.period_s, task.latency_s), task)
+    return Margins(now, -log(now) / task.period_s, tolerated, chatter, floor)
+
+
+def require_margin(found: Margins, least_s: float = LEAST_DELAY_MARGIN_S) -> None:
+    """Raises DesignRefused for a loop that may not be offered."""
+    if not found.spectral_radius < 1.0:
+        raise DesignRefused(f"the loop is unstable: its spectral radius is {found.spectral_radius:.4f}")
+    if found.delay_margin_s < least_s:
+        raise DesignRefused(
+            f"the loop stands only {1e3 * found.delay_margin_s:.1f} ms more delay, at least {1e3 * least_s:g} ms are "
+            f"needed: more weight on torque, a slower disturbance estimate, or less latency"
+        )
+
+
+def closed_loop(form: LinearForm, plant: Sampled) -> FloatArray:
+    """The matrix of one period of [x; z; u_{k-1}; ..; u_{k-d}], d that of `plant`."""
+    F, G = plant.augmented()
+    size, states, n = F.shape[0], form.states, form.n
+    e = np.zeros((2 * n, size))
+    e[:, : 2 * n] = np.eye(2 * n)
+    of_z, of_x = form.part(form.torque, "z"), form.part(form.torque, "e") @ e
+    whole = np.zeros((size + states,) * 2)
+    whole[:size, :size] = F + G @ of_x
+    whole[:size, size:] = G @ of_z
+    whole[size:, :size] = form.part(form.state, "e") @ e + form.applied @ of_x
+    whole[size:, size:] = form.part(form.state, "z") + form.applied @ of_z
+    return whole
+
+
+def _noise(form: LinearForm, plant: Sampled, task: DesignTask) -> tuple[float, float]:
+    """Chatter in Nm and the tension errors' root mean squared 2-norm in N under `task.noise`, stationary."""
+    n, loop = form.n, closed_loop(form, plant)
+    size = loop.shape[0] - form.states
+    seen = np.diag(np.repeat([task.noise.tension_n, task.noise.speed_m_per_s], n))
+    seen[list(task.draw_spans)] = 0.0
+    moved = np.zeros((size, n))
+    moved[n : 2 * n] = np.eye(n) * task.noise.acceleration_m_per_s1_5 * task.period_s**0.5
+    of_e = form.part(form.torque, "e")
+    _, G = plant.augmented()
+    entry = np.vstack((G @ of_e, form.part(form.state, "e") + form.applied @ of_e)) @ seen
+    entry = np.hstack((entry, np.vstack((moved, np.zeros((form.states, n))))))
+    spread: FloatArray = np.asarray(solve_discrete_lyapunov(loop, entry @ entry.T), dtype=np.float64)
+    # u_k - u_{k-1} = (O M - O) X_{k-1} + (O E + D [noise now] - D [noise before]): O what X does to the torque
+    out = np.hstack((of_e, np.zeros((n, size - 2 * n)), form.part(form.torque, "z")))
+    direct = np.hstack((of_e @ seen, np.zeros((n, n))))
+    step = out @ (loop - np.eye(len(loop)))
+    change = step @ spread @ step.T + (out @ entry - direct) @ (out @ entry - direct).T + direct @ direct.T
+    tension = float(np.trace(spread[:n, :n]))
+    return float(np.sqrt(change.diagonal().max())), float(np.sqrt(tension))

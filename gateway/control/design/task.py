@@ -1,0 +1,165 @@
+"""What a design is made for, and what refuses it."""
+
+from dataclasses import dataclass, field
+from math import inf
+
+import numpy as np
+
+from gateway.core.controller_laws import Feedforward
+from gateway.core.line import Line
+from gateway.core.signals import FloatArray
+from gateway.core.web_model import WebModel, equilibrium_torque, linearise, nominal_model, reference_speeds
+
+
+class DesignRefused(Exception):
+    """No controller can be offered; the text says why."""
+
+
+@dataclass(frozen=True)
+class Noise:
+    """What moves the line and its measurements at random, as far as it is known."""
+
+    tension_n: float = 0.1  #: standard deviation of a sample
+    speed_m_per_s: float = 1e-4
+    acceleration_m_per_s1_5: float = 1.6e-3  #: intensity of the white noise on roller accelerations
+
+
+@dataclass(frozen=True)
+class DesignLimits:
+    """What the design keeps to. Per drive and span."""
+
+    torque_nm: float = inf
+    torque_rate_nm_per_s: float = inf
+    tension_min_n: float = 0.0
+    tension_max_n: float = inf
+    speed_max_m_per_s: float = 0.0  #: up to which the equilibrium must be within the torque; 0: not asked
+
+
+@dataclass(frozen=True)
+class DesignTask:
+    """Tensions (n,) in N and a speed in m/s fix the operating point."""
+
+    model: WebModel
+    period_s: float
+    latency_s: float
+    tension_n: FloatArray
+    unwind_speed_m_per_s: float
+    draw_spans: tuple[int, ...] = ()
+    noise: Noise = field(default_factory=Noise)
+    limits: DesignLimits = field(default_factory=DesignLimits)
+
+    @property
+    def n(self) -> int:
+        return self.model.n
+
+    @property
+    def tension_spans(self) -> list[int]:
+        """Spans (from 0) whose tension is measured and controlled."""
+        return [i for i in range(self.n) if i not in self.draw_spans]
+
+
+def task_of(line: Line) -> DesignTask:
+    """The design task of a line: its nominal model at the first recipe's tensions and half the greatest speed."""
+    limits = line.limits
+    return DesignTask(
+        model=nominal_model(line),
+        period_s=line.control.period_s,
+        latency_s=line.control.latency_s,
+        tension_n=np.array(line.recipes[0].tension_n),
+        unwind_speed_m_per_s=0.5 * limits.speed_max_m_per_s,
+        draw_spans=tuple(i for i, span in enumerate(line.spans) if span.control == "draw"),
+        limits=DesignLimits(
+            limits.torque_nm, limits.torque_rate_nm_per_s, limits.tension_min_n, limits.tension_max_n,
+            limits.speed_max_m_per_s,
+        ),
+    )  # fmt: skip
+
+
+def linear(task: DesignTask) -> tuple[FloatArray, FloatArray]:
+    """A (2n, 2n) and B (2n, n) at the operating point."""
+    speed = reference_speeds(task.model, task.tension_n, task.unwind_speed_m_per_s)
+    return linearise(task.model, task.tension_n, speed, task.unwind_speed_m_per_s)
+
+
+def feedforward_of(model: WebModel) -> Feedforward:
+    """The feed-forward part of phi for a model."""
+    return Feedforward(
+        stiffness_n=model.stiffness_n,
+        length_m=model.length_m.tolist(),
+        radius_m=model.radius_m.tolist(),
+        inertia_kg_m2=model.inertia_kg_m2.tolist(),
+        friction_nms_per_rad=model.friction_nms_per_rad.tolist(),
+        tension_before_n=model.tension_before_n,
+        tension_after_n=model.tension_after_n,
+    )
+
+
+def check_task(task: DesignTask) -> None:
+    """Raises DesignRefused with every reason for which no law can do it."""
+    found = _bad_numbers(task) or [*_torque_reasons(task), *_control_reasons(task)]
+    if found:
+        raise DesignRefused("; ".join(found))
+
+
+def _bad_numbers(task: DesignTask) -> list[str]:
+    model = task.model
+    positive = {
+        "stiffness_n": np.array([model.stiffness_n]),
+        "length_m": model.length_m,
+        "radius_m": model.radius_m,
+        "inertia_kg_m2": model.inertia_kg_m2,
+        "period_s": np.array([task.period_s]),
+        "noise.tension_n": np.array([task.noise.tension_n]),
+        "noise.speed_m_per_s": np.array([task.noise.speed_m_per_s]),
+        "noise.acceleration_m_per_s1_5": np.array([task.noise.acceleration_m_per_s1_5]),
+        "limits.torque_nm": np.array([task.limits.torque_nm]),
+        "limits.torque_rate_nm_per_s": np.array([task.limits.torque_rate_nm_per_s]),
+    }
+    not_negative = {
+        "friction_nms_per_rad": model.friction_nms_per_rad,
+        "latency_s": np.array([task.latency_s]),
+        "tension_n": task.tension_n,
+        "unwind_speed_m_per_s": np.array([task.unwind_speed_m_per_s]),
+    }
+    found = [f"{name} is {_listed(v)}; allowed: above 0" for name, v in positive.items() if not (v > 0.0).all()]
+    found += [
+        f"{name} is {_listed(v)}; allowed: 0 and above, finite"
+        for name, v in not_negative.items()
+        if not ((v >= 0.0) & np.isfinite(v)).all()
+    ]
+    if len(task.tension_n) != model.n:
+        found.append(f"{len(task.tension_n)} tensions for {model.n} spans")
+    elif not found and (task.tension_n >= model.stiffness_n).any():
+        found.append(f"tension_n is {_listed(task.tension_n)}: the web of {model.stiffness_n:g} N would tear")
+    return found
+
+
+def _torque_reasons(task: DesignTask) -> list[str]:
+    """Where the torque does not even hold the line at its greatest speed."""
+    speed = max(task.limits.speed_max_m_per_s, task.unwind_speed_m_per_s)
+    speeds = reference_speeds(task.model, task.tension_n, speed)
+    torque = equilibrium_torque(task.model, task.tension_n, speeds)
+    return [
+        f"roller {i + 1} needs {torque[i]:.1f} Nm to keep {speed:g} m/s, the limit is {task.limits.torque_nm:g} Nm: "
+        f"a greater torque limit, or a lower speed"
+        for i in np.flatnonzero(np.abs(torque) >= task.limits.torque_nm)
+    ]
+
+
+def _control_reasons(task: DesignTask) -> list[str]:
+    # A web without stiffness, or a roller that its drive cannot turn, shows as a loss of rank.
+    A, B = linear(task)
+    scale = np.abs(np.linalg.eigvals(A)).max()
+    blocks: list[FloatArray] = []
+    block = B
+    for _ in range(A.shape[0]):
+        blocks.append(block / max(np.abs(block).max(), 1e-300))
+        block = A @ block / scale
+        if np.linalg.matrix_rank(np.hstack(blocks)) == A.shape[0]:
+            return []
+    rank = int(np.linalg.matrix_rank(np.hstack(blocks)))
+    return [f"not controllable: the drives reach {rank} of {A.shape[0]} states"]
+
+
+def _listed(values: FloatArray) -> str:
+    return ", ".join(f"{value:g}" for value in np.unique(values))

@@ -1,0 +1,92 @@
+"""Model predictive control (eq. mpc), condensed, solved by OSQP from where the last solution ended.
+
+A solution that is late, or none, is never applied: then the next move of the last plan is, and when that is used up the
+linear feedback that the problem has without constraints.
+"""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import osqp as _osqp  # pyright: ignore[reportMissingTypeStubs]
+
+from gateway.control.deviation import Deviation, Measured
+from gateway.control.law import Decision
+from gateway.control.lqg import feedback
+from gateway.control.mpc_problem import MpcProblem
+from gateway.control.observer import Estimate, Observer, ObserverState
+from gateway.control.reference import Reference
+from gateway.core.controller_laws import MpcConfig
+from gateway.core.signals import FloatArray
+
+
+@dataclass(slots=True)
+class MpcState:
+    observer: ObserverState
+    applied_nm: FloatArray  #: (n,), the torque sent last
+    plan_nm: FloatArray  #: (k, n), what the last solution would send in the periods from now on; () when it is used up
+    unsolved: int = 0  #: periods so far without a solution in time
+
+
+@dataclass(slots=True)
+class Planned(Decision):
+    """A decision with the plan behind it."""
+
+    found: Estimate | None = None
+    plan_nm: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
+    solution: FloatArray = field(default_factory=lambda: np.empty(0))  #: of the quadratic programme
+    solve_s: float = 0.0
+
+
+osqp: Any = _osqp  # it has no types
+SOLVED = int(osqp.SolverStatus.OSQP_SOLVED)
+
+
+class Mpc:
+    """The law of `MpcConfig`. Holds the solver, whose warm start is the only thing that a second run would not have."""
+
+    def __init__(self, config: MpcConfig) -> None:
+        self.n = config.n
+        self.config = config
+        deviation = Deviation(config.feedforward, config.draw_spans, config.period_s, config.latency_s)
+        self._observer = Observer(config.predictor, deviation, config.draw_spans, config.period_s)
+        self._gain = np.hstack((np.array(config.fallback_state), np.array(config.fallback_input).reshape(self.n, -1)))
+        self.problem = MpcProblem(config)
+        self._solver = osqp.OSQP()
+        self._solver.setup(
+            self.problem.P, np.zeros(self.problem.variables), self.problem.A,
+            np.full(self.problem.rows, -np.inf), np.full(self.problem.rows, np.inf),
+            verbose=False, warm_starting=True, polishing=False, eps_abs=1e-3, eps_rel=1e-5, check_termination=5,
+            max_iter=config.most_iterations, time_limit=config.time_limit_s,
+            # By iterations, not by time: the same problem is solved in the same way on every computer.
+            adaptive_rho_interval=20, adaptive_rho_tolerance=3.0,
+        )  # fmt: skip
+
+    def engage(self, measured: Measured, reference: Reference, applied_nm: FloatArray) -> MpcState:
+        state = MpcState(
+            self._observer.engage(measured, reference, applied_nm), applied_nm.copy(), np.empty((0, self.n))
+        )
+        state.observer.bump_nm = applied_nm - self.ask(state, measured, reference).torque_nm
+        return state
+
+    def ask(self, state: MpcState, measured: Measured, reference: Reference) -> Planned:
+        found = self._observer.estimate(state.observer, measured, reference)
+        q, lower, upper = self.problem.vectors(found, reference.tension_n, state.applied_nm)
+        self._solver.update(q=q, l=lower, u=upper)
+        solved = self._solver.solve(raise_error=False)
+        if solved.info.status_val == SOLVED:
+            plan = self.problem.torques(solved.x, found)
+            return Planned(plan[0] + found.bump_nm, found.errors, "", found, plan[1:], solved.x, solved.info.run_time)
+        if len(state.plan_nm):
+            rest = state.plan_nm
+            return Planned(rest[0].copy(), found.errors, f"plan: {solved.info.status}", found, rest[1:])
+        return Planned(feedback(self._gain, found), found.errors, f"linear feedback: {solved.info.status}", found)
+
+    def commit(self, state: MpcState, decision: Decision, applied_nm: FloatArray) -> MpcState:
+        assert isinstance(decision, Planned) and decision.found is not None
+        return MpcState(
+            self._observer.predict(decision.found, applied_nm),
+            applied_nm.copy(),
+            decision.plan_nm,
+            state.unsolved + bool(decision.fallback),
+        )

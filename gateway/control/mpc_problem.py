@@ -1,0 +1,132 @@
+"""The quadratic programme of the model predictive controller, condensed: torques of blocks are its variables.
+
+With x = [x~; torques in flight] and w = u~ + d, x_{k+1} = F x_k + G w_k. Over the horizon the states are
+X = Phi x_0 + Gamma z, z the torques w of each block and one slack per span, so that
+
+    minimise  1/2 z' P z + q' z   subject to   lower <= A z <= upper
+
+where P and A stay as they are and q, lower, upper follow from the estimate. Rows: torque of each block; its change from
+the block before; and, where tension limits are looked at, the tensions at the end of each block, eased by the slack.
+"""
+
+import numpy as np
+from scipy.sparse import csc_matrix, triu
+
+from gateway.control.observer import Estimate
+from gateway.core.controller_laws import MpcConfig
+from gateway.core.signals import FloatArray
+
+
+class MpcProblem:
+    """P, A and the products that give the rest. All in Nm and N."""
+
+    def __init__(self, config: MpcConfig) -> None:
+        self._config = config
+        n, blocks = config.n, config.blocks
+        self._n = n
+        self._limited = config.weight_tension_limit > 0.0
+        F, G = augmented(config)
+        free, forced = _trajectories(F, G, blocks)  # (N_p, s, s) and (N_p, s, n blocks)
+        weight = np.zeros((config.horizon, F.shape[0], F.shape[0]))
+        weight[:, : 2 * n, : 2 * n] = np.diag(config.weight_state)
+        weight[-1] = config.weight_terminal  # the state at the end is in it with all that comes after
+        torque = np.kron(np.diag(np.array(blocks, dtype=np.float64)), np.diag(config.weight_torque))
+        weighted = np.einsum("ksz,kst->kzt", forced, weight)
+        hessian = 2.0 * (np.einsum("kzt,kty->zy", weighted, forced) + torque)
+        self._linear: FloatArray = 2.0 * np.einsum("kzt,kts->zs", weighted, free)
+        ends = np.cumsum(blocks) - 1
+        self._tension_free = free[ends][:, :n].reshape(-1, F.shape[0])
+        tension = forced[ends][:, :n].reshape(-1, n * len(blocks))
+
+        self.torque_variables = n * len(blocks)
+        self.variables = self.torque_variables + (n if self._limited else 0)
+        change = np.eye(self.torque_variables) - np.eye(self.torque_variables, k=-n)
+        rows = [np.eye(self.torque_variables), change]
+        if self._limited:
+            hessian = _block_diagonal(hessian, 2.0 * config.weight_tension_limit * np.eye(n))
+            ease = np.tile(np.eye(n), (len(blocks), 1))
+            none = np.zeros((2 * self.torque_variables, n))
+            rows = [np.hstack((np.vstack(rows), none)), np.hstack((tension, ease)), np.hstack((tension, -ease))]
+        matrix = np.vstack(rows)
+        # The symmetric part: rounding makes halves differ, and the solver reads one of them.
+        self.P = csc_matrix(triu(0.5 * (hessian + hessian.T)))
+        self.A = csc_matrix(matrix)
+        self.rows = matrix.shape[0]
+        self._blocks = np.repeat(np.arange(len(blocks)), blocks)
+        self._lower = np.full(self.rows, -np.inf)
+        self._upper = np.full(self.rows, np.inf)
+
+    def gain(self) -> FloatArray:
+        """K (n, 2n + n d) of w_0 = -K [x~; torques in flight]: the law where no limit is reached."""
+        m = self.torque_variables
+        whole: FloatArray = np.array(self.P.toarray(), dtype=np.float64)
+        hessian = whole[:m, :m]
+        linear: FloatArray = self._linear
+        gain: FloatArray = np.asarray(np.linalg.solve(hessian + np.triu(hessian, 1).T, linear), dtype=np.float64)
+        return gain[: self._n]
+
+    def vectors(
+        self, found: Estimate, tension_setpoint_n: FloatArray, applied_nm: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """q, lower and upper for an estimate, set-points (n,) and the torque sent last (n,)."""
+        config, n, m = self._config, self._n, self.torque_variables
+        x = np.concatenate((found.state, found.in_flight_nm.ravel()))
+        q = np.zeros(self.variables)
+        q[:m] = self._linear.dot(x)
+        lower, upper = self._lower, self._upper
+        shift = found.errors.torque_nm - found.disturbance_nm  # u = w + shift
+        blocks = len(config.blocks)
+        lower[:m] = np.tile(-config.torque_nm - shift, blocks)
+        upper[:m] = np.tile(config.torque_nm - shift, blocks)
+        reach = config.torque_rate_nm_per_s * config.period_s
+        lower[m : 2 * m], upper[m : 2 * m] = -reach, reach
+        lower[m : m + n] += applied_nm - shift
+        upper[m : m + n] += applied_nm - shift
+        if self._limited:
+            tension = np.tile(tension_setpoint_n, blocks) + self._tension_free.dot(x)
+            lower[2 * m : 3 * m] = config.tension_min_n - tension
+            upper[3 * m :] = config.tension_max_n - tension
+        return q, lower, upper
+
+    def torques(self, solution: FloatArray, found: Estimate) -> FloatArray:
+        """The plan (N_p, n) in Nm of a solution."""
+        blocks = solution[: self.torque_variables].reshape(-1, self._n)
+        return blocks[self._blocks] + (found.errors.torque_nm - found.disturbance_nm)
+
+
+def augmented(config: MpcConfig) -> tuple[FloatArray, FloatArray]:
+    """F (s, s) and G (s, n) of [x~; u~_{k-1}; ..; u~_{k-d}], s = 2n + n d."""
+    n, inputs = config.n, [np.array(matrix) for matrix in config.predictor.inputs]
+    depth = len(inputs) - 1
+    size = 2 * n + n * depth
+    F, G = np.zeros((size, size)), np.zeros((size, n))
+    F[: 2 * n, : 2 * n] = config.predictor.transition
+    G[: 2 * n] = inputs[0]
+    for age in range(1, depth + 1):
+        F[: 2 * n, 2 * n + n * (age - 1) : 2 * n + n * age] = inputs[age]
+    if depth:
+        G[2 * n : 3 * n] = np.eye(n)
+        F[3 * n :, 2 * n : size - n] = np.eye(n * (depth - 1))
+    return F, G
+
+
+def _trajectories(F: FloatArray, G: FloatArray, blocks: list[int]) -> tuple[FloatArray, FloatArray]:
+    """What the state and the blocks' torques do to the states at the ends of periods 1 to N_p."""
+    size, n = G.shape
+    free: list[FloatArray] = []
+    forced: list[FloatArray] = []
+    of_state, of_torques = np.eye(size), np.zeros((size, n * len(blocks)))
+    for block, periods in enumerate(blocks):
+        for _ in range(periods):
+            of_state, of_torques = F @ of_state, F @ of_torques
+            of_torques[:, n * block : n * (block + 1)] += G
+            free.append(of_state)
+            forced.append(of_torques)
+    return np.array(free), np.array(forced)
+
+
+def _block_diagonal(first: FloatArray, second: FloatArray) -> FloatArray:
+    a, b = len(first), len(second)
+    whole = np.zeros((a + b, a + b))
+    whole[:a, :a], whole[a:, a:] = first, second
+    return whole

@@ -1,0 +1,145 @@
+"""MPC against a second solver, against the linear law that it is without limits, and against bad input."""
+
+import clarabel
+import numpy as np
+import pytest
+from scipy.sparse import csc_matrix, vstack
+
+from gateway.control.design import DesignLimits, DesignRefused, DesignTask, MpcWeights, design_lqg, design_mpc
+from gateway.control.design.lq import LqgWeights
+from gateway.control.law import Measured
+from gateway.control.laws import make_law
+from gateway.control.mpc import Mpc
+from gateway.control.reference import Steady
+from gateway.core.web_model import equilibrium_torque, reference_speeds
+from tests.unit.control_support import model
+
+LIMITS = DesignLimits(60.0, 1000.0, 2.0, 60.0, 0.1)
+
+
+def task(limits=LIMITS, n=6, period_s=0.01, latency_s=0.01, draw=()):
+    return DesignTask(model(n), period_s, latency_s, np.full(n, 30.0), 0.05, draw, limits=limits)
+
+
+def patient():
+    """Samples at random, each far from the last, take more iterations than a line does from period to period."""
+    return design_mpc(task()).model_copy(update={"most_iterations": 5000, "time_limit_s": 1.0})
+
+
+def second_opinion(P, q, A, lower, upper):
+    """The same programme by an interior-point method."""
+    below, above = np.isfinite(lower), np.isfinite(upper)
+    rows = vstack((A[above], -A[below]), format="csc")
+    limits = np.concatenate((upper[above], -lower[below]))
+    settings = clarabel.DefaultSettings()
+    settings.verbose = False
+    solved = clarabel.DefaultSolver(
+        csc_matrix(P), q, csc_matrix(rows), limits, [clarabel.NonnegativeConeT(len(limits))], settings
+    ).solve()
+    return np.array(solved.x), solved.obj_val
+
+
+def random_line(generator, n=6):
+    """A sample off the set-points by up to 20 N and 0.02 m/s, and the torque that was sent before."""
+    theta, setpoint = model(n), generator.uniform(20.0, 40.0, n)
+    speed = reference_speeds(theta, setpoint, 0.05)
+    torque = equilibrium_torque(theta, setpoint, speed)
+    tension = np.clip(setpoint + generator.uniform(-20.0, 20.0, n), 0.0, 60.0)
+    return Measured(tension, speed + generator.uniform(-0.02, 0.02, n), 0.05), Steady(setpoint), torque
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_solutions_are_those_of_a_second_solver(seed):
+    law = make_law(patient())
+    assert isinstance(law, Mpc)
+    P = law.problem.P.toarray()
+    P += np.triu(P, 1).T
+    generator = np.random.default_rng(seed)
+    apart, active = [], 0
+    for _ in range(250):
+        measured, reference, torque = random_line(generator)
+        state = law.engage(measured, reference, torque)
+        state.observer.disturbance_nm = generator.uniform(-2.0, 2.0, 6)
+        decision = law.ask(state, measured, reference)
+        assert not decision.fallback
+        q, lower, upper = (v.copy() for v in law.problem.vectors(decision.found, reference.tension_n, torque))
+        theirs, best = second_opinion(law.problem.P, q, law.problem.A, lower, upper)
+        mine = decision.solution
+        rows = law.problem.A @ mine
+        assert np.maximum(lower - rows, rows - upper).max() < 0.1  # Nm or N
+        assert abs(0.5 * mine @ P @ mine + q @ mine - best) < 2e-3 * abs(best)
+        apart.append(float(np.abs(mine[:6] - theirs[:6]).max()))
+        rows = law.problem.A @ theirs
+        active += bool((np.minimum(rows - lower, upper - rows) < 1e-3).any())
+    assert active > 200  # it is limits that are solved for
+    assert np.median(apart) < 0.02 and np.percentile(apart, 99) < 1.0
+
+
+def test_without_limits_it_is_the_linear_law():
+    weights = dict(torque_per_nm2=0.01, disturbance_nm_per_sqrt_s=2.0)
+    free = task(DesignLimits())
+    mpc = make_law(design_mpc(free, MpcWeights(**weights), (1,) * 10))
+    lqg = make_law(design_lqg(free, LqgWeights(**weights)))
+    generator = np.random.default_rng(1)
+    for _ in range(20):
+        measured, reference, torque = random_line(generator)
+        state = lqg.engage(measured, reference, torque)
+        for _ in range(3):
+            measured, _, _ = random_line(generator)
+            linear = lqg.ask(state, measured, reference)
+            planned = mpc.ask(
+                type(mpc.engage(measured, reference, torque))(state, torque, np.empty((0, 6))), measured, reference
+            )
+            assert not planned.fallback
+            most = 0.05 + 2e-3 * np.abs(linear.torque_nm).max()
+            assert np.allclose(planned.torque_nm, linear.torque_nm, atol=most)
+            state = lqg.commit(state, linear, linear.torque_nm)
+
+
+def test_limits_are_kept_and_the_first_torque_is_the_one_before():
+    law = make_law(patient())
+    generator = np.random.default_rng(2)
+    for _ in range(50):
+        measured, reference, torque = random_line(generator)
+        decision = law.ask(law.engage(measured, reference, torque), measured, reference)
+        assert np.allclose(decision.torque_nm, torque, atol=0.3)  # bumpless, as far as it is solved twice alike
+        plan = np.vstack((torque, decision.torque_nm - decision.found.bump_nm, decision.plan_nm))
+        assert np.abs(plan[1:]).max() <= 60.0 + 0.05
+        assert np.abs(np.diff(plan, axis=0)).max() <= 10.0 + 0.05
+
+
+def test_what_is_not_solved_in_time_is_not_applied():
+    config = design_mpc(task()).model_copy(update={"time_limit_s": 1e-9})
+    late, law = make_law(config), make_law(design_mpc(task()))
+    measured, reference, torque = random_line(np.random.default_rng(3))
+    state = late.engage(measured, reference, torque)
+    decision = late.ask(state, measured, reference)
+    assert decision.fallback.startswith("linear feedback")
+    assert late.commit(state, decision, torque).unsolved == 1
+    # With a plan from before, its next move comes first; when it is used up, the linear feedback.
+    good = law.ask(law.engage(measured, reference, torque), measured, reference)
+    state = law.commit(state, good, good.torque_nm)
+    moves = len(good.plan_nm)
+    assert moves == config.horizon - 1
+    for move in range(moves + 2):
+        decision = late.ask(state, measured, reference)
+        if move < moves:
+            assert decision.fallback.startswith("plan") and (decision.torque_nm == good.plan_nm[move]).all()
+        else:
+            assert decision.fallback.startswith("linear feedback")
+        state = late.commit(state, decision, decision.torque_nm)
+    assert state.unsolved == moves + 2
+
+
+@pytest.mark.parametrize(
+    ("weights", "blocks", "says"),
+    [
+        (MpcWeights(torque_per_nm2=0.0), (1, 2), "torque_per_nm2"),
+        (MpcWeights(tension_per_n2=float("nan")), (1, 2), "tension_per_n2"),
+        (MpcWeights(), (), "horizon"),
+        (MpcWeights(), (3, 0), "horizon"),
+    ],
+)
+def test_bad_weights_and_horizons_are_refused(weights, blocks, says):
+    with pytest.raises(DesignRefused, match=says):
+        design_mpc(task(), weights, blocks)
