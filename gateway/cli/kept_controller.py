@@ -65,9 +65,10 @@ def _hash_of(path: Path) -> str:
     """The hash of the configuration at `path`, as it is written where it cannot be read; "" where there is none."""
     try:
         payload = path.read_bytes()
-        return config_hash(parse_controller(payload))
     except FileNotFoundError:
         return ""
+    try:
+        return config_hash(parse_controller(payload))
     except ControllerRefused:  # of another version of the format, say; what `run` has written it still knows
         return hashlib.sha256(payload).hexdigest()
 

@@ -37,8 +37,6 @@ from tests.bench.figures import Bench
 from tests.bench.oracle import Terms, oracle
 
 SEEDS = 20
-#: What the paper prints for its final configuration.
-PAPER_N = {"tension": 1.0449, "velocity": 0.2944}
 
 
 def mpc_without_observer(task: DesignTask) -> Controller:
@@ -145,6 +143,11 @@ def main() -> None:
             f"{entry['rmse_n']:8.4f} N (p95 {entry['p95_n']:.4f}){over}"
         )
     bench.tables["rows"] = table
+    for entry in table:
+        name = "_".join(entry[key] for key in ("tier", "law", "known", "case")).lower().replace(" + ", "_")
+        bench.figure(f"{name}_n", entry["rmse_n"], "N", entry["n"])
+        if entry["to_oracle"]:
+            bench.figure(f"{name}_to_oracle", entry["to_oracle"], "x", entry["n"])
     bench.tables["oracle"] = {f"{tier} {case}": value for (tier, case), value in best.items()}
     bench.figure("unsafe_events", sum(one.unsafe for found in rows.values() for one in found), "", len(jobs))
     bench.finish()
