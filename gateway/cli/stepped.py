@@ -10,7 +10,7 @@ import numpy as np
 
 from drivers.memory import MemoryLink
 from gateway.cli.cases import CHANGE_AT_S, DURATION_S, Case
-from gateway.control.laws import make_law
+from gateway.control.laws import make_law, untimed
 from gateway.core.controller import Controller
 from gateway.core.line import Line, Recipe
 from gateway.core.messages import Arm, Command, Reply
@@ -48,7 +48,7 @@ class SteppedLoop:
         self.truth = SteppedLine(self.plant, self.seed, self.line.control.latency_s)
         link = MemoryLink(self.line, self.truth)
         watch = Watch(self.line, np.zeros(self.line.n))  # the memory link carries floats
-        law = make_law(self.config)
+        law = make_law(untimed(self.config))
         self.cycle = Cycle(self.line, law, [link], watch, lambda: self.now_s, self._record, self._announce)
         _finish(link.open())
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from gateway.control.deviation import Deviation, Measured
 from gateway.control.law import Law
-from gateway.control.laws import make_law
+from gateway.control.laws import make_law, untimed
 from gateway.control.linear_form import linear_form
 from gateway.control.reference import Steady
 from gateway.core.controller import Controller
@@ -157,7 +157,7 @@ def simulate_slowly(
     samples, moved = setup.draw(course.periods, plants.n)
     tensions, torques = np.empty((2, plants.count, course.periods, plants.n))
     for b in range(plants.count):
-        law = make_law(config)
+        law = make_law(untimed(config))
         tensions[b], torques[b] = _one(law, plants.model(b), course, setup, samples, moved)
     return rollouts_of(tensions, torques, course, setup, record=record)
 

@@ -119,7 +119,8 @@ def main() -> None:
     parser.add_argument("--laws", default=",".join(LAWS))
     given = parser.parse_args()
     tiers = [TIERS[name] for name in given.tiers.split(",")]
-    bench = Bench("control", list(range(given.seeds)))
+    whole = set(tiers) == set(TIERS.values()) and set(given.laws.split(",")) == set(LAWS)
+    bench = Bench("control" if whole else "control-part", list(range(given.seeds)))
     best = bounds(tiers)
     jobs = [
         Job(tier, case, law, known, "s_real", seed)
