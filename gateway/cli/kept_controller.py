@@ -36,7 +36,7 @@ def kept_controller(line: Line, folder: Path) -> tuple[Path, str]:
     An LQI on the line's nominal model is designed the first time, and anew when the line has changed since; the old
     one is then kept as controller-HASH.json. Raises DesignRefused and OSError.
     """
-    from gateway.control.design import design_lqi, task_of
+    from gateway.control.design import design_lqi, margins, require_margin, task_of
 
     path = folder / CONTROLLER
     kept_hash = _hash_of(path)
@@ -46,7 +46,9 @@ def kept_controller(line: Line, folder: Path) -> tuple[Path, str]:
         return path, f"{path} is used: it was put there, not designed by run, and is never replaced"
     if path.exists() and source.get("made_from") == wanted:
         return path, ""
-    config = design_lqi(task_of(line))
+    task = task_of(line)
+    config = design_lqi(task)
+    require_margin(margins(config, task))
     if kept_hash == config_hash(config):  # what has changed does not matter to the design
         said = ""
     elif kept_hash:

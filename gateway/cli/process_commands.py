@@ -319,6 +319,13 @@ def _require_fit(line: Line, config: "Controller", path: Path, way_out: str) -> 
         reasons.append(f"its draw-controlled spans are {spans[0]}, the line's {spans[1]}")
     if abs(config.period_s - line.control.period_s) > 1e-9:
         reasons.append(f"it is for a period of {config.period_s} s, the line's is {line.control.period_s} s")
+    if abs(config.latency_s - line.control.latency_s) > 1e-9:
+        reasons.append(f"it is for a latency of {config.latency_s} s, the line's is {line.control.latency_s} s")
+    if config.kind == "mpc" and (config.torque_nm, config.torque_rate_nm_per_s) != (
+        line.limits.torque_nm,
+        line.limits.torque_rate_nm_per_s,
+    ):
+        reasons.append("it plans with other limits of torque and torque rate than the line's")
     if config.feedforward.stiffness_n <= line.limits.tension_max_n:
         reasons.append(f"its web stiffness of {config.feedforward.stiffness_n:g} N is below the greatest tension")
     if reasons:

@@ -26,6 +26,7 @@ class MpcState:
     applied_nm: FloatArray  #: (n,), the torque sent last
     plan_nm: FloatArray  #: (k, n), what the last solution would send in the periods from now on; () when it is used up
     unsolved: int = 0  #: periods so far without a solution in time
+    first: "Planned | None" = None  #: made when the law was engaged
 
 
 @dataclass(slots=True)
@@ -43,7 +44,7 @@ SOLVED = int(osqp.SolverStatus.OSQP_SOLVED)
 
 
 class Mpc:
-    """The law of `MpcConfig`. Holds the solver, whose warm start is the only thing that a second run would not have."""
+    """The law of `MpcConfig`. Holds the solver, with the start and the step size that the solution before has left."""
 
     def __init__(self, config: MpcConfig) -> None:
         self.n = config.n
@@ -52,24 +53,23 @@ class Mpc:
         self._observer = Observer(config.predictor, deviation, config.draw_spans, config.period_s)
         self._gain = np.hstack((np.array(config.fallback_state), np.array(config.fallback_input).reshape(self.n, -1)))
         self.problem = MpcProblem(config)
-        self._solver = osqp.OSQP()
-        self._solver.setup(
-            self.problem.P, np.zeros(self.problem.variables), self.problem.A,
-            np.full(self.problem.rows, -np.inf), np.full(self.problem.rows, np.inf),
-            verbose=False, warm_starting=True, polishing=False, eps_abs=1e-3, eps_rel=1e-5, check_termination=5,
-            max_iter=config.most_iterations, time_limit=config.time_limit_s,
-            # By iterations, not by time: the same problem is solved in the same way on every computer.
-            adaptive_rho_interval=20, adaptive_rho_tolerance=3.0,
-        )  # fmt: skip
+        self._solver: Any = None
 
     def engage(self, measured: Measured, reference: Reference, applied_nm: FloatArray) -> MpcState:
-        state = MpcState(
-            self._observer.engage(measured, reference, applied_nm), applied_nm.copy(), np.empty((0, self.n))
-        )
-        state.observer.bump_nm = applied_nm - self.ask(state, measured, reference).torque_nm
+        """The first decision is made here, and asked for next. Without a solution it is `applied_nm` once more."""
+        self._solver = self._new_solver()
+        observer = self._observer.engage(measured, reference, applied_nm)
+        state = MpcState(observer, applied_nm.copy(), np.empty((0, self.n)))
+        first = self.ask(state, measured, reference)
+        if not first.fallback and first.found is not None:
+            first.found.bump_nm = applied_nm - first.torque_nm
+        first.torque_nm = applied_nm.copy()
+        state.first = first
         return state
 
     def ask(self, state: MpcState, measured: Measured, reference: Reference) -> Planned:
+        if state.first is not None:
+            return state.first
         found = self._observer.estimate(state.observer, measured, reference)
         q, lower, upper = self.problem.vectors(found, reference.tension_n, state.applied_nm)
         self._solver.update(q=q, l=lower, u=upper)
@@ -79,8 +79,21 @@ class Mpc:
             return Planned(plan[0] + found.bump_nm, found.errors, "", found, plan[1:], solved.x, solved.info.run_time)
         if len(state.plan_nm):
             rest = state.plan_nm
-            return Planned(rest[0].copy(), found.errors, f"plan: {solved.info.status}", found, rest[1:])
+            return Planned(rest[0] + found.bump_nm, found.errors, f"plan: {solved.info.status}", found, rest[1:])
         return Planned(feedback(self._gain, found), found.errors, f"linear feedback: {solved.info.status}", found)
+
+    def _new_solver(self) -> Any:
+        """Nothing in it of what was solved before: neither a start nor a step size."""
+        solver, problem, config = osqp.OSQP(), self.problem, self.config
+        solver.setup(
+            problem.P, np.zeros(problem.variables), problem.A,
+            np.full(problem.rows, -np.inf), np.full(problem.rows, np.inf),
+            verbose=False, warm_starting=True, polishing=False, eps_abs=1e-3, eps_rel=1e-5, check_termination=5,
+            max_iter=config.most_iterations, time_limit=config.time_limit_s,
+            # By iterations, not by time: the same problem is solved in the same way on every computer.
+            adaptive_rho_interval=20, adaptive_rho_tolerance=3.0,
+        )  # fmt: skip
+        return solver
 
     def commit(self, state: MpcState, decision: Decision, applied_nm: FloatArray) -> MpcState:
         assert isinstance(decision, Planned) and decision.found is not None

@@ -82,9 +82,13 @@ class MpcProblem:
         lower[m : 2 * m], upper[m : 2 * m] = -reach, reach
         lower[m : m + n] += applied_nm - shift
         upper[m : m + n] += applied_nm - shift
+        for bound in (lower, upper):  # what was taken over is added to the first torque
+            bound[:n] -= found.bump_nm
+            bound[m : m + n] -= found.bump_nm
         if self._limited:
             tension = np.tile(tension_setpoint_n, blocks) + self._tension_free.dot(x)
-            lower[2 * m : 3 * m] = config.tension_min_n - tension
+            least = np.tile(np.minimum(config.tension_min_n, tension_setpoint_n), blocks)  # a slack web is tensioned
+            lower[2 * m : 3 * m] = least - tension
             upper[3 * m :] = config.tension_max_n - tension
         return q, lower, upper
 

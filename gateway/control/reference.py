@@ -73,8 +73,8 @@ class MinimumJerk:
     def move(self, index: int, target: float, greatest_rate: float, now_s: float, least_s: float = 0.0) -> None:
         """Set out for `target` at once; from rest the rate stays at `greatest_rate` or below, in units per second.
 
-        From a value that moves already, the rate that it has is kept at first. A move takes `least_s` or longer: one of
-        a hair's breadth in no time at all has a small rate and a huge acceleration.
+        From a value that moves already, rate and acceleration are kept at first, and it may go past its target. A move
+        takes `least_s` or longer: one of a hair's breadth in no time at all has a small rate and a huge acceleration.
         """
         value, rate, acceleration = self.at(now_s)[:, index]
         distance = target - value
@@ -100,11 +100,15 @@ class MinimumJerk:
 
     def moving(self, now_s: float) -> bool:
         """Whether any value is on its way."""
-        return bool(np.count_nonzero(self._begin_s + self._time_s > now_s))
+        return bool(np.count_nonzero((self._time_s > 0.0) & (self._begin_s + self._time_s > now_s)))
+
+    def is_moving(self, index: int, now_s: float) -> bool:
+        """Whether this value is on its way."""
+        return bool(self._time_s[index] > 0.0 and self._begin_s[index] + self._time_s[index] > now_s)
 
     def at(self, now_s: float) -> FloatArray:
-        """Value, rate and acceleration (3, m) at a time."""
-        s: FloatArray = np.minimum(now_s - self._begin_s, self._time_s)
+        """Value, rate and acceleration (3, m) at a time; before a move began, as at its beginning."""
+        s: FloatArray = np.clip(now_s - self._begin_s, 0.0, self._time_s)
         c = self._polynomial
         found = np.empty((3, len(s)))
         found[0] = c[0] + s * (c[1] + s * (c[2] + s * (c[3] + s * (c[4] + s * c[5]))))

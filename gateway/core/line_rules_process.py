@@ -169,6 +169,7 @@ def tensioning_in_time(line: Line) -> Iterator[Finding]:
     rate, time_s = line.moves.tension_rate_n_per_s, line.limits.tensioning_time_s
     for i, recipe in enumerate(line.recipes):
         needed_s = max(recipe.tension_n, default=0.0) / rate
+        needed_s *= 15.0 / 8.0 if line.moves.shape == "minimum-jerk" else 1.0
         if needed_s >= time_s:
             yield Finding(
                 ("recipes", i, "tension_n"),

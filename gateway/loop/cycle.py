@@ -190,15 +190,19 @@ class Cycle:
         self._advance_setpoints()
         # It is latched at the next tick: after a late wake-up that is less than a period from the last.
         interval_s = tick.due_s + self.limits.period_s - self._latched_s
+        before, path = self.torque_path.fallback, self.torque_path
         try:
-            return self.torque_path.control(self._estimate(), self.setpoints, applied_nm, interval_s)
+            found = path.control(self._estimate(), self.setpoints, applied_nm, interval_s)
+            if path.fallback and not before:
+                self._alarm([Finding("fallback", Action.NONE, f"the law has no solution of its own: {path.fallback}")])
+            return found
         except LawFailed as failed:
             off = machines.torque_off(self.machine, tick.now_s, failed.finding.text)
             self._move_to(off, [failed.finding])
             return self._torque(seen, tick)
 
     def _estimate(self) -> Measured:
-        # The measured values as they are; a law with an observer takes its place here.
+        # The measured values as they are: a law that wants an observer brings its own.
         inputs = self.inputs
         return Measured(inputs.tension.value, inputs.speed.value, float(inputs.unwind_speed.value[0]))
 
@@ -206,7 +210,8 @@ class Cycle:
         moves, phase = self.line.moves, self.machine.phase
         goal = self.setpoints.speed_target_m_per_s if phase is Phase.RUNNING else 0.0
         rate = moves.stop_rate_m_per_s2 if phase is Phase.SLOWING else moves.speed_rate_m_per_s2
-        self.setpoints.advance(moves, self.limits.period_s, goal, rate)
+        shape = moves.shape if phase is Phase.RUNNING else "ramp"  # what stops does not wait for a curve to bend
+        self.setpoints.advance(moves, self.limits.period_s, goal, rate, shape)
 
     def _write(self, torque_nm: FloatArray) -> None:
         outputs, phase = self.outputs, self.machine.phase

@@ -2,12 +2,13 @@
 
 from dataclasses import dataclass
 from math import inf
+from typing import Literal
 
 import numpy as np
 
 from gateway.control.reference import MinimumJerk, Motion, Reference, Steady
 from gateway.core.line import Moves, Recipe
-from gateway.core.signals import FloatArray
+from gateway.core.signals import BoolArray, FloatArray
 
 STEP_PAUSE_S = 2.0  #: between two steps of one quantity, so that they do not add up to one that is larger than allowed
 LEAST_MOVE_S = 0.2  #: that a minimum-jerk move takes, however small
@@ -45,6 +46,7 @@ class Setpoints:
         self._speed_stepped_s = -inf
         self._curve = MinimumJerk(np.zeros(n + 1))
         self._time_s = 0.0  #: on the curve
+        self._ramped: BoolArray = np.zeros(n + 1, dtype=np.bool_)  #: values that go to their target on a ramp
 
     def aim_at(self, recipe: Recipe) -> None:
         """The recipe's set-points become the targets."""
@@ -89,36 +91,54 @@ class Setpoints:
     def speed_step_pause_s(self, now_s: float) -> float:
         return self._speed_stepped_s + STEP_PAUSE_S - now_s
 
-    def advance(self, moves: Moves, period_s: float, speed_goal_m_per_s: float, speed_rate_m_per_s2: float) -> None:
+    def advance(
+        self,
+        moves: Moves,
+        period_s: float,
+        speed_goal_m_per_s: float,
+        speed_rate_m_per_s2: float,
+        speed_shape: Literal["ramp", "minimum-jerk"] = "ramp",
+    ) -> None:
         """Move on by one period: tensions towards their targets, speed towards `speed_goal_m_per_s`."""
         self._time_s += period_s
+        if speed_shape == "minimum-jerk":
+            self._advance_speed_smoothly(period_s, speed_goal_m_per_s, speed_rate_m_per_s2)
+        else:
+            self._ramp_speed(period_s, speed_goal_m_per_s, speed_rate_m_per_s2)
         if moves.shape == "minimum-jerk":
-            self._advance_smoothly(moves, period_s, speed_goal_m_per_s, speed_rate_m_per_s2)
-            return
-        if not self._there():
+            self._advance_smoothly(moves, period_s)
+        elif not self._there():
             reach = moves.tension_rate_n_per_s * period_s
             self.tension_n = self.tension_n + np.clip(self.tension_target_n - self.tension_n, -reach, reach)
-        self._ramp_speed(period_s, speed_goal_m_per_s, speed_rate_m_per_s2)
 
-    def _advance_smoothly(self, moves: Moves, period_s: float, speed_goal_m_per_s: float, rate_m_per_s2: float) -> None:
-        n = len(self.tension_n)  # a curve begins where the set-point is now: it has moved a period from now
-        for i in np.flatnonzero(self.tension_target_n != self._curve.target[:n]):
-            self._curve.move(
-                int(i), float(self.tension_target_n[i]), moves.tension_rate_n_per_s, self._time_s, LEAST_MOVE_S
-            )
-        if speed_goal_m_per_s == self.speed_target_m_per_s:  # a stop does not wait for a curve to bend
-            if speed_goal_m_per_s != self._curve.target[n]:
-                self._curve.move(n, speed_goal_m_per_s, rate_m_per_s2, self._time_s, LEAST_MOVE_S)
-            self.speed_m_per_s = float(self._curve.at(self._time_s)[0, n])
-        else:
-            self._ramp_speed(period_s, speed_goal_m_per_s, rate_m_per_s2)
-            self._curve.put(n, self.speed_m_per_s)
-        if not self._there():
-            self.tension_n = self._curve.at(self._time_s)[0, :n]
+    def _advance_smoothly(self, moves: Moves, period_s: float) -> None:
+        """Tensions along their curves. To a target that changes on the way on a ramp: a curve would overshoot."""
+        before_s = self._time_s - period_s
+        for i in np.flatnonzero((self.tension_target_n != self._curve.target[:-1]) | self._ramped[:-1]).tolist():
+            target_n = float(self.tension_target_n[i])
+            if not self._ramped[i] and not self._curve.is_moving(i, before_s):
+                # It begins where it is now, and has moved in a period from now.
+                self._curve.move(i, target_n, moves.tension_rate_n_per_s, self._time_s, LEAST_MOVE_S)
+                continue
+            reach, value = moves.tension_rate_n_per_s * period_s, float(self.tension_n[i])
+            self._curve.put(i, value + max(-reach, min(reach, target_n - value)))
+            self._ramped[i] = self._curve.target[i] != target_n
+        self.tension_n = self._curve.at(self._time_s)[0, :-1]
+
+    def _advance_speed_smoothly(self, period_s: float, goal_m_per_s: float, rate_m_per_s2: float) -> None:
+        """As the tensions."""
+        i, before_s = len(self.tension_n), self._time_s - period_s
+        if goal_m_per_s != self._curve.target[i] or self._ramped[i]:
+            if self._ramped[i] or self._curve.is_moving(i, before_s):
+                self._ramp_speed(period_s, goal_m_per_s, rate_m_per_s2)
+                return
+            self._curve.move(i, goal_m_per_s, rate_m_per_s2, self._time_s, LEAST_MOVE_S)
+        self.speed_m_per_s = float(self._curve.at(self._time_s)[0, i])
 
     def _ramp_speed(self, period_s: float, goal_m_per_s: float, rate_m_per_s2: float) -> None:
         reach = rate_m_per_s2 * period_s
-        self.speed_m_per_s += max(-reach, min(reach, goal_m_per_s - self.speed_m_per_s))
+        self.begin_at_speed(self.speed_m_per_s + max(-reach, min(reach, goal_m_per_s - self.speed_m_per_s)))
+        self._ramped[-1] = self.speed_m_per_s != goal_m_per_s
 
     def followed_by(self, tension_n: FloatArray, measured: FloatArray) -> bool:
         """Whether every set-point is where it shall be and every measured tension (n,) is near it."""

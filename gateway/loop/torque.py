@@ -27,6 +27,7 @@ class TorquePath:
     def __init__(self, law: Law[Any], limits: EnvelopeLimits, line: Line) -> None:
         self.law = law
         self.lost: BoolArray = np.zeros(law.n, dtype=np.bool_)  #: drives that left by themselves: off until armed
+        self.fallback = ""  #: why the law asked for something else than its own solution in this period
         self._limits = limits
         self._moves = line.moves
         self._speed_lag_s = line.control.period_s if line.plc.speed_lag_s is None else line.plc.speed_lag_s
@@ -53,6 +54,7 @@ class TorquePath:
             setpoints.begin_at(np.where(self._limits.measured > 0, measured.tension_n, 0.0))
             self._state = self.law.engage(measured, setpoints.reference(self._speed_lag_s), applied_nm)
         decision = self.law.ask(self._state, measured, setpoints.reference(self._speed_lag_s))
+        self.fallback = decision.fallback
         for finding in check_torque(decision.torque_nm):
             raise LawFailed(finding)
         torque_nm = limit_torque(self._limits, decision.torque_nm, applied_nm, interval_s)

@@ -59,7 +59,7 @@ def test_solutions_are_those_of_a_second_solver(seed):
     for _ in range(250):
         measured, reference, torque = random_line(generator)
         state = law.engage(measured, reference, torque)
-        state.observer.disturbance_nm = generator.uniform(-2.0, 2.0, 6)
+        state.observer.disturbance_nm, state.first = generator.uniform(-2.0, 2.0, 6), None
         decision = law.ask(state, measured, reference)
         assert not decision.fallback
         q, lower, upper = (v.copy() for v in law.problem.vectors(decision.found, reference.tension_n, torque))
@@ -118,6 +118,8 @@ def test_what_is_not_solved_in_time_is_not_applied():
     assert late.commit(state, decision, torque).unsolved == 1
     # With a plan from before, its next move comes first; when it is used up, the linear feedback.
     good = law.ask(law.engage(measured, reference, torque), measured, reference)
+    assert good.found is not None
+    good.found.bump_nm[:] = 0.0
     state = law.commit(state, good, good.torque_nm)
     moves = len(good.plan_nm)
     assert moves == config.horizon - 1

@@ -21,7 +21,7 @@ class MpcWeights(LqgWeights):
 
 DEFAULT_BLOCKS = (1, 1, 1, 1, 2, 3, 6)
 FALLBACK_TORQUE_PER_NM2 = 0.06
-TIME_SHARE = 0.5  #: of a period that a solution may take
+TIME_SHARE = 0.3  #: of a period that a solution may take; half of it may go before the samples are in
 
 
 def design_mpc(

@@ -1,0 +1,74 @@
+"""Set-points that move along minimum-jerk curves: never past what was asked for, never faster than allowed."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gateway.core.line import Moves, Recipe
+from gateway.loop.setpoints import Setpoints
+
+MOVES = Moves(shape="minimum-jerk", tension_rate_n_per_s=20.0, speed_rate_m_per_s2=0.05)
+PERIOD_S = 0.01
+
+
+def setpoints():
+    found = Setpoints(Recipe(name="a", tension_n=[30.0, 30.0], speed_m_per_s=0.1))
+    found.begin_at(np.array([30.0, 30.0]))
+    found.begin_at_speed(0.1)
+    return found
+
+
+changes = st.lists(st.tuples(st.integers(1, 120), st.floats(2.0, 58.0), st.floats(0.0, 0.1)), min_size=1, max_size=6)
+
+
+@settings(max_examples=60, deadline=None)
+@given(changes)
+def test_no_change_on_the_way_takes_them_past_old_and_new_targets(story):
+    moving = setpoints()
+    seen_n, seen_m_per_s = [30.0], [0.1]
+    for periods, tension_n, speed_m_per_s in story:
+        moving.tension_target_n[0], moving.speed_target_m_per_s = tension_n, speed_m_per_s
+        seen_n.append(tension_n)
+        seen_m_per_s.append(speed_m_per_s)
+        for _ in range(periods):
+            before = float(moving.tension_n[0]), moving.speed_m_per_s
+            moving.advance(MOVES, PERIOD_S, speed_m_per_s, 0.05, "minimum-jerk")
+            assert min(seen_n) - 1e-9 <= moving.tension_n[0] <= max(seen_n) + 1e-9
+            assert min(seen_m_per_s) - 1e-12 <= moving.speed_m_per_s <= max(seen_m_per_s) + 1e-12
+            assert abs(moving.tension_n[0] - before[0]) <= 20.0 * PERIOD_S + 1e-9
+            assert abs(moving.speed_m_per_s - before[1]) <= 0.05 * PERIOD_S + 1e-12
+    for _ in range(1200):
+        moving.advance(MOVES, PERIOD_S, speed_m_per_s, 0.05, "minimum-jerk")
+    assert moving.tension_n[0] == tension_n and moving.speed_m_per_s == speed_m_per_s
+    assert not moving.reference(0.02).moving
+
+
+def test_a_stop_is_a_ramp_whatever_the_target_of_the_speed_is():
+    moving = setpoints()
+    moving.speed_target_m_per_s = 0.0
+    for _ in range(5):
+        moving.advance(MOVES, PERIOD_S, 0.0, 0.05, "minimum-jerk")
+    begun = moving.speed_m_per_s
+    for _ in range(30):
+        moving.advance(MOVES, PERIOD_S, 0.0, 0.1, "ramp")
+    assert moving.speed_m_per_s == pytest.approx(begun - 30 * 0.1 * PERIOD_S, abs=1e-9)
+
+
+def test_before_a_move_has_reached_the_unwinder_it_asks_for_nothing():
+    moving = setpoints()
+    moving.speed_target_m_per_s = 0.09
+    moving.advance(MOVES, PERIOD_S, 0.09, 0.05, "minimum-jerk")
+    reference = moving.reference(2.0)  # the unwinder follows two seconds late
+    motion = reference.ahead(0.015)
+    assert reference.moving and motion.unwind_acceleration_m_per_s2 == 0.0 and motion.unwind_speed_change_m_per_s == 0.0
+
+
+def test_a_ramp_has_no_curve_behind_it():
+    moving = setpoints()
+    ramp = MOVES.model_copy(update={"shape": "ramp"})
+    moving.tension_target_n[0] = 40.0
+    for _ in range(20):
+        moving.advance(ramp, PERIOD_S, 0.1, 0.05)
+        assert not moving.reference(2.0).moving
+    assert moving.tension_n[0] == pytest.approx(34.0)
