@@ -1,7 +1,7 @@
 """Model predictive control (eq. mpc), condensed, solved by OSQP from where the last solution ended.
 
 A solution that is late, or none, is never applied: then the next move of the last plan is, and when that is used up the
-linear feedback that the problem has without constraints.
+linear feedback, a more cautious one than the problem's own.
 """
 
 from dataclasses import dataclass, field
@@ -61,7 +61,9 @@ class Mpc:
         observer = self._observer.engage(measured, reference, applied_nm)
         state = MpcState(observer, applied_nm.copy(), np.empty((0, self.n)))
         first = self.ask(state, measured, reference)
-        if not first.fallback and first.found is not None:
+        if first.fallback:
+            first.fallback = f"held: {first.fallback}"
+        elif first.found is not None:
             first.found.bump_nm = applied_nm - first.torque_nm
         first.torque_nm = applied_nm.copy()
         state.first = first

@@ -13,6 +13,7 @@ import numpy as np
 from scipy.sparse import csc_matrix, triu
 
 from gateway.control.observer import Estimate
+from gateway.control.sampled import Sampled
 from gateway.core.controller_laws import MpcConfig
 from gateway.core.signals import FloatArray
 
@@ -25,7 +26,8 @@ class MpcProblem:
         n, blocks = config.n, config.blocks
         self._n = n
         self._limited = config.weight_tension_limit > 0.0
-        F, G = augmented(config)
+        model = config.predictor
+        F, G = Sampled(np.array(model.transition), [np.array(matrix) for matrix in model.inputs]).augmented()
         free, forced = _trajectories(F, G, blocks)  # (N_p, s, s) and (N_p, s, n blocks)
         weight = np.zeros((config.horizon, F.shape[0], F.shape[0]))
         weight[:, : 2 * n, : 2 * n] = np.diag(config.weight_state)
@@ -96,22 +98,6 @@ class MpcProblem:
         """The plan (N_p, n) in Nm of a solution."""
         blocks = solution[: self.torque_variables].reshape(-1, self._n)
         return blocks[self._blocks] + (found.errors.torque_nm - found.disturbance_nm)
-
-
-def augmented(config: MpcConfig) -> tuple[FloatArray, FloatArray]:
-    """F (s, s) and G (s, n) of [x~; u~_{k-1}; ..; u~_{k-d}], s = 2n + n d."""
-    n, inputs = config.n, [np.array(matrix) for matrix in config.predictor.inputs]
-    depth = len(inputs) - 1
-    size = 2 * n + n * depth
-    F, G = np.zeros((size, size)), np.zeros((size, n))
-    F[: 2 * n, : 2 * n] = config.predictor.transition
-    G[: 2 * n] = inputs[0]
-    for age in range(1, depth + 1):
-        F[: 2 * n, 2 * n + n * (age - 1) : 2 * n + n * age] = inputs[age]
-    if depth:
-        G[2 * n : 3 * n] = np.eye(n)
-        F[3 * n :, 2 * n : size - n] = np.eye(n * (depth - 1))
-    return F, G
 
 
 def _trajectories(F: FloatArray, G: FloatArray, blocks: list[int]) -> tuple[FloatArray, FloatArray]:

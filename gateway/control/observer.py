@@ -7,11 +7,9 @@ import numpy as np
 from gateway.control.deviation import Deviation, Errors, Measured
 from gateway.control.flight import deviations, newest_first
 from gateway.control.reference import Reference
-from gateway.control.takeover import fade
+from gateway.control.takeover import NEAR_SETPOINT, fade
 from gateway.core.controller_laws import Predictor
 from gateway.core.signals import FloatArray
-
-THERE = 0.02  #: of a set-point: noise, as far as anybody can tell from one sample
 
 
 @dataclass(slots=True)
@@ -95,6 +93,6 @@ class Observer:
     def _measured(self, measured: Measured, reference: Reference) -> FloatArray:
         """The first estimate: a tension near its set-point is taken to be there, not where one sample has it."""
         setpoint = reference.tension_n
-        there = np.abs(measured.tension_n - setpoint) <= THERE * setpoint
+        there = np.abs(measured.tension_n - setpoint) <= NEAR_SETPOINT * setpoint
         there[self._draw] = True
         return np.concatenate((np.where(there, setpoint, measured.tension_n), measured.speed_m_per_s))

@@ -18,6 +18,7 @@ from gateway.control.linear_form import linear_form
 from gateway.control.reference import Steady
 from gateway.core.controller import Controller
 from gateway.core.controller_laws import MpcConfig
+from gateway.core.metrics import BAND
 from gateway.core.signals import FloatArray
 from gateway.core.web_model import WebModel, equilibrium_torque, reference_speeds
 
@@ -97,11 +98,8 @@ class Setup:
 
     @property
     def delay_steps(self) -> int:
-        """Raises ValueError when the latency is not a whole number of integration steps."""
-        steps = round(self.latency_s / self.step_s)
-        if abs(steps * self.step_s - self.latency_s) > 1e-9:
-            raise ValueError(f"a latency of {self.latency_s:g} s is no whole number of steps of {self.step_s:g} s")
-        return steps
+        """Integration steps from a sample to the torque that it causes."""
+        return round(self.latency_s / self.step_s)
 
     def draw(self, periods: int, n: int) -> tuple[FloatArray, FloatArray]:
         """Noise on the samples (k, 2n), and speeds (k substeps, n) that the rollers are moved by in each step."""
@@ -131,9 +129,6 @@ class Rollouts:
     def rmse_n(self) -> FloatArray:
         """Eq. rmse of each plant, (b,)."""
         return np.sqrt(self.squared_error_n2.sum(axis=1))
-
-
-SETTLED_BAND = 0.02
 
 
 def simulate(config: Controller, plants: Plants, course: Course, setup: Setup, *, record: bool = False) -> Rollouts:
@@ -188,7 +183,7 @@ def references(config: Controller, course: Course) -> FloatArray:
 def rollouts_of(tensions: FloatArray, torques: FloatArray, course: Course, setup: Setup, *, record: bool) -> Rollouts:
     """The same from recordings (b, k, n)."""
     error = tensions - course.tension_n
-    after, band = error[:, course.changed :], SETTLED_BAND * course.tension_n[-1]
+    after, band = error[:, course.changed :], BAND * course.tension_n[-1]
     direction = step_direction(course)
     beyond = np.where(direction == 0.0, np.abs(after), direction * after).max(axis=1)
     outside = np.abs(after) > band
@@ -281,6 +276,7 @@ def _check(config: Controller, plants: Plants, course: Course, setup: Setup) -> 
         wrong.append(f"law, plants and course have {config.n}, {plants.n} and {course.tension_n.shape[1]} spans")
     if course.periods == 0 or not 0 <= course.changed < course.periods:
         wrong.append(f"the course has {course.periods} periods and its change at {course.changed}")
+    if abs(setup.delay_steps * setup.step_s - setup.latency_s) > 1e-9:
+        wrong.append(f"a latency of {setup.latency_s:g} s is no whole number of steps of {setup.step_s:g} s")
     if wrong:
         raise ValueError("; ".join(wrong))
-    setup.delay_steps  # noqa: B018  (raises for a latency that the steps do not meet)

@@ -17,8 +17,9 @@ from gateway.control.deviation import Measured
 from gateway.control.laws import make_law
 from gateway.control.linear_form import LinearForm
 from gateway.control.reference import Steady
-from gateway.control.rollout import SETTLED_BAND, Course, Plants, Rollouts, Setup, references, start, step_direction
+from gateway.control.rollout import Course, Plants, Rollouts, Setup, references, start, step_direction
 from gateway.core.controller import Controller
+from gateway.core.metrics import BAND
 from gateway.core.signals import FloatArray
 
 LANES = 8
@@ -56,7 +57,7 @@ def run(
         *_entries(form.torque), *_entries(np.hstack((form.state, form.applied))),
         reference, course.unwind_speed_m_per_s, samples, moved,
         np.array([setup.tension_step_n] * n + [setup.speed_step_m_per_s] * n),
-        SETTLED_BAND * course.tension_n[-1], step_direction(course), course.changed,
+        BAND * course.tension_n[-1], step_direction(course), course.changed,
         setup.substeps, setup.delay_steps, setup.step_s,
         setup.torque_nm, setup.torque_rate_nm_per_s * setup.period_s, tension_n, torque_nm,
     )  # fmt: skip

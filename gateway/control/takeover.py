@@ -3,6 +3,7 @@
 from math import exp
 
 FADE_S = 0.1  #: time constant
+NEAR_SETPOINT = 0.02  #: a tension this near its set-point, as a fraction, is taken to be there: the rest is noise
 
 
 def fade(period_s: float) -> float:

@@ -14,7 +14,6 @@ import numpy as np
 from gateway.core.signals import FloatArray
 
 BAND = 0.02  #: of y_inf, within which a tension has settled
-CONVERGED = (0.05, 20.0, 2.0)  #: RMSE per set-point, overshoot in %, settling time in s (eq. convergence_criteria)
 
 
 def rmse_n(tension_n: FloatArray, setpoint_n: FloatArray) -> float:
@@ -104,20 +103,6 @@ class ScoreWeights:
 def score(found: Performance, weights: ScoreWeights) -> float:
     """S = w . [six metrics]; inf where one of them is."""
     return float(weights.vector() @ found.vector()) if np.isfinite(found.vector()).all() else inf
-
-
-def converged(
-    time_s: FloatArray, tension_n: FloatArray, setpoint_n: FloatArray, changed_s: float
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """RMSE per set-point, overshoot in % and settling time in s of each span (n,), for `CONVERGED` (window: from the
-    change on)."""
-    after = time_s >= changed_s
-    relative = rmse_per_span_n(tension_n[after], setpoint_n[after]) / setpoint_n[-1]
-    return (
-        relative,
-        overshoot_pct(time_s, tension_n, setpoint_n, changed_s),
-        settling_time_s(time_s, tension_n, setpoint_n, changed_s),
-    )
 
 
 def _since(time_s: FloatArray, outside: FloatArray) -> float:

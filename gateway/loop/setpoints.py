@@ -7,12 +7,12 @@ from typing import Literal
 import numpy as np
 
 from gateway.control.reference import MinimumJerk, Motion, Reference, Steady
+from gateway.control.takeover import NEAR_SETPOINT
 from gateway.core.line import Moves, Recipe
 from gateway.core.signals import BoolArray, FloatArray
 
 STEP_PAUSE_S = 2.0  #: between two steps of one quantity, so that they do not add up to one that is larger than allowed
 LEAST_MOVE_S = 0.2  #: that a minimum-jerk move takes, however small
-THERE = 0.02  #: a tension this near its set-point, as a fraction, need not be brought to it: that is noise
 NEAR = 0.2  #: a tension this near its set-point, as a fraction, has followed it
 
 
@@ -57,7 +57,7 @@ class Setpoints:
     def begin_at(self, tension_n: FloatArray) -> None:
         """Start from what is measured, so that nothing jumps when control takes over. Targets stay."""
         target = self.tension_target_n
-        there = np.abs(tension_n - target) <= THERE * target
+        there = np.abs(tension_n - target) <= NEAR_SETPOINT * target
         self.tension_n = np.where(there, target, np.minimum(np.maximum(tension_n, 0.0), target))
         for i, value in enumerate(self.tension_n.tolist()):
             self._curve.put(i, value)

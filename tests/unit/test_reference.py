@@ -32,11 +32,11 @@ def test_from_rest_to_rest_it_is_the_known_quintic(begin, end, rate):
 @given(st.floats(-50, 50), st.floats(-50, 50), st.floats(0.05, 0.95))
 def test_a_new_target_on_the_way_tears_nothing(first, second, share):
     curve = MinimumJerk(np.array([0.0, 7.0]))
-    curve.move(0, first, 20.0, 0.0)
-    at_s = share * 15.0 / 8.0 * abs(first) / 20.0
+    curve.move(0, first, 20.0, 0.0, 0.2)  # none so short that it is not worth a curve
+    at_s = share * max(15.0 / 8.0 * abs(first) / 20.0, 0.2)
     before = curve.at(at_s)
-    curve.move(0, second, 20.0, at_s)
-    assert np.allclose(curve.at(at_s), before, atol=1e-4)
+    curve.move(0, second, 20.0, at_s, 0.2)
+    assert np.allclose(curve.at(at_s), before, atol=1e-6)
     assert curve.at(at_s + 60.0)[:, 0].tolist() == [second, 0.0, 0.0]
     assert curve.at(at_s)[:, 1].tolist() == [7.0, 0.0, 0.0]
 

@@ -6,8 +6,9 @@ from typing import TypedDict
 import numpy as np
 from scipy.linalg import LinAlgError, solve_discrete_are
 
-from gateway.control.design.sampling import Sampled, with_dead_time
+from gateway.control.design.sampling import with_dead_time
 from gateway.control.design.task import DesignRefused, DesignTask, check_task, feedforward_of, linear
+from gateway.control.sampled import Sampled
 from gateway.core.controller_laws import Feedforward, LqgConfig, LqiConfig, LqrConfig, Predictor
 from gateway.core.signals import FloatArray
 

@@ -6,9 +6,10 @@ from math import inf, log
 import numpy as np
 from scipy.linalg import solve_discrete_lyapunov
 
-from gateway.control.design.sampling import Sampled, with_dead_time
+from gateway.control.design.sampling import with_dead_time
 from gateway.control.design.task import DesignRefused, DesignTask, linear
 from gateway.control.linear_form import LinearForm, linear_form
+from gateway.control.sampled import Sampled
 from gateway.core.controller import Controller
 from gateway.core.signals import FloatArray
 
