@@ -323,17 +323,25 @@ def test_a_request_acts_when_the_kernel_took_it() -> None:
             stamps.append(stamp.timestamp)
             return 0.5
 
-        face = ModbusFace({DRIVE: DriveRegisters(ModbusAxis(drive))}, lambda: 9.0, arrival)
+        face = ModbusFace({DRIVE: DriveRegisters(ModbusAxis(drive))}, lambda: 0.25, arrival)
         port = await face.open("127.0.0.1", 0)
         reader, writer = await asyncio.open_connection("127.0.0.1", port)
-        for k in range(2):
-            writer.write(_cycle(k, SHUTDOWN, 0) + _cycle(k, SWITCH_ON, 0))
+        try:
+            # The kernel begins to stamp a little after it was asked to, unless another socket had asked before.
+            for _ in range(1000):
+                writer.write(_cycle(0, SHUTDOWN, 0) + _cycle(0, SWITCH_ON, 0))
+                await reader.readexactly(2 * 19)
+                if stamps:
+                    break
+            seen = len(stamps)
+            writer.write(_cycle(0, SHUTDOWN, 0) + _cycle(0, SWITCH_ON, 0))
             await reader.readexactly(2 * 19)
-        assert len(stamps) == 2 and stamps[0] < stamps[1], "one for what came together"
-        assert world.now_s == 0.5
-        writer.close()
-        await writer.wait_closed()
-        await face.close()
+            assert seen == 1 and len(stamps) == 2 and stamps[0] < stamps[1], "one for what came together"
+            assert world.now_s == 0.5
+        finally:
+            writer.close()
+            await writer.wait_closed()
+            await face.close()
 
     asyncio.run(run())
 
