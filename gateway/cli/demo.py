@@ -13,7 +13,6 @@ from pathlib import Path
 
 from rich.console import Console
 
-from gateway.cli.cases import CASES, CHANGE_AT_S, DURATION_S, Case
 from gateway.cli.children import ChildFailed, Children, free_udp_port
 from gateway.cli.demo_progress import Progress
 from gateway.cli.line_commands import known_maps
@@ -24,6 +23,7 @@ from gateway.core.line import Line
 from gateway.core.line_file import load_line
 from gateway.core.line_template import line_template
 from gateway.core.messages import Arm, Command, SelectRecipe, Start, Stop
+from gateway.core.scenario import PAPER, Scenario
 from gateway.core.topics import GATEWAY_STATUS
 from gateway.mailbox.paths import GATEWAY_SOCKET
 from gateway.mailbox.port import Unreachable
@@ -57,7 +57,7 @@ class Setup:
 class Window:
     """When a case ran, on CLOCK_MONOTONIC."""
 
-    case: Case
+    case: Scenario
     begin_s: float
     end_s: float
 
@@ -144,7 +144,7 @@ async def _story(children: Children, setup: Setup, console: Console) -> tuple[li
             progress.step("starting the processes")
             await operator.wait(lambda status: status.loop.running, READY_TIME_S, "the loop")
             await _begin_with_repeats(operator)
-            windows = [await _run_with_repeats(operator, setup, case) for case in CASES]
+            windows = [await _run_with_repeats(operator, setup, case) for case in PAPER]
             progress.step("stopping")
             await operator.order(Stop())
             await operator.wait_at_rest()
@@ -165,7 +165,7 @@ async def _begin_with_repeats(operator: "Operator") -> None:
             await operator.recover(f"not started; once more ({failed})", str(failed))
 
 
-async def _run_with_repeats(operator: "Operator", setup: Setup, case: Case) -> Window:
+async def _run_with_repeats(operator: "Operator", setup: Setup, case: Scenario) -> Window:
     """A computer that stalls, or on which the simulated devices do, stops the line, as it must; then once more."""
     for repeats in range(MOST_REPEATS + 1):
         try:
@@ -178,16 +178,17 @@ async def _run_with_repeats(operator: "Operator", setup: Setup, case: Case) -> W
     raise AssertionError("the last repeat returns or raises")
 
 
-async def _run_case(operator: "Operator", setup: Setup, case: Case) -> Window:
+async def _run_case(operator: "Operator", setup: Setup, case: Scenario) -> Window:
     progress = operator.progress
     await operator.order(SelectRecipe(name=case.name))
-    progress.step(f"{case.title.lower()}: settling at its set-points")
-    await operator.wait_settled(case.tension_n, case.unwind_speed_m_per_s)
+    progress.step(f"{case.heading.lower()}: settling at its set-points")
+    await operator.wait_settled(case.tension_n, case.speed_m_per_s)
     begin_s = time.monotonic()
-    progress.case(case.title, DURATION_S)
-    await operator.watch(CHANGE_AT_S)
-    await operator.order(case.change)
-    await operator.watch(begin_s + DURATION_S - time.monotonic())
+    progress.case(case.heading, case.duration_s)
+    await operator.watch(case.change_at_s)
+    for command in case.commands():
+        await operator.order(command)
+    await operator.watch(begin_s + case.duration_s - time.monotonic())
     end_s = time.monotonic()
     # Beyond the window, so that it is whole whenever exactly the change took effect.
     await operator.watch(4 * setup.line.control.period_s)
@@ -275,7 +276,7 @@ class Operator:
         self._stopping = True
         await self.wait(_at_rest, 20.0, "the stop")
 
-    async def wait_settled(self, tension_n: tuple[float, ...], speed_m_per_s: float) -> None:
+    async def wait_settled(self, tension_n: list[float], speed_m_per_s: float) -> None:
         since_s = time.monotonic()
 
         def settled(status: GatewayStatus) -> bool:

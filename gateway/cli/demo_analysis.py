@@ -13,10 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gateway.cli.cases import CHANGE_AT_S, DURATION_S
 from gateway.cli.demo import DemoFailed, Setup, Window, command_line, machine_lines, now_iso
 from gateway.cli.demo_result import CaseResult, DemoResult, Percentiles, TimingResult
-from gateway.cli.stepped import run_case
+from gateway.cli.stepped import run_scenario
 from gateway.core.controller import config_hash
 from gateway.core.metrics import rmse_n, rmse_per_span_n
 from gateway.supervisor.historian import FILE_NAME
@@ -83,8 +82,8 @@ def read_evidence(setup: Setup, windows: list[Window], world_start_s: float) -> 
 
 def trace_of(window: Window, evidence: Evidence) -> CaseTrace:
     """The 15 s around the change, from 1 s before it on."""
-    begin_s = _change_s(window, evidence.history) - CHANGE_AT_S
-    rows = slice(*np.searchsorted(evidence.truth_s, (begin_s, begin_s + DURATION_S)))
+    begin_s = _change_s(window, evidence.history) - window.case.change_at_s
+    rows = slice(*np.searchsorted(evidence.truth_s, (begin_s, begin_s + window.case.duration_s)))
     return CaseTrace(window, rows, window.case.setpoints_n(evidence.truth_s[rows] - begin_s))
 
 
@@ -95,7 +94,7 @@ def _change_s(window: Window, history: Arrays) -> float:
     together = np.column_stack((history["tension_setpoint_n"][during], history["speed_setpoint_m_per_s"][during]))
     changed = np.flatnonzero((together != together[0]).any(axis=1))
     if not changed.size:
-        raise DemoFailed(f"the history shows no change of set-point in the {window.case.title.lower()}")
+        raise DemoFailed(f"the history shows no change of set-point in the {window.case.heading.lower()}")
     return float(time_s[during[changed[0]]])
 
 
@@ -105,7 +104,8 @@ def _case(setup: Setup, trace: CaseTrace, evidence: Evidence) -> CaseResult:
     begin_s, end_s = evidence.truth_s[trace.rows][[0, -1]]
     missed = evidence.history["missed"][(evidence.history["time_s"] >= begin_s) & (evidence.history["time_s"] <= end_s)]
     plant = load_plant(setup.out / "plant.toml")
-    stepped = [run_case(setup.line, setup.config, plant, case, setup.seed + k).rmse_n for k in range(STEPPED_SEEDS)]
+    seeds = range(setup.seed, setup.seed + STEPPED_SEEDS)
+    stepped = [run_scenario(setup.line, setup.config, plant, case, seed).rmse_n for seed in seeds]
     rmse, stepped_rmse = rmse_n(tension, trace.setpoint_n), float(np.mean(stepped))
     return CaseResult(
         name=case.name,

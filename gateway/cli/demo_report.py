@@ -53,7 +53,7 @@ def _chart(setup: Setup, trace: CaseTrace, result: CaseResult, evidence: Evidenc
     thinned = slice(trace.rows.start, trace.rows.stop, PLOT_EVERY)
     return Case(
         name=case.name,
-        title=case.title,
+        title=case.heading,
         description=case.description,
         law=f"{setup.config.kind.upper()}, designed on the line file's nominal model.",
         source="The recorder inside the simulated line: true tensions, speeds and torques. The gateway had only the "

@@ -4,17 +4,20 @@ import time
 from collections.abc import Awaitable
 from dataclasses import dataclass, field
 from math import ceil
-from typing import TypeVar
+from typing import Generic, TypeVar
 
 import numpy as np
 
 from drivers.memory import MemoryLink
-from gateway.cli.cases import CHANGE_AT_S, DURATION_S, Case
+from gateway.control.deviation import Measured
+from gateway.control.law import Decision, Law
 from gateway.control.laws import make_law, untimed
+from gateway.control.reference import Reference
 from gateway.core.controller import Controller
 from gateway.core.line import Line, Recipe
 from gateway.core.messages import Arm, Command, Reply
-from gateway.core.metrics import rmse_n, rmse_per_span_n
+from gateway.core.metrics import RunMetrics, run_metrics
+from gateway.core.scenario import Scenario
 from gateway.core.signals import FloatArray
 from gateway.core.states import Phase
 from gateway.core.telemetry import Frame, pack, unpack
@@ -28,6 +31,7 @@ from sim_plant.plant import Plant
 from sim_plant.stepped import SteppedLine
 
 T = TypeVar("T")
+State = TypeVar("State")
 
 
 @dataclass
@@ -48,8 +52,8 @@ class SteppedLoop:
         self.truth = SteppedLine(self.plant, self.seed, self.line.control.latency_s)
         link = MemoryLink(self.line, self.truth)
         watch = Watch(self.line, np.zeros(self.line.n))  # the memory link carries floats
-        law = make_law(untimed(self.config))
-        self.cycle = Cycle(self.line, law, [link], watch, lambda: self.now_s, self._record, self._announce)
+        self.law = TimedLaw(make_law(untimed(self.config)))
+        self.cycle = Cycle(self.line, self.law, [link], watch, lambda: self.now_s, self._record, self._announce)
         _finish(link.open())
 
     def begin_in_production(self, tension_n: FloatArray, unwind_speed_m_per_s: float) -> None:
@@ -99,41 +103,79 @@ class SteppedLoop:
             self.transitions.append((self.now_s, after.phase, after.reason))
 
 
+class TimedLaw(Generic[State]):
+    """A law that notes what each step has taken: asking and committing, on this computer."""
+
+    def __init__(self, law: Law[State]) -> None:
+        self.n = law.n
+        self.step_s: list[float] = []
+        self._law = law
+        self._asking_s = 0.0
+
+    def engage(self, measured: Measured, reference: Reference, applied_nm: FloatArray) -> State:
+        return self._law.engage(measured, reference, applied_nm)
+
+    def ask(self, state: State, measured: Measured, reference: Reference) -> Decision:
+        began_s = time.perf_counter()
+        decision = self._law.ask(state, measured, reference)
+        self._asking_s = time.perf_counter() - began_s
+        return decision
+
+    def commit(self, state: State, decision: Decision, applied_nm: FloatArray) -> State:
+        began_s = time.perf_counter()
+        following = self._law.commit(state, decision, applied_nm)
+        self.step_s.append(self._asking_s + time.perf_counter() - began_s)
+        return following
+
+
 @dataclass(frozen=True)
 class SteppedResult:
-    """A case in stepped time, judged by the recorder at the simulated devices."""
+    """A scenario in stepped time, judged by the recorder at the simulated devices."""
 
-    rmse_n: float
-    rmse_per_span_n: FloatArray  #: (n,)
+    metrics: RunMetrics
     unsafe_events: int
     wall_s: float  #: what it took
-    tension_n: FloatArray  #: (k, n), true, every millisecond
-    time_s: FloatArray  #: (k,)
+    step_s: FloatArray  #: (periods,), what the law itself took in each, on this computer
+    time_s: FloatArray  #: (k,), every millisecond
+    setpoint_n: FloatArray  #: (k, n)
+    tension_n: FloatArray  #: (k, n), true
+    torque_nm: FloatArray  #: (k, n), at the drives
+
+    @property
+    def rmse_n(self) -> float:
+        return self.metrics.rmse_n
 
 
-def run_case(line: Line, config: Controller, plant: Plant, case: Case, seed: int) -> SteppedResult:
-    """The case from the plant's own equilibrium on, over its whole duration."""
+def run_scenario(line: Line, config: Controller, plant: Plant, scenario: Scenario, seed: int) -> SteppedResult:
+    """The scenario from the plant's own equilibrium on, over its whole duration.
+
+    Raises ValueError where the line refuses the change.
+    """
     loop = SteppedLoop(line, config, plant, seed)
-    loop.begin_in_production(np.array(case.tension_n), case.unwind_speed_m_per_s)
+    loop.begin_in_production(np.array(scenario.tension_n), scenario.speed_m_per_s)
     period_s = line.control.period_s
-    started = time.perf_counter()
-    loop.step(round(CHANGE_AT_S / period_s))
+    before = round(scenario.change_at_s / period_s)
+    started_s = time.perf_counter()
+    loop.step(before)
     loop.now_s = loop.periods * period_s
-    reply = loop.command(case.change)
-    if not reply.ok:
-        raise ValueError(f"{case.title}: {reply.text}")
-    loop.step(round((DURATION_S - CHANGE_AT_S) / period_s))
-    loop.truth.sample(DURATION_S)
-    wall_s = time.perf_counter() - started
-    recording = loop.truth.recorder.recording()
-    setpoints = case.setpoints_n(recording.time_s)
+    for command in scenario.commands():
+        reply = loop.command(command)
+        if not reply.ok:
+            raise ValueError(f"{scenario.heading}: {reply.text}")
+    loop.step(round(scenario.duration_s / period_s) - before)
+    loop.truth.sample(scenario.duration_s)
+    wall_s = time.perf_counter() - started_s
+    found = loop.truth.recorder.recording()
+    setpoint = scenario.setpoints_n(found.time_s)
     return SteppedResult(
-        rmse_n=rmse_n(recording.tension_n, setpoints),
-        rmse_per_span_n=rmse_per_span_n(recording.tension_n, setpoints),
+        metrics=run_metrics(found.time_s, found.tension_n, setpoint, found.torque_nm, scenario.change_at_s),
         unsafe_events=loop.truth.recorder.unsafe_total,
         wall_s=wall_s,
-        tension_n=recording.tension_n,
-        time_s=recording.time_s,
+        step_s=np.array(loop.law.step_s),
+        time_s=found.time_s,
+        setpoint_n=setpoint,
+        tension_n=found.tension_n,
+        torque_nm=found.torque_nm,
     )
 
 

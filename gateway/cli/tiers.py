@@ -2,10 +2,9 @@
 
 from dataclasses import dataclass
 
-from gateway.cli.cases import Case
 from gateway.control.reference import MinimumJerk
 from gateway.core.line import Line
-from gateway.core.messages import SetTension
+from gateway.core.scenario import Scenario
 from sim_plant.plant import Plant
 
 
@@ -19,19 +18,23 @@ class Tier:
     torque_rate_nm_per_s: float
     move_s: float = 0.0  #: of the change, along a minimum-jerk curve; 0: a literal step
 
-    def case(self, case: Case) -> Case:
-        """The case as this tier moves."""
-        return case.moved_over(self.move_s) if self.move_s else case
+    def scenario(self, scenario: Scenario) -> Scenario:
+        """`scenario` as this tier moves."""
+        return scenario.moved_over(self.move_s) if self.move_s else scenario
 
-    def line(self, line: Line, case: Case) -> Line:
+    def line(self, line: Line, scenario: Scenario) -> Line:
         """`line` under these conditions."""
         control = {"period_s": self.period_s, "latency_s": self.latency_s}
         limits = {"torque_nm": self.torque_nm, "torque_rate_nm_per_s": self.torque_rate_nm_per_s}
         moves: dict[str, object] = {}
         moved: dict[str, object] = {}
         if self.move_s:
-            name = "tension_rate_n_per_s" if isinstance(case.change, SetTension) else "speed_rate_m_per_s2"
-            moves = {"shape": "minimum-jerk", name: MinimumJerk.PEAK * case.size / self.move_s}
+            per_size = MinimumJerk.PEAK / self.move_s
+            moves = {"shape": "minimum-jerk"}
+            if scenario.tension_step_n:
+                moves["tension_rate_n_per_s"] = per_size * scenario.tension_step_n
+            if scenario.speed_step_m_per_s:
+                moves["speed_rate_m_per_s2"] = per_size * scenario.speed_step_m_per_s
             # The speed is written a period later, and the unwinder's drive interpolates to it over another.
             moved = {"plc": line.plc.model_copy(update={"speed_lag_s": 2.0 * self.period_s})}
         return line.model_copy(

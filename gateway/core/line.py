@@ -156,6 +156,17 @@ class History(Strict):
     keep_events_days: Positive = 3650.0
 
 
+class Priorities(Strict):
+    """What matters on this line: the weights w of the score S (eq. performance_score)."""
+
+    rmse_per_n: NonNegative = 1.0
+    settling_per_s: NonNegative = 0.2
+    overshoot_per_pct: NonNegative = 0.01
+    effort_per_n2m2s: NonNegative = 1e-5
+    robustness_per_n: NonNegative = 0.02
+    compute_per_s: NonNegative = 100.0
+
+
 class Line(Strict):
     format: Annotated[int, Field(ge=1, le=1)]  #: not Literal: that takes `true` and 1.0 for 1
     site: Name
@@ -172,6 +183,7 @@ class Line(Strict):
     load_cells: list[LoadCell]
     plc: LinePlc
     history: History = History()
+    priorities: Priorities = Priorities()
     recipes: Annotated[list[Recipe], Field(min_length=1)]  #: the first is the one a line starts with
 
     @property

@@ -31,6 +31,7 @@ HELP: dict[str, dict[str, str]] = {
         "load_cells": "one per tension-controlled span",
         "plc": "drives the unwinder, owns the permissive and the emergency stop",
         "history": "what the gateway keeps on disk; the oldest goes first",
+        "priorities": "what matters on this line: the weights by which r2rgate design chooses among controllers",
         "recipes": "set-points for a grade; the line starts with the first",
     },
     "Control": {
@@ -127,6 +128,14 @@ HELP: dict[str, dict[str, str]] = {
         "keep_days": "of telemetry: about 0.7 GB a day for six spans at 100 Hz",
         "keep_gb": "largest size, of telemetry and events together",
         "keep_events_days": "of events: state changes, commands, alarms",
+    },
+    "Priorities": {
+        "rmse_per_n": "per N of tracking error",
+        "settling_per_s": "per s of settling time",
+        "overshoot_per_pct": "per % of overshoot",
+        "effort_per_n2m2s": "per (Nm)2 s of torque, squared and integrated",
+        "robustness_per_n": "per N by which the tension may differ where the model is wrong within its tolerances",
+        "compute_per_s": "per s of computing in a control period",
     },
     "Recipe": {
         "name": "name of the grade",

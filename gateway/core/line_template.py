@@ -27,7 +27,7 @@ def line_template(spans: int = 6, out: str = "line.toml", wiring: Wiring = DEMON
     more = {1: "", 2: " ~~span 2~~ roller 2"}.get(spans, f" ~~span 2~~ ... ~~span {spans}~~ roller {spans}")
     parts = [_HEAD.format(more=more, out=out), _line(spans), _process(spans), _web()]
     parts += [_rollers(spans), _spans(spans), *wired_tables(wiring, spans)]
-    return "\n".join([*parts, _history(), _recipes(spans)])
+    return "\n".join([*parts, _history(), _priorities(), _recipes(spans)])
 
 
 def _line(spans: int) -> str:
@@ -103,6 +103,18 @@ def _spans(spans: int) -> str:
 
 def _history() -> str:
     return table("history", "History", {"keep_days": "90.0", "keep_gb": "20.0", "keep_events_days": "3650.0"})
+
+
+def _priorities() -> str:
+    values = {
+        "rmse_per_n": "1.0",
+        "settling_per_s": "0.2",
+        "overshoot_per_pct": "0.01",
+        "effort_per_n2m2s": "1e-5",
+        "robustness_per_n": "0.02",
+        "compute_per_s": "100.0",
+    }
+    return table("priorities", "Priorities", values)
 
 
 def _recipes(spans: int) -> str:

@@ -11,6 +11,7 @@ from math import inf
 
 import numpy as np
 
+from gateway.core.line import Priorities
 from gateway.core.signals import FloatArray
 
 BAND = 0.02  #: of y_inf, within which a tension has settled
@@ -62,6 +63,34 @@ def effort_n2m2s(time_s: FloatArray, torque_nm: FloatArray) -> float:
 
 
 @dataclass(frozen=True)
+class RunMetrics:
+    """All metrics of a run, as written (`paper`) and corrected; (n,) per span."""
+
+    rmse_n: float
+    rmse_per_span_n: FloatArray
+    settling_s: FloatArray  #: inf: never
+    settling_paper_s: float
+    overshoot_pct: FloatArray
+    overshoot_paper_pct: float
+    effort_n2m2s: float
+
+
+def run_metrics(
+    time_s: FloatArray, tension_n: FloatArray, setpoint_n: FloatArray, torque_nm: FloatArray, changed_s: float
+) -> RunMetrics:
+    """Metrics of sampled trajectories, with the change at `changed_s`."""
+    return RunMetrics(
+        rmse_n=rmse_n(tension_n, setpoint_n),
+        rmse_per_span_n=rmse_per_span_n(tension_n, setpoint_n),
+        settling_s=settling_time_s(time_s, tension_n, setpoint_n, changed_s),
+        settling_paper_s=settling_time_paper_s(time_s, tension_n, setpoint_n),
+        overshoot_pct=overshoot_pct(time_s, tension_n, setpoint_n, changed_s),
+        overshoot_paper_pct=overshoot_paper_pct(tension_n, setpoint_n),
+        effort_n2m2s=effort_n2m2s(time_s, torque_nm),
+    )
+
+
+@dataclass(frozen=True)
 class Performance:
     """P = [RMSE, OS, t_s] of a run (as corrected, of the worst span), and what else S weighs."""
 
@@ -79,30 +108,17 @@ class Performance:
         )
 
 
-@dataclass(frozen=True)
-class ScoreWeights:
-    """w of eq. performance_score, each per the unit of its metric: what a line's priorities say."""
-
-    rmse_per_n: float = 1.0
-    settling_per_s: float = 0.2
-    overshoot_per_pct: float = 0.01
-    effort_per_n2m2s: float = 1e-5
-    robustness_per_n: float = 0.02
-    compute_per_s: float = 100.0
-
-    def vector(self) -> FloatArray:
-        """In the order of `Performance.vector`."""
-        return np.array(
-            [
-                self.rmse_per_n, self.settling_per_s, self.overshoot_per_pct, self.effort_per_n2m2s,
-                self.robustness_per_n, self.compute_per_s,
-            ]
-        )  # fmt: skip
+def score(found: Performance, priorities: Priorities) -> float:
+    """S = w . [six metrics] (eq. performance_score); inf where one of them is."""
+    return float(weights(priorities) @ found.vector()) if np.isfinite(found.vector()).all() else inf
 
 
-def score(found: Performance, weights: ScoreWeights) -> float:
-    """S = w . [six metrics]; inf where one of them is."""
-    return float(weights.vector() @ found.vector()) if np.isfinite(found.vector()).all() else inf
+def weights(priorities: Priorities) -> FloatArray:
+    """w, in the order of `Performance.vector`."""
+    p = priorities
+    return np.array(
+        [p.rmse_per_n, p.settling_per_s, p.overshoot_per_pct, p.effort_per_n2m2s, p.robustness_per_n, p.compute_per_s]
+    )
 
 
 def _since(time_s: FloatArray, outside: FloatArray) -> float:

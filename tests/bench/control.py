@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 from rich.progress import Progress
 
-from gateway.cli.cases import CASES, Case
-from gateway.cli.stepped import run_case
+from gateway.cli.stepped import run_scenario
 from gateway.cli.tiers import TIERS, Tier
 from gateway.control.design import (
     DesignTask,
@@ -31,6 +30,7 @@ from gateway.core.controller import Controller
 from gateway.core.line import Line
 from gateway.core.line_file import load_line
 from gateway.core.line_template import line_template
+from gateway.core.scenario import PAPER, Scenario
 from gateway.core.web_model import WebModel
 from sim_plant.plant import Plant, load_plant
 from tests.bench.figures import Bench
@@ -57,7 +57,7 @@ LAWS: dict[str, Callable[[DesignTask], Controller]] = {
 @dataclass(frozen=True)
 class Job:
     tier: Tier
-    case: Case
+    case: Scenario
     law: str
     known: str  #: the plant that the design was made on
     truth: str
@@ -87,14 +87,14 @@ def belief(plant: Plant) -> WebModel:
     )  # fmt: skip
 
 
-def line_of(tier: Tier, case: Case) -> Line:
+def line_of(tier: Tier, case: Scenario) -> Line:
     return tier.line(load_line(line_template(6, "line.toml"), "line.toml"), case)
 
 
 def run(job: Job) -> Outcome:
     line = line_of(job.tier, job.case)
     config = LAWS[job.law](replace(task_of(line), model=belief(plant_named(job.known))))
-    found = run_case(line, config, job.tier.plant(plant_named(job.truth)), job.tier.case(job.case), job.seed)
+    found = run_scenario(line, config, job.tier.plant(plant_named(job.truth)), job.tier.scenario(job.case), job.seed)
     return Outcome(found.rmse_n, found.unsafe_events)
 
 
@@ -106,7 +106,7 @@ def bounds(tiers: Sequence[Tier]) -> dict[tuple[str, str], float]:
         if tier.move_s:
             continue
         terms = Terms(tier.period_s, tier.latency_s, tier.torque_nm, tier.torque_rate_nm_per_s)
-        for case in CASES:
+        for case in PAPER:
             found[tier.name, case.name] = oracle(case, truth, terms).rmse_n
             print(f"oracle, tier {tier.name}, {case.name}: {found[tier.name, case.name]:.4f} N", flush=True)
     return found
@@ -125,7 +125,7 @@ def main() -> None:
     jobs = [
         Job(tier, case, law, known, "s_real", seed)
         for tier in tiers
-        for case in CASES
+        for case in PAPER
         for law in given.laws.split(",")
         for known in ("s_sim", "s_real")
         for seed in range(given.seeds)

@@ -16,8 +16,7 @@ import piqp
 from numpy.typing import NDArray
 from scipy.sparse import block_diag, coo_matrix, csc_matrix, eye, hstack, triu, vstack
 
-from gateway.cli.cases import CHANGE_AT_S, DURATION_S, Case
-from gateway.core.messages import SetSpeed
+from gateway.core.scenario import Scenario
 from sim_plant.physics import STEP_S, WebParameters, equilibrium, integrate
 
 FloatArray = NDArray[np.float64]
@@ -58,13 +57,13 @@ class Oracle:
 Solver = Callable[[csc_matrix, FloatArray, csc_matrix, FloatArray, csc_matrix, FloatArray, FloatArray], FloatArray]
 
 
-def oracle(case: Case, plant: WebParameters, terms: Terms, solve: Solver | None = None) -> Oracle:
+def oracle(case: Scenario, plant: WebParameters, terms: Terms, solve: Solver | None = None) -> Oracle:
     """The oracle of `case` on `plant`. `solve` solves the quadratic programmes (default: by piqp)."""
     solve = solve or by_piqp
     n = plant.n
-    before_n, after_n = np.array(case.tension_n), case.setpoints_n(np.array([DURATION_S]))[0]
-    speed, rest = equilibrium(plant, before_n, case.unwind_speed_m_per_s)
-    unwind = case.change.speed_m_per_s if isinstance(case.change, SetSpeed) else case.unwind_speed_m_per_s
+    before_n, after_n = np.array(case.tension_n), np.array(case.tension_end_n)
+    speed, rest = equilibrium(plant, before_n, case.speed_m_per_s)
+    unwind = case.speed_end_m_per_s
     _, wanted = equilibrium(plant, after_n, unwind)
     start = np.concatenate((before_n, speed))
     periods = min(round(LOOKED_AT_S / terms.period_s), LOOKED_AT_PERIODS)
@@ -78,8 +77,8 @@ def oracle(case: Case, plant: WebParameters, terms: Terms, solve: Solver | None 
         error = float(np.sum((tension - after_n) ** 2))
         change, before, iterations = abs(before - error) / error, error, iterations + 1
     total = before + float(np.sum((before_n - after_n) ** 2))  # and the change's own sample
-    samples = round(DURATION_S / STEP_S) + 1
-    assert CHANGE_AT_S + LOOKED_AT_S < DURATION_S
+    samples = round(case.duration_s / STEP_S) + 1
+    assert case.change_at_s + LOOKED_AT_S < case.duration_s
     return Oracle(float(np.sqrt(total / samples)), torque, tension, iterations, change)
 
 

@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from gateway.cli.cases import CASES, DURATION_S
-from gateway.cli.stepped import SteppedResult, run_case
+from gateway.cli.stepped import SteppedResult, run_scenario
 from gateway.control.design import design_lqi, design_pid, task_of
 from gateway.core.line_file import load_line
 from gateway.core.line_template import line_template
+from gateway.core.scenario import PAPER
 from sim_plant.physics import derivative, equilibrium
 from sim_plant.plant import load_plant
 from tests.bench.figures import Bench
@@ -22,11 +22,11 @@ def main() -> None:
     table = {}
     for law, design in (("lqi", design_lqi), ("pid", design_pid)):
         config = design(task_of(line))
-        run_case(line, config, plant, CASES[0], 0)  # compiled and warm
-        for case in CASES:
-            results = [run_case(line, config, plant, case, seed) for seed in SEEDS]
+        run_scenario(line, config, plant, PAPER[0], 0)  # compiled and warm
+        for case in PAPER:
+            results = [run_scenario(line, config, plant, case, seed) for seed in SEEDS]
             table[f"{law} {case.name}"] = results
-    for case in CASES:
+    for case in PAPER:
         rmse = [result.rmse_n for result in table[f"lqi {case.name}"]]
         bench.figure(f"rmse_{case.name}_n", float(np.mean(rmse)), "N", len(rmse))
         bench.figure(f"rmse_{case.name}_p95_n", float(np.percentile(rmse, 95)), "N", len(rmse))
@@ -34,7 +34,7 @@ def main() -> None:
         bench.figure(f"rmse_{case.name}_pid_n", float(np.mean(pid)), "N", len(pid))
     everything = [result for results in table.values() for result in results]
     bench.figure("unsafe_events", sum(result.unsafe_events for result in everything), "", len(everything))
-    speed = [DURATION_S / result.wall_s for result in everything]
+    speed = [result.time_s[-1] / result.wall_s for result in everything]
     bench.figure("faster_than_real_time", float(np.median(speed)), "x", len(speed))
     physics(bench)
     bench.tables["cases"] = {name: row(results) for name, results in table.items()}

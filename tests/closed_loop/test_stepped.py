@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from gateway.cli.cases import CASES, TENSION
-from gateway.cli.stepped import run_case
+from gateway.cli.stepped import run_scenario
 from gateway.control.design import design_lqi, design_pid, task_of
 from gateway.core.messages import Arm, Hold, SelectRecipe, SetSpeed, SetTension, Start, Stop
+from gateway.core.scenario import PAPER, TENSION
 from gateway.core.states import LoopState, Phase
 from tests.closed_loop.conftest import demo_line, real_plant, start, stepped
 
@@ -172,21 +172,21 @@ def _deaf(link):
 def test_the_same_seed_gives_the_same_run_and_another_one_does_not():
     line, plant = demo_line(), real_plant()
     config = design_lqi(task_of(line))
-    runs = [run_case(line, config, plant, TENSION, seed) for seed in (5, 5, 6)]
+    runs = [run_scenario(line, config, plant, TENSION, seed) for seed in (5, 5, 6)]
     assert (runs[0].tension_n == runs[1].tension_n).all() and (runs[0].tension_n != runs[2].tension_n).any()
 
 
-@pytest.mark.parametrize(("case", "reference_n"), [(CASES[0], 2.01), (CASES[1], 1.16)])
+@pytest.mark.parametrize(("case", "reference_n"), [(PAPER[0], 2.01), (PAPER[1], 1.16)])
 def test_lqi_on_the_wrong_model_keeps_the_reference_figures(case, reference_n):
     """Tier A of the benchmark; the reference is an independent study's LQI."""
     line = demo_line()
-    results = [run_case(line, design_lqi(task_of(line)), real_plant(), case, seed) for seed in range(6)]
+    results = [run_scenario(line, design_lqi(task_of(line)), real_plant(), case, seed) for seed in range(6)]
     assert np.mean([result.rmse_n for result in results]) <= 1.05 * reference_n
     assert sum(result.unsafe_events for result in results) == 0
 
 
 def test_pid_holds_both_cases_without_an_unsafe_event():
     line = demo_line()
-    results = [run_case(line, design_pid(task_of(line)), real_plant(), case, 1) for case in CASES]
+    results = [run_scenario(line, design_pid(task_of(line)), real_plant(), case, 1) for case in PAPER]
     assert sum(result.unsafe_events for result in results) == 0
     assert max(result.rmse_n for result in results) < 3.0

@@ -7,11 +7,11 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from gateway.cli.cases import CHANGE_AT_S, DURATION_S, TENSION
-from gateway.cli.stepped import run_case
+from gateway.cli.stepped import run_scenario
 from gateway.control.design import design_lqi, design_pid, task_of
 from gateway.core.messages import SetTension, Stop
 from gateway.core.metrics import rmse_n
+from gateway.core.scenario import TENSION
 from gateway.core.signals import Quality
 from gateway.core.states import Phase
 from gateway.core.telemetry import Frame
@@ -77,10 +77,10 @@ class Case(NamedTuple):
 def case():
     """The tension case from equilibrium on, and some seconds more."""
     with VirtualLine(seed=1) as line:
-        line.begin_in_production(np.array(TENSION.tension_n), TENSION.unwind_speed_m_per_s)
+        line.begin_in_production(np.array(TENSION.tension_n), TENSION.speed_m_per_s)
         begun_s, first = line.world_s(line.now_s) + line.period_s, len(line.frames)
-        line.step(round(CHANGE_AT_S / line.period_s))
-        assert line.command(TENSION.change).ok
+        line.step(round(TENSION.change_at_s / line.period_s))
+        assert all(line.command(command).ok for command in TENSION.commands())
         line.step(CASE_PERIODS - (len(line.frames) - first))
         yield Case(line, begun_s, line.recorded()[first:])
 
@@ -88,10 +88,10 @@ def case():
 def test_the_tension_case_over_the_wires_is_that_of_stepped_time(case):
     recording = case.line.recording()
     time_s = recording.time_s - case.begun_s
-    within = (time_s > 0.0) & (time_s <= DURATION_S)
+    within = (time_s > 0.0) & (time_s <= TENSION.duration_s)
     wired_n = rmse_n(recording.tension_n[within], TENSION.setpoints_n(time_s[within]))
     config = design_lqi(task_of(demo_line()))
-    stepped = [run_case(demo_line(), config, real_plant(), TENSION, seed).rmse_n for seed in range(3)]
+    stepped = [run_scenario(demo_line(), config, real_plant(), TENSION, seed).rmse_n for seed in range(3)]
     assert wired_n == pytest.approx(np.mean(stepped), rel=0.03)
 
 

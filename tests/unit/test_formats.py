@@ -15,6 +15,7 @@ from pydantic import TypeAdapter
 from gateway.cli.demo_result import DemoResult
 from gateway.core.controller import ControllerConfig, parse_controller
 from gateway.core.messages import Command, Event, Reply
+from gateway.core.scenario import Scenario, scenario_of
 from sim_plant.plant import Plant, plant_of
 from tests.bench.figures import BenchResult
 
@@ -29,6 +30,7 @@ def _json(adapter: TypeAdapter[Any]) -> Callable[[bytes], object]:
 FORMATS: dict[str, tuple[TypeAdapter[Any], Callable[[bytes], object], str]] = {
     "controller": (TypeAdapter(ControllerConfig), parse_controller, "json"),
     "plant": (TypeAdapter(Plant), lambda payload: plant_of(tomllib.loads(payload.decode())), "toml"),
+    "scenario": (TypeAdapter(Scenario), lambda payload: scenario_of(tomllib.loads(payload.decode())), "toml"),
     "demo-result": (TypeAdapter(DemoResult), _json(TypeAdapter(DemoResult)), "json"),
     "bench": (TypeAdapter(BenchResult), _json(TypeAdapter(BenchResult)), "json"),
     "command": (TypeAdapter(Command), _json(TypeAdapter(Command)), "json"),

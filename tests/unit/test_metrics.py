@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from gateway.core.line import Priorities
 from gateway.core.metrics import (
     Performance,
-    ScoreWeights,
     effort_n2m2s,
     overshoot_paper_pct,
     overshoot_pct,
@@ -45,6 +45,10 @@ def test_what_never_settles_has_no_settling_time_and_no_score():
     (settling,) = settling_time_s(time, tension, setpoint, 1.0)
     assert settling == np.inf
     found = Performance(1.0, 2.0, float(settling), 3.0, 4.0, 5e-6)
-    assert score(found, ScoreWeights()) == np.inf
+    assert score(found, Priorities()) == np.inf
     settled = Performance(1.0, 2.0, 0.5, 300.0, 4.0, 5e-6)
-    assert score(settled, ScoreWeights(1, 2, 3, 4, 5, 6)) == pytest.approx(1 + 2 * 0.5 + 3 * 2 + 4 * 300 + 5 * 4 + 3e-5)
+    weighed = Priorities(
+        rmse_per_n=1.0, settling_per_s=2.0, overshoot_per_pct=3.0, effort_per_n2m2s=4.0, robustness_per_n=5.0,
+        compute_per_s=6.0,
+    )  # fmt: skip
+    assert score(settled, weighed) == pytest.approx(1 + 2 * 0.5 + 3 * 2 + 4 * 300 + 5 * 4 + 3e-5)

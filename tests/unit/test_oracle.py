@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gateway.cli.cases import CASES
+from gateway.core.scenario import PAPER
 from sim_plant.plant import load_plant
 from tests.bench.oracle import Terms, by_clarabel, by_piqp, oracle, rk4_with_derivative
 
@@ -11,7 +11,7 @@ TIER_A = Terms(0.010, 0.010, 60.0, 1000.0)
 STUDY_N = {"tension": 1.8348, "velocity": 1.0867}
 
 
-@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+@pytest.mark.parametrize("case", PAPER, ids=lambda case: case.name)
 def test_it_is_that_of_an_independent_study(case):
     found = oracle(case, load_plant("sim_plant/plants/s_real.toml").parameters(), TIER_A, by_piqp)
     assert found.rmse_n == pytest.approx(STUDY_N[case.name], rel=5e-3)
@@ -21,7 +21,7 @@ def test_it_is_that_of_an_independent_study(case):
 
 def test_a_second_solver_finds_the_same():
     truth = load_plant("sim_plant/plants/s_sim.toml").parameters()
-    found = [oracle(CASES[1], truth, TIER_A, solve).rmse_n for solve in (by_piqp, by_clarabel)]
+    found = [oracle(PAPER[1], truth, TIER_A, solve).rmse_n for solve in (by_piqp, by_clarabel)]
     assert found[0] == pytest.approx(found[1], rel=1e-6)
 
 
