@@ -7,6 +7,7 @@ import typer
 from pydantic import ValidationError
 
 from gateway.cli import (
+    design_commands,
     doctor_commands,
     fault_commands,
     line_commands,
@@ -34,7 +35,7 @@ app.command(rich_help_panel=ENGINEER)(line_commands.init)
 app.command(rich_help_panel=ENGINEER)(line_commands.check)
 app.add_typer(scan_commands.app, rich_help_panel=ENGINEER)
 app.command(rich_help_panel=ENGINEER)(doctor_commands.doctor)
-app.command(rich_help_panel=ENGINEER)(process_commands.design)
+app.command(rich_help_panel=ENGINEER)(design_commands.design)
 app.command(rich_help_panel=PROCESSES)(process_commands.run)
 app.command(rich_help_panel=PROCESSES)(process_commands.loop)
 app.command(rich_help_panel=PROCESSES)(process_commands.gateway)

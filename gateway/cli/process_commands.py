@@ -52,52 +52,6 @@ def default_data_folder(line: Line) -> Path:
     return (service if access(service, W_OK) else own) / f"{line.site}-{line.line}"
 
 
-def design(
-    file: LineFile,
-    law: Annotated[Literal["lqi", "lqg", "lqr", "mpc", "pid"], typer.Option(help="The control law.")] = "lqi",
-    out: Annotated[Path, typer.Option(help="The file to write; its folder is made.")] = Path("controller.json"),
-) -> None:
-    """Design a controller from the line's nominal model and write its configuration.
-
-    lqi: state feedback with integral action; lqr: without; lqg: on a Kalman observer of torque disturbances; mpc: the
-    same with torque, torque rate and tension as constraints; pid: cascade of speed and tension loops. A loop that
-    would stand less than 4 ms more delay is not offered.
-
-    Example: r2rgate design line.toml --law mpc --out controller.json
-    """
-    from gateway.control import design as designs
-    from gateway.control.design import DesignRefused
-    from gateway.core.controller import canonical, config_hash
-
-    line = read_line(file)
-    make = {
-        "lqi": designs.design_lqi,
-        "lqg": designs.design_lqg,
-        "lqr": designs.design_lqr,
-        "mpc": designs.design_mpc,
-        "pid": designs.design_pid,
-    }
-    try:
-        task = designs.task_of(line)
-        config = make[law](task)
-        margins = designs.margins(config, task)
-        designs.require_margin(margins)
-    except DesignRefused as refused:
-        typer.echo(f"no {law} controller for {file}: {refused}", err=True)
-        raise typer.Exit(REFUSED) from None
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        out.write_bytes(canonical(config) + b"\n")
-    except OSError as error:
-        _refuse(f"--out {out} cannot be written: {error.strerror}; name a file in a folder that you may write")
-    spans = f"{line.n} span{'' if line.n == 1 else 's'}"
-    typer.echo(f"{out}: {law} for {spans} at {line.control.period_s * 1e3:g} ms, hash {config_hash(config)[:12]}")
-    typer.echo(
-        f"stands {1e3 * margins.delay_margin_s:.1f} ms more delay; slowest mode {1.0 / margins.decay_per_s:.2f} s; "
-        f"noise moves the torque by {margins.chatter_nm:.2f} Nm from period to period"
-    )
-
-
 def loop(
     file: LineFile,
     controller: ControllerFile = None,

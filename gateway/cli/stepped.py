@@ -4,15 +4,13 @@ import time
 from collections.abc import Awaitable
 from dataclasses import dataclass, field
 from math import ceil
-from typing import Generic, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
 from drivers.memory import MemoryLink
-from gateway.control.deviation import Measured
-from gateway.control.law import Decision, Law
+from gateway.cli.timed_law import TimedLaw
 from gateway.control.laws import make_law, untimed
-from gateway.control.reference import Reference
 from gateway.core.controller import Controller
 from gateway.core.line import Line, Recipe
 from gateway.core.messages import Arm, Command, Reply
@@ -31,7 +29,6 @@ from sim_plant.plant import Plant
 from sim_plant.stepped import SteppedLine
 
 T = TypeVar("T")
-State = TypeVar("State")
 
 
 @dataclass
@@ -101,31 +98,6 @@ class SteppedLoop:
             self.alarms += [(self.now_s, finding) for finding in findings]
         else:
             self.transitions.append((self.now_s, after.phase, after.reason))
-
-
-class TimedLaw(Generic[State]):
-    """A law that notes what each step has taken: asking and committing, on this computer."""
-
-    def __init__(self, law: Law[State]) -> None:
-        self.n = law.n
-        self.step_s: list[float] = []
-        self._law = law
-        self._asking_s = 0.0
-
-    def engage(self, measured: Measured, reference: Reference, applied_nm: FloatArray) -> State:
-        return self._law.engage(measured, reference, applied_nm)
-
-    def ask(self, state: State, measured: Measured, reference: Reference) -> Decision:
-        began_s = time.perf_counter()
-        decision = self._law.ask(state, measured, reference)
-        self._asking_s = time.perf_counter() - began_s
-        return decision
-
-    def commit(self, state: State, decision: Decision, applied_nm: FloatArray) -> State:
-        began_s = time.perf_counter()
-        following = self._law.commit(state, decision, applied_nm)
-        self.step_s.append(self._asking_s + time.perf_counter() - began_s)
-        return following
 
 
 @dataclass(frozen=True)

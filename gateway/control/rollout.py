@@ -153,7 +153,7 @@ def simulate_slowly(
     tensions, torques = np.empty((2, plants.count, course.periods, plants.n))
     for b in range(plants.count):
         law = make_law(untimed(config))
-        tensions[b], torques[b] = _one(law, plants.model(b), course, setup, samples, moved)
+        tensions[b], torques[b] = run_law(law, plants.model(b), course, setup, samples, moved)
     return rollouts_of(tensions, torques, course, setup, record=record)
 
 
@@ -210,10 +210,10 @@ def limited(setup: Setup, asked_nm: FloatArray, before_nm: FloatArray) -> FloatA
     return np.minimum(np.maximum(held, before_nm - reach), before_nm + reach)
 
 
-def _one(
+def run_law(
     law: Law[Any], model: WebModel, course: Course, setup: Setup, samples: FloatArray, moved: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Tensions and torques (k, n) of one plant."""
+    """Tensions and torques (k, n) of one plant, with noise as `Setup.draw` gives it."""
     n = model.n
     alone = plants_of([model])
     (state,), (applied,) = start(alone, course)

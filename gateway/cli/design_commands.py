@@ -1,0 +1,152 @@
+"""`design`: phase 1 of a line, from its file to a configuration, with everything that led to it."""
+
+import json
+import time
+from enum import StrEnum
+from os import W_OK, access
+from pathlib import Path
+from typing import Annotated, NoReturn
+
+import typer
+
+from gateway.cli.process_commands import REFUSED, LineFile, read_line
+from gateway.core.line import Line
+
+
+class LawName(StrEnum):
+    """Architectures that a controller can have."""
+
+    PID = "pid"
+    LQR = "lqr"
+    LQI = "lqi"
+    LQG = "lqg"
+    MPC = "mpc"
+
+
+def design(
+    file: LineFile,
+    law: Annotated[
+        list[LawName] | None, typer.Option(help="Only this architecture; repeatable. Without: all five.")
+    ] = None,
+    out: Annotated[Path, typer.Option(help="The configuration to write; its folder is made.")] = Path(
+        "controller.json"
+    ),
+    scenario: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="What to tune for: tension, velocity, or a TOML file; repeatable. Without: the largest steps."
+        ),
+    ] = None,
+    iterations: Annotated[
+        int, typer.Option(min=0, max=50, help="Attempts after the first guess, per architecture.")
+    ] = 50,
+    untuned: Annotated[
+        bool, typer.Option("--untuned", help="The first guess of one --law as it is, without any simulation.")
+    ] = False,
+    seed: Annotated[int, typer.Option(min=0, help="Of the noise, and of the lines within the tolerances.")] = 0,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+) -> None:
+    """Design a controller: tune each architecture on the line's model, compare, choose, and say why.
+
+    Candidates run on the nominal model and on lines within its tolerances. One that would stand less than 4 ms more
+    delay, or leave the tension limits, is not offered. Weights of the score: [priorities] of the line's file. Beside
+    OUT lie OUT's .design.json (every attempt with its reason) and .design.html (the report). About three minutes.
+
+    Exit code: 0 written, 2 refused.
+
+    Example: r2rgate design line.toml --out controller.json
+
+    Example, in a second: r2rgate design line.toml --law lqi --untuned
+    """
+    from gateway.control.design import DesignRefused
+
+    line = read_line(file)
+    names = list(dict.fromkeys(one.value for one in law or LawName))
+    _may_write(out)
+    try:
+        if untuned:
+            _first_guess(line, names, out, as_json)
+        else:
+            _phase(line, names, scenario or [], iterations, seed, out, as_json)
+    except DesignRefused as refused:
+        _refuse(f"no controller for {file}: {refused}")
+
+
+def _first_guess(line: Line, names: list[str], out: Path, as_json: bool) -> None:
+    from gateway.commissioning.architectures import ARCHITECTURES
+    from gateway.control.design import margins, require_margin, task_of
+    from gateway.core.controller import canonical, config_hash
+
+    if len(names) != 1:
+        _refuse("--untuned compares nothing: name one architecture with --law")
+    architecture, task = ARCHITECTURES[names[0]], task_of(line)
+    config = architecture.design(task, architecture.first())
+    found = margins(config, task)
+    require_margin(found)
+    out.write_bytes(canonical(config) + b"\n")
+    if as_json:
+        typer.echo(json.dumps({"controller": config_hash(config), "out": str(out), **vars(found)}))
+        return
+    spans = f"{line.n} span{'' if line.n == 1 else 's'}"
+    typer.echo(
+        f"{out}: {names[0]} for {spans} at {line.control.period_s * 1e3:g} ms, hash {config_hash(config)[:12]}\n"
+        f"stands {1e3 * found.delay_margin_s:.1f} ms more delay; slowest mode {1.0 / found.decay_per_s:.2f} s; "
+        f"noise moves the torque by {found.chatter_nm:.2f} Nm from period to period"
+    )
+
+
+def _phase(
+    line: Line, names: list[str], given: list[str], iterations: int, seed: int, out: Path, as_json: bool
+) -> None:
+    from gateway.cli.design_phase import run_design
+    from gateway.cli.design_progress import Progress
+    from gateway.cli.design_report import page_of
+    from gateway.cli.design_result import result_of
+    from gateway.cli.design_table import print_design
+    from gateway.cli.report.page_render import render_page
+    from gateway.cli.scenarios import load_scenario
+    from gateway.commissioning.suite import suite_of
+    from gateway.core.controller import canonical
+    from gateway.core.scenario import ScenarioRefused
+
+    try:
+        scenarios = [load_scenario(one) for one in given] or suite_of(line)
+    except ScenarioRefused as refused:
+        _refuse(f"--scenario: {refused}")
+    began_s = time.monotonic()
+    with Progress(names, iterations, quiet=as_json) as progress:
+        found = run_design(line, scenarios, names, iterations, seed, progress.attempted)
+    result = result_of(line, found, seed)
+    record, report = out.with_suffix(".design.json"), out.with_suffix(".design.html")
+    record.write_text(result.model_dump_json(indent=2) + "\n", encoding="utf-8")
+    report.write_text(render_page(page_of(result, found)), encoding="utf-8")
+    if found.chosen is not None and found.chosen.config is not None:
+        out.write_bytes(canonical(found.chosen.config) + b"\n")
+    if as_json:
+        typer.echo(result.model_dump_json(indent=2))
+    else:
+        print_design(result, time.monotonic() - began_s)
+        typer.echo(f"record: {record}\nreport: {report}")
+    if found.chosen is None:
+        _refuse(f"{out} is not written: no architecture can be offered")
+    elif not as_json:
+        typer.echo(
+            f"configuration: {out}, hash {result.controller[:12]}; try it with: r2rgate run LINE --controller {out}"
+        )
+
+
+def _may_write(out: Path) -> None:
+    """Known before minutes of work, not after them."""
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        why = "" if access(out if out.exists() else out.parent, W_OK) else "Permission denied"
+        why = "it is a folder" if out.is_dir() else why
+    except OSError as error:
+        why = str(error.strerror)
+    if why:
+        _refuse(f"--out {out} cannot be written: {why}; name a file in a folder that you may write")
+
+
+def _refuse(message: str) -> NoReturn:
+    typer.echo(message, err=True)
+    raise typer.Exit(REFUSED)

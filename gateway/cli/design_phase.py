@@ -1,0 +1,169 @@
+"""Phase 1 of a line, composed: algorithm 1 for each architecture in workers, then the comparison and the choice."""
+
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor, wait
+from dataclasses import dataclass
+from multiprocessing import get_context
+from multiprocessing.queues import SimpleQueue
+from statistics import median
+from threading import Thread
+
+import numpy as np
+
+from gateway.cli.timed_law import TimedLaw
+from gateway.commissioning.architectures import ARCHITECTURES
+from gateway.commissioning.assessment import Assessment, assess
+from gateway.commissioning.ground import Ground, ground_of
+from gateway.commissioning.records import Attempt, Trial
+from gateway.commissioning.search import PatternSearch
+from gateway.commissioning.selection import Candidate, candidate, explanation, ranked
+from gateway.commissioning.trial import trial_of
+from gateway.commissioning.tuning import Tuned, tune
+from gateway.control.design import DesignRefused, margins
+from gateway.control.laws import make_law, untimed
+from gateway.control.rollout import run_law, simulate
+from gateway.core.controller import Controller, config_hash
+from gateway.core.line import Line
+from gateway.core.scenario import Scenario
+from gateway.core.signals import FloatArray
+
+BOX_PLANTS = 8  #: within the tolerances, beside the nominal model, for every final figure
+PLANTS_TUNED_ON = {"mpc": 3}  #: in all; others on all of them: they cost a thousandth
+LEAD_S, WATCHED_S = 0.2, 5.2  #: of each scenario while tuning: before the change, and in all
+
+Told = tuple[str, Attempt]  #: architecture, and what was tried with it
+_told: "SimpleQueue[Told | None]"  #: of a worker
+
+
+@dataclass(frozen=True)
+class Trace:
+    """What a candidate did on the nominal model: tensions and torques (k, n) at `time_s` (k,)."""
+
+    time_s: FloatArray
+    setpoint_n: FloatArray
+    tension_n: FloatArray
+    torque_nm: FloatArray
+
+
+@dataclass(frozen=True)
+class Finished:
+    """What a worker hands back for one architecture."""
+
+    architecture: str
+    tuned: Tuned
+    config: Controller | None
+    trial: Trial | None
+    refused: str
+    traces: dict[str, Trace]  #: by scenario
+
+
+@dataclass(frozen=True)
+class Design:
+    """The outcome of phase 1."""
+
+    assessment: Assessment
+    ground: Ground
+    finished: list[Finished]
+    candidates: list[Candidate]  #: ranked
+    explanation: list[str]
+
+    @property
+    def chosen(self) -> Finished | None:
+        """C*; None: nothing can be offered."""
+        best = self.candidates[0]
+        if best.score is None:
+            return None
+        return next(one for one in self.finished if one.architecture == best.architecture)
+
+
+def run_design(
+    line: Line,
+    scenarios: Sequence[Scenario],
+    names: Sequence[str],
+    iterations: int,
+    seed: int,
+    on_attempt: Callable[[str, Attempt], None],
+) -> Design:
+    """Tune, compare, choose. Raises DesignRefused where no design can begin."""
+    ground = ground_of(line, scenarios, BOX_PLANTS, seed)
+    assessment = assess(line, ground.task)
+    finished = _tuned_in_workers(ground, names, iterations, on_attempt)
+    candidates = ranked([_candidate(one, ground, line) for one in finished])
+    return Design(assessment, ground, finished, candidates, explanation(candidates))
+
+
+def _tuned_in_workers(
+    ground: Ground, names: Sequence[str], iterations: int, on_attempt: Callable[[str, Attempt], None]
+) -> list[Finished]:
+    context = get_context("spawn")
+    told: SimpleQueue[Told | None] = context.SimpleQueue()
+
+    def listen() -> None:
+        while (heard := told.get()) is not None:
+            on_attempt(*heard)
+
+    listener = Thread(target=listen, daemon=True)
+    listener.start()
+    try:
+        workers = min(len(names), os.cpu_count() or 1)
+        with ProcessPoolExecutor(workers, context, _begin_worker, (told,)) as pool:
+            # The slowest first: the others fill the gaps.
+            order = sorted(names, key=lambda name: name not in PLANTS_TUNED_ON)
+            running: dict[str, Future[Finished]] = {
+                name: pool.submit(finish_architecture, name, ground, iterations) for name in order
+            }
+            wait(running.values())
+            return [running[name].result() for name in names]
+    finally:
+        told.put(None)
+        listener.join()
+
+
+def _begin_worker(told: "SimpleQueue[Told | None]") -> None:
+    import numba
+
+    global _told
+    _told = told
+    numba.set_num_threads(1)  # the workers share the processors as it is
+
+
+def finish_architecture(name: str, ground: Ground, iterations: int) -> Finished:
+    """Algorithm 1 on one architecture, and its best on the whole ground."""
+    architecture = ARCHITECTURES[name]
+    plants = PLANTS_TUNED_ON.get(name, len(ground.models))
+    small = ground.shortened(plants, LEAD_S, WATCHED_S)
+    tuned = tune(
+        architecture, small, PatternSearch(), iterations, on_attempt=lambda attempt: _told.put((name, attempt))
+    )
+    try:
+        config = tuned.config(architecture, ground)
+    except DesignRefused as refused:
+        return Finished(name, tuned, None, None, str(refused), {})
+    runs = [simulate(config, ground.plants, course, ground.setup, record=True) for course in ground.courses]
+    traces: dict[str, Trace] = {}
+    for scenario, course, run in zip(ground.scenarios, ground.courses, runs, strict=True):
+        time_s: FloatArray = ground.setup.period_s * np.arange(course.periods, dtype=np.float64)
+        traces[scenario.name] = Trace(time_s, course.tension_n, run.tension_n[0], run.torque_nm[0])
+    return Finished(name, tuned, config, trial_of(ground, margins(config, ground.task), runs), "", traces)
+
+
+def step_time_s(config: Controller, ground: Ground) -> float:
+    """Median time that a step of the law takes in this process, over the ground's first scenario."""
+    law, course, setup = TimedLaw(make_law(untimed(config))), ground.courses[0], ground.setup
+    run_law(law, ground.models[0], course, setup, *setup.draw(course.periods, ground.task.n))
+    return median(law.step_s)
+
+
+def _candidate(one: Finished, ground: Ground, line: Line) -> Candidate:
+    architecture, best = ARCHITECTURES[one.architecture], one.tuned.best
+    return candidate(
+        architecture.name,
+        architecture.title,
+        best.values if best else architecture.first(),
+        config_hash(one.config) if one.config else "",
+        one.trial,
+        step_time_s(one.config, ground) if one.config else None,
+        one.refused,
+        line.priorities,
+    )

@@ -1,0 +1,42 @@
+"""Phase 1 while it works: a bar per architecture, with the cost of the best so far."""
+
+from types import TracebackType
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, TaskID, TextColumn
+from rich.progress import Progress as Bars
+
+from gateway.commissioning.records import Attempt
+
+
+class Progress:
+    """Lines of plain text where the output is no terminal; nothing at all when quiet."""
+
+    def __init__(self, names: list[str], iterations: int, quiet: bool) -> None:
+        console = Console(stderr=True, quiet=quiet, highlight=False)
+        self._console = console
+        self._bars = Bars(
+            TextColumn("{task.fields[law]:4}"), BarColumn(24), MofNCompleteColumn(), TextColumn("{task.fields[told]}"),
+            console=console, disable=not console.is_terminal,
+        )  # fmt: skip
+        self._tasks: dict[str, TaskID] = {
+            name: self._bars.add_task(name, total=iterations + 1, law=name, told="waiting") for name in names
+        }
+        self._best: dict[str, float] = {}
+
+    def __enter__(self) -> "Progress":
+        self._bars.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._bars.stop()
+
+    def attempted(self, name: str, attempt: Attempt) -> None:
+        if attempt.accepted and attempt.cost_n2s is not None:
+            self._best[name] = attempt.cost_n2s
+        best = f"J {self._best[name]:.2f} N2s" if name in self._best else f"not yet: {attempt.refused[:40]}"
+        self._bars.update(self._tasks[name], completed=attempt.number + 1, told=best)
+        if not self._console.is_terminal and (attempt.accepted or attempt.number == 0):
+            self._console.print(f"{name} {attempt.number}: {best}", markup=False)

@@ -1,0 +1,136 @@
+"""Phase 1 as a page: the choice first, then the comparison, the courses, and every attempt with its reason."""
+
+import numpy as np
+
+from gateway.cli.design_phase import Design, Finished
+from gateway.cli.design_result import DesignResult, TuningResult
+from gateway.cli.design_table import cells
+from gateway.cli.report.page import Chart, Page, Section, Series, Table
+from gateway.commissioning.architectures import ARCHITECTURES
+from gateway.commissioning.selection import TERMS
+from gateway.core.scenario import Scenario
+from gateway.core.signals import FloatArray
+
+HEADS = (
+    "Law", "RMSE, N", "t_s, s", "Overshoot, %", "Effort, (Nm)² s", "R, N", "Step, µs", "Delay margin, ms", "J, N² s",
+    "S",
+)  # fmt: skip
+
+
+def page_of(result: DesignResult, found: Design) -> Page:
+    """`render_page` makes the page of it."""
+    return Page(
+        title=f"Controller design: {result.chosen or 'none offered'}",
+        origin=f"Line {result.line}",
+        when=result.date,
+        command=result.command,
+        versions=result.versions,
+        machine=result.machine,
+        answer=tuple(result.explanation),
+        sections=(
+            Section("The line", tuple(result.assessment.sentences)),
+            _comparison(result),
+            *(_courses(scenario, found) for scenario in result.scenarios),
+            _tuning(result),
+            *(_attempts(one) for one in result.tuning),
+        ),
+        notes=(
+            f"Candidates run on the nominal model and on {result.plants} lines drawn evenly from the tolerances in the "
+            "line's file (MPC is tuned on fewer of them), with noise, torque limits and latency. RMSE, settling time, "
+            "overshoot and effort are those of the nominal model; R is how far any of the other lines is from it at "
+            "any time.",
+            "J is the integral of the squared tension error and of the squared torque times 1e-5, summed over the "
+            "scenarios, in the mean over all these lines. Tuning lowers J; the choice among architectures is by S.",
+        ),
+    )
+
+
+def _comparison(result: DesignResult) -> Section:
+    rows = tuple((ARCHITECTURES[one.architecture].title, *cells(one)[1:]) for one in result.candidates)
+    scored = [one for one in result.candidates if one.score is not None]
+    parts = tuple((one.architecture, *(f"{part:.3f}" for part in one.terms), f"{one.score:.3f}") for one in scored)
+    weights = ", ".join(f"{name} {value:g}" for name, value in result.priorities.model_dump().items())
+    return Section(
+        "Comparison",
+        (),
+        (
+            Table("Each architecture at its best. The first is chosen.", HEADS, rows, frozenset(range(1, len(HEADS)))),
+            Table(
+                "What the scores are made of: each metric times its weight.",
+                ("Law", *(term.capitalize() for term in TERMS), "S"),
+                parts,
+                frozenset(range(1, len(TERMS) + 2)),
+                note=f"Weights: {weights}.",
+            ),
+        ),
+    )
+
+
+def _courses(scenario: Scenario, found: Design) -> Section:
+    """Tension and torque of the span that is moved most, every law under the same noise."""
+    with_traces = [one for one in found.finished if scenario.name in one.traces]
+    span = _moved_most(scenario, with_traces)
+    number = span + 1
+    charts: list[Chart] = []
+    if with_traces:
+        first = with_traces[0].traces[scenario.name]
+        tensions = [Series(one.architecture, one.traces[scenario.name].tension_n[:, span]) for one in with_traces]
+        torques = [Series(one.architecture, one.traces[scenario.name].torque_nm[:, span]) for one in with_traces]
+        setpoint = Series("set-point", first.setpoint_n[:, span], dashed=True)
+        charts.append(Chart(f"Tension of span {number}", "N", first.time_s, (*tensions, setpoint)))
+        charts.append(Chart(f"Torque of roller {number}", "Nm", first.time_s, tuple(torques)))
+    return Section(scenario.heading, (scenario.description,) if scenario.description else (), (), tuple(charts))
+
+
+def _moved_most(scenario: Scenario, finished: list[Finished]) -> int:
+    """The span with the greatest step; where none steps, the one that strays furthest."""
+    steps = np.abs(np.subtract(scenario.tension_end_n, scenario.tension_n))
+    if steps.any() or not finished:
+        return int(np.argmax(steps))
+    strayed = [
+        np.abs(one.traces[scenario.name].tension_n - one.traces[scenario.name].setpoint_n).max(axis=0)
+        for one in finished
+    ]
+    return int(np.argmax(np.max(strayed, axis=0)))
+
+
+def _tuning(result: DesignResult) -> Section:
+    most = max((len(one.history) for one in result.tuning), default=1)
+    series = tuple(Series(one.architecture, _best_so_far(one, most)) for one in result.tuning)
+    chart = Chart(
+        "Cost of the best so far", "N² s", np.arange(most, dtype=np.float64), series, x_label="Attempt", log_y=True
+    )
+    said = tuple(
+        f"{one.architecture}: {len(one.history)} attempts, "
+        + ("until nothing better was to be expected." if one.converged else "as many as allowed.")
+        for one in result.tuning
+    )
+    return Section("Tuning", said, (), (chart,) if most > 1 else ())
+
+
+def _best_so_far(one: TuningResult, most: int) -> FloatArray:
+    costs = np.full(most, np.nan)
+    best = np.nan
+    for attempt in one.history:
+        if attempt.accepted and attempt.cost_n2s is not None:
+            best = attempt.cost_n2s
+        costs[attempt.number] = best
+    costs[len(one.history) :] = best
+    return costs
+
+
+def _attempts(one: TuningResult) -> Section:
+    knobs = [knob.name for knob in ARCHITECTURES[one.architecture].knobs]
+    rows = tuple(
+        (
+            str(attempt.number),
+            *(f"{attempt.values[name]:g}" if name in attempt.values else "-" for name in knobs),
+            "-" if attempt.trial is None or attempt.trial.cost_n2s is None else f"{attempt.trial.cost_n2s:.2f}",
+            "accepted" if attempt.accepted else attempt.refused or "not better",
+            attempt.reason,
+        )
+        for attempt in one.history
+    )
+    numeric = frozenset(range(len(knobs) + 2))
+    table = Table("Every attempt.", ("No.", *knobs, "J, N² s", "Verdict", "Reason"), rows, numeric)
+    return Section(f"Attempts: {one.architecture}", (), (table,))

@@ -1,0 +1,50 @@
+"""Phase 1 on the terminal: the comparison as a table that fits 80 columns, then the reasons."""
+
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+
+from gateway.cli.design_result import DesignResult
+from gateway.commissioning.selection import Candidate
+
+COLUMNS = ("law", "RMSE N", "t_s s", "OS %", "effort", "R N", "us", "delay ms", "J N2s", "S")
+
+
+def print_design(result: DesignResult, took_s: float) -> None:
+    console = Console(highlight=False)
+    for sentence in result.assessment.sentences:
+        console.print(sentence, markup=False, soft_wrap=True)
+    table = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
+    for name in COLUMNS:
+        table.add_column(name, justify="left" if name == "law" else "right", no_wrap=True)
+    for candidate in result.candidates:
+        table.add_row(*cells(candidate), style="bold" if candidate.architecture == result.chosen else "")
+    console.print(table)
+    for sentence in result.explanation:
+        console.print(sentence, markup=False, soft_wrap=True)
+    attempts = sum(len(one.history) for one in result.tuning)
+    console.print(
+        f"{attempts} attempts on the nominal model and up to {result.plants} lines within the tolerances, "
+        f"{took_s:.0f} s. RMSE, t_s, OS, effort: nominal model; R: worst of the tolerances.",
+        soft_wrap=True,
+    )
+
+
+def cells(candidate: Candidate) -> list[str]:
+    """A row of the comparison; a dash for what there is not."""
+    trial = candidate.trial
+    if trial is None:
+        return [candidate.architecture, *["-"] * (len(COLUMNS) - 1)]
+    rmse = sum(trial.rmse_n.values()) / len(trial.rmse_n)
+    return [
+        candidate.architecture,
+        f"{rmse:.3f}",
+        "never" if trial.settling_s is None else f"{trial.settling_s:.2f}",
+        f"{trial.overshoot_pct:.1f}",
+        f"{trial.effort_n2m2s:.0f}",
+        "-" if trial.robustness_n is None else f"{trial.robustness_n:.1f}",
+        "-" if candidate.compute_s is None else f"{1e6 * candidate.compute_s:.0f}",
+        f"{1e3 * trial.delay_margin_s:.1f}",
+        "-" if trial.cost_n2s is None else f"{trial.cost_n2s:.1f}",
+        "-" if candidate.score is None else f"{candidate.score:.3f}",
+    ]

@@ -1,0 +1,1 @@
+"""Commissioning: the phases, their algorithms, and the rule policy that decides when nobody else does. Pure."""

@@ -1,0 +1,99 @@
+"""Before any design: how fast the line is, how its spans hang together, and whether a linear model is enough."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from gateway.control.design import DesignTask
+from gateway.control.design.sampling import with_dead_time
+from gateway.control.design.task import linear
+from gateway.core.line import Line, NonNegative, Strict
+from gateway.core.signals import FloatArray
+from gateway.core.web_model import equilibrium_torque, reference_speeds
+
+STRAIN = 0.1  #: beyond it the products T v of the web equation are no small correction
+MODES_MOVE = 0.3  #: beyond it one set of gains for all speeds is a compromise
+COUPLED = 0.3  #: of a torque's effect on its own span: beyond it loops that are tuned one by one fight each other
+
+
+class Assessment(Strict):
+    """Figures of the nominal model at the design point, and what follows for the choice of a controller."""
+
+    fastest_s: NonNegative  #: time constant of the fastest mode
+    slowest_s: NonNegative  #: of the slowest; 1e9 stands for a web at rest, which does not forget by itself
+    dead_time_s: NonNegative  #: from a sample to the middle of the time for which its torque acts
+    coupling: NonNegative  #: what a torque does to a neighbouring span's tension, of what it does to its own
+    strain: NonNegative  #: greatest permitted tension over E A: the relative size of the nonlinear terms
+    modes_move: NonNegative  #: change of the sampled dynamics between standstill and greatest speed, relative
+    torque_use: NonNegative  #: of the limit, needed to hold the first recipe at the greatest speed
+    linearised: bool
+    schedule: bool
+    sentences: list[str]
+
+
+def assess(line: Line, task: DesignTask) -> Assessment:
+    """The assessment of a line with its design task."""
+    A, _ = linear(task)
+    rates = -np.linalg.eigvals(A).real
+    fastest_s = 1.0 / float(rates.max())
+    slowest_s = 1.0 / max(float(rates.min()), 1e-9)
+    dead_time_s = task.latency_s + 0.5 * task.period_s
+    coupling = _coupling(task, 0.5 / dead_time_s)
+    strain = line.limits.tension_max_n / task.model.stiffness_n
+    modes_move = _modes_move(task, line.limits.speed_max_m_per_s)
+    speeds = reference_speeds(task.model, task.tension_n, line.limits.speed_max_m_per_s)
+    torque_use = float(np.abs(equilibrium_torque(task.model, task.tension_n, speeds)).max()) / line.limits.torque_nm
+    found = Assessment(
+        fastest_s=fastest_s, slowest_s=slowest_s, dead_time_s=dead_time_s, coupling=coupling, strain=strain,
+        modes_move=modes_move, torque_use=torque_use, linearised=strain <= STRAIN, schedule=modes_move > MODES_MOVE,
+        sentences=[],
+    )  # fmt: skip
+    return found.model_copy(update={"sentences": _sentences(found, line.limits.speed_max_m_per_s)})
+
+
+def _sentences(found: Assessment, speed_m_per_s: float) -> list[str]:
+    short = found.dead_time_s < 0.5 * found.fastest_s
+    pace = "short beside them" if short else "as long as the fastest of them: it sets the pace"
+    together = "the spans must be controlled together" if found.coupling > COUPLED else "single spans hardly meet"
+    linearised = "designs take the model linearised at the operating point, simulation and feed-forward the full one"
+    rough = "a linear design is a rough guide here, and what simulation of the full model says is what counts"
+    follow = "gains should follow the speed" if found.schedule else "one set of gains serves all speeds"
+    meet = ": large steps meet it, and MPC alone knows of it beforehand" if found.torque_use > 0.5 else ""
+    return [
+        f"The line's own modes take from {found.fastest_s:.3g} to {found.slowest_s:.3g} s; the dead time of "
+        f"{1e3 * found.dead_time_s:.3g} ms is {pace}.",
+        f"Within the bandwidth in reach a torque that moves its own span by 1 N moves another by "
+        f"{found.coupling:.2f} N: {together}.",
+        f"Tension reaches {100.0 * found.strain:.2g} % of E A, which is the size of the nonlinear terms: "
+        f"{linearised if found.linearised else rough}.",
+        f"From standstill to {speed_m_per_s:g} m/s the sampled dynamics change by {100.0 * found.modes_move:.2g} %: "
+        f"{follow}.",
+        f"Holding the first recipe at that speed takes {100.0 * found.torque_use:.0f} % of the torque limit{meet}.",
+    ]
+
+
+def _coupling(task: DesignTask, rad_per_s: float) -> float:
+    """max |G_ji| / |G_ii|, j != i, from torques to tensions at a frequency, without draw spans."""
+    A, B = linear(task)
+    spans = task.tension_spans
+    if len(spans) < 2:
+        return 0.0
+    gain = np.abs(np.linalg.solve(1j * rad_per_s * np.eye(len(A)) - A, B)[np.ix_(spans, spans)])
+    own = gain.diagonal()
+    return float(((gain - np.diag(own)) / own).max())
+
+
+def _modes_move(task: DesignTask, fastest_m_per_s: float) -> float:
+    """||F(v_max) - F(0)|| / ||F(v_max) - I||, F the state's transition over the time that a controller looks at."""
+
+    def transition(speed_m_per_s: float) -> FloatArray:
+        A, B = linear(replace(task, unwind_speed_m_per_s=speed_m_per_s))
+        return with_dead_time(A, B, 10.0 * task.period_s, 0.0).transition
+
+    fast = transition(fastest_m_per_s)
+    # Speeds in units in which they weigh as much as the tensions that they cause.
+    n = task.n
+    scale = np.concatenate((np.ones(n), np.full(n, task.model.stiffness_n / float(np.mean(task.model.length_m)))))
+    moved = scale[:, None] * (fast - transition(0.0)) / scale
+    whole = scale[:, None] * (fast - np.eye(2 * n)) / scale
+    return float(np.linalg.norm(moved) / np.linalg.norm(whole))

@@ -1,0 +1,136 @@
+"""What candidates are tried on: scenarios, the nominal model, and plants of the box in which the truth may lie."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from math import ceil
+
+import numpy as np
+
+from gateway.control.design import DesignRefused, DesignTask, task_of
+from gateway.control.design.margins import LEAST_DELAY_MARGIN_S
+from gateway.control.design.task import linear
+from gateway.control.rollout import Course, Plants, Setup, plants_of
+from gateway.core.line import Line, Parameter
+from gateway.core.scenario import Scenario
+from gateway.core.signals import FloatArray
+from gateway.core.web_model import WebModel, equilibrium_torque, reference_speeds
+
+MOST_DRAWS = 200  #: per plant of the box, until one is found that can be held
+FASTEST_MODE = 0.5  #: of an integration step, as |eigenvalue| times its length
+MOST_SUBSTEPS = 50
+
+
+@dataclass(frozen=True)
+class Ground:
+    task: DesignTask
+    scenarios: tuple[Scenario, ...]
+    models: tuple[WebModel, ...]  #: the nominal one first
+    setup: Setup
+    least_margin_s: float = LEAST_DELAY_MARGIN_S
+
+    @cached_property
+    def plants(self) -> Plants:
+        return plants_of(list(self.models))
+
+    @cached_property
+    def courses(self) -> tuple[Course, ...]:
+        return tuple(course_of(scenario, self.task.period_s) for scenario in self.scenarios)
+
+    def shortened(self, plants: int, lead_s: float, duration_s: float) -> "Ground":
+        """The same with so many plants, at most `lead_s` before each change and at most `duration_s` in all."""
+
+        def shorter(scenario: Scenario) -> Scenario:
+            lead = min(lead_s, scenario.change_at_s)
+            end = min(duration_s, scenario.duration_s)
+            return scenario.model_copy(update={"change_at_s": lead, "duration_s": end})
+
+        return replace(self, scenarios=tuple(map(shorter, self.scenarios)), models=self.models[:plants])
+
+
+def ground_of(line: Line, scenarios: Sequence[Scenario], plants: int, seed: int) -> Ground:
+    """The ground of a line: its nominal model, and `plants` more within its tolerances.
+
+    Raises DesignRefused where a scenario does not fit the line, or hardly any plant of the box can be held.
+    """
+    reasons = [reason for scenario in scenarios for reason in scenario.reasons_against(line.n, line.limits)]
+    if reasons:
+        raise DesignRefused("; ".join(reasons))
+    task = task_of(line)
+    latency_s, substeps = _stepping(task)
+    setup = Setup(
+        task.period_s, latency_s, substeps, torque_nm=line.limits.torque_nm,
+        torque_rate_nm_per_s=line.limits.torque_rate_nm_per_s, tension_noise_n=task.noise.tension_n,
+        speed_noise_m_per_s=task.noise.speed_m_per_s, acceleration_m_per_s1_5=task.noise.acceleration_m_per_s1_5,
+        seed=seed,
+    )  # fmt: skip
+    models = (task.model, *box_models(line, scenarios, plants, seed))
+    return Ground(task, tuple(scenarios), models, setup)
+
+
+def box_models(line: Line, scenarios: Sequence[Scenario], count: int, seed: int) -> list[WebModel]:
+    """Models drawn evenly from the tolerances, every roller and span by itself.
+
+    Those that the drives could not hold at an end of the scenarios are left out: there nobody could. Raises
+    DesignRefused where too few remain.
+    """
+    generator = np.random.default_rng(seed)
+
+    def drawn(*parameters: Parameter) -> FloatArray:
+        value, tolerance = np.array([[p.value, p.tolerance] for p in parameters]).T
+        return value * (1.0 + tolerance * generator.uniform(-1.0, 1.0, len(value)))
+
+    found: list[WebModel] = []
+    for _ in range(MOST_DRAWS * count):
+        if len(found) == count:
+            break
+        model = WebModel(
+            float(drawn(line.web.stiffness_n)[0]),
+            drawn(*(span.length_m for span in line.spans)),
+            drawn(*(roller.radius_m for roller in line.rollers)),
+            drawn(*(roller.inertia_kg_m2 for roller in line.rollers)),
+            drawn(*(roller.friction_nms_per_rad for roller in line.rollers)),
+            line.web.tension_before_n,
+            line.web.tension_after_n,
+        )
+        if all(_can_be_held(model, scenario, line.limits.torque_nm) for scenario in scenarios):
+            found.append(model)
+    if len(found) < count:
+        raise DesignRefused(
+            f"of {MOST_DRAWS * count} lines within the tolerances only {len(found)} can be held by "
+            f"{line.limits.torque_nm:g} Nm: narrower tolerances, a lower speed, or a greater torque limit"
+        )
+    return found
+
+
+def course_of(scenario: Scenario, period_s: float) -> Course:
+    """What the scenario asks for, period by period."""
+    at = round(scenario.change_at_s / period_s)
+    # Counted from the change, so that no rounding of a time puts it a period off.
+    since = np.arange(-at, round(scenario.duration_s / period_s) - at, dtype=np.float64)
+    time: FloatArray = scenario.change_at_s + since * period_s
+    return Course(scenario.setpoints_n(time), scenario.speeds_m_per_s(time), at)
+
+
+def _can_be_held(model: WebModel, scenario: Scenario, torque_nm: float) -> bool:
+    ends = ((scenario.tension_n, scenario.speed_m_per_s), (scenario.tension_end_n, scenario.speed_end_m_per_s))
+    for tension_n, speed_m_per_s in ends:
+        tension = np.array(tension_n)
+        speeds = reference_speeds(model, tension, speed_m_per_s)
+        if np.abs(equilibrium_torque(model, tension, speeds)).max() >= torque_nm:
+            return False
+    return True
+
+
+def _stepping(task: DesignTask) -> tuple[float, int]:
+    """Latency in s and integration steps a period, of which the latency is a whole number; where none fits, the next
+    longer latency that does."""
+    A, _ = linear(task)
+    fastest = float(np.abs(np.linalg.eigvals(A)).max())
+    least = min(max(1, ceil(task.period_s * fastest / FASTEST_MODE)), MOST_SUBSTEPS)
+    for substeps in range(least, MOST_SUBSTEPS + 1):
+        step_s = task.period_s / substeps
+        if abs(round(task.latency_s / step_s) * step_s - task.latency_s) < 1e-9:
+            return task.latency_s, substeps
+    step_s = task.period_s / MOST_SUBSTEPS
+    return ceil(task.latency_s / step_s) * step_s, MOST_SUBSTEPS

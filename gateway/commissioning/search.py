@@ -1,0 +1,100 @@
+"""The proposer that needs nobody: a pattern search over the logarithms of the knobs (Hooke and Jeeves 1961).
+
+It keeps nothing: where it stands follows from the history, so that it takes over from any other proposer, or goes on
+after an interruption, as if nothing had happened.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import log
+
+from gateway.commissioning.architectures import Architecture, Knob
+from gateway.commissioning.ground import Ground
+from gateway.commissioning.records import Attempt, Suggestion
+from gateway.commissioning.trial import diagnosis
+from gateway.commissioning.tuning import best_of
+
+FIRST_FACTOR = 2.0
+LAST_FACTOR = 1.1  #: turning a knob by less changes nothing that anybody would notice
+CALMER = {"torque_per_nm2": 1, "disturbance_nm_per_sqrt_s": -1, "speed_share": -1, "tension_share": -1}
+SAME = 1e-3  #: relative
+
+
+@dataclass(frozen=True)
+class Turn:
+    """One knob by a factor."""
+
+    knob: Knob
+    factor: float
+
+    def applied(self, values: dict[str, float]) -> dict[str, float] | None:
+        """The values after the turn; None where the knob is at its end already."""
+        before = values[self.knob.name]
+        after = _rounded(min(max(before * self.factor, self.knob.least), self.knob.most))
+        return None if _same(before, after) else values | {self.knob.name: after}
+
+
+class PatternSearch:
+    """`Proposer`: every knob up and down by a factor; what helps is repeated, else the factor becomes smaller."""
+
+    def suggest(self, architecture: Architecture, ground: Ground, history: Sequence[Attempt]) -> Suggestion | None:
+        if not history:
+            known = "where this architecture did well on lines of this kind"
+            return Suggestion(values=architecture.first(), reason=known)
+        best = best_of(history)
+        if best is None:
+            return self._calmer(architecture, history)
+        seen = [attempt.values for attempt in history]
+        factor = FIRST_FACTOR
+        while factor >= LAST_FACTOR:
+            for turn in _turns(architecture, history, best, factor):
+                values = turn.applied(best.values)
+                if values is not None and not any(_alike(values, other) for other in seen):
+                    return Suggestion(values=values, reason=_reason(best, ground, turn))
+            factor = factor**0.5
+        return None
+
+    def _calmer(self, architecture: Architecture, history: Sequence[Attempt]) -> Suggestion | None:
+        """Nothing has been valid yet: all knobs towards a calmer loop at once."""
+        last = history[-1].values
+        values = dict(last)
+        for knob in architecture.knobs:
+            if direction := CALMER.get(knob.name, 0):
+                factor = 2.0**direction
+                values[knob.name] = _rounded(min(max(last[knob.name] * factor, knob.least), knob.most))
+        if _alike(values, last):
+            return None
+        return Suggestion(values=values, reason=f"{history[-1].refused}: a calmer loop")
+
+
+def _turns(architecture: Architecture, history: Sequence[Attempt], best: Attempt, factor: float) -> list[Turn]:
+    """Every turn by `factor`, first the one that has led to the best."""
+    turns = [Turn(knob, f) for knob in architecture.knobs for f in (1.0 / factor, factor)]
+    before = best_of(history[: best.number])
+    if before is None:
+        return turns
+    return sorted(turns, key=lambda turn: -_along(turn, before, best))
+
+
+def _along(turn: Turn, before: Attempt, best: Attempt) -> float:
+    """How far the step from `before` to `best` went the way of `turn`."""
+    return log(turn.factor) * log(best.values[turn.knob.name] / before.values[turn.knob.name])
+
+
+def _reason(best: Attempt, ground: Ground, turn: Turn) -> str:
+    found = diagnosis(best.trial, ground) if best.trial is not None else "the best so far"
+    way = turn.knob.more if turn.factor > 1.0 else f"the reverse of: {turn.knob.more}"
+    return f"{found}: {turn.knob.name} times {turn.factor:.2f} ({way})"
+
+
+def _rounded(value: float) -> float:
+    """Three digits: more say nothing."""
+    return float(f"{value:.3g}")
+
+
+def _same(a: float, b: float) -> bool:
+    return abs(log(a / b)) < SAME
+
+
+def _alike(a: dict[str, float], b: dict[str, float]) -> bool:
+    return a.keys() == b.keys() and all(_same(a[name], b[name]) for name in a)

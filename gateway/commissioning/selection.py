@@ -1,0 +1,100 @@
+"""From tuned candidates to the one that is offered: the score S = w . metrics (eq. performance_score), and why."""
+
+from collections.abc import Mapping, Sequence
+
+from gateway.commissioning.records import Trial
+from gateway.core.line import NonNegative, Positive, Priorities, Strict
+from gateway.core.metrics import Performance, score, weights
+
+TERMS = ("tracking error", "settling time", "overshoot", "effort", "robustness", "computing")
+UNITS = ("N", "s", "%", "(Nm)2 s", "N", "ms")
+SHOWN = (1.0, 1.0, 1.0, 1.0, 1.0, 1e3)  #: factor from SI to the unit above
+CLOSE = 0.02  #: of the score: a difference that no line would show
+
+
+class Candidate(Strict):
+    """A tuned architecture, evaluated on the whole ground."""
+
+    architecture: str
+    title: str
+    hash: str  #: of its configuration; "" where there is none
+    values: dict[str, Positive]
+    trial: Trial | None
+    compute_s: NonNegative | None  #: median of a step
+    refused: str  #: why it is not offered; "" where it is
+    score: NonNegative | None  #: S; None: not offered, or a metric is without bound
+    terms: list[float]  #: the parts of S, in the order of TERMS
+
+
+def candidate(
+    architecture: str,
+    title: str,
+    values: Mapping[str, float],
+    config_hash: str,
+    trial: Trial | None,
+    compute_s: float | None,
+    refused: str,
+    priorities: Priorities,
+) -> Candidate:
+    """With its score, where it has one."""
+    performance = None if refused or trial is None or compute_s is None else performance_of(trial, compute_s)
+    whole = score(performance, priorities) if performance else None
+    return Candidate(
+        architecture=architecture, title=title, hash=config_hash, values=dict(values), trial=trial,
+        compute_s=compute_s, refused=refused, score=whole,
+        terms=(weights(priorities) * performance.vector()).tolist() if performance else [],
+    )  # fmt: skip
+
+
+def performance_of(trial: Trial, compute_s: float) -> Performance | None:
+    """The six metrics of a trial; None where one of them is without bound."""
+    if trial.settling_s is None or trial.robustness_n is None:
+        return None
+    return Performance(
+        rmse_n=sum(trial.rmse_n.values()) / len(trial.rmse_n),
+        overshoot_pct=trial.overshoot_pct,
+        settling_s=trial.settling_s,
+        effort_n2m2s=trial.effort_n2m2s,
+        robustness_n=trial.robustness_n,
+        compute_s=compute_s,
+    )
+
+
+def ranked(candidates: Sequence[Candidate]) -> list[Candidate]:
+    """C* first (argmin S); what has no score comes last."""
+    return sorted(candidates, key=lambda one: (one.score is None, one.score or 0.0))
+
+
+def explanation(candidates: Sequence[Candidate]) -> list[str]:
+    """Why the first of `ranked` is chosen and what it costs, from the numbers alone."""
+    order = ranked(candidates)
+    if not order or order[0].score is None:
+        return ["No architecture can be offered: see the reason beside each."]
+    best, others = order[0], [one for one in order[1:] if one.score is not None]
+    said = [f"{best.architecture} is chosen: its score of {best.score:.3f} is the least."]
+    if others:
+        said.append(_against(best, others[0]))
+    for one in order:
+        if one.refused:
+            said.append(f"{one.architecture} is not offered: {one.refused}.")
+        elif one.score is None:
+            said.append(f"{one.architecture} has no score: on a line within the tolerances it does not settle.")
+    return said
+
+
+def _against(best: Candidate, other: Candidate) -> str:
+    """The two side by side: where the difference of their scores comes from."""
+    assert best.score is not None and other.score is not None
+    ahead = other.score - best.score
+    parts = sorted(((b - a, name) for a, b, name in zip(best.terms, other.terms, TERMS, strict=True)), reverse=True)
+    gains = [f"{name} ({difference:+.3f})" for difference, name in parts if difference > 0.05 * abs(ahead)]
+    costs = [f"{name} ({difference:+.3f})" for difference, name in parts if difference < -0.05 * abs(ahead)]
+    text = f"It is ahead of {other.architecture} by {ahead:.3f}"
+    text += f" through {_listed(gains)}" if gains else ""
+    text += f", and behind it in {_listed(costs)}" if costs else ""
+    close = " The two are so close that either will do." if ahead < CLOSE * best.score else ""
+    return f"{text}.{close}"
+
+
+def _listed(names: Sequence[str]) -> str:
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"

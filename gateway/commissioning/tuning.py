@@ -1,0 +1,87 @@
+"""Algorithm 1: from a first guess to the best hyperparameters of one architecture, with every attempt on record.
+
+Whoever proposes - a search, a language model - sees the same history and answers with values and a reason. What is
+proposed is designed, simulated and validated here; it is accepted only where it is valid and J falls.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+from gateway.commissioning.architectures import Architecture
+from gateway.commissioning.ground import Ground
+from gateway.commissioning.records import Attempt, Suggestion
+from gateway.commissioning.trial import reasons_against, tried
+from gateway.control.design import DesignRefused
+from gateway.core.controller import Controller
+
+MOST_ITERATIONS = 50
+
+
+class Proposer(Protocol):
+    """Who chooses the next values."""
+
+    def suggest(self, architecture: Architecture, ground: Ground, history: Sequence[Attempt]) -> Suggestion | None:
+        """The next values, the first when there is no history; None: nothing better is to be expected."""
+        ...
+
+
+@dataclass(frozen=True)
+class Tuned:
+    history: tuple[Attempt, ...]
+    converged: bool  #: the proposer had nothing more to say
+
+    @property
+    def best(self) -> Attempt | None:
+        """The last one accepted; None: nothing could be offered."""
+        return best_of(self.history)
+
+    def config(self, architecture: Architecture, ground: Ground) -> Controller:
+        """The configuration of the best attempt with `architecture`. Raises DesignRefused where there is none."""
+        if self.best is None:
+            reasons = list(dict.fromkeys(attempt.refused for attempt in self.history if attempt.refused))
+            tries = f"{len(self.history)} attempt{'s' if len(self.history) > 1 else ''}"
+            raise DesignRefused(f"none of {tries} can be offered; {'; '.join(reasons[:3])}")
+        return architecture.design(ground.task, self.best.values)
+
+
+def best_of(history: Sequence[Attempt]) -> Attempt | None:
+    """The last one accepted."""
+    return next((attempt for attempt in reversed(history) if attempt.accepted), None)
+
+
+def tune(
+    architecture: Architecture,
+    ground: Ground,
+    proposer: Proposer,
+    most: int = MOST_ITERATIONS,
+    history: Sequence[Attempt] = (),
+    on_attempt: Callable[[Attempt], None] = lambda attempt: None,
+) -> Tuned:
+    """Run algorithm 1, or go on with a `history` that was interrupted. `most` attempts follow the first guess."""
+    done = list(history)
+    while len(done) <= most:
+        suggestion = proposer.suggest(architecture, ground, done)
+        if suggestion is None:
+            return Tuned(tuple(done), converged=True)
+        attempt = attempted(architecture, ground, suggestion, done)
+        done.append(attempt)
+        on_attempt(attempt)
+    return Tuned(tuple(done), converged=False)
+
+
+def attempted(
+    architecture: Architecture, ground: Ground, suggestion: Suggestion, history: Sequence[Attempt]
+) -> Attempt:
+    """What became of a suggestion: designed, simulated, validated, and compared with the best before."""
+    number, values, reason = len(history), dict(suggestion.values), suggestion.reason
+    try:
+        trial = tried(architecture.design(ground.task, values), ground)
+    except DesignRefused as refused:
+        return Attempt(number=number, values=values, reason=reason, trial=None, refused=str(refused), accepted=False)
+    against = "; ".join(reasons_against(trial, ground))
+    best = best_of(history)
+    better = best is None or (trial.cost_n2s or 0.0) < (best.cost_n2s or 0.0)
+    return Attempt(
+        number=number, values=values, reason=reason, trial=trial, refused=against, accepted=not against and better
+    )
