@@ -10,6 +10,7 @@ import numpy as np
 from gateway.cli.report.data import Case, Timing
 from gateway.cli.report.embed import cycles_per_point
 from gateway.cli.report.markup import (
+    chart_place,
     count,
     fixed,
     flagged,
@@ -21,6 +22,7 @@ from gateway.cli.report.markup import (
     range_words,
     swatch,
     table,
+    zoom_bar,
 )
 
 PERCENTILES = (("p50", 50.0), ("p99", 99.0), ("p99.9", 99.9), ("Largest", 100.0))
@@ -52,16 +54,16 @@ def case_section(index: int, case: Case) -> str:
 {_readout(case)}
 <figure><figcaption><h3>Tension, N</h3>
 <p>{tension} Set-points are dashed in the colour of their span. The tension must stay within {band}.</p></figcaption>
-{_chart("tension", tension)}</figure>
+{chart_place("tension", tension)}</figure>
 <figure><figcaption><h3>Tension of each span, N</h3>
 <p>The same, larger: every chart has a scale of its own.</p></figcaption>
 <div class="multiples">{multiples}</div></figure>
 <figure><figcaption><h3>Torque, Nm</h3>
 <p>{torque} Limits at ±{number(case.torque_limit_nm)} Nm, dashed red where they lie in view.</p></figcaption>
-{_chart("torque", torque)}</figure>
+{chart_place("torque", torque)}</figure>
 <figure><figcaption><h3>Speed, m/s</h3>
 <p>{speed} The unwinder is the dotted line.</p></figcaption>
-{_chart("speed", speed)}</figure>
+{chart_place("speed", speed)}</figure>
 </section>"""
 
 
@@ -87,17 +89,17 @@ def timing_section(timing: Timing) -> str:
 <p>{grouped(len(timing.time_s))} cycles with a period of {number(timing.period_us / 1000.0)} ms.
 Missed cycles: {count(timing.missed, "attention-text")}.</p>
 {_percentile_table(timing)}
-<div class="readout">{_zoom_bar()}<div class="scroll"><table><thead><tr><td></td>
+<div class="readout">{zoom_bar()}<div class="scroll"><table><thead><tr><td></td>
 <th scope="col">smallest</th><th scope="col">median</th><th scope="col">largest</th></tr></thead>
 <tbody>{readout}</tbody></table></div></div>
 <figure><figcaption><h3>Lateness, µs, log scale</h3><p>{thinning}</p></figcaption>
-{_chart("lateness", lateness)}</figure>
+{chart_place("lateness", lateness)}</figure>
 <figure><figcaption><h3>Cycle time, µs, log scale</h3><p>{thinning}</p></figcaption>
-{_chart("cycle", cycle)}</figure>
+{chart_place("cycle", cycle)}</figure>
 <figure><figcaption><h3>How often: number of cycles by time, log scales</h3>
 <p>{swatch(0)}lateness {swatch(1)}cycle time.
 <span data-bin>Every cycle is counted. Point at a bar for its numbers.</span></p></figcaption>
-{_chart("histogram", "Histogram of lateness and cycle time; the table of percentiles tells the same")}</figure>
+{chart_place("histogram", "Histogram of lateness and cycle time; the table of percentiles tells the same")}</figure>
 </section>"""
 
 
@@ -157,7 +159,7 @@ def _span_chart(case: Case, i: int) -> str:
     label, rmse = case.span_labels[i], fixed(case.rmse_per_span_n[i], 4)
     words = f"{label}: {range_words(case.tension_n[i], 'N')}, RMSE {rmse} N"
     head = f'{swatch(i)}{escape(label)} <span class="muted">RMSE {rmse} N</span>'
-    return f"<div><h4>{head}</h4>{_chart(f'span-{i}', words)}</div>"
+    return f"<div><h4>{head}</h4>{chart_place(f'span-{i}', words)}</div>"
 
 
 def _readout(case: Case) -> str:
@@ -176,20 +178,6 @@ def _readout(case: Case) -> str:
     return f"""<p class="muted hint">Point at a chart to read its values here. Drag across it to look closer,
 double-click to see the whole case again. In a chart that has the focus, arrow keys move the cursor, + and − zoom,
 0 shows the whole case. The coloured buttons hide and show a span.</p>
-<div class="readout">{_zoom_bar('<button type="button" data-all>All spans</button>')}
+<div class="readout">{zoom_bar(more='<button type="button" data-all>All spans</button>')}
 <div class="scroll" tabindex="0" role="region" aria-label="Values at the cursor">
 <table><thead><tr><td></td>{heads}</tr></thead><tbody>{rows}</tbody></table></div></div>"""
-
-
-def _zoom_bar(more: str = "") -> str:
-    actions = (("in", "Zoom in"), ("out", "Zoom out"), ("reset", "Whole time"))
-    buttons = "".join(f'<button type="button" data-zoom="{action}">{name}</button>' for action, name in actions)
-    return f'<div class="bar"><span class="now" data-at></span>{buttons}{more}</div>'
-
-
-def _chart(name: str, words: str) -> str:
-    """A place for a chart; `words` say what it shows, for those who do not see it."""
-    return (
-        f'<div class="chart" data-chart="{name}" tabindex="0" role="application"'
-        f' aria-roledescription="chart" aria-label="{escape(words)}"></div>'
-    )

@@ -1,7 +1,8 @@
 """Numbers as a person reads them, and the tables they stand in."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from html import escape
 
 import numpy as np
 
@@ -98,6 +99,26 @@ def range_words(values: FloatArray, unit: str) -> str:
     return f"{number(-largest(-values))} to {number(largest(values))} {unit}"
 
 
-def swatch(index: int) -> str:
+def versions_text(versions: Mapping[str, str]) -> str:
+    """Programs and libraries with their versions, in one line of HTML."""
+    return ", ".join(f"{escape(name)} {escape(version)}" for name, version in versions.items())
+
+
+def swatch(index: int, style: str = "") -> str:
     """A patch of the colour in which span `index` (from 0) is drawn."""
-    return f'<span class="swatch t{index % SPAN_COLOURS}"></span>'
+    return f'<span class="swatch t{index % SPAN_COLOURS}{style}"></span>'
+
+
+def zoom_bar(whole: str = "Whole time", more: str = "") -> str:
+    """Where the cursor is, and the buttons that zoom; `whole` names the one that shows all."""
+    actions = (("in", "Zoom in"), ("out", "Zoom out"), ("reset", whole))
+    buttons = "".join(f'<button type="button" data-zoom="{action}">{name}</button>' for action, name in actions)
+    return f'<div class="bar"><span class="now" data-at></span>{buttons}{more}</div>'
+
+
+def chart_place(name: str, words: str, more: str = "") -> str:
+    """A place for a chart; `words` say what it shows, for those who do not see it. `more` are further attributes."""
+    return (
+        f'<div class="chart" data-chart="{name}" tabindex="0" role="application"'
+        f' aria-roledescription="chart" aria-label="{escape(words)}"{more}></div>'
+    )
