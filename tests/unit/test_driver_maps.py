@@ -1,6 +1,9 @@
 """Device maps: the shipped ones load, and what is wrong in one is refused with file, key, allowed and nearest."""
 
+import asyncio
 import shutil
+import socket
+import struct
 from collections.abc import Callable
 from itertools import product
 from pathlib import Path
@@ -8,15 +11,18 @@ from typing import get_args
 
 import pytest
 
-from drivers.canopen.configure import DriveSettings, drive_steps
+from drivers.canopen.configure import DriveSettings, drive_expected, drive_steps
 from drivers.canopen.maps import DriveMap
+from drivers.canopen.pdo import PdoCodec
 from drivers.device_map import MAPS, MapRefused, load_map, map_names
 from drivers.map_fields import SpeedUnit, TensionUnit, TimeUnit, TorqueUnit, WebSpeedUnit
 from drivers.modbus.maps import LoadCellMap, PlcMap
+from drivers.port import PrepareRefused
 from drivers.registry import LinksRefused, build_links
 from gateway.core.line import Line
+from gateway.core.signals import DriveRequest, DriveState, Inputs, Outputs
 from gateway.core.units import SI_PER_UNIT
-from tests.protocol.driver_support import line
+from tests.protocol.driver_support import ENABLED, GROUP, Drive, Drives, cycle, free_port, line, until
 
 
 def test_the_shipped_maps_load_and_each_is_for_a_role_on_its_wire() -> None:
@@ -180,3 +186,105 @@ def test_a_new_drive_is_a_map(tmp_path: Path) -> None:
     assert isinstance(device, DriveMap)
     steps = drive_steps(device, DriveSettings(1, 80.0, 60.0, 0.1))
     assert [step.value for step in steps if (step.index, step.sub) == (0x6072, 0)] == [750], "writable: 60 of 80 Nm"
+
+
+# A maker's drive: what its manual says, and that it can be driven
+
+NANOTEC = "nanotec-pd2-cb42c-can"
+
+
+class Pd2(Drive):
+    """The objects that the map needs as the drive is delivered, and 60A9h as it is to be commissioned."""
+
+    def __init__(self, node: int) -> None:
+        super().__init__(node)
+        del self.objects[0x1400, 5], self.objects[0x6076, 0]
+        self.objects |= {
+            (0x1016, 1): bytes(4),
+            (0x1018, 1): struct.pack("<I", 0x26C),
+            (0x1018, 2): struct.pack("<I", 0x20),
+            (0x1400, 2): b"\xff",
+            (0x6007, 0): struct.pack("<h", 1),
+            (0x605E, 0): struct.pack("<h", 2),
+            (0x6072, 0): struct.pack("<H", 100),
+            (0x60A9, 0): struct.pack("<I", 0xFDB44700),
+        }
+
+
+def test_what_nanotecs_manual_says() -> None:
+    device = load_map(MAPS / f"{NANOTEC}.toml")
+    assert isinstance(device, DriveMap)
+    assert (device.identity.vendor_id, device.identity.product_code) == (0x26C, 0x20)
+    steps = {(step.index, step.sub): step.value for step in drive_steps(device, DriveSettings(3, 0.5, 0.4, 0.1))}
+    needed = {
+        (0x1016, 1): 0x007F0064,  # 100 ms of node 127
+        (0x1017, 0): 100,
+        (0x1400, 1): 0x203,
+        (0x1400, 2): 1,  # with the next SYNC
+        (0x1800, 1): 0x183,
+        (0x1800, 2): 1,
+        (0x6007, 0): 2,  # disable voltage
+        (0x605E, 0): 0,  # free to turn
+        (0x6060, 0): 10,
+        (0x6072, 0): 800,
+    }
+    assert steps.items() >= needed.items()
+    assert (0x60A9, 0) not in steps, "6080h and the ramps count in it"
+    assert [(entry.index, entry.value) for entry in drive_expected(device, 3)] == [(0x60A9, 0xFDB44700)]
+    codec = PdoCodec(device, rated_torque_nm=0.5, radius_m=0.04)
+    sample = codec.decode(bytes.fromhex("3712 60EA0000 F401"))
+    assert sample.speed_m_per_s == pytest.approx(0.2513, abs=1e-4), "60 rpm in thousandths"
+    assert sample.torque_nm == pytest.approx(0.25), "500 is half of the rated torque"
+    assert codec.encode(0x0F, -0.55) == bytes.fromhex("0F00 B4FB 0A"), "1100 is 110 % of it"
+
+
+def nanotec_line(port: int) -> Line:
+    good = line(2, can_bus={"interface": "udp_multicast", "channel": GROUP, "port": port})
+    drives = [drive.model_copy(update={"map": NANOTEC, "rated_torque_nm": 0.5}) for drive in good.drives]
+    return good.model_copy(update={"drives": drives, "limits": good.limits.model_copy(update={"torque_nm": 0.4})})
+
+
+async def drive_the_pd2s(drives: list[Pd2], port: int) -> None:
+    link = build_links(nanotec_line(port))[0]
+    inputs, outputs = Inputs(2), Outputs(2)
+    async with Drives([*drives], interface="udp_multicast", channel=GROUP, port=port, hop_limit=0, fd=False):
+        await link.open()
+        try:
+            await link.prepare()
+            for drive in drives:
+                drive.statusword, drive.speed_um_per_s, drive.torque_per_mille = ENABLED, 60_000, 500  # the fields
+            await cycle(link, inputs)
+            outputs.drive_request[:] = DriveRequest.ENABLE
+            outputs.torque_nm[:] = (0.25, -0.1)
+            link.write(outputs)
+            await until(lambda: all(drive.rpdos for drive in drives))
+        finally:
+            await link.close()
+    assert list(inputs.drive_state) == [DriveState.ENABLED] * 2
+    assert inputs.speed.value == pytest.approx([0.2513] * 2, abs=1e-4)
+    assert inputs.torque.value == pytest.approx([0.25] * 2)
+
+
+def test_a_nanotec_drive_is_configured_and_driven() -> None:
+    drives = [Pd2(1), Pd2(2)]
+    asyncio.run(drive_the_pd2s(drives, free_port(socket.SOCK_DGRAM)))
+    for drive, per_mille in zip(drives, (500, -200), strict=True):
+        assert drive.rpdos == [struct.pack("<Hhb", 0x0F, per_mille, 10)]
+        assert drive.objects[0x1016, 1] == bytes.fromhex("6400 7F00")
+        assert (drive.objects[0x6007, 0], drive.objects[0x605E, 0]) == (b"\2\0", b"\0\0")
+        assert struct.unpack("<H", drive.objects[0x6072, 0]) == (800,)
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "words"),
+    [
+        ((0x60A9, 0), 0x00B44700, "60A9h sub 0 is 0xb44700, its map says 0xfdb44700"),  # whole rpm, as delivered
+        ((0x1018, 2), 0x11, "product 0x11, its map says vendor 0x26c product 0x20"),  # a C5-E-2-09
+    ],
+)
+def test_a_nanotec_drive_that_is_otherwise_is_refused(place: tuple[int, int], value: int, words: str) -> None:
+    drives = [Pd2(1), Pd2(2)]
+    drives[1].objects[place] = struct.pack("<I", value)
+    with pytest.raises(PrepareRefused, match=words):
+        asyncio.run(drive_the_pd2s(drives, free_port(socket.SOCK_DGRAM)))
+    assert drives[0].writes == drives[1].writes == []
