@@ -12,6 +12,7 @@ from gateway.cli import (
     line_commands,
     operate_commands,
     process_commands,
+    rehearse_commands,
     scan_commands,
     status_commands,
 )
@@ -35,6 +36,7 @@ app.command(rich_help_panel=ENGINEER)(line_commands.check)
 app.add_typer(scan_commands.app, rich_help_panel=ENGINEER)
 app.command(rich_help_panel=ENGINEER)(doctor_commands.doctor)
 app.command(rich_help_panel=ENGINEER)(process_commands.design)
+app.command(rich_help_panel=ENGINEER)(rehearse_commands.rehearse)
 app.command(rich_help_panel=PROCESSES)(process_commands.run)
 app.command(rich_help_panel=PROCESSES)(process_commands.loop)
 app.command(rich_help_panel=PROCESSES)(process_commands.gateway)
