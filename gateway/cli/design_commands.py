@@ -28,18 +28,12 @@ def design(
     law: Annotated[
         list[LawName] | None, typer.Option(help="Only this architecture; repeatable. Without: all five.")
     ] = None,
-    out: Annotated[Path, typer.Option(help="The configuration to write; its folder is made.")] = Path(
-        "controller.json"
-    ),
+    out: Annotated[Path, typer.Option(help="The configuration to write.")] = Path("controller.json"),
     scenario: Annotated[
         list[str] | None,
-        typer.Option(
-            help="What to tune for: tension, velocity, or a TOML file; repeatable. Without: the largest steps."
-        ),
+        typer.Option(help="tension, velocity, or a TOML file; repeatable. Without: the largest steps."),
     ] = None,
-    iterations: Annotated[
-        int, typer.Option(min=0, max=50, help="Attempts after the first guess, per architecture.")
-    ] = 50,
+    iterations: Annotated[int, typer.Option(min=0, max=50, help="Attempts after the first guess.")] = 50,
     untuned: Annotated[
         bool, typer.Option("--untuned", help="The first guess of one --law as it is, without any simulation.")
     ] = False,
@@ -131,7 +125,7 @@ def _phase(
         _refuse(f"{out} is not written: no architecture can be offered")
     elif not as_json:
         typer.echo(
-            f"configuration: {out}, hash {result.controller[:12]}; try it with: r2rgate run LINE --controller {out}"
+            f"configuration: {out}, hash {result.controller[:12]}; to use it: r2rgate run LINE --controller {out}"
         )
 
 

@@ -11,6 +11,8 @@ from gateway.commissioning.selection import TERMS
 from gateway.core.scenario import Scenario
 from gateway.core.signals import FloatArray
 
+BEFORE_S, AFTER_S = 0.5, 2.5  #: of the change, that the charts show
+
 HEADS = (
     "Law", "RMSE, N", "t_s, s", "Overshoot, %", "Effort, (Nm)² s", "R, N", "Step, µs", "Delay margin, ms", "J, N² s",
     "S",
@@ -74,11 +76,12 @@ def _courses(scenario: Scenario, found: Design) -> Section:
     charts: list[Chart] = []
     if with_traces:
         first = with_traces[0].traces[scenario.name]
-        tensions = [Series(one.architecture, one.traces[scenario.name].tension_n[:, span]) for one in with_traces]
-        torques = [Series(one.architecture, one.traces[scenario.name].torque_nm[:, span]) for one in with_traces]
-        setpoint = Series("set-point", first.setpoint_n[:, span], dashed=True)
-        charts.append(Chart(f"Tension of span {number}", "N", first.time_s, (*tensions, setpoint)))
-        charts.append(Chart(f"Torque of roller {number}", "Nm", first.time_s, tuple(torques)))
+        around = np.abs(first.time_s - scenario.change_at_s - 0.5 * (AFTER_S - BEFORE_S)) <= 0.5 * (AFTER_S + BEFORE_S)
+        tensions = [Series(one.architecture, one.traces[scenario.name].tension_n[around, span]) for one in with_traces]
+        torques = [Series(one.architecture, one.traces[scenario.name].torque_nm[around, span]) for one in with_traces]
+        setpoint = Series("set-point", first.setpoint_n[around, span], dashed=True)
+        charts.append(Chart(f"Tension of span {number}", "N", first.time_s[around], (*tensions, setpoint)))
+        charts.append(Chart(f"Torque of roller {number}", "Nm", first.time_s[around], tuple(torques)))
     return Section(scenario.heading, (scenario.description,) if scenario.description else (), (), tuple(charts))
 
 

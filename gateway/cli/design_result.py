@@ -52,7 +52,8 @@ def result_of(line: Line, found: Design, seed: int) -> DesignResult:
         command=" ".join(["r2rgate", *sys.argv[1:]]),
         date=datetime.now(UTC).isoformat(timespec="seconds"),
         versions={name: version(name) for name in LIBRARIES},
-        machine=f"{os.cpu_count()} processors, {platform.system()} {platform.release()}, Python {platform.python_version()}",
+        machine=f"{os.cpu_count()} processors, {platform.system()} {platform.release()}, "
+        f"Python {platform.python_version()}",
         line=f"{line.site}/{line.line}",
         seed=seed,
         plants=len(found.ground.models) - 1,

@@ -13,6 +13,7 @@ from gateway.cli import (
     line_commands,
     operate_commands,
     process_commands,
+    rehearse_commands,
     scan_commands,
     status_commands,
 )
@@ -36,6 +37,7 @@ app.command(rich_help_panel=ENGINEER)(line_commands.check)
 app.add_typer(scan_commands.app, rich_help_panel=ENGINEER)
 app.command(rich_help_panel=ENGINEER)(doctor_commands.doctor)
 app.command(rich_help_panel=ENGINEER)(design_commands.design)
+app.command(rich_help_panel=ENGINEER)(rehearse_commands.rehearse)
 app.command(rich_help_panel=PROCESSES)(process_commands.run)
 app.command(rich_help_panel=PROCESSES)(process_commands.loop)
 app.command(rich_help_panel=PROCESSES)(process_commands.gateway)

@@ -34,6 +34,7 @@ class Knob:
     least: float
     most: float
     more: str  #: what a greater value does
+    less: str  #: what a smaller one does
 
 
 @dataclass(frozen=True)
@@ -68,24 +69,24 @@ class Architecture:
         return found
 
 
-_TORQUE = "calmer torque, slower loop"
-_DISTURBANCE = "disturbances are taken back faster, and noise and delay are felt more"
-
-
 def _weight(first: float) -> Knob:
-    return Knob("torque_per_nm2", "N2/Nm2", first, 1e-5, 100.0, _TORQUE)
+    return Knob(
+        "torque_per_nm2", "N2/Nm2", first, 1e-5, 100.0, "calmer torque, slower loop", "faster loop, busier torque"
+    )
 
 
 def _disturbance(first: float) -> Knob:
-    return Knob("disturbance_nm_per_sqrt_s", "Nm/s^0.5", first, 0.01, 100.0, _DISTURBANCE)
+    return Knob(
+        "disturbance_nm_per_sqrt_s", "Nm/s^0.5", first, 0.01, 100.0, "faster on disturbances", "less moved by noise"
+    )
 
 
 PID = Architecture(
     "pid",
     "PID: a speed loop per roller, tension trim on the draw",
     (
-        Knob("speed_share", "", 0.5, 0.02, 1.5, "faster speed loops, nearer to what the dead time stands"),
-        Knob("tension_share", "", 1.0 / 3.0, 0.01, 1.0, "faster tension trim, nearer to the speed loops"),
+        Knob("speed_share", "", 0.5, 0.02, 1.5, "faster speed loops", "calmer speed loops"),
+        Knob("tension_share", "", 1.0 / 3.0, 0.01, 1.0, "faster tension trim", "calmer tension trim"),
     ),
     lambda task, values: design_pid(task, values["speed_share"], values["tension_share"]),
 )
@@ -100,8 +101,24 @@ LQI = Architecture(
     "LQI: state feedback with integral action",
     (
         _weight(LqiWeights().torque_per_nm2),
-        Knob("integral_per_n2s2", "1/s2", LqiWeights().integral_per_n2s2, 1.0, 1e6, "offsets vanish faster"),
-        Knob("antiwindup", "", LqiWeights().antiwindup, 0.01, 1.0, "integrals let go sooner at a torque limit"),
+        Knob(
+            "integral_per_n2s2",
+            "1/s2",
+            LqiWeights().integral_per_n2s2,
+            1.0,
+            1e6,
+            "offsets vanish faster",
+            "less push from the integrals",
+        ),
+        Knob(
+            "antiwindup",
+            "",
+            LqiWeights().antiwindup,
+            0.01,
+            1.0,
+            "integrals let go sooner at a limit",
+            "integrals hold on longer",
+        ),
     ),
     lambda task, values: design_lqi(task, LqiWeights(**values)),
 )

@@ -83,7 +83,7 @@ def _along(turn: Turn, before: Attempt, best: Attempt) -> float:
 
 def _reason(best: Attempt, ground: Ground, turn: Turn) -> str:
     found = diagnosis(best.trial, ground) if best.trial is not None else "the best so far"
-    way = turn.knob.more if turn.factor > 1.0 else f"the reverse of: {turn.knob.more}"
+    way = turn.knob.more if turn.factor > 1.0 else turn.knob.less
     return f"{found}: {turn.knob.name} times {turn.factor:.2f} ({way})"
 
 

@@ -92,8 +92,20 @@ def _against(best: Candidate, other: Candidate) -> str:
     text = f"It is ahead of {other.architecture} by {ahead:.3f}"
     text += f" through {_listed(gains)}" if gains else ""
     text += f", and behind it in {_listed(costs)}" if costs else ""
-    close = " The two are so close that either will do." if ahead < CLOSE * best.score else ""
-    return f"{text}.{close}"
+    return f"{text}.{_if_close(best, other) if ahead < CLOSE * best.score else ''}"
+
+
+def _if_close(best: Candidate, other: Candidate) -> str:
+    """What decides between two that no line would tell apart: what the latency may do."""
+    text = " The two are so close that either will do."
+    if best.trial is not None and other.trial is not None:
+        own_ms, other_ms = 1e3 * best.trial.delay_margin_s, 1e3 * other.trial.delay_margin_s
+        if other_ms > 2.0 * own_ms:
+            text += (
+                f" Where the latency is not certain take {other.architecture}, which stands {other_ms:.1f} ms more "
+                f"delay instead of {own_ms:.1f} ms."
+            )
+    return text
 
 
 def _listed(names: Sequence[str]) -> str:

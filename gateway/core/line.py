@@ -163,7 +163,7 @@ class Priorities(Strict):
     settling_per_s: NonNegative = 0.2
     overshoot_per_pct: NonNegative = 0.01
     effort_per_n2m2s: NonNegative = 1e-5
-    robustness_per_n: NonNegative = 0.02
+    robustness_per_n: NonNegative = 0.1
     compute_per_s: NonNegative = 100.0
 
 

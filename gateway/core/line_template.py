@@ -111,7 +111,7 @@ def _priorities() -> str:
         "settling_per_s": "0.2",
         "overshoot_per_pct": "0.01",
         "effort_per_n2m2s": "1e-5",
-        "robustness_per_n": "0.02",
+        "robustness_per_n": "0.1",
         "compute_per_s": "100.0",
     }
     return table("priorities", "Priorities", values)

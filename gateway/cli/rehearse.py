@@ -1,0 +1,222 @@
+"""A line's commissioning rehearsed against a simulated plant in stepped time: which design is worth what."""
+
+import os
+import signal
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from math import isfinite
+from multiprocessing import get_context
+from typing import Protocol, TypeVar
+
+import numpy as np
+
+from gateway.cli.rehearse_designs import DESIGNS, TRUTH, Design, offered, truth_of
+from gateway.cli.rehearse_result import CaseResult, ConfigurationResult, Spread
+from gateway.cli.stepped import SteppedResult, run_scenario
+from gateway.cli.tiers import Tier
+from gateway.control.design import DesignRefused, DesignTask, task_of
+from gateway.core.controller import Controller, config_hash
+from gateway.core.line import Line
+from gateway.core.scenario import PAPER, Scenario, ScenarioRefused, scenario_of
+from sim_plant.plant import Plant
+
+J = TypeVar("J")
+R = TypeVar("R")
+
+
+class RehearsalRefused(Exception):
+    """Line, plant and scenarios do not go together. `reasons` has all of it."""
+
+    def __init__(self, reasons: list[str]) -> None:
+        super().__init__("; ".join(reasons))
+        self.reasons = reasons
+
+
+@dataclass(frozen=True)
+class Case:
+    """A scenario, and the line and the plant under the conditions that it is run in."""
+
+    scenario: Scenario
+    line: Line
+    plant: Plant
+
+
+def cases_of(line: Line, plant: Plant, scenarios: Sequence[Scenario], tier: Tier | None) -> list[Case]:
+    """`scenarios` (none: both of the paper's) on `line` and `plant`, under `tier` or else under their own conditions.
+
+    Wires and addresses are not looked at: nothing here is on a wire. Raises RehearsalRefused with every reason.
+    """
+    reasons: list[str] = []
+    if line.n != plant.spans:
+        reasons.append(f"the line has {_spans(line.n)}, the plant has {_spans(plant.spans)}: change either")
+    if not scenarios and line.n != PAPER[0].n:
+        reasons.append(
+            f"the paper's scenarios are for {PAPER[0].n} spans, the line has {line.n}: name the TOML file of a "
+            f"scenario with --scenario"
+        )
+    elif not scenarios:
+        scenarios = PAPER
+    found: list[Case] = []
+    for scenario in scenarios:
+        try:
+            found.append(_case(line, plant, scenario, tier))
+        except ScenarioRefused as refused:
+            reasons.append(f"{scenario.name}: {refused}")
+            continue
+        reasons += found[-1].scenario.reasons_against(line.n, found[-1].line.limits)
+    if reasons:
+        raise RehearsalRefused(reasons)
+    return found
+
+
+def _case(line: Line, plant: Plant, scenario: Scenario, tier: Tier | None) -> Case:
+    if tier is not None:
+        moved = scenario_of(scenario.moved_over(tier.move_s).model_dump())  # it may end before its move does
+        return Case(moved, tier.line(line, moved), tier.plant(plant))
+    return Case(scenario, _moving_as(line, scenario), plant)
+
+
+def _moving_as(line: Line, scenario: Scenario) -> Line:
+    """A scenario that moves says how fast: `line` with the rates at which its set-points do. Steps need none."""
+    if not scenario.move_s:
+        return line
+    control, limits = line.control, line.limits
+    own = Tier(
+        "", "", control.period_s, control.latency_s, limits.torque_nm, limits.torque_rate_nm_per_s, scenario.move_s
+    )
+    return line.model_copy(update={"moves": own.line(line, scenario).moves})
+
+
+def rehearse(
+    cases: Sequence[Case],
+    seed: int,
+    workers: int,
+    tell: Callable[[str], None] = lambda text: None,
+    designs: Sequence[Design] = DESIGNS,
+) -> list[ConfigurationResult]:
+    """Every design in every case. But for compute times the result does not depend on `workers` (processes).
+
+    A design that is refused is not offered, a run that is refused is a failure; the others go on.
+    """
+    with _mapped(workers) as mapped:
+        tell("designing")
+        tasks = [(design, _task(design, cases[0])) for design in designs]  # the scenario plays no part in a design
+        configs = list(mapped(_designed, tasks))
+        jobs = [(config, case, seed) for config in configs if not isinstance(config, str) for case in cases]
+        found: list[CaseResult | str] = []
+        for outcome in mapped(_run, jobs):
+            found.append(outcome)
+            tell(f"{len(found)} of {len(jobs)} runs")
+    outcomes = iter(found)
+    return _beside_truth([_configuration(d, c, cases, outcomes) for d, c in zip(designs, configs, strict=True)])
+
+
+def _task(design: Design, case: Case) -> DesignTask:
+    task = task_of(case.line)
+    return replace(task, model=truth_of(case.plant)) if design.model == TRUTH else task
+
+
+def _designed(job: tuple[Design, DesignTask]) -> Controller | str:
+    """The configuration, or why there is none."""
+    try:
+        return offered(*job)
+    except DesignRefused as refused:
+        return str(refused)
+
+
+def _run(job: tuple[Controller, Case, int]) -> CaseResult | str:
+    """The figures of a run, or why there are none."""
+    config, case, seed = job
+    try:
+        return _figures(case.scenario, run_scenario(case.line, config, case.plant, case.scenario, seed))
+    except ValueError as refused:
+        return f"the gateway stopped the line before the change, or refuses it ({refused})"
+
+
+def _figures(scenario: Scenario, run: SteppedResult) -> CaseResult:
+    metrics = run.metrics
+    p50, p99 = np.percentile(run.step_s * 1e6, (50, 99))
+    return CaseResult(
+        scenario=scenario.name,
+        rmse_n=metrics.rmse_n,
+        rmse_per_span_n=metrics.rmse_per_span_n.tolist(),
+        settling_s=[_unless_never(time_s) for time_s in metrics.settling_s.tolist()],
+        settling_paper_s=_unless_never(metrics.settling_paper_s),
+        overshoot_pct=metrics.overshoot_pct.tolist(),
+        overshoot_paper_pct=metrics.overshoot_paper_pct,
+        effort_n2m2s=metrics.effort_n2m2s,
+        compute_us=Spread(p50=float(p50), p99=float(p99), max=float(run.step_s.max() * 1e6)),
+        tension_min_n=float(run.tension_n.min()),
+        tension_max_n=float(run.tension_n.max()),
+        unsafe_events=run.unsafe_events,
+        stopped=not run.torque_nm[-1].any(),
+    )
+
+
+def _configuration(
+    design: Design, config: Controller | str, cases: Sequence[Case], outcomes: Iterator[CaseResult | str]
+) -> ConfigurationResult:
+    """Takes of `outcomes` what belongs to `config`: one for each case, none where it was refused."""
+    is_offered = not isinstance(config, str)
+    own = {case.scenario.name: next(outcomes) for case in cases} if is_offered else {}
+    return ConfigurationResult(
+        name=design.name,
+        law=design.law,
+        model=design.model,
+        controller=config_hash(config) if is_offered else None,
+        refused=None if is_offered else config,
+        cases=[outcome for outcome in own.values() if not isinstance(outcome, str)],
+        failures={name: outcome for name, outcome in own.items() if isinstance(outcome, str)},
+    )
+
+
+def _beside_truth(found: list[ConfigurationResult]) -> list[ConfigurationResult]:
+    """With every RMSE over the best that a design on the truth has reached; that of a line at rest is worth nothing."""
+    best: dict[str, float] = {}
+    for configuration in found:
+        for case in configuration.cases:
+            if configuration.model == TRUTH and not case.stopped:
+                best[case.scenario] = min(case.rmse_n, best.get(case.scenario, np.inf))
+
+    def beside(case: CaseResult) -> CaseResult:
+        comparable = case.scenario in best and not case.stopped
+        return case.model_copy(
+            update={"ratio_to_truth_design": case.rmse_n / best[case.scenario] if comparable else None}
+        )
+
+    return [one.model_copy(update={"cases": [beside(case) for case in one.cases]}) for one in found]
+
+
+class Mapped(Protocol):
+    def __call__(self, function: Callable[[J], R], jobs: Sequence[J], /) -> Iterator[R]: ...
+
+
+@contextmanager
+def _mapped(workers: int) -> Iterator[Mapped]:
+    """`map` over processes: results in the order of the jobs, each as soon as it and those before it are there."""
+    if workers == 1:
+        yield map
+        return
+    # Not forked: numba and the linear algebra library have threads of their own by now.
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_end_on_interrupt) as pool:
+        yield pool.map
+
+
+def _end_on_interrupt() -> None:
+    """In a process of the pool: Ctrl-C in the terminal reaches it as well, and ends it without a traceback."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
+def processors() -> int:
+    """How many this process may use."""
+    return len(os.sched_getaffinity(0))
+
+
+def _unless_never(time_s: float) -> float | None:
+    return time_s if isfinite(time_s) else None
+
+
+def _spans(count: int) -> str:
+    return f"{count} span" if count == 1 else f"{count} spans"

@@ -1,0 +1,74 @@
+"""A rehearsal on the terminal: a table for each scenario that fits 80 columns, and a few plain lines."""
+
+from pathlib import Path
+
+import numpy as np
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+
+from gateway.cli.rehearse_result import CaseResult, RehearseResult
+from gateway.core.line_problem import printable
+
+COLUMNS = ("configuration", "RMSE N", "/truth", "settle s", "over %", "p99 us", "T N", "unsafe")
+
+
+def print_result(result: RehearseResult, out: Path, console: Console) -> None:
+    for scenario in result.scenarios:
+        console.print(f"{printable(scenario.heading)}: {conditions(result)}", markup=False)
+        console.print(_table(result, scenario.name))
+        console.print()
+    for line in remarks(result):
+        console.print(printable(line), markup=False)
+    unsafe = result.unsafe_events
+    console.print(f"unsafe events at the simulated drives, all runs: {unsafe}", style="bold red" if unsafe else "")
+    console.print(f"result: {out}", markup=False, soft_wrap=True)
+
+
+def conditions(result: RehearseResult) -> str:
+    given = result.conditions
+    under = f"tier {result.tier}" if result.tier else "the line's own conditions"
+    return (
+        f"{under}, {1e3 * given.period_s:g} ms, latency {1e3 * given.latency_s:g} ms, {given.torque_nm:g} Nm, "
+        f"seed {result.seed}"
+    )
+
+
+def remarks(result: RehearseResult) -> list[str]:
+    """What the figures do not say."""
+    told: list[str] = []
+    for one in result.configurations:
+        if one.refused is not None:
+            told.append(f"{one.name} is not offered: {one.refused}")
+        told += [f"{one.name} has no figures in {scenario}: {why}" for scenario, why in one.failures.items()]
+        told += [f"{one.name}: the gateway stopped the line in {case.scenario}" for case in one.cases if case.stopped]
+    if result.without_term:
+        told.append("the plant has what no model of a design has a term for:")
+        told += [f"  {what}" for what in result.without_term]
+    return told
+
+
+def _table(result: RehearseResult, scenario: str) -> Table:
+    table = Table(box=SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 1, 0, 0))
+    for name in COLUMNS:
+        table.add_column(name, justify="left" if name == "configuration" else "right", no_wrap=True)
+    for one in result.configurations:
+        for case in one.cases:
+            if case.scenario == scenario:
+                table.add_row(one.name, *_cells(case), style="bold red" if case.unsafe_events or case.stopped else "")
+    return table
+
+
+def _cells(case: CaseResult) -> list[str]:
+    """Settling and overshoot of the worst span."""
+    settling = [np.inf if time_s is None else time_s for time_s in case.settling_s]
+    ratio = case.ratio_to_truth_design
+    return [
+        f"{case.rmse_n:.3f}",
+        "-" if ratio is None else f"{ratio:.3f}",
+        "never" if np.isinf(max(settling)) else f"{max(settling):.2f}",
+        f"{max(case.overshoot_pct):.1f}",
+        f"{case.compute_us.p99:.0f}",
+        f"{case.tension_min_n:.0f} to {case.tension_max_n:.0f}",
+        "STOP" if case.stopped else str(case.unsafe_events),
+    ]
