@@ -98,17 +98,18 @@ def _moved_most(scenario: Scenario, finished: list[Finished]) -> int:
 
 
 def _tuning(result: DesignResult) -> Section:
-    most = max((len(one.history) for one in result.tuning), default=1)
-    series = tuple(Series(one.architecture, _best_so_far(one, most)) for one in result.tuning)
-    chart = Chart(
-        "Cost of the best so far", "N² s", np.arange(most, dtype=np.float64), series, x_label="Attempt", log_y=True
-    )
     said = tuple(
         f"{one.architecture}: {len(one.history)} attempts, "
         + ("until nothing better was to be expected." if one.converged else "as many as allowed.")
         for one in result.tuning
     )
-    return Section("Tuning", said, (), (chart,) if most > 1 else ())
+    most = max(len(one.history) for one in result.tuning)
+    if most < 2:
+        return Section("Tuning", said)
+    series = tuple(Series(one.architecture, _best_so_far(one, most)) for one in result.tuning)
+    number = np.arange(most, dtype=np.float64)
+    chart = Chart("Cost of the best so far", "N² s", number, series, x_label="Attempt", log_y=True)
+    return Section("Tuning", said, (), (chart,))
 
 
 def _best_so_far(one: TuningResult, most: int) -> FloatArray:

@@ -91,8 +91,9 @@ def diagnosis(trial: Trial, ground: Ground) -> str:
 
 
 def _cost(run: Rollouts, course: Course, period_s: float) -> float:
-    error_n2s = period_s * course.periods * float(np.mean(run.squared_error_n2.sum(axis=1)))
-    return error_n2s + TORQUE_PER_NM2 * float(np.mean(run.effort_n2m2s.sum(axis=1)))
+    squared_error: FloatArray = run.squared_error_n2.sum(axis=1)  # (b,)
+    effort: FloatArray = run.effort_n2m2s.sum(axis=1)
+    return period_s * course.periods * float(np.mean(squared_error)) + TORQUE_PER_NM2 * float(np.mean(effort))
 
 
 def _nominal(run: Rollouts, course: Course, period_s: float) -> RunMetrics:

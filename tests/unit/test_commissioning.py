@@ -125,13 +125,13 @@ def test_only_what_is_better_and_valid_is_accepted(ground):
     tuned = tune(
         LQR,
         ground,
-        Told({"torque_per_nm2": 3.0}, {"torque_per_nm2": 0.03}, {"torque_per_nm2": 3.0}, {"torque_per_nm2": 1e-5}),
+        Told({"torque_per_nm2": 3.0}, {"torque_per_nm2": 0.1}, {"torque_per_nm2": 3.0}, {"torque_per_nm2": 1e-5}),
     )
     assert [attempt.accepted for attempt in tuned.history] == [True, True, False, False]
     assert tuned.converged and tuned.best is tuned.history[1]
     last = tuned.history[-1]
     assert "more delay" in last.refused and last.cost_n2s is None and last.trial.cost_n2s is not None
-    assert tuned.config(LQR, ground) == LQR.design(ground.task, {"torque_per_nm2": 0.03})
+    assert tuned.config(LQR, ground) == LQR.design(ground.task, {"torque_per_nm2": 0.1})
 
 
 @pytest.mark.parametrize(

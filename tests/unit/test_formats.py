@@ -13,6 +13,7 @@ import pytest
 from pydantic import TypeAdapter
 
 from gateway.cli.demo_result import DemoResult
+from gateway.cli.design_result import DesignResult
 from gateway.cli.rehearse_result import RehearseResult
 from gateway.core.controller import ControllerConfig, parse_controller
 from gateway.core.messages import Command, Event, Reply
@@ -34,6 +35,7 @@ FORMATS: dict[str, tuple[TypeAdapter[Any], Callable[[bytes], object], str]] = {
     "scenario": (TypeAdapter(Scenario), lambda payload: scenario_of(tomllib.loads(payload.decode())), "toml"),
     "demo-result": (TypeAdapter(DemoResult), _json(TypeAdapter(DemoResult)), "json"),
     "rehearse": (TypeAdapter(RehearseResult), _json(TypeAdapter(RehearseResult)), "json"),
+    "design": (TypeAdapter(DesignResult), _json(TypeAdapter(DesignResult)), "json"),
     "bench": (TypeAdapter(BenchResult), _json(TypeAdapter(BenchResult)), "json"),
     "command": (TypeAdapter(Command), _json(TypeAdapter(Command)), "json"),
     "reply": (TypeAdapter(Reply), _json(TypeAdapter(Reply)), "json"),
