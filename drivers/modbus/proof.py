@@ -37,10 +37,11 @@ class Proof:
     async def go_on(self, connection: ModbusConnection, deadline_s: float) -> list[str]:
         """The checks that are left; what speaks against the unit. Raises ModbusTimeout."""
         while not self.complete:
-            at = self._passed  # `prepare` may prove, or void, all of it meanwhile
+            at = self._passed
             if reasons := await self.judge(at, connection, deadline_s):
                 return reasons
-            self._passed = at + 1
+            if self._passed == at:  # `prepare` may have proven, or voided, all of it meanwhile
+                self._passed = at + 1
         return []
 
     async def judge(self, group: int, connection: ModbusConnection, deadline_s: float) -> list[str]:

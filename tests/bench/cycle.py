@@ -99,7 +99,7 @@ class Cell:
             "helpers_rss_mb": round(self.worst(lambda one: one.helpers_rss_mb), 1),
             "cpu_share": round(float(np.mean([one.cpu_share for one in self.slices])), 4),
             "reader_answers": sum(one.answers for one in self.slices),
-            "unsafe_events": sum(one.unsafe for one in self.slices),
+            "unsafe_events": [event for one in self.slices for event in one.unsafe],
             "stops": [text for one in self.slices for text in one.stops],
         }
 
@@ -135,7 +135,7 @@ def main() -> None:
     wired = wire_time(bench, settings)
     everything = [*cells, *disturbed, *wired]
     periods = sum(cell.periods for cell in everything)
-    bench.figure("unsafe_events", sum(one.unsafe for cell in everything for one in cell.slices), "", periods)
+    bench.figure("unsafe_events", sum(len(one.unsafe) for cell in everything for one in cell.slices), "", periods)
     bench.figure("stops", sum(len(one.stops) for cell in everything for one in cell.slices), "", periods)
     bench.figure("slices_not_run", sum(len(cell.not_run) for cell in everything), "", periods)
     bench.tables["not_run"] = [text for cell in everything for text in cell.not_run]

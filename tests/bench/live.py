@@ -191,10 +191,10 @@ class LiveLine:
         self.children.end("sim")
         return read_recording(self.folder / "recording")
 
-    def unsafe(self) -> int:
-        """The recorder's count, once the simulated line has ended."""
-        summary = json.loads((self.folder / "recording" / "summary.json").read_text())
-        return sum(summary["unsafe_events"].values())
+    def unsafe(self) -> list[str]:
+        """What the recorder has seen, once the simulated line has ended."""
+        events = read_recording(self.folder / "recording").of_kind("unsafe")
+        return [json.dumps({key: value for key, value in event.items() if key != "kind"}) for event in events]
 
 
 def all_heard(status: GatewayStatus) -> bool:

@@ -35,7 +35,7 @@ class Slice:
     helpers_rss_mb: float  #: of its child processes together
     cpu_share: float  #: of one processor
     answers: int  #: had by the full-speed reader
-    unsafe: int
+    unsafe: list[str]  #: what the recorder has seen
     stops: list[str]  #: why the line did not come to run at once, or stopped
 
 

@@ -248,7 +248,10 @@ def test_design_makes_the_folder_and_suggestions_can_be_pasted(line_file: Path, 
     out = tmp_path / "new one" / "c.json"
     said = refused("loop", line_file, "--controller", out)
     assert f"r2rgate design '{line_file}' --out '{out}' writes one" in said
-    assert CliRunner().invoke(app, ["design", str(line_file), "--law", "lqi", "--untuned", "--out", str(out)]).exit_code == 0
+    assert (
+        CliRunner().invoke(app, ["design", str(line_file), "--law", "lqi", "--untuned", "--out", str(out)]).exit_code
+        == 0
+    )
     assert out.exists()
 
 
@@ -277,7 +280,10 @@ def test_a_controller_that_does_not_fit_ends_run_with_the_loops_sentence(line_fi
     small = tmp_path / "small.toml"
     small.write_text(line_template(1), encoding="utf-8")
     controller = tmp_path / "c.json"
-    assert CliRunner().invoke(app, ["design", str(small), "--law", "lqi", "--untuned", "--out", str(controller)]).exit_code == 0
+    assert (
+        CliRunner().invoke(app, ["design", str(small), "--law", "lqi", "--untuned", "--out", str(controller)]).exit_code
+        == 0
+    )
     before = controller.read_bytes()
     folders = ["--run-dir", tmp_path / "r", "--data-dir", tmp_path / "d"]
     command = [sys.executable, "-m", "gateway.cli", "run", line_file, "--controller", controller, *folders]
