@@ -20,7 +20,7 @@ from gateway.core.controller import Controller
 from gateway.core.controller_laws import MpcConfig
 from gateway.core.metrics import BAND
 from gateway.core.signals import FloatArray
-from gateway.core.web_model import WebModel, equilibrium_torque, reference_speeds
+from gateway.core.web_model import WebModel
 
 
 @dataclass(frozen=True)
@@ -159,25 +159,27 @@ def simulate_slowly(
 
 def start(plants: Plants, course: Course) -> tuple[FloatArray, FloatArray]:
     """State (b, 2n) and torques (b, n) of each plant's own equilibrium at the beginning of the course."""
-    tension, unwind = course.tension_n[0], float(course.unwind_speed_m_per_s[0])
-    states, torques = np.empty((plants.count, 2 * plants.n)), np.empty((plants.count, plants.n))
-    for b in range(plants.count):
-        model = plants.model(b)
-        speed = reference_speeds(model, tension, unwind)
-        states[b] = np.concatenate((tension, speed))
-        torques[b] = equilibrium_torque(model, tension, speed)
-    return states, torques
+    tension = np.tile(course.tension_n[0], (plants.count, 1))
+    before, after = plants.boundary_n[:, :1], plants.boundary_n[:, 1:]
+    # Eq. reference_velocity and dv/dt = 0, for all plants at once.
+    ratios: FloatArray = (plants.stiffness_n - np.hstack((before, tension[:, :-1]))) / (plants.stiffness_n - tension)
+    speeds: FloatArray = course.unwind_speed_m_per_s[0] * np.cumprod(ratios, axis=1)
+    pulled: FloatArray = plants.radius_m * (np.hstack((tension[:, 1:], after)) - tension)
+    return np.hstack((tension, speeds)), plants.friction_nms_per_rad * speeds / plants.radius_m - pulled
 
 
 def references(config: Controller, course: Course) -> FloatArray:
     """[T_ref; v_ref; u_ref] (k, 3n) as the law has them."""
     deviation = Deviation(config.feedforward, config.draw_spans, config.period_s, config.latency_s)
+    asked = np.column_stack((course.tension_n, course.unwind_speed_m_per_s))
+    # What stands for a while is computed once.
+    begins = np.flatnonzero(np.concatenate(([True], (asked[1:] != asked[:-1]).any(axis=1))))
     rows: list[FloatArray] = []
-    for tension, unwind in zip(course.tension_n, course.unwind_speed_m_per_s.tolist(), strict=True):
+    for tension, unwind in zip(course.tension_n[begins], course.unwind_speed_m_per_s[begins].tolist(), strict=True):
         reference = Steady(tension)
         state = deviation.state(reference, unwind)
         rows.append(np.concatenate((state, deviation.torque(reference, unwind, 0))))
-    return np.array(rows)
+    return np.repeat(np.array(rows), np.diff(np.append(begins, course.periods)), axis=0)
 
 
 def rollouts_of(tensions: FloatArray, torques: FloatArray, course: Course, setup: Setup, *, record: bool) -> Rollouts:

@@ -24,8 +24,9 @@ from gateway.core.signals import FloatArray
 
 LANES = 8
 
-# numba's decorator has no types; what it returns is called as the function it decorates.
-_inlined: Any = njit(inline="always", error_model="numpy")
+# numba's decorator has no types; what it returns is called as the function it decorates. Whether to inline is left to
+# LLVM: one large function has too many arrays for it to see that they do not overlap, and becomes scalar code.
+_part: Any = njit(error_model="numpy", fastmath={"contract"})
 _parallel: Any = njit(parallel=True, cache=True, error_model="numpy", fastmath={"contract"})
 
 # Rows of what the kernel accumulates for each roller or span.
@@ -80,7 +81,9 @@ def _lanes(values: FloatArray, fill: Any) -> FloatArray:
 def _entries(matrix: FloatArray) -> tuple[Any, Any, FloatArray]:
     """Where each row begins, columns and values of the non-zero entries."""
     rows, columns = np.nonzero(matrix)
-    return np.searchsorted(rows, np.arange(matrix.shape[0] + 1)), columns, np.ascontiguousarray(matrix[rows, columns])
+    begins = np.searchsorted(rows, np.arange(matrix.shape[0] + 1))
+    # Unsigned: a signed index may count from the end, and asking for it each time costs six times the sum itself.
+    return begins.astype(np.uint64), columns.astype(np.uint64), np.ascontiguousarray(matrix[rows, columns])
 
 
 def _engaged(
@@ -112,7 +115,7 @@ def flattened(state: Any) -> FloatArray:
     return np.concatenate([np.ravel(getattr(state, name)) for name in state.__slots__])
 
 
-@_inlined
+@_part
 def _rate(coefficients, boundary, state, torque, unwind, rate, n):
     """d[T; v]/dt for all lanes; rows of `coefficients` are EA, 1/L, R^2/J, f/J, R/J, n each."""
     for i in range(n):
@@ -131,7 +134,7 @@ def _rate(coefficients, boundary, state, torque, unwind, rate, n):
             )
 
 
-@_inlined
+@_part
 def _product(begins, columns, values, vector, out):
     """out = matrix @ vector for all lanes."""
     for row in range(begins.size - 1):
@@ -143,7 +146,7 @@ def _product(begins, columns, values, vector, out):
                 out[row, w] += value * vector[column, w]
 
 
-@_inlined
+@_part
 def _see(state, samples, reference, steps, signals, size, n):
     """Errors as measured, and the reference, into `signals` [z; e; x_ref; u_ref; u_applied]."""
     for j in range(2 * n):
@@ -157,7 +160,7 @@ def _see(state, samples, reference, steps, signals, size, n):
             signals[size + 2 * n + j, w] = reference[j]
 
 
-@_inlined
+@_part
 def _limit(asked, before, most_nm, reach_nm, applied, n):
     """What the envelope lets through."""
     for i in range(n):
@@ -167,7 +170,7 @@ def _limit(asked, before, most_nm, reach_nm, applied, n):
             applied[i, w] = min(max(held, was - reach_nm), was + reach_nm)
 
 
-@_inlined
+@_part
 def _account(state, reference, applied, before, sums, n):
     """Torques and tensions of a period."""
     for i in range(n):
@@ -182,7 +185,7 @@ def _account(state, reference, applied, before, sums, n):
             sums[_MOST, i, w] = max(sums[_MOST, i, w], tension)
 
 
-@_inlined
+@_part
 def _account_change(state, reference, band, direction, since, sums, n):
     """Settling and overshoot, `since` periods after the change."""
     for i in range(n):
@@ -194,7 +197,7 @@ def _account_change(state, reference, band, direction, since, sums, n):
             sums[_BEYOND, i, w] = max(sums[_BEYOND, i, w], past)
 
 
-@_inlined
+@_part
 def _added(state, factor, slope, out):
     """out = state + factor slope"""
     for j in range(state.shape[0]):
@@ -202,7 +205,7 @@ def _added(state, factor, slope, out):
             out[j, w] = state[j, w] + factor * slope[j, w]
 
 
-@_inlined
+@_part
 def _step(coefficients, boundary, state, torque, unwind, moved, step_s, slopes, probe, n):
     """One step of RK4, and what moves the rollers at random."""
     k1, k2, k3, k4 = slopes[0], slopes[1], slopes[2], slopes[3]

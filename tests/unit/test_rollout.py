@@ -124,3 +124,12 @@ def test_torque_never_leaves_its_limits_and_designs_hold_on_the_box(seed, design
 def test_what_does_not_fit_is_refused(setup, says):
     with pytest.raises(ValueError, match=says):
         simulate(design_lqi(task()), random_plants(1), course(), setup)
+
+
+def test_the_start_is_each_plants_own_equilibrium():
+    from gateway.control.rollout import rate, start
+
+    plants = random_plants(5)
+    states, torques = start(plants, course())
+    for b in range(plants.count):
+        assert np.abs(rate(plants.model(b), states[b], torques[b], 0.01)).max() < 1e-9
