@@ -106,7 +106,7 @@ class LqrConfig(Law):
 class LqiConfig(Law):
     """State feedback with integral action and the torques in flight as states.
 
-    u = u_ref - K_x x~ - K_u [u~_{k-1}; ..; u~_{k-d}] - K_i q
+    u = u_ref - K_x x~ - K_u [u~_{k-1}; ..; u~_{k-d}] - K_i q, q the integral of the controlled errors
     """
 
     kind: Literal["lqi"] = "lqi"
