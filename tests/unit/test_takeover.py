@@ -166,6 +166,14 @@ def test_any_law_takes_over_from_any_other(first, second, case, instant, seed, d
         assert np.abs(tension[-30:] - alone[1][0][-30:])[:, spans].max() < 0.3
 
 
+@pytest.mark.parametrize("after", [2, 4, 10, 20])
+def test_what_is_never_corrected_is_not_taken_from_a_transient(after):
+    """The torque of a step is no disturbance: an observer that keeps what it took would hold the line off for good."""
+    step, theta, k, mpc = CASES[1], plant(3), CHANGE + after, "mpc without disturbances"
+    taken, alone = (run(laws, step, theta, 3)[0] for laws in ({0: law("lqi"), k: law(mpc)}, {0: law(mpc)}))
+    assert np.abs(taken[-50:] - alone[-50:]).max() < 3.0
+
+
 @pytest.mark.parametrize("design", [design_pid, design_lqr, design_lqi, design_lqg])
 @pytest.mark.parametrize("top_m_per_s", [0.1, 10.0])
 def test_gains_that_follow_the_speed_move_the_torque_no_more_than_gains_that_stay(design, top_m_per_s):
