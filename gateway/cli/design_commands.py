@@ -37,6 +37,9 @@ def design(
     untuned: Annotated[
         bool, typer.Option("--untuned", help="The first guess of one --law as it is, without any simulation.")
     ] = False,
+    schedule: Annotated[
+        str, typer.Option(help="Speeds in m/s, such as 0.1,2,5: gains that follow the unwinder. Not for mpc.")
+    ] = "",
     seed: Annotated[int, typer.Option(min=0, help="Of the noise, and of the lines within the tolerances.")] = 0,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
@@ -55,18 +58,19 @@ def design(
     from gateway.control.design import DesignRefused
 
     line = read_line(file)
-    names = list(dict.fromkeys(one.value for one in law or LawName))
+    speeds = _speeds(schedule)
+    names = list(dict.fromkeys(one.value for one in law or LawName if law or not speeds or one is not LawName.MPC))
     _may_write(out)
     try:
         if untuned:
-            _first_guess(line, names, out, as_json)
+            _first_guess(line, names, speeds, out, as_json)
         else:
-            _phase(line, names, scenario or [], iterations, seed, out, as_json)
+            _phase(line, names, scenario or [], speeds, iterations, seed, out, as_json)
     except DesignRefused as refused:
         _refuse(f"no controller for {file}: {refused}")
 
 
-def _first_guess(line: Line, names: list[str], out: Path, as_json: bool) -> None:
+def _first_guess(line: Line, names: list[str], speeds: list[float], out: Path, as_json: bool) -> None:
     from gateway.commissioning.architectures import ARCHITECTURES
     from gateway.control.design import margins, require_margin, task_of
     from gateway.core.controller import canonical, config_hash
@@ -74,7 +78,7 @@ def _first_guess(line: Line, names: list[str], out: Path, as_json: bool) -> None
     if len(names) != 1:
         _refuse("--untuned compares nothing: name one architecture with --law")
     architecture, task = ARCHITECTURES[names[0]], task_of(line)
-    config = architecture.design(task, architecture.first())
+    config = architecture.design(task, architecture.first(), speeds)
     found = margins(config, task)
     require_margin(found)
     out.write_bytes(canonical(config) + b"\n")
@@ -90,7 +94,14 @@ def _first_guess(line: Line, names: list[str], out: Path, as_json: bool) -> None
 
 
 def _phase(
-    line: Line, names: list[str], given: list[str], iterations: int, seed: int, out: Path, as_json: bool
+    line: Line,
+    names: list[str],
+    given: list[str],
+    speeds: list[float],
+    iterations: int,
+    seed: int,
+    out: Path,
+    as_json: bool,
 ) -> None:
     from gateway.cli.design_phase import run_design
     from gateway.cli.design_progress import Progress
@@ -109,7 +120,7 @@ def _phase(
         _refuse(f"--scenario: {refused}")
     began_s = time.monotonic()
     with Progress(names, iterations, quiet=as_json) as progress:
-        found = run_design(line, scenarios, names, iterations, seed, progress.attempted)
+        found = run_design(line, scenarios, names, iterations, seed, progress.attempted, speeds)
     result = result_of(line, found, seed)
     record, report = out.with_suffix(".design.json"), out.with_suffix(".design.html")
     record.write_text(result.model_dump_json(indent=2) + "\n", encoding="utf-8")
@@ -127,6 +138,20 @@ def _phase(
         typer.echo(
             f"configuration: {out}, hash {result.controller[:12]}; to use it: r2rgate run LINE --controller {out}"
         )
+
+
+def _speeds(given: str) -> list[float]:
+    from gateway.core.controller_schedule import wrong_speeds
+
+    speeds: list[float] = []
+    try:
+        speeds = [float(one) for one in given.split(",")] if given else []
+        wrong = wrong_speeds(speeds) if speeds else ""
+    except ValueError:
+        wrong = "these are no numbers"
+    if wrong:
+        _refuse(f"--schedule {given}: {wrong}")
+    return speeds
 
 
 def _may_write(out: Path) -> None:

@@ -84,9 +84,10 @@ def run_design(
     iterations: int,
     seed: int,
     on_attempt: Callable[[str, Attempt], None],
+    speeds_m_per_s: Sequence[float] = (),
 ) -> Design:
     """Tune, compare, choose. Raises DesignRefused where no design can begin."""
-    ground = ground_of(line, scenarios, BOX_PLANTS, seed)
+    ground = ground_of(line, scenarios, BOX_PLANTS, seed, speeds_m_per_s)
     assessment = assess(line, ground.task)
     finished = _tuned_in_workers(ground, names, iterations, on_attempt)
     candidates = ranked([_candidate(one, ground, line) for one in finished])

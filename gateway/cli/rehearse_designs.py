@@ -1,7 +1,7 @@
 """The configurations that a rehearsal compares, and what a design can know of the truth."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -16,12 +16,7 @@ from gateway.control.design import (
     margins,
     require_margin,
 )
-from gateway.control.design.margins import DELAY_STEP_S, LEAST_DELAY_MARGIN_S, closed_loop
-from gateway.control.design.sampling import with_dead_time
-from gateway.control.design.task import linear
-from gateway.control.linear_form import linear_form
 from gateway.core.controller import Controller
-from gateway.core.controller_laws import MpcConfig
 from gateway.core.web_model import WebModel
 from sim_plant.plant import Plant
 
@@ -58,29 +53,8 @@ DESIGNS = (
 def offered(design: Design, task: DesignTask) -> Controller:
     """The configuration on the model of `task`. Raises DesignRefused, also where it stands too little delay."""
     config = design.make(task)
-    if isinstance(config, MpcConfig) and not np.any(config.predictor.gain_disturbance):
-        _require_margin_of_constant_disturbance(config, task)
-    else:
-        require_margin(margins(config, task))
+    require_margin(margins(config, task))
     return config
-
-
-def _require_margin_of_constant_disturbance(config: MpcConfig, task: DesignTask) -> None:
-    """`margins` takes a disturbance estimate that nothing ever corrects for modes at 1, and the loop for unstable.
-
-    It is a constant: its rows of the closed loop say that it stays, and no eigenvalue of the rest depends on it.
-    """
-    form, (A, B) = linear_form(config), linear(task)
-
-    def radius(extra_s: float) -> float:
-        loop = closed_loop(form, with_dead_time(A, B, task.period_s, task.latency_s + extra_s))
-        moves = (loop != np.eye(len(loop))).any(axis=1)
-        return float(np.abs(np.linalg.eigvals(loop[np.ix_(moves, moves)])).max())
-
-    delays = np.arange(0.0, LEAST_DELAY_MARGIN_S + 0.5 * DELAY_STEP_S, DELAY_STEP_S)
-    first = next((i for i, extra_s in enumerate(delays) if not radius(extra_s) < 1.0), len(delays))
-    stood_s = float(delays[max(first - 1, 0)])
-    require_margin(replace(margins(config, task), spectral_radius=radius(0.0), delay_margin_s=stood_s))
 
 
 def truth_of(plant: Plant) -> WebModel:

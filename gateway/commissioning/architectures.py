@@ -4,7 +4,7 @@ A knob acts on a whole family of gains through the design; gains follow from it 
 and are turned by factors.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from gateway.control.design import (
@@ -19,8 +19,11 @@ from gateway.control.design import (
     design_lqr,
     design_mpc,
     design_pid,
+    design_scheduled,
 )  # fmt: skip
 from gateway.core.controller import Controller
+from gateway.core.controller_laws import MpcConfig
+from gateway.core.controller_schedule import LinearConfig
 from gateway.core.nearest import nearest
 
 Values = Mapping[str, float]
@@ -42,15 +45,20 @@ class Architecture:
     name: str
     title: str
     knobs: tuple[Knob, ...]
-    make: Callable[[DesignTask, Values], Controller]
+    make: Callable[[DesignTask, Values], LinearConfig | MpcConfig]
 
     def first(self) -> dict[str, float]:
         return {knob.name: knob.first for knob in self.knobs}
 
-    def design(self, task: DesignTask, values: Values) -> Controller:
-        """The configuration at `values`. Raises DesignRefused, also for values that are none of its knobs'."""
+    def design(self, task: DesignTask, values: Values, speeds_m_per_s: Sequence[float] = ()) -> Controller:
+        """The configuration at `values`; with speeds, one whose gains follow them.
+
+        Raises DesignRefused, also for values that are none of its knobs', and for a schedule of MPC.
+        """
         if wrong := self.wrong(values):
             raise DesignRefused("; ".join(wrong))
+        if speeds_m_per_s:
+            return design_scheduled(task, lambda at_speed: self.make(at_speed, values), list(speeds_m_per_s))
         return self.make(task, values)
 
     def wrong(self, values: Values) -> list[str]:

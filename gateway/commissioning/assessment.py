@@ -1,18 +1,14 @@
 """Before any design: how fast the line is, how its spans hang together, and whether a linear model is enough."""
 
-from dataclasses import replace
-
 import numpy as np
 
-from gateway.control.design import DesignTask
-from gateway.control.design.sampling import with_dead_time
+from gateway.control.design import DesignTask, design_lqi, design_scheduled, gains_change
 from gateway.control.design.task import linear
 from gateway.core.line import Line, NonNegative, Strict
-from gateway.core.signals import FloatArray
 from gateway.core.web_model import equilibrium_torque, reference_speeds
 
 STRAIN = 0.1  #: beyond it the products T v of the web equation are no small correction
-MODES_MOVE = 0.3  #: beyond it one set of gains for all speeds is a compromise
+GAINS_MOVE = 0.2  #: beyond it one set of gains for all speeds is a compromise
 COUPLED = 0.3  #: of a torque's effect on its own span: beyond it loops that are tuned one by one fight each other
 
 
@@ -24,7 +20,7 @@ class Assessment(Strict):
     dead_time_s: NonNegative  #: from a sample to the middle of the time for which its torque acts
     coupling: NonNegative  #: what a torque does to a neighbouring span's tension, of what it does to its own
     strain: NonNegative  #: greatest permitted tension over E A: the relative size of the nonlinear terms
-    modes_move: NonNegative  #: change of the sampled dynamics between standstill and greatest speed, relative
+    gains_move: NonNegative  #: change of the gains of a linear feedback over the line's speeds, relative
     torque_use: NonNegative  #: of the limit, needed to hold the first recipe at the greatest speed
     linearised: bool
     schedule: bool
@@ -40,12 +36,12 @@ def assess(line: Line, task: DesignTask) -> Assessment:
     dead_time_s = task.latency_s + 0.5 * task.period_s
     coupling = _coupling(task, 0.5 / dead_time_s)
     strain = line.limits.tension_max_n / task.model.stiffness_n
-    modes_move = _modes_move(task, line.limits.speed_max_m_per_s)
+    gains_move = _gains_move(task, line.limits.speed_max_m_per_s)
     speeds = reference_speeds(task.model, task.tension_n, line.limits.speed_max_m_per_s)
     torque_use = float(np.abs(equilibrium_torque(task.model, task.tension_n, speeds)).max()) / line.limits.torque_nm
     found = Assessment(
         fastest_s=fastest_s, slowest_s=slowest_s, dead_time_s=dead_time_s, coupling=coupling, strain=strain,
-        modes_move=modes_move, torque_use=torque_use, linearised=strain <= STRAIN, schedule=modes_move > MODES_MOVE,
+        gains_move=gains_move, torque_use=torque_use, linearised=strain <= STRAIN, schedule=gains_move > GAINS_MOVE,
         sentences=[],
     )  # fmt: skip
     return found.model_copy(update={"sentences": _sentences(found, line.limits.speed_max_m_per_s)})
@@ -57,7 +53,7 @@ def _sentences(found: Assessment, speed_m_per_s: float) -> list[str]:
     together = "the spans must be controlled together" if found.coupling > COUPLED else "single spans hardly meet"
     linearised = "designs take the model linearised at the operating point, simulation and feed-forward the full one"
     rough = "a linear design is a rough guide here, and what simulation of the full model says is what counts"
-    follow = "gains should follow the speed" if found.schedule else "one set of gains serves all speeds"
+    follow = "gains should follow the speed (--schedule)" if found.schedule else "one set of gains serves all speeds"
     meet = ": large steps meet it, and MPC alone knows of it beforehand" if found.torque_use > 0.5 else ""
     return [
         f"The line's own modes take from {found.fastest_s:.3g} to {found.slowest_s:.3g} s; the dead time of "
@@ -66,7 +62,7 @@ def _sentences(found: Assessment, speed_m_per_s: float) -> list[str]:
         f"{found.coupling:.2f} N: {together}.",
         f"Tension reaches {100.0 * found.strain:.2g} % of E A, which is the size of the nonlinear terms: "
         f"{linearised if found.linearised else rough}.",
-        f"From standstill to {speed_m_per_s:g} m/s the sampled dynamics change by {100.0 * found.modes_move:.2g} %: "
+        f"Up to {speed_m_per_s:g} m/s the gains of a linear feedback change by {100.0 * found.gains_move:.2g} %: "
         f"{follow}.",
         f"Holding the first recipe at that speed takes {100.0 * found.torque_use:.0f} % of the torque limit{meet}.",
     ]
@@ -83,17 +79,6 @@ def _coupling(task: DesignTask, rad_per_s: float) -> float:
     return float(((gain - np.diag(own)) / own).max())
 
 
-def _modes_move(task: DesignTask, fastest_m_per_s: float) -> float:
-    """||F(v_max) - F(0)|| / ||F(v_max) - I||, F the state's transition over the time that a controller looks at."""
-
-    def transition(speed_m_per_s: float) -> FloatArray:
-        A, B = linear(replace(task, unwind_speed_m_per_s=speed_m_per_s))
-        return with_dead_time(A, B, 10.0 * task.period_s, 0.0).transition
-
-    fast = transition(fastest_m_per_s)
-    # Speeds in units in which they weigh as much as the tensions that they cause.
-    n = task.n
-    scale = np.concatenate((np.ones(n), np.full(n, task.model.stiffness_n / float(np.mean(task.model.length_m)))))
-    moved = scale[:, None] * (fast - transition(0.0)) / scale
-    whole = scale[:, None] * (fast - np.eye(2 * n)) / scale
-    return float(np.linalg.norm(moved) / np.linalg.norm(whole))
+def _gains_move(task: DesignTask, fastest_m_per_s: float) -> float:
+    """By how much the gains of an LQI change from a tenth of the greatest speed to all of it, relative."""
+    return max(gains_change(design_scheduled(task, design_lqi, [0.1 * fastest_m_per_s, fastest_m_per_s])).values())

@@ -27,6 +27,7 @@ class Ground:
     scenarios: tuple[Scenario, ...]
     models: tuple[WebModel, ...]  #: the nominal one first
     setup: Setup
+    speeds_m_per_s: tuple[float, ...] = ()  #: over which gains follow the speed; none: one set for all
     least_margin_s: float = LEAST_DELAY_MARGIN_S
 
     @cached_property
@@ -48,7 +49,9 @@ class Ground:
         return replace(self, scenarios=tuple(map(shorter, self.scenarios)), models=self.models[:plants])
 
 
-def ground_of(line: Line, scenarios: Sequence[Scenario], plants: int, seed: int) -> Ground:
+def ground_of(
+    line: Line, scenarios: Sequence[Scenario], plants: int, seed: int, speeds_m_per_s: Sequence[float] = ()
+) -> Ground:
     """The ground of a line: its nominal model, and `plants` more within its tolerances.
 
     Raises DesignRefused where a scenario does not fit the line, or hardly any plant of the box can be held.
@@ -65,7 +68,7 @@ def ground_of(line: Line, scenarios: Sequence[Scenario], plants: int, seed: int)
         seed=seed,
     )  # fmt: skip
     models = (task.model, *box_models(line, scenarios, plants, seed))
-    return Ground(task, tuple(scenarios), models, setup)
+    return Ground(task, tuple(scenarios), models, setup, tuple(speeds_m_per_s))
 
 
 def box_models(line: Line, scenarios: Sequence[Scenario], count: int, seed: int) -> list[WebModel]:

@@ -42,7 +42,7 @@ class Tuned:
             reasons = list(dict.fromkeys(attempt.refused for attempt in self.history if attempt.refused))
             tries = f"{len(self.history)} attempt{'s' if len(self.history) > 1 else ''}"
             raise DesignRefused(f"none of {tries} can be offered; {'; '.join(reasons[:3])}")
-        return architecture.design(ground.task, self.best.values)
+        return architecture.design(ground.task, self.best.values, ground.speeds_m_per_s)
 
 
 def best_of(history: Sequence[Attempt]) -> Attempt | None:
@@ -76,7 +76,7 @@ def attempted(
     """What became of a suggestion: designed, simulated, validated, and compared with the best before."""
     number, values, reason = len(history), dict(suggestion.values), suggestion.reason
     try:
-        trial = tried(architecture.design(ground.task, values), ground)
+        trial = tried(architecture.design(ground.task, values, ground.speeds_m_per_s), ground)
     except DesignRefused as refused:
         return Attempt(number=number, values=values, reason=reason, trial=None, refused=str(refused), accepted=False)
     against = "; ".join(reasons_against(trial, ground))

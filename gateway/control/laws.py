@@ -7,8 +7,10 @@ from gateway.control.lqg import Lqg
 from gateway.control.lqi import Lqi
 from gateway.control.lqr import Lqr
 from gateway.control.pid import Pid
+from gateway.control.scheduled import Scheduled, SpeedGrid
 from gateway.core.controller import Controller
 from gateway.core.controller_laws import LqgConfig, LqiConfig, LqrConfig, MpcConfig, PidConfig
+from gateway.core.controller_schedule import ScheduledConfig
 
 ENDLESS_S = 1e6
 
@@ -33,3 +35,6 @@ def make_law(config: Controller) -> Law[Any]:
             from gateway.control.mpc import Mpc  # 25 MB of solver, for those who use it
 
             return Mpc(config)
+        case ScheduledConfig():
+            grid = SpeedGrid(config)
+            return Scheduled(grid, [make_law(law) for law in grid.laws])

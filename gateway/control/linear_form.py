@@ -15,8 +15,8 @@ import numpy as np
 
 from gateway.control.mpc_problem import MpcProblem
 from gateway.control.takeover import fade
-from gateway.core.controller import Controller
 from gateway.core.controller_laws import LqgConfig, LqiConfig, LqrConfig, MpcConfig, PidConfig, Predictor
+from gateway.core.controller_schedule import LinearConfig
 from gateway.core.signals import FloatArray
 
 
@@ -41,6 +41,18 @@ class LinearForm:
         return rows[:, begin[name] : begin[names[names.index(name) + 1]]]
 
 
+def without_constants(form: LinearForm) -> LinearForm:
+    """The form without states that never change, such as a disturbance that no measurement corrects.
+
+    They are modes at 1 which say nothing of stability.
+    """
+    states, width = form.state.shape
+    constant = (form.state == np.eye(states, width)).all(axis=1) & ~form.applied.any(axis=1)
+    kept = np.flatnonzero(~constant)
+    columns = [*kept.tolist(), *range(states, width)]
+    return LinearForm(form.n, form.torque[:, columns], form.state[kept][:, columns], form.applied[kept])
+
+
 class _Signals:
     """Rows that pick a signal out of [z; e; x_ref; u_ref]."""
 
@@ -53,8 +65,8 @@ class _Signals:
         self.u_ref = eye[states + 4 * n :]
 
 
-def linear_form(config: Controller) -> LinearForm:
-    """The form of a law; of MPC, that of its feedback where no limit is reached."""
+def linear_form(config: LinearConfig | MpcConfig) -> LinearForm:
+    """The form of a law; of MPC, that of its feedback where no limit is reached. A schedule has one per speed."""
     match config:
         case PidConfig():
             return _pid(config)
@@ -100,17 +112,18 @@ def _lqr(config: LqrConfig) -> LinearForm:
 
 
 def _lqi(config: LqiConfig) -> LinearForm:
-    """z = [integral; torques in flight, newest first]"""
+    """z = [integral part in Nm; torques in flight, newest first]"""
     n, gain_input = config.n, np.array(config.gain_input).reshape(config.n, -1)
-    depth, gain_integral = gain_input.shape[1] // n, np.array(config.gain_integral)
+    depth = gain_input.shape[1] // n
     signals = _Signals(n, n + n * depth)
     integral, sent = signals.z[:n], signals.z[n:]
     error, controlled = _errors(signals, config.draw_spans)
     in_flight = sent - np.tile(signals.u_ref, (depth, 1))
-    torque = signals.u_ref - np.array(config.gain_state) @ error - gain_input @ in_flight - gain_integral @ integral
-    taken_back = config.antiwindup * np.linalg.inv(gain_integral)
-    integral_next = integral + config.period_s * controlled + taken_back @ torque
-    applied = np.vstack((-taken_back, _newest(n, depth)))
+    torque = signals.u_ref - np.array(config.gain_state) @ error - gain_input @ in_flight + integral
+    integral_next = (
+        integral - config.period_s * np.array(config.gain_integral) @ controlled - config.antiwindup * torque
+    )
+    applied = np.vstack((config.antiwindup * np.eye(n), _newest(n, depth)))
     return LinearForm(n, torque, np.vstack((integral_next, _shifted(sent, n))), applied)
 
 

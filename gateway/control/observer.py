@@ -9,7 +9,7 @@ from gateway.control.flight import deviations, newest_first
 from gateway.control.reference import Reference
 from gateway.control.takeover import NEAR_SETPOINT, fade
 from gateway.core.controller_laws import Predictor
-from gateway.core.signals import FloatArray
+from gateway.core.signals import BoolArray, FloatArray
 
 
 @dataclass(slots=True)
@@ -43,6 +43,7 @@ class Observer:
         self._period_s = period_s
         self._draw = np.array(draw_spans, dtype=np.intp)
         self._gain = np.vstack((predictor.gain_state, predictor.gain_disturbance))  # one product a period
+        self._corrects = bool(np.any(self._gain[2 * self.n :]))  #: the disturbance
         self._fade = fade(period_s)
         self._ahead = np.hstack((predictor.transition, *predictor.inputs))
 
@@ -50,11 +51,14 @@ class Observer:
         """As if the line stood where it is: whatever holds it there beside `applied_nm` (n,) is the disturbance.
 
         Not what would make a law ask for `applied_nm` at once: noise of one sample would be taken for a disturbance.
+        An observer that never corrects it takes none in the middle of a move: it would be wrong for ever.
         """
         errors = self._deviation.errors(measured, reference)
         in_flight = np.tile(applied_nm, (self.depth, 1))
         seen = self._measured(measured, reference)
-        return ObserverState(seen, errors.torque_nm - applied_nm, in_flight, np.zeros(self.n))
+        taken = self._corrects or self._there(measured, reference).all()
+        disturbance = errors.torque_nm - applied_nm if taken else np.zeros(self.n)
+        return ObserverState(seen, disturbance, in_flight, np.zeros(self.n))
 
     def estimate(self, state: ObserverState, measured: Measured, reference: Reference) -> Estimate:
         """What the sample says, weighed against what was predicted."""
@@ -92,7 +96,12 @@ class Observer:
 
     def _measured(self, measured: Measured, reference: Reference) -> FloatArray:
         """The first estimate: a tension near its set-point is taken to be there, not where one sample has it."""
+        there = self._there(measured, reference)
+        return np.concatenate((np.where(there, reference.tension_n, measured.tension_n), measured.speed_m_per_s))
+
+    def _there(self, measured: Measured, reference: Reference) -> BoolArray:
+        """Spans (n,) whose tension is near its set-point; one without a load cell is taken to be."""
         setpoint = reference.tension_n
         there = np.abs(measured.tension_n - setpoint) <= NEAR_SETPOINT * setpoint
         there[self._draw] = True
-        return np.concatenate((np.where(there, setpoint, measured.tension_n), measured.speed_m_per_s))
+        return there

@@ -14,7 +14,6 @@ import numpy as np
 from gateway.control.deviation import Deviation, Measured
 from gateway.control.law import Law
 from gateway.control.laws import make_law, untimed
-from gateway.control.linear_form import linear_form
 from gateway.control.reference import Steady
 from gateway.core.controller import Controller
 from gateway.core.controller_laws import MpcConfig
@@ -141,7 +140,7 @@ def simulate(config: Controller, plants: Plants, course: Course, setup: Setup, *
         return simulate_slowly(config, plants, course, setup, record=record)
     from gateway.control.rollout_kernel import run  # compiled code, for those who use it
 
-    return run(config, linear_form(config), plants, course, setup, record=record)
+    return run(config, plants, course, setup, record=record)
 
 
 def simulate_slowly(

@@ -15,10 +15,11 @@ from numba import njit, prange
 
 from gateway.control.deviation import Measured
 from gateway.control.laws import make_law
-from gateway.control.linear_form import LinearForm
+from gateway.control.linear_form import linear_form
 from gateway.control.reference import Steady
 from gateway.control.rollout import Course, Plants, Rollouts, Setup, references, start, step_direction
-from gateway.core.controller import Controller
+from gateway.control.scheduled import SpeedGrid
+from gateway.core.controller_schedule import LinearConfig, ScheduledConfig
 from gateway.core.metrics import BAND
 from gateway.core.signals import FloatArray
 
@@ -34,16 +35,18 @@ _SQUARED, _LEAST, _MOST, _LAST, _BEYOND, _TORQUE, _STEP, _EFFORT = range(8)
 
 
 def run(
-    config: Controller, form: LinearForm, plants: Plants, course: Course, setup: Setup, *, record: bool
+    config: LinearConfig | ScheduledConfig, plants: Plants, course: Course, setup: Setup, *, record: bool
 ) -> Rollouts:
-    """`rollout.simulate` for a law with a linear form."""
+    """`rollout.simulate` for a law with a linear form, or with one for each speed."""
     n, count = plants.n, plants.count
+    laws, which = _laws(config, course)
+    forms = [linear_form(law) for law in laws]
     blocks = -(-count // LANES)
     fill = np.minimum(np.arange(blocks * LANES), count - 1)  # the last block repeats the last plant
     states, torques = start(plants, course)
     samples, moved = setup.draw(course.periods, n)
     reference = references(config, course)
-    memory = _engaged(config, course, setup, states, torques, samples[0])
+    memory = _engaged(laws[which[0]], course, setup, states, torques, samples[0])
     coefficients = np.stack(
         (
             plants.stiffness_n, 1.0 / plants.length_m, plants.radius_m**2 / plants.inertia_kg_m2,
@@ -55,7 +58,7 @@ def run(
     found = _simulate(
         _lanes(coefficients.transpose(1, 0, 2).reshape(count, -1), fill), _lanes(plants.boundary_n, fill),
         _lanes(states, fill), _lanes(torques, fill), _lanes(memory, fill),
-        *_entries(form.torque), *_entries(np.hstack((form.state, form.applied))),
+        *_entries([form.torque for form in forms]), *_entries([np.hstack((f.state, f.applied)) for f in forms]), which,
         reference, course.unwind_speed_m_per_s, samples, moved,
         np.array([setup.tension_step_n] * n + [setup.speed_step_m_per_s] * n),
         BAND * course.tension_n[-1], step_direction(course), course.changed,
@@ -78,16 +81,26 @@ def _lanes(values: FloatArray, fill: Any) -> FloatArray:
     return np.ascontiguousarray(picked.reshape(-1, LANES, values.shape[1]).transpose(0, 2, 1))
 
 
-def _entries(matrix: FloatArray) -> tuple[Any, Any, FloatArray]:
-    """Where each row begins, columns and values of the non-zero entries."""
-    rows, columns = np.nonzero(matrix)
-    begins = np.searchsorted(rows, np.arange(matrix.shape[0] + 1))
+def _laws(config: LinearConfig | ScheduledConfig, course: Course) -> tuple[list[LinearConfig], Any]:
+    """The laws that a course needs, and which of them each period (k,): the unwinder's speed is known before."""
+    if not isinstance(config, ScheduledConfig):
+        return [config], np.zeros(course.periods, dtype=np.int64)
+    grid = SpeedGrid(config)
+    used, which = np.unique(grid.course(course.unwind_speed_m_per_s.tolist()), return_inverse=True)
+    return [grid.laws[at] for at in used], which
+
+
+def _entries(matrices: list[FloatArray]) -> tuple[Any, Any, FloatArray]:
+    """Where each row begins, columns, and values (matrices, entries) of what is non-zero in any of them."""
+    every = np.array(matrices)
+    rows, columns = np.nonzero(every.any(axis=0))
+    begins = np.searchsorted(rows, np.arange(every.shape[1] + 1))
     # Unsigned: a signed index may count from the end, and asking for it each time costs six times the sum itself.
-    return begins.astype(np.uint64), columns.astype(np.uint64), np.ascontiguousarray(matrix[rows, columns])
+    return begins.astype(np.uint64), columns.astype(np.uint64), np.ascontiguousarray(every[:, rows, columns])
 
 
 def _engaged(
-    config: Controller, course: Course, setup: Setup, states: FloatArray, torques: FloatArray, noise: FloatArray
+    config: LinearConfig, course: Course, setup: Setup, states: FloatArray, torques: FloatArray, noise: FloatArray
 ) -> FloatArray:
     """The law's state (b, s) as it engages on each plant.
 
@@ -227,7 +240,7 @@ def _step(coefficients, boundary, state, torque, unwind, moved, step_s, slopes, 
 @_parallel
 def _simulate(
     coefficients, boundary, states, torques, memories,
-    torque_begins, torque_columns, torque_values, state_begins, state_columns, state_values,
+    torque_begins, torque_columns, torque_values, state_begins, state_columns, state_values, which,
     reference, unwinds, samples, moved, steps, band, direction, changed, substeps, delay, step_s,
     most_nm, reach_nm, tension_out, torque_out,
 ):  # fmt: skip
@@ -246,7 +259,7 @@ def _simulate(
         sent[:] = before
         for k in range(unwinds.size):
             _see(state, samples[k], reference[k], steps, signals, size, n)
-            _product(torque_begins, torque_columns, torque_values, signals, asked)
+            _product(torque_begins, torque_columns, torque_values[which[k]], signals, asked)
             _limit(asked, before, most_nm, reach_nm, applied, n)
             if k == 0:
                 before[:] = applied  # a change counts from the first torque of the law's own
@@ -258,7 +271,7 @@ def _simulate(
             if tension_out.size > 0:
                 tension_out[block * LANES : (block + 1) * LANES, k] = state[:n].T
                 torque_out[block * LANES : (block + 1) * LANES, k] = applied.T
-            _product(state_begins, state_columns, state_values, signals, following)
+            _product(state_begins, state_columns, state_values[which[k]], signals, following)
             signals[:size] = following
             for sub in range(substeps):
                 age = max(-(-(delay - sub) // substeps), 0)

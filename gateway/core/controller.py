@@ -7,9 +7,10 @@ from typing import Annotated
 from pydantic import Field, TypeAdapter, ValidationError
 from pydantic_core import ErrorDetails
 
-from gateway.core.controller_laws import LqgConfig, LqiConfig, LqrConfig, MpcConfig, PidConfig
+from gateway.core.controller_laws import MpcConfig
+from gateway.core.controller_schedule import LinearConfig, ScheduledConfig
 
-Controller = PidConfig | LqrConfig | LqiConfig | LqgConfig | MpcConfig
+Controller = LinearConfig | MpcConfig | ScheduledConfig
 ControllerConfig = Annotated[Controller, Field(discriminator="kind")]
 _adapter: TypeAdapter[Controller] = TypeAdapter(ControllerConfig)
 

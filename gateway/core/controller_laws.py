@@ -10,7 +10,9 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from gateway.core.line import NonNegative, Positive, Strict
+from gateway.core.signals import FloatArray
 
+CONVEX = 1e-9  #: of the greatest eigenvalue: how far below 0 the smallest may come by rounding
 Matrix = list[list[float]]
 Vector = list[float]
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
@@ -106,7 +108,7 @@ class LqrConfig(Law):
 class LqiConfig(Law):
     """State feedback with integral action and the torques in flight as states.
 
-    u = u_ref - K_x x~ - K_u [u~_{k-1}; ..; u~_{k-d}] - K_i q
+    u = u_ref - K_x x~ - K_u [u~_{k-1}; ..; u~_{k-d}] - K_i q, q the integral of the controlled errors
     """
 
     kind: Literal["lqi"] = "lqi"
@@ -200,6 +202,7 @@ class MpcConfig(Law):
         self._require("fallback_state", self.fallback_state, (n, 2 * n))
         size = 2 * n + n * depth
         self._require("weight_terminal", self.weight_terminal, (size, size))
+        _check_convex(np.array(self.weight_terminal))
         _check_predictor(n, self.predictor, depth)
         for name, vector, length in (
             ("weight_state", self.weight_state, 2 * n),
@@ -212,6 +215,18 @@ class MpcConfig(Law):
         if self.tension_min_n >= self.tension_max_n:
             raise ValueError(f"tension_min_n {self.tension_min_n:g} is not below tension_max_n {self.tension_max_n:g}")
         return self
+
+
+def _check_convex(weight_terminal: FloatArray) -> None:
+    """A cost that falls without end in some direction has no least: the solver would find out at the first sample."""
+    symmetric = 0.5 * (weight_terminal + weight_terminal.T)
+    eigenvalues: FloatArray = np.asarray(np.linalg.eigvalsh(symmetric), dtype=np.float64)
+    least, greatest = float(eigenvalues[0]), float(np.abs(eigenvalues).max())
+    if least < -CONVEX * greatest:
+        raise ValueError(
+            f"weight_terminal is not positive semidefinite: its smallest eigenvalue is {least:.4g}, allowed: from 0 up "
+            f"(rounding: {-CONVEX * greatest:.1g})"
+        )
 
 
 def _check_predictor(n: int, predictor: Predictor, depth: int) -> None:

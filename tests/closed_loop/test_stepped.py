@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gateway.cli.stepped import run_scenario
-from gateway.control.design import design_lqi, design_pid, task_of
+from gateway.control.design import design_lqi, design_pid, design_scheduled, task_of
 from gateway.core.messages import Arm, Hold, SelectRecipe, SetSpeed, SetTension, Start, Stop
 from gateway.core.scenario import PAPER, TENSION
 from gateway.core.states import LoopState, Phase
@@ -190,3 +190,12 @@ def test_pid_holds_both_cases_without_an_unsafe_event():
     results = [run_scenario(line, design_pid(task_of(line)), real_plant(), case, 1) for case in PAPER]
     assert sum(result.unsafe_events for result in results) == 0
     assert max(result.rmse_n for result in results) < 3.0
+
+
+def test_a_scheduled_law_runs_in_the_cycle_as_the_law_that_it_is_made_of():
+    """The speed case: gains of this line hardly depend on the speed, so that neither may the result."""
+    line, plant, case = demo_line(), real_plant(), PAPER[1]
+    config = design_scheduled(task_of(line), design_lqi, [0.0, 0.05, 0.1])
+    found, alone = (run_scenario(line, one, plant, case, seed=1) for one in (config, design_lqi(task_of(line))))
+    assert found.unsafe_events == alone.unsafe_events == 0
+    assert found.rmse_n == pytest.approx(alone.rmse_n, rel=0.01) and found.rmse_n != alone.rmse_n

@@ -87,11 +87,12 @@ def test_what_cannot_be_done_is_refused_and_nothing_is_written(line_file: Path, 
         (("--law", "lqi", "--scenario", "nowhere.toml"), "nowhere.toml cannot be read"),
         (("--law", "lqi", "--scenario", "tension"), "tension is for 6 spans, the line has 2"),
         (("--law", "fuzzy"), "'fuzzy' is not one of"),
+        (("--law", "lqi", "--untuned", "--schedule", "1,0.5"), "--schedule 1,0.5: "),
+        (("--law", "lqi", "--untuned", "--schedule", "fast"), "these are no numbers"),
     ):
         code, _, err = design(line_file, *given, "--out", out)
         assert code == 2 and says in err.replace("\n", " ").replace("│", "").replace("  ", " ")
     assert not out.exists()
-
 
 
 def test_where_no_torque_holds_the_line_nothing_is_offered(line_file: Path, tmp_path: Path) -> None:

@@ -241,6 +241,19 @@ def test_a_stretchy_web_and_a_fast_one_are_told():
     assert assess(fast, task_of(fast)).schedule
 
 
+def test_gains_that_follow_the_speed_are_tuned_like_any(ground):
+    from dataclasses import replace
+
+    speeds = replace(ground, speeds_m_per_s=(0.01, 0.1))
+    tuned = tune(LQR, speeds, Told({"torque_per_nm2": 0.1}))
+    config = tuned.config(LQR, speeds)
+    assert config.kind == "scheduled" and config.speed_m_per_s == [0.01, 0.1]
+    alone = tune(LQR, ground, Told({"torque_per_nm2": 0.1}))
+    assert tuned.best.cost_n2s == pytest.approx(alone.best.cost_n2s, rel=0.01), "this line hardly needs it"
+    mpc = attempted(ARCHITECTURES["mpc"], speeds, Suggestion(values=ARCHITECTURES["mpc"].first(), reason=""), ())
+    assert "mpc has no schedule" in mpc.refused
+
+
 def test_a_line_of_one_span_has_no_neighbours():
     assert assess(demo(1), task_of(demo(1))).coupling == 0.0
 

@@ -1,5 +1,7 @@
 """MPC against a second solver, against the linear law that it is without limits, and against bad input."""
 
+import json
+
 import clarabel
 import numpy as np
 import pytest
@@ -8,9 +10,10 @@ from scipy.sparse import csc_matrix, vstack
 from gateway.control.design import DesignLimits, DesignRefused, DesignTask, MpcWeights, design_lqg, design_mpc
 from gateway.control.design.lq import LqgWeights
 from gateway.control.law import Measured
-from gateway.control.laws import make_law
+from gateway.control.laws import make_law, untimed
 from gateway.control.mpc import Mpc
 from gateway.control.reference import Steady
+from gateway.core.controller import ControllerRefused, canonical, parse_controller
 from gateway.core.web_model import equilibrium_torque, reference_speeds
 from tests.unit.control_support import model
 
@@ -23,7 +26,7 @@ def task(limits=LIMITS, n=6, period_s=0.01, latency_s=0.01, draw=()):
 
 def patient():
     """Samples at random, each far from the last, take more iterations than a line does from period to period."""
-    return design_mpc(task()).model_copy(update={"most_iterations": 5000, "time_limit_s": 1.0})
+    return untimed(design_mpc(task()).model_copy(update={"most_iterations": 5000}))
 
 
 def second_opinion(P, q, A, lower, upper):
@@ -78,7 +81,7 @@ def test_solutions_are_those_of_a_second_solver(seed):
 def test_without_limits_it_is_the_linear_law():
     weights = dict(torque_per_nm2=0.01, disturbance_nm_per_sqrt_s=2.0)
     free = task(DesignLimits())
-    mpc = make_law(design_mpc(free, MpcWeights(**weights), (1,) * 10))
+    mpc = make_law(untimed(design_mpc(free, MpcWeights(**weights), (1,) * 10)))
     lqg = make_law(design_lqg(free, LqgWeights(**weights)))
     generator = np.random.default_rng(1)
     for _ in range(20):
@@ -110,7 +113,7 @@ def test_limits_are_kept_and_the_first_torque_is_the_one_before():
 
 def test_what_is_not_solved_in_time_is_not_applied():
     config = design_mpc(task()).model_copy(update={"time_limit_s": 1e-9})
-    late, law = make_law(config), make_law(design_mpc(task()))
+    late, law = make_law(config), make_law(untimed(design_mpc(task())))
     measured, reference, torque = random_line(np.random.default_rng(3))
     state = late.engage(measured, reference, torque)
     decision = late.ask(state, measured, reference)
@@ -145,3 +148,23 @@ def test_what_is_not_solved_in_time_is_not_applied():
 def test_bad_weights_and_horizons_are_refused(weights, blocks, says):
     with pytest.raises(DesignRefused, match=says):
         design_mpc(task(), weights, blocks)
+
+
+def test_a_terminal_weight_that_falls_without_end_is_refused():
+    config = design_mpc(task(n=2)).model_dump(mode="json")
+    parse_controller(json.dumps(config).encode())
+    config["weight_terminal"][4][4] -= 1e3
+    with pytest.raises(
+        ControllerRefused, match=r"not positive semidefinite: its smallest eigenvalue is -\d"
+    ) as refused:
+        parse_controller(json.dumps(config).encode())
+    least = np.linalg.eigvalsh(np.array(config["weight_terminal"])).min()
+    assert f"eigenvalue is {least:.4g}" in str(refused.value)
+
+
+@pytest.mark.parametrize("n", [1, 6, 20])
+@pytest.mark.parametrize("draw", [(), (0,)])
+def test_every_design_is_read_again(n, draw):
+    """Rounding makes no terminal weight of a design look as if it fell."""
+    config = design_mpc(task(n=n, draw=draw))
+    assert parse_controller(canonical(config)) == config

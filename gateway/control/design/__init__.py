@@ -4,6 +4,7 @@ from gateway.control.design.lq import LqgWeights, LqiWeights, LqWeights, design_
 from gateway.control.design.margins import Margins, margins, require_margin
 from gateway.control.design.mpc import MpcWeights, design_mpc
 from gateway.control.design.pid import design_pid
+from gateway.control.design.schedule import design_scheduled, gains_change
 from gateway.control.design.task import DesignLimits, DesignRefused, DesignTask, Noise, task_of
 
 __all__ = [
@@ -21,6 +22,8 @@ __all__ = [
     "design_lqr",
     "design_mpc",
     "design_pid",
+    "design_scheduled",
+    "gains_change",
     "margins",
     "require_margin",
     "task_of",

@@ -1,6 +1,7 @@
 """How far a loop is from trouble: delay, decay, and what noise does to the torque. All on the sampled linear loop."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import pairwise
 from math import inf, log
 
 import numpy as np
@@ -8,9 +9,11 @@ from scipy.linalg import solve_discrete_lyapunov
 
 from gateway.control.design.sampling import with_dead_time
 from gateway.control.design.task import DesignRefused, DesignTask, linear
-from gateway.control.linear_form import LinearForm, linear_form
+from gateway.control.linear_form import LinearForm, linear_form, without_constants
 from gateway.control.sampled import Sampled
 from gateway.core.controller import Controller
+from gateway.core.controller_laws import MpcConfig
+from gateway.core.controller_schedule import LinearConfig, ScheduledConfig, law_at
 from gateway.core.signals import FloatArray
 
 LEAST_DELAY_MARGIN_S = 0.004
@@ -30,8 +33,27 @@ class Margins:
 
 
 def margins(config: Controller, task: DesignTask) -> Margins:
-    """Margins of `config` on the model, noise and latency of `task`."""
-    form, (A, B) = linear_form(config), linear(task)
+    """Margins of `config` on the model, noise and latency of `task`.
+
+    Of a schedule the worst of each figure at its nodes and in the middle between them, each at its own speed, in place
+    of the task's. (Speeds that change slowly against the loop: what a change itself does is no linear loop.)
+    """
+    if not isinstance(config, ScheduledConfig):
+        return _margins(config, task)
+    nodes = config.speed_m_per_s
+    speeds = [*nodes, *(0.5 * (low + high) for low, high in pairwise(nodes))]
+    each = [_margins(law_at(config, v), replace(task, unwind_speed_m_per_s=v)) for v in speeds]
+    return Margins(
+        spectral_radius=max(found.spectral_radius for found in each),
+        decay_per_s=min(found.decay_per_s for found in each),
+        delay_margin_s=min(found.delay_margin_s for found in each),
+        chatter_nm=max(found.chatter_nm for found in each),
+        noise_floor_n=max(found.noise_floor_n for found in each),
+    )
+
+
+def _margins(config: LinearConfig | MpcConfig, task: DesignTask) -> Margins:
+    form, (A, B) = without_constants(linear_form(config)), linear(task)
 
     def radius(extra_s: float) -> float:
         plant = with_dead_time(A, B, task.period_s, task.latency_s + extra_s)

@@ -1,5 +1,6 @@
 """What a design is made for, and what refuses it."""
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from math import inf
 
@@ -7,8 +8,11 @@ import numpy as np
 
 from gateway.core.controller_laws import Feedforward
 from gateway.core.line import Line
-from gateway.core.signals import FloatArray
+from gateway.core.signals import BoolArray, FloatArray
 from gateway.core.web_model import WebModel, equilibrium_torque, linearise, nominal_model, reference_speeds
+
+#: Slower, a draw span's tension decays (with L / v) too slowly for any design to tell it from never.
+LEAST_DRAW_SPEED_M_PER_S = 1e-6
 
 
 class DesignRefused(Exception):
@@ -102,35 +106,68 @@ def check_task(task: DesignTask) -> None:
 
 
 def _bad_numbers(task: DesignTask) -> list[str]:
-    model = task.model
+    model, limits, noise = task.model, task.limits, task.noise
     positive = {
-        "stiffness_n": np.array([model.stiffness_n]),
+        "stiffness_n": model.stiffness_n,
         "length_m": model.length_m,
         "radius_m": model.radius_m,
         "inertia_kg_m2": model.inertia_kg_m2,
-        "period_s": np.array([task.period_s]),
-        "noise.tension_n": np.array([task.noise.tension_n]),
-        "noise.speed_m_per_s": np.array([task.noise.speed_m_per_s]),
-        "noise.acceleration_m_per_s1_5": np.array([task.noise.acceleration_m_per_s1_5]),
-        "limits.torque_nm": np.array([task.limits.torque_nm]),
-        "limits.torque_rate_nm_per_s": np.array([task.limits.torque_rate_nm_per_s]),
+        "period_s": task.period_s,
+        "noise.tension_n": noise.tension_n,
+        "noise.speed_m_per_s": noise.speed_m_per_s,
+        "noise.acceleration_m_per_s1_5": noise.acceleration_m_per_s1_5,
     }
     not_negative = {
         "friction_nms_per_rad": model.friction_nms_per_rad,
-        "latency_s": np.array([task.latency_s]),
+        "latency_s": task.latency_s,
         "tension_n": task.tension_n,
-        "unwind_speed_m_per_s": np.array([task.unwind_speed_m_per_s]),
+        "unwind_speed_m_per_s": task.unwind_speed_m_per_s,
+        "limits.tension_min_n": limits.tension_min_n,
+        "limits.speed_max_m_per_s": limits.speed_max_m_per_s,
     }
-    found = [f"{name} is {_listed(v)}; allowed: above 0" for name, v in positive.items() if not (v > 0.0).all()]
-    found += [
-        f"{name} is {_listed(v)}; allowed: 0 and above, finite"
-        for name, v in not_negative.items()
-        if not ((v >= 0.0) & np.isfinite(v)).all()
+    may_be_none = {
+        "limits.torque_nm": limits.torque_nm,
+        "limits.torque_rate_nm_per_s": limits.torque_rate_nm_per_s,
+        "limits.tension_max_n": limits.tension_max_n,
+    }
+    found = [
+        *_outside(positive, lambda v: (v > 0.0) & np.isfinite(v), "above 0, finite"),
+        *_outside(not_negative, lambda v: (v >= 0.0) & np.isfinite(v), "0 and above, finite"),
+        *_outside(may_be_none, lambda v: v > 0.0, "above 0"),
     ]
-    if len(task.tension_n) != model.n:
-        found.append(f"{len(task.tension_n)} tensions for {model.n} spans")
-    elif not found and (task.tension_n >= model.stiffness_n).any():
+    return found or _bad_together(task)
+
+
+def _outside(
+    values: Mapping[str, FloatArray | float], allowed: Callable[[FloatArray], BoolArray], said: str
+) -> list[str]:
+    arrays = {name: np.atleast_1d(np.asarray(value, dtype=np.float64)) for name, value in values.items()}
+    return [f"{name} is {_listed(v)}; allowed: {said}" for name, v in arrays.items() if not allowed(v).all()]
+
+
+def _bad_together(task: DesignTask) -> list[str]:
+    """Numbers that are good each by itself."""
+    model, limits, n = task.model, task.limits, task.n
+    found: list[str] = []
+    if len(task.tension_n) != n:
+        found.append(f"{len(task.tension_n)} tensions for {n} spans")
+    elif (task.tension_n >= model.stiffness_n).any():
         found.append(f"tension_n is {_listed(task.tension_n)}: the web of {model.stiffness_n:g} N would tear")
+    if not limits.tension_min_n < limits.tension_max_n:
+        found.append(
+            f"limits.tension_min_n is {limits.tension_min_n:g}; allowed: below limits.tension_max_n, "
+            f"{limits.tension_max_n:g}"
+        )
+    draw = task.draw_spans
+    if any(type(i) is not int for i in draw) or [*draw] != sorted({*draw} & {*range(n)}):
+        found.append(f"draw_spans is {list(draw)}; allowed: whole numbers from 0 to {n - 1}, ascending, each once")
+    elif draw and task.unwind_speed_m_per_s < LEAST_DRAW_SPEED_M_PER_S:
+        found.append(
+            f"unwind_speed_m_per_s is {task.unwind_speed_m_per_s:g} and span {draw[0] + 1} is draw-controlled: its "
+            f"tension follows from a ratio of speeds, and of a web that stands nothing brings it back; allowed: "
+            f"{LEAST_DRAW_SPEED_M_PER_S:g} m/s and above: design for a speed at which the line runs, that law holds it "
+            f"at standstill too"
+        )
     return found
 
 
