@@ -15,6 +15,7 @@ import argparse
 import sys
 import time
 from datetime import UTC, datetime
+from math import isfinite
 
 from gateway.cli.report import Section
 from gateway.cli.tiers import TIERS
@@ -49,8 +50,11 @@ def main() -> None:
     )  # fmt: skip
     parts, drawn = _measured(given, wanted)
     for part in parts.values():
-        for figure in part.figures:
-            bench.figure(*figure)
+        for name, value, unit, n in part.figures:
+            if isfinite(value):
+                bench.figure(name, value, unit, n)
+            else:
+                print(f"{name}: no figure, {value}")
         bench.tables |= {table.caption: {"heads": table.heads, "rows": table.rows} for table in part.section.tables}
     for letter, name in (("a", "unsafe_events"), ("b", "ensemble_unsafe_events"), ("c", "sim_unsafe_events")):
         if letter in parts:

@@ -134,8 +134,8 @@ def _comparison(
 def _paper_row(law: str, oracle_n: float) -> tuple[str, ...]:
     rmse_n, settling_s, overshoot_pct, effort, compute_ms = COMPARISON[law]
     remark = (
-        f"RMSE out of reach: {LEAST_AT_THAT_EFFORT_N:.2f} N at that U_total, "
-        f"{LEAST_ELEMENT_WISE_N:.2f} N if meant element-wise; whatever the effort, {oracle_n:.4f} N under this tier"
+        f"RMSE out of reach: at that U_total {LEAST_AT_THAT_EFFORT_N:.2f} N, element-wise "
+        f"{LEAST_ELEMENT_WISE_N:.2f} N; oracle {oracle_n:.4f} N"
     )
     numbers = (told(rmse_n, 4), "", told(settling_s, 2), "", told(overshoot_pct, 2), "", told(effort, 2), "")
     return (law, "the paper", *numbers, told(compute_ms, 4), remark)
