@@ -57,7 +57,7 @@ def main() -> None:
                 print(f"{name}: no figure, {value}")
         bench.tables |= {table.caption: {"heads": table.heads, "rows": table.rows} for table in part.section.tables}
     for letter, name in (("a", "unsafe_events"), ("b", "ensemble_unsafe_events"), ("c", "sim_unsafe_events")):
-        if letter in parts:
+        if letter in parts and parts[letter].runs:
             bench.figure(name, parts[letter].unsafe, "", parts[letter].runs)
     write(given, bench, [parts[letter] for letter in sorted(parts)], drawn)
     bench.finish()
