@@ -1,169 +1,145 @@
-"""`make bench-control`: the paper's cases under every tier, each law beside the oracle; the compute time of a step.
+"""`make bench-control`: the paper's cases under every tier, each law beside the oracle, in parts:
 
-Every run goes through the whole cycle in stepped time (loop, envelope, in-memory link, simulated line) and is judged by
-the recorder there. Designs know the model that they were made on and nothing else.
+    a  every law on S_real under tiers P, A, A-fast and B, designed on S_sim and on the truth; the other boundary
+    b  the ensemble of random plants around S_sim
+    c  the paper's two tables beside ours
+    d  compute time of a step
+    e  rollouts a second
+    f  growth with the number of spans
+    g  independent checks of solver and designs
+
+Writes out/bench/control.json, .md and .html; of a part of it, out/bench/control-part.*.
 """
 
 import argparse
-import os
-from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, replace
-from typing import Any
+import sys
+import time
+from datetime import UTC, datetime
+from math import isfinite
 
-import numpy as np
-from rich.progress import Progress
+from gateway.cli.report import Section
+from gateway.cli.tiers import TIERS
+from tests.bench.control_checks import checks
+from tests.bench.control_compute import compute, p50_ms
+from tests.bench.control_ensemble import on_ensemble
+from tests.bench.control_growth import growth
+from tests.bench.control_page import drawings, write
+from tests.bench.control_paper import beside_the_paper
+from tests.bench.control_plants import TEST
+from tests.bench.control_real import on_real
+from tests.bench.control_rollouts import rollouts
+from tests.bench.control_runs import LAWS, Runs
+from tests.bench.control_tables import SEEDS, Given, Part
+from tests.bench.figures import LIBRARIES, Bench
 
-from gateway.cli.stepped import run_scenario
-from gateway.cli.tiers import TIERS, Tier
-from gateway.control.design import (
-    DesignTask,
-    MpcWeights,
-    design_lqg,
-    design_lqi,
-    design_lqr,
-    design_mpc,
-    design_pid,
-    task_of,
-)  # fmt: skip
-from gateway.core.controller import Controller
-from gateway.core.line import Line
-from gateway.core.line_file import load_line
-from gateway.core.line_template import line_template
-from gateway.core.scenario import PAPER, Scenario
-from gateway.core.web_model import WebModel
-from sim_plant.plant import Plant, load_plant
-from tests.bench.figures import Bench
-from tests.bench.oracle import Terms, oracle
-
-SEEDS = 20
-
-
-def mpc_without_observer(task: DesignTask) -> Controller:
-    """The paper's baseline: nothing in it takes an offset away."""
-    return design_mpc(task, MpcWeights(disturbance_nm_per_sqrt_s=0.0))
-
-
-LAWS: dict[str, Callable[[DesignTask], Controller]] = {
-    "PID": design_pid,
-    "LQR": design_lqr,
-    "LQI": design_lqi,
-    "LQG": design_lqg,
-    "MPC": mpc_without_observer,
-    "MPC + observer": design_mpc,
-}
-
-
-@dataclass(frozen=True)
-class Job:
-    tier: Tier
-    case: Scenario
-    law: str
-    known: str  #: the plant that the design was made on
-    truth: str
-    seed: int
-
-    @property
-    def row(self) -> tuple[str, str, str, str]:
-        return self.tier.name, self.case.name, self.law, self.known
-
-
-@dataclass(frozen=True)
-class Outcome:
-    rmse_n: float
-    unsafe: int
-
-
-def plant_named(name: str) -> Plant:
-    return load_plant(f"sim_plant/plants/{name}.toml")
-
-
-def belief(plant: Plant) -> WebModel:
-    """What a design knows when it knows the truth."""
-    p = plant.parameters()
-    return WebModel(
-        float(p.stiffness_n[0]), p.length_m, p.radius_m, p.inertia_kg_m2, p.friction_nms_per_rad, p.tension_before_n,
-        p.tension_after_n,
-    )  # fmt: skip
-
-
-def line_of(tier: Tier, case: Scenario) -> Line:
-    return tier.line(load_line(line_template(6, "line.toml"), "line.toml"), case)
-
-
-def run(job: Job) -> Outcome:
-    line = line_of(job.tier, job.case)
-    config = LAWS[job.law](replace(task_of(line), model=belief(plant_named(job.known))))
-    found = run_scenario(line, config, job.tier.plant(plant_named(job.truth)), job.tier.scenario(job.case), job.seed)
-    return Outcome(found.rmse_n, found.unsafe_events)
-
-
-def bounds(tiers: Sequence[Tier]) -> dict[tuple[str, str], float]:
-    """The oracle's RMSE on S_real, by tier and case; tier B has none."""
-    truth = plant_named("s_real").parameters()
-    found = {}
-    for tier in tiers:
-        if tier.move_s:
-            continue
-        terms = Terms(tier.period_s, tier.latency_s, tier.torque_nm, tier.torque_rate_nm_per_s)
-        for case in PAPER:
-            found[tier.name, case.name] = oracle(case, truth, terms).rmse_n
-            print(f"oracle, tier {tier.name}, {case.name}: {found[tier.name, case.name]:.4f} N", flush=True)
-    return found
+PARTS = "abcdefg"
+SOLVERS = ("osqp", "piqp", "clarabel", "control")
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(prog="make bench-control", description=__doc__)
-    parser.add_argument("--seeds", type=int, default=SEEDS)
-    parser.add_argument("--tiers", default=",".join(TIERS))
-    parser.add_argument("--laws", default=",".join(LAWS))
-    given = parser.parse_args()
-    tiers = [TIERS[name] for name in given.tiers.split(",")]
-    whole = set(tiers) == set(TIERS.values()) and set(given.laws.split(",")) == set(LAWS)
-    bench = Bench("control" if whole else "control-part", list(range(given.seeds)))
-    best = bounds(tiers)
-    jobs = [
-        Job(tier, case, law, known, "s_real", seed)
-        for tier in tiers
-        for case in PAPER
-        for law in given.laws.split(",")
-        for known in ("s_sim", "s_real")
-        for seed in range(given.seeds)
-    ]
-    rows: dict[tuple[str, str, str, str], list[Outcome]] = {}
-    with ProcessPoolExecutor(os.cpu_count()) as pool, Progress() as progress:
-        bar = progress.add_task("runs", total=len(jobs))
-        for job, outcome in zip(jobs, pool.map(run, jobs, chunksize=4), strict=True):
-            rows.setdefault(job.row, []).append(outcome)
-            progress.advance(bar)
-    table = [told(row, outcomes, best) for row, outcomes in rows.items()]
-    for entry in table:
-        over = f", {entry['to_oracle']:.3f} x oracle" if entry["to_oracle"] else ""
-        print(
-            f"{entry['tier']:7} {entry['case']:9} {entry['law']:15} on {entry['known']:7} "
-            f"{entry['rmse_n']:8.4f} N (p95 {entry['p95_n']:.4f}){over}"
-        )
-    bench.tables["rows"] = table
-    for entry in table:
-        name = "_".join(entry[key] for key in ("tier", "law", "known", "case")).lower().replace(" + ", "_")
-        bench.figure(f"{name}_n", entry["rmse_n"], "N", entry["n"])
-        if entry["to_oracle"]:
-            bench.figure(f"{name}_to_oracle", entry["to_oracle"], "x", entry["n"])
-    bench.tables["oracle"] = {f"{tier} {case}": value for (tier, case), value in best.items()}
-    bench.figure("unsafe_events", sum(one.unsafe for found in rows.values() for one in found), "", len(jobs))
+    given, wanted = _arguments()
+    whole = (
+        given.tiers == tuple(TIERS.values())
+        and given.laws == tuple(LAWS)
+        and (given.seeds, given.plants) == (SEEDS, len(TEST))
+        and wanted == set(PARTS)
+    )
+    bench = Bench(
+        "control" if whole else "control-part", list(range(given.seeds)), command=given.command,
+        libraries=(*LIBRARIES, *SOLVERS), goals_of="control", date=given.when,
+    )  # fmt: skip
+    parts, drawn = _measured(given, wanted)
+    for part in parts.values():
+        for name, value, unit, n in part.figures:
+            if isfinite(value):
+                bench.figure(name, value, unit, n)
+            else:
+                print(f"{name}: no figure, {value}")
+        bench.tables |= {table.caption: {"heads": table.heads, "rows": table.rows} for table in part.section.tables}
+    for letter, name in (("a", "unsafe_events"), ("b", "ensemble_unsafe_events"), ("c", "sim_unsafe_events")):
+        if letter in parts and parts[letter].runs:
+            bench.figure(name, parts[letter].unsafe, "", parts[letter].runs)
+    write(given, bench, [parts[letter] for letter in sorted(parts)], drawn)
     bench.finish()
 
 
-def told(row: tuple[str, str, str, str], outcomes: list[Outcome], best: dict[tuple[str, str], float]) -> dict[str, Any]:
-    tier, case, law, known = row
-    rmse = [outcome.rmse_n for outcome in outcomes]
-    mean = float(np.mean(rmse))
-    bound = best.get((tier, case))
-    return {
-        "tier": tier, "case": case, "law": law, "known": known, "rmse_n": mean,
-        "p95_n": float(np.percentile(rmse, 95)), "to_oracle": mean / bound if bound else None,
-        "unsafe": sum(outcome.unsafe for outcome in outcomes), "n": len(rmse),
-    }  # fmt: skip
+def _measured(given: Given, wanted: set[str]) -> tuple[dict[str, Part], list[Section]]:
+    """The parts by letter. What takes time of its own is measured first, with nothing beside it."""
+    parts: dict[str, Part] = {}
+    alone = {"d": compute, "e": rollouts, "f": growth, "g": checks}
+    for letter, measure in alone.items():
+        if letter in wanted:
+            with _Timed(letter):
+                parts[letter] = measure(given)
+    drawn: list[Section] = []
+    with Runs() as runs:
+        if "a" in wanted:
+            with _Timed("a"):
+                parts["a"] = on_real(given, runs)
+                drawn = drawings(given, runs)
+        if "b" in wanted:
+            with _Timed("b"):
+                parts["b"] = on_ensemble(given, runs)
+        if "c" in wanted:
+            with _Timed("c"):
+                compute_ms = p50_ms(parts["d"]) if "d" in parts else {}
+                parts["c"] = beside_the_paper(given, runs, compute_ms)
+    return parts, drawn
+
+
+class _Timed:
+    """Says how long a part has taken."""
+
+    def __init__(self, letter: str) -> None:
+        self._letter = letter
+
+    def __enter__(self) -> None:
+        self._began_s = time.monotonic()
+
+    def __exit__(self, *_: object) -> None:
+        print(f"part {self._letter}: {time.monotonic() - self._began_s:.0f} s", flush=True)
+
+
+def _arguments() -> tuple[Given, set[str]]:
+    parser = argparse.ArgumentParser(
+        prog="make bench-control", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--seeds", type=_count(SEEDS), default=SEEDS, help=f"on S_real, 1 to {SEEDS}")
+    parser.add_argument(
+        "--plants", type=_count(len(TEST)), default=len(TEST), help=f"of the ensemble, 1 to {len(TEST)}"
+    )
+    parser.add_argument("--tiers", type=_some(TIERS), default=tuple(TIERS), help=",".join(TIERS))
+    parser.add_argument("--laws", type=_some(LAWS), default=tuple(LAWS), help=",".join(LAWS))
+    parser.add_argument("--parts", type=_some(PARTS), default=tuple(PARTS), help=",".join(PARTS))
+    args = parser.parse_args()
+    more = " ".join(f"'{word}'" if " " in word else word for word in sys.argv[1:])
+    return Given(
+        command=f'make bench-control ARGS="{more}"' if more else "make bench-control",
+        when=datetime.now(UTC).isoformat(timespec="seconds"),
+        tiers=tuple(tier for name, tier in TIERS.items() if name in args.tiers),
+        laws=tuple(law for law in LAWS if law in args.laws),
+        seeds=args.seeds,
+        plants=args.plants,
+    ), set(args.parts)
+
+
+def _count(most: int):
+    def parse(text: str) -> int:
+        if not text.isdecimal() or not 1 <= int(text) <= most:
+            raise argparse.ArgumentTypeError(f"{text} is not 1 to {most}")
+        return int(text)
+
+    return parse
+
+
+def _some(known):
+    def parse(text: str) -> tuple[str, ...]:
+        names = tuple(text.split(","))
+        if unknown := [name for name in names if name not in known]:
+            raise argparse.ArgumentTypeError(f"unknown: {', '.join(unknown)}; allowed: {', '.join(known)}")
+        return names
+
+    return parse
 
 
 if __name__ == "__main__":

@@ -48,10 +48,14 @@ class Bench:
     seeds: list[int] = field(default_factory=list)
     figures: list[Figure] = field(default_factory=list)
     tables: dict[str, Any] = field(default_factory=dict)
+    command: str = ""  #: empty: make bench-NAME
+    libraries: tuple[str, ...] = LIBRARIES
+    goals_of: str = ""  #: the benchmark whose goals figures are held against; empty: its own
+    date: str = field(default_factory=lambda: datetime.now(UTC).isoformat(timespec="seconds"))
 
     def figure(self, name: str, value: float, unit: str, n: int) -> None:
         """One figure from `n` measurements."""
-        goal = GOALS.get(self.name, {}).get(name)
+        goal = GOALS.get(self.goals_of or self.name, {}).get(name)
         met = None if goal is None else bool(_MEETS[goal["op"]](value, goal["value"]))
         self.figures.append(
             Figure(
@@ -65,18 +69,21 @@ class Bench:
             )
         )
 
-    def finish(self) -> None:
-        """Write and print. Raises SystemExit when a figure that has a goal was not measured."""
-        result = BenchResult(
+    def result(self) -> BenchResult:
+        return BenchResult(
             name=self.name,
-            command=f"make bench-{self.name}",
-            date=datetime.now(UTC).isoformat(timespec="seconds"),
+            command=self.command or f"make bench-{self.name}",
+            date=self.date,
             machine=f"{os.cpu_count()} cpus, {platform.system()} {platform.release()}, Python {sys.version.split()[0]}",
-            versions={name: version(name) for name in LIBRARIES},
+            versions={name: version(name) for name in self.libraries},
             seeds=self.seeds,
             figures=self.figures,
             tables=self.tables,
         )
+
+    def finish(self) -> None:
+        """Write and print. Raises SystemExit when a figure that has a goal was not measured."""
+        result = self.result()
         path = Path("out/bench") / f"{self.name}.json"
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(result.model_dump_json(indent=2) + "\n")

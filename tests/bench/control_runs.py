@@ -1,0 +1,230 @@
+"""What is run: a law, designed on one plant, on another, under a tier; many side by side, each only once.
+
+Every run goes through the whole cycle in stepped time (loop, envelope, in-memory link, simulated line) and is judged by
+the recorder there. A design knows the model that it was made on and nothing else.
+"""
+
+import os
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from functools import cache
+from multiprocessing import get_context
+from typing import Any, Literal, Self
+
+import numpy as np
+from rich.progress import Progress
+
+from gateway.cli.stepped import SteppedResult, run_scenario
+from gateway.cli.tiers import TIERS, Tier
+from gateway.control.design import (
+    DesignRefused,
+    DesignTask,
+    MpcWeights,
+    design_lqg,
+    design_lqi,
+    design_lqr,
+    design_mpc,
+    design_pid,
+    task_of,
+)  # fmt: skip
+from gateway.core.controller import Controller
+from gateway.core.line import Line
+from gateway.core.line_file import load_line
+from gateway.core.line_template import line_template
+from gateway.core.metrics import RunMetrics
+from gateway.core.scenario import PAPER, Scenario
+from gateway.core.signals import FloatArray
+from gateway.core.web_model import WebModel
+from sim_plant.physics import STEP_S, equilibrium
+from sim_plant.plant import Plant, load_plant
+from tests.bench.control_plants import FASTEST_M_PER_S, random_plant
+from tests.bench.oracle import Terms, by_clarabel, by_piqp, oracle
+
+Boundary = Literal["free", "continued"]  #: T_0 = T_{n+1} = 0; or those of the first and the last span
+CASES = {case.name: case for case in PAPER}
+
+# What charts show of a run: densely around the change, sparsely until the line is at rest.
+TRACE_S: FloatArray = np.concatenate((np.arange(0.9, 1.5, 0.002), np.arange(1.5, 6.0, 0.02)))
+
+
+def mpc_without_observer(task: DesignTask) -> Controller:
+    """The paper's baseline: nothing in it takes an offset away."""
+    return design_mpc(task, MpcWeights(disturbance_nm_per_sqrt_s=0.0))
+
+
+LAWS: dict[str, Callable[[DesignTask], Controller]] = {
+    "PID": design_pid,
+    "LQR": design_lqr,
+    "LQI": design_lqi,
+    "LQG": design_lqg,
+    "MPC": mpc_without_observer,
+    "MPC + observer": design_mpc,
+}
+
+
+@dataclass(frozen=True)
+class Job:
+    """Names, so that it is small to send and can be looked up."""
+
+    tier: str
+    case: str
+    law: str
+    known: str  #: the plant that the design was made on
+    truth: str
+    seed: int
+    boundary: Boundary = "free"
+
+
+@dataclass(frozen=True)
+class Bound:
+    """A question to the oracle."""
+
+    tier: str
+    case: str
+    truth: str
+    boundary: Boundary = "free"
+
+
+@dataclass(frozen=True)
+class Trace:
+    """(len(TRACE_S), n) each."""
+
+    tension_n: FloatArray
+    torque_nm: FloatArray
+
+
+@dataclass(frozen=True)
+class Outcome:
+    metrics: RunMetrics | None  #: None: no design was offered
+    unsafe: int = 0
+    refused: str = ""
+    trace: Trace | None = None  #: of the first seed on a plant of the paper
+
+    @property
+    def rmse_n(self) -> float:
+        return self.metrics.rmse_n if self.metrics else float("nan")
+
+
+@dataclass(frozen=True)
+class Best:
+    rmse_n: float
+    trace: Trace
+
+
+@cache
+def plant_named(name: str, boundary: Boundary = "free", case: str = "") -> Plant:
+    """A plant of the paper by the name of its file, or `random-SEED` of the ensemble."""
+    if name.startswith("random-"):
+        plant = random_plant(int(name.removeprefix("random-")))
+    else:
+        plant = load_plant(f"sim_plant/plants/{name}.toml")
+    if boundary == "free":
+        return plant
+    tension = CASES[case].tension_n
+    ends = {"tension_before_n": tension[0], "tension_after_n": tension[-1]}
+    return plant.model_copy(update={"web": plant.web.model_copy(update=ends)})
+
+
+def belief(plant: Plant) -> WebModel:
+    """What a design knows when it knows this plant."""
+    p = plant.parameters()
+    return WebModel(
+        float(p.stiffness_n[0]), p.length_m, p.radius_m, p.inertia_kg_m2, p.friction_nms_per_rad, p.tension_before_n,
+        p.tension_after_n,
+    )  # fmt: skip
+
+
+def line_of(tier: Tier, case: Scenario) -> Line:
+    """The line of the template, with S_sim in its file, under a tier."""
+    return tier.line(load_line(line_template(case.n, "line.toml"), "line.toml"), case)
+
+
+def task_on(tier: Tier, case: Scenario, model: WebModel) -> DesignTask:
+    """The line's own design task on `model`. A plant of the ensemble need not hold more than the ensemble's speed."""
+    task = task_of(line_of(tier, case))
+    return replace(task, model=model, limits=replace(task.limits, speed_max_m_per_s=FASTEST_M_PER_S))
+
+
+def run(job: Job) -> Outcome:
+    """One run. A design that is refused is an outcome too."""
+    tier, case = TIERS[job.tier], CASES[job.case]
+    known, truth = (plant_named(name, job.boundary, job.case) for name in (job.known, job.truth))
+    try:
+        config = LAWS[job.law](task_on(tier, case, belief(known)))
+    except DesignRefused as refusal:
+        return Outcome(None, refused=str(refusal))
+    found = run_scenario(line_of(tier, case), config, tier.plant(truth), tier.scenario(case), job.seed)
+    traced = job.seed == 0 and job.boundary == "free" and not job.truth.startswith("random")
+    return Outcome(found.metrics, found.unsafe_events, trace=_trace(found) if traced else None)
+
+
+def bound(asked: Bound) -> Best:
+    """The oracle's answer. It knows literal steps only."""
+    tier, case = TIERS[asked.tier], CASES[asked.case]
+    plant = plant_named(asked.truth, asked.boundary, asked.case).parameters()
+    terms = Terms(tier.period_s, tier.latency_s, tier.torque_nm, tier.torque_rate_nm_per_s)
+    try:
+        found = oracle(case, plant, terms, by_piqp)
+    except RuntimeError:  # not solved: what it needs is an answer, not this solver's
+        found = oracle(case, plant, terms, by_clarabel)
+    _, rest = equilibrium(plant, np.array(case.tension_n), case.speed_m_per_s)
+    # From the change on there is a row a millisecond, the first of them a millisecond after it.
+    since = np.round((TRACE_S - case.change_at_s) / STEP_S).astype(int)
+    tension = np.vstack((case.tension_n, found.tension_n))
+    torque = np.vstack((rest, np.repeat(found.torque_nm, terms.steps, axis=0)))
+    rows = np.clip(since, 0, len(found.tension_n))
+    beyond = since > len(found.tension_n)
+    shown = [np.where(beyond[:, None], np.nan, values[rows]) for values in (tension, torque)]
+    return Best(found.rmse_n, Trace(*shown))
+
+
+def _trace(found: SteppedResult) -> Trace:
+    rows = np.searchsorted(found.time_s, TRACE_S - 0.5 * STEP_S)
+    return Trace(found.tension_n[rows], found.torque_nm[rows])
+
+
+class Runs:
+    """Runs in other processes. What was run before is not run again. Use as a context."""
+
+    def __init__(self, workers: int | None = None) -> None:
+        # Fresh processes: threads of compiled code do not survive a fork.
+        self._pool = ProcessPoolExecutor(workers or os.cpu_count(), mp_context=get_context("spawn"))
+        self._outcomes: dict[Job, Outcome] = {}
+        self._bests: dict[Bound, Best] = {}
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._pool.shutdown(cancel_futures=True)
+
+    def of(self, jobs: Sequence[Job], title: str) -> list[Outcome]:
+        """Outcomes of `jobs`, in their order."""
+        return _all(self._outcomes, jobs, self.each, run, title)
+
+    def best(self, asked: Sequence[Bound], title: str = "oracle") -> list[Best]:
+        """The oracle's answers, in the order of the questions."""
+        return _all(self._bests, asked, self.each, bound, title)
+
+    def each(self, function: Callable[[Any], Any], given: Sequence[Any], title: str) -> Iterable[Any]:
+        """`function` of each, in its order."""
+        with Progress() as progress:
+            bar = progress.add_task(title, total=len(given))
+            for found in self._pool.map(function, given):
+                progress.advance(bar)
+                yield found
+
+    @property
+    def made(self) -> dict[Job, Outcome]:
+        """Everything that has been run so far."""
+        return self._outcomes
+
+
+def _all(
+    known: dict[Any, Any], wanted: Sequence[Any], each: Callable[..., Iterable[Any]], function: Any, title: str
+) -> list[Any]:
+    missing = [one for one in dict.fromkeys(wanted) if one not in known]
+    if missing:
+        known.update(zip(missing, each(function, missing, title), strict=True))
+    return [known[one] for one in wanted]
