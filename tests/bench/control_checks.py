@@ -11,6 +11,7 @@ import control
 import numpy as np
 from scipy.sparse import csc_matrix, vstack
 
+from gateway.cli.rehearse_designs import truth_of
 from gateway.cli.report import Section, Table
 from gateway.cli.tiers import A as TIER
 from gateway.control.design import DesignTask, LqiWeights, LqWeights, MpcWeights, design_lqi, design_lqr, design_mpc
@@ -24,7 +25,7 @@ from gateway.core.controller_laws import MpcConfig
 from gateway.core.signals import FloatArray
 from gateway.core.web_model import equilibrium_torque, reference_speeds
 from tests.bench.control_plants import TEST
-from tests.bench.control_runs import CASES, belief, plant_named, task_on
+from tests.bench.control_runs import CASES, plant_named, task_on
 from tests.bench.control_tables import Given, Part, numeric
 from tests.bench.control_tries import Condensed, Met
 
@@ -84,7 +85,7 @@ def checks(given: Given) -> Part:
 
 def check_mpc(solver: Condensed | None) -> Apart:
     """The law, or another solver of the same problems, against clarabel."""
-    task = task_on(TIER, CASES["tension"], belief(plant_named("s_sim")))
+    task = task_on(TIER, CASES["tension"], truth_of(plant_named("s_sim")))
     config = design_mpc(task).model_copy(update={"most_iterations": 20_000, "time_limit_s": ENDLESS_S})
     law, problem = Mpc(config), MpcProblem(config)
     whole = problem.P.toarray()
@@ -144,7 +145,7 @@ def by_clarabel(problem: MpcProblem, met: Met) -> tuple[FloatArray, float]:
 
 def check_designs(plant: str) -> dict[str, float]:
     """Relative differences of gains to those of python-control, tier A: a latency of one period."""
-    task = task_on(TIER, CASES["tension"], belief(plant_named(plant)))
+    task = task_on(TIER, CASES["tension"], truth_of(plant_named(plant)))
     n, period_s = task.n, task.period_s
     assert task.latency_s == period_s
     A, B = linear(task)

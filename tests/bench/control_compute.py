@@ -4,13 +4,14 @@ from math import nan
 
 import numpy as np
 
+from gateway.cli.rehearse_designs import truth_of
 from gateway.cli.report import Section, Table
 from gateway.cli.stepped import SteppedResult, run_scenario
 from gateway.cli.tiers import A
 from gateway.core.scenario import Scenario
 from gateway.core.signals import FloatArray
 from gateway.loop.realtime import freeze_collector
-from tests.bench.control_runs import CASES, LAWS, belief, line_of, plant_named, task_on
+from tests.bench.control_runs import CASES, LAWS, line_of, plant_named, task_on
 from tests.bench.control_tables import FEW_SEEDS, Given, Part, numeric, seeds_told, slug, told
 
 PAPER_MPC_MS = 0.2319
@@ -72,7 +73,7 @@ def step_times(law: str, runs: list[tuple[Scenario, int]]) -> tuple[FloatArray, 
     plant = A.plant(plant_named("s_real"))
     found: list[tuple[FloatArray, np.ndarray]] = []
     for i, (case, seed) in enumerate([runs[0], *runs]):
-        config = LAWS[law](task_on(A, case, belief(plant_named("s_sim"))))
+        config = LAWS[law](task_on(A, case, truth_of(plant_named("s_sim"))))
         freeze_collector()
         result = run_scenario(line_of(A, case), config, plant, case, seed)
         if i:  # the first is for caches and compiled code

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from gateway.cli.rehearse_designs import truth_of
 from gateway.cli.report import Chart, Section, Series, Table
 from gateway.cli.stepped import run_scenario
 from gateway.cli.tiers import A
@@ -19,7 +20,6 @@ from gateway.core.signals import FloatArray
 from gateway.loop.realtime import freeze_collector
 from sim_plant.plant import Plant, load_plant
 from tests.bench.control_rollouts import loops_per_s
-from tests.bench.control_runs import belief
 from tests.bench.control_tables import Given, Part, numeric, slug, told
 from tests.bench.control_tries import TRIED, problems, replayed
 
@@ -59,7 +59,7 @@ def subject(n: int) -> Subject:
     )
     line = A.line(load_line(line_template(n, "line.toml"), "line.toml"), case)
     plant = A.plant(load_plant("sim_plant/plants/s_real.toml").model_copy(update={"spans": n}))
-    return Subject(line, plant, case, replace(task_of(line), model=belief(plant)))
+    return Subject(line, plant, case, replace(task_of(line), model=truth_of(plant)))
 
 
 def growth(given: Given) -> Part:

@@ -5,6 +5,7 @@ from math import inf, nan
 
 import numpy as np
 
+from gateway.cli.rehearse_designs import truth_of
 from gateway.cli.report import Section, Table
 from gateway.cli.tiers import TIERS, Tier
 from gateway.control.rollout import Setup, plants_of, simulate
@@ -12,7 +13,7 @@ from sim_plant.physics import STEP_S
 from tests.bench.control_plants import SPREAD, scaled
 from tests.bench.control_real import jobs_of, oracle_of
 from tests.bench.control_rollouts import course_of
-from tests.bench.control_runs import CASES, LAWS, Bound, Job, Outcome, Runs, belief, plant_named, task_on
+from tests.bench.control_runs import CASES, LAWS, Bound, Job, Outcome, Runs, plant_named, task_on
 from tests.bench.control_tables import FEW_SEEDS, Given, Part, mean, numeric, seeds_told, slug, told
 
 COMPARED = ("P", "A")
@@ -145,9 +146,9 @@ def _robustness_of(asked: tuple[str, str]) -> float:
     """Eq. robustness of a law by tier and name, in N: over the corners of the ensemble's box, at the samples."""
     tier, case = TIERS[asked[0]], CASES["tension"]
     base = plant_named("s_sim")
-    config = LAWS[asked[1]](task_on(tier, case, belief(base)))
+    config = LAWS[asked[1]](task_on(tier, case, truth_of(base)))
     corners = product(*((1.0 - spread, 1.0 + spread) for spread in SPREAD.values()))
-    models = [belief(base), *(belief(scaled(base, dict(zip(SPREAD, corner, strict=True)))) for corner in corners)]
+    models = [truth_of(base), *(truth_of(scaled(base, dict(zip(SPREAD, corner, strict=True)))) for corner in corners)]
     course = course_of(case, tier.period_s, ROBUSTNESS_S)
     setup = Setup(
         tier.period_s, tier.latency_s, round(tier.period_s / STEP_S), tier.torque_nm, tier.torque_rate_nm_per_s

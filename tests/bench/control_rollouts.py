@@ -5,6 +5,7 @@ import time
 
 import numpy as np
 
+from gateway.cli.rehearse_designs import truth_of
 from gateway.cli.report import Section, Table
 from gateway.cli.tiers import A
 from gateway.control.rollout import Course, Plants, Setup, plants_of, simulate
@@ -14,7 +15,7 @@ from gateway.core.scenario import Scenario
 from gateway.core.signals import FloatArray
 from sim_plant.physics import STEP_S
 from tests.bench.control_plants import TEST, random_plant
-from tests.bench.control_runs import CASES, LAWS, belief, plant_named, task_on
+from tests.bench.control_runs import CASES, LAWS, plant_named, task_on
 from tests.bench.control_tables import Given, Part, numeric, slug, told
 
 ROLLOUT_S = 10.0
@@ -34,7 +35,7 @@ def _rollouts(given: Given, figures: list[tuple[str, float, str, int]]) -> Table
     heads = ("Law", "10 ms steps, 1/s", "1 ms steps, 1/s", "Loops")
     rows = []
     for law in given.laws:
-        config = LAWS[law](task_on(A, CASES["tension"], belief(plant_named("s_sim"))))
+        config = LAWS[law](task_on(A, CASES["tension"], truth_of(plant_named("s_sim"))))
         count = SLOW_LOOPS if isinstance(config, MpcConfig) else LOOPS
         speeds = [
             loops_per_s(config, CASES["tension"], count, substeps) for substeps in (1, round(A.period_s / STEP_S))
@@ -79,5 +80,5 @@ def course_of(case: Scenario, period_s: float, duration_s: float) -> Course:
 
 def _plants(count: int, n: int) -> Plants:
     """Plants of the ensemble, again and again."""
-    models = [belief(random_plant(seed, n)) for seed in TEST[:count]]
+    models = [truth_of(random_plant(seed, n)) for seed in TEST[:count]]
     return plants_of([models[i % len(models)] for i in range(count)])

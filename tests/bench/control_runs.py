@@ -15,12 +15,12 @@ from typing import Any, Literal, Self
 import numpy as np
 from rich.progress import Progress
 
+from gateway.cli.rehearse_designs import mpc_without_observer, truth_of
 from gateway.cli.stepped import SteppedResult, run_scenario
 from gateway.cli.tiers import TIERS, Tier
 from gateway.control.design import (
     DesignRefused,
     DesignTask,
-    MpcWeights,
     design_lqg,
     design_lqi,
     design_lqr,
@@ -46,11 +46,6 @@ CASES = {case.name: case for case in PAPER}
 
 # What charts show of a run: densely around the change, sparsely until the line is at rest.
 TRACE_S: FloatArray = np.concatenate((np.arange(0.9, 1.5, 0.002), np.arange(1.5, 6.0, 0.02)))
-
-
-def mpc_without_observer(task: DesignTask) -> Controller:
-    """The paper's baseline: nothing in it takes an offset away."""
-    return design_mpc(task, MpcWeights(disturbance_nm_per_sqrt_s=0.0))
 
 
 LAWS: dict[str, Callable[[DesignTask], Controller]] = {
@@ -126,15 +121,6 @@ def plant_named(name: str, boundary: Boundary = "free", case: str = "") -> Plant
     return plant.model_copy(update={"web": plant.web.model_copy(update=ends)})
 
 
-def belief(plant: Plant) -> WebModel:
-    """What a design knows when it knows this plant."""
-    p = plant.parameters()
-    return WebModel(
-        float(p.stiffness_n[0]), p.length_m, p.radius_m, p.inertia_kg_m2, p.friction_nms_per_rad, p.tension_before_n,
-        p.tension_after_n,
-    )  # fmt: skip
-
-
 def line_of(tier: Tier, case: Scenario) -> Line:
     """The line of the template, with S_sim in its file, under a tier."""
     return tier.line(load_line(line_template(case.n, "line.toml"), "line.toml"), case)
@@ -151,7 +137,7 @@ def run(job: Job) -> Outcome:
     tier, case = TIERS[job.tier], CASES[job.case]
     known, truth = (plant_named(name, job.boundary, job.case) for name in (job.known, job.truth))
     try:
-        config = LAWS[job.law](task_on(tier, case, belief(known)))
+        config = LAWS[job.law](task_on(tier, case, truth_of(known)))
     except DesignRefused as refusal:
         return Outcome(None, refused=str(refusal))
     found = run_scenario(line_of(tier, case), config, tier.plant(truth), tier.scenario(case), job.seed)
