@@ -46,7 +46,7 @@ def design(
     """Design a controller: tune each architecture on the line's model, compare, choose, and say why.
 
     Candidates run on the nominal model and on lines within its tolerances. One that would stand less than 4 ms more
-    delay, or leave the tension limits, is not offered. Weights of the score: [priorities] of the line's file. Beside
+    delay, or leave the tension limits, is not offered. Weights of the score: \\[priorities] of the line's file. Beside
     OUT lie OUT's .design.json (every attempt with its reason) and .design.html (the report). About three minutes.
 
     Exit code: 0 written, 2 refused.
@@ -59,8 +59,12 @@ def design(
 
     line = read_line(file)
     speeds = _speeds(schedule)
+    if speeds and law and LawName.MPC in law:
+        _refuse("--schedule: mpc has no schedule, its programme belongs to one model; allowed: pid, lqr, lqi, lqg")
+    if untuned and scenario:
+        _refuse("--untuned simulates nothing: leave --scenario away")
     names = list(dict.fromkeys(one.value for one in law or LawName if law or not speeds or one is not LawName.MPC))
-    _may_write(out)
+    _may_write(out, [file, *map(Path, scenario or [])], only=untuned)
     try:
         if untuned:
             _first_guess(line, names, speeds, out, as_json)
@@ -72,7 +76,7 @@ def design(
 
 def _first_guess(line: Line, names: list[str], speeds: list[float], out: Path, as_json: bool) -> None:
     from gateway.commissioning.architectures import ARCHITECTURES
-    from gateway.control.design import margins, require_margin, task_of
+    from gateway.control.design import DesignRefused, margins, require_margin, task_of, weak_spots
     from gateway.core.controller import canonical, config_hash
 
     if len(names) != 1:
@@ -81,7 +85,9 @@ def _first_guess(line: Line, names: list[str], speeds: list[float], out: Path, a
     config = architecture.design(task, architecture.first(), speeds)
     found = margins(config, task)
     require_margin(found)
-    out.write_bytes(canonical(config) + b"\n")
+    if weak := weak_spots(config, task):
+        raise DesignRefused("; ".join(weak))
+    _write(out, canonical(config) + b"\n")
     if as_json:
         typer.echo(json.dumps({"controller": config_hash(config), "out": str(out), **vars(found)}))
         return
@@ -122,22 +128,34 @@ def _phase(
     with Progress(names, iterations, quiet=as_json) as progress:
         found = run_design(line, scenarios, names, iterations, seed, progress.attempted, speeds)
     result = result_of(line, found, seed)
-    record, report = out.with_suffix(".design.json"), out.with_suffix(".design.html")
-    record.write_text(result.model_dump_json(indent=2) + "\n", encoding="utf-8")
-    report.write_text(render_page(page_of(result, found)), encoding="utf-8")
     if found.chosen is not None and found.chosen.config is not None:
-        out.write_bytes(canonical(found.chosen.config) + b"\n")
+        _write(out, canonical(found.chosen.config) + b"\n")
+    record, report = _beside(out)
+    _write(record, (result.model_dump_json(indent=2) + "\n").encode())
+    _write(report, render_page(page_of(result, found)).encode())
     if as_json:
         typer.echo(result.model_dump_json(indent=2))
     else:
         print_design(result, time.monotonic() - began_s)
         typer.echo(f"record: {record}\nreport: {report}")
     if found.chosen is None:
-        _refuse(f"{out} is not written: no architecture can be offered")
-    elif not as_json:
-        typer.echo(
-            f"configuration: {out}, hash {result.controller[:12]}; to use it: r2rgate run LINE --controller {out}"
+        _refuse(
+            f"no configuration was written{'; the one in ' + str(out) + ' is left as it was' if out.exists() else ''}"
         )
+    elif not as_json:
+        typer.echo(f"configuration: {out}, hash {result.controller[:12]}; r2rgate run FILE --controller {out} uses it")
+
+
+def _beside(out: Path) -> tuple[Path, Path]:
+    """Where record and report go."""
+    return out.with_suffix(".design.json"), out.with_suffix(".design.html")
+
+
+def _write(path: Path, content: bytes) -> None:
+    """All of it or nothing."""
+    part = path.with_name(path.name + ".part")
+    part.write_bytes(content)
+    part.replace(path)
 
 
 def _speeds(given: str) -> list[float]:
@@ -154,16 +172,19 @@ def _speeds(given: str) -> list[float]:
     return speeds
 
 
-def _may_write(out: Path) -> None:
-    """Known before minutes of work, not after them."""
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        why = "" if access(out if out.exists() else out.parent, W_OK) else "Permission denied"
-        why = "it is a folder" if out.is_dir() else why
-    except OSError as error:
-        why = str(error.strerror)
-    if why:
-        _refuse(f"--out {out} cannot be written: {why}; name a file in a folder that you may write")
+def _may_write(out: Path, inputs: list[Path], only: bool) -> None:
+    """Known before minutes of work, not after them: what is written can be, and is none of the files that are read."""
+    for path in (out,) if only else (out, *_beside(out)):
+        if path.resolve() in [given.resolve() for given in inputs]:
+            _refuse(f"--out {out} would overwrite {path}, which is read; name another file")
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            why = "" if access(path if path.exists() else path.parent, W_OK) else "Permission denied"
+            why = "it is a folder" if path.is_dir() else why
+        except OSError as error:
+            why = str(error.strerror)
+        if why:
+            _refuse(f"--out {path} cannot be written: {why}; name a file in a folder that you may write")
 
 
 def _refuse(message: str) -> NoReturn:

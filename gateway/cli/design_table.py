@@ -33,7 +33,7 @@ def print_design(result: DesignResult, took_s: float) -> None:
 def cells(candidate: Candidate) -> list[str]:
     """A row of the comparison; a dash for what there is not."""
     trial = candidate.trial
-    if trial is None:
+    if trial is None:  # explained below the table
         return [candidate.architecture, *["-"] * (len(COLUMNS) - 1)]
     rmse = sum(trial.rmse_n.values()) / len(trial.rmse_n)
     return [

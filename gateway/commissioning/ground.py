@@ -39,11 +39,11 @@ class Ground:
         return tuple(course_of(scenario, self.task.period_s) for scenario in self.scenarios)
 
     def shortened(self, plants: int, lead_s: float, duration_s: float) -> "Ground":
-        """The same with so many plants, at most `lead_s` before each change and at most `duration_s` in all."""
+        """The same with so many plants, `lead_s` before each change, `duration_s` in all beside its move, at most."""
 
         def shorter(scenario: Scenario) -> Scenario:
             lead = min(lead_s, scenario.change_at_s)
-            end = min(duration_s, scenario.duration_s)
+            end = min(duration_s + scenario.move_s, scenario.duration_s)
             return scenario.model_copy(update={"change_at_s": lead, "duration_s": end})
 
         return replace(self, scenarios=tuple(map(shorter, self.scenarios)), models=self.models[:plants])
@@ -57,9 +57,14 @@ def ground_of(
     Raises DesignRefused where a scenario does not fit the line, or hardly any plant of the box can be held.
     """
     reasons = [reason for scenario in scenarios for reason in scenario.reasons_against(line.n, line.limits)]
+    task = task_of(line)
+    reasons += [
+        f"{scenario.name} changes after {scenario.change_at_s:g} s; allowed: {task.period_s:g} s, a period, or more"
+        for scenario in scenarios
+        if round(scenario.change_at_s / task.period_s) < 1
+    ]
     if reasons:
         raise DesignRefused("; ".join(reasons))
-    task = task_of(line)
     latency_s, substeps = _stepping(task)
     setup = Setup(
         task.period_s, latency_s, substeps, torque_nm=line.limits.torque_nm,
@@ -127,10 +132,15 @@ def _can_be_held(model: WebModel, scenario: Scenario, torque_nm: float) -> bool:
 
 def _stepping(task: DesignTask) -> tuple[float, int]:
     """Latency in s and integration steps a period, of which the latency is a whole number; where none fits, the next
-    longer latency that does."""
+    longer latency that does. Raises DesignRefused where the model is too fast for any."""
     A, _ = linear(task)
     fastest = float(np.abs(np.linalg.eigvals(A)).max())
-    least = min(max(1, ceil(task.period_s * fastest / FASTEST_MODE)), MOST_SUBSTEPS)
+    least = max(1, ceil(task.period_s * fastest / FASTEST_MODE))
+    if least > MOST_SUBSTEPS:
+        raise DesignRefused(
+            f"the line has a mode of {1e3 / fastest:.2g} ms, too fast for a control period of "
+            f"{1e3 * task.period_s:g} ms: check stiffness, lengths and inertias, or control faster"
+        )
     for substeps in range(least, MOST_SUBSTEPS + 1):
         step_s = task.period_s / substeps
         if abs(round(task.latency_s / step_s) * step_s - task.latency_s) < 1e-9:

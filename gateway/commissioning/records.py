@@ -11,16 +11,18 @@ class Suggestion(Strict):
 
 
 class Trial(Strict):
-    """What became of a candidate in simulation. Of the nominal model, unless it says "of the box"."""
+    """What became of a candidate in simulation. Tensions are those of the spans that have a load cell."""
 
-    cost_n2s: NonNegative | None  #: J of the nominal model and the box together; None: it was not run, or ran away
-    rmse_n: dict[str, NonNegative]  #: by scenario
-    settling_s: NonNegative | None  #: of the slowest span; None: never
-    overshoot_pct: NonNegative  #: of the worst span
-    tension_min_n: float
+    cost_n2s: NonNegative | None  #: J, over all plants; None: one of them ran away
+    rmse_n: dict[str, NonNegative]  #: of the nominal model, by scenario
+    settling_s: NonNegative | None  #: of its slowest span, without noise; None: never
+    watched_s: NonNegative  #: from the change on: what counts for a span that never settles
+    overshoot_pct: NonNegative  #: of its worst span, without noise
+    tension_min_n: float  #: of any plant
     tension_max_n: float
-    effort_n2m2s: NonNegative  #: mean over the scenarios
-    robustness_n: NonNegative | None  #: R: how far any plant of the box is from the nominal course; None: it ran away
+    effort_n2m2s: NonNegative  #: of the nominal model, mean over the scenarios
+    robustness_n: NonNegative | None  #: R: how far any plant is from the nominal course; None: one ran away
+    weak: list[str]  #: where the linear loop stands too little: speeds, and plants of the box
     delay_margin_s: NonNegative
     decay_per_s: float
     chatter_nm: NonNegative

@@ -56,13 +56,14 @@ class PatternSearch:
 
     def _calmer(self, architecture: Architecture, history: Sequence[Attempt]) -> Suggestion | None:
         """Nothing has been valid yet: all knobs towards a calmer loop at once."""
-        last = history[-1].values
+        told = history[-1].values  # somebody else's, perhaps: of knobs that there are not
+        last = architecture.first() | {name: told[name] for name in architecture.first() if name in told}
         values = dict(last)
         for knob in architecture.knobs:
             if direction := CALMER.get(knob.name, 0):
                 factor = 2.0**direction
                 values[knob.name] = _rounded(min(max(last[knob.name] * factor, knob.least), knob.most))
-        if _alike(values, last):
+        if _alike(values, told):
             return None
         return Suggestion(values=values, reason=f"{history[-1].refused}: a calmer loop")
 

@@ -47,13 +47,13 @@ def candidate(
 
 
 def performance_of(trial: Trial, compute_s: float) -> Performance | None:
-    """The six metrics of a trial; None where one of them is without bound."""
-    if trial.settling_s is None or trial.robustness_n is None:
+    """The six metrics of a trial; None where one has run away. What never settles counts as long as it was watched."""
+    if trial.robustness_n is None:
         return None
     return Performance(
         rmse_n=sum(trial.rmse_n.values()) / len(trial.rmse_n),
         overshoot_pct=trial.overshoot_pct,
-        settling_s=trial.settling_s,
+        settling_s=trial.watched_s if trial.settling_s is None else trial.settling_s,
         effort_n2m2s=trial.effort_n2m2s,
         robustness_n=trial.robustness_n,
         compute_s=compute_s,
@@ -68,17 +68,19 @@ def ranked(candidates: Sequence[Candidate]) -> list[Candidate]:
 def explanation(candidates: Sequence[Candidate]) -> list[str]:
     """Why the first of `ranked` is chosen and what it costs, from the numbers alone."""
     order = ranked(candidates)
-    if not order or order[0].score is None:
-        return ["No architecture can be offered: see the reason beside each."]
-    best, others = order[0], [one for one in order[1:] if one.score is not None]
-    said = [f"{best.architecture} is chosen: its score of {best.score:.3f} is the least."]
-    if others:
-        said.append(_against(best, others[0]))
+    said: list[str] = []
+    scored = [one for one in order if one.score is not None]
+    if scored:
+        best = scored[0]
+        said.append(f"{best.architecture} is chosen: its score of {best.score:.3f} is the least.")
+        said += [_against(best, other) for other in scored[1:2]]
+    else:
+        said.append("No architecture can be offered.")
     for one in order:
         if one.refused:
             said.append(f"{one.architecture} is not offered: {one.refused}.")
-        elif one.score is None:
-            said.append(f"{one.architecture} has no score: on a line within the tolerances it does not settle.")
+        elif one.trial is not None and one.trial.settling_s is None:
+            said.append(f"{one.architecture} does not settle within 2 % of its set-points while it is watched.")
     return said
 
 

@@ -36,12 +36,16 @@ class Tuned:
         """The last one accepted; None: nothing could be offered."""
         return best_of(self.history)
 
+    def reasons(self) -> str:
+        """Why nothing can be offered, where there is no best."""
+        found = list(dict.fromkeys(attempt.refused for attempt in self.history if attempt.refused))
+        tries = f"{len(self.history)} attempt{'' if len(self.history) == 1 else 's'}"
+        return f"none of {tries} holds; {'; '.join(found[:3])}"
+
     def config(self, architecture: Architecture, ground: Ground) -> Controller:
         """The configuration of the best attempt with `architecture`. Raises DesignRefused where there is none."""
         if self.best is None:
-            reasons = list(dict.fromkeys(attempt.refused for attempt in self.history if attempt.refused))
-            tries = f"{len(self.history)} attempt{'s' if len(self.history) > 1 else ''}"
-            raise DesignRefused(f"none of {tries} can be offered; {'; '.join(reasons[:3])}")
+            raise DesignRefused(self.reasons())
         return architecture.design(ground.task, self.best.values, ground.speeds_m_per_s)
 
 

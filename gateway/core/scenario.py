@@ -127,12 +127,12 @@ class Scenario(Strict):
         fastest = max(self.speed_m_per_s, self.speed_end_m_per_s)
         if fastest > limits.speed_max_m_per_s:
             found.append(f"{self.name} runs at {fastest:g} m/s; allowed: up to {limits.speed_max_m_per_s:g} m/s")
-        if self.move_s == 0.0 and self.tension_step_n > limits.tension_step_max_n:
+        if self.move_s == 0.0 and self.tension_step_n > limits.tension_step_max_n + 1e-9:
             found.append(
                 f"{self.name} steps by {self.tension_step_n:g} N; allowed at once: limits.tension_step_max_n, "
                 f"{limits.tension_step_max_n:g} N"
             )
-        if self.move_s == 0.0 and self.speed_step_m_per_s > limits.speed_step_max_m_per_s + 1e-12:
+        if self.move_s == 0.0 and self.speed_step_m_per_s > limits.speed_step_max_m_per_s + 1e-9:
             found.append(
                 f"{self.name} steps by {self.speed_step_m_per_s:g} m/s; allowed at once: "
                 f"limits.speed_step_max_m_per_s, {limits.speed_step_max_m_per_s:g} m/s"

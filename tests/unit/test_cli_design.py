@@ -56,7 +56,7 @@ def test_the_record_holds_every_attempt_with_its_reason(run: tuple[Path, str]) -
     scores = [candidate.score for candidate in record.candidates if candidate.score is not None]
     assert scores == sorted(scores)
     for candidate in record.candidates:
-        assert candidate.score == pytest.approx(sum(candidate.terms))
+        assert candidate.refused or candidate.score == pytest.approx(sum(candidate.terms))
 
 
 def test_the_page_carries_the_choice_and_every_attempt(run: tuple[Path, str]) -> None:
@@ -66,9 +66,9 @@ def test_the_page_carries_the_choice_and_every_attempt(run: tuple[Path, str]) ->
 
 
 def test_json_is_the_record_and_nothing_else(line_file: Path, tmp_path: Path) -> None:
-    code, out, _ = design(line_file, "--law", "lqr", "--iterations", 0, "--out", tmp_path / "c.json", "--json")
+    code, out, _ = design(line_file, "--law", "lqi", "--iterations", 1, "--out", tmp_path / "c.json", "--json")
     assert code == 0
-    assert DesignResult.model_validate_json(out).chosen == "lqr"
+    assert DesignResult.model_validate_json(out).chosen == "lqi"
 
 
 def test_a_first_guess_costs_no_simulation(line_file: Path, tmp_path: Path) -> None:
@@ -86,13 +86,42 @@ def test_what_cannot_be_done_is_refused_and_nothing_is_written(line_file: Path, 
         (("--untuned",), "name one architecture with --law"),
         (("--law", "lqi", "--scenario", "nowhere.toml"), "nowhere.toml cannot be read"),
         (("--law", "lqi", "--scenario", "tension"), "tension is for 6 spans, the line has 2"),
+        (("--law", "mpc", "--schedule", "0,0.1"), "mpc has no schedule"),
+        (("--law", "lqi", "--untuned", "--scenario", "tension"), "--untuned simulates nothing"),
         (("--law", "fuzzy"), "'fuzzy' is not one of"),
         (("--law", "lqi", "--untuned", "--schedule", "1,0.5"), "--schedule 1,0.5: "),
         (("--law", "lqi", "--untuned", "--schedule", "fast"), "these are no numbers"),
     ):
         code, _, err = design(line_file, *given, "--out", out)
         assert code == 2 and says in err.replace("\n", " ").replace("│", "").replace("  ", " ")
-    assert not out.exists()
+        assert not out.exists()
+
+
+def test_no_file_that_is_read_is_written_over(line_file: Path) -> None:
+    before = line_file.read_bytes()
+    code, _, err = design(line_file, "--law", "lqi", "--untuned", "--out", line_file)
+    assert code == 2 and "would overwrite" in err and line_file.read_bytes() == before
+
+
+def test_everything_that_is_written_is_known_to_be_possible_before_the_work(line_file: Path, tmp_path: Path) -> None:
+    (tmp_path / "c.design.json").mkdir()
+    code, _, err = design(line_file, "--law", "lqi", "--out", tmp_path / "c.json")
+    assert code == 2 and "c.design.json cannot be written: it is a folder" in err
+
+
+def test_a_controller_that_is_there_survives_when_nothing_can_be_offered(line_file: Path, tmp_path: Path) -> None:
+    """Limits that no line of the box keeps to: all is told, nothing is lost."""
+    text = line_file.read_text(encoding="utf-8")
+    tight = text.replace("tension_max_n = 60.0 ", "tension_max_n = 44.5 ").replace(
+        "tension_margin_n = 1.0 ", "tension_margin_n = 0.1 "
+    )
+    assert tight != text
+    line_file.write_text(tight, encoding="utf-8")
+    out = tmp_path / "c.json"
+    out.write_text("what was there")
+    code, said, err = design(line_file, "--law", "pid", "--iterations", 0, "--out", out)
+    assert code == 2 and "is left as it was" in err and out.read_text() == "what was there"
+    assert "No architecture can be offered." in said and "pid is not offered: " in said
 
 
 def test_where_no_torque_holds_the_line_nothing_is_offered(line_file: Path, tmp_path: Path) -> None:

@@ -1,7 +1,7 @@
 """From what is believed about the web to controller configurations. Design time only: the loop never imports this."""
 
 from gateway.control.design.lq import LqgWeights, LqiWeights, LqWeights, design_lqg, design_lqi, design_lqr
-from gateway.control.design.margins import Margins, margins, require_margin
+from gateway.control.design.margins import Margins, is_stable, margins, require_margin, weak_spots
 from gateway.control.design.mpc import MpcWeights, design_mpc
 from gateway.control.design.pid import design_pid
 from gateway.control.design.schedule import design_scheduled, gains_change
@@ -24,7 +24,9 @@ __all__ = [
     "design_pid",
     "design_scheduled",
     "gains_change",
+    "is_stable",
     "margins",
     "require_margin",
     "task_of",
+    "weak_spots",
 ]

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.linalg import solve_discrete_lyapunov
 
 from gateway.control.design.sampling import with_dead_time
-from gateway.control.design.task import DesignRefused, DesignTask, linear
+from gateway.control.design.task import LEAST_DRAW_SPEED_M_PER_S, DesignRefused, DesignTask, linear
 from gateway.control.linear_form import LinearForm, linear_form, without_constants
 from gateway.control.sampled import Sampled
 from gateway.core.controller import Controller
@@ -80,6 +80,29 @@ def require_margin(found: Margins, least_s: float = LEAST_DELAY_MARGIN_S) -> Non
             f"the loop stands only {1e3 * found.delay_margin_s:.1f} ms more delay, at least {1e3 * least_s:g} ms are "
             f"needed: more weight on torque, a slower disturbance estimate, or less latency"
         )
+
+
+def weak_spots(config: Controller, task: DesignTask, least_s: float = LEAST_DELAY_MARGIN_S) -> list[str]:
+    """Speeds from standstill to the greatest of the task's limits at which the loop stands too little; empty: none."""
+    fastest = task.limits.speed_max_m_per_s
+    slowest = LEAST_DRAW_SPEED_M_PER_S if task.draw_spans else 0.0
+    speeds = [slowest, 0.5 * fastest, fastest] if fastest > slowest else []
+    found: list[str] = []
+    for speed in speeds:
+        at_speed = replace(task, unwind_speed_m_per_s=speed)
+        if not is_stable(config, at_speed):
+            found.append(f"at {speed:g} m/s the loop is unstable")
+        elif not is_stable(config, at_speed, least_s):
+            found.append(f"at {speed:g} m/s it stands less than {1e3 * least_s:g} ms more delay")
+    return found
+
+
+def is_stable(config: Controller, task: DesignTask, extra_s: float = 0.0) -> bool:
+    """Whether the loop is stable on the model and at the speed of `task`, with so much more delay."""
+    law = law_at(config, task.unwind_speed_m_per_s) if isinstance(config, ScheduledConfig) else config
+    plant = with_dead_time(*linear(task), task.period_s, task.latency_s + extra_s)
+    loop = closed_loop(without_constants(linear_form(law)), plant)
+    return bool(np.abs(np.linalg.eigvals(loop)).max() < 1.0)
 
 
 def closed_loop(form: LinearForm, plant: Sampled) -> FloatArray:
