@@ -63,6 +63,7 @@ class SteppedLoop:
         recipe = Recipe(name="production", tension_n=tension_n.tolist(), speed_m_per_s=unwind_speed_m_per_s)
         cycle.setpoints.aim_at(recipe)
         cycle.setpoints.begin_at_speed(unwind_speed_m_per_s)
+        cycle.torque_path.unmeasured_n = tension_n.copy()  # of draw spans: no load cell says it
 
     def arm(self) -> Reply:
         """As the operator's `arm`, without waiting for the drives: step on until READY."""
