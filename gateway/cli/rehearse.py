@@ -14,7 +14,7 @@ import numpy as np
 
 from gateway.cli.rehearse_designs import DESIGNS, TRUTH, Design, offered, truth_of
 from gateway.cli.rehearse_result import CaseResult, ConfigurationResult, Spread
-from gateway.cli.stepped import SteppedResult, run_scenario
+from gateway.cli.stepped import CommandRefused, SteppedResult, run_scenario
 from gateway.cli.tiers import Tier
 from gateway.control.design import DesignRefused, DesignTask, task_of
 from gateway.core.controller import Controller, config_hash
@@ -131,8 +131,8 @@ def _run(job: tuple[Controller, Case, int]) -> CaseResult | str:
     config, case, seed = job
     try:
         return _figures(case.scenario, run_scenario(case.line, config, case.plant, case.scenario, seed))
-    except ValueError as refused:
-        return f"the gateway stopped the line before the change, or refuses it ({refused})"
+    except CommandRefused as refused:
+        return f"the change is refused: {refused}"
 
 
 def _figures(scenario: Scenario, run: SteppedResult) -> CaseResult:

@@ -31,6 +31,10 @@ from sim_plant.stepped import SteppedLine
 T = TypeVar("T")
 
 
+class CommandRefused(Exception):
+    """The line has refused a scenario's change; the text says why."""
+
+
 @dataclass
 class SteppedLoop:
     """A loop and a simulated line that share a clock which only `step` moves."""
@@ -122,7 +126,7 @@ class SteppedResult:
 def run_scenario(line: Line, config: Controller, plant: Plant, scenario: Scenario, seed: int) -> SteppedResult:
     """The scenario from the plant's own equilibrium on, over its whole duration.
 
-    Raises ValueError where the line refuses the change.
+    Raises CommandRefused where the line refuses the change: it has been stopped, or it is not allowed.
     """
     loop = SteppedLoop(line, config, plant, seed)
     loop.begin_in_production(np.array(scenario.tension_n), scenario.speed_m_per_s)
@@ -134,7 +138,7 @@ def run_scenario(line: Line, config: Controller, plant: Plant, scenario: Scenari
     for command in scenario.commands():
         reply = loop.command(command)
         if not reply.ok:
-            raise ValueError(f"{scenario.heading}: {reply.text}")
+            raise CommandRefused(_left_production(loop) or reply.text)
     loop.step(round(scenario.duration_s / period_s) - before)
     loop.truth.sample(scenario.duration_s)
     wall_s = time.perf_counter() - started_s
@@ -150,6 +154,14 @@ def run_scenario(line: Line, config: Controller, plant: Plant, scenario: Scenari
         tension_n=found.tension_n,
         torque_nm=found.torque_nm,
     )
+
+
+def _left_production(loop: SteppedLoop) -> str | None:
+    """When and why the gateway has stopped a line that began in production; None: it has not."""
+    if not loop.transitions:
+        return None
+    time_s, _, reason = loop.transitions[0]
+    return f"stopped at {time_s:g} s: {reason}"
 
 
 def _finish(awaitable: Awaitable[T]) -> T:

@@ -1,5 +1,6 @@
 """`rehearse`: what it compares, what its figures are, and what it refuses."""
 
+import re
 from dataclasses import asdict
 from io import StringIO
 from pathlib import Path
@@ -147,8 +148,20 @@ def test_a_line_that_the_gateway_stops_is_told_and_no_yardstick() -> None:
     """Rollers a tenth as heavy as believed: the loop is unstable on them."""
     heavy, light = line(2), plant(2, inertia_kg_m2=0.1)
     lqi, truth = rehearse(cases_of(heavy, light, [SHORT], None), 0, 1, designs=named("lqi", "truth-lqi"))
-    assert lqi.cases == [] and "stopped the line" in lqi.failures["short"]
+    assert lqi.cases == [] and re.fullmatch(r"the change is refused: stopped at 0\.\d+ s: .+", lqi.failures["short"])
     assert truth.cases[0].stopped and truth.cases[0].ratio_to_truth_design is None
+
+
+@pytest.mark.parametrize("mistake", [np.linalg.LinAlgError("singular"), ValueError("shapes do not fit")])
+def test_a_mistake_of_the_program_is_not_told_as_a_refusal(
+    mistake: ValueError, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(*_: object) -> None:
+        raise mistake
+
+    monkeypatch.setattr("gateway.cli.rehearse.run_scenario", fails)
+    with pytest.raises(type(mistake), match=str(mistake)):
+        rehearse(cases_of(line(2), plant(2), [SHORT], None), 0, 1, designs=named("lqr"))
 
 
 def test_the_truth_is_known_roller_by_roller_and_what_has_no_term_is_named() -> None:
