@@ -151,7 +151,7 @@ def _figures(scenario: Scenario, run: SteppedResult) -> CaseResult:
         tension_min_n=float(run.tension_n.min()),
         tension_max_n=float(run.tension_n.max()),
         unsafe_events=run.unsafe_events,
-        stopped=not run.torque_nm[-1].any(),
+        stopped=run.stopped,
     )
 
 
@@ -173,15 +173,15 @@ def _configuration(
 
 
 def _beside_truth(found: list[ConfigurationResult]) -> list[ConfigurationResult]:
-    """With every RMSE over the best that a design on the truth has reached; that of a line at rest is worth nothing."""
+    """With every RMSE over the best that a design on the truth has reached; that of a stopped line is worth nothing."""
     best: dict[str, float] = {}
     for configuration in found:
         for case in configuration.cases:
-            if configuration.model == TRUTH and not case.stopped:
+            if configuration.model == TRUTH and case.stopped is None:
                 best[case.scenario] = min(case.rmse_n, best.get(case.scenario, np.inf))
 
     def beside(case: CaseResult) -> CaseResult:
-        comparable = case.scenario in best and not case.stopped
+        comparable = case.scenario in best and case.stopped is None
         return case.model_copy(
             update={"ratio_to_truth_design": case.rmse_n / best[case.scenario] if comparable else None}
         )

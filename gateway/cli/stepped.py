@@ -111,6 +111,7 @@ class SteppedResult:
 
     metrics: RunMetrics
     unsafe_events: int
+    stopped: str | None  #: when and why the gateway left RUN, if it did: the line may still be slowing at the end
     wall_s: float  #: what it took
     step_s: FloatArray  #: (periods,), what the law itself took in each, on this computer
     time_s: FloatArray  #: (k,), every millisecond
@@ -147,6 +148,7 @@ def run_scenario(line: Line, config: Controller, plant: Plant, scenario: Scenari
     return SteppedResult(
         metrics=run_metrics(found.time_s, found.tension_n, setpoint, found.torque_nm, scenario.change_at_s),
         unsafe_events=loop.truth.recorder.unsafe_total,
+        stopped=_left_production(loop),
         wall_s=wall_s,
         step_s=np.array(loop.law.step_s),
         time_s=found.time_s,
