@@ -14,7 +14,7 @@ import numpy as np
 
 from gateway.cli.rehearse_designs import DESIGNS, TRUTH, Design, offered, truth_of
 from gateway.cli.rehearse_result import CaseResult, ConfigurationResult, Spread
-from gateway.cli.stepped import CommandRefused, SteppedResult, run_scenario
+from gateway.cli.stepped import CommandRefused, SteppedResult, periods_before, run_scenario
 from gateway.cli.tiers import Tier
 from gateway.control.design import DesignRefused, DesignTask, task_of
 from gateway.core.controller import Controller, config_hash
@@ -65,7 +65,7 @@ def cases_of(line: Line, plant: Plant, scenarios: Sequence[Scenario], tier: Tier
         except ScenarioRefused as refused:
             reasons.append(f"{scenario.name}: {refused}")
             continue
-        reasons += found[-1].scenario.reasons_against(line.n, found[-1].line.limits)
+        reasons += _reasons_against(found[-1])
     if reasons:
         raise RehearsalRefused(reasons)
     return found
@@ -76,6 +76,18 @@ def _case(line: Line, plant: Plant, scenario: Scenario, tier: Tier | None) -> Ca
         moved = scenario_of(scenario.moved_over(tier.move_s).model_dump())  # it may end before its move does
         return Case(moved, tier.line(line, moved), tier.plant(plant))
     return Case(scenario, _moving_as(line, scenario), plant)
+
+
+def _reasons_against(case: Case) -> list[str]:
+    """Why `case` cannot be run; empty where it can."""
+    scenario, period_s = case.scenario, case.line.control.period_s
+    reasons = scenario.reasons_against(case.line.n, case.line.limits)
+    if periods_before(scenario, period_s) < 1:
+        reasons.append(
+            f"{scenario.name} changes at {scenario.change_at_s:g} s, before control has begun; allowed: change_at_s of "
+            f"more than half a period, {0.5 * period_s:g} s"
+        )
+    return reasons
 
 
 def _moving_as(line: Line, scenario: Scenario) -> Line:

@@ -124,6 +124,11 @@ class SteppedResult:
         return self.metrics.rmse_n
 
 
+def periods_before(scenario: Scenario, period_s: float) -> int:
+    """Control periods before the change. At least one must be: it is then that the law takes over."""
+    return round(scenario.change_at_s / period_s)
+
+
 def run_scenario(line: Line, config: Controller, plant: Plant, scenario: Scenario, seed: int) -> SteppedResult:
     """The scenario from the plant's own equilibrium on, over its whole duration.
 
@@ -132,7 +137,7 @@ def run_scenario(line: Line, config: Controller, plant: Plant, scenario: Scenari
     loop = SteppedLoop(line, config, plant, seed)
     loop.begin_in_production(np.array(scenario.tension_n), scenario.speed_m_per_s)
     period_s = line.control.period_s
-    before = round(scenario.change_at_s / period_s)
+    before = periods_before(scenario, period_s)
     started_s = time.perf_counter()
     loop.step(before)
     loop.now_s = loop.periods * period_s

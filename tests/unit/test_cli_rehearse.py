@@ -214,6 +214,10 @@ def test_what_does_not_go_together_is_refused_with_every_reason() -> None:
         cases_of(line(4), plant(), [], A)
     assert "4 spans, the plant has 6 spans" in refused.value.reasons[0]
     assert "for 6 spans, the line has 4: name the TOML file of a scenario" in refused.value.reasons[1]
+    hasty = SHORT.model_copy(update={"change_at_s": 0.004, "tension_after_n": [30.0, 59.5]})
+    with pytest.raises(RehearsalRefused, match=r"59.5 N; .*at 0.004 s, before control has begun; allowed: .*, 0.005 s"):
+        cases_of(line(2), plant(2), [hasty], None)
+    assert cases_of(line(2), plant(2), [SHORT.model_copy(update={"change_at_s": 0.004})], TIER_P)  # periods of 1 ms
     wild = SHORT.model_copy(update={"tension_after_n": [30.0, 59.5], "duration_s": 0.7})
     with pytest.raises(RehearsalRefused, match="the scenario ends before"):
         cases_of(line(2), plant(2), [wild], B)
