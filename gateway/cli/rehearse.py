@@ -14,7 +14,7 @@ import numpy as np
 
 from gateway.cli.rehearse_designs import DESIGNS, TRUTH, Design, offered, truth_of
 from gateway.cli.rehearse_result import CaseResult, ConfigurationResult, Spread
-from gateway.cli.stepped import SteppedResult, run_scenario
+from gateway.cli.stepped import CommandRefused, SteppedResult, periods_before, run_scenario
 from gateway.cli.tiers import Tier
 from gateway.control.design import DesignRefused, DesignTask, task_of
 from gateway.core.controller import Controller, config_hash
@@ -65,7 +65,7 @@ def cases_of(line: Line, plant: Plant, scenarios: Sequence[Scenario], tier: Tier
         except ScenarioRefused as refused:
             reasons.append(f"{scenario.name}: {refused}")
             continue
-        reasons += found[-1].scenario.reasons_against(line.n, found[-1].line.limits)
+        reasons += _reasons_against(found[-1])
     if reasons:
         raise RehearsalRefused(reasons)
     return found
@@ -76,6 +76,18 @@ def _case(line: Line, plant: Plant, scenario: Scenario, tier: Tier | None) -> Ca
         moved = scenario_of(scenario.moved_over(tier.move_s).model_dump())  # it may end before its move does
         return Case(moved, tier.line(line, moved), tier.plant(plant))
     return Case(scenario, _moving_as(line, scenario), plant)
+
+
+def _reasons_against(case: Case) -> list[str]:
+    """Why `case` cannot be run; empty where it can."""
+    scenario, period_s = case.scenario, case.line.control.period_s
+    reasons = scenario.reasons_against(case.line.n, case.line.limits)
+    if periods_before(scenario, period_s) < 1:
+        reasons.append(
+            f"{scenario.name} changes at {scenario.change_at_s:g} s, before control has begun; allowed: change_at_s of "
+            f"more than half a period, {0.5 * period_s:g} s"
+        )
+    return reasons
 
 
 def _moving_as(line: Line, scenario: Scenario) -> Line:
@@ -131,8 +143,8 @@ def _run(job: tuple[Controller, Case, int]) -> CaseResult | str:
     config, case, seed = job
     try:
         return _figures(case.scenario, run_scenario(case.line, config, case.plant, case.scenario, seed))
-    except ValueError as refused:
-        return f"the gateway stopped the line before the change, or refuses it ({refused})"
+    except CommandRefused as refused:
+        return f"the change is refused: {refused}"
 
 
 def _figures(scenario: Scenario, run: SteppedResult) -> CaseResult:
@@ -151,7 +163,7 @@ def _figures(scenario: Scenario, run: SteppedResult) -> CaseResult:
         tension_min_n=float(run.tension_n.min()),
         tension_max_n=float(run.tension_n.max()),
         unsafe_events=run.unsafe_events,
-        stopped=not run.torque_nm[-1].any(),
+        stopped=run.stopped,
     )
 
 
@@ -173,15 +185,15 @@ def _configuration(
 
 
 def _beside_truth(found: list[ConfigurationResult]) -> list[ConfigurationResult]:
-    """With every RMSE over the best that a design on the truth has reached; that of a line at rest is worth nothing."""
+    """With every RMSE over the best that a design on the truth has reached; that of a stopped line is worth nothing."""
     best: dict[str, float] = {}
     for configuration in found:
         for case in configuration.cases:
-            if configuration.model == TRUTH and not case.stopped:
+            if configuration.model == TRUTH and case.stopped is None:
                 best[case.scenario] = min(case.rmse_n, best.get(case.scenario, np.inf))
 
     def beside(case: CaseResult) -> CaseResult:
-        comparable = case.scenario in best and not case.stopped
+        comparable = case.scenario in best and case.stopped is None
         return case.model_copy(
             update={"ratio_to_truth_design": case.rmse_n / best[case.scenario] if comparable else None}
         )

@@ -42,7 +42,7 @@ class CaseResult(Strict):
     tension_min_n: float  #: all spans
     tension_max_n: float
     unsafe_events: int
-    stopped: bool  #: the gateway had stopped the line: no drive gave torque at the end
+    stopped: str | None  #: "stopped at ...": when and why the gateway stopped the line; null: it ran to the end
 
 
 class ConfigurationResult(Strict):

@@ -41,7 +41,7 @@ def remarks(result: RehearseResult) -> list[str]:
         if one.refused is not None:
             told.append(f"{one.name} is not offered: {one.refused}")
         told += [f"{one.name} has no figures in {scenario}: {why}" for scenario, why in one.failures.items()]
-        told += [f"{one.name}: the gateway stopped the line in {case.scenario}" for case in one.cases if case.stopped]
+        told += [f"{one.name} in {case.scenario}: {case.stopped}" for case in one.cases if case.stopped is not None]
     if result.without_term:
         told.append("the plant has what no model of a design has a term for:")
         told += [f"  {what}" for what in result.without_term]
@@ -70,5 +70,5 @@ def _cells(case: CaseResult) -> list[str]:
         f"{max(case.overshoot_pct):.1f}",
         f"{case.compute_us.p99:.0f}",
         f"{case.tension_min_n:.0f} to {case.tension_max_n:.0f}",
-        "STOP" if case.stopped else str(case.unsafe_events),
+        "STOP" if case.stopped is not None else str(case.unsafe_events),
     ]

@@ -31,6 +31,10 @@ from sim_plant.stepped import SteppedLine
 T = TypeVar("T")
 
 
+class CommandRefused(Exception):
+    """The line has refused a scenario's change; the text says why."""
+
+
 @dataclass
 class SteppedLoop:
     """A loop and a simulated line that share a clock which only `step` moves."""
@@ -63,6 +67,7 @@ class SteppedLoop:
         recipe = Recipe(name="production", tension_n=tension_n.tolist(), speed_m_per_s=unwind_speed_m_per_s)
         cycle.setpoints.aim_at(recipe)
         cycle.setpoints.begin_at_speed(unwind_speed_m_per_s)
+        cycle.torque_path.unmeasured_n = tension_n.copy()  # of draw spans: no load cell says it
 
     def arm(self) -> Reply:
         """As the operator's `arm`, without waiting for the drives: step on until READY."""
@@ -106,6 +111,7 @@ class SteppedResult:
 
     metrics: RunMetrics
     unsafe_events: int
+    stopped: str | None  #: when and why the gateway left RUN, if it did: the line may still be slowing at the end
     wall_s: float  #: what it took
     step_s: FloatArray  #: (periods,), what the law itself took in each, on this computer
     time_s: FloatArray  #: (k,), every millisecond
@@ -118,22 +124,27 @@ class SteppedResult:
         return self.metrics.rmse_n
 
 
+def periods_before(scenario: Scenario, period_s: float) -> int:
+    """Control periods before the change. At least one must be: it is then that the law takes over."""
+    return round(scenario.change_at_s / period_s)
+
+
 def run_scenario(line: Line, config: Controller, plant: Plant, scenario: Scenario, seed: int) -> SteppedResult:
     """The scenario from the plant's own equilibrium on, over its whole duration.
 
-    Raises ValueError where the line refuses the change.
+    Raises CommandRefused where the line refuses the change: it has been stopped, or it is not allowed.
     """
     loop = SteppedLoop(line, config, plant, seed)
     loop.begin_in_production(np.array(scenario.tension_n), scenario.speed_m_per_s)
     period_s = line.control.period_s
-    before = round(scenario.change_at_s / period_s)
+    before = periods_before(scenario, period_s)
     started_s = time.perf_counter()
     loop.step(before)
     loop.now_s = loop.periods * period_s
     for command in scenario.commands():
         reply = loop.command(command)
         if not reply.ok:
-            raise ValueError(f"{scenario.heading}: {reply.text}")
+            raise CommandRefused(_left_production(loop) or reply.text)
     loop.step(round(scenario.duration_s / period_s) - before)
     loop.truth.sample(scenario.duration_s)
     wall_s = time.perf_counter() - started_s
@@ -142,6 +153,7 @@ def run_scenario(line: Line, config: Controller, plant: Plant, scenario: Scenari
     return SteppedResult(
         metrics=run_metrics(found.time_s, found.tension_n, setpoint, found.torque_nm, scenario.change_at_s),
         unsafe_events=loop.truth.recorder.unsafe_total,
+        stopped=_left_production(loop),
         wall_s=wall_s,
         step_s=np.array(loop.law.step_s),
         time_s=found.time_s,
@@ -149,6 +161,14 @@ def run_scenario(line: Line, config: Controller, plant: Plant, scenario: Scenari
         tension_n=found.tension_n,
         torque_nm=found.torque_nm,
     )
+
+
+def _left_production(loop: SteppedLoop) -> str | None:
+    """When and why the gateway has stopped a line that began in production; None: it has not."""
+    if not loop.transitions:
+        return None
+    time_s, _, reason = loop.transitions[0]
+    return f"stopped at {time_s:g} s: {reason}"
 
 
 def _finish(awaitable: Awaitable[T]) -> T:

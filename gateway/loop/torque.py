@@ -27,6 +27,9 @@ class TorquePath:
     def __init__(self, law: Law[Any], limits: EnvelopeLimits, line: Line) -> None:
         self.law = law
         self.lost: BoolArray = np.zeros(law.n, dtype=np.bool_)  #: drives that left by themselves: off until armed
+        #: Tensions (n,) in N that spans without a load cell are taken to have when control takes over: none, as if
+        #: at rest. Whoever begins with a line that runs says what they are.
+        self.unmeasured_n: FloatArray = np.zeros(law.n)
         self.fallback = ""  #: why the law asked for something else than its own solution in this period
         self._limits = limits
         self._moves = line.moves
@@ -40,6 +43,7 @@ class TorquePath:
     def disengage(self) -> None:
         """The next `control` engages anew, from what is measured then."""
         self._state = None
+        self.unmeasured_n.fill(0.0)
 
     def control(
         self, measured: Measured, setpoints: Setpoints, applied_nm: FloatArray, interval_s: float
@@ -51,7 +55,7 @@ class TorquePath:
         if self.any_lost():
             applied_nm = np.where(self.lost, 0.0, applied_nm)
         if self._state is None:
-            setpoints.begin_at(np.where(self._limits.measured > 0, measured.tension_n, 0.0))
+            setpoints.begin_at(np.where(self._limits.measured > 0, measured.tension_n, self.unmeasured_n))
             self._state = self.law.engage(measured, setpoints.reference(self._speed_lag_s), applied_nm)
         decision = self.law.ask(self._state, measured, setpoints.reference(self._speed_lag_s))
         self.fallback = decision.fallback

@@ -1,10 +1,14 @@
 """The whole cycle in stepped time: arm, start, run, hold, stop, and what the recorder at the drives says of it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from gateway.cli.stepped import run_scenario
-from gateway.control.design import design_lqi, design_pid, design_scheduled, task_of
+from gateway.cli.rehearse_designs import truth_of
+from gateway.cli.stepped import SteppedLoop, run_scenario
+from gateway.control.design import design_lqg, design_lqi, design_lqr, design_pid, design_scheduled, task_of
+from gateway.core.line import Line
 from gateway.core.messages import Arm, Hold, SelectRecipe, SetSpeed, SetTension, Start, Stop
 from gateway.core.scenario import PAPER, TENSION
 from gateway.core.states import LoopState, Phase
@@ -199,3 +203,42 @@ def test_a_scheduled_law_runs_in_the_cycle_as_the_law_that_it_is_made_of():
     found, alone = (run_scenario(line, one, plant, case, seed=1) for one in (config, design_lqi(task_of(line))))
     assert found.unsafe_events == alone.unsafe_events == 0
     assert found.rmse_n == pytest.approx(alone.rmse_n, rel=0.01) and found.rmse_n != alone.rmse_n
+
+
+DRAWN = 2  #: from 0: the span that the tension case steps
+
+
+def draw_line() -> Line:
+    """The demonstration line without the load cell of one span: its roller keeps a speed ratio."""
+    line = demo_line()
+    spans = list(line.spans)
+    spans[DRAWN] = spans[DRAWN].model_copy(update={"control": "draw"})
+    cells = [cell for cell in line.load_cells if cell.span != DRAWN + 1]
+    return line.model_copy(update={"spans": spans, "load_cells": cells})
+
+
+@pytest.mark.parametrize("design", [design_lqr, design_lqg])
+@pytest.mark.parametrize("case", PAPER)
+def test_a_line_with_a_draw_span_begins_at_rest_and_keeps_what_it_controls(case, design):
+    line, plant = draw_line(), real_plant()
+    config = design(replace(task_of(line), model=truth_of(plant)))  # what moves is not the model's fault
+    found = run_scenario(line, config, plant, case, seed=1)
+    before = found.tension_n[found.time_s < case.change_at_s, DRAWN]
+    assert np.abs(before - case.tension_n[DRAWN]).max() < 0.2
+    error = np.abs(found.tension_n[-1] - case.tension_end_n)
+    assert np.delete(error, DRAWN).max() < 0.5
+    assert found.unsafe_events == 0
+
+
+def test_a_draw_span_that_starts_from_rest_begins_without_tension():
+    """Its set-point stands where the web does: there in production, at nothing once the line has been unloaded."""
+    line = draw_line()
+    loop = SteppedLoop(line, design_lqi(task_of(line)), real_plant(), seed=1)
+    loop.begin_in_production(TENSIONS, 0.01)
+    loop.step(100)
+    assert all((frame.tension_setpoint_n == TENSIONS).all() for frame in loop.recorded())
+    loop.command(Stop())
+    assert loop.step_until(Phase.OFF, 5.0)
+    assert loop.arm().ok and loop.step_until(Phase.READY, 1.0)
+    assert loop.command(Start()).ok and loop.step_until(Phase.TENSIONING, 1.0)
+    assert loop.recorded()[-1].tension_setpoint_n[DRAWN] == 0.0

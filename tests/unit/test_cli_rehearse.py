@@ -1,6 +1,7 @@
 """`rehearse`: what it compares, what its figures are, and what it refuses."""
 
-from dataclasses import asdict
+import re
+from dataclasses import asdict, replace
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -79,7 +80,7 @@ def test_every_design_runs_and_is_held_against_the_best_on_the_truth(tension: li
     ]
     assert all(one.refused is None and not one.failures for one in tension)
     cases = {one.name: one.cases[0] for one in tension}
-    assert not any(case.unsafe_events or case.stopped for case in cases.values())
+    assert not any(case.unsafe_events or case.stopped is not None for case in cases.values())
     best = min(cases["truth-lqi"].rmse_n, cases["truth-mpc-observer"].rmse_n)
     for case in cases.values():
         assert case.ratio_to_truth_design == case.rmse_n / best
@@ -106,7 +107,7 @@ def test_the_figures_are_those_of_the_run_itself(tension: list[ConfigurationResu
         "tension_min_n": run.tension_n.min(),
         "tension_max_n": run.tension_n.max(),
         "unsafe_events": run.unsafe_events,
-        "stopped": False,
+        "stopped": None,
     }
 
 
@@ -147,8 +148,33 @@ def test_a_line_that_the_gateway_stops_is_told_and_no_yardstick() -> None:
     """Rollers a tenth as heavy as believed: the loop is unstable on them."""
     heavy, light = line(2), plant(2, inertia_kg_m2=0.1)
     lqi, truth = rehearse(cases_of(heavy, light, [SHORT], None), 0, 1, designs=named("lqi", "truth-lqi"))
-    assert lqi.cases == [] and "stopped the line" in lqi.failures["short"]
+    assert lqi.cases == [] and re.fullmatch(r"the change is refused: stopped at 0\.\d+ s: .+", lqi.failures["short"])
     assert truth.cases[0].stopped and truth.cases[0].ratio_to_truth_design is None
+
+
+def test_a_line_that_is_still_slowing_at_the_end_is_a_stopped_one() -> None:
+    """Its drives give torque, and its RMSE is small: nothing has gone wrong for long."""
+    brief = SHORT.model_copy(update={"duration_s": 0.4})
+    light = plant(2, inertia_kg_m2=0.1)
+    (truth,) = rehearse(cases_of(line(2), light, [brief], None), 0, 1, designs=named("truth-lqi"))
+    (case,) = truth.cases
+    assert case.ratio_to_truth_design is None
+    assert case.stopped is not None and re.match(r"stopped at 0\.3\d s: the speed of roller 1", case.stopped)
+    task = replace(task_of(line(2)), model=truth_of(light))
+    run = run_scenario(line(2), offered(named("truth-lqi")[0], task), light, brief, 0)
+    assert run.torque_nm[-1].all() and run.stopped == case.stopped
+
+
+@pytest.mark.parametrize("mistake", [np.linalg.LinAlgError("singular"), ValueError("shapes do not fit")])
+def test_a_mistake_of_the_program_is_not_told_as_a_refusal(
+    mistake: ValueError, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(*_: object) -> None:
+        raise mistake
+
+    monkeypatch.setattr("gateway.cli.rehearse.run_scenario", fails)
+    with pytest.raises(type(mistake), match=str(mistake)):
+        rehearse(cases_of(line(2), plant(2), [SHORT], None), 0, 1, designs=named("lqr"))
 
 
 def test_the_truth_is_known_roller_by_roller_and_what_has_no_term_is_named() -> None:
@@ -188,6 +214,10 @@ def test_what_does_not_go_together_is_refused_with_every_reason() -> None:
         cases_of(line(4), plant(), [], A)
     assert "4 spans, the plant has 6 spans" in refused.value.reasons[0]
     assert "for 6 spans, the line has 4: name the TOML file of a scenario" in refused.value.reasons[1]
+    hasty = SHORT.model_copy(update={"change_at_s": 0.004, "tension_after_n": [30.0, 59.5]})
+    with pytest.raises(RehearsalRefused, match=r"59.5 N; .*at 0.004 s, before control has begun; allowed: .*, 0.005 s"):
+        cases_of(line(2), plant(2), [hasty], None)
+    assert cases_of(line(2), plant(2), [SHORT.model_copy(update={"change_at_s": 0.004})], TIER_P)  # periods of 1 ms
     wild = SHORT.model_copy(update={"tension_after_n": [30.0, 59.5], "duration_s": 0.7})
     with pytest.raises(RehearsalRefused, match="the scenario ends before"):
         cases_of(line(2), plant(2), [wild], B)
@@ -236,7 +266,7 @@ def test_unsafe_events_are_an_exit_code(tmp_path: Path) -> None:
 def test_the_table_says_what_its_figures_do_not(tension: list[ConfigurationResult], tmp_path: Path) -> None:
     example = RehearseResult.model_validate_json((ROOT / "docs/examples/rehearse.json").read_text())
     lqr, lqi, pid, *others = tension
-    stopped = lqr.cases[0].model_copy(update={"stopped": True})
+    stopped = lqr.cases[0].model_copy(update={"stopped": "stopped at 0.4 s: tension 2 is missing"})
     result = example.model_copy(
         update={
             "scenarios": [TENSION],
@@ -255,7 +285,7 @@ def test_the_table_says_what_its_figures_do_not(tension: list[ConfigurationResul
     assert max(map(len, text.splitlines()[: 4 + len(others)])) <= 80
     for said in (
         "STOP\n",
-        "lqr: the gateway stopped the line in tension",
+        "lqr in tension: stopped at 0.4 s: tension 2 is missing",
         "lqi is not offered: too little delay",
         "pid has no figures in tension: no luck",
         "  effects.slack: the web cannot push",
