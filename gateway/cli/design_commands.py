@@ -74,7 +74,7 @@ def _first_guess(line: Line, names: list[str], out: Path, as_json: bool) -> None
     if len(names) != 1:
         _refuse("--untuned compares nothing: name one architecture with --law")
     architecture, task = ARCHITECTURES[names[0]], task_of(line)
-    config = architecture.design(task, architecture.first())
+    config = architecture.design(task, architecture.first(task))
     found = margins(config, task)
     require_margin(found)
     out.write_bytes(canonical(config) + b"\n")

@@ -160,7 +160,7 @@ def _candidate(one: Finished, ground: Ground, line: Line) -> Candidate:
     return candidate(
         architecture.name,
         architecture.title,
-        best.values if best else architecture.first(),
+        best.values if best else architecture.first(ground.task),
         config_hash(one.config) if one.config else "",
         one.trial,
         step_time_s(one.config, ground) if one.config else None,

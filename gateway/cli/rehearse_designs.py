@@ -7,13 +7,13 @@ import numpy as np
 
 from gateway.control.design import (
     DesignTask,
-    MpcWeights,
     design_lqg,
     design_lqi,
     design_lqr,
     design_mpc,
     design_pid,
     margins,
+    mpc_weights,
     require_margin,
 )
 from gateway.control.design.margins import DELAY_STEP_S, LEAST_DELAY_MARGIN_S, closed_loop
@@ -40,7 +40,7 @@ class Design:
 
 def mpc_without_observer(task: DesignTask) -> Controller:
     """The paper's baseline: nothing in it takes an offset away."""
-    return design_mpc(task, MpcWeights(disturbance_nm_per_sqrt_s=0.0))
+    return design_mpc(task, replace(mpc_weights(task), disturbance_nm_per_sqrt_s=0.0))
 
 
 DESIGNS = (

@@ -40,7 +40,7 @@ class PatternSearch:
     def suggest(self, architecture: Architecture, ground: Ground, history: Sequence[Attempt]) -> Suggestion | None:
         if not history:
             known = "where this architecture did well on lines of this kind"
-            return Suggestion(values=architecture.first(), reason=known)
+            return Suggestion(values=architecture.first(ground.task), reason=known)
         best = best_of(history)
         if best is None:
             return self._calmer(architecture, history)

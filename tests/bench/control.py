@@ -18,12 +18,12 @@ from gateway.cli.stepped import run_scenario
 from gateway.cli.tiers import TIERS, Tier
 from gateway.control.design import (
     DesignTask,
-    MpcWeights,
     design_lqg,
     design_lqi,
     design_lqr,
     design_mpc,
     design_pid,
+    mpc_weights,
     task_of,
 )  # fmt: skip
 from gateway.core.controller import Controller
@@ -41,7 +41,7 @@ SEEDS = 20
 
 def mpc_without_observer(task: DesignTask) -> Controller:
     """The paper's baseline: nothing in it takes an offset away."""
-    return design_mpc(task, MpcWeights(disturbance_nm_per_sqrt_s=0.0))
+    return design_mpc(task, replace(mpc_weights(task), disturbance_nm_per_sqrt_s=0.0))
 
 
 LAWS: dict[str, Callable[[DesignTask], Controller]] = {

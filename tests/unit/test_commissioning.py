@@ -95,7 +95,7 @@ def test_a_trial_says_what_the_runs_were(ground):
     from gateway.commissioning.trial import TORQUE_PER_NM2
     from gateway.control.rollout import simulate_slowly
 
-    config = LQI.design(ground.task, LQI.first())
+    config = LQI.design(ground.task, LQI.first(ground.task))
     trial = tried(config, ground)
     runs = [simulate_slowly(config, ground.plants, course, ground.setup, record=True) for course in ground.courses]
     cost = 0.0
@@ -112,7 +112,7 @@ def test_a_trial_says_what_the_runs_were(ground):
 
 
 def test_what_runs_away_has_no_cost_and_is_not_offered(ground):
-    config = LQR.design(ground.task, LQR.first())
+    config = LQR.design(ground.task, LQR.first(ground.task))
     wild = config.model_copy(update={"gain_state": (-np.array(config.gain_state)).tolist()})
     trial = tried(wild, ground)
     assert reasons_against(trial, ground) == ["the loop is unstable"]
@@ -255,5 +255,5 @@ def test_a_scenario_with_a_draw_span_is_tried_as_well():
     spans = [line.spans[0], line.spans[1].model_copy(update={"control": "draw"}), line.spans[2]]
     drawn = line.model_copy(update={"spans": spans})
     ground = ground_of(drawn, suite_of(drawn), 1, 0).shortened(2, 0.1, 1.1)
-    trial = tried(LQI.design(ground.task, LQI.first()), ground)
+    trial = tried(LQI.design(ground.task, LQI.first(ground.task)), ground)
     assert trial.cost_n2s is not None and isinstance(ground.scenarios[0], Scenario)

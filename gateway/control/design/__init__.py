@@ -1,10 +1,20 @@
 """From what is believed about the web to controller configurations. Design time only: the loop never imports this."""
 
-from gateway.control.design.lq import LqgWeights, LqiWeights, LqWeights, design_lqg, design_lqi, design_lqr
+from gateway.control.design.lq import design_lqg, design_lqi, design_lqr
 from gateway.control.design.margins import Margins, margins, require_margin
-from gateway.control.design.mpc import MpcWeights, design_mpc
+from gateway.control.design.mpc import design_mpc
 from gateway.control.design.pid import design_pid
 from gateway.control.design.task import DesignLimits, DesignRefused, DesignTask, Noise, task_of
+from gateway.control.design.weights import (
+    LqgWeights,
+    LqiWeights,
+    LqWeights,
+    MpcWeights,
+    lqg_weights,
+    lqi_weights,
+    lqr_weights,
+    mpc_weights,
+)
 
 __all__ = [
     "DesignLimits",
@@ -21,7 +31,11 @@ __all__ = [
     "design_lqr",
     "design_mpc",
     "design_pid",
+    "lqg_weights",
+    "lqi_weights",
+    "lqr_weights",
     "margins",
+    "mpc_weights",
     "require_margin",
     "task_of",
 ]
