@@ -15,6 +15,7 @@ from gateway.control.design import (
     margins,
     mpc_weights,
     require_margin,
+    without_disturbances,
 )
 from gateway.control.design.margins import DELAY_STEP_S, LEAST_DELAY_MARGIN_S, closed_loop
 from gateway.control.design.sampling import with_dead_time
@@ -40,7 +41,7 @@ class Design:
 
 def mpc_without_observer(task: DesignTask) -> Controller:
     """The paper's baseline: nothing in it takes an offset away."""
-    return design_mpc(task, replace(mpc_weights(task), disturbance_nm_per_sqrt_s=0.0))
+    return design_mpc(task, without_disturbances(mpc_weights(task)))
 
 
 DESIGNS = (

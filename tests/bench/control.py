@@ -25,6 +25,7 @@ from gateway.control.design import (
     design_pid,
     mpc_weights,
     task_of,
+    without_disturbances,
 )  # fmt: skip
 from gateway.core.controller import Controller
 from gateway.core.line import Line
@@ -41,7 +42,7 @@ SEEDS = 20
 
 def mpc_without_observer(task: DesignTask) -> Controller:
     """The paper's baseline: nothing in it takes an offset away."""
-    return design_mpc(task, replace(mpc_weights(task), disturbance_nm_per_sqrt_s=0.0))
+    return design_mpc(task, without_disturbances(mpc_weights(task)))
 
 
 LAWS: dict[str, Callable[[DesignTask], Controller]] = {

@@ -8,12 +8,14 @@ from gateway.control.design.task import DesignLimits, DesignRefused, DesignTask,
 from gateway.control.design.weights import (
     LqgWeights,
     LqiWeights,
+    LqrWeights,
     LqWeights,
     MpcWeights,
     lqg_weights,
     lqi_weights,
     lqr_weights,
     mpc_weights,
+    without_disturbances,
 )
 
 __all__ = [
@@ -23,6 +25,7 @@ __all__ = [
     "LqWeights",
     "LqgWeights",
     "LqiWeights",
+    "LqrWeights",
     "Margins",
     "MpcWeights",
     "Noise",
@@ -38,4 +41,5 @@ __all__ = [
     "mpc_weights",
     "require_margin",
     "task_of",
+    "without_disturbances",
 ]

@@ -7,16 +7,24 @@ from scipy.linalg import LinAlgError, solve_discrete_are
 
 from gateway.control.design.sampling import with_dead_time
 from gateway.control.design.task import DesignRefused, DesignTask, check_task, feedforward_of, linear
-from gateway.control.design.weights import LqgWeights, LqiWeights, LqWeights, lqg_weights, lqi_weights, lqr_weights
+from gateway.control.design.weights import (
+    LqgWeights,
+    LqiWeights,
+    LqrWeights,
+    LqWeights,
+    lqg_weights,
+    lqi_weights,
+    lqr_weights,
+)
 from gateway.control.sampled import Sampled
 from gateway.core.controller_laws import Feedforward, LqgConfig, LqiConfig, LqrConfig, Predictor
 from gateway.core.signals import FloatArray
 
 
-def design_lqr(task: DesignTask, weights: LqWeights | None = None) -> LqrConfig:
+def design_lqr(task: DesignTask, weights: LqrWeights | None = None) -> LqrConfig:
     """State feedback on the sampled model with its dead time, without integral action. Raises DesignRefused."""
     weights = weights or lqr_weights(task)
-    gain, _ = feedback(task, weights)
+    gain, _ = feedback(task, weights, weights.common_torque)
     n = task.n
     return LqrConfig(**shared(task), gain_state=gain[:, : 2 * n].tolist(), gain_input=gain[:, 2 * n :].tolist())
 
@@ -58,21 +66,19 @@ def design_lqg(task: DesignTask, weights: LqgWeights | None = None) -> LqgConfig
     n = task.n
     return LqgConfig(
         **shared(task),
-        predictor=design_predictor(task, weights.disturbance_nm_per_sqrt_s, weights.roller_noise),
+        predictor=design_predictor(task, weights),
         gain_state=gain[:, : 2 * n].tolist(),
         gain_input=gain[:, 2 * n :].tolist(),
     )
 
 
-def design_predictor(task: DesignTask, disturbance_nm_per_sqrt_s: float, roller_noise: float = 1.0) -> Predictor:
-    """The stationary Kalman filter of [x~; d], d a random walk of that intensity (0: there is none).
-
-    Rollers are believed to be moved by `roller_noise` times the task's noise.
+def design_predictor(task: DesignTask, weights: LqgWeights) -> Predictor:
+    """The stationary Kalman filter of [x~; d], d a random walk of the intensity in `weights` (0: there is none).
 
     Raises DesignRefused.
     """
     n = task.n
-    walks = disturbance_nm_per_sqrt_s > 0.0
+    walks = weights.disturbance_nm_per_sqrt_s > 0.0
     A, B = linear(task)
     plant = with_dead_time(A, B, task.period_s, task.latency_s)
     whole: FloatArray = np.eye(3 * n)
@@ -83,9 +89,9 @@ def design_predictor(task: DesignTask, disturbance_nm_per_sqrt_s: float, roller_
     F, C = whole[:states, :states], np.eye(states)[measured]
     moved = np.concatenate(
         (
-            np.zeros(n),
-            np.full(n, (roller_noise * task.noise.acceleration_m_per_s1_5) ** 2 * task.period_s),
-            np.full(n, disturbance_nm_per_sqrt_s**2 * task.period_s),
+            np.full(n, weights.web_noise_n_per_sqrt_s**2 * task.period_s),
+            np.full(n, (weights.roller_noise * task.noise.acceleration_m_per_s1_5) ** 2 * task.period_s),
+            np.full(n, weights.disturbance_nm_per_sqrt_s**2 * task.period_s),
         )
     )[:states]
     seen = np.repeat([task.noise.tension_n**2, task.noise.speed_m_per_s**2], [len(task.tension_spans), n])
@@ -103,13 +109,17 @@ def design_predictor(task: DesignTask, disturbance_nm_per_sqrt_s: float, roller_
     )
 
 
-def feedback(task: DesignTask, weights: LqWeights) -> tuple[FloatArray, FloatArray]:
-    """K (n, 2n + n d) on [x~; torques in flight], and the matrix P of the cost that remains. Raises DesignRefused."""
+def feedback(task: DesignTask, weights: LqWeights, common_torque: float = 1.0) -> tuple[FloatArray, FloatArray]:
+    """K (n, 2n + n d) on [x~; torques in flight], and the matrix P of the cost that remains.
+
+    Torque that all rollers give alike has `common_torque` times the weight. Raises DesignRefused.
+    """
     _check(task, weights)
     n, plant, kept = task.n, *_controlled(task)
     F, G = plant.augmented()
     cost = np.concatenate((_state_cost(task, weights, kept), np.zeros(n * plant.depth)))
-    gain, remaining = dlqr(F, G, np.diag(cost), weights.torque_per_nm2 * np.eye(n))
+    effort = weights.torque_per_nm2 * (np.eye(n) - (1.0 - common_torque) / n)
+    gain, remaining = dlqr(F, G, np.diag(cost), effort)
     columns = [*kept, *range(2 * n, 2 * n + n * plant.depth)]
     whole = np.zeros((2 * n + n * plant.depth,) * 2)
     whole[np.ix_(columns, columns)] = remaining
@@ -157,6 +167,8 @@ def _check(task: DesignTask, weights: LqWeights) -> None:
     ]
     if not weights.torque_per_nm2 > 0.0:
         wrong.append(f"torque_per_nm2 is {weights.torque_per_nm2}; allowed: above 0")
+    if not values.get("common_torque", 1.0) > 0.0:
+        wrong.append("common_torque is 0; allowed: above 0")
     if not (weights.tension_per_n2 > 0.0 or weights.speed_per_m2_s2 > 0.0):
         wrong.append("tension_per_n2 and speed_per_m2_s2 are both 0: there is nothing to control")
     if wrong:

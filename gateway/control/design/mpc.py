@@ -35,7 +35,7 @@ def design_mpc(task: DesignTask, weights: MpcWeights | None = None, blocks: tupl
         state[i], state[n + i] = 0.0, weights.draw_speed_per_m2_s2
     return MpcConfig(
         **shared(task),
-        predictor=design_predictor(task, weights.disturbance_nm_per_sqrt_s, weights.roller_noise),
+        predictor=design_predictor(task, weights),
         weight_state=state,
         weight_torque=[weights.torque_per_nm2] * n,
         weight_terminal=remaining.tolist(),

@@ -18,7 +18,7 @@ the natural frequency of the loop is (b^2 / torque weight)^(1/4), and a weight i
 `docs/decisions/0020-weights-follow-the-dead-time.md` has the figures.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import isfinite
 
 import numpy as np
@@ -33,6 +33,7 @@ REFERENCE_QUICKNESS = 0.04 / 0.95 * 2400.0  #: b of S_sim, N/s^2/Nm
 LQI_SHARE, LQG_SHARE = 0.5, 0.58  #: natural frequency times D
 LET_GO_S = 0.009
 MPC_RATE_SHARE = 0.4
+FOLLOWING_ROLLER_NOISE, FOLLOWING_WEB_NOISE_N_PER_SQRT_S = 20.0, 1.0
 
 
 @dataclass(frozen=True)
@@ -43,6 +44,13 @@ class LqWeights:
     speed_per_m2_s2: float = 0.0
     draw_speed_per_m2_s2: float = 4.0e4  #: of a draw span, in place of the tension's weight
     torque_per_nm2: float = 0.03
+
+
+@dataclass(frozen=True)
+class LqrWeights(LqWeights):
+    """As `LqWeights`, and how much cheaper torque is that all rollers give alike."""
+
+    common_torque: float = 1.0  #: times `torque_per_nm2`
 
 
 @dataclass(frozen=True)
@@ -62,6 +70,7 @@ class LqgWeights(LqWeights):
     torque_per_nm2: float = 0.03
     disturbance_nm_per_sqrt_s: float = 2.0  #: how fast torque disturbances wander
     roller_noise: float = 1.0  #: times `Noise.acceleration_m_per_s1_5`; more: a faster observer
+    web_noise_n_per_sqrt_s: float = 0.0  #: of the tensions' own equations; 0: they are believed
 
 
 @dataclass(frozen=True)
@@ -87,9 +96,16 @@ def rate_share(task: DesignTask) -> float:
     return rate / REFERENCE_RATE_NM_PER_S if isfinite(rate) else 1.0
 
 
-def lqr_weights(task: DesignTask) -> LqWeights:
-    """Those of `design_lqr`."""
-    return LqWeights(torque_per_nm2=_feedback_torque_weight(task))
+def lqr_weights(task: DesignTask) -> LqrWeights:
+    """Those of `design_lqr`.
+
+    Without integral action a torque that the model has wrong leaves an offset of that torque over the feedback's gain.
+    Friction and radii that are all wrong alike are what costs most, so that torque which all rollers give alike is made
+    cheaper, down to a quarter, as far as delay leaves room. It costs nothing in steps of single spans.
+    """
+    torque = _feedback_torque_weight(task)
+    by_delay = _torque_weight_at(task, LQG_SHARE / stood_s(task))
+    return LqrWeights(torque_per_nm2=torque, common_torque=max(0.25, (by_delay / torque) ** 2))
 
 
 def lqi_weights(task: DesignTask) -> LqiWeights:
@@ -140,6 +156,20 @@ def mpc_weights(task: DesignTask) -> MpcWeights:
         torque_per_nm2=first.torque_per_nm2 * times * (_quickness(task) / REFERENCE_QUICKNESS) ** 2,
         disturbance_nm_per_sqrt_s=first.disturbance_nm_per_sqrt_s * slower**-0.5,
         roller_noise=max(1.0, 1.0 / times),
+    )
+
+
+def without_disturbances(weights: MpcWeights) -> MpcWeights:
+    """`weights` of a law that estimates no torque disturbance, and so corrects no offset.
+
+    Its observer follows the measurements: one that believes the tensions' equations makes of every error of the model a
+    steady error of the estimate, which no feedback sees.
+    """
+    return replace(
+        weights,
+        disturbance_nm_per_sqrt_s=0.0,
+        roller_noise=max(weights.roller_noise, FOLLOWING_ROLLER_NOISE),
+        web_noise_n_per_sqrt_s=FOLLOWING_WEB_NOISE_N_PER_SQRT_S,
     )
 
 
