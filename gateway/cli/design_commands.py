@@ -82,7 +82,7 @@ def _first_guess(line: Line, names: list[str], speeds: list[float], out: Path, a
     if len(names) != 1:
         _refuse("--untuned compares nothing: name one architecture with --law")
     architecture, task = ARCHITECTURES[names[0]], task_of(line)
-    config = architecture.design(task, architecture.first(), speeds)
+    config = architecture.design(task, architecture.first(task), speeds)
     found = margins(config, task)
     require_margin(found)
     if weak := weak_spots(config, task):

@@ -137,7 +137,7 @@ def finish_architecture(name: str, ground: Ground, iterations: int) -> Finished:
     architecture = ARCHITECTURES[name]
     plants = PLANTS_TUNED_ON.get(name, len(ground.models))
     if refused := _too_slow(architecture, ground):
-        return Finished(name, Tuned((), converged=True), architecture.first(), None, None, refused, {})
+        return Finished(name, Tuned((), converged=True), architecture.first(ground.task), None, None, refused, {})
     small = ground.shortened(plants, LEAD_S, WATCHED_S)
     tuned = tune(
         architecture, small, PatternSearch(), iterations, on_attempt=lambda attempt: _told.put((name, attempt))
@@ -156,7 +156,7 @@ def _validated(
     architecture: Architecture, tuned: Tuned, ground: Ground
 ) -> tuple[dict[str, float], Controller | None, Trial | None, list[Rollouts], str]:
     """The best attempt that holds on the whole ground too: it was tuned on a part of it. With its trial and runs."""
-    values, trial, refused = architecture.first(), None, tuned.reasons()
+    values, trial, refused = architecture.first(ground.task), None, tuned.reasons()
     for attempt in reversed([one for one in tuned.history if one.accepted]):
         values = dict(attempt.values)
         config = architecture.design(ground.task, values, ground.speeds_m_per_s)
@@ -172,7 +172,7 @@ def _validated(
 def _too_slow(architecture: Architecture, ground: Ground) -> str:
     """Why there is no sense in tuning: its steps do not fit into the control period on this computer."""
     try:
-        config = architecture.design(ground.task, architecture.first())
+        config = architecture.design(ground.task, architecture.first(ground.task))
     except DesignRefused:
         return ""  # the attempts will say why
     took_s, period_s = step_time_s(config, ground, PROBED_PERIODS), ground.task.period_s

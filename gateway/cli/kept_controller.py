@@ -18,7 +18,7 @@ CONTROLLER, SOURCE = "controller.json", "controller.source.json"
 def source_hash(line: Line) -> str:
     """SHA-256 of what a design is made from: timing, limits, web, rollers, spans and the design point; not names."""
     source: dict[str, Any] = {
-        "design": 2,  #: what designs are like; raised when they change
+        "design": 3,  #: what designs are like; raised when they change
         "period_s": line.control.period_s,
         "latency_s": line.control.latency_s,
         "limits": line.limits.model_dump(),

@@ -7,14 +7,15 @@ import numpy as np
 
 from gateway.control.design import (
     DesignTask,
-    MpcWeights,
     design_lqg,
     design_lqi,
     design_lqr,
     design_mpc,
     design_pid,
     margins,
+    mpc_weights,
     require_margin,
+    without_disturbances,
 )
 from gateway.core.controller import Controller
 from gateway.core.web_model import WebModel
@@ -35,7 +36,7 @@ class Design:
 
 def mpc_without_observer(task: DesignTask) -> Controller:
     """The paper's baseline: nothing in it takes an offset away."""
-    return design_mpc(task, MpcWeights(disturbance_nm_per_sqrt_s=0.0))
+    return design_mpc(task, without_disturbances(mpc_weights(task)))
 
 
 DESIGNS = (

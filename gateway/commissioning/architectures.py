@@ -5,22 +5,23 @@ and are turned by factors.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 
 from gateway.control.design import (
     DesignRefused,
     DesignTask,
-    LqgWeights,
-    LqiWeights,
-    LqWeights,
-    MpcWeights,
     design_lqg,
     design_lqi,
     design_lqr,
     design_mpc,
     design_pid,
     design_scheduled,
+    lqg_weights,
+    lqi_weights,
+    lqr_weights,
+    mpc_weights,
 )  # fmt: skip
+from gateway.control.design.pid import SPEED_SHARE, TENSION_SHARE
 from gateway.core.controller import Controller
 from gateway.core.controller_laws import MpcConfig
 from gateway.core.controller_schedule import LinearConfig
@@ -33,7 +34,6 @@ Values = Mapping[str, float]
 class Knob:
     name: str
     unit: str
-    first: float  #: where to begin
     least: float
     most: float
     more: str  #: what a greater value does
@@ -45,10 +45,13 @@ class Architecture:
     name: str
     title: str
     knobs: tuple[Knob, ...]
+    begin: Callable[[DesignTask], Values]  #: the values of a design that is given none
     make: Callable[[DesignTask, Values], LinearConfig | MpcConfig]
 
-    def first(self) -> dict[str, float]:
-        return {knob.name: knob.first for knob in self.knobs}
+    def first(self, task: DesignTask) -> dict[str, float]:
+        """Where to begin."""
+        begin = self.begin(task)
+        return {knob.name: min(max(begin[knob.name], knob.least), knob.most) for knob in self.knobs}
 
     def design(self, task: DesignTask, values: Values, speeds_m_per_s: Sequence[float] = ()) -> Controller:
         """The configuration at `values`; with speeds, one whose gains follow them.
@@ -77,69 +80,52 @@ class Architecture:
         return found
 
 
-def _weight(first: float) -> Knob:
-    return Knob(
-        "torque_per_nm2", "N2/Nm2", first, 1e-5, 100.0, "calmer torque, slower loop", "faster loop, busier torque"
-    )
-
-
-def _disturbance(first: float) -> Knob:
-    return Knob(
-        "disturbance_nm_per_sqrt_s", "Nm/s^0.5", first, 0.01, 100.0, "faster on disturbances", "less moved by noise"
-    )
-
-
+TORQUE_WEIGHT = Knob(
+    "torque_per_nm2", "N2/Nm2", 1e-5, 100.0, "calmer torque, slower loop", "faster loop, busier torque"
+)
+DISTURBANCE = Knob(
+    "disturbance_nm_per_sqrt_s", "Nm/s^0.5", 0.01, 100.0, "faster on disturbances", "less moved by noise"
+)
 PID = Architecture(
     "pid",
     "PID: a speed loop per roller, tension trim on the draw",
     (
-        Knob("speed_share", "", 0.5, 0.02, 1.5, "faster speed loops", "calmer speed loops"),
-        Knob("tension_share", "", 1.0 / 3.0, 0.01, 1.0, "faster tension trim", "calmer tension trim"),
+        Knob("speed_share", "", 0.02, 1.5, "faster speed loops", "calmer speed loops"),
+        Knob("tension_share", "", 0.01, 1.0, "faster tension trim", "calmer tension trim"),
     ),
+    lambda task: {"speed_share": SPEED_SHARE, "tension_share": TENSION_SHARE},
     lambda task, values: design_pid(task, values["speed_share"], values["tension_share"]),
 )
 LQR = Architecture(
     "lqr",
     "LQR: state feedback, no integral action",
-    (_weight(LqWeights().torque_per_nm2),),
-    lambda task, values: design_lqr(task, LqWeights(**values)),
+    (TORQUE_WEIGHT,),
+    lambda task: asdict(lqr_weights(task)),
+    lambda task, values: design_lqr(task, replace(lqr_weights(task), **values)),
 )
 LQI = Architecture(
     "lqi",
     "LQI: state feedback with integral action",
     (
-        _weight(LqiWeights().torque_per_nm2),
-        Knob(
-            "integral_per_n2s2",
-            "1/s2",
-            LqiWeights().integral_per_n2s2,
-            1.0,
-            1e6,
-            "offsets vanish faster",
-            "less push from the integrals",
-        ),
-        Knob(
-            "antiwindup",
-            "",
-            LqiWeights().antiwindup,
-            0.01,
-            1.0,
-            "integrals let go sooner at a limit",
-            "integrals hold on longer",
-        ),
+        TORQUE_WEIGHT,
+        Knob("integral_per_n2s2", "1/s2", 1.0, 1e6, "offsets vanish faster", "less push from the integrals"),
+        Knob("antiwindup", "", 0.01, 1.0, "integrals let go sooner at a limit", "integrals hold on longer"),
     ),
-    lambda task, values: design_lqi(task, LqiWeights(**values)),
+    lambda task: asdict(lqi_weights(task)),
+    lambda task, values: design_lqi(task, replace(lqi_weights(task), **values)),
 )
 LQG = Architecture(
     "lqg",
     "LQG: state feedback on a Kalman observer of torque disturbances",
-    (_weight(LqgWeights().torque_per_nm2), _disturbance(LqgWeights().disturbance_nm_per_sqrt_s)),
-    lambda task, values: design_lqg(task, LqgWeights(**values)),
+    (TORQUE_WEIGHT, DISTURBANCE),
+    lambda task: asdict(lqg_weights(task)),
+    lambda task, values: design_lqg(task, replace(lqg_weights(task), **values)),
 )
 MPC = Architecture(
     "mpc",
     "MPC: constraints over a horizon, on the same observer",
-    (_weight(MpcWeights().torque_per_nm2), _disturbance(MpcWeights().disturbance_nm_per_sqrt_s)),
-    lambda task, values: design_mpc(task, MpcWeights(**values)),
+    (TORQUE_WEIGHT, DISTURBANCE),
+    lambda task: asdict(mpc_weights(task)),
+    lambda task, values: design_mpc(task, replace(mpc_weights(task), **values)),
 )
 ARCHITECTURES = {one.name: one for one in (PID, LQR, LQI, LQG, MPC)}

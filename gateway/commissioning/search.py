@@ -40,10 +40,10 @@ class PatternSearch:
     def suggest(self, architecture: Architecture, ground: Ground, history: Sequence[Attempt]) -> Suggestion | None:
         if not history:
             known = "where this architecture did well on lines of this kind"
-            return Suggestion(values=architecture.first(), reason=known)
+            return Suggestion(values=architecture.first(ground.task), reason=known)
         best = best_of(history)
         if best is None:
-            return self._calmer(architecture, history)
+            return self._calmer(architecture, ground, history)
         seen = [attempt.values for attempt in history]
         factor = FIRST_FACTOR
         while factor >= LAST_FACTOR:
@@ -54,10 +54,11 @@ class PatternSearch:
             factor = factor**0.5
         return None
 
-    def _calmer(self, architecture: Architecture, history: Sequence[Attempt]) -> Suggestion | None:
+    def _calmer(self, architecture: Architecture, ground: Ground, history: Sequence[Attempt]) -> Suggestion | None:
         """Nothing has been valid yet: all knobs towards a calmer loop at once."""
         told = history[-1].values  # somebody else's, perhaps: of knobs that there are not
-        last = architecture.first() | {name: told[name] for name in architecture.first() if name in told}
+        first = architecture.first(ground.task)
+        last = first | {name: told[name] for name in first if name in told}
         values = dict(last)
         for knob in architecture.knobs:
             if direction := CALMER.get(knob.name, 0):

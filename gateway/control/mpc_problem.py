@@ -54,6 +54,9 @@ class MpcProblem:
         self.P = csc_matrix(triu(0.5 * (hessian + hessian.T)))
         self.A = csc_matrix(matrix)
         self.rows = matrix.shape[0]
+        # From the middle of a block to that of the next; the first torque follows the one sent last by a period.
+        apart = np.concatenate(([1.0], 0.5 * (np.array(blocks[1:]) + np.array(blocks[:-1]))))
+        self._reach_nm: FloatArray = config.torque_rate_nm_per_s * config.period_s * np.repeat(apart, n)
         self._blocks = np.repeat(np.arange(len(blocks)), blocks)
         self._lower = np.full(self.rows, -np.inf)
         self._upper = np.full(self.rows, np.inf)
@@ -80,8 +83,7 @@ class MpcProblem:
         blocks = len(config.blocks)
         lower[:m] = np.tile(-config.torque_nm - shift, blocks)
         upper[:m] = np.tile(config.torque_nm - shift, blocks)
-        reach = config.torque_rate_nm_per_s * config.period_s
-        lower[m : 2 * m], upper[m : 2 * m] = -reach, reach
+        lower[m : 2 * m], upper[m : 2 * m] = -self._reach_nm, self._reach_nm
         lower[m : m + n] += applied_nm - shift
         upper[m : m + n] += applied_nm - shift
         for bound in (lower, upper):  # what was taken over is added to the first torque

@@ -19,7 +19,7 @@ from gateway.cli.rehearse_table import print_result
 from gateway.cli.stepped import run_scenario
 from gateway.cli.tiers import PAPER as TIER_P
 from gateway.cli.tiers import TIERS, A, B
-from gateway.control.design import DesignRefused, MpcWeights, design_lqi, design_mpc, task_of
+from gateway.control.design import DesignRefused, MpcWeights, design_lqi, design_mpc, design_pid, task_of
 from gateway.core.controller import config_hash
 from gateway.core.line import Line
 from gateway.core.line_file import load_line
@@ -84,8 +84,8 @@ def test_every_design_runs_and_is_held_against_the_best_on_the_truth(tension: li
     best = min(cases["truth-lqi"].rmse_n, cases["truth-mpc-observer"].rmse_n)
     for case in cases.values():
         assert case.ratio_to_truth_design == case.rmse_n / best
-    assert cases["mpc-observer"].rmse_n < cases["mpc"].rmse_n  # nothing in the latter takes the offset away
-    assert None in cases["lqr"].settling_s and None not in cases["lqi"].settling_s
+    last_s = {name: max(np.inf if time is None else time for time in case.settling_s) for name, case in cases.items()}
+    assert last_s["lqr"] > 5.0 > 2.0 * last_s["lqi"]  # nothing in the former takes an offset away
 
 
 def test_the_lqi_on_the_wrong_model_is_where_the_study_had_it(tension: list[ConfigurationResult]) -> None:
@@ -127,9 +127,10 @@ def test_the_seed_makes_the_figures_and_the_number_of_processes_does_not() -> No
 
 
 def test_a_design_that_stands_too_little_delay_is_not_offered_and_the_others_go_on() -> None:
-    """The cascade's bandwidth follows from a dead time of half a millisecond."""
     short = SHORT.model_copy(update={"duration_s": 0.6})
-    lqi, pid = rehearse(cases_of(line(2), plant(2), [short], TIER_P), 0, 1, designs=named("lqi", "pid"))
+    hasty = Design("pid", "pid", NOMINAL, lambda task: design_pid(task, speed_share=1.5))
+    designs = [*named("lqi"), hasty]
+    lqi, pid = rehearse(cases_of(line(2), plant(2), [short], TIER_P), 0, 1, designs=designs)
     assert pid.refused is not None and "at least 4 ms are needed" in pid.refused
     assert pid.controller is None and pid.cases == [] and pid.failures == {}
     assert lqi.refused is None and len(lqi.cases) == 1

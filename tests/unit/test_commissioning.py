@@ -131,7 +131,7 @@ def test_a_trial_says_what_the_runs_were(ground):
     from gateway.commissioning.trial import TORQUE_PER_NM2
     from gateway.control.rollout import simulate_slowly
 
-    config = LQI.design(ground.task, LQI.first())
+    config = LQI.design(ground.task, LQI.first(ground.task))
     trial = tried(config, ground)
     runs = [simulate_slowly(config, ground.plants, course, ground.setup, record=True) for course in ground.courses]
     cost = 0.0
@@ -148,7 +148,7 @@ def test_a_trial_says_what_the_runs_were(ground):
 
 
 def test_an_unstable_loop_is_not_offered(ground):
-    config = LQR.design(ground.task, LQR.first())
+    config = LQR.design(ground.task, LQR.first(ground.task))
     wild = config.model_copy(update={"gain_state": (-np.array(config.gain_state)).tolist()})
     assert reasons_against(tried(wild, ground), ground) == ["the loop is unstable"]
 
@@ -156,7 +156,7 @@ def test_an_unstable_loop_is_not_offered(ground):
 def test_what_leaves_the_limits_on_any_line_of_the_box_is_not_offered(ground):
     """On the nominal model all is well: the others count as much."""
     whole = ground_of(demo(), suite_of(demo()), 8, 0)
-    hasty = LQI.design(whole.task, LQI.first())
+    hasty = LQI.design(whole.task, LQI.first(whole.task))
     nominal, box = (tried(hasty, one) for one in (whole.shortened(1, 0.2, 5.2), whole.shortened(9, 0.2, 5.2)))
     assert reasons_against(nominal, whole) == []
     assert box.tension_max_n > 60.0
@@ -170,7 +170,7 @@ def test_settling_does_not_depend_on_the_noise():
     found = []
     for seed in range(3):
         ground = ground_of(light, suite_of(light), 0, seed)
-        config = config or LQI.design(ground.task, LQI.first())
+        config = config or LQI.design(ground.task, LQI.first(ground.task))
         found.append(tried(config, ground).settling_s)
     assert found[0] is not None and len(set(found)) == 1
 
@@ -183,10 +183,10 @@ def test_gains_for_high_speeds_alone_are_weak_at_standstill():
         model=replace(fast.model, friction_nms_per_rad=np.full(6, 0.03)),
         limits=replace(fast.limits, speed_max_m_per_s=30.0),
     )
-    narrow = LQI.design(slippery, LQI.first() | {"torque_per_nm2": 0.1}, [28.0, 30.0])
+    narrow = LQI.design(slippery, LQI.first(slippery) | {"torque_per_nm2": 0.1}, [28.0, 30.0])
     assert margins(narrow, slippery).delay_margin_s > 0.004
     assert any("at 0 m/s" in weak for weak in weak_spots(narrow, slippery))
-    assert weak_spots(LQI.design(task_of(demo()), LQI.first()), task_of(demo())) == []
+    assert weak_spots(LQI.design(task_of(demo()), LQI.first(task_of(demo()))), task_of(demo())) == []
 
 
 # Algorithm 1
@@ -327,7 +327,9 @@ def test_gains_that_follow_the_speed_are_tuned_like_any(ground):
     assert config.kind == "scheduled" and config.speed_m_per_s == [0.01, 0.1]
     alone = tune(LQR, ground, Told({"torque_per_nm2": 0.1}))
     assert tuned.best.cost_n2s == pytest.approx(alone.best.cost_n2s, rel=0.01), "this line hardly needs it"
-    mpc = attempted(ARCHITECTURES["mpc"], speeds, Suggestion(values=ARCHITECTURES["mpc"].first(), reason=""), ())
+    mpc = attempted(
+        ARCHITECTURES["mpc"], speeds, Suggestion(values=ARCHITECTURES["mpc"].first(ground.task), reason=""), ()
+    )
     assert "mpc has no schedule" in mpc.refused
 
 
@@ -345,7 +347,7 @@ def test_a_line_with_a_draw_span_is_judged_by_the_tensions_that_it_controls():
     spans = [line.spans[0], line.spans[1].model_copy(update={"control": "draw"}), line.spans[2]]
     drawn = line.model_copy(update={"spans": spans})
     ground = ground_of(drawn, suite_of(drawn), 2, 0)
-    trial = tried(LQI.design(ground.task, LQI.first()), ground)
+    trial = tried(LQI.design(ground.task, LQI.first(ground.task)), ground)
     assert trial.settling_s is not None and reasons_against(trial, ground) == []
     one = candidate("lqi", "LQI", {}, "0" * 64, trial, 1e-5, "", Priorities())
     assert one.score is not None

@@ -1,6 +1,5 @@
 """Linear-quadratic designs: LQR, LQI, and LQG on an observer of torque disturbances."""
 
-from dataclasses import dataclass
 from typing import TypedDict
 
 import numpy as np
@@ -8,44 +7,24 @@ from scipy.linalg import LinAlgError, solve_discrete_are
 
 from gateway.control.design.sampling import with_dead_time
 from gateway.control.design.task import DesignRefused, DesignTask, check_task, feedforward_of, linear
+from gateway.control.design.weights import (
+    LqgWeights,
+    LqiWeights,
+    LqrWeights,
+    LqWeights,
+    lqg_weights,
+    lqi_weights,
+    lqr_weights,
+)
 from gateway.control.sampled import Sampled
 from gateway.core.controller_laws import Feedforward, LqgConfig, LqiConfig, LqrConfig, Predictor
 from gateway.core.signals import FloatArray
 
 
-@dataclass(frozen=True)
-class LqWeights:
-    """Weights per squared deviation."""
-
-    tension_per_n2: float = 1.0
-    speed_per_m2_s2: float = 0.0
-    draw_speed_per_m2_s2: float = 4.0e4  #: of a draw span, in place of the tension's weight
-    torque_per_nm2: float = 0.03
-
-
-@dataclass(frozen=True)
-class LqiWeights(LqWeights):
-    """Chosen on 60 random plants around S_sim (EA, J, L +-20 %, R +-15 %, f +-50 %), both cases of the benchmark at
-    10 ms period and latency: the smallest sum of RMSEs whose peaks stay below 52 N."""
-
-    torque_per_nm2: float = 0.06
-    integral_per_n2s2: float = 1000.0
-    draw_integral_per_m2: float = 4.0e6
-    antiwindup: float = 0.4
-
-
-@dataclass(frozen=True)
-class LqgWeights(LqWeights):
-    """Feedback as in `LqWeights`, and how fast torque disturbances are believed to wander."""
-
-    torque_per_nm2: float = 0.03
-    disturbance_nm_per_sqrt_s: float = 2.0
-
-
-def design_lqr(task: DesignTask, weights: LqWeights | None = None) -> LqrConfig:
+def design_lqr(task: DesignTask, weights: LqrWeights | None = None) -> LqrConfig:
     """State feedback on the sampled model with its dead time, without integral action. Raises DesignRefused."""
-    weights = weights or LqWeights()
-    gain, _ = feedback(task, weights)
+    weights = weights or lqr_weights(task)
+    gain, _ = feedback(task, weights, weights.common_torque)
     n = task.n
     return LqrConfig(**shared(task), gain_state=gain[:, : 2 * n].tolist(), gain_input=gain[:, 2 * n :].tolist())
 
@@ -55,7 +34,7 @@ def design_lqi(task: DesignTask, weights: LqiWeights | None = None) -> LqiConfig
 
     Raises DesignRefused where the Riccati equation has no stabilising solution.
     """
-    weights = weights or LqiWeights()
+    weights = weights or lqi_weights(task)
     _check(task, weights)
     n, plant, kept = task.n, *_controlled(task)
     F, G = plant.augmented()
@@ -82,24 +61,24 @@ def design_lqi(task: DesignTask, weights: LqiWeights | None = None) -> LqiConfig
 
 def design_lqg(task: DesignTask, weights: LqgWeights | None = None) -> LqgConfig:
     """Feedback on the estimate of `design_predictor`. Raises DesignRefused."""
-    weights = weights or LqgWeights()
+    weights = weights or lqg_weights(task)
     gain, _ = feedback(task, weights)
     n = task.n
     return LqgConfig(
         **shared(task),
-        predictor=design_predictor(task, weights.disturbance_nm_per_sqrt_s),
+        predictor=design_predictor(task, weights),
         gain_state=gain[:, : 2 * n].tolist(),
         gain_input=gain[:, 2 * n :].tolist(),
     )
 
 
-def design_predictor(task: DesignTask, disturbance_nm_per_sqrt_s: float) -> Predictor:
-    """The stationary Kalman filter of [x~; d], d a random walk of that intensity (0: there is none).
+def design_predictor(task: DesignTask, weights: LqgWeights) -> Predictor:
+    """The stationary Kalman filter of [x~; d], d a random walk of the intensity in `weights` (0: there is none).
 
     Raises DesignRefused.
     """
     n = task.n
-    walks = disturbance_nm_per_sqrt_s > 0.0
+    walks = weights.disturbance_nm_per_sqrt_s > 0.0
     A, B = linear(task)
     plant = with_dead_time(A, B, task.period_s, task.latency_s)
     whole: FloatArray = np.eye(3 * n)
@@ -110,9 +89,9 @@ def design_predictor(task: DesignTask, disturbance_nm_per_sqrt_s: float) -> Pred
     F, C = whole[:states, :states], np.eye(states)[measured]
     moved = np.concatenate(
         (
-            np.zeros(n),
-            np.full(n, task.noise.acceleration_m_per_s1_5**2 * task.period_s),
-            np.full(n, disturbance_nm_per_sqrt_s**2 * task.period_s),
+            np.full(n, weights.web_noise_n_per_sqrt_s**2 * task.period_s),
+            np.full(n, (weights.roller_noise * task.noise.acceleration_m_per_s1_5) ** 2 * task.period_s),
+            np.full(n, weights.disturbance_nm_per_sqrt_s**2 * task.period_s),
         )
     )[:states]
     seen = np.repeat([task.noise.tension_n**2, task.noise.speed_m_per_s**2], [len(task.tension_spans), n])
@@ -130,13 +109,17 @@ def design_predictor(task: DesignTask, disturbance_nm_per_sqrt_s: float) -> Pred
     )
 
 
-def feedback(task: DesignTask, weights: LqWeights) -> tuple[FloatArray, FloatArray]:
-    """K (n, 2n + n d) on [x~; torques in flight], and the matrix P of the cost that remains. Raises DesignRefused."""
+def feedback(task: DesignTask, weights: LqWeights, common_torque: float = 1.0) -> tuple[FloatArray, FloatArray]:
+    """K (n, 2n + n d) on [x~; torques in flight], and the matrix P of the cost that remains.
+
+    Torque that all rollers give alike has `common_torque` times the weight. Raises DesignRefused.
+    """
     _check(task, weights)
     n, plant, kept = task.n, *_controlled(task)
     F, G = plant.augmented()
     cost = np.concatenate((_state_cost(task, weights, kept), np.zeros(n * plant.depth)))
-    gain, remaining = dlqr(F, G, np.diag(cost), weights.torque_per_nm2 * np.eye(n))
+    effort = weights.torque_per_nm2 * (np.eye(n) - (1.0 - common_torque) / n)
+    gain, remaining = dlqr(F, G, np.diag(cost), effort)
     columns = [*kept, *range(2 * n, 2 * n + n * plant.depth)]
     whole = np.zeros((2 * n + n * plant.depth,) * 2)
     whole[np.ix_(columns, columns)] = remaining
@@ -184,6 +167,8 @@ def _check(task: DesignTask, weights: LqWeights) -> None:
     ]
     if not weights.torque_per_nm2 > 0.0:
         wrong.append(f"torque_per_nm2 is {weights.torque_per_nm2}; allowed: above 0")
+    if not values.get("common_torque", 1.0) > 0.0:
+        wrong.append("common_torque is 0; allowed: above 0")
     if not (weights.tension_per_n2 > 0.0 or weights.speed_per_m2_s2 > 0.0):
         wrong.append("tension_per_n2 and speed_per_m2_s2 are both 0: there is nothing to control")
     if wrong:
