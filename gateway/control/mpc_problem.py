@@ -6,7 +6,8 @@ X = Phi x_0 + Gamma z, z the torques w of each block and one slack per span, so 
     minimise  1/2 z' P z + q' z   subject to   lower <= A z <= upper
 
 where P and A stay as they are and q, lower, upper follow from the estimate. Rows: torque of each block; its change from
-the block before; and, where tension limits are looked at, the tensions at the end of each block, eased by the slack.
+the block before, as far as the rate goes from one block's middle to the next; and, where tension limits are looked at,
+the tensions at the end of each block, eased by the slack.
 """
 
 import numpy as np

@@ -31,8 +31,8 @@ REFERENCE_RATE_NM_PER_S = 1000.0
 RATE_POWER = -1.5
 REFERENCE_QUICKNESS = 0.04 / 0.95 * 2400.0  #: b of S_sim, N/s^2/Nm
 LQI_SHARE, LQG_SHARE = 0.5, 0.58  #: natural frequency times D
-LET_GO_S = 0.009
-MPC_RATE_SHARE = 0.4
+LET_GO_S = 0.009  #: least time of back-calculation
+MPC_RATE_SHARE = 0.4  #: of its torque weight at 1000 Nm/s, the rate's part
 FOLLOWING_ROLLER_NOISE, FOLLOWING_WEB_NOISE_N_PER_SQRT_S = 20.0, 1.0
 
 
