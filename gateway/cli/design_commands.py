@@ -49,7 +49,7 @@ def design(
     delay, or leave the tension limits, is not offered. Weights of the score: \\[priorities] of the line's file. Beside
     OUT lie OUT's .design.json (every attempt with its reason) and .design.html (the report). About three minutes.
 
-    Exit code: 0 written, 2 refused.
+    Exit code: 0 written, 2 refused, 130 interrupted.
 
     Example: r2rgate design line.toml --out controller.json
 
@@ -116,6 +116,7 @@ def _phase(
     from gateway.cli.design_table import print_design
     from gateway.cli.report.page_render import render_page
     from gateway.cli.scenarios import load_scenario
+    from gateway.cli.waiting import interruptible
     from gateway.commissioning.suite import suite_of
     from gateway.core.controller import canonical
     from gateway.core.scenario import ScenarioRefused
@@ -125,7 +126,7 @@ def _phase(
     except ScenarioRefused as refused:
         _refuse(f"--scenario: {refused}")
     began_s = time.monotonic()
-    with Progress(names, iterations, quiet=as_json) as progress:
+    with interruptible(f"{out} and its record are as before"), Progress(names, iterations, as_json) as progress:
         found = run_design(line, scenarios, names, iterations, seed, progress.attempted, speeds)
     result = result_of(line, found, seed)
     if found.chosen is not None and found.chosen.config is not None:

@@ -1,8 +1,7 @@
 """Phase 1 of a line, composed: algorithm 1 for each architecture in workers, then the comparison and the choice."""
 
-import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, wait
+from concurrent.futures import Future, wait
 from dataclasses import dataclass
 from multiprocessing import get_context
 from multiprocessing.queues import SimpleQueue
@@ -12,6 +11,7 @@ from threading import Thread
 import numpy as np
 
 from gateway.cli.timed_law import TimedLaw
+from gateway.cli.workers import Workers, processors
 from gateway.commissioning.architectures import ARCHITECTURES, Architecture
 from gateway.commissioning.assessment import Assessment, assess
 from gateway.commissioning.ground import Ground, ground_of
@@ -100,8 +100,7 @@ def run_design(
 def _tuned_in_workers(
     ground: Ground, names: Sequence[str], iterations: int, on_attempt: Callable[[str, Attempt], None]
 ) -> list[Finished]:
-    context = get_context("spawn")
-    told: SimpleQueue[Told | None] = context.SimpleQueue()
+    told: SimpleQueue[Told | None] = get_context("spawn").SimpleQueue()
 
     def listen() -> None:
         while (heard := told.get()) is not None:
@@ -109,19 +108,18 @@ def _tuned_in_workers(
 
     listener = Thread(target=listen, daemon=True)
     listener.start()
-    try:
-        workers = min(len(names), os.cpu_count() or 1)
-        with ProcessPoolExecutor(workers, context, _begin_worker, (told,)) as pool:
-            # The slowest first: the others fill the gaps.
-            order = sorted(names, key=lambda name: name not in PLANTS_TUNED_ON)
-            running: dict[str, Future[Finished]] = {
-                name: pool.submit(finish_architecture, name, ground, iterations) for name in order
-            }
-            wait(running.values())
-            return [running[name].result() for name in names]
-    finally:
-        told.put(None)
-        listener.join()
+    with Workers(min(len(names), processors()), _begin_worker, (told,)) as pool:
+        # The slowest first: the others fill the gaps.
+        order = sorted(names, key=lambda name: name not in PLANTS_TUNED_ON)
+        running: dict[str, Future[Finished]] = {
+            name: pool.submit(finish_architecture, name, ground, iterations) for name in order
+        }
+        wait(running.values())
+        finished = [running[name].result() for name in names]
+    # Only here: a worker that was ended in the middle of telling has the queue's lock for ever.
+    told.put(None)
+    listener.join()
+    return finished
 
 
 def _begin_worker(told: "SimpleQueue[Told | None]") -> None:

@@ -1,13 +1,9 @@
 """A line's commissioning rehearsed against a simulated plant in stepped time: which design is worth what."""
 
-import os
-import signal
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from math import isfinite
-from multiprocessing import get_context
 from typing import Protocol, TypeVar
 
 import numpy as np
@@ -16,6 +12,7 @@ from gateway.cli.rehearse_designs import DESIGNS, TRUTH, Design, offered, truth_
 from gateway.cli.rehearse_result import CaseResult, ConfigurationResult, Spread
 from gateway.cli.stepped import CommandRefused, SteppedResult, periods_before, run_scenario
 from gateway.cli.tiers import Tier
+from gateway.cli.workers import Workers
 from gateway.control.design import DesignRefused, DesignTask, task_of
 from gateway.core.controller import Controller, config_hash
 from gateway.core.line import Line
@@ -211,19 +208,8 @@ def _mapped(workers: int) -> Iterator[Mapped]:
     if workers == 1:
         yield map
         return
-    # Not forked: numba and the linear algebra library have threads of their own by now.
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_end_on_interrupt) as pool:
+    with Workers(workers) as pool:
         yield pool.map
-
-
-def _end_on_interrupt() -> None:
-    """In a process of the pool: Ctrl-C in the terminal reaches it as well, and ends it without a traceback."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
-
-
-def processors() -> int:
-    """How many this process may use."""
-    return len(os.sched_getaffinity(0))
 
 
 def _unless_never(time_s: float) -> float | None:

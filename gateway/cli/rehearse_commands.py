@@ -43,7 +43,7 @@ def rehearse(
     on the plant's own parameters show what better knowledge would bring. The files must agree in the number of spans;
     wires and addresses do not matter. The same seed gives the same figures, but for compute times.
 
-    Exit code: 0 done, 1 done and unsafe events were seen at the simulated drives, 2 refused.
+    Exit code: 0 done, 1 done and unsafe events were seen at the simulated drives, 2 refused, 130 interrupted.
 
     Example: r2rgate rehearse --line line.toml --plant sim_plant/plants/s_real.toml --tier A
     """
@@ -52,7 +52,7 @@ def rehearse(
     cases = _cases(line, plant, _scenarios(scenario), tier)
     _require_writable(out)
     began_s = time.monotonic()
-    found = _rehearsed(cases, seed, workers)
+    found = _rehearsed(cases, seed, workers, out)
     result = _result(line, line_file, plant, plant_file, cases, tier, seed, found, time.monotonic() - began_s)
     text = result.model_dump_json(indent=2) + "\n"
     try:
@@ -128,16 +128,13 @@ def _require_writable(out: Path) -> None:
         _refuse(f"--out {out} cannot be written: {why}; name a file in a folder that you may write")
 
 
-def _rehearsed(cases: list["Case"], seed: int, workers: int | None) -> list["ConfigurationResult"]:
-    from gateway.cli.rehearse import processors, rehearse
-    from gateway.cli.waiting import INTERRUPTED, progress
+def _rehearsed(cases: list["Case"], seed: int, workers: int | None, out: Path) -> list["ConfigurationResult"]:
+    from gateway.cli.rehearse import rehearse
+    from gateway.cli.waiting import interruptible, progress
+    from gateway.cli.workers import processors
 
-    try:
-        with progress() as tell:
-            return rehearse(cases, seed, workers or processors(), tell)
-    except KeyboardInterrupt:
-        typer.echo("interrupted", err=True)
-        raise typer.Exit(INTERRUPTED) from None
+    with interruptible(f"{out} is not written"), progress() as tell:
+        return rehearse(cases, seed, workers or processors(), tell)
 
 
 def _result(

@@ -26,6 +26,16 @@ def progress() -> Iterator[Callable[[str], None]]:
         yield lambda text: status.update(Text(text))
 
 
+@contextmanager
+def interruptible(kept: str) -> Iterator[None]:
+    """Ctrl-C in the block ends the program with exit code 130 and a line that says what is `kept` of the work."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        print(f"interrupted: {kept}", file=sys.stderr)
+        raise typer.Exit(INTERRUPTED) from None
+
+
 def run_until_done(work: Coroutine[Any, Any, T]) -> T:
     """Run `work`; Ctrl-C ends it in order, and the program with exit code 130."""
     try:

@@ -14,7 +14,7 @@ from scipy.sparse import csc_matrix, vstack
 from gateway.cli.rehearse_designs import truth_of
 from gateway.cli.report import Section, Table
 from gateway.cli.tiers import A as TIER
-from gateway.control.design import DesignTask, LqiWeights, LqWeights, MpcWeights, design_lqi, design_lqr, design_mpc
+from gateway.control.design import DesignTask, LqiWeights, LqrWeights, MpcWeights, design_lqi, design_lqr, design_mpc
 from gateway.control.design.task import linear
 from gateway.control.law import Measured
 from gateway.control.laws import ENDLESS_S
@@ -153,14 +153,15 @@ def check_designs(plant: str) -> dict[str, float]:
     F, G = np.asarray(held.A), np.asarray(held.B)
     late_F = np.block([[F, G], [np.zeros((n, 3 * n))]])
     late_G = np.vstack((np.zeros((2 * n, n)), np.eye(n)))
-    lqr, lqi, weights, integral = design_lqr(task), design_lqi(task), LqWeights(), LqiWeights()
+    weights, integral = LqrWeights(), LqiWeights()  # as they are: what they follow from is not looked at here
+    lqr, lqi = design_lqr(task, weights), design_lqi(task, integral)
     Q, R = np.diag([weights.tension_per_n2] * n + [0.0] * 2 * n), weights.torque_per_nm2 * np.eye(n)
     theirs, P, _ = control.dlqr(late_F, late_G, Q, R)
     summed = np.hstack((period_s * np.eye(n), np.zeros((n, 2 * n)), np.eye(n)))
     F_i = np.vstack((np.hstack((late_F, np.zeros((3 * n, n)))), summed))
     Q_i = np.diag([integral.tension_per_n2] * n + [0.0] * 2 * n + [integral.integral_per_n2s2] * n)
     theirs_i, _, _ = control.dlqr(F_i, np.vstack((late_G, np.zeros((n, n)))), Q_i, integral.torque_per_nm2 * np.eye(n))
-    mpc = design_mpc(task)
+    mpc = design_mpc(task, MpcWeights())
     own = np.hstack((lqr.gain_state, lqr.gain_input))
     own_i = np.hstack((lqi.gain_state, lqi.gain_input, lqi.gain_integral))
     K = np.linalg.solve(R + late_G.T @ P @ late_G, late_G.T @ P @ late_F)

@@ -248,6 +248,16 @@ def test_json_is_all_of_standard_output_and_the_file_says_the_same(tmp_path: Pat
     assert [len(one.cases) for one in result.configurations] == [1] * len(DESIGNS)
 
 
+def test_an_interruption_says_what_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("gateway.cli.rehearse.rehearse", interrupted)
+    found = command(tmp_path, "--out", tmp_path / "r.json")
+    assert (found.exit_code, found.stdout) == (130, "")
+    assert found.stderr == f"interrupted: {tmp_path / 'r.json'} is not written\n"
+
+
 def test_unsafe_events_are_an_exit_code(tmp_path: Path) -> None:
     """A recorder that allows less than the scenario asks for, and a table that fits the screen."""
     strict = tmp_path / "strict.toml"

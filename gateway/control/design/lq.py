@@ -23,6 +23,7 @@ from gateway.core.signals import FloatArray
 
 def design_lqr(task: DesignTask, weights: LqrWeights | None = None) -> LqrConfig:
     """State feedback on the sampled model with its dead time, without integral action. Raises DesignRefused."""
+    check_task(task)  # what the weights follow from must be numbers
     weights = weights or lqr_weights(task)
     gain, _ = feedback(task, weights, weights.common_torque)
     n = task.n
@@ -34,6 +35,7 @@ def design_lqi(task: DesignTask, weights: LqiWeights | None = None) -> LqiConfig
 
     Raises DesignRefused where the Riccati equation has no stabilising solution.
     """
+    check_task(task)  # what the weights follow from must be numbers
     weights = weights or lqi_weights(task)
     _check(task, weights)
     n, plant, kept = task.n, *_controlled(task)
@@ -61,6 +63,7 @@ def design_lqi(task: DesignTask, weights: LqiWeights | None = None) -> LqiConfig
 
 def design_lqg(task: DesignTask, weights: LqgWeights | None = None) -> LqgConfig:
     """Feedback on the estimate of `design_predictor`. Raises DesignRefused."""
+    check_task(task)  # what the weights follow from must be numbers
     weights = weights or lqg_weights(task)
     gain, _ = feedback(task, weights)
     n = task.n

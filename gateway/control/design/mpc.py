@@ -4,7 +4,7 @@ from dataclasses import replace
 from math import floor, isfinite
 
 from gateway.control.design.lq import design_predictor, feedback, shared
-from gateway.control.design.task import DesignRefused, DesignTask
+from gateway.control.design.task import DesignRefused, DesignTask, check_task
 from gateway.control.design.weights import MpcWeights, lqi_weights, mpc_weights
 from gateway.core.controller_laws import MpcConfig
 
@@ -21,6 +21,7 @@ def design_mpc(task: DesignTask, weights: MpcWeights | None = None, blocks: tupl
 
     Raises DesignRefused.
     """
+    check_task(task)
     weights = weights or mpc_weights(task)
     blocks = default_blocks(task.period_s) if blocks is None else blocks
     if not blocks or min(blocks) < 1:

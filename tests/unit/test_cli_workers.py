@@ -1,0 +1,80 @@
+"""Ctrl-C while processes work: one line of the command's own, and nothing is left of them, whatever they were at."""
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from gateway.core.line_template import line_template
+
+PATIENCE_S = 30.0  #: for what takes a tenth of a second; what it ends would take minutes
+STORY = """
+import os, sys, time
+from gateway.cli.workers import Workers
+try:
+    with Workers(2) as pool:
+        if sys.argv[1] == "at work":
+            pool.submit(os.getpid).result()
+        working = pool.map(time.sleep, 20 * [600.0])
+        print("begun", flush=True)
+        list(working)
+except KeyboardInterrupt:
+    sys.exit(130)
+"""
+TO_ALL: Callable[[int, int], None] = os.killpg  #: as a terminal does
+TO_ONE: Callable[[int, int], None] = os.kill  #: as another program does
+
+
+def begin(*arguments: object) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, *map(str, arguments)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        preexec_fn=heed_ctrl_c,
+    )
+
+
+def heed_ctrl_c() -> None:
+    """Whoever runs the tests in the background lets them ignore it, and all their children."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
+def interrupt(process: subprocess.Popen[str], send: Callable[[int, int], None]) -> tuple[str, str]:
+    """What it says from then on: until every process that could say something has ended."""
+    send(process.pid, signal.SIGINT)
+    try:
+        return process.communicate(timeout=PATIENCE_S)
+    except subprocess.TimeoutExpired:
+        os.killpg(process.pid, signal.SIGKILL)
+        process.communicate()
+        raise
+
+
+@pytest.mark.parametrize("send", [TO_ALL, TO_ONE])
+@pytest.mark.parametrize("stage", ["starting", "at work"])
+def test_workers_end_with_what_they_work_for(stage: str, send: Callable[[int, int], None]) -> None:
+    process = begin("-c", STORY, stage)
+    assert process.stdout is not None and process.stdout.readline() == "begun\n"
+    assert interrupt(process, send) == ("", "")
+    assert process.returncode == 130
+
+
+@pytest.mark.parametrize("send", [TO_ALL, TO_ONE])
+def test_an_interrupted_design_says_what_is_kept(send: Callable[[int, int], None], tmp_path: Path) -> None:
+    line, out = tmp_path / "line.toml", tmp_path / "c.json"
+    line.write_text(line_template(2), encoding="utf-8")
+    out.write_text("as before")
+    process = begin("-m", "gateway.cli", "design", line, "--law", "mpc", "--law", "lqi", "--out", out)
+    assert process.stderr is not None and ": J " in process.stderr.readline()
+    said, complained = interrupt(process, send)
+    assert process.returncode == 130 and said == ""
+    *attempts, last = complained.splitlines()
+    assert last == f"interrupted: {out} and its record are as before"
+    assert all(": J " in one for one in attempts)
+    assert out.read_text() == "as before" and set(tmp_path.iterdir()) == {line, out}
