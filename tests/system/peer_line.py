@@ -17,6 +17,7 @@ SPANS = 3
 HELD_PERIODS = 5  #: a signal is held for three; one before is under way, and the command is written with the next
 SEEN_LATE_MS = 100.0  #: on a machine that others use, too: two processes and a wire in between
 RUN_S = 3.0
+SETTLE_S, SETTLED_N = 5.0, 0.3  #: after the line has come to RUN; a law for a long period takes its time
 TARGET_N = (28.0, 36.0, 20.0)
 
 
@@ -95,6 +96,10 @@ def assert_arms_and_holds_tension(line: PeerLine) -> None:
     line.live.stop()
     line.live.run()
     assert line.peer("state")["axes"] == ["ENABLED"] * SPANS
+    settled_by_s = monotonic() + SETTLE_S
+    while np.abs(np.array(line.peer("state")["tension_n"]) - TARGET_N).max() > SETTLED_N:
+        assert monotonic() < settled_by_s, line.peer("state")["tension_n"]
+        sleep(0.02)
     seen: list[list[float]] = []
     end_s = monotonic() + RUN_S
     while monotonic() < end_s:
