@@ -8,6 +8,8 @@ from rich.progress import Progress as Bars
 
 from gateway.commissioning.records import Attempt
 
+BESIDE_A_BAR = 48  #: characters
+
 
 class Progress:
     """Lines of plain text where the output is no terminal; nothing at all when quiet."""
@@ -36,7 +38,7 @@ class Progress:
     def attempted(self, name: str, attempt: Attempt) -> None:
         if attempt.accepted and attempt.cost_n2s is not None:
             self._best[name] = attempt.cost_n2s
-        best = f"J {self._best[name]:.2f} N2s" if name in self._best else f"not yet: {attempt.refused[:40]}"
-        self._bars.update(self._tasks[name], completed=attempt.number + 1, told=best)
+        best = f"J {self._best[name]:.2f} N2s" if name in self._best else f"not yet: {attempt.refused}"
+        self._bars.update(self._tasks[name], completed=attempt.number + 1, told=best[:BESIDE_A_BAR])
         if not self._console.is_terminal and (attempt.accepted or attempt.number == 0):
-            self._console.print(f"{name} {attempt.number}: {best}", markup=False)
+            self._console.print(f"{name} {attempt.number}: {best}", markup=False, soft_wrap=True)

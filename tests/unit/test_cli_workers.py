@@ -1,10 +1,12 @@
 """Ctrl-C while processes work: one line of the command's own, and nothing is left of them, whatever they were at."""
 
 import os
+import re
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pytest
@@ -25,19 +27,27 @@ try:
 except KeyboardInterrupt:
     sys.exit(130)
 """
+ATTEMPT = re.compile(r"(mpc|lqi) \d+: (J [\d.]+ N2s|not yet: .+)$")
 TO_ALL: Callable[[int, int], None] = os.killpg  #: as a terminal does
 TO_ONE: Callable[[int, int], None] = os.kill  #: as another program does
 
 
-def begin(*arguments: object) -> subprocess.Popen[str]:
-    return subprocess.Popen(
+@contextmanager
+def begun(*arguments: object) -> Iterator[subprocess.Popen[str]]:
+    """A command of its own session. Nothing of it is left, whatever becomes of the test."""
+    with subprocess.Popen(
         [sys.executable, *map(str, arguments)],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
         start_new_session=True,
         preexec_fn=heed_ctrl_c,
-    )
+    ) as process:
+        try:
+            yield process
+        finally:
+            with suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
 
 
 def heed_ctrl_c() -> None:
@@ -48,21 +58,16 @@ def heed_ctrl_c() -> None:
 def interrupt(process: subprocess.Popen[str], send: Callable[[int, int], None]) -> tuple[str, str]:
     """What it says from then on: until every process that could say something has ended."""
     send(process.pid, signal.SIGINT)
-    try:
-        return process.communicate(timeout=PATIENCE_S)
-    except subprocess.TimeoutExpired:
-        os.killpg(process.pid, signal.SIGKILL)
-        process.communicate()
-        raise
+    return process.communicate(timeout=PATIENCE_S)
 
 
 @pytest.mark.parametrize("send", [TO_ALL, TO_ONE])
 @pytest.mark.parametrize("stage", ["starting", "at work"])
 def test_workers_end_with_what_they_work_for(stage: str, send: Callable[[int, int], None]) -> None:
-    process = begin("-c", STORY, stage)
-    assert process.stdout is not None and process.stdout.readline() == "begun\n"
-    assert interrupt(process, send) == ("", "")
-    assert process.returncode == 130
+    with begun("-c", STORY, stage) as process:
+        assert process.stdout is not None and process.stdout.readline() == "begun\n"
+        assert interrupt(process, send) == ("", "")
+        assert process.returncode == 130
 
 
 @pytest.mark.parametrize("send", [TO_ALL, TO_ONE])
@@ -70,11 +75,13 @@ def test_an_interrupted_design_says_what_is_kept(send: Callable[[int, int], None
     line, out = tmp_path / "line.toml", tmp_path / "c.json"
     line.write_text(line_template(2), encoding="utf-8")
     out.write_text("as before")
-    process = begin("-m", "gateway.cli", "design", line, "--law", "mpc", "--law", "lqi", "--out", out)
-    assert process.stderr is not None and ": J " in process.stderr.readline()
-    said, complained = interrupt(process, send)
+    # Each takes minutes; which of the two has its first attempt first is a matter of the machine.
+    laws = ("--law", "mpc", "--law", "lqi", "--iterations", "50")
+    with begun("-m", "gateway.cli", "design", line, *laws, "--out", out) as process:
+        assert process.stderr is not None and ATTEMPT.match(process.stderr.readline())
+        said, complained = interrupt(process, send)
     assert process.returncode == 130 and said == ""
     *attempts, last = complained.splitlines()
     assert last == f"interrupted: {out} and its record are as before"
-    assert all(": J " in one for one in attempts)
+    assert all(ATTEMPT.match(one) for one in attempts)
     assert out.read_text() == "as before" and set(tmp_path.iterdir()) == {line, out}
