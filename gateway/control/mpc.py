@@ -5,15 +5,14 @@ linear feedback, a more cautious one than the problem's own.
 """
 
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
-import osqp as _osqp  # pyright: ignore[reportMissingTypeStubs]
 
 from gateway.control.deviation import Deviation, Measured
 from gateway.control.law import Decision
 from gateway.control.lqg import feedback
 from gateway.control.mpc_problem import MpcProblem
+from gateway.control.mpc_solver import MpcSolver
 from gateway.control.observer import Estimate, Observer, ObserverState
 from gateway.control.reference import Reference
 from gateway.core.controller_laws import MpcConfig
@@ -36,11 +35,6 @@ class Planned(Decision):
     found: Estimate | None = None
     plan_nm: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
     solution: FloatArray = field(default_factory=lambda: np.empty(0))  #: of the quadratic programme
-    solve_s: float = 0.0
-
-
-osqp: Any = _osqp  # it has no types
-SOLVED = int(osqp.SolverStatus.OSQP_SOLVED)
 
 
 class Mpc:
@@ -53,11 +47,11 @@ class Mpc:
         self._observer = Observer(config.predictor, deviation, config.draw_spans, config.period_s)
         self._gain = np.hstack((np.array(config.fallback_state), np.array(config.fallback_input).reshape(self.n, -1)))
         self.problem = MpcProblem(config)
-        self._solver: Any = None
+        self._solver = MpcSolver(self.problem, config.most_iterations, config.time_limit_s)
 
     def engage(self, measured: Measured, reference: Reference, applied_nm: FloatArray) -> MpcState:
         """The first decision is made here, and asked for next. Without a solution it is `applied_nm` once more."""
-        self._solver = self._new_solver()
+        self._solver.forget()
         observer = self._observer.engage(measured, reference, applied_nm)
         state = MpcState(observer, applied_nm.copy(), np.empty((0, self.n)))
         first = self.ask(state, measured, reference)
@@ -74,28 +68,14 @@ class Mpc:
             return state.first
         found = self._observer.estimate(state.observer, measured, reference)
         q, lower, upper = self.problem.vectors(found, reference.tension_n, state.applied_nm)
-        self._solver.update(q=q, l=lower, u=upper)
-        solved = self._solver.solve(raise_error=False)
-        if solved.info.status_val == SOLVED:
-            plan = self.problem.torques(solved.x, found)
-            return Planned(plan[0] + found.bump_nm, found.errors, "", found, plan[1:], solved.x, solved.info.run_time)
+        solution, status = self._solver.solve(q, lower, upper)
+        if solution is not None:
+            plan = self.problem.torques(solution, found)
+            return Planned(plan[0] + found.bump_nm, found.errors, "", found, plan[1:], solution)
         if len(state.plan_nm):
             rest = state.plan_nm
-            return Planned(rest[0] + found.bump_nm, found.errors, f"plan: {solved.info.status}", found, rest[1:])
-        return Planned(feedback(self._gain, found), found.errors, f"linear feedback: {solved.info.status}", found)
-
-    def _new_solver(self) -> Any:
-        """Nothing in it of what was solved before: neither a start nor a step size."""
-        solver, problem, config = osqp.OSQP(), self.problem, self.config
-        solver.setup(
-            problem.P, np.zeros(problem.variables), problem.A,
-            np.full(problem.rows, -np.inf), np.full(problem.rows, np.inf),
-            verbose=False, warm_starting=True, polishing=False, eps_abs=1e-3, eps_rel=1e-5, check_termination=5,
-            max_iter=config.most_iterations, time_limit=config.time_limit_s,
-            # By iterations, not by time: the same problem is solved in the same way on every computer.
-            adaptive_rho_interval=20, adaptive_rho_tolerance=3.0,
-        )  # fmt: skip
-        return solver
+            return Planned(rest[0] + found.bump_nm, found.errors, f"plan: {status}", found, rest[1:])
+        return Planned(feedback(self._gain, found), found.errors, f"linear feedback: {status}", found)
 
     def commit(self, state: MpcState, decision: Decision, applied_nm: FloatArray) -> MpcState:
         assert isinstance(decision, Planned) and decision.found is not None

@@ -7,7 +7,7 @@ X = Phi x_0 + Gamma z, z the torques w of each block and one slack per span, so 
 
 where P and A stay as they are and q, lower, upper follow from the estimate. Rows: torque of each block; its change from
 the block before, as far as the rate goes from one block's middle to the next; and, where tension limits are looked at,
-the tensions at the end of each block, eased by the slack.
+the tensions at the end of each block, to which a span's slack is added.
 """
 
 import numpy as np
@@ -44,15 +44,16 @@ class MpcProblem:
         self.torque_variables = n * len(blocks)
         self.variables = self.torque_variables + (n if self._limited else 0)
         change = np.eye(self.torque_variables) - np.eye(self.torque_variables, k=-n)
-        rows = [np.eye(self.torque_variables), change]
+        self.torque_rows = 2 * self.torque_variables  #: the first ones of A; the others are of tensions
+        matrix = np.vstack((np.eye(self.torque_variables), change))
+        # The symmetric part: rounding makes halves differ, and the solver reads one of them.
+        hessian = 0.5 * (hessian + hessian.T)
+        self.hessian: FloatArray = hessian  #: of the torques alone, (n blocks, n blocks)
         if self._limited:
             hessian = _block_diagonal(hessian, 2.0 * config.weight_tension_limit * np.eye(n))
-            ease = np.tile(np.eye(n), (len(blocks), 1))
-            none = np.zeros((2 * self.torque_variables, n))
-            rows = [np.hstack((np.vstack(rows), none)), np.hstack((tension, ease)), np.hstack((tension, -ease))]
-        matrix = np.vstack(rows)
-        # The symmetric part: rounding makes halves differ, and the solver reads one of them.
-        self.P = csc_matrix(triu(0.5 * (hessian + hessian.T)))
+            none = np.zeros((self.torque_rows, n))
+            matrix = np.block([[matrix, none], [tension, np.tile(np.eye(n), (len(blocks), 1))]])
+        self.P = csc_matrix(triu(hessian))
         self.A = csc_matrix(matrix)
         self.rows = matrix.shape[0]
         # From the middle of a block to that of the next; the first torque follows the one sent last by a period.
@@ -64,17 +65,16 @@ class MpcProblem:
 
     def gain(self) -> FloatArray:
         """K (n, 2n + n d) of w_0 = -K [x~; torques in flight]: the law where no limit is reached."""
-        m = self.torque_variables
-        whole: FloatArray = np.array(self.P.toarray(), dtype=np.float64)
-        hessian = whole[:m, :m]
-        linear: FloatArray = self._linear
-        gain: FloatArray = np.asarray(np.linalg.solve(hessian + np.triu(hessian, 1).T, linear), dtype=np.float64)
+        gain: FloatArray = np.asarray(np.linalg.solve(self.hessian, self._linear), dtype=np.float64)
         return gain[: self._n]
 
     def vectors(
         self, found: Estimate, tension_setpoint_n: FloatArray, applied_nm: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """q, lower and upper for an estimate, set-points (n,) and the torque sent last (n,)."""
+        """q, lower and upper for an estimate, set-points (n,) and the torque sent last (n,).
+
+        The next call writes over them.
+        """
         config, n, m = self._config, self._n, self.torque_variables
         x = np.concatenate((found.state, found.in_flight_nm.ravel()))
         q = np.zeros(self.variables)
@@ -93,8 +93,8 @@ class MpcProblem:
         if self._limited:
             tension = np.tile(tension_setpoint_n, blocks) + self._tension_free.dot(x)
             least = np.tile(np.minimum(config.tension_min_n, tension_setpoint_n), blocks)  # a slack web is tensioned
-            lower[2 * m : 3 * m] = least - tension
-            upper[3 * m :] = config.tension_max_n - tension
+            lower[2 * m :] = least - tension
+            upper[2 * m :] = config.tension_max_n - tension
         return q, lower, upper
 
     def torques(self, solution: FloatArray, found: Estimate) -> FloatArray:

@@ -18,6 +18,7 @@ from gateway.control.law import Measured
 from gateway.control.laws import ENDLESS_S
 from gateway.control.mpc import Mpc
 from gateway.control.mpc_problem import MpcProblem
+from gateway.control.mpc_solver import MpcSolver
 from gateway.control.reference import Steady
 from gateway.control.rollout import Setup, limited, rk4
 from gateway.control.sampled import Sampled
@@ -120,6 +121,23 @@ class Condensed:
         return np.array(self._solver.solve(raise_error=False).x)
 
 
+class Staged:
+    """As the law does it: with no more limits than matter."""
+
+    name = "law"
+
+    def prepare(self, config: MpcConfig) -> None:
+        self._n = config.n
+        self._solver = MpcSolver(MpcProblem(config), config.most_iterations, ENDLESS_S)
+        self._solver.forget()
+
+    def solve(self, met: Met) -> FloatArray:
+        solution, status = self._solver.solve(met.q, met.lower, met.upper)
+        if solution is None:
+            raise RuntimeError(f"MPC has not solved it: {status}")
+        return solution[: self._n]
+
+
 class Sparse:
     """OSQP on the sparse form, with the law's settings but for those given."""
 
@@ -190,7 +208,7 @@ class SparseForm:
         ease = kron(np.ones((len(blocks), 1)), eye(n))
         columns = [s * periods, m, *([n] if slack else [])]
         rows: list[list[Any]] = [[of_states, of_torques], [None, eye(m)], [None, change]]
-        rows += [[pick, None, ease], [pick, None, -ease]] if slack else []
+        rows += [[pick, None, ease]] if slack else []
         self.A = csc_matrix(
             vstack(
                 [
@@ -212,9 +230,8 @@ class SparseForm:
             blocks = len(config.blocks)
             least = np.tile(np.minimum(config.tension_min_n, met.setpoint_n) - met.setpoint_n, blocks)
             most = np.tile(config.tension_max_n - met.setpoint_n, blocks)
-            none = np.full(len(least), np.inf)
-            lower += [least, -none]
-            upper += [none, most]
+            lower += [least]
+            upper += [most]
         return np.concatenate(lower), np.concatenate(upper)
 
     def first(self, solution: FloatArray) -> FloatArray:
@@ -235,7 +252,8 @@ def _osqp(P: csc_matrix, A: csc_matrix, settings: dict[str, Any]) -> Any:
 
 
 TRIED: dict[str, Solver] = {
-    "OSQP, condensed, as in the law": Condensed("osqp"),
+    "as in the law: OSQP, condensed, no more limits than matter": Staged(),
+    "OSQP, condensed, all limits": Condensed("osqp"),
     "OSQP, condensed, tolerance 1e-2": Condensed("osqp_loose", eps_abs=1e-2, eps_rel=1e-4),
     "OSQP, condensed, step size kept": Condensed("osqp_fixed", adaptive_rho=False),
     "OSQP, condensed, step size adapted every 50": Condensed("osqp_slow", adaptive_rho_interval=50),

@@ -12,6 +12,7 @@ from gateway.control.design.lq import LqgWeights
 from gateway.control.law import Measured
 from gateway.control.laws import make_law, untimed
 from gateway.control.mpc import Mpc
+from gateway.control.mpc_solver import MpcSolver
 from gateway.control.reference import Steady
 from gateway.core.controller import ControllerRefused, canonical, parse_controller
 from gateway.core.web_model import equilibrium_torque, reference_speeds
@@ -76,6 +77,43 @@ def test_solutions_are_those_of_a_second_solver(seed):
         active += bool((np.minimum(rows - lower, upper - rows) < 1e-3).any())
     assert active > 200  # it is limits that are solved for
     assert np.median(apart) < 0.02 and np.percentile(apart, 99) < 1.0
+
+
+@pytest.mark.parametrize(
+    ("off_n", "off_m_per_s", "needs"),
+    [(0.2, 0.0, "no limit"), (6.0, 0.0, "torque limits"), (19.0, 0.2, "tension limits")],
+)
+def test_no_more_limits_are_looked_at_than_matter(off_n, off_m_per_s, needs):
+    """Whichever it does with, the solution is that of the programme with all of them."""
+    law = make_law(patient())
+    generator = np.random.default_rng(7)
+    P = np.array(law.problem.P.todense())
+    P += np.triu(P, 1).T
+    seen = 0
+    for _ in range(60):
+        theta, setpoint = model(6), generator.uniform(22.0, 40.0, 6)
+        speed = reference_speeds(theta, setpoint, 0.05)
+        torque = equilibrium_torque(theta, setpoint, speed)
+        off = generator.uniform(-1.0, 1.0, (2, 6))
+        measured = Measured(setpoint + off_n * off[0], speed + off_m_per_s * off[1], 0.05)
+        state = law.engage(measured, Steady(setpoint), torque)
+        found = law.ask(state, measured, Steady(setpoint)).found
+        q, lower, upper = law.problem.vectors(found, setpoint, torque)
+        solver = MpcSolver(law.problem, 5000, 10.0)
+        solver.forget()
+        mine, status = solver.solve(q, lower, upper)
+        theirs, best = second_opinion(law.problem.P, q, law.problem.A, lower, upper)
+        assert abs(0.5 * mine @ P @ mine + q @ mine - best) < 2e-3 * abs(best)
+        limited = law.problem.A @ theirs
+        limited = np.minimum(limited - lower, upper - limited) < 1e-3
+        rows = law.problem.torque_rows
+        if needs == "no limit":
+            seen += status == "no limit reached" and not limited.any()
+        elif needs == "torque limits":
+            seen += status == "solved" and bool(limited[:rows].any()) and not limited[rows:].any()
+        else:
+            seen += status == "solved" and bool(limited[rows:].any()) and np.abs(mine[-6:]).max() > 1e-3
+    assert seen > 10
 
 
 def test_without_limits_it_is_the_linear_law():
