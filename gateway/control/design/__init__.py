@@ -5,7 +5,7 @@ from gateway.control.design.margins import Margins, is_stable, margins, require_
 from gateway.control.design.mpc import design_mpc
 from gateway.control.design.pid import design_pid
 from gateway.control.design.schedule import design_scheduled, gains_change
-from gateway.control.design.task import DesignLimits, DesignRefused, DesignTask, Noise, task_of
+from gateway.control.design.task import DesignLimits, DesignRefused, DesignTask, task_of
 from gateway.control.design.weights import (
     LqgWeights,
     LqiWeights,
@@ -29,7 +29,6 @@ __all__ = [
     "LqrWeights",
     "Margins",
     "MpcWeights",
-    "Noise",
     "design_lqg",
     "design_lqi",
     "design_lqr",

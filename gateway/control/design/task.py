@@ -9,6 +9,7 @@ import numpy as np
 from gateway.core.controller_laws import Feedforward
 from gateway.core.line import Line
 from gateway.core.signals import BoolArray, FloatArray
+from gateway.core.theta import Noise
 from gateway.core.web_model import WebModel, equilibrium_torque, linearise, nominal_model, reference_speeds
 
 #: Slower, a draw span's tension decays (with L / v) too slowly for any design to tell it from never.
@@ -17,15 +18,6 @@ LEAST_DRAW_SPEED_M_PER_S = 1e-6
 
 class DesignRefused(Exception):
     """No controller can be offered; the text says why."""
-
-
-@dataclass(frozen=True)
-class Noise:
-    """What moves the line and its measurements at random, as far as it is known."""
-
-    tension_n: float = 0.1  #: standard deviation of a sample
-    speed_m_per_s: float = 1e-4
-    acceleration_m_per_s1_5: float = 1.6e-3  #: intensity of the white noise on roller accelerations
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,42 @@
+"""theta: everything that is believed of a line's physics; what the paper leaves out stands beside its two equations."""
+
+from dataclasses import dataclass
+
+from gateway.core.line import Line
+from gateway.core.signals import FloatArray
+from gateway.core.web_model import WebModel, nominal_model
+
+
+@dataclass(frozen=True)
+class Noise:
+    """What moves the line and its measurements at random, as far as it is known."""
+
+    tension_n: float = 0.1  #: standard deviation of a sample
+    speed_m_per_s: float = 1e-4
+    acceleration_m_per_s1_5: float = 1.6e-3  #: intensity of the white noise on roller accelerations
+
+
+@dataclass(frozen=True)
+class Theta:
+    """A torque sent with the sample at t moves the roller from t + latency on, behind a lag of the first order:
+
+        torque_lag dm_i/dt = u_i(t - latency) - m_i
+        dv_i/dt = R_i^2/J_i (T_{i+1} - T_i) - f_i/J_i v_i + R_i/J_i (m_i - c_i sign(v_i))
+
+    and the tensions follow as in `web_model`. c is the Coulomb friction of the bearings.
+    """
+
+    web: WebModel
+    coulomb_nm: FloatArray  #: (n,), 0 and above
+    torque_lag_s: float  #: 0: none
+    latency_s: float  #: from a sample to the torque that it causes
+
+    @property
+    def n(self) -> int:
+        return self.web.n
+
+
+def nominal_theta(line: Line) -> Theta:
+    """The line's file, which knows of no Coulomb friction and no lag."""
+    web = nominal_model(line)
+    return Theta(web, 0.0 * web.radius_m, 0.0, line.control.latency_s)
