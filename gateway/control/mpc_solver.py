@@ -1,7 +1,7 @@
 """Solves the programmes of the model predictive controller, with no more limits than matter.
 
-An optimum that keeps limits which were not asked for is the optimum with them, too. So a programme is solved without any
-limit first, which is a product with a matrix; where that breaks one, with those of torque and its rate; and where
+An optimum that keeps limits which were not asked for is the optimum with them, too. So a programme is solved without
+any limit first, which is a product with a matrix; where that breaks one, with those of torque and its rate; and where
 tensions leave theirs even so, with all. OSQP begins each from where its last solution ended.
 """
 

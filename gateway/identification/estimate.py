@@ -38,8 +38,9 @@ class Estimate:
     structure: Structure
     theta: Theta
     noise: Noise | None  #: None: the method says nothing of it
-    #: By name: stiffness_n, length_m, radius_m, inertia_kg_m2, friction_nms_per_rad, coulomb_nm, torque_lag_s, latency_s,
-    #: and the combinations stiffness_per_length (EA/L, N/m), radius_per_inertia (R/J), friction_per_inertia (f/J) and
-    #: radius2_per_inertia (R^2/J); "inertia_kg_m2[3]" (from 1) where rollers differ. Of a prior alone, as wide as that.
+    #: By name: stiffness_n, length_m, radius_m, inertia_kg_m2, friction_nms_per_rad, coulomb_nm, torque_lag_s,
+    #: latency_s, and the combinations stiffness_per_length (EA/L, N/m), radius_per_inertia (R/J), friction_per_inertia
+    #: (f/J) and radius2_per_inertia (R^2/J); "inertia_kg_m2[3]" (from 1) where rollers differ. Of what the data do not
+    #: tell, as wide as the prior.
     intervals: dict[str, Interval]
     samples: int
