@@ -300,6 +300,23 @@ def imagined(theta: Theta, stretch: Stretch, gains: Gains, innovation: FloatArra
     return replace(stretch, measured=np.vstack((stretch.measured[: stretch.first + 1], outputs)))
 
 
+def free_run(theta: Theta, predicted: Predicted, begin: int, length: int) -> FloatArray:
+    """Errors (length, m) of the model left to itself, from what was known after prediction `begin` on.
+
+    Measurements do not correct it, torques and the unwinder's speed are those of the stretch.
+    """
+    stretch, gains = predicted.stretch, predicted.gains
+    state = predicted.state[begin] + gains.gain[gains.which[begin]] @ predicted.innovation[begin]
+    first = stretch.first + 1 + begin
+    end = first + length + 1
+    part = replace(
+        stretch, measured=stretch.measured[:end], torque_nm=stretch.torque_nm[:end], first=first, start=state,
+        unwind_m_per_s=stretch.unwind_m_per_s[:end],
+    )  # fmt: skip
+    nothing = Gains(np.zeros((1, 2 * stretch.n, len(stretch.outputs))), gains.root[:1], np.zeros(length, dtype=np.int64))
+    return innovations([theta], part, nothing)[0][0]
+
+
 def _boundary(theta: Theta) -> FloatArray:
     return np.array([theta.web.tension_before_n, theta.web.tension_after_n])
 
