@@ -313,7 +313,9 @@ def free_run(theta: Theta, predicted: Predicted, begin: int, length: int) -> Flo
         stretch, measured=stretch.measured[:end], torque_nm=stretch.torque_nm[:end], first=first, start=state,
         unwind_m_per_s=stretch.unwind_m_per_s[:end],
     )  # fmt: skip
-    nothing = Gains(np.zeros((1, 2 * stretch.n, len(stretch.outputs))), gains.root[:1], np.zeros(length, dtype=np.int64))
+    nothing = Gains(
+        np.zeros((1, 2 * stretch.n, len(stretch.outputs))), gains.root[:1], np.zeros(length, dtype=np.int64)
+    )
     return innovations([theta], part, nothing)[0][0]
 
 

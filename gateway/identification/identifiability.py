@@ -126,7 +126,7 @@ def _worst(known: list[Known]) -> dict[str, Known]:
 
 
 def symbol(name: str) -> str:
-    """"radius_m[2]" is "R 2"."""
+    """ "radius_m[2]" is "R 2"."""
     family, _, index = name.partition("[")
     return f"{SYMBOLS[family]} {index[:-1]}".rstrip()
 

@@ -48,8 +48,13 @@ class Choice:
 
 
 def choose(
-    recordings: Sequence[Recording], line: Line, noise0: Noise, held_out: Sequence[Recording] = (), *,
-    unwinder: Unwinder | None = None, measured: dict[str, tuple[float, float]] | None = None,
+    recordings: Sequence[Recording],
+    line: Line,
+    noise0: Noise,
+    held_out: Sequence[Recording] = (),
+    *,
+    unwinder: Unwinder | None = None,
+    measured: dict[str, tuple[float, float]] | None = None,
 ) -> Choice:
     """Fit the structures of the paper, with Coulomb friction and with torque lag, then with rollers that differ.
 

@@ -1,4 +1,4 @@
-"""Whether a model holds on data that it was not made from: size and whiteness of innovations, and errors in N and m/s."""
+"""Whether a model holds on data that it was not made from: size and whiteness of innovations, errors in N and m/s."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -130,7 +130,9 @@ def _judged(outputs: list[Output], normalised: float, together: float) -> tuple[
             f"innovations are not white: portmanteau statistic {together:.2f} of its quantile"
             f" ({1 - RISK:.0%}), most of all {worst.name} ({worst.portmanteau:.2f})"
         )
-        advice.append("try a richer structure (Coulomb friction, torque lag, rollers that differ), and check the latency")
+        advice.append(
+            "try a richer structure (Coulomb friction, torque lag, rollers that differ), and check the latency"
+        )
     return findings, advice
 
 
@@ -148,7 +150,9 @@ def _judge_noise(noise: Noise, expected: Noise | None, findings: list[str], advi
         found, wanted = getattr(noise, name), getattr(expected, name)
         if not _TOO_QUIET * wanted <= found <= _TOO_LOUD * wanted:
             findings.append(f"noise of {name.split('_')[0]} came out as {found:.2g} {unit}, {wanted:.2g} was expected")
-            advice.append("the fit makes up for a wrong structure by noise, or a sensor is not what its data sheet says")
+            advice.append(
+                "the fit makes up for a wrong structure by noise, or a sensor is not what its data sheet says"
+            )
 
 
 def _name_line(theta: Theta, predicted: list[Predicted], findings: list[str], advice: list[str]) -> None:
@@ -177,5 +181,5 @@ def _name_line(theta: Theta, predicted: list[Predicted], findings: list[str], ad
 def normalised_band(samples: int, outputs: int, level: float = 0.95) -> tuple[float, float]:
     """Within which the normalised innovation squared of a true model lies."""
     freedom = samples * outputs
-    low, high = chi2.ppf([0.5 - 0.5 * level, 0.5 + 0.5 * level], freedom).tolist()
-    return low / freedom, high / freedom
+    low, high = (float(chi2.ppf(0.5 + 0.5 * side * level, freedom)) / freedom for side in (-1.0, 1.0))
+    return low, high
