@@ -6,6 +6,7 @@ before and after the data. An eigenvalue of lambda makes the standard deviation 
 """
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -15,7 +16,7 @@ from gateway.identification.parameters import COMBINATIONS, SYMBOLS, Parameters
 from gateway.identification.prediction_error import Z95, Fit
 from gateway.identification.prior import deviation
 
-BY_DATA, BY_PRIOR = 0.2, 0.7  #: standard deviation over that of the prior: up to the first, from the second on
+STRONG, NOTHING = 0.03, 0.7  #: standard deviation over that of the prior: up to the first, from the second on
 TAPE = 0.002  #: tolerance of a length or radius that is measured
 _WORTH = 0.7  #: a measurement that makes an interval narrower than this part of it is worth it
 _SHOWN = 0.15  #: smallest part of a combination that is named, of its largest
@@ -30,9 +31,10 @@ class Known:
     posterior: float
 
     @property
-    def teller(self) -> str:
+    def told(self) -> Literal["strongly", "weakly", "not"]:
+        """By the data."""
         ratio = self.posterior / self.prior
-        return "the data" if ratio <= BY_DATA else "the prior" if ratio >= BY_PRIOR else "both"
+        return "strongly" if ratio <= STRONG else "not" if ratio >= NOTHING else "weakly"
 
 
 @dataclass(frozen=True)
@@ -94,10 +96,10 @@ def _after_measuring(parameters: Parameters, covariance: FloatArray, name: str) 
 def _words(parameters: Parameters, known: list[Known], remedies: dict[str, dict[str, float]]) -> list[str]:
     families = _worst(known)
     words: list[str] = []
-    for teller, told in (("the data", "told by the data"), ("both", "told in part"), ("the prior", "not told")):
-        some = [f"{symbol(one.name)} to {_percent(one.posterior)}" for one in families.values() if one.teller == teller]
+    for told in ("strongly", "weakly", "not"):
+        some = [f"{symbol(one.name)} to {_percent(one.posterior)}" for one in families.values() if one.told == told]
         if some:
-            words.append(f"{told}: {', '.join(some)}")
+            words.append(f"{told} told by the data: {', '.join(some)}")
     for name, after in remedies.items():
         better = {
             other: max(value for key, value in after.items() if key.split("[")[0] == other)

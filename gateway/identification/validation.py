@@ -1,7 +1,7 @@
 """Whether a model holds on data that it was not made from: size and whiteness of innovations, errors in N and m/s."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import pi
 
 import numpy as np
@@ -19,6 +19,7 @@ FREE_RUN_S = 1.0  #: how far ahead the model is left to itself
 RISK = 0.01  #: that whiteness is denied of a true model, all outputs together
 _TOO_QUIET = 0.2  #: of what was expected: measuring noise that a fit has pushed aside
 _TOO_LOUD = 3.0
+_INSISTS = 3.0  #: in the log-likelihood
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,8 @@ def validate(theta: Theta, noise: Noise, stretches: Sequence[Stretch], expected:
     together = portmanteau_of_all(white, RISK)
     normalised = float(np.mean(np.concatenate([np.square(part).ravel() for part in white])))
     findings, advice = _judged(outputs, normalised, together)
-    _judge_noise(noise, expected, findings, advice)
+    if expected is not None:
+        _judge_noise(theta, noise, expected, predicted, findings, advice)
     if together > 1.0:
         _name_line(theta, predicted, findings, advice)
     return Validation(
@@ -143,12 +145,20 @@ def _where(loud: list[Output]) -> str:
     return f"look at drives and bearings first ({', '.join(o.name for o in loud)}): friction, torque lag, latency"
 
 
-def _judge_noise(noise: Noise, expected: Noise | None, findings: list[str], advice: list[str]) -> None:
-    if expected is None:
-        return
+def _judge_noise(
+    theta: Theta, noise: Noise, expected: Noise, predicted: list[Predicted], findings: list[str], advice: list[str]
+) -> None:
+    """Measuring noise far from what was expected, where the data insist on it."""
     for name, unit in (("tension_n", "N"), ("speed_m_per_s", "m/s")):
         found, wanted = getattr(noise, name), getattr(expected, name)
-        if not _TOO_QUIET * wanted <= found <= _TOO_LOUD * wanted:
+        if _TOO_QUIET * wanted <= found <= _TOO_LOUD * wanted:
+            continue
+        as_expected = replace(noise, **{name: wanted})
+        gain = sum(
+            float((one.log_likelihood - predict(theta, as_expected, one.stretch).log_likelihood).sum())
+            for one in predicted
+        )
+        if gain > _INSISTS:
             findings.append(f"noise of {name.split('_')[0]} came out as {found:.2g} {unit}, {wanted:.2g} was expected")
             advice.append(
                 "the fit makes up for a wrong structure by noise, or a sensor is not what its data sheet says"
