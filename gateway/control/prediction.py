@@ -49,6 +49,7 @@ class Stretch:
     outputs: CountArray  #: (m,), which entries of [T; v] are measured: all but tensions without a load cell
     measured: FloatArray  #: (k, m)
     torque_nm: FloatArray  #: (k, n)
+    unwinder: Unwinder
     unwind_m_per_s: FloatArray  #: (k, 2), at begin and end of the period from each sample on
     first: int  #: the sample with which predicting begins
     start: FloatArray  #: (2n,), state at `first`
@@ -141,7 +142,7 @@ def stretch_of(recording: Recording, unwinder: Unwinder = "linear") -> Stretch:
     points, point = _operating_points(np.column_stack((filled, v0)), recording.period_s)
     following = np.append(v0[1:], v0[-1]) if unwinder == "linear" else v0
     return Stretch(
-        recording, outputs, measured, np.ascontiguousarray(recording.torque_nm),
+        recording, outputs, measured, np.ascontiguousarray(recording.torque_nm), unwinder,
         np.column_stack((v0, following)), first, filled[first].copy(), points, point,
     )  # fmt: skip
 

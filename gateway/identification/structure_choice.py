@@ -66,10 +66,8 @@ def choose(
         return prior_of(line, structure).measured(measured or {})
 
     first = fit(recordings, prior(SHARED[-1]), noise0, unwinder)
-    stretches, held = first.stretches, None
-    if held_out:
-        follows = (first.stretches[0].unwind_m_per_s[:-1, 1] == first.stretches[0].unwind_m_per_s[1:, 0]).all()
-        held = stretches_of(held_out, "linear" if follows else "held")
+    stretches = first.stretches
+    held = stretches_of(held_out, stretches[0].unwinder) if held_out else None
     candidates = [_candidate(SHARED[-1], first, held)]
     for structure in SHARED[:-1]:
         candidates.append(_candidate(structure, fit_stretches(stretches, prior(structure), first.noise), held))
