@@ -49,6 +49,7 @@ class Stretch:
     outputs: CountArray  #: (m,), which entries of [T; v] are measured: all but tensions without a load cell
     measured: FloatArray  #: (k, m)
     torque_nm: FloatArray  #: (k, n)
+    unwinder: Unwinder
     unwind_m_per_s: FloatArray  #: (k, 2), at begin and end of the period from each sample on
     first: int  #: the sample with which predicting begins
     start: FloatArray  #: (2n,), state at `first`
@@ -141,7 +142,7 @@ def stretch_of(recording: Recording, unwinder: Unwinder = "linear") -> Stretch:
     points, point = _operating_points(np.column_stack((filled, v0)), recording.period_s)
     following = np.append(v0[1:], v0[-1]) if unwinder == "linear" else v0
     return Stretch(
-        recording, outputs, measured, np.ascontiguousarray(recording.torque_nm),
+        recording, outputs, measured, np.ascontiguousarray(recording.torque_nm), unwinder,
         np.column_stack((v0, following)), first, filled[first].copy(), points, point,
     )  # fmt: skip
 
@@ -298,6 +299,25 @@ def imagined(theta: Theta, stretch: Stretch, gains: Gains, innovation: FloatArra
         stretch.outputs, gains.gain, _padded(gains, stretch), innovation, outputs,
     )  # fmt: skip
     return replace(stretch, measured=np.vstack((stretch.measured[: stretch.first + 1], outputs)))
+
+
+def free_run(theta: Theta, predicted: Predicted, begin: int, length: int) -> FloatArray:
+    """Errors (length, m) of the model left to itself, from what was known after prediction `begin` on.
+
+    Measurements do not correct it, torques and the unwinder's speed are those of the stretch.
+    """
+    stretch, gains = predicted.stretch, predicted.gains
+    state = predicted.state[begin] + gains.gain[gains.which[begin]] @ predicted.innovation[begin]
+    first = stretch.first + 1 + begin
+    end = first + length + 1
+    part = replace(
+        stretch, measured=stretch.measured[:end], torque_nm=stretch.torque_nm[:end], first=first, start=state,
+        unwind_m_per_s=stretch.unwind_m_per_s[:end],
+    )  # fmt: skip
+    nothing = Gains(
+        np.zeros((1, 2 * stretch.n, len(stretch.outputs))), gains.root[:1], np.zeros(length, dtype=np.int64)
+    )
+    return innovations([theta], part, nothing)[0][0]
 
 
 def _boundary(theta: Theta) -> FloatArray:

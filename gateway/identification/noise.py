@@ -10,7 +10,7 @@ from gateway.core.theta import Noise, Theta
 
 _STEP = 1e-3  #: of a logarithm, for derivatives
 _REACH = 1.0  #: longest step
-_DAMPINGS = (0.0, 10.0, 1e2, 1e3, 1e4, 1e5)  #: the next when a step is too long, or makes the likelihood smaller
+_DAMPINGS = (0.0, *(10.0**power for power in range(1, 10)))  #: the next when a step is too long, or the wrong way
 _BOUND = 7.0  #: the noise is looked for within this of where the search began
 _WIDE = 1.0  #: standard deviation of a prior that keeps what the data do not tell from running away
 

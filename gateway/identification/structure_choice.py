@@ -1,0 +1,116 @@
+"""Which structure the data call for: by evidence, with data that no fit has seen as a witness.
+
+The evidence is the likelihood of the data under a structure with its parameters integrated out (Laplace): a parameter
+that explains nothing costs the volume of prior that it excludes. Held-out likelihood needs no prior, and less care.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from gateway.control.prediction import Stretch, Unwinder, predict
+from gateway.core.line import Line
+from gateway.core.recording import Recording
+from gateway.core.theta import Noise
+from gateway.identification.estimate import Structure
+from gateway.identification.prediction_error import Fit, fit, fit_stretches, score, stretches_of
+from gateway.identification.prior import Prior, prior_of
+
+SHARED = (
+    Structure(), Structure(coulomb=True), Structure(torque_lag=True), Structure(coulomb=True, torque_lag=True)
+)  # fmt: skip
+ENOUGH = 3.0  #: log evidence, 20 to 1, that a richer structure needs beyond a simpler one
+ONE_SPEED = 1.3  #: the fastest over the slowest: less is one speed
+
+
+@dataclass(frozen=True)
+class Candidate:
+    structure: Structure
+    fitted: Fit
+    held_out: float | None  #: log-likelihood per sample of data that the fit has not seen
+    normalised: float | None  #: and its normalised innovation squared
+
+    @property
+    def evidence(self) -> float:
+        return self.fitted.evidence
+
+
+@dataclass(frozen=True)
+class Choice:
+    candidates: list[Candidate]  #: the most evidence first
+    chosen: Candidate
+    cautions: list[str]
+
+    @property
+    def fitted(self) -> Fit:
+        return self.chosen.fitted
+
+
+def choose(
+    recordings: Sequence[Recording],
+    line: Line,
+    noise0: Noise,
+    held_out: Sequence[Recording] = (),
+    *,
+    unwinder: Unwinder | None = None,
+    measured: dict[str, tuple[float, float]] | None = None,
+) -> Choice:
+    """Fit the structures of the paper, with Coulomb friction and with torque lag, then with rollers that differ.
+
+    Where rollers differ is only asked of the structure that was best without it, and of what that adds to it: each
+    question is of one term. `measured` as in `Prior.measured`. Raises Unpredictable.
+    """
+
+    def prior(structure: Structure) -> Prior:
+        return prior_of(line, structure).measured(measured or {})
+
+    first = fit(recordings, prior(SHARED[-1]), noise0, unwinder)
+    stretches = first.stretches
+    held = stretches_of(held_out, stretches[0].unwinder) if held_out else None
+    candidates = [_candidate(SHARED[-1], first, held)]
+    for structure in SHARED[:-1]:
+        candidates.append(_candidate(structure, fit_stretches(stretches, prior(structure), first.noise), held))
+    best = _chosen(candidates)
+    apart = Structure(True, best.structure.coulomb, best.structure.torque_lag)
+    own = prior(apart)
+    start = own.parameters.logs(best.fitted.parameters.theta(best.fitted.logs))
+    candidates.append(_candidate(apart, fit_stretches(stretches, own, best.fitted.noise, start=start), held))
+    candidates.sort(key=lambda candidate: -candidate.evidence)
+    chosen = _chosen(candidates)
+    return Choice(candidates, chosen, _cautions(candidates, chosen, stretches))
+
+
+def _candidate(structure: Structure, fitted: Fit, held: list[Stretch] | None) -> Candidate:
+    if held is None:
+        return Candidate(structure, fitted, None, None)
+    theta = fitted.parameters.theta(fitted.logs)
+    white = np.concatenate([predict(theta, fitted.noise, stretch).whitened.ravel() for stretch in held])
+    return Candidate(structure, fitted, score(fitted, held), float(np.mean(np.square(white))))
+
+
+def _chosen(candidates: list[Candidate]) -> Candidate:
+    """The one with fewest parameters of those that the best has not 20 to 1 against."""
+    best = max(candidate.evidence for candidate in candidates)
+    near = [candidate for candidate in candidates if candidate.evidence >= best - ENOUGH]
+    return min(near, key=lambda candidate: (candidate.fitted.parameters.size, -candidate.evidence))
+
+
+def _cautions(candidates: list[Candidate], chosen: Candidate, stretches: list[Stretch]) -> list[str]:
+    found: list[str] = []
+    speeds = np.abs(np.vstack([stretch.points[:, -1:] for stretch in stretches]))
+    if speeds.max() < ONE_SPEED * speeds.min():
+        told = f"the data have one speed only ({speeds.mean():.3g} m/s)"
+        found.append(
+            f"{told}: Coulomb friction is told from viscous friction by how fast rollers settle alone; record a second"
+            " speed"
+        )
+    scored = [candidate for candidate in candidates if candidate.held_out is not None]
+    if scored and chosen.held_out is not None:
+        other = max(scored, key=lambda candidate: candidate.held_out or -np.inf)
+        gap = (other.held_out or 0.0) - chosen.held_out
+        if gap * sum(stretch.predictions for stretch in stretches) > ENOUGH:
+            found.append(f"held-out data prefer the structure '{other.structure}' to '{chosen.structure}'")
+    if not chosen.fitted.converged:
+        found.append(f"the fit of the structure '{chosen.structure}' has not converged")
+    return found

@@ -1,0 +1,121 @@
+"""What is said of a model: what it rests on, whether it holds on unseen data, and which structure the data call for."""
+
+import numpy as np
+import pytest
+
+from gateway.core.theta import Noise
+from gateway.identification.estimate import Structure
+from gateway.identification.identifiability import identifiability
+from gateway.identification.prediction_error import fit, stretches_of
+from gateway.identification.prior import prior_of
+from gateway.identification.structure_choice import choose
+from gateway.identification.validation import validate
+from tests.closed_loop.recorded import demonstration_line, real_plant, recorded
+from tests.closed_loop.truths import altered, with_friction_and_lag
+
+BOTH = Structure(coulomb=True, torque_lag=True)
+
+
+@pytest.fixture(scope="module")
+def fitted():
+    return fit([recorded(real_plant(), 0)], prior_of(demonstration_line(), Structure()), Noise())
+
+
+@pytest.fixture(scope="module")
+def with_friction():
+    """Two recordings at two speeds, of a line with Coulomb friction and torque lag."""
+    plant = with_friction_and_lag(real_plant())
+    return [recorded(plant, seed, 4.0, (0.05, 0.1)) for seed in (0, 1)]
+
+
+def validated(fitted, recording, unwinder="linear"):
+    theta = fitted.parameters.theta(fitted.logs)
+    return validate(theta, fitted.noise, stretches_of([recording], unwinder), Noise())
+
+
+def test_products_are_known_better_than_their_parts(fitted):
+    found = identifiability(fitted)
+    known = {one.name: one for one in found.known}
+    for product, part in (("stiffness_per_length", "stiffness_n"), ("radius_per_inertia", "inertia_kg_m2")):
+        assert known[product].posterior < 0.2 * known[part].posterior
+    assert known["stiffness_per_length"].told == "strongly" and known["stiffness_n"].told == "weakly"
+    weakest, strongest = found.directions[-1], found.directions[0]
+    assert strongest.information > 1e4 * weakest.information > 0.0
+    assert {"radius_m", "inertia_kg_m2"} <= set(weakest.weights)
+
+
+def test_directions_are_independent_before_and_after(fitted):
+    """In units of the prior they are orthogonal, with the information as variance ratio."""
+    found = identifiability(fitted).directions
+    names = fitted.parameters.names
+    for direction in found[:2]:
+        row = np.array([direction.weights.get(name, 0.0) for name in names])
+        prior, posterior = (row @ C @ row for C in (fitted.prior.covariance, fitted.covariance))
+        assert posterior < 1e-2 * prior  # what is left out of the weights as small keeps it from 1 / information
+
+
+def test_the_remedy_is_what_a_tape_measure_does(fitted):
+    """What is promised of a measured radius is what a fit with it has."""
+    promised = identifiability(fitted).remedies["radius_m"]["inertia_kg_m2"]
+    prior = fitted.prior.measured({"radius_m": (0.035, 0.002)})
+    measured = fit([fitted.stretches[0].recording], prior, Noise())
+    row = measured.parameters.maps["inertia_kg_m2"]
+    assert np.sqrt(row @ measured.covariance @ row) == pytest.approx(promised, rel=0.1)
+    words = identifiability(fitted).words
+    assert words[0].startswith("strongly told by the data: EA/L to ±0.") and "f/J to ±0." in words[0]
+    assert words[1].startswith("weakly told by the data: EA to ±1.") and "R^2/J" in words[1]
+    assert any(word.startswith("measure R to 0.2%: that brings J from") for word in words)
+
+
+def test_a_true_model_holds(fitted):
+    found = validated(fitted, recorded(real_plant(), 1))
+    assert found.valid and not found.findings and not found.recommendations
+    assert found.mean("tension", "r2") > 0.99 and found.mean("speed", "r2") > 0.99
+    assert found.mean("tension", "r2_free") > 0.95
+    assert 0.07 < found.mean("tension", "mae") < 0.1  # 0.8 of the load cells' noise is the least
+    assert len(found.outputs) == 12 and found.samples == 494
+
+
+def test_noise_that_makes_up_for_a_structure_is_seen_through(with_friction):
+    """Innovations have the size that the fitted noise gives them, and the model is wrong all the same."""
+    data, unseen = with_friction
+    poor = fit([data], prior_of(demonstration_line(), Structure()), Noise(), "held")
+    found = validated(poor, unseen, "held")
+    assert 0.8 < found.normalised < 1.2
+    assert not found.valid
+    assert any("not white" in finding for finding in found.findings)
+    assert any("was expected" in finding for finding in found.findings)
+    assert any("richer structure" in advice for advice in found.recommendations)
+
+
+def test_a_model_that_is_off_has_innovations_that_are_too_large(fitted):
+    stiffer = fitted.parameters.logs(fitted.parameters.theta(fitted.logs)) + np.array([0.3, 0.0, 0.0, 0.0, 0.0])
+    stretches = stretches_of([recorded(real_plant(), 1)])
+    found = validate(fitted.parameters.theta(stiffer), fitted.noise, stretches)
+    assert not found.valid and found.normalised > 1.2
+
+
+def test_eccentric_rollers_are_named():
+    """0.5 % at roller 3: the spectral line is its turn."""
+    plant = altered(real_plant(), {"effects": {"eccentricity": {"share": [0.0, 0.0, 0.005, 0.0, 0.0, 0.0]}}})
+    data, unseen = (recorded(plant, seed, 6.0, (0.1,)) for seed in (0, 1))
+    found = validated(fit([data], prior_of(demonstration_line(), Structure()), Noise()), unseen)
+    assert not found.valid
+    assert any("spectral line at 0.4" in finding or "spectral line at 0.5" in finding for finding in found.findings)
+    assert any("eccentricity" in advice for advice in found.recommendations)
+
+
+def test_friction_and_lag_are_chosen_where_they_are(with_friction):
+    data, unseen = with_friction
+    found = choose([data], demonstration_line(), Noise(), [unseen])
+    assert found.chosen.structure == BOTH
+    assert found.chosen.normalised == pytest.approx(1.0, abs=0.1)
+    assert found.chosen.held_out == max(candidate.held_out for candidate in found.candidates)
+    assert not found.cautions
+
+
+def test_nothing_is_chosen_beyond_what_is_there_and_one_speed_is_told():
+    found = choose([recorded(real_plant(), 0)], demonstration_line(), Noise())
+    assert found.chosen.structure == Structure()
+    assert [candidate.structure for candidate in found.candidates][0] == Structure()
+    assert len(found.cautions) == 1 and "one speed only (0.05 m/s)" in found.cautions[0]
