@@ -29,7 +29,7 @@ def fields(spans: int = 2, scale: float = 1.0, **changes: Any) -> dict[str, Any]
     return {
         "format": 1,
         "site": "demo",
-        "line": "six-span" if spans == 6 else "line",
+        "line": "line-1",
         "created": CREATED,
         "program_version": "0.1.0",
         "method": "prediction error",
