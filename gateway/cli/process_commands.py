@@ -43,13 +43,18 @@ def read_line(file: Path) -> Line:
     raise typer.Exit(REFUSED)
 
 
-def default_data_folder(line: Line) -> Path:
-    """/var/lib/r2rgate where it may be written, else the user's own state folder; then site-line."""
+def data_base() -> Path:
+    """Where the lines' folders lie: /var/lib/r2rgate where it may be written, else the user's own state folder."""
     from os import W_OK, access, environ
 
     service = Path("/var/lib/r2rgate")
     own = Path(environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state") / "r2rgate"
-    return (service if access(service, W_OK) else own) / f"{line.site}-{line.line}"
+    return service if access(service, W_OK) else own
+
+
+def default_data_folder(line: Line) -> Path:
+    """site-line in `data_base`."""
+    return data_base() / f"{line.site}-{line.line}"
 
 
 def loop(
