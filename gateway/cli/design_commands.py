@@ -9,8 +9,9 @@ from typing import Annotated, NoReturn
 
 import typer
 
-from gateway.cli.process_commands import REFUSED, LineFile, read_line
+from gateway.cli.process_commands import REFUSED, DataFolder, LineFile, read_line
 from gateway.core.line import Line
+from gateway.core.line_model import LineModel
 
 
 class LawName(StrEnum):
@@ -41,6 +42,11 @@ def design(
         str, typer.Option(help="Speeds in m/s, such as 0.1,2,5: gains that follow the unwinder. Not for mpc.")
     ] = "",
     seed: Annotated[int, typer.Option(min=0, help="Of the noise, and of the lines within the tolerances.")] = 0,
+    model: Annotated[
+        str | None,
+        typer.Option(help="An identified model in place of FILE's values: a file, a version, an id, or newest."),
+    ] = None,
+    data_dir: DataFolder = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
     """Design a controller: tune each architecture on the line's model, compare, choose, and say why.
@@ -48,12 +54,15 @@ def design(
     Candidates run on the nominal model and on lines within its tolerances. One that would stand less than 4 ms more
     delay, or leave the tension limits, is not offered. Weights of the score: \\[priorities] of the line's file. Beside
     OUT lie OUT's .design.json (every attempt with its reason) and .design.html (the report). About three minutes.
+    With --model (r2rgate models) the identified model and its intervals stand in place of FILE's values and tolerances.
 
     Exit code: 0 written, 2 refused, 130 interrupted.
 
     Example: r2rgate design line.toml --out controller.json
 
     Example, in a second: r2rgate design line.toml --law lqi --untuned
+
+    Example, on what was identified last: r2rgate design line.toml --model newest
     """
     from gateway.control.design import DesignRefused
 
@@ -64,24 +73,49 @@ def design(
     if untuned and scenario:
         _refuse("--untuned simulates nothing: leave --scenario away")
     names = list(dict.fromkeys(one.value for one in law or LawName if law or not speeds or one is not LawName.MPC))
-    _may_write(out, [file, *map(Path, scenario or [])], only=untuned)
+    _may_write(out, [file, *map(Path, scenario or []), *([Path(model)] if model else [])], only=untuned)
+    identified = _identified(line, file, model, data_dir) if model else None
     try:
         if untuned:
-            _first_guess(line, names, speeds, out, as_json)
+            _first_guess(line, identified, names, speeds, out, as_json)
         else:
-            _phase(line, names, scenario or [], speeds, iterations, seed, out, as_json)
+            _phase(line, identified, names, scenario or [], speeds, iterations, seed, out, as_json)
     except DesignRefused as refused:
         _refuse(f"no controller for {file}: {refused}")
 
 
-def _first_guess(line: Line, names: list[str], speeds: list[float], out: Path, as_json: bool) -> None:
+def _identified(line: Line, file: Path, wanted: str, data_dir: Path | None) -> LineModel:
+    """The model that is wanted; the command ends where it is none of this line."""
+    from gateway.cli.model_place import chosen, reasons_against_line
+    from gateway.supervisor.model_store import ModelsError
+
+    try:
+        found = chosen(wanted, file, data_dir).model
+    except ModelsError as error:
+        _refuse(f"--model: {error}")
+    reasons = reasons_against_line(found, line)
+    if abs(found.data.period_s - line.control.period_s) > 1e-9:
+        reasons.append(
+            f"its data have a period of {found.data.period_s:g} s, the line {line.control.period_s:g} s: its latency "
+            "is that of another loop; identify at this period"
+        )
+    if reasons:
+        _refuse("\n".join(f"--model {wanted} is not used: {reason}" for reason in reasons))
+    return found
+
+
+def _first_guess(
+    line: Line, model: LineModel | None, names: list[str], speeds: list[float], out: Path, as_json: bool
+) -> None:
     from gateway.commissioning.architectures import ARCHITECTURES
-    from gateway.control.design import DesignRefused, margins, require_margin, task_of, weak_spots
+    from gateway.control.design import DesignRefused, margins, require_margin, task_of, task_on, weak_spots
     from gateway.core.controller import canonical, config_hash
+    from gateway.core.line_model import noise_of, theta_of
 
     if len(names) != 1:
         _refuse("--untuned compares nothing: name one architecture with --law")
-    architecture, task = ARCHITECTURES[names[0]], task_of(line)
+    architecture = ARCHITECTURES[names[0]]
+    task = task_of(line) if model is None else task_on(line, theta_of(model), noise_of(model))
     config = architecture.design(task, architecture.first(task), speeds)
     found = margins(config, task)
     require_margin(found)
@@ -101,6 +135,7 @@ def _first_guess(line: Line, names: list[str], speeds: list[float], out: Path, a
 
 def _phase(
     line: Line,
+    model: LineModel | None,
     names: list[str],
     given: list[str],
     speeds: list[float],
@@ -127,8 +162,8 @@ def _phase(
         _refuse(f"--scenario: {refused}")
     began_s = time.monotonic()
     with interruptible(f"{out} and its record are as before"), Progress(names, iterations, as_json) as progress:
-        found = run_design(line, scenarios, names, iterations, seed, progress.attempted, speeds)
-    result = result_of(line, found, seed)
+        found = run_design(line, scenarios, names, iterations, seed, progress.attempted, speeds, model)
+    result = result_of(line, found, seed, model)
     if found.chosen is not None and found.chosen.config is not None:
         _write(out, canonical(found.chosen.config) + b"\n")
     record, report = _beside(out)

@@ -14,6 +14,7 @@ from gateway.cli.timed_law import TimedLaw
 from gateway.cli.workers import Workers, processors
 from gateway.commissioning.architectures import ARCHITECTURES, Architecture
 from gateway.commissioning.assessment import Assessment, assess
+from gateway.commissioning.belief import words_on
 from gateway.commissioning.ground import Ground, ground_of
 from gateway.commissioning.records import Attempt, Trial
 from gateway.commissioning.search import PatternSearch
@@ -25,6 +26,7 @@ from gateway.control.laws import make_law, untimed
 from gateway.control.rollout import Course, Rollouts, run_law
 from gateway.core.controller import Controller, config_hash
 from gateway.core.line import Line
+from gateway.core.line_model import LineModel, model_hash
 from gateway.core.scenario import Scenario
 from gateway.core.signals import FloatArray
 
@@ -88,10 +90,14 @@ def run_design(
     seed: int,
     on_attempt: Callable[[str, Attempt], None],
     speeds_m_per_s: Sequence[float] = (),
+    model: LineModel | None = None,
 ) -> Design:
-    """Tune, compare, choose. Raises DesignRefused where no design can begin."""
-    ground = ground_of(line, scenarios, BOX_PLANTS, seed, speeds_m_per_s)
+    """Tune, compare, choose, on the line's nominal model or on `model`. Raises DesignRefused where none can begin."""
+    ground = ground_of(line, scenarios, BOX_PLANTS, seed, speeds_m_per_s, model)
     assessment = assess(line, ground.task)
+    if model is not None:
+        said = words_on(model, f"model {model_hash(model)[:12]}", scenarios)
+        assessment = assessment.model_copy(update={"sentences": [*said, *assessment.sentences]})
     finished = _tuned_in_workers(ground, names, iterations, on_attempt)
     candidates = ranked([_candidate(one, ground, line) for one in finished])
     return Design(assessment, ground, finished, candidates, explanation(candidates))

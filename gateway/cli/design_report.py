@@ -21,6 +21,9 @@ HEADS = (
 
 def page_of(result: DesignResult, found: Design) -> Page:
     """`render_page` makes the page of it."""
+    model, within = "nominal model", "the tolerances in the line's file"
+    if result.model:
+        model, within = f"identified model {result.model[:12]}", "its intervals, at least 2.5 % either way"
     return Page(
         title=f"Controller design: {result.chosen or 'none offered'}",
         origin=f"Line {result.line}",
@@ -37,10 +40,9 @@ def page_of(result: DesignResult, found: Design) -> Page:
             *(_attempts(one) for one in result.tuning),
         ),
         notes=(
-            f"Candidates run on the nominal model and on {result.plants} lines drawn evenly from the tolerances in the "
-            "line's file (MPC is tuned on fewer of them), with noise, torque limits and latency. RMSE, settling time, "
-            "overshoot and effort are those of the nominal model; R is how far any of the other lines is from it at "
-            "any time.",
+            f"Candidates run on the {model} and on {result.plants} lines drawn evenly from {within} (MPC is tuned on "
+            "fewer of them), with noise, torque limits and latency. RMSE, settling time, overshoot and effort are "
+            f"those of the {model}; R is how far any of the other lines is from it at any time.",
             "J is the integral of the squared tension error and of the squared torque times 1e-5, summed over the "
             "scenarios, in the mean over all these lines. Tuning lowers J; the choice among architectures is by S.",
         ),

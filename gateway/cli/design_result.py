@@ -11,6 +11,7 @@ from gateway.commissioning.assessment import Assessment
 from gateway.commissioning.records import Attempt
 from gateway.commissioning.selection import Candidate
 from gateway.core.line import Line, Priorities, Strict
+from gateway.core.line_model import LineModel, model_hash
 from gateway.core.scenario import Scenario
 
 
@@ -30,8 +31,9 @@ class DesignResult(Strict):
     versions: dict[str, str]
     machine: str
     line: str  #: site/line
+    model: str = ""  #: hash of the identified model; "": the nominal model of the line's file
     seed: int
-    plants: int  #: of the box within the line's tolerances, beside the nominal model
+    plants: int  #: of the box within the line's tolerances, or the model's intervals, beside the nominal model
     assessment: Assessment
     scenarios: list[Scenario]
     priorities: Priorities
@@ -45,7 +47,7 @@ class DesignResult(Strict):
 LIBRARIES = ("r2rgate", "numpy", "scipy", "numba", "osqp")
 
 
-def result_of(line: Line, found: Design, seed: int) -> DesignResult:
+def result_of(line: Line, found: Design, seed: int, model: LineModel | None = None) -> DesignResult:
     """The outcome of phase 1, to be kept."""
     chosen = found.candidates[0] if found.chosen is not None else None
     return DesignResult(
@@ -55,6 +57,7 @@ def result_of(line: Line, found: Design, seed: int) -> DesignResult:
         machine=f"{os.cpu_count()} processors, {platform.system()} {platform.release()}, "
         f"Python {platform.python_version()}",
         line=f"{line.site}/{line.line}",
+        model="" if model is None else model_hash(model),
         seed=seed,
         plants=len(found.ground.models) - 1,
         assessment=found.assessment,

@@ -23,9 +23,10 @@ def print_design(result: DesignResult, took_s: float) -> None:
     for sentence in result.explanation:
         console.print(sentence, markup=False, soft_wrap=True)
     attempts = sum(len(one.history) for one in result.tuning)
+    model, within = ("identified model", "its intervals") if result.model else ("nominal model", "the tolerances")
     console.print(
-        f"{attempts} attempts on the nominal model and up to {result.plants} lines within the tolerances, "
-        f"{took_s:.0f} s. RMSE, t_s, OS, effort: nominal model; R: worst of the tolerances.",
+        f"{attempts} attempts on the {model} and up to {result.plants} lines within {within}, {took_s:.0f} s. "
+        f"RMSE, t_s, OS, effort: {model}; R: worst of {within}.",
         soft_wrap=True,
     )
 

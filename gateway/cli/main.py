@@ -11,6 +11,7 @@ from gateway.cli import (
     doctor_commands,
     fault_commands,
     line_commands,
+    models_commands,
     operate_commands,
     process_commands,
     rehearse_commands,
@@ -37,6 +38,7 @@ app.command(rich_help_panel=ENGINEER)(line_commands.check)
 app.add_typer(scan_commands.app, rich_help_panel=ENGINEER)
 app.command(rich_help_panel=ENGINEER)(doctor_commands.doctor)
 app.command(rich_help_panel=ENGINEER)(design_commands.design)
+app.add_typer(models_commands.app, rich_help_panel=ENGINEER)
 app.command(rich_help_panel=ENGINEER)(rehearse_commands.rehearse)
 app.command(rich_help_panel=PROCESSES)(process_commands.run)
 app.command(rich_help_panel=PROCESSES)(process_commands.loop)

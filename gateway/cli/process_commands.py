@@ -22,6 +22,11 @@ if TYPE_CHECKING:
 #: Exit codes. `run` starts a crashed child again, but not one that was refused or that runs already.
 CRASHED, REFUSED, ALREADY_RUNNING = 1, 2, 3
 
+#: A design on an identified model has the dead time that was found, the drives' lag in it. One for somewhat more than
+#: the line's file says is slower than need be; one for less would eat its own delay margin, so that the file must be
+#: put right first. In periods.
+LESS_LATENCY, MORE_LATENCY = 0.1, 1.0
+
 LineFile = Annotated[Path, typer.Argument(help="The line description (r2rgate init writes one).")]
 RunFolder = Annotated[Path | None, typer.Option("--run-dir", help="Where the line's sockets shall lie.")]
 DataFolder = Annotated[Path | None, typer.Option("--data-dir", help="Where history and configurations are kept.")]
@@ -43,13 +48,18 @@ def read_line(file: Path) -> Line:
     raise typer.Exit(REFUSED)
 
 
-def default_data_folder(line: Line) -> Path:
-    """/var/lib/r2rgate where it may be written, else the user's own state folder; then site-line."""
+def data_base() -> Path:
+    """Where the lines' folders lie: /var/lib/r2rgate where it may be written, else the user's own state folder."""
     from os import W_OK, access, environ
 
     service = Path("/var/lib/r2rgate")
     own = Path(environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state") / "r2rgate"
-    return (service if access(service, W_OK) else own) / f"{line.site}-{line.line}"
+    return service if access(service, W_OK) else own
+
+
+def default_data_folder(line: Line) -> Path:
+    """site-line in `data_base`."""
+    return data_base() / f"{line.site}-{line.line}"
 
 
 def loop(
@@ -273,8 +283,13 @@ def _require_fit(line: Line, config: "Controller", path: Path, way_out: str) -> 
         reasons.append(f"its draw-controlled spans are {spans[0]}, the line's {spans[1]}")
     if abs(config.period_s - line.control.period_s) > 1e-9:
         reasons.append(f"it is for a period of {config.period_s} s, the line's is {line.control.period_s} s")
-    if abs(config.latency_s - line.control.latency_s) > 1e-9:
-        reasons.append(f"it is for a latency of {config.latency_s} s, the line's is {line.control.latency_s} s")
+    least_s = line.control.latency_s - LESS_LATENCY * line.control.period_s - 1e-9
+    most_s = line.control.latency_s + MORE_LATENCY * line.control.period_s + 1e-9
+    if not least_s <= config.latency_s <= most_s:
+        reasons.append(
+            f"it is for a latency of {config.latency_s} s, the line's is {line.control.latency_s} s; allowed: "
+            f"{least_s:.4g} to {most_s:.4g} s"
+        )
     if config.kind == "mpc" and (config.torque_nm, config.torque_rate_nm_per_s) != (
         line.limits.torque_nm,
         line.limits.torque_rate_nm_per_s,

@@ -7,11 +7,13 @@ from math import ceil
 
 import numpy as np
 
-from gateway.control.design import DesignRefused, DesignTask, task_of
+from gateway.commissioning.belief import Draw, within_intervals, within_tolerances
+from gateway.control.design import DesignRefused, DesignTask, task_of, task_on
 from gateway.control.design.margins import LEAST_DELAY_MARGIN_S
 from gateway.control.design.task import linear
 from gateway.control.rollout import Course, Plants, Setup, plants_of
-from gateway.core.line import Line, Parameter
+from gateway.core.line import Line
+from gateway.core.line_model import LineModel, noise_of, theta_of
 from gateway.core.scenario import Scenario
 from gateway.core.signals import FloatArray
 from gateway.core.web_model import WebModel, equilibrium_torque, reference_speeds
@@ -19,6 +21,7 @@ from gateway.core.web_model import WebModel, equilibrium_torque, reference_speed
 MOST_DRAWS = 200  #: per plant of the box, until one is found that can be held
 FASTEST_MODE = 0.5  #: of an integration step, as |eigenvalue| times its length
 MOST_SUBSTEPS = 50
+ROUNDED = 0.025  #: of a period, by which a latency may be rounded that is no whole number of steps
 
 
 @dataclass(frozen=True)
@@ -50,14 +53,20 @@ class Ground:
 
 
 def ground_of(
-    line: Line, scenarios: Sequence[Scenario], plants: int, seed: int, speeds_m_per_s: Sequence[float] = ()
+    line: Line,
+    scenarios: Sequence[Scenario],
+    plants: int,
+    seed: int,
+    speeds_m_per_s: Sequence[float] = (),
+    model: LineModel | None = None,
 ) -> Ground:
     """The ground of a line: its nominal model, and `plants` more within its tolerances.
 
-    Raises DesignRefused where a scenario does not fit the line, or hardly any plant of the box can be held.
+    With `model` that one and its intervals stand in their place. Raises DesignRefused where a scenario does not fit the
+    line, or hardly any plant of the box can be held.
     """
     reasons = [reason for scenario in scenarios for reason in scenario.reasons_against(line.n, line.limits)]
-    task = task_of(line)
+    task = task_of(line) if model is None else task_on(line, theta_of(model), noise_of(model))
     reasons += [
         f"{scenario.name} changes after {scenario.change_at_s:g} s; allowed: {task.period_s:g} s, a period, or more"
         for scenario in scenarios
@@ -72,35 +81,26 @@ def ground_of(
         speed_noise_m_per_s=task.noise.speed_m_per_s, acceleration_m_per_s1_5=task.noise.acceleration_m_per_s1_5,
         seed=seed,
     )  # fmt: skip
-    models = (task.model, *box_models(line, scenarios, plants, seed))
+    draw = within_tolerances(line) if model is None else within_intervals(line, model)
+    models = (task.model, *box_models(line, scenarios, plants, seed, draw))
     return Ground(task, tuple(scenarios), models, setup, tuple(speeds_m_per_s))
 
 
-def box_models(line: Line, scenarios: Sequence[Scenario], count: int, seed: int) -> list[WebModel]:
-    """Models drawn evenly from the tolerances, every roller and span by itself.
+def box_models(
+    line: Line, scenarios: Sequence[Scenario], count: int, seed: int, draw: Draw | None = None
+) -> list[WebModel]:
+    """Models drawn from the tolerances, or by `draw`, every roller and span by itself.
 
     Those that the drives could not hold at an end of the scenarios are left out: there nobody could. Raises
     DesignRefused where too few remain.
     """
     generator = np.random.default_rng(seed)
-
-    def drawn(*parameters: Parameter) -> FloatArray:
-        value, tolerance = np.array([[p.value, p.tolerance] for p in parameters]).T
-        return value * (1.0 + tolerance * generator.uniform(-1.0, 1.0, len(value)))
-
+    draw = draw or within_tolerances(line)
     found: list[WebModel] = []
     for _ in range(MOST_DRAWS * count):
         if len(found) == count:
             break
-        model = WebModel(
-            float(drawn(line.web.stiffness_n)[0]),
-            drawn(*(span.length_m for span in line.spans)),
-            drawn(*(roller.radius_m for roller in line.rollers)),
-            drawn(*(roller.inertia_kg_m2 for roller in line.rollers)),
-            drawn(*(roller.friction_nms_per_rad for roller in line.rollers)),
-            line.web.tension_before_n,
-            line.web.tension_after_n,
-        )
+        model = draw(generator)
         if all(_can_be_held(model, scenario, line.limits.torque_nm) for scenario in scenarios):
             found.append(model)
     if len(found) < count:
@@ -131,8 +131,8 @@ def _can_be_held(model: WebModel, scenario: Scenario, torque_nm: float) -> bool:
 
 
 def _stepping(task: DesignTask) -> tuple[float, int]:
-    """Latency in s and integration steps a period, of which the latency is a whole number; where none fits, the next
-    longer latency that does. Raises DesignRefused where the model is too fast for any."""
+    """Latency in s and integration steps a period, of which the latency is a whole number; where none fits, the
+    nearest latency that does. Raises DesignRefused where the model is too fast for any."""
     A, _ = linear(task)
     fastest = float(np.abs(np.linalg.eigvals(A)).max())
     least = max(1, ceil(task.period_s * fastest / FASTEST_MODE))
@@ -141,9 +141,16 @@ def _stepping(task: DesignTask) -> tuple[float, int]:
             f"the line has a mode of {1e3 / fastest:.2g} ms, too fast for a control period of "
             f"{1e3 * task.period_s:g} ms: check stiffness, lengths and inertias, or control faster"
         )
-    for substeps in range(least, MOST_SUBSTEPS + 1):
-        step_s = task.period_s / substeps
-        if abs(round(task.latency_s / step_s) * step_s - task.latency_s) < 1e-9:
+    steps = range(least, MOST_SUBSTEPS + 1)
+    for substeps in steps:
+        if abs(_whole_steps_s(task, substeps) - task.latency_s) < 1e-9:
             return task.latency_s, substeps
-    step_s = task.period_s / MOST_SUBSTEPS
-    return ceil(task.latency_s / step_s) * step_s, MOST_SUBSTEPS
+    allowed_s = ROUNDED * task.period_s
+    substeps = next(one for one in steps if abs(_whole_steps_s(task, one) - task.latency_s) <= allowed_s)
+    return _whole_steps_s(task, substeps), substeps
+
+
+def _whole_steps_s(task: DesignTask, substeps: int) -> float:
+    """The latency as the nearest whole number of steps."""
+    step_s = task.period_s / substeps
+    return round(task.latency_s / step_s) * step_s

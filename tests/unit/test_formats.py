@@ -16,6 +16,7 @@ from gateway.cli.demo_result import DemoResult
 from gateway.cli.design_result import DesignResult
 from gateway.cli.rehearse_result import RehearseResult
 from gateway.core.controller import ControllerConfig, parse_controller
+from gateway.core.line_model import LineModel, parse_model
 from gateway.core.messages import Command, Event, Reply
 from gateway.core.scenario import Scenario, scenario_of
 from sim_plant.plant import Plant, plant_of
@@ -31,6 +32,7 @@ def _json(adapter: TypeAdapter[Any]) -> Callable[[bytes], object]:
 #: name: (schema, how a program reads the example, the example's ending)
 FORMATS: dict[str, tuple[TypeAdapter[Any], Callable[[bytes], object], str]] = {
     "controller": (TypeAdapter(ControllerConfig), parse_controller, "json"),
+    "line-model": (TypeAdapter(LineModel), parse_model, "json"),
     "plant": (TypeAdapter(Plant), lambda payload: plant_of(tomllib.loads(payload.decode())), "toml"),
     "scenario": (TypeAdapter(Scenario), lambda payload: scenario_of(tomllib.loads(payload.decode())), "toml"),
     "demo-result": (TypeAdapter(DemoResult), _json(TypeAdapter(DemoResult)), "json"),

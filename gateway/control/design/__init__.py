@@ -5,7 +5,7 @@ from gateway.control.design.margins import Margins, is_stable, margins, require_
 from gateway.control.design.mpc import design_mpc
 from gateway.control.design.pid import design_pid
 from gateway.control.design.schedule import design_scheduled, gains_change
-from gateway.control.design.task import DesignLimits, DesignRefused, DesignTask, task_of
+from gateway.control.design.task import DesignLimits, DesignRefused, DesignTask, task_of, task_on
 from gateway.control.design.weights import (
     LqgWeights,
     LqiWeights,
@@ -44,6 +44,7 @@ __all__ = [
     "mpc_weights",
     "require_margin",
     "task_of",
+    "task_on",
     "weak_spots",
     "without_disturbances",
 ]

@@ -1,7 +1,7 @@
 """What a design is made for, and what refuses it."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import inf
 
 import numpy as np
@@ -9,7 +9,7 @@ import numpy as np
 from gateway.core.controller_laws import Feedforward
 from gateway.core.line import Line
 from gateway.core.signals import BoolArray, FloatArray
-from gateway.core.theta import Noise
+from gateway.core.theta import Noise, Theta
 from gateway.core.web_model import WebModel, equilibrium_torque, linearise, nominal_model, reference_speeds
 
 #: Slower, a draw span's tension decays (with L / v) too slowly for any design to tell it from never.
@@ -69,6 +69,26 @@ def task_of(line: Line) -> DesignTask:
             limits.speed_max_m_per_s,
         ),
     )  # fmt: skip
+
+
+def task_on(line: Line, theta: Theta, noise: Noise | None = None) -> DesignTask:
+    """`task_of`, on what is believed of the line now in place of its file's values. `noise` None: as `task_of` has it.
+
+    What a linear design knows of the rest of theta:
+
+    - The torque's lag is taken as so much more dead time, beside the latency. At the frequencies of a loop that stands
+      the two together, a lag turns the phase by atan(w t) where dead time turns it by w t: the design is on the safe
+      side.
+    - Coulomb friction has no place in it. While a roller turns it is a constant torque, which integral action (LQI,
+      PID) and the disturbance observer (LQG, MPC) find; an LQR keeps an offset of it. The feed-forward knows viscous
+      friction only, as `Feedforward` has it: at a reversal or a start the torque comes from the feedback.
+    """
+    return replace(
+        task_of(line),
+        model=theta.web,
+        latency_s=theta.latency_s + theta.torque_lag_s,
+        noise=noise or Noise(),
+    )
 
 
 def linear(task: DesignTask) -> tuple[FloatArray, FloatArray]:
