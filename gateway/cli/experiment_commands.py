@@ -110,7 +110,7 @@ def run(file: ExperimentFile, run_dir: RunFolder = None, as_json: Json = False) 
         typer.echo(f"interrupted: {reply.text}", err=True)
         raise typer.Exit(ABORTED) from None
     except (Unreachable, PathTooLong) as error:
-        typer.echo(f"{error}; whether the experiment goes on, `r2rgate status` tells", err=True)
+        typer.echo(str(error), err=True)
         raise typer.Exit(UNREACHABLE) from None
     if as_json:
         typer.echo(json.dumps(vars(ended), indent=2))

@@ -65,12 +65,25 @@ async def follow_on(
     if not reply.ok:
         return Ended(False, False, f"refused ({reply.state}): {reply.text}", reply.reasons, "", 0.0, 0.0)
     show(reply.text)
-    begin_s = before.wall_s
+    try:
+        return await _end(line, experiment, before.wall_s, show, sleep)
+    except Unreachable as error:
+        raise Unreachable(f"{error}; whether the experiment goes on, `r2rgate status` tells") from error
+
+
+async def _end(
+    line: Line,
+    experiment: Experiment,
+    since_s: float,
+    show: Callable[[str], None],
+    sleep: Callable[[float], Awaitable[None]],
+) -> Ended:
+    begin_s = since_s
     for _ in range(round((experiment.duration_s + SLACK_S) / LOOK_EVERY_S)):
         await sleep(LOOK_EVERY_S)
         now = await line.status()
         for event in now.events:
-            if event.wall_s < before.wall_s or not event.kind.startswith("experiment"):
+            if event.wall_s < since_s or not event.kind.startswith("experiment"):
                 continue
             if event.kind == "experiment":
                 begin_s = event.wall_s

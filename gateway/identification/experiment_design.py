@@ -84,13 +84,13 @@ def design_experiment(
     recipe = line.recipes[0]
     base: FloatArray = np.array(recipe.tension_n if tension_n is None else tension_n, dtype=np.float64)
     _check(line, config, base)
+    most_n = _most_n(line, base)
     drawing = _Drawing(
         Foresight(line, config, base, recipe.speed_m_per_s if speed_m_per_s is None else speed_m_per_s),
         wanted or Wanted(),
         seed,
     )
     speeds = drawing.speeds(speeds_m_per_s)
-    most_n = drawing.most_n()
     dwell, needs = _best_dwell(drawing, speeds, most_n)
     told = drawing.told(drawing.foresight.some_models, speeds, dwell)
     amplitude, duration = min(drawing.least_amplitude(told, most_n), most_n), PREFERRED_S
@@ -164,24 +164,6 @@ class _Drawing:
             "tolerances"
         )
 
-    def rate_n_per_s(self) -> float | None:
-        """Of the set-points; None where steps are allowed."""
-        return None if self.line.limits.tension_step_max_n >= 2.0 * GRID_N else self.line.moves.tension_rate_n_per_s
-
-    def most_n(self) -> float:
-        """The greatest amplitude that set-points may have."""
-        base, low, high = self.foresight.base_n, self.foresight.low_n, self.foresight.high_n
-        spans = self.foresight.task.tension_spans
-        room = np.minimum(base - low, high - base)[spans]
-        if room.min() < GRID_N:
-            i = spans[int(room.argmin())]
-            raise ExperimentRefused(
-                f"the band is too narrow: span {i + 1} stands at {base[i]:g} N, set-points are allowed from {low:g} to "
-                f"{high:g} N, and an experiment moves them by {GRID_N:g} N or more; wider limits, or another set-point"
-            )
-        steps = inf if self.rate_n_per_s() is not None else 0.5 * self.line.limits.tension_step_max_n
-        return _down(min(float(room.min()), steps))
-
     def experiment(self, amplitude_n: float, dwell: int, speeds: Sequence[float], duration_s: float) -> Experiment:
         """A leg takes the way to its speed longer than `duration_s`, which is what is computed with."""
         moves, before = self.line.moves, self.foresight.speed
@@ -198,7 +180,7 @@ class _Drawing:
                 name="commissioning",
                 amplitude_n=[amplitude_n if i in spans else 0.0 for i in range(self.line.n)],
                 dwell_s=round(dwell * self.line.control.period_s, 9),
-                rate_n_per_s=self.rate_n_per_s(),
+                rate_n_per_s=_rate_n_per_s(self.line),
                 seed=self.seed,
                 legs=legs,
                 abort=Abort(deviation_n=2.0 * amplitude_n),
@@ -300,6 +282,27 @@ def _check(line: Line, config: Controller, base: FloatArray) -> None:
         raise ExperimentRefused("the controller is for another line: spans, draw-controlled spans or period differ")
     if len(base) != line.n or not (np.isfinite(base) & (base > 0.0)).all():
         raise ExperimentRefused(f"tensions of {base.tolist()} N; allowed: {line.n} of them, above 0")
+
+
+def _rate_n_per_s(line: Line) -> float | None:
+    """Of the set-points; None where steps are allowed."""
+    return None if line.limits.tension_step_max_n >= 2.0 * GRID_N else line.moves.tension_rate_n_per_s
+
+
+def _most_n(line: Line, base: FloatArray) -> float:
+    """The greatest amplitude that set-points may have."""
+    limits = line.limits
+    low, high = limits.tension_min_n + limits.tension_margin_n, limits.tension_max_n - limits.tension_margin_n
+    spans = [i for i, span in enumerate(line.spans) if span.control == "tension"]
+    room: FloatArray = np.minimum(base - low, high - base)[spans]
+    if room.min() < GRID_N:
+        i = spans[int(room.argmin())]
+        raise ExperimentRefused(
+            f"the band is too narrow: span {i + 1} stands at {base[i]:g} N, set-points are allowed from {low:g} to "
+            f"{high:g} N, and an experiment moves them by {GRID_N:g} N or more; wider limits, or another set-point"
+        )
+    steps = inf if _rate_n_per_s(line) is not None else 0.5 * limits.tension_step_max_n
+    return _down(min(float(room.min()), steps))
 
 
 def _best_dwell(drawing: _Drawing, speeds: Sequence[float], most_n: float) -> tuple[int, dict[int, float]]:
