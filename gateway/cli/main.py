@@ -9,6 +9,7 @@ from pydantic import ValidationError
 from gateway.cli import (
     design_commands,
     doctor_commands,
+    experiment_commands,
     fault_commands,
     line_commands,
     models_commands,
@@ -40,6 +41,7 @@ app.command(rich_help_panel=ENGINEER)(doctor_commands.doctor)
 app.command(rich_help_panel=ENGINEER)(design_commands.design)
 app.add_typer(models_commands.app, rich_help_panel=ENGINEER)
 app.command(rich_help_panel=ENGINEER)(rehearse_commands.rehearse)
+app.add_typer(experiment_commands.app, rich_help_panel=ENGINEER)
 app.command(rich_help_panel=PROCESSES)(process_commands.run)
 app.command(rich_help_panel=PROCESSES)(process_commands.loop)
 app.command(rich_help_panel=PROCESSES)(process_commands.gateway)

@@ -28,7 +28,7 @@ def arm(run_dir: RunFolder = None, as_json: Json = False) -> None:
 
     Example: r2rgate arm
     """
-    _send(Arm(), run_dir, as_json, ARM_TIME_S)
+    send(Arm(), run_dir, as_json, ARM_TIME_S)
 
 
 def start(run_dir: RunFolder = None, as_json: Json = False) -> None:
@@ -36,7 +36,7 @@ def start(run_dir: RunFolder = None, as_json: Json = False) -> None:
 
     Example: r2rgate start
     """
-    _send(Start(), run_dir, as_json)
+    send(Start(), run_dir, as_json)
 
 
 def hold(run_dir: RunFolder = None, as_json: Json = False) -> None:
@@ -44,7 +44,7 @@ def hold(run_dir: RunFolder = None, as_json: Json = False) -> None:
 
     Example: r2rgate hold
     """
-    _send(Hold(), run_dir, as_json)
+    send(Hold(), run_dir, as_json)
 
 
 def stop(run_dir: RunFolder = None, as_json: Json = False) -> None:
@@ -54,7 +54,7 @@ def stop(run_dir: RunFolder = None, as_json: Json = False) -> None:
 
     Example: r2rgate stop
     """
-    _send(Stop(), run_dir, as_json)
+    send(Stop(), run_dir, as_json)
 
 
 def set_tension(
@@ -73,7 +73,7 @@ def set_tension(
     if span < 1:
         _refuse(f"there is no span {span}; allowed: 1 or more, as they stand in the line's file")
     _require_number(tension_n, "N", "a tension inside the line's limits")
-    _send(SetTension(span=span, tension_n=tension_n, step=step), run_dir, as_json)
+    send(SetTension(span=span, tension_n=tension_n, step=step), run_dir, as_json)
 
 
 def speed(
@@ -89,7 +89,7 @@ def speed(
     Example: r2rgate speed 0.05
     """
     _require_number(speed_m_per_s, "m/s", "a speed from 0 to the line's limit")
-    _send(SetSpeed(speed_m_per_s=speed_m_per_s, step=step), run_dir, as_json)
+    send(SetSpeed(speed_m_per_s=speed_m_per_s, step=step), run_dir, as_json)
 
 
 def recipe(
@@ -101,7 +101,7 @@ def recipe(
 
     Example: r2rgate recipe velocity
     """
-    _send(SelectRecipe(name=name), run_dir, as_json)
+    send(SelectRecipe(name=name), run_dir, as_json)
 
 
 async def request(run_folder: Path, command: Command, timeout_s: float = REPLY_TIME_S) -> Reply:
@@ -133,7 +133,8 @@ def _way(command: Command) -> tuple[Topic, str]:
     return (LOOP_COMMAND, LOOP_SOCKET) if isinstance(command, Stop) else (GATEWAY_COMMAND, GATEWAY_SOCKET)
 
 
-def _send(command: Command, run_dir: Path | None, as_json: bool, timeout_s: float = REPLY_TIME_S) -> None:
+def send(command: Command, run_dir: Path | None, as_json: bool, timeout_s: float = REPLY_TIME_S) -> None:
+    """Send it and print the reply. Ends the program with code 2 where it is refused, 3 where nobody answers."""
     from gateway.cli.status_commands import choose_run_folder
 
     try:

@@ -67,6 +67,12 @@ def loop(
     controller: ControllerFile = None,
     run_dir: RunFolder = None,
     data_dir: DataFolder = None,
+    simulated: Annotated[
+        bool,
+        typer.Option(
+            "--simulated", help="The line is simulated, nobody can be hurt: `r2rgate experiment run` is accepted."
+        ),
+    ] = False,
 ) -> None:
     """The control loop: SILENT until armed. SIGTERM and Ctrl-C stop the line first.
 
@@ -92,7 +98,11 @@ def loop(
     try:
         with _a_crash_is_no_refusal():
             run_loop(
-                line, config, run_dir or default_run_folder(line), lambda text: print(text, file=sys.stderr, flush=True)
+                line,
+                config,
+                run_dir or default_run_folder(line),
+                lambda text: print(text, file=sys.stderr, flush=True),
+                simulated=simulated,
             )
     except AlreadyRunning as error:
         _refuse(f"a loop runs here already, this one ends: {error}", ALREADY_RUNNING)

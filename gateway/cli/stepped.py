@@ -46,6 +46,7 @@ class SteppedLoop:
     frames: list[bytes] = field(default_factory=list[bytes])
     transitions: list[tuple[float, Phase, str]] = field(default_factory=list[tuple[float, Phase, str]])
     alarms: list[tuple[float, Finding]] = field(default_factory=list[tuple[float, Finding]])
+    told: list[tuple[str, str]] = field(default_factory=list[tuple[str, str]])  #: kind and text
 
     def __post_init__(self) -> None:
         self.now_s = 0.0
@@ -54,7 +55,10 @@ class SteppedLoop:
         link = MemoryLink(self.line, self.truth)
         watch = Watch(self.line, np.zeros(self.line.n))  # the memory link carries floats
         self.law = TimedLaw(make_law(untimed(self.config)))
-        self.cycle = Cycle(self.line, self.law, [link], watch, lambda: self.now_s, self._record, self._announce)
+        self.cycle = Cycle(
+            self.line, self.law, [link], watch, lambda: self.now_s, self._record, self._announce, self._tell,
+            simulated=True,
+        )  # fmt: skip
         _finish(link.open())
 
     def begin_in_production(self, tension_n: FloatArray, unwind_speed_m_per_s: float) -> None:
@@ -97,6 +101,9 @@ class SteppedLoop:
 
     def _record(self, frame: Frame) -> None:
         self.frames.append(pack(frame))
+
+    def _tell(self, kind: str, text: str, **data: object) -> None:
+        self.told.append((kind, text))
 
     def _announce(self, before: Machine, after: Machine, findings: list[Finding]) -> None:
         if after.phase is before.phase:

@@ -50,6 +50,7 @@ def run_together(
         Child("loop", lambda: loop, data_folder / "loop.log"),
     ]
     if plant is not None:
+        loop.append("--simulated")  # it is the line that is started here
 
         def sim() -> list[str]:
             return [str(plant), "--record", str(new_recording(data_folder)), "--priority", "40"]

@@ -64,8 +64,8 @@ class MinimumJerk:
         self._polynomial[0] = value
         self.target: FloatArray = np.array(value, dtype=np.float64)
 
-    def put(self, index: int, value: float) -> None:
-        """It is there at once, and stands."""
+    def put(self, index: int | slice, value: float | FloatArray) -> None:
+        """It is there at once, and stands; or several are."""
         self._polynomial[:, index] = 0.0
         self._polynomial[0, index] = self.target[index] = value
         self._time_s[index] = 0.0

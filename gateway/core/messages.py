@@ -5,6 +5,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, TypeAdapter, ValidationError
 
+from gateway.core.experiment import Experiment, experiment_hash
 from gateway.core.line import Strict
 
 
@@ -56,12 +57,30 @@ class SelectRecipe(Strict):
     name: str
 
 
-Command = Annotated[Arm | Start | Hold | Stop | SetTension | SetSpeed | SelectRecipe, Field(discriminator="command")]
+class RunExperiment(Strict):
+    """In RUN, with set-points that stand: move them as the experiment says, then back."""
+
+    command: Literal["experiment"] = "experiment"
+    experiment: Experiment
+
+
+class AbortExperiment(Strict):
+    """End the experiment that runs; set-points go back to where they stood before it."""
+
+    command: Literal["experiment-abort"] = "experiment-abort"
+
+
+Command = Annotated[
+    Arm | Start | Hold | Stop | SetTension | SetSpeed | SelectRecipe | RunExperiment | AbortExperiment,
+    Field(discriminator="command"),
+]
 _command: TypeAdapter[Command] = TypeAdapter(Command)
 
 
 def in_words(command: Command) -> str:
     """A command as a person would type it: "set 3 44.0 step"."""
+    if isinstance(command, RunExperiment):
+        return f"experiment {command.experiment.name} ({experiment_hash(command.experiment)[:12]})"
     values = command.model_dump().items()
     return " ".join(key if value is True else str(value) for key, value in values if value is not False)
 

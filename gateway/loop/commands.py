@@ -3,8 +3,21 @@
 from math import isfinite
 
 from drivers.port import PrepareRefused
+from gateway.core.doubts import in_words
 from gateway.core.line import Recipe
-from gateway.core.messages import Arm, Command, Hold, Reply, SelectRecipe, SetSpeed, SetTension, Start, Stop
+from gateway.core.messages import (
+    AbortExperiment,
+    Arm,
+    Command,
+    Hold,
+    Reply,
+    RunExperiment,
+    SelectRecipe,
+    SetSpeed,
+    SetTension,
+    Start,
+    Stop,
+)
 from gateway.core.nearest import nearest
 from gateway.core.signals import Channel, Quality
 from gateway.core.states import LoopState, Phase
@@ -26,24 +39,34 @@ class Refused(Exception):
 def carry_out(cycle: Cycle, command: Command, now_s: float) -> Reply:
     """Do `command` between two periods. `arm` takes longer: `prepare_to_arm` goes before it."""
     try:
-        match command:
-            case Arm():
-                text = _arm(cycle, now_s)
-            case Start():
-                text = _start(cycle, now_s)
-            case Hold():
-                text = _hold(cycle, now_s)
-            case Stop():
-                text = _stop(cycle, now_s)
-            case SetTension():
-                text = _set_tension(cycle, command, now_s)
-            case SetSpeed():
-                text = _set_speed(cycle, command, now_s)
-            case SelectRecipe():
-                text = _select_recipe(cycle, command)
+        text = _do(cycle, command, now_s)
     except Refused as refusal:
         return Reply(ok=False, state=cycle.machine.state.name, text=str(refusal), reasons=refusal.reasons)
+    if isinstance(command, SetTension | SetSpeed | SelectRecipe):  # the operator's word goes before an experiment's
+        cycle.experiments.end("a set-point was changed")
     return Reply(ok=True, state=cycle.machine.state.name, text=text)
+
+
+def _do(cycle: Cycle, command: Command, now_s: float) -> str:
+    match command:
+        case Arm():
+            return _arm(cycle, now_s)
+        case Start():
+            return _start(cycle, now_s)
+        case Hold():
+            return _hold(cycle, now_s)
+        case Stop():
+            return _stop(cycle, now_s)
+        case SetTension():
+            return _set_tension(cycle, command, now_s)
+        case SetSpeed():
+            return _set_speed(cycle, command, now_s)
+        case SelectRecipe():
+            return _select_recipe(cycle, command)
+        case RunExperiment():
+            return _run_experiment(cycle, command)
+        case AbortExperiment():
+            return _abort_experiment(cycle)
 
 
 async def prepare_to_arm(cycle: Cycle) -> Reply | None:
@@ -236,6 +259,8 @@ def _pace(cycle: Cycle, rate: str) -> str:
 def _require_step(cycle: Cycle, size: float, largest: float, unit: str, pause_s: float) -> None:
     if cycle.machine.phase is not Phase.RUNNING:
         raise Refused(f"a step needs a running line, this one is {cycle.machine.state.name}; leave out the step")
+    if cycle.experiments.run is not None:
+        raise Refused("an experiment moves the set-points; abort it first, or leave out the step, which ends it")
     if size > largest * (1.0 + 1e-9):
         raise Refused(f"a step of {size:g} {unit} is too large; allowed: {largest:g} {unit}, or a ramp of any size")
     if pause_s > 0.0:
@@ -251,3 +276,25 @@ def _select_recipe(cycle: Cycle, command: SelectRecipe) -> str:
         raise Refused(f"there is no recipe {command.name!r}{hint} Known: {', '.join(recipes)}")
     cycle.setpoints.aim_at(recipe)
     return f"recipe {recipe.name}: tensions and speed move to it"
+
+
+def _run_experiment(cycle: Cycle, command: RunExperiment) -> str:
+    experiment = command.experiment
+    if cycle.experiments.run is not None:
+        raise Refused("an experiment is under way; it can be aborted")
+    if cycle.machine.phase is not Phase.RUNNING:
+        raise Refused(f"an experiment needs a running line, this one is {cycle.machine.phase.name.lower()}")
+    reasons = cycle.experiments.why_not(experiment, cycle.line)
+    if doubts := in_words(int(cycle.watch.doubts)):
+        reasons.append(f"the loop doubts what it measures: {', '.join(doubts)}")
+    if reasons:
+        raise Refused("the experiment is not run", reasons)
+    cycle.experiments.begin(experiment)
+    return f"experiment {experiment.name} runs for {experiment.duration_s:g} s; abort, hold, stop and set end it"
+
+
+def _abort_experiment(cycle: Cycle) -> str:
+    if cycle.experiments.run is None:
+        raise Refused("no experiment is under way")
+    cycle.experiments.end("operator's abort")
+    return "set-points go back to where they stood"

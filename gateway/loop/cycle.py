@@ -13,6 +13,7 @@ from gateway.core.signals import BoolArray, DriveRequest, DriveState, FloatArray
 from gateway.core.states import Phase
 from gateway.core.telemetry import Frame
 from gateway.loop import machine as machines
+from gateway.loop.experiment import Experiments, Tell
 from gateway.loop.machine import Machine, Observation, Times
 from gateway.loop.pacer import Tick
 from gateway.loop.setpoints import Setpoints
@@ -71,6 +72,9 @@ class Cycle:
         clock: Callable[[], float],
         record: Callable[[Frame], None],
         announce: Callable[[Machine, Machine, list[Finding]], None],
+        tell: Tell | None = None,
+        *,
+        simulated: bool = False,
     ) -> None:
         self.line = line
         self.links = links
@@ -83,6 +87,7 @@ class Cycle:
         self.account = Account()
         self.watch = watch
         self.clock = clock
+        self.experiments = Experiments(self.setpoints, self.limits.period_s, clock, tell, simulated=simulated)
         self._record = record
         self._announce = announce
         self._times = Times(line.limits.tensioning_time_s, line.moves.stop_time_s)
@@ -101,6 +106,7 @@ class Cycle:
         cycle_s = self.clock() - tick.now_s
         if self.machine.phase in CONTROLLED and seen.usable:  # only blocks proposals: after the commands are out
             self._alarm(self.watch.controlled(self.inputs, self.setpoints, before_nm, saturated))
+        self.experiments.look(self.inputs, torque_nm, saturated, self.account.held, tick.due_s)
         self._frame(tick, saturated, cycle_s)
 
     def any_enabled(self) -> bool:
@@ -170,6 +176,8 @@ class Cycle:
         before, self.machine = self.machine, machine
         if before.phase is machine.phase:
             return
+        if machine.phase is not Phase.RUNNING:
+            self.experiments.end(f"the line left RUN: {machine.reason or machine.state.name}")
         if machine.phase is Phase.OFF:  # a speed from before the stop is not taken up again
             self.setpoints.speed_target_m_per_s = self.setpoints.recipe.speed_m_per_s
         self._announce(before, machine, findings)
@@ -209,6 +217,8 @@ class Cycle:
     def _advance_setpoints(self) -> None:
         moves, phase = self.line.moves, self.machine.phase
         goal = self.setpoints.speed_target_m_per_s if phase is Phase.RUNNING else 0.0
+        if self.experiments.run is not None:
+            goal = self.experiments.run.advance(self.setpoints)
         rate = moves.stop_rate_m_per_s2 if phase is Phase.SLOWING else moves.speed_rate_m_per_s2
         shape = moves.shape if phase is Phase.RUNNING else "ramp"  # what stops does not wait for a curve to bend
         self.setpoints.advance(moves, self.limits.period_s, goal, rate, shape)

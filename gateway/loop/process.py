@@ -27,16 +27,20 @@ from gateway.mailbox.unix import UnixMailbox
 RESTING_PERIODS = 5
 
 
-def run_loop(line: Line, config: Controller, run_folder: Path, say: Callable[[str], None]) -> None:
+def run_loop(
+    line: Line, config: Controller, run_folder: Path, say: Callable[[str], None], *, simulated: bool = False
+) -> None:
     """Run until SIGTERM or SIGINT, which stop the line first.
+
+    `simulated`: the line is, for certain; then it takes experiments.
 
     Raises AlreadyRunning before anything is sent, CannotListen, PathTooLong, and LinksRefused
     when the drivers cannot carry the line.
     """
-    asyncio.run(_main(line, config, run_folder, say))
+    asyncio.run(_main(line, config, run_folder, say, simulated))
 
 
-async def _main(line: Line, config: Controller, run_folder: Path, say: Callable[[str], None]) -> None:
+async def _main(line: Line, config: Controller, run_folder: Path, say: Callable[[str], None], simulated: bool) -> None:
     mailbox = UnixMailbox()
     # First the socket, whose lock makes this the only loop of the line; only then are the buses touched.
     await mailbox.listen(run_folder / LOOP_SOCKET)
@@ -44,7 +48,9 @@ async def _main(line: Line, config: Controller, run_folder: Path, say: Callable[
     links = build_links(line)
     voice = Voice(mailbox, links, line.control.period_s)
     watch = Watch(line, speed_steps_m_per_s(line))
-    cycle = Cycle(line, make_law(config), links, watch, monotonic, voice.record, voice.announce)
+    cycle = Cycle(
+        line, make_law(config), links, watch, monotonic, voice.record, voice.announce, voice.tell, simulated=simulated
+    )
     runner = Runner(cycle)
     ending = asyncio.Event()
     for number in (signal.SIGTERM, signal.SIGINT):

@@ -47,6 +47,7 @@ class Setpoints:
         self._curve = MinimumJerk(np.zeros(n + 1))
         self._time_s = 0.0  #: on the curve
         self._ramped: BoolArray = np.zeros(n + 1, dtype=np.bool_)  #: values that go to their target on a ramp
+        self._excited = False  #: an experiment says where tensions stand, and their targets where they go back to
 
     def aim_at(self, recipe: Recipe) -> None:
         """The recipe's set-points become the targets."""
@@ -79,6 +80,23 @@ class Setpoints:
         self.speed_target_m_per_s = speed_m_per_s
         self._speed_stepped_s = now_s
 
+    def excite(self, tension_n: FloatArray) -> None:
+        """An experiment's set-points (n,), at once, for this period. Targets stay; `settle` ends it."""
+        self._excited = True
+        if tension_n is not self.tension_n:
+            self.tension_n = tension_n
+            self._curve.put(slice(len(tension_n)), tension_n)
+
+    def settle(self, now_s: float) -> None:
+        """No experiment any more: from where they are, tensions go to their targets as they always do."""
+        if self._excited:
+            self._excited = False
+            self._tension_stepped_s[:] = now_s
+
+    def at_rest(self) -> bool:
+        """Whether every set-point stands at its target."""
+        return self._there() and self.speed_m_per_s == self.speed_target_m_per_s
+
     def begin_at_speed(self, speed_m_per_s: float) -> None:
         """It is what is asked of the line PLC from now on. The target stays."""
         self.speed_m_per_s = speed_m_per_s
@@ -105,6 +123,8 @@ class Setpoints:
             self._advance_speed_smoothly(period_s, speed_goal_m_per_s, speed_rate_m_per_s2)
         else:
             self._ramp_speed(period_s, speed_goal_m_per_s, speed_rate_m_per_s2)
+        if self._excited:
+            return
         if moves.shape == "minimum-jerk":
             self._advance_smoothly(moves, period_s)
         elif not self._there():

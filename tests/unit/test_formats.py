@@ -16,6 +16,7 @@ from gateway.cli.demo_result import DemoResult
 from gateway.cli.design_result import DesignResult
 from gateway.cli.rehearse_result import RehearseResult
 from gateway.core.controller import ControllerConfig, parse_controller
+from gateway.core.experiment import Experiment, parse_experiment
 from gateway.core.line_model import LineModel, parse_model
 from gateway.core.messages import Command, Event, Reply
 from gateway.core.scenario import Scenario, scenario_of
@@ -39,6 +40,7 @@ FORMATS: dict[str, tuple[TypeAdapter[Any], Callable[[bytes], object], str]] = {
     "rehearse": (TypeAdapter(RehearseResult), _json(TypeAdapter(RehearseResult)), "json"),
     "design": (TypeAdapter(DesignResult), _json(TypeAdapter(DesignResult)), "json"),
     "bench": (TypeAdapter(BenchResult), _json(TypeAdapter(BenchResult)), "json"),
+    "experiment": (TypeAdapter(Experiment), parse_experiment, "json"),
     "command": (TypeAdapter(Command), _json(TypeAdapter(Command)), "json"),
     "reply": (TypeAdapter(Reply), _json(TypeAdapter(Reply)), "json"),
     "event": (TypeAdapter(Event), _json(TypeAdapter(Event)), "json"),

@@ -1,0 +1,184 @@
+"""What an experiment does to tensions and torques before it is run: rollouts on corners of the line's tolerances.
+
+A corner on which the controller in service does not hold the line where it stands, or would not with two milliseconds
+more delay, is left out: the line runs, so it is none of these. Should it be one after all, the experiment ends itself.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from math import ceil, inf
+
+import numpy as np
+
+from gateway.control.design.margins import is_stable
+from gateway.control.design.task import linear, task_of
+from gateway.control.rollout import Course, Setup, plants_of, simulate
+from gateway.core.controller import Controller
+from gateway.core.controller_laws import MpcConfig
+from gateway.core.experiment import Experiment, ExperimentRefused, setpoints, speed_goals, turns
+from gateway.core.line import Line
+from gateway.core.signals import FloatArray
+from gateway.core.web_model import WebModel, equilibrium_torque, reference_speeds
+
+HELD = 0.9  #: of the torque limit, for a line within the tolerances that goes at a speed
+STANDS_S = 5.0  #: for which a corner must be held before anything moves
+STANDS_DELAY_S = 0.002  #: more than the line's
+AFTER_S = 1.0  #: that are watched after the end
+FASTEST_MODE = 0.5  #: of an integration step, as |eigenvalue| times its length
+WINDOW_S = 1.0  #: over which shares of periods are taken
+
+
+@dataclass(frozen=True)
+class Foreseen:
+    """On all corners that were simulated, with noise."""
+
+    deviation_n: float  #: greatest, of a tension from its set-point before the experiment
+    tension_min_n: float
+    tension_max_n: float
+    saturated_share: float  #: of the periods of the worst second: a torque is at a limit
+    reversal_share: float  #: a torque turns round
+
+    def text(self) -> str:
+        return f"tensions from {self.tension_min_n:.1f} to {self.tension_max_n:.1f} N"
+
+
+class Foresight:
+    """A line under `config` that stands at tensions (n,) in N and a speed, and what its tolerances leave possible.
+
+    Raises ExperimentRefused where the controller cannot even hold the nominal line.
+    """
+
+    def __init__(self, line: Line, config: Controller, base_n: FloatArray, speed_m_per_s: float) -> None:
+        self.line, self.config = line, config
+        self.base_n, self.speed = base_n, speed_m_per_s
+        self.task = task_of(line)
+        self.setup = _setup(line)
+        limits = line.limits
+        self.low_n = limits.tension_min_n + limits.tension_margin_n  #: where tensions and set-points may go
+        self.high_n = limits.tension_max_n - limits.tension_margin_n
+        #: Half of what a torque may move in a period, or a tenth of its limit.
+        self.reversal_nm = min(0.5 * limits.torque_rate_nm_per_s * self.setup.period_s, 0.1 * limits.torque_nm)
+        signs = [(0.0,) * 5, *product((-1.0, 1.0), repeat=5)]
+        if isinstance(config, MpcConfig):  # no compiled rollout: a minute for all
+            signs = [one for one in signs if _is_some(one)]
+        corners = [self._corner(one) for one in signs]
+        stand = [stands and self._waits(model) for stands, model in zip(self._stand(corners), corners, strict=True)]
+        if not stand[0]:
+            raise ExperimentRefused(
+                f"the controller in service does not hold the nominal line at {speed_m_per_s:g} m/s within "
+                f"{self.low_n:g} to {self.high_n:g} N when nothing moves, or would not with "
+                f"{1e3 * STANDS_DELAY_S:g} ms more delay: design another first"
+            )
+        self.left_out = stand.count(False)  #: corners
+        self.models = [model for model, stands in zip(corners, stand, strict=True) if stands]  #: the nominal one first
+        #: Nominal, and corners of a 2^(5-2) design, which moves each tolerance both ways: for what takes longer.
+        self.some_models = [
+            model for model, stands, one in zip(corners, stand, signs, strict=True) if stands and _is_some(one)
+        ]
+
+    def needs_nm(self, speed_m_per_s: float) -> float:
+        """The greatest torque that a line within the tolerances takes at a speed."""
+        speeds = [reference_speeds(model, self.base_n, speed_m_per_s) for model in self.models]
+        return max(
+            float(np.abs(equilibrium_torque(model, self.base_n, speed)).max())
+            for model, speed in zip(self.models, speeds, strict=True)
+        )
+
+    def can_go(self, speed_m_per_s: float) -> bool:
+        return self.needs_nm(speed_m_per_s) <= HELD * self.line.limits.torque_nm
+
+    def of(self, experiment: Experiment) -> Foreseen:
+        """What it does at worst."""
+        run = simulate(self.config, plants_of(self.models), self._course(experiment), self.setup, record=True)
+        spans, limits = self.task.tension_spans, self.line.limits
+        tension = np.nan_to_num(run.tension_n[:, :, spans], nan=inf)
+        move: FloatArray = np.diff(run.torque_nm, axis=1)
+        reach = limits.torque_rate_nm_per_s * self.setup.period_s
+        cut = (np.abs(move) >= reach * (1.0 - 1e-9)) | (np.abs(run.torque_nm[:, 1:]) >= limits.torque_nm)
+        way, turned = np.zeros((move.shape[0], move.shape[2])), np.zeros(move.shape[:2])
+        for k in range(move.shape[1]):
+            way, now = turns(way, move[:, k], self.reversal_nm)
+            turned[:, k] = now.any(axis=1)
+        window = round(WINDOW_S / self.setup.period_s)
+        return Foreseen(
+            float(np.abs(tension - self.base_n[spans]).max()),
+            float(tension.min()),
+            float(tension.max()),
+            _worst_share(np.asarray(cut.any(axis=2), dtype=np.float64), window),
+            _worst_share(turned, window),
+        )
+
+    def _course(self, experiment: Experiment) -> Course:
+        """With the speed as the line's ramp makes it, and a while after the end."""
+        period_s = self.setup.period_s
+        after = round(AFTER_S / period_s)
+        moved = setpoints(experiment, self.base_n, period_s)
+        goals = np.concatenate((speed_goals(experiment, self.speed, period_s), np.full(after, self.speed)))
+        reach, speed, speeds = self.line.moves.speed_rate_m_per_s2 * period_s, self.speed, [self.speed]
+        for goal in goals.tolist():
+            speed += max(-reach, min(reach, goal - speed))
+            speeds.append(speed)
+        return Course(np.vstack((self.base_n, moved, np.tile(self.base_n, (after, 1)))), np.array(speeds))
+
+    def _stand(self, models: Sequence[WebModel]) -> list[bool]:
+        periods = round(STANDS_S / self.setup.period_s)
+        course = Course(np.tile(self.base_n, (periods, 1)), np.full(periods, self.speed))
+        run = simulate(self.config, plants_of(list(models)), course, self.setup)
+        spans = self.task.tension_spans
+        low, high = run.tension_min_n[:, spans], run.tension_max_n[:, spans]
+        return [bool((a >= self.low_n).all() and (b <= self.high_n).all()) for a, b in zip(low, high, strict=True)]
+
+    def _waits(self, model: WebModel) -> bool:
+        task = replace(self.task, model=model, tension_n=self.base_n, unwind_speed_m_per_s=self.speed)
+        return is_stable(self.config, task, STANDS_DELAY_S)
+
+    def _corner(self, signs: Sequence[float]) -> WebModel:
+        line, model = self.line, self.task.model
+
+        def factor(sign: float, tolerances: list[float]) -> FloatArray:
+            return 1.0 + sign * np.array(tolerances)
+
+        return WebModel(
+            model.stiffness_n * (1.0 + signs[0] * line.web.stiffness_n.tolerance),
+            model.length_m * factor(signs[1], [span.length_m.tolerance for span in line.spans]),
+            model.radius_m * factor(signs[2], [roller.radius_m.tolerance for roller in line.rollers]),
+            model.inertia_kg_m2 * factor(signs[3], [roller.inertia_kg_m2.tolerance for roller in line.rollers]),
+            model.friction_nms_per_rad
+            * factor(signs[4], [roller.friction_nms_per_rad.tolerance for roller in line.rollers]),
+            model.tension_before_n,
+            model.tension_after_n,
+        )
+
+
+def _is_some(signs: Sequence[float]) -> bool:
+    """Of a 2^(5-2) design, or the nominal line."""
+    a, b, c, d, e = signs
+    return d == a * b and e == a * c
+
+
+def _setup(line: Line) -> Setup:
+    """Integration steps a period: small enough for the line's modes, and the latency is a whole number of them."""
+    task = task_of(line)
+    A, _ = linear(task)
+    fastest = float(np.abs(np.linalg.eigvals(A)).max())
+    least = max(1, ceil(task.period_s * fastest / FASTEST_MODE))
+    fitting = (m for m in range(least, least + 50) if _is_whole(task.latency_s * m / task.period_s))
+    substeps = next(fitting, least + 50)
+    step_s = task.period_s / substeps
+    return Setup(
+        task.period_s, ceil(task.latency_s / step_s - 1e-6) * step_s, substeps, line.limits.torque_nm,
+        line.limits.torque_rate_nm_per_s, task.noise.tension_n, task.noise.speed_m_per_s,
+        task.noise.acceleration_m_per_s1_5,
+    )  # fmt: skip
+
+
+def _is_whole(number: float) -> bool:
+    return abs(number - round(number)) < 1e-6
+
+
+def _worst_share(had: FloatArray, window: int) -> float:
+    """Of the periods of any window, (b, k)."""
+    counts = np.concatenate((np.zeros((len(had), 1)), np.cumsum(had, axis=1)), axis=1)
+    window = min(window, counts.shape[1] - 1)
+    return float((counts[:, window:] - counts[:, :-window]).max() / window)
