@@ -87,7 +87,7 @@ _OF_ROLLER = np.array([[0, 0, 0, -1, 1], [0, 0, 1, -1, 0], [0, 0, 2, -1, 0], [0,
 _OF_SPAN = np.array([[1, -1, 0, 0, 0], [0, -1, 0, 0, 0]], dtype=np.float64)
 
 
-def fit(line: Line, structure: Structure, evidence: Evidence, latency_s: float | None = None) -> Fit:
+def fit(line: Line, structure: Structure, evidence: Evidence) -> Fit:
     """The parameters with the greatest posterior density, and their 95 % intervals.
 
     The prior is log-normal around the line's file; a tolerance t is a standard deviation of log(1 + t) / sqrt(3).
@@ -108,8 +108,6 @@ def fit(line: Line, structure: Structure, evidence: Evidence, latency_s: float |
     covariance: FloatArray = np.linalg.inv(slopes.T @ slopes).astype(np.float64)
     fitted[layout.coulomb] = np.maximum(fitted[layout.coulomb], 0.0)
     theta = _theta(line, layout.parameters(fitted))
-    if latency_s is not None:
-        theta = replace(theta, latency_s=latency_s)
     return Fit(theta, _intervals(layout, structure, fitted, covariance))
 
 

@@ -42,20 +42,20 @@ def age(keep, drift, information, moment, sums):
 
 
 @compiled
-def take_in(speed, tension, sent, late, period_s, noise, filters, information, moment, sums):
+def take_in(speed, tension, torque, period_s, noise, filters, information, moment, sums):
     """The period from sample [0] to [1] of `speed` (2, n+1), v_0 .. v_n, and `tension` (2, n+2), T_0 .. T_{n+1}.
 
-    `sent` (2, n): the two torques that may have acted in it, newest first; the older did so for the part `late` of it.
-    `noise` (2, 2): for rollers and for spans, the variance of what moves one within a period beside its regressors, and
-    that of a sample. `filters` (2n, 8), `information` (2n, 4, 4), `moment` (2n, 4) and `sums` (2n, 2) are changed.
+    `torque` (n,) stands for what acted in it. `noise` (2, 2): for rollers and for spans, the variance of what moves one
+    within a period beside its regressors, and that of a sample. `filters` (2n, 8), `information` (2n, 4, 4), `moment`
+    (2n, 4) and `sums` (2n, 2) are changed.
     """
-    n = sent.shape[1]
+    n = torque.size
     regressor = np.empty(4)
     half_s = 0.5 * period_s
     for i in range(n):
         v = speed[0, i + 1]
         regressor[0] = -period_s * v
-        regressor[1] = period_s * ((1.0 - late) * sent[0, i] + (late * sent[1, i] if late > 0.0 else 0.0))
+        regressor[1] = period_s * torque[i]
         regressor[2] = half_s * (tension[0, i + 2] - tension[0, i + 1] + tension[1, i + 2] - tension[1, i + 1])
         regressor[3] = -period_s * np.sign(v)
         _filter(i, v, speed[1, i + 1], regressor, 4, 0.0, noise[0], filters, information, moment, sums)

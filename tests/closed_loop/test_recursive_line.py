@@ -126,6 +126,17 @@ def test_two_speeds_are_one_line():
         assert abs(errors(found, name)[0]) < 5e-3, name
 
 
+def test_drives_that_lag_by_5_ms_are_no_trouble_when_it_is_known():
+    plant = real_plant()
+    plant = plant.model_copy(update={"drives": plant.drives.model_copy(update={"torque_lag_s": 0.005})})
+    data = recorded(plant, 0)
+    line = demonstration_line()
+    found = [estimated_recursively(Settings(line, torque_lag_s=0.005), data)]
+    for name in STRONG:
+        assert abs(errors(found, name)[0]) < 6e-3, name
+    assert abs(errors([estimated_recursively(Settings(line), data)], "radius_per_inertia")[0]) > 0.05
+
+
 @pytest.mark.parametrize("quiet", [False, True])
 def test_drift_of_friction_is_followed_within_a_second(quiet):
     """A bearing of roller 3 has 20 % more friction from 12 s on, during an experiment or in quiet production."""

@@ -50,6 +50,32 @@ def test_exact_data_give_the_truth_whatever_the_latency(latency_s):
     np.testing.assert_allclose(found.theta.web.radius_m, 0.035, rtol=2e-2)
 
 
+def test_a_lag_that_is_known_is_taken_into_account():
+    """The same torques, as they would have been sent to drives with a lag of 20 ms to give what was given."""
+    line, lag_s, h = line_of(3), 0.02, 0.01
+    data = shaken(line, true_model(3))
+    left = np.exp(-h / lag_s)
+    target, given = [data.torque_nm[0]], data.torque_nm[0]
+    lagging = Settings(line, QUIET, torque_lag_s=lag_s)
+    weight = begin(lagging).withheld
+    for torque in data.torque_nm[1:]:  # whose first period counts as `torque`
+        target.append((torque - weight * given) / (1.0 - weight))
+        given = target[-1] + left * (given - target[-1])
+    sent = replace(data, torque_nm=np.array(target))
+    found = estimated_recursively(lagging, sent)
+    assert worst(found) < 3e-4
+    assert found.theta.torque_lag_s == lag_s
+    assert worst(estimated_recursively(Settings(line, QUIET), sent)) > 0.05
+
+
+def test_a_latency_from_elsewhere_goes_before_that_of_the_file():
+    line, data = line_of(3), shaken(line_of(3, 0.02), true_model(3))
+    found = estimated_recursively(Settings(line, QUIET, latency_s=0.02), data)
+    assert worst(found) < 3e-4
+    assert found.theta.latency_s == 0.02
+    assert worst(estimated_recursively(Settings(line, QUIET), data)) > 0.05
+
+
 def test_rollers_that_differ():
     line, model = line_of(3), true_model(3, spread=0.1)
     found = estimated_recursively(Settings(line, QUIET), shaken(line, model), Structure(per_roller=True))
@@ -94,6 +120,10 @@ def test_a_torque_lag_is_refused():
 def test_settings_refuse_what_they_cannot_do(forgetting_s):
     with pytest.raises(ValueError, match="forgetting_s: is"):
         Settings(line_of(1), forgetting_s=forgetting_s)
+    with pytest.raises(ValueError, match=r"latency_s: is -0.01, should be 0 or greater"):
+        Settings(line_of(1), latency_s=-0.01)
+    with pytest.raises(ValueError, match=r"torque_lag_s: is -0.01, should be 0 or greater"):
+        Settings(line_of(1), torque_lag_s=-0.01)
     with pytest.raises(ValueError, match="noise: is"):
         Settings(line_of(1), noise=Noise(tension_n=0.0))
 
@@ -170,7 +200,7 @@ def test_a_sample_that_comes_twice_or_late_is_left_out():
 def test_normal_equations_are_those_of_weighted_least_squares():
     """The sums of the kernel by their definition, for one roller: filter regressors and speed, then add up."""
     line, noise, forgetting_s = line_of(1), Noise(), 2.0
-    settings = Settings(line, noise, forgetting_s)
+    settings = Settings(line, noise, forgetting_s=forgetting_s)
     data = shaken(line, true_model(1), 1.0, noise)
     state = begin(settings)
     for sample in samples_of(data):
