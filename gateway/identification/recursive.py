@@ -10,8 +10,8 @@ for the torque, and k(b) is undone by `combinations`). Both are regressions, but
 an error that is not white, and least squares on it is biased. So both sides pass the filter that makes it white, which
 is that of a Kalman predictor for the noise (Ljung 1999, System Identification, section 7.5: what is linear in the
 parameters stays so). With excitation the ratio of the noises need not be known. On a quiet line all that moves is noise
-and the loop's answer to it: there R/J and f/J are biased by 1 % when the disturbance is twice as strong as believed,
-and by less when it is weaker; EA/L would be by 3 %, so that spans learn only while their tension moves.
+and the loop's answer to it: there R/J and f/J are biased by 2 % when the disturbance is twice as strong as believed,
+and by less when it is weaker; EA/L would be by 7 %, so that spans learn only while their tension moves.
 
 What was learnt is kept as normal equations, to which the line's file is a prior when they are solved. They fade with
 `forgetting_s`: without excitation to nothing, and the estimate to the prior with the prior's width (stabilised
