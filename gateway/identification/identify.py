@@ -1,4 +1,4 @@
-"""Phase 0 whole: data are assessed, every method estimates from their greater part, the rest judges, all make the model.
+"""Phase 0 whole: data are assessed, each method estimates from their greater part, the rest judges, all make the model.
 
 What is offered is the prediction-error estimate of the structure that the data call for, made from all of them. How it
 does on data that it has not seen is told of the same structure, made from the part before.
