@@ -100,13 +100,17 @@ def design_experiment(
         duration = drawing.least_duration(told, amplitude, speeds)
         if duration <= before:
             break
+    least = drawing.least_amplitude(told, amplitude, duration)
+    if least < amplitude:  # what took the time was not for want of movement
+        amplitude = least
+        experiment, foreseen = drawing.bounded(amplitude, dwell, speeds, duration)
     experiment = drawing.with_abort(experiment, foreseen)
     expected, *corners = (drawing.widths(one, amplitude, duration) for one in told)
     worst = {name: max(widths[name] for widths in (expected, *corners)) for name in COMBINATIONS}
     reasons = why(
         experiment, line, speeds=speeds, duration_s=duration, least=duration == PREFERRED_S, most_n=most_n,
         needs={dwell * line.control.period_s: need for dwell, need in needs.items()}, expected=expected, worst=worst,
-        foreseen=foreseen.text(), saturated_share=foreseen.saturated_share, left_out=drawing.foresight.left_out,
+        foreseen=foreseen.text(), saturated_share=foreseen.saturated_share, drawn_in=drawing.foresight.drawn_in,
     )  # fmt: skip
     return DesignedExperiment(experiment, expected, worst, foreseen, reasons)
 
@@ -218,14 +222,14 @@ class _Drawing:
         every = [self.widths(one, amplitude_n, duration_s) for one in told]
         return max(width / self.wanted.of(name) for widths in every for name, width in widths.items())
 
-    def least_amplitude(self, told: Sequence[_Told], most_n: float) -> float:
-        """On its grid; infinity where the greatest is not enough in the preferred time."""
-        if self.lack(told, most_n, PREFERRED_S) > 1.0:
+    def least_amplitude(self, told: Sequence[_Told], most_n: float, duration_s: float = PREFERRED_S) -> float:
+        """On its grid; infinity where the greatest is not enough."""
+        if self.lack(told, most_n, duration_s) > 1.0:
             return inf
         low, high = 0, round(most_n / GRID_N)  # too little, enough
         while high - low > 1:
             middle = (low + high) // 2
-            enough = self.lack(told, middle * GRID_N, PREFERRED_S) <= 1.0
+            enough = self.lack(told, middle * GRID_N, duration_s) <= 1.0
             low, high = (low, middle) if enough else (middle, high)
         return high * GRID_N
 

@@ -1,7 +1,8 @@
 """What an experiment does to tensions and torques before it is run: rollouts on corners of the line's tolerances.
 
-A corner on which the controller in service does not hold the line where it stands, or would not with two milliseconds
-more delay, is left out: the line runs, so it is none of these. Should it be one after all, the experiment ends itself.
+Where the controller in service does not hold a corner, or would not with two milliseconds more delay, the last point on
+the way to it that is held takes its place: the line runs, so the truth is not beyond. Should it be there after all, the
+experiment ends itself.
 """
 
 from collections.abc import Sequence
@@ -13,9 +14,10 @@ import numpy as np
 
 from gateway.control.design.margins import is_stable
 from gateway.control.design.task import linear, task_of
+from gateway.control.mpc_problem import MpcProblem
 from gateway.control.rollout import Course, Setup, plants_of, simulate
 from gateway.core.controller import Controller
-from gateway.core.controller_laws import MpcConfig
+from gateway.core.controller_laws import LqgConfig, MpcConfig
 from gateway.core.experiment import Experiment, ExperimentRefused, setpoints, speed_goals, turns
 from gateway.core.line import Line
 from gateway.core.signals import FloatArray
@@ -23,6 +25,7 @@ from gateway.core.web_model import WebModel, equilibrium_torque, reference_speed
 
 HELD = 0.9  #: of the torque limit, for a line within the tolerances that goes at a speed
 STANDS_S = 5.0  #: for which a corner must be held before anything moves
+SHARES = (1.0, 0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2, 0.1)  #: of the way to a corner
 STANDS_DELAY_S = 0.002  #: more than the line's
 AFTER_S = 1.0  #: that are watched after the end
 FASTEST_MODE = 0.5  #: of an integration step, as |eigenvalue| times its length
@@ -50,7 +53,7 @@ class Foresight:
     """
 
     def __init__(self, line: Line, config: Controller, base_n: FloatArray, speed_m_per_s: float) -> None:
-        self.line, self.config = line, config
+        self.line, self.config = line, _without_limits(config)
         self.base_n, self.speed = base_n, speed_m_per_s
         self.task = task_of(line)
         self.setup = _setup(line)
@@ -60,22 +63,20 @@ class Foresight:
         #: Half of what a torque may move in a period, or a tenth of its limit.
         self.reversal_nm = min(0.5 * limits.torque_rate_nm_per_s * self.setup.period_s, 0.1 * limits.torque_nm)
         signs = [(0.0,) * 5, *product((-1.0, 1.0), repeat=5)]
-        if isinstance(config, MpcConfig):  # no compiled rollout: a minute for all
-            signs = [one for one in signs if _is_some(one)]
-        corners = [self._corner(one) for one in signs]
-        stand = [stands and self._waits(model) for stands, model in zip(self._stand(corners), corners, strict=True)]
-        if not stand[0]:
+        reached = [self._reached(one) for one in signs]
+        if reached[0] is None:
             raise ExperimentRefused(
                 f"the controller in service does not hold the nominal line at {speed_m_per_s:g} m/s within "
                 f"{self.low_n:g} to {self.high_n:g} N when nothing moves, or would not with "
                 f"{1e3 * STANDS_DELAY_S:g} ms more delay: design another first"
             )
-        self.left_out = stand.count(False)  #: corners
-        self.models = [model for model, stands in zip(corners, stand, strict=True) if stands]  #: the nominal one first
+        self.drawn_in = sum(
+            any(one) and (point is None or point != one) for one, point in zip(signs, reached, strict=True)
+        )
+        held = [(one, point) for one, point in zip(signs, reached, strict=True) if point is not None]
+        self.models = [self._corner(point) for _, point in held]  #: the nominal one first
         #: Nominal, and corners of a 2^(5-2) design, which moves each tolerance both ways: for what takes longer.
-        self.some_models = [
-            model for model, stands, one in zip(corners, stand, signs, strict=True) if stands and _is_some(one)
-        ]
+        self.some_models = [self._corner(point) for one, point in held if _is_some(one)]
 
     def needs_nm(self, speed_m_per_s: float) -> float:
         """The greatest torque that a line within the tolerances takes at a speed."""
@@ -121,6 +122,13 @@ class Foresight:
             speeds.append(speed)
         return Course(np.vstack((self.base_n, moved, np.tile(self.base_n, (after, 1)))), np.array(speeds))
 
+    def _reached(self, signs: Sequence[float]) -> tuple[float, ...] | None:
+        """The point on the way from the nominal line to a corner up to which the line is held; None: nowhere."""
+        ways = [tuple(share * sign for sign in signs) for share in SHARES] if any(signs) else [tuple(signs)]
+        waiting = [way for way in ways if self._waits(self._corner(way))]
+        stand = self._stand([self._corner(way) for way in waiting]) if waiting else []
+        return next((way for way, stands in zip(waiting, stand, strict=True) if stands), None)
+
     def _stand(self, models: Sequence[WebModel]) -> list[bool]:
         periods = round(STANDS_S / self.setup.period_s)
         course = Course(np.tile(self.base_n, (periods, 1)), np.full(periods, self.speed))
@@ -149,6 +157,18 @@ class Foresight:
             model.tension_before_n,
             model.tension_after_n,
         )
+
+
+def _without_limits(config: Controller) -> Controller:
+    """Of MPC its feedback where no limit is reached: its rollouts would take minutes. The loop's limits stay."""
+    if not isinstance(config, MpcConfig):
+        return config
+    gain = MpcProblem(config).gain()
+    return LqgConfig(
+        period_s=config.period_s, latency_s=config.latency_s, draw_spans=config.draw_spans,
+        feedforward=config.feedforward, predictor=config.predictor,
+        gain_state=gain[:, : 2 * config.n].tolist(), gain_input=gain[:, 2 * config.n :].tolist(),
+    )  # fmt: skip
 
 
 def _is_some(signs: Sequence[float]) -> bool:

@@ -25,7 +25,7 @@ def why(
     worst: Mapping[str, float],
     foreseen: str,
     saturated_share: float,
-    left_out: int,
+    drawn_in: int,
 ) -> tuple[str, ...]:
     """`least`: the amplitude is the least that tells enough in the preferred time; `needs`: by dwell in s."""
     amplitude, limits, abort = max(experiment.amplitude_n), line.limits, experiment.abort
@@ -46,7 +46,7 @@ def why(
         if len(speeds) > 1
         else "one, as was asked: viscous and dry friction are told apart badly, and a model is tried where it was made"
     )
-    left = f"; left out: {left_out} corners on which the controller could not hold the line" if left_out else ""
+    left = f"; {drawn_in} corners were drawn in to where the controller still holds the line" if drawn_in else ""
     told = ", ".join(f"{word} {percent(expected[name])} ({percent(worst[name])})" for name, word in WORDS.items())
     return (
         f"amplitude: {amplitude:g} N either way in every span with a load cell, {moved}; {amplitude_why}",

@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 
+from gateway.cli.stepped import CommandRefused
+from gateway.cli.stepped_experiment import run_experiment
 from gateway.control.design import design_lqg, design_lqi, task_of
 from gateway.control.rollout import Course, Setup
 from gateway.core.experiment import ExperimentRefused, Leg, setpoints
-from gateway.core.messages import RunExperiment
 from gateway.core.recording import Recording, recording_of
 from gateway.core.telemetry import frame_dtype
 from gateway.core.theta import Noise
@@ -15,7 +16,7 @@ from gateway.identification import experiment_information as information
 from gateway.identification.experiment_design import PREFERRED_S, Wanted, design_experiment
 from tests.closed_loop.conftest import demo_line
 from tests.closed_loop.recorded import per_roller, real_plant
-from tests.closed_loop.test_experiment import BASE, SPEED, asked, producing
+from tests.closed_loop.test_experiment import BASE, SPEED, asked, producing, swinging
 
 ONES = np.ones(6)
 S_REAL = WebModel(2200.0, 1.2 * ONES, 0.035 * ONES, 1.0 * ONES, 15.0 * ONES)
@@ -38,13 +39,10 @@ def run(experiment, seed, plant=None, lead=0) -> Recording:
     """The recording of a complete run on S_real, or another plant, with so many periods before it."""
     loop = producing(seed=seed, plant=plant)
     loop.step(lead)
-    before = len(loop.frames) - lead
-    reply = loop.command(RunExperiment(experiment=experiment))
-    assert reply.ok, reply.reasons
-    loop.step(experiment.periods(0.01))
-    assert loop.told[-1][0] == "experiment-end", loop.told[-1]
-    assert loop.truth.recorder.unsafe_total == 0
-    return recording_of(np.frombuffer(b"".join(loop.frames[before:]), frame_dtype(6)), 0.01, "")
+    found = run_experiment(loop, experiment)
+    assert found.samples == experiment.periods(0.01) and loop.truth.recorder.unsafe_total == 0
+    frames = np.frombuffer(b"".join(loop.frames[-found.samples - lead :]), frame_dtype(6))
+    return recording_of(frames, 0.01, found.source)
 
 
 def predicted(experiment, model=S_REAL, noise=None):
@@ -131,6 +129,13 @@ def test_on_plants_of_the_tolerances_tensions_go_no_further_than_was_foreseen(de
         recording = run(designed.experiment, seed, plant)
         away = np.abs(recording.tension_n - BASE).max()
         assert designed.experiment.amplitude_n[0] < away < designed.foreseen.deviation_n
+
+
+def test_a_line_that_cannot_bear_it_ends_it_and_stepped_time_says_so(designed):
+    with pytest.raises(CommandRefused, match="aborted: "):
+        run_experiment(producing(plant=swinging()), designed.experiment)
+    with pytest.raises(CommandRefused, match="the experiment is not run; the experiment has 1 amplitudes"):
+        run_experiment(producing(), asked(amplitude_n=[1.0]))
 
 
 def test_more_precision_takes_more_movement_or_time(designed):
