@@ -32,7 +32,7 @@ SIGN_WIDTH_M_PER_S = 1e-3  #: the friction's sign at standstill is tanh(v / widt
 UNMEASURED_N = 10.0  #: standard deviation of a tension without a load cell when a stretch begins
 _REACH = 0.35  #: of a step of the integration, over the fastest pole
 _RESTS = 1e-5  #: relative change of a variance in a period
-_SAME_SPEED = 0.1  #: operating points closer than this share, or _SAME_M_PER_S, are one
+_SAME_SPEED = 0.4  #: operating points closer than this share, or _SAME_M_PER_S, are one
 _SAME_M_PER_S = 2e-3
 _POINT_S = 0.5  #: over which operating points are means
 
@@ -75,20 +75,20 @@ class Gains:
     """The Kalman filter along a stretch. Row 0 of `which` is of the first predicted sample."""
 
     gain: FloatArray  #: (g, 2n, m)
-    root: FloatArray  #: (g, m, m), inverse of the lower Cholesky factor of S
+    factor: FloatArray  #: (g, m, m), lower Cholesky factor of S
+    root: FloatArray  #: (g, m, m), its inverse
     which: CountArray  #: (k,)
 
     @property
     def log_determinant(self) -> FloatArray:
         """Of S at each prediction, (k,)."""
-        found: FloatArray = -2.0 * np.log(np.diagonal(self.root, axis1=1, axis2=2)).sum(axis=1)
+        found: FloatArray = 2.0 * np.log(np.diagonal(self.factor, axis1=1, axis2=2)).sum(axis=1)
         return found[self.which]
 
     @property
     def covariance(self) -> FloatArray:
         """S of each prediction, (k, m, m)."""
-        factor = np.linalg.inv(self.root)
-        return (factor @ factor.transpose(0, 2, 1))[self.which]
+        return (self.factor @ self.factor.transpose(0, 2, 1))[self.which]
 
 
 @dataclass(frozen=True)
@@ -251,15 +251,15 @@ def gains_of(theta: Theta, noise: Noise, stretch: Stretch) -> Gains:
     begin = np.full(2 * n, UNMEASURED_N**2)
     begin[outputs] = variances
     m = len(outputs)
-    gain, root = np.empty((samples, 2 * n, m)), np.empty((samples, m, m))
+    gain, factor, root = (np.empty((samples, rows, m)) for rows in (2 * n, m, m))
     which: CountArray = np.zeros(samples, dtype=np.int64)
     found: int = prediction_kernel.kalman(
-        transitions, intensities, stretch.point, variances, outputs, np.diag(begin), stretch.first, _RESTS, gain, root,
-        which,
+        transitions, intensities, stretch.point, variances, outputs, np.diag(begin), stretch.first, _RESTS, gain,
+        factor, root, which,
     )  # fmt: skip
     if found < 0:
         raise Unpredictable("the predictor has no gain: the noise is not above 0, or parameters are extreme")
-    return Gains(gain[:found].copy(), root[:found].copy(), which[stretch.first + 1 :])
+    return Gains(gain[:found].copy(), factor[:found].copy(), root[:found].copy(), which[stretch.first + 1 :])
 
 
 def predict(theta: Theta, noise: Noise, stretch: Stretch) -> Predicted:
@@ -314,9 +314,8 @@ def free_run(theta: Theta, predicted: Predicted, begin: int, length: int) -> Flo
         stretch, measured=stretch.measured[:end], torque_nm=stretch.torque_nm[:end], first=first, start=state,
         unwind_m_per_s=stretch.unwind_m_per_s[:end],
     )  # fmt: skip
-    nothing = Gains(
-        np.zeros((1, 2 * stretch.n, len(stretch.outputs))), gains.root[:1], np.zeros(length, dtype=np.int64)
-    )
+    blind = np.zeros((1, 2 * stretch.n, len(stretch.outputs)))
+    nothing = Gains(blind, gains.factor[:1], gains.root[:1], np.zeros(length, dtype=np.int64))
     return innovations([theta], part, nothing)[0][0]
 
 

@@ -168,6 +168,7 @@ def imagine(coefficients, boundary, times, torque, unwind, first, start, seen, g
 def _inverse_cholesky(covariance, root, inverse):
     """`inverse` of the lower `root` of `covariance`; False when it is not positive definite."""
     m = covariance.shape[0]
+    root[:] = 0.0
     for i in range(m):
         for j in range(i + 1):
             total = covariance[i, j]
@@ -191,17 +192,17 @@ def _inverse_cholesky(covariance, root, inverse):
 
 
 @_compiled
-def kalman(transitions, intensities, point, noise, seen, covariance, first, tolerance, gains, roots, which):
+def kalman(transitions, intensities, point, noise, seen, covariance, first, tolerance, gains, factors, roots, which):
     """Gains from the Riccati recursion along a recording; returns how many there are.
 
     `transitions` F and `intensities` Q (p, s, s) of the operating points, `point` (k,) which of them holds from each
     sample on, `noise` (m,) variances of the outputs, `covariance` (s, s) of the state at sample `first`. The recursion
     rests when no variance changes by more than `tolerance` of itself in a period, until the operating point changes.
-    Fills `gains` (g, s, m), `roots` (g, m, m), the inverses of the lower Cholesky factors of S, and `which` (k,).
+    Fills `gains` (g, s, m), the lower Cholesky `factors` of S (g, m, m), their inverses `roots`, and `which` (k,).
     Returns -1 when a covariance is not positive definite.
     """
     s, m = covariance.shape[0], seen.size
-    spread, root = np.empty((m, m)), np.empty((m, m))
+    spread = np.empty((m, m))
     crossed = np.empty((m, s))
     found, rests = 0, False
     for k in range(first, point.size - 1):
@@ -216,7 +217,7 @@ def kalman(transitions, intensities, point, noise, seen, covariance, first, tole
                 spread[i, j] = covariance[seen[i], seen[j]]
             spread[i, i] += noise[i]
             crossed[i] = covariance[seen[i]]
-        if not _inverse_cholesky(spread, root, roots[found]):
+        if not _inverse_cholesky(spread, factors[found], roots[found]):
             return -1
         whitened = roots[found] @ crossed
         gains[found] = whitened.T @ roots[found]

@@ -68,7 +68,7 @@ def _derivatives(theta: Theta, logs: FloatArray, stretch: Stretch) -> tuple[floa
 def _whitened_change(base: Gains, other: Gains) -> FloatArray:
     """S^-1/2 (S' - S) S^-T/2 over the step, (k, m, m)."""
     pairs, at = np.unique(np.column_stack((base.which, other.which)), axis=0, return_inverse=True)
-    mixed = base.root[pairs[:, 0]] @ np.linalg.inv(other.root[pairs[:, 1]])
+    mixed = base.root[pairs[:, 0]] @ other.factor[pairs[:, 1]]
     change = (mixed @ mixed.transpose(0, 2, 1) - np.eye(mixed.shape[1])) / _STEP
     return change[at.ravel()]
 

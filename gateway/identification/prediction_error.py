@@ -177,7 +177,7 @@ def bootstrap(fitted: Fit, draws: int, seed: int = 0) -> FloatArray:
         copies: list[Stretch] = []
         for stretch, own in zip(fitted.stretches, gains, strict=True):
             white = generator.standard_normal((stretch.predictions, len(stretch.outputs)))
-            drawn: FloatArray = np.linalg.solve(own.root[own.which], white[:, :, None])[:, :, 0].astype(np.float64)
+            drawn: FloatArray = (own.factor[own.which] @ white[:, :, None])[:, :, 0]
             copies.append(imagined(theta, stretch, own, drawn))
         moved = replace(prior, mean=fitted.logs + root @ generator.standard_normal(len(root)))
         found.append(fit_stretches(copies, moved, fitted.noise, start=fitted.logs, know_noise=True).logs)

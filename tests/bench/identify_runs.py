@@ -26,7 +26,7 @@ from tests.closed_loop.truths import altered, true_values, with_friction_and_lag
 
 WORKERS = 2
 SPEED_M_PER_S, FAST_M_PER_S = 0.05, 0.1
-HELD_OUT = 1000  #: added to a seed for data that no fit has seen
+HELD_OUT = 1000  #: added to a seed for data that no fit has seen, once more for each speed
 STRONG = ("stiffness_per_length", "radius_per_inertia", "friction_per_inertia")
 STRESS_M_PER_S2 = 5e-2 / np.sqrt(1e-3)  #: white noise of intensity 5e-2, held for 1 ms
 
@@ -142,7 +142,9 @@ def at_two_speeds(plant: Plant, seed: int, *, is_theta: bool = True) -> Chosen:
     """Five seconds at each; and as much that the fit has not seen."""
     speeds = (SPEED_M_PER_S, FAST_M_PER_S)
     data = recorded(plant, seed, speeds_m_per_s=speeds)
-    unseen = {speed: [recorded(plant, seed + HELD_OUT, speeds_m_per_s=(speed,))] for speed in speeds}
+    unseen = {
+        speed: [recorded(plant, seed + HELD_OUT * (1 + i), speeds_m_per_s=(speed,))] for i, speed in enumerate(speeds)
+    }
     return chosen(plant, [data], unseen, is_theta=is_theta)
 
 
