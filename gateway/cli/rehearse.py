@@ -8,8 +8,9 @@ from typing import Protocol, TypeVar
 
 import numpy as np
 
+from gateway.cli.rehearse_adaptations import adapt
 from gateway.cli.rehearse_designs import DESIGNS, TRUTH, Design, offered, truth_of
-from gateway.cli.rehearse_result import CaseResult, ConfigurationResult, Spread
+from gateway.cli.rehearse_result import AdaptationResult, CaseResult, ConfigurationResult, Spread
 from gateway.cli.stepped import CommandRefused, SteppedResult, periods_before, run_scenario
 from gateway.cli.tiers import Tier
 from gateway.cli.workers import Workers
@@ -104,14 +105,20 @@ def rehearse(
     workers: int,
     tell: Callable[[str], None] = lambda text: None,
     designs: Sequence[Design] = DESIGNS,
-) -> list[ConfigurationResult]:
-    """Every design in every case. But for compute times the result does not depend on `workers` (processes).
+    adaptations: int = 0,
+) -> tuple[list[ConfigurationResult], list[AdaptationResult]]:
+    """Every design in every case, and the rounds of adaptation that have brought some of them.
 
-    A design that is refused is not offered, a run that is refused is a failure; the others go on.
+    But for compute times the result does not depend on `workers` (processes). A design that is refused is not offered,
+    a run that is refused is a failure; the others go on.
     """
+    first = cases[0]
+    rounds = adapt(first.line, first.plant, first.scenario, seed, adaptations, tell)
     with _mapped(workers) as mapped:
         tell("designing")
-        tasks = [(design, _task(design, cases[0])) for design in designs]  # the scenario plays no part in a design
+        tasks = [(design, _task(design, first)) for design in designs]  # the scenario plays no part in a design
+        at = next((i for i, (design, _) in enumerate(tasks) if design.model == TRUTH), len(tasks))
+        tasks[at:at] = [task for one in rounds for task in one.designs]
         configs = list(mapped(_designed, tasks))
         jobs = [(config, case, seed) for config in configs if not isinstance(config, str) for case in cases]
         found: list[CaseResult | str] = []
@@ -119,7 +126,8 @@ def rehearse(
             found.append(outcome)
             tell(f"{len(found)} of {len(jobs)} runs")
     outcomes = iter(found)
-    return _beside_truth([_configuration(d, c, cases, outcomes) for d, c in zip(designs, configs, strict=True)])
+    configurations = [_configuration(d, c, cases, outcomes) for (d, _), c in zip(tasks, configs, strict=True)]
+    return _beside_truth(configurations), [one.result for one in rounds]
 
 
 def _task(design: Design, case: Case) -> DesignTask:

@@ -10,7 +10,7 @@ from gateway.cli.process_commands import REFUSED, read_line
 
 if TYPE_CHECKING:
     from gateway.cli.rehearse import Case
-    from gateway.cli.rehearse_result import ConfigurationResult, RehearseResult
+    from gateway.cli.rehearse_result import AdaptationResult, ConfigurationResult, RehearseResult
     from gateway.core.line import Line
     from gateway.core.scenario import Scenario
     from sim_plant.plant import Plant
@@ -30,7 +30,9 @@ def rehearse(
         Literal["P", "A", "A-fast", "B"] | None,
         typer.Option(help="Period, latency, limits and moves of the benchmark. Without it those of the two files."),
     ] = None,
-    adaptations: Annotated[int, typer.Option(help="Rounds of adaptation. So far only 0: the designs.")] = 0,
+    adaptations: Annotated[
+        int, typer.Option(min=0, max=5, help="Rounds of experiment, model and new designs; 5 s of data at each speed.")
+    ] = 0,
     seed: Annotated[int, typer.Option(min=0, help="Of the simulated line's noise.")] = 0,
     llm: Annotated[str, typer.Option(help="Language model. So far only off.")] = "off",
     out: Annotated[Path, typer.Option(help="The result, as JSON; its folder is made.")] = Path("out/rehearse.json"),
@@ -40,20 +42,24 @@ def rehearse(
     """Rehearse a line's commissioning against a simulated plant, in stepped time: no hardware, no waiting.
 
     Every law is designed on the line's nominal model and run by the whole cycle of the gateway. LQI and MPC designed
-    on the plant's own parameters show what better knowledge would bring. The files must agree in the number of spans;
-    wires and addresses do not matter. The same seed gives the same figures, but for compute times.
+    on the plant's own parameters show what better knowledge would bring. With --adaptations the line's physics are
+    identified from experiments on it, and LQI and MPC designed on what was found. The files must agree in the number of
+    spans; wires and addresses do not matter. The same seed gives the same figures, but for compute times.
 
     Exit code: 0 done, 1 done and unsafe events were seen at the simulated drives, 2 refused, 130 interrupted.
 
     Example: r2rgate rehearse --line line.toml --plant sim_plant/plants/s_real.toml --tier A
     """
-    _require_possible(adaptations, llm)
+    if llm != "off":
+        _refuse(f"--llm {llm} is not possible yet; allowed now: off")
     line, plant = read_line(line_file), _read_plant(plant_file)
     cases = _cases(line, plant, _scenarios(scenario), tier)
     _require_writable(out)
     began_s = time.monotonic()
-    found = _rehearsed(cases, seed, workers, out)
-    result = _result(line, line_file, plant, plant_file, cases, tier, seed, found, time.monotonic() - began_s)
+    found, rounds = _rehearsed(cases, seed, workers, out, adaptations)
+    result = _result(
+        line, line_file, plant, plant_file, cases, tier, seed, adaptations, found, rounds, time.monotonic() - began_s
+    )
     text = result.model_dump_json(indent=2) + "\n"
     try:
         out.write_text(text, encoding="utf-8")
@@ -68,16 +74,6 @@ def rehearse(
 
         print_result(result, out, Console(highlight=False))
     raise typer.Exit(UNSAFE if result.unsafe_events else 0)
-
-
-def _require_possible(adaptations: int, llm: str) -> None:
-    wrong: list[str] = []
-    if adaptations != 0:
-        wrong.append(f"--adaptations {adaptations} is not possible yet; allowed now: 0, the designs without adaptation")
-    if llm != "off":
-        wrong.append(f"--llm {llm} is not possible yet; allowed now: off")
-    if wrong:
-        _refuse("\n".join(wrong))
 
 
 def _read_plant(file: Path) -> "Plant":
@@ -128,13 +124,15 @@ def _require_writable(out: Path) -> None:
         _refuse(f"--out {out} cannot be written: {why}; name a file in a folder that you may write")
 
 
-def _rehearsed(cases: list["Case"], seed: int, workers: int | None, out: Path) -> list["ConfigurationResult"]:
+def _rehearsed(
+    cases: list["Case"], seed: int, workers: int | None, out: Path, adaptations: int
+) -> tuple[list["ConfigurationResult"], list["AdaptationResult"]]:
     from gateway.cli.rehearse import rehearse
     from gateway.cli.waiting import interruptible, progress
     from gateway.cli.workers import processors
 
     with interruptible(f"{out} is not written"), progress() as tell:
-        return rehearse(cases, seed, workers or processors(), tell)
+        return rehearse(cases, seed, workers or processors(), tell, adaptations=adaptations)
 
 
 def _result(
@@ -145,7 +143,9 @@ def _result(
     cases: list["Case"],
     tier: str | None,
     seed: int,
+    adaptations: int,
     found: list["ConfigurationResult"],
+    rounds: list["AdaptationResult"],
     wall_s: float,
 ) -> "RehearseResult":
     import platform
@@ -162,7 +162,7 @@ def _result(
         machine=f"{platform.system()} {platform.release()}, {platform.machine()}, Python {platform.python_version()}",
         versions={name: version(name) for name in LIBRARIES},
         seed=seed,
-        adaptations=0,
+        adaptations=adaptations,
         llm="off",
         line=NamedFile(file=str(line_file), name=f"{line.site}/{line.line}"),
         plant=NamedFile(file=str(plant_file), name=plant.name),
@@ -175,6 +175,7 @@ def _result(
         ),
         scenarios=[case.scenario for case in cases],
         without_term=without_term(plant),
+        rounds=rounds,
         configurations=found,
         unsafe_events=sum(case.unsafe_events for one in found for case in one.cases),
         wall_s=round(wall_s, 1),

@@ -50,11 +50,33 @@ class ConfigurationResult(Strict):
 
     name: str
     law: str
-    model: str  #: that it was designed on: "nominal" of the line's file, "truth" of the plant's
+    model: str  #: that it was designed on: "nominal" of the line's file, "truth" of the plant's, or "identified-K"
     controller: str | None  #: hash of the configuration; null: not offered
     refused: str | None  #: why it is not offered; null: it is
     cases: list[CaseResult]  #: in the order of `scenarios`
     failures: dict[str, str]  #: by scenario, why there is no case of it
+
+
+class Found(Strict):
+    """A parameter, and its interval of 95 %."""
+
+    value: float
+    low: float
+    high: float
+
+
+class AdaptationResult(Strict):
+    """A round: experiment, model, and the designs on it, which are among the configurations."""
+
+    number: int
+    data_s: float  #: of data that the model was made from, those of earlier rounds included
+    structure: str | None = None  #: what the model has beside the paper's parameters; null: there is no model
+    intervals: dict[str, Found] = {}  #: by parameter and combination
+    normalised_innovation: float | None = None  #: on held-out data; 1 is right
+    valid: bool = False  #: whether the model holds there
+    findings: list[str] = []  #: what speaks against it
+    refused: list[str]  #: why there is no model
+    wall_s: float
 
 
 class RehearseResult(Strict):
@@ -64,7 +86,7 @@ class RehearseResult(Strict):
     machine: str
     versions: dict[str, str]
     seed: int  #: of the plant's noise
-    adaptations: int
+    adaptations: int  #: rounds that were asked for
     llm: str
     line: NamedFile
     plant: NamedFile
@@ -72,6 +94,7 @@ class RehearseResult(Strict):
     conditions: Conditions
     scenarios: list[Scenario]  #: as they were run
     without_term: list[str]  #: what the plant's file has and no model of a design: the truth's designs lack it, too
+    rounds: list[AdaptationResult] = []  #: of adaptation, as far as they came
     configurations: list[ConfigurationResult]
     unsafe_events: int  #: in all runs
     wall_s: float

@@ -7,9 +7,10 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from gateway.cli.rehearse_result import CaseResult, RehearseResult
+from gateway.cli.rehearse_result import AdaptationResult, CaseResult, RehearseResult
 from gateway.core.line_problem import printable
 
+STRONG = {"stiffness_per_length": "EA/L", "radius_per_inertia": "R/J", "friction_per_inertia": "f/J"}
 COLUMNS = ("configuration", "RMSE N", "/truth", "settle s", "over %", "p99 us", "T N", "unsafe")
 
 
@@ -36,7 +37,7 @@ def conditions(result: RehearseResult) -> str:
 
 def remarks(result: RehearseResult) -> list[str]:
     """What the figures do not say."""
-    told: list[str] = []
+    told = [line for one in result.rounds for line in _round(one)]
     for one in result.configurations:
         if one.refused is not None:
             told.append(f"{one.name} is not offered: {one.refused}")
@@ -46,6 +47,22 @@ def remarks(result: RehearseResult) -> list[str]:
         told.append("the plant has what no model of a design has a term for:")
         told += [f"  {what}" for what in result.without_term]
     return told
+
+
+def _round(one: AdaptationResult) -> list[str]:
+    """A round of adaptation, what it found, and what speaks against it."""
+    if one.refused:
+        return [f"adaptation {one.number} brought no model: {why}" for why in one.refused]
+    strong = ", ".join(
+        f"{symbol} {found.value:.5g} +-{50.0 * (found.high - found.low) / found.value:.2g} %"
+        for name, symbol in STRONG.items()
+        if (found := one.intervals.get(name)) is not None
+    )
+    told = [
+        f"adaptation {one.number}: {one.data_s:g} s of data, structure {one.structure}; {strong}",
+        f"  innovations on held-out data {one.normalised_innovation:.2f} of what noise makes (1 is right)",
+    ]
+    return told + [f"  {finding}" for finding in one.findings]
 
 
 def _table(result: RehearseResult, scenario: str) -> Table:

@@ -18,7 +18,6 @@ from gateway.identification.regressions import EquationFit, equation_fits, movin
 
 UNKNOWN_S = 0.005  #: an offset whose standard deviation is above this is not known
 _VAGUE_S = 0.1
-_STEP_SHARE = 0.5  #: of the range of v0, within one period: then it steps
 
 
 @dataclass(frozen=True)
@@ -55,8 +54,7 @@ def estimate_alignment(recording: Recording, line: Line, fits: Sequence[Equation
     found: list[Alignment] = []
     for group in _linked(fits, n, covariance):
         found += _relative(group, n, names, offset, covariance)
-    within_s = 0.5 * recording.period_s if _steps(recording.unwind_speed_m_per_s) else 0.0
-    found = [_wider(a, within_s) if a.channel == names[0] else a for a in found]
+    found = [_wider(a, 0.5 * recording.period_s) if a.channel == names[0] else a for a in found]
     absent = {names[1 + n + i] for i in range(n) if i not in there}
     return sorted((a for a in found if a.channel not in absent), key=lambda a: names.index(a.channel))
 
@@ -135,13 +133,8 @@ def _relative(
     return found
 
 
-def _steps(x: FloatArray) -> bool:
-    known = x[np.isfinite(x)]
-    return len(known) > 1 and float(np.abs(np.diff(known)).max()) > _STEP_SHARE * float(np.ptp(known))
-
-
 def _wider(alignment: Alignment, by_s: float) -> Alignment:
-    """When within a period a step happened, nobody knows."""
+    """Whether it goes straight from sample to sample, or stays, nobody knows: half a period lies between the two."""
     return replace(alignment, low_s=alignment.low_s - by_s, high_s=alignment.high_s + by_s)
 
 

@@ -64,7 +64,7 @@ def named(*names: str) -> list[Design]:
 @pytest.fixture(scope="module")
 def tension() -> list[ConfigurationResult]:
     """Everything in the paper's tension case, tier A, on S_real."""
-    return rehearse(cases_of(line(), plant(), [TENSION], A), seed=1, workers=1)
+    return rehearse(cases_of(line(), plant(), [TENSION], A), seed=1, workers=1)[0]
 
 
 def test_every_design_runs_and_is_held_against_the_best_on_the_truth(tension: list[ConfigurationResult]) -> None:
@@ -119,9 +119,9 @@ def figures(found: list[ConfigurationResult]) -> list[dict[str, Any]]:
 def test_the_seed_makes_the_figures_and_the_number_of_processes_does_not() -> None:
     cases = cases_of(line(2), plant(2), [SHORT], None)
     designs = named("lqi", "mpc-observer", "truth-lqi")
-    alone = rehearse(cases, 3, 1, designs=designs)
-    assert figures(alone) == figures(rehearse(cases, 3, 2, designs=designs))
-    assert figures(alone) != figures(rehearse(cases, 4, 1, designs=designs))
+    alone, _ = rehearse(cases, 3, 1, designs=designs)
+    assert figures(alone) == figures(rehearse(cases, 3, 2, designs=designs)[0])
+    assert figures(alone) != figures(rehearse(cases, 4, 1, designs=designs)[0])
     spread = alone[0].cases[0].compute_us
     assert 0.0 < spread.p50 <= spread.p99 <= spread.max
 
@@ -130,7 +130,7 @@ def test_a_design_that_stands_too_little_delay_is_not_offered_and_the_others_go_
     short = SHORT.model_copy(update={"duration_s": 0.6})
     hasty = Design("pid", "pid", NOMINAL, lambda task: design_pid(task, speed_share=1.5))
     designs = [*named("lqi"), hasty]
-    lqi, pid = rehearse(cases_of(line(2), plant(2), [short], TIER_P), 0, 1, designs=designs)
+    (lqi, pid), _ = rehearse(cases_of(line(2), plant(2), [short], TIER_P), 0, 1, designs=designs)
     assert pid.refused is not None and "at least 4 ms are needed" in pid.refused
     assert pid.controller is None and pid.cases == [] and pid.failures == {}
     assert lqi.refused is None and len(lqi.cases) == 1
@@ -148,7 +148,7 @@ def test_the_mpc_without_observer_must_stand_delay_like_any_other() -> None:
 def test_a_line_that_the_gateway_stops_is_told_and_no_yardstick() -> None:
     """Rollers a tenth as heavy as believed: the loop is unstable on them."""
     heavy, light = line(2), plant(2, inertia_kg_m2=0.1)
-    lqi, truth = rehearse(cases_of(heavy, light, [SHORT], None), 0, 1, designs=named("lqi", "truth-lqi"))
+    (lqi, truth), _ = rehearse(cases_of(heavy, light, [SHORT], None), 0, 1, designs=named("lqi", "truth-lqi"))
     assert lqi.cases == [] and re.fullmatch(r"the change is refused: stopped at 0\.\d+ s: .+", lqi.failures["short"])
     assert truth.cases[0].stopped and truth.cases[0].ratio_to_truth_design is None
 
@@ -157,7 +157,7 @@ def test_a_line_that_is_still_slowing_at_the_end_is_a_stopped_one() -> None:
     """Its drives give torque, and its RMSE is small: nothing has gone wrong for long."""
     brief = SHORT.model_copy(update={"duration_s": 0.4})
     light = plant(2, inertia_kg_m2=0.1)
-    (truth,) = rehearse(cases_of(line(2), light, [brief], None), 0, 1, designs=named("truth-lqi"))
+    ((truth,), _) = rehearse(cases_of(line(2), light, [brief], None), 0, 1, designs=named("truth-lqi"))
     (case,) = truth.cases
     assert case.ratio_to_truth_design is None
     assert case.stopped is not None and re.match(r"stopped at 0\.3\d s: the speed of roller 1", case.stopped)

@@ -1,0 +1,141 @@
+"""Adaptation rehearsed: an experiment on the simulated line, a model from its data, designs on that model; and again.
+
+The line runs as it would: under the controller in service, experiment and abort condition in the loop's own hands, data
+as the loop has recorded them. What is estimated knows of the plant what the load cells and drives have told.
+"""
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from gateway.cli.rehearse_designs import Design, offered
+from gateway.cli.rehearse_result import AdaptationResult, Found
+from gateway.cli.stepped import CommandRefused, SteppedLoop
+from gateway.cli.stepped_experiment import run_experiment
+from gateway.control.design import DesignRefused, DesignTask, design_lqi, design_mpc, task_of, task_on
+from gateway.core.controller import Controller
+from gateway.core.experiment import Experiment, ExperimentRefused
+from gateway.core.line import Line
+from gateway.core.recording import Recording
+from gateway.core.scenario import Scenario
+from gateway.core.theta import Noise
+from gateway.identification.experiment_design import design_experiment
+from gateway.identification.identify import Identified, NotIdentified, identify
+from sim_plant.plant import Plant
+
+AT_EACH_SPEED_S = 5.0  #: of data, at most
+SETTLE_S = 0.5  #: that the line runs before an experiment
+SEEDS_APART = 1000  #: the noise of an experiment is that of no scenario
+IN_SERVICE = "lqi"  #: of a round's designs, the one under which the next round's experiment runs
+
+
+class NoExperiment(Exception):
+    """The experiment could not be run; the text says why."""
+
+
+@dataclass(frozen=True)
+class Adapted:
+    """A round: what came of it, and the designs that it has brought with the task that each was made for."""
+
+    result: AdaptationResult
+    designs: list[tuple[Design, DesignTask]]
+
+
+def adapt(
+    line: Line,
+    plant: Plant,
+    scenario: Scenario,
+    seed: int,
+    rounds: int,
+    tell: Callable[[str], None] = lambda text: None,
+) -> list[Adapted]:
+    """Round after round, each on the data of all before it as well. Ends early where a round brings no model.
+
+    The line stands as `scenario` has it at the begin when an experiment is made.
+    """
+    found: list[Adapted] = []
+    recordings: list[Recording] = []
+    in_service: Controller = design_lqi(task_of(line))
+    for number in range(1, rounds + 1):
+        began_s = time.perf_counter()
+
+        def doing(text: str, number: int = number) -> None:
+            tell(f"adaptation {number}: {text}")
+
+        try:
+            doing("experiment")
+            recordings.append(_experiment(line, in_service, plant, scenario, seed + SEEDS_APART * number))
+            identified = identify(recordings, line, Noise(), time.perf_counter, tell=doing)
+        except (NoExperiment, NotIdentified) as refused:
+            reasons = refused.reasons if isinstance(refused, NotIdentified) else [str(refused)]
+            found.append(Adapted(_result(number, recordings, None, reasons, time.perf_counter() - began_s), []))
+            break
+        estimate = identified.estimate
+        task = task_on(line, estimate.theta, estimate.noise)
+        model = f"identified-{number}"
+        designs = [
+            Design(f"adapt{number}-lqi", "lqi", model, design_lqi),
+            Design(f"adapt{number}-mpc-observer", "mpc", model, design_mpc),
+        ]
+        found.append(
+            Adapted(
+                _result(number, recordings, identified, [], time.perf_counter() - began_s),
+                [(design, task) for design in designs],
+            )
+        )
+        in_service = _next_in_service(designs, task, in_service)
+    return found
+
+
+def _next_in_service(designs: Sequence[Design], task: DesignTask, before: Controller) -> Controller:
+    for design in designs:
+        if design.law == IN_SERVICE:
+            try:
+                return offered(design, task)
+            except DesignRefused:
+                break
+    return before
+
+
+def _experiment(line: Line, config: Controller, plant: Plant, scenario: Scenario, seed: int) -> Recording:
+    """What is recorded while the experiment that is designed for this line runs on it. Raises NoExperiment."""
+    tension_n, speed = np.array(scenario.tension_n), scenario.speed_m_per_s
+    try:
+        designed = design_experiment(line, config, tension_n=tension_n.tolist(), speed_m_per_s=speed, seed=seed)
+        loop = SteppedLoop(line, config, plant, seed)
+        loop.begin_in_production(tension_n, speed)
+        loop.step(round(SETTLE_S / line.control.period_s))
+        return run_experiment(loop, _no_longer(designed.experiment))
+    except (ExperimentRefused, CommandRefused) as refused:
+        raise NoExperiment(str(refused)) from refused
+
+
+def _no_longer(experiment: Experiment) -> Experiment:
+    """With no more than `AT_EACH_SPEED_S` at each speed."""
+    legs = [leg.model_copy(update={"duration_s": min(leg.duration_s, AT_EACH_SPEED_S)}) for leg in experiment.legs]
+    return experiment.model_copy(update={"legs": legs})
+
+
+def _result(
+    number: int, recordings: Sequence[Recording], identified: Identified | None, refused: list[str], wall_s: float
+) -> AdaptationResult:
+    data_s = sum(recording.samples * recording.period_s for recording in recordings)
+    if identified is None:
+        return AdaptationResult(number=number, data_s=data_s, refused=refused, wall_s=round(wall_s, 1))
+    estimate = identified.estimate
+    return AdaptationResult(
+        number=number,
+        data_s=data_s,
+        structure=str(estimate.structure),
+        intervals={
+            name: Found(value=interval.value, low=interval.low, high=interval.high)
+            for name, interval in estimate.intervals.items()
+        },
+        normalised_innovation=identified.validation.normalised,
+        valid=identified.validation.valid,
+        findings=[*identified.validation.findings, *identified.choice.cautions],
+        refused=[],
+        wall_s=round(wall_s, 1),
+    )
