@@ -17,13 +17,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 
 from gateway.core.line import Line
 from gateway.core.recording import Recording
 from gateway.core.signals import FloatArray
 from gateway.core.theta import Noise
 from gateway.core.web_model import nominal_model
+from gateway.identification.coloured_regression import VAGUE_S, Solved, coloured
 
 LEAST_SAMPLES = 60  #: of a stretch that is used
 MOST_STRETCHES = 20  #: the longest ones: each brings an unknown of its own
@@ -31,10 +31,8 @@ LEAST_REACH_S, REACH_PERIODS = 0.03, 5  #: shifts are looked for so far either w
 WINDOW_S = 0.1  #: over which changes are compared with what the equation says of them
 MOVING_SHARE = 0.2  #: of these windows: those with most movement, so that quiet hours hide nothing
 MOVING = 5.0  #: times what noise makes of such changes
-COLOURS = (0.0, 0.1, 0.2, 0.3, 0.45, 0.6, 0.75, 0.85, 0.9, 0.94, 0.97, 0.98, 0.99, 0.995)
 _FINE = 200  #: steps per period of the profile likelihood
 _GAUSS_NEWTON_STEPS = 12
-_VAGUE_S = 0.1  #: standard deviation of the prior of a span's leads: what nothing is known of stays near 0
 
 
 @dataclass(frozen=True)
@@ -151,11 +149,11 @@ def fit_roller(
 
     sought = delay_s is None
     delay, information = delay_s or 0.0, 0.0
-    found = _Solved(y, table(delay), weak, colour)
+    found = Solved(y, table(delay), weak, colour)
     if sought:
         for _ in range(2):  # the delay is found for a colour, and the colour for a delay
             delay, information = _best_delay(y, table, found.colour, line.control.latency_s, stretches[0].data.period_s)
-            found = _Solved(y, table(delay), weak, colour)
+            found = Solved(y, table(delay), weak, colour)
     nominal = float(model.radius_m[i] / model.inertia_kg_m2[i])
     shift, known = np.array([delay]), np.array([[information]])
     return _fit_of("roller", i, found, nominal, found.covariance, shift, known, stretches)
@@ -187,82 +185,22 @@ def fit_span(
     if sought:  # first both together, which is a shift of the tension, coarsely
         step = 0.5 * stretches[0].data.period_s
         shifts = step * np.arange(-np.floor(reach / step), np.floor(reach / step) + 1)
-        lead = min((_Solved(y, table(np.full(2, d))[0], weak, 0.9).cost, abs(d), d) for d in shifts)[2] * np.ones(2)
-    found = _Solved(y, table(lead)[0], weak, colour)
-    prior = np.eye(2) / _VAGUE_S**2
+        lead = min((Solved(y, table(np.full(2, d))[0], weak, 0.9).cost, abs(d), d) for d in shifts)[2] * np.ones(2)
+    found = Solved(y, table(lead)[0], weak, colour)
+    prior = np.eye(2) / VAGUE_S**2
     for _ in range(2 if sought else 0):  # the leads are found for a colour, and the colour for leads
         for _ in range(_GAUSS_NEWTON_STEPS):
             gradient, information, _ = found.along(table(lead)[1])
             step = np.linalg.solve(information + prior, gradient - prior @ lead)
             lead = np.clip(lead + step, -reach, reach)
-            found = _Solved(y, table(lead)[0], weak, found.colour)
+            found = Solved(y, table(lead)[0], weak, found.colour)
             if np.abs(step).max() < 1e-6:
                 break
-        found = _Solved(y, table(lead)[0], weak, colour)
+        found = Solved(y, table(lead)[0], weak, colour)
     _, information, covariance = found.along(table(lead)[1])
     nominal = line.web.stiffness_n.value / span.value
     spread = covariance if sought else found.covariance
     return _fit_of("span", i, found, nominal, spread, lead, information, stretches)
-
-
-class _Solved:
-    """Least squares of coloured rows with a prior on one coefficient `weak` = (column, mean, standard deviation)."""
-
-    def __init__(
-        self, y: list[FloatArray], table: list[FloatArray], weak: tuple[int, float, float], colour: float | None
-    ) -> None:
-        self.y, self.table, self.weak = y, table, weak
-        colours = COLOURS if colour is None else (colour,)
-        self.cost, self.colour = min((self._at(c)[2], c) for c in colours)
-        self.solution, self.rows, _ = self._at(self.colour)
-        self.p = table[0].shape[1]
-        self.coefficients = self.solution[: self.p]
-        self.innovation = self.rows[1] - self.rows[0] @ self.solution
-        count = sum(map(len, y))
-        self.variance = max(float(np.sum(self.innovation[:count] ** 2)) / max(count - len(self.solution), 1), 1e-300)
-        self.covariance = self._inverse(self.rows[0])[: self.p, : self.p]
-
-    def residuals(self) -> list[FloatArray]:
-        return [a - b @ self.coefficients for a, b in zip(self.y, self.table, strict=True)]
-
-    def along(self, slopes: list[FloatArray]) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Gradient and information of what moves the first column by `slopes`, coefficients unknown; and the
-        coefficients' covariance while this is unknown."""
-        A = self.rows[0]
-        extra = self._coloured([self.coefficients[0] * s for s in slopes], self.colour)
-        extra = np.vstack((extra, np.zeros((len(A) - len(extra), extra.shape[1]))))
-        Q, _ = np.linalg.qr(A)
-        apart = extra - Q @ (Q.T @ extra)
-        information = apart.T @ apart / self.variance
-        width = np.sqrt(self.variance) / _VAGUE_S
-        wide = np.block([[A, extra], [np.zeros((extra.shape[1], A.shape[1])), width * np.eye(extra.shape[1])]])
-        return apart.T @ self.innovation / self.variance, information, self._inverse(wide)[: self.p, : self.p]
-
-    def _at(self, colour: float) -> tuple[FloatArray, tuple[FloatArray, FloatArray], float]:
-        A = self._coloured(self.table, colour)
-        first = np.zeros((len(A), len(self.y)))  # the error before each stretch's first row
-        begin = 0
-        for j, part in enumerate(self.y):
-            first[begin : begin + len(part), j] = colour ** np.arange(len(part))
-            begin += len(part)
-        A = np.hstack((A, first)) if colour > 0.0 else A
-        b = self._coloured([part[:, None] for part in self.y], colour)[:, 0]
-        free = np.linalg.lstsq(A, b, rcond=None)[0]
-        sigma = float(np.sqrt(np.mean((b - A @ free) ** 2))) + 1e-150
-        column, mean, deviation = self.weak
-        prior = np.zeros(A.shape[1])
-        prior[column] = sigma / deviation
-        A, b = np.vstack((A, prior)), np.append(b, mean * prior[column])
-        solution: FloatArray = np.asarray(np.linalg.lstsq(A, b, rcond=None)[0], dtype=np.float64)
-        return solution, (A, b), float(np.sum((b - A @ solution) ** 2))
-
-    def _inverse(self, A: FloatArray) -> FloatArray:
-        scale = np.sqrt(np.sum(A**2, axis=0)) + 1e-150  # columns differ by orders of magnitude
-        return np.linalg.pinv((A / scale).T @ (A / scale), rcond=1e-13) * self.variance / np.outer(scale, scale)
-
-    @staticmethod
-    def _coloured(parts: list[FloatArray], colour: float) -> FloatArray:
-        return np.vstack([lfilter([1.0], [1.0, -colour], part, axis=0) for part in parts])
 
 
 def _best_delay(
@@ -275,14 +213,11 @@ def _best_delay(
     """
     reach = round(reach_s(period_s) / period_s)
     nearest = round(latency_s / period_s)
-    coloured = [
-        np.vstack([lfilter([1.0], [1.0, -colour], part, axis=0) for part in table(m * period_s - latency_s)])
-        for m in range(nearest - reach, nearest + reach + 1)
-    ]
-    target = np.concatenate([lfilter([1.0], [1.0, -colour], part) for part in y])
-    Q, _ = np.linalg.qr(coloured[0][:, 1:])
+    tables = [coloured(table(m * period_s - latency_s), colour) for m in range(nearest - reach, nearest + reach + 1)]
+    target = coloured([part[:, None] for part in y], colour)[:, 0]
+    Q, _ = np.linalg.qr(tables[0][:, 1:])
     target = target - Q @ (Q.T @ target)
-    torque = [x[:, 0] - Q @ (Q.T @ x[:, 0]) for x in coloured]
+    torque = [x[:, 0] - Q @ (Q.T @ x[:, 0]) for x in tables]
     part = np.arange(_FINE + 1) / _FINE
     delays, costs = [], []
     for j in range(2 * reach):
@@ -299,7 +234,7 @@ def _best_delay(
 
 
 def _fit_of(
-    kind: str, i: int, found: _Solved, nominal: float, covariance: FloatArray, shift_s: FloatArray,
+    kind: str, i: int, found: Solved, nominal: float, covariance: FloatArray, shift_s: FloatArray,
     information: FloatArray, stretches: list[Stretch],
 ) -> EquationFit:  # fmt: skip
     period_s = stretches[0].data.period_s
