@@ -26,7 +26,7 @@ class MpcSolver:
         self._problem = problem
         self._most_iterations = most_iterations
         self._time_limit_s = time_limit_s
-        self._free: FloatArray = -np.linalg.inv(problem.hessian)
+        self._free: FloatArray = np.asarray(np.linalg.inv(-problem.hessian), dtype=np.float64)
         self._rows: FloatArray = np.array(problem.A.toarray())[:, : problem.torque_variables]
         self._torques: Any = None
         self._whole: Any = None
