@@ -15,6 +15,7 @@ from gateway.cli import (
     models_commands,
     operate_commands,
     process_commands,
+    recordings_export,
     rehearse_commands,
     scan_commands,
     status_commands,
@@ -56,7 +57,7 @@ app.command("set", rich_help_panel=LINE, context_settings=NUMBERS)(operate_comma
 app.command(rich_help_panel=LINE, context_settings=NUMBERS)(operate_commands.speed)
 app.command(rich_help_panel=LINE)(operate_commands.recipe)
 app.command(rich_help_panel=LINE)(status_commands.status)
-app.command("export", rich_help_panel=EVIDENCE)(status_commands.export_csv)
+app.command("export", rich_help_panel=EVIDENCE)(recordings_export.export)
 
 
 @app.callback(invoke_without_command=True)
