@@ -113,7 +113,8 @@ def _identify(data: "Data", align: bool, out: Path, report: Path, folder: Path |
         except NotIdentified as refused:
             _end_refused(result_of(data, refused.assessments, refused.reasons, None), as_json)
         except ValueError as error:  # a held-out part without a free run's length, or data that no method can use
-            _end_refused(result_of(data, [], [str(error)], None), as_json)
+            more = f"{error}; more data under control may help: 5 s or more in a row at each of two speeds"
+            _end_refused(result_of(data, [], [more], None), as_json)
         result = result_of(data, found.assessments, [], found)
         try:
             model = model_of_found(data.line, data.recordings, found, result.date, all_delays(data.delays))
