@@ -19,10 +19,14 @@ from gateway.cli.recordings_csv import write_csv
 from gateway.core.line_model import canonical, model_hash, parse_model
 from gateway.core.line_template import line_template
 from gateway.core.recording import Recording
+from gateway.core.signals import DriveState, Quality
+from gateway.core.states import LoopState
 from gateway.identification import identify as pipeline
 from gateway.supervisor.models import open_repository
 from tests.closed_loop.recorded import demonstration_line, real_plant, recorded
 from tests.closed_loop.spoiled import shifted, swapped
+from tests.unit.supervisor_support import frame_of
+from tests.unit.test_historian import WALL_AHEAD_S, writer_of
 
 STRONG = {"stiffness_per_length": 2200.0 / 1.2, "radius_per_inertia": 0.035, "friction_per_inertia": 15.0}
 
@@ -116,9 +120,10 @@ def test_the_terminal_shows_every_method_with_its_intervals_in_80_columns(
 ) -> None:
     _, result, _ = run
     assert result.found is not None
-    console = Console(file=io.StringIO(), width=80)
+    text = io.StringIO()
+    console = Console(file=text, width=80)
     print_result(result, result.found, console)
-    said = console.file.getvalue()
+    said = text.getvalue()
     tables = [line for line in said.splitlines() if "±" in line and "  " in line and ":" not in line]
     assert len(tables) >= 8 and max(map(len, tables)) <= 80 and "…" not in said
     for one in result.found.methods:
@@ -269,6 +274,33 @@ def test_without_files_it_is_the_history_of_the_line_that_runs(
     (folder / "line.toml").write_text(text)
     code, _, err = identify(folder, "--run-dir", folder)
     assert code == 2 and "runs demo/line-1, the file describes demo/line-2" in err and len(asked) == 2
+
+
+def test_a_history_gives_the_model_that_its_samples_give_in_a_file(
+    run: tuple[Path, IdentifyResult, str], recording: Recording, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fields = ("tension_n", "tension_setpoint_n", "speed_m_per_s", "torque_nm", "torque_actual_nm")
+    good, enabled = np.full(2, Quality.GOOD, np.int8), np.full(2, DriveState.ENABLED, np.int8)
+    frames = [
+        frame_of(
+            k, float(recording.time_s[k]), 2, tension_quality=good, drive_state=enabled, state=LoopState.RUN, held=0,
+            unwind_speed_m_per_s=float(recording.unwind_speed_m_per_s[k]),
+            **{name: getattr(recording, name)[k] for name in fields},
+        )
+        for k in range(recording.samples)
+    ]  # fmt: skip
+    writer = writer_of(folder / "history.sqlite", spans=2)
+    writer.store(frames, [], WALL_AHEAD_S)
+    writer.disconnect()
+    monkeypatch.setattr(identify_data, "time", SimpleNamespace(time=lambda: WALL_AHEAD_S + recording.time_s[-1] + 1.0))
+    code, out, err = identify(folder, "--history", folder / "history.sqlite", "--json")
+    assert code == 0, err
+    result, from_file = IdentifyResult.model_validate_json(out), run[1]
+    assert result.recordings[0].digest == from_file.recordings[0].digest == recording.digest()
+    assert result.found is not None and from_file.found is not None
+    assert result.found.parameters == from_file.found.parameters
+    code, _, err = identify(folder, "--history", folder / "history.sqlite", "--last", "0.5")
+    assert code == 2 and "the last 0.5 s were asked for: --last takes more" in err
 
 
 def test_where_no_line_runs_it_says_so(folder: Path) -> None:
