@@ -150,13 +150,11 @@ def why(choice: Choice) -> str:
         return f"{name}: no other structure was tried"
     if chosen is not best:
         return (
-            f"{name}: {_name(best.structure)} has more evidence, by {best.evidence - chosen.evidence:.1f} of its "
-            f"logarithm only; {ENOUGH:g} (20 to 1) would be needed for more parameters"
+            f"{name}: {_name(best.structure)} has more log evidence, but only by "
+            f"{best.evidence - chosen.evidence:.1f}; {ENOUGH:g} (20 to 1) would be needed for more parameters"
         )
-    behind = chosen.evidence - others[0].evidence
-    return (
-        f"{name}: the most evidence; the next, {_name(others[0].structure)}, is behind by {behind:.1f} of its logarithm"
-    )
+    ahead = chosen.evidence - others[0].evidence
+    return f"{name}: the most evidence; {_name(others[0].structure)} is next, its log evidence {ahead:.1f} less"
 
 
 def _name(structure: Structure) -> str:

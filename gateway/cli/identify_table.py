@@ -17,7 +17,8 @@ SHOWN = (
     "inertia_kg_m2", "friction_nms_per_rad",
 )  # fmt: skip
 SHORT_METHODS = {"recursive least squares": "recursive LS"}
-SOME_OFFSET_S = 1e-3  #: an interval that lies wholly beyond this is named
+SHORT_SYMBOLS = {"coulomb_nm": "c", "torque_lag_s": "lag"}  #: names would be too long for 80 columns
+SOME_OFFSET_S = 1e-3  #: an interval that lies wholly beyond this counts; findings name its channel
 AS_GOOD = 2.0  #: standard errors behind the best, up to which nothing can be said
 
 
@@ -106,11 +107,6 @@ def offset_words(row: RecordingRow) -> list[str]:
     said = [
         f"time offsets of {len(known)} channels known to ±{widest_ms:.2g} ms or better; surely beyond 1 ms: {len(far)}"
     ]
-    said += [
-        f"{one.channel} is {1e3 * one.offset_s:+.2f} ms late ({1e3 * (one.low_s or 0.0):.2f} to "
-        f"{1e3 * (one.high_s or 0.0):.2f} ms)"
-        for one in far
-    ]
     return said + ([f"not known of: {', '.join(unknown)}"] if unknown else [])
 
 
@@ -120,6 +116,8 @@ def method_words(found: Found) -> list[str]:
         f"score: error of free runs of 1 s, {found.windows} of them, in standard deviations of the sensors' noise; "
         "behind: the best, in standard errors of the difference"
     ]
+    if any("[" in name for one in found.methods for name in one.intervals):
+        said.append("~: rollers or spans differ; their mean, and the widest interval")
     worse = [one.method for one in others if one.behind is None or one.behind >= AS_GOOD]
     same = [one.method for one in others if one.method not in worse]
     if same:
@@ -183,7 +181,7 @@ def structure_rows(found: Found) -> list[tuple[str, ...]]:
 
 
 def _structures(found: Found) -> Table:
-    table = _table("structure", "parameters", "log evidence", "held-out", "innovation²")
+    table = _table("structure", "params", "evidence", "held-out", "innov.²")
     for one, row in zip(found.structures, structure_rows(found), strict=True):
         table.add_row(*row, style="bold" if one.chosen else "")
     return table
@@ -195,7 +193,8 @@ def _model(found: Found) -> Table:
         m, base = one.model, one.name.split("[")[0]
         width = f"{half_width_pct(m):.2g} %"
         values = [f"{value:.4g}" for value in (one.file.value, m.value, m.low, m.high)]
-        table.add_row(symbol_of(one.name), UNITS[base], *values, width, one.told)
+        symbol = SHORT_SYMBOLS.get(base, symbol_of(base)) + one.name.removeprefix(base)
+        table.add_row(symbol, UNITS[base], *values, width, one.told)
     return table
 
 

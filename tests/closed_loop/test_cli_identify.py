@@ -134,6 +134,19 @@ def test_the_terminal_shows_every_method_with_its_intervals_in_80_columns(
     assert all(sentence in said for sentence in result.found.words)
 
 
+def test_rollers_that_differ_fit_80_columns_too(run: tuple[Path, IdentifyResult, str]) -> None:
+    found = run[1].found
+    assert found is not None
+    some = [one for one in found.parameters if one.name in ("friction_nms_per_rad", "radius2_per_inertia")]
+    each = [one.model_copy(update={"name": f"{one.name}[60]"}) for one in some]
+    each += [some[0].model_copy(update={"name": name}) for name in ("coulomb_nm[60]", "torque_lag_s")]
+    structure = found.structures[0].model_copy(update={"structure": "per roller, Coulomb friction, torque lag"})
+    text = io.StringIO()
+    differing = found.model_copy(update={"parameters": each, "structures": [structure]})
+    print_result(run[1], differing, Console(file=text, width=80))
+    assert "…" not in text.getvalue() and "R²/J[60]" in text.getvalue() and "c[60]" in text.getvalue()
+
+
 def test_the_page_holds_its_own_data_and_the_answer(run: tuple[Path, IdentifyResult, str]) -> None:
     folder, result, _ = run
     assert result.found is not None
