@@ -114,7 +114,7 @@ def method_words(found: Found) -> list[str]:
     best, *others = found.methods
     said = [
         f"score: error of free runs of 1 s, {found.windows} of them, in standard deviations of the sensors' noise; "
-        "behind: the best, in standard errors of the difference"
+        "behind: the best, in standard errors of the difference; seconds of prediction error: all structures together"
     ]
     if any("[" in name for one in found.methods for name in one.intervals):
         said.append("~: rollers or spans differ; their mean, and the widest interval")
