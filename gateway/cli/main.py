@@ -11,6 +11,7 @@ from gateway.cli import (
     doctor_commands,
     experiment_commands,
     fault_commands,
+    identify_commands,
     line_commands,
     models_commands,
     operate_commands,
@@ -39,6 +40,7 @@ app.command(rich_help_panel=ENGINEER)(line_commands.init)
 app.command(rich_help_panel=ENGINEER)(line_commands.check)
 app.add_typer(scan_commands.app, rich_help_panel=ENGINEER)
 app.command(rich_help_panel=ENGINEER)(doctor_commands.doctor)
+app.command(rich_help_panel=ENGINEER)(identify_commands.identify)
 app.command(rich_help_panel=ENGINEER)(design_commands.design)
 app.add_typer(models_commands.app, rich_help_panel=ENGINEER)
 app.command(rich_help_panel=ENGINEER)(rehearse_commands.rehearse)

@@ -14,6 +14,7 @@ from pydantic import TypeAdapter
 
 from gateway.cli.demo_result import DemoResult
 from gateway.cli.design_result import DesignResult
+from gateway.cli.identify_result import IdentifyResult
 from gateway.cli.rehearse_result import RehearseResult
 from gateway.core.controller import ControllerConfig, parse_controller
 from gateway.core.experiment import Experiment, parse_experiment
@@ -39,6 +40,7 @@ FORMATS: dict[str, tuple[TypeAdapter[Any], Callable[[bytes], object], str]] = {
     "demo-result": (TypeAdapter(DemoResult), _json(TypeAdapter(DemoResult)), "json"),
     "rehearse": (TypeAdapter(RehearseResult), _json(TypeAdapter(RehearseResult)), "json"),
     "design": (TypeAdapter(DesignResult), _json(TypeAdapter(DesignResult)), "json"),
+    "identify": (TypeAdapter(IdentifyResult), _json(TypeAdapter(IdentifyResult)), "json"),
     "bench": (TypeAdapter(BenchResult), _json(TypeAdapter(BenchResult)), "json"),
     "experiment": (TypeAdapter(Experiment), parse_experiment, "json"),
     "command": (TypeAdapter(Command), _json(TypeAdapter(Command)), "json"),

@@ -1,0 +1,53 @@
+"""Time offsets between channels taken out of recordings before anything is estimated from them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from gateway.core.line import Line
+from gateway.core.line_model import ChannelDelay
+from gateway.core.recording import Recording
+from gateway.identification.alignment import Alignment, aligned
+from gateway.identification.assessment import OFFSET_WARNED_S, assess
+from gateway.identification.findings import Severity
+
+
+@dataclass(frozen=True)
+class Moved:
+    recording: Recording
+    delays: list[ChannelDelay]  #: what was found and taken out
+
+
+def without_offsets(recording: Recording, line: Line) -> Moved:
+    """With every channel moved whose interval lies beyond 1 ms; by whole periods where its interval has one in it.
+
+    Torques stay: what acts late there is the model's latency and lag. Where the data are refused for anything but
+    offsets they stay as they are: offsets mean nothing then.
+    """
+    said = assess(recording, line)
+    if said.kinds(Severity.REFUSAL) - {"offset"}:
+        return Moved(recording, [])
+    late = [_whole(one, recording.period_s) for one in said.alignments if _is_late(one)]
+    delays = [
+        ChannelDelay(channel=one.channel, late_s=one.offset_s, low_s=one.low_s, high_s=one.high_s) for one in late
+    ]
+    return Moved(aligned(recording, late), delays)
+
+
+def all_delays(delays: Sequence[Sequence[ChannelDelay]]) -> list[ChannelDelay]:
+    """Of each channel, the longest that any recording had."""
+    found: dict[str, ChannelDelay] = {}
+    for one in [delay for each in delays for delay in each]:
+        if one.channel not in found or abs(one.late_s) > abs(found[one.channel].late_s):
+            found[one.channel] = one
+    return list(found.values())
+
+
+def _is_late(one: Alignment) -> bool:
+    beyond_s = max(one.low_s, -one.high_s)
+    return one.known and not one.reference and not one.channel.startswith("torque") and beyond_s > OFFSET_WARNED_S
+
+
+def _whole(one: Alignment, period_s: float) -> Alignment:
+    """By whole periods nothing is lost of noise or signal."""
+    whole_s = period_s * round(one.offset_s / period_s)
+    return replace(one, offset_s=whole_s) if whole_s and one.low_s <= whole_s <= one.high_s else one

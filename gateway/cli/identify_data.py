@@ -1,0 +1,138 @@
+"""What `r2rgate identify` is given: recordings from files or from the history, and what was measured by hand."""
+
+import asyncio
+import re
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from gateway.cli.recordings import read_recording, recording_of_history
+from gateway.cli.recordings_export import seconds_of
+from gateway.cli.recordings_table import RecordingRefused
+from gateway.cli.status_commands import ask_status, choose_run_folder
+from gateway.core.line import Line, Parameter
+from gateway.core.nearest import nearest
+from gateway.core.recording import Recording
+from gateway.identification.parameters import EACH
+from gateway.mailbox.paths import default_run_folder, running_lines
+
+MEASURABLE = ("stiffness_n", *EACH)
+LAST = "60s"
+_MEASURED = re.compile(r"\s*(\w+)\s*=\s*([^,\s]+)\s*,\s*([0-9.eE+-]+)\s*%\s*")
+
+
+class DataRefused(Exception):
+    """Every reason, a line each."""
+
+
+@dataclass(frozen=True)
+class Asked:
+    """Where to look where no file is named."""
+
+    last: str
+    history: Path | None
+    run_dir: Path | None
+
+
+def recordings_of(line: Line, files: Sequence[Path], asked: Asked) -> list[Recording]:
+    """Of the files, else of the running line's history. Raises DataRefused, Unreachable, PathTooLong."""
+    if not files:
+        return [_from_history(line, asked)]
+    found: list[Recording] = []
+    refused: list[str] = []
+    for file in files:
+        try:
+            found.append(read_recording(file))
+        except RecordingRefused as error:
+            refused.append(str(error))
+    digests = [one.digest() for one in found]
+    refused += [
+        f"{found[i].source} is the same data as {found[digests.index(digest)].source}: leave one away"
+        for i, digest in enumerate(digests)
+        if digests.index(digest) < i
+    ]
+    if refused:
+        raise DataRefused("\n".join(refused))
+    return found
+
+
+def _from_history(line: Line, asked: Asked) -> Recording:
+    seconds = seconds_of(asked.last)
+    path = asked.history
+    if path is None:
+        own = default_run_folder(line)
+        folder = choose_run_folder(asked.run_dir or (own if own in running_lines() else None))
+        status = asyncio.run(ask_status(folder))
+        if (status.site, status.line) != (line.site, line.line):
+            raise DataRefused(
+                f"in {folder} runs {status.site}/{status.line}, the file describes {line.site}/{line.line}: name its "
+                "--run-dir, or its file"
+            )
+        path = Path(status.historian.path)
+    now_s = time.time()
+    try:
+        return recording_of_history(path, now_s - seconds, now_s)
+    except RecordingRefused as error:
+        raise DataRefused(
+            f"{error}; the last {seconds:g} s were asked for: --last takes more, r2rgate export makes a file of a "
+            "while that is worth keeping"
+        ) from error
+
+
+def measured_of(given: Sequence[str], line: Line) -> dict[str, tuple[float, float]]:
+    """{name: (value, tolerance)} of such as "radius_m=0.035,0.5%". Raises DataRefused."""
+    found: dict[str, tuple[float, float]] = {}
+    wrong: list[str] = []
+    for text in given:
+        try:
+            name, value, tolerance = _parsed(text)
+            if name in found:
+                raise DataRefused(f"{name} is given twice")
+            _require_possible(name, value, _of_file(name, line))
+            found[name] = (value, tolerance)
+        except DataRefused as error:
+            wrong.append(f"--measured {text}: {error}")
+    if wrong:
+        raise DataRefused("\n".join(wrong))
+    return found
+
+
+def _parsed(text: str) -> tuple[str, float, float]:
+    parts = _MEASURED.fullmatch(text)
+    if parts is None:
+        raise DataRefused("should be NAME=VALUE,TOLERANCE% in SI units, such as radius_m=0.035,0.5%")
+    name = parts[1]
+    if name not in MEASURABLE:
+        like = nearest(name, MEASURABLE)
+        hint = f"; did you mean {like}?" if like else ""
+        raise DataRefused(f"there is no such parameter; allowed: {', '.join(MEASURABLE)}{hint}")
+    try:
+        value, tolerance = float(parts[2]), 0.01 * float(parts[3])
+    except ValueError:
+        raise DataRefused("value and tolerance should be numbers") from None
+    if not (0.0 < value < float("inf") and 1e-5 <= tolerance < 1.0):
+        raise DataRefused("the value should be above 0, the tolerance 0.001 % or more and below 100 %")
+    return name, value, tolerance
+
+
+def _of_file(name: str, line: Line) -> list[Parameter]:
+    if name == "stiffness_n":
+        return [line.web.stiffness_n]
+    return [getattr(part, name) for part in (line.spans if name == "length_m" else line.rollers)]
+
+
+def _require_possible(name: str, value: float, of_file: list[Parameter]) -> None:
+    """A value for all, within what the line's file allows: a wrong unit or parameter shows here."""
+    if len({one.value for one in of_file}) > 1:
+        raise DataRefused(
+            f"the line's file has {min(one.value for one in of_file):g} to {max(one.value for one in of_file):g}, and "
+            "one value would be for all: write each with its tolerance into the line's file"
+        )
+    first = max(of_file, key=lambda one: one.tolerance)
+    low, high = first.value * (1.0 - first.tolerance), first.value * (1.0 + first.tolerance)
+    if not low <= value <= high:
+        raise DataRefused(
+            f"the line's file has {first.value:g} ±{first.tolerance:.0%}, which is {low:.4g} to {high:.4g}: correct "
+            "the unit, or the line's file"
+        )
