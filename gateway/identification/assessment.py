@@ -62,7 +62,7 @@ def _offsets(alignments: list[Alignment], period_s: float) -> list[Finding]:
         else:
             limit_s = OFFSET_REFUSED_S
             what = f"it is {abs(1e3 * alignment.offset_s):.1f} ms {'late' if late else 'early'} ({interval})"
-            mend = "correct it by `aligned`, or take the times where the channel is sampled"
+            mend = "align it (identify --align), or take the times where the channel is sampled"
         severity = Severity.REFUSAL if beyond_s > limit_s else Severity.WARNING
         found.append(Finding("offset", severity, what, alignment.channel, alignment.offset_s, limit_s, mend))
     return found

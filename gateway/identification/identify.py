@@ -15,7 +15,7 @@ from gateway.core.recording import ARRAYS, Recording
 from gateway.core.signals import FloatArray
 from gateway.core.theta import Noise
 from gateway.identification.assessment import assess
-from gateway.identification.comparison import Comparison, compare
+from gateway.identification.comparison import WINDOW_S, Comparison, compare
 from gateway.identification.estimate import Estimate
 from gateway.identification.findings import Assessment, Finding
 from gateway.identification.prediction_error import LEAST_S, Fit, fit_stretches, stretches_of
@@ -25,6 +25,7 @@ from gateway.identification.subspace import estimated_by_subspace
 from gateway.identification.validation import Validation, validate
 
 HELD_OUT = 0.3  #: of each stretch, its end
+LEAST_HELD_OUT_S = WINDOW_S + 0.2  #: a window of the comparison, and what comes before it
 GAP_PERIODS = 10  #: between recordings that are joined
 
 
@@ -108,10 +109,10 @@ def parts(recordings: Sequence[Recording]) -> tuple[list[Recording], list[Record
     before: list[Recording] = []
     after: list[Recording] = []
     for recording in recordings:
-        least = round(LEAST_S / recording.period_s)
-        for stretch in recording.stretches(least):
+        held = round(LEAST_HELD_OUT_S / recording.period_s)
+        for stretch in recording.stretches(round(LEAST_S / recording.period_s)):
             cut = round((1.0 - HELD_OUT) * stretch.samples)
-            if stretch.samples - cut >= least:
+            if stretch.samples - cut >= held:
                 before.append(stretch.part(0, cut))
                 after.append(stretch.part(cut, stretch.samples))
             else:
@@ -147,5 +148,5 @@ def _too_short(recordings: Sequence[Recording]) -> str:
     sources = ", ".join(recording.source for recording in recordings)
     return (
         f"{sources}: no stretch is long enough to hold {HELD_OUT:.0%} of it back; record at least "
-        f"{LEAST_S / HELD_OUT:.1f} s in a row under control, better 5 s at each of two speeds"
+        f"{LEAST_HELD_OUT_S / HELD_OUT:g} s in a row under control, better 5 s at each of two speeds"
     )

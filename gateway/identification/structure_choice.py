@@ -6,12 +6,14 @@ that explains nothing costs the volume of prior that it excludes. Held-out likel
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import sqrt
 
 import numpy as np
 
 from gateway.control.prediction import Stretch, Unwinder, predict
 from gateway.core.line import Line
 from gateway.core.recording import Recording
+from gateway.core.signals import FloatArray
 from gateway.core.theta import Noise
 from gateway.identification.estimate import Structure
 from gateway.identification.prediction_error import Fit, fit, fit_stretches, score, stretches_of
@@ -21,6 +23,7 @@ SHARED = (
     Structure(), Structure(coulomb=True), Structure(torque_lag=True), Structure(coulomb=True, torque_lag=True)
 )  # fmt: skip
 ENOUGH = 3.0  #: log evidence, 20 to 1, that a richer structure needs beyond a simpler one
+SURE = 3.0  #: standard errors by which held-out data must prefer another structure
 ONE_SPEED = 1.3  #: the fastest over the slowest: less is one speed
 
 
@@ -78,7 +81,7 @@ def choose(
     candidates.append(_candidate(apart, fit_stretches(stretches, own, best.fitted.noise, start=start), held))
     candidates.sort(key=lambda candidate: -candidate.evidence)
     chosen = _chosen(candidates)
-    return Choice(candidates, chosen, _cautions(candidates, chosen, stretches))
+    return Choice(candidates, chosen, _cautions(candidates, chosen, stretches, held or []))
 
 
 def _candidate(structure: Structure, fitted: Fit, held: list[Stretch] | None) -> Candidate:
@@ -96,7 +99,9 @@ def _chosen(candidates: list[Candidate]) -> Candidate:
     return min(near, key=lambda candidate: (candidate.fitted.parameters.size, -candidate.evidence))
 
 
-def _cautions(candidates: list[Candidate], chosen: Candidate, stretches: list[Stretch]) -> list[str]:
+def _cautions(
+    candidates: list[Candidate], chosen: Candidate, stretches: list[Stretch], held: list[Stretch]
+) -> list[str]:
     found: list[str] = []
     speeds = np.abs(np.vstack([stretch.points[:, -1:] for stretch in stretches]))
     if speeds.max() < ONE_SPEED * speeds.min():
@@ -105,12 +110,18 @@ def _cautions(candidates: list[Candidate], chosen: Candidate, stretches: list[St
             f"{told}: Coulomb friction is told from viscous friction by how fast rollers settle alone; record a second"
             " speed"
         )
-    scored = [candidate for candidate in candidates if candidate.held_out is not None]
-    if scored and chosen.held_out is not None:
-        other = max(scored, key=lambda candidate: candidate.held_out or -np.inf)
-        gap = (other.held_out or 0.0) - chosen.held_out
-        if gap * sum(stretch.predictions for stretch in stretches) > ENOUGH:
-            found.append(f"held-out data prefer the structure '{other.structure}' to '{chosen.structure}'")
+    if held:
+        own = _log_likelihood(chosen, held)
+        for other in candidates:
+            gain = _log_likelihood(other, held) - own
+            if other is not chosen and gain.mean() * sqrt(len(gain)) > SURE * gain.std():
+                found.append(f"held-out data prefer the structure '{other.structure}' to '{chosen.structure}'")
     if not chosen.fitted.converged:
         found.append(f"the fit of the structure '{chosen.structure}' has not converged")
     return found
+
+
+def _log_likelihood(candidate: Candidate, held: list[Stretch]) -> FloatArray:
+    """Of every sample, (k,)."""
+    theta = candidate.fitted.parameters.theta(candidate.fitted.logs)
+    return np.concatenate([predict(theta, candidate.fitted.noise, stretch).log_likelihood for stretch in held])

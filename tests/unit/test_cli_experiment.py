@@ -118,6 +118,7 @@ def test_the_example_is_what_design_writes_today(tmp_path):
     assert written.abort.deviation_n == pytest.approx(example.abort.deviation_n, rel=0.05)
     for word in ("amplitude: 0.5 N", "dwell: 100 ms", "duration:", "speeds:", "foreseen", "it ends itself when"):
         assert word in result.output
+    line.write_text(line_template(2, "line.toml"))
     result = CliRunner().invoke(app, [*arguments, "--json", "--recipe", "velocity"])
     assert json.loads(result.output)["expected_half_widths"]["stiffness_per_length"] < 0.005
 

@@ -249,7 +249,7 @@ def test_json_is_all_of_standard_output_and_the_file_says_the_same(tmp_path: Pat
 
 
 def test_an_interruption_says_what_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def interrupted(*_: object) -> None:
+    def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr("gateway.cli.rehearse.rehearse", interrupted)
@@ -312,12 +312,13 @@ BAD_PLANT = "format = 1\nname = 'x'\nspans = 6\n[web]\nstiffnes_n = 3.0\nlength_
     [
         (
             ["--adaptations", 2, "--llm", "qwen"],
-            ["--adaptations 2", "allowed now: 0", "--llm qwen", "allowed now: off"],
+            ["--llm qwen", "allowed now: off"],
         ),
         (
             ["--scenario", "nowhere"],
             ["--scenario nowhere cannot be read", "allowed: tension, velocity, or a TOML file"],
         ),
+        (["--adaptations", 6], ["less than or equal to 5"]),
         (["--tier", "C"], ["'P', 'A',", "'A-fast', 'B'"]),
         (["--out", "/proc/r2rgate-nowhere/r.json"], ["--out /proc/r2rgate-nowhere/r.json cannot be written"]),
         (["--out", "/"], ["--out / cannot be written: it is a folder"]),
