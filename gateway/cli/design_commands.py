@@ -90,10 +90,16 @@ def _identified(line: Line, file: Path, wanted: str, data_dir: Path | None) -> L
     from gateway.supervisor.model_store import ModelsError
 
     try:
-        found = chosen(wanted, file, data_dir).model
+        choice = chosen(wanted, file, data_dir)
     except ModelsError as error:
         _refuse(f"--model: {error}")
+    found = choice.model
     reasons = reasons_against_line(found, line)
+    if choice.entry is not None and choice.entry.state == "rejected":
+        reasons.append(
+            f"{choice.name} was rejected: {choice.entry.marks[-1].reason}; allowed: another version (r2rgate models), "
+            "or the file of this one, on your own word"
+        )
     if abs(found.data.period_s - line.control.period_s) > 1e-9:
         reasons.append(
             f"its data have a period of {found.data.period_s:g} s, the line {line.control.period_s:g} s: its latency "

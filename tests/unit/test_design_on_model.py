@@ -254,6 +254,15 @@ def test_a_model_that_does_not_fit_is_refused_before_the_work(folder: Path) -> N
     assert not (folder / "c.json").exists()
 
 
+def test_a_rejected_model_is_not_designed_on(folder: Path) -> None:
+    with begin_repository(folder / "data" / "models.sqlite") as models:
+        models.mark(models.store(model(), 1.0).id, "rejected", 2.0, "innovations are not white")
+    code, _, err = design(folder, "--untuned", "--model", "newest", "--data-dir", folder / "data")
+    assert code == 2 and "version 1 was rejected: innovations are not white" in err
+    assert not (folder / "c.json").exists()
+    assert design(folder, "--untuned", "--model", folder / "model.json")[0] == 0  # on one's own word
+
+
 @pytest.mark.parametrize(("latency_s", "fits"), [(0.0095, True), (0.0131, True), (0.0201, False), (0.0085, False)])
 def test_a_configuration_for_the_dead_time_that_was_found_fits_the_line(
     latency_s: float, fits: bool, capsys: pytest.CaptureFixture[str]
