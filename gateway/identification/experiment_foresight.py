@@ -60,8 +60,10 @@ class Foresight:
         limits = line.limits
         self.low_n = limits.tension_min_n + limits.tension_margin_n  #: where tensions and set-points may go
         self.high_n = limits.tension_max_n - limits.tension_margin_n
-        #: Half of what a torque may move in a period, or a tenth of its limit.
-        self.reversal_nm = min(0.5 * limits.torque_rate_nm_per_s * self.setup.period_s, 0.1 * limits.torque_nm)
+        # Half of what a torque may move in a period, and from a twentieth to a tenth of its limit: at short periods
+        # noise alone does the half.
+        swing_nm = max(0.5 * limits.torque_rate_nm_per_s * self.setup.period_s, 0.05 * limits.torque_nm)
+        self.reversal_nm = min(swing_nm, 0.1 * limits.torque_nm)
         signs = [(0.0,) * 5, *product((-1.0, 1.0), repeat=5)]
         reached = [self._reached(one) for one in signs]
         if reached[0] is None:
