@@ -17,16 +17,18 @@ from gateway.cli.stepped_experiment import run_experiment
 from gateway.control.design import DesignRefused, DesignTask, design_lqi, design_mpc, task_of, task_on
 from gateway.core.controller import Controller
 from gateway.core.experiment import Experiment, ExperimentRefused
-from gateway.core.line import Line
+from gateway.core.line import Line, Parameter
 from gateway.core.recording import Recording
 from gateway.core.scenario import Scenario
-from gateway.core.theta import Noise
+from gateway.core.theta import Noise, Theta
 from gateway.identification.experiment_design import design_experiment
 from gateway.identification.identify import Identified, NotIdentified, identify
 from sim_plant.plant import Plant
 
 AT_EACH_SPEED_S = 5.0  #: of data, at most
 SETTLE_S = 0.5  #: that the line runs before an experiment
+LEFT_OPEN = 0.05  #: of a value that was found: what data leave open, and what drifts until the next experiment
+OF_A_ROLLER = ("radius_m", "inertia_kg_m2", "friction_nms_per_rad")
 SEEDS_APART = 1000  #: the noise of an experiment is that of no scenario
 IN_SERVICE = "lqi"  #: of a round's designs, the one under which the next round's experiment runs
 
@@ -58,6 +60,7 @@ def adapt(
     found: list[Adapted] = []
     recordings: list[Recording] = []
     in_service: Controller = design_lqi(task_of(line))
+    believed = line  #: by whose values and tolerances the next experiment is designed
     for number in range(1, rounds + 1):
         began_s = time.perf_counter()
 
@@ -66,7 +69,8 @@ def adapt(
 
         try:
             doing("experiment")
-            recordings.append(_experiment(line, in_service, plant, scenario, seed + SEEDS_APART * number))
+            experiment = _experiment(believed, in_service, scenario, number)
+            recordings.append(_recorded(line, in_service, plant, scenario, experiment, seed + SEEDS_APART * number))
             identified = identify(recordings, line, Noise(), time.perf_counter, tell=doing)
         except (NoExperiment, NotIdentified) as refused:
             reasons = refused.reasons if isinstance(refused, NotIdentified) else [str(refused)]
@@ -85,7 +89,7 @@ def adapt(
                 [(design, task) for design in designs],
             )
         )
-        in_service = _next_in_service(designs, task, in_service)
+        in_service, believed = _next_in_service(designs, task, in_service), _believing(line, estimate.theta)
     return found
 
 
@@ -99,16 +103,43 @@ def _next_in_service(designs: Sequence[Design], task: DesignTask, before: Contro
     return before
 
 
-def _experiment(line: Line, config: Controller, plant: Plant, scenario: Scenario, seed: int) -> Recording:
-    """What is recorded while the experiment that is designed for this line runs on it. Raises NoExperiment."""
-    tension_n, speed = np.array(scenario.tension_n), scenario.speed_m_per_s
+def _believing(line: Line, theta: Theta) -> Line:
+    """The line with what was found in place of its file's values, and `LEFT_OPEN` either way in place of tolerances."""
+    web = theta.web
+    each = {name: [_known(value) for value in getattr(web, name).tolist()] for name in (*OF_A_ROLLER, "length_m")}
+    rollers = [
+        roller.model_copy(update={name: each[name][i] for name in OF_A_ROLLER}) for i, roller in enumerate(line.rollers)
+    ]
+    spans = [span.model_copy(update={"length_m": each["length_m"][i]}) for i, span in enumerate(line.spans)]
+    known = line.web.model_copy(update={"stiffness_n": _known(web.stiffness_n)})
+    return line.model_copy(update={"web": known, "rollers": rollers, "spans": spans})
+
+
+def _known(value: float) -> Parameter:
+    return Parameter(value=value, tolerance=LEFT_OPEN)
+
+
+def _experiment(believed: Line, config: Controller, scenario: Scenario, seed: int) -> Experiment:
+    """For the line as it is believed to be, standing as the scenario begins. Raises NoExperiment."""
     try:
-        designed = design_experiment(line, config, tension_n=tension_n.tolist(), speed_m_per_s=speed, seed=seed)
-        loop = SteppedLoop(line, config, plant, seed)
-        loop.begin_in_production(tension_n, speed)
-        loop.step(round(SETTLE_S / line.control.period_s))
-        return run_experiment(loop, _no_longer(designed.experiment))
-    except (ExperimentRefused, CommandRefused) as refused:
+        designed = design_experiment(
+            believed, config, tension_n=scenario.tension_n, speed_m_per_s=scenario.speed_m_per_s, brief=True, seed=seed
+        )
+    except ExperimentRefused as refused:
+        raise NoExperiment(str(refused)) from refused
+    return _no_longer(designed.experiment)
+
+
+def _recorded(
+    line: Line, config: Controller, plant: Plant, scenario: Scenario, experiment: Experiment, seed: int
+) -> Recording:
+    """Raises NoExperiment where the line refuses it or it is aborted."""
+    loop = SteppedLoop(line, config, plant, seed)
+    loop.begin_in_production(np.array(scenario.tension_n), scenario.speed_m_per_s)
+    loop.step(round(SETTLE_S / line.control.period_s))
+    try:
+        return run_experiment(loop, experiment)
+    except CommandRefused as refused:
         raise NoExperiment(str(refused)) from refused
 
 

@@ -75,11 +75,13 @@ def design_experiment(
     speed_m_per_s: float | None = None,
     speeds_m_per_s: Sequence[float] | None = None,
     wanted: Wanted | None = None,
+    brief: bool = False,
     seed: int = 0,
 ) -> DesignedExperiment:
     """The experiment for a line that stands at these tensions and this speed (its first recipe's), under `config`.
 
-    `speeds_m_per_s` are those of the legs. Raises ExperimentRefused with the reason where none can be offered.
+    `speeds_m_per_s` are those of the legs. `brief`: `PREFERRED_S` at each speed, which may tell less than is wanted.
+    Raises ExperimentRefused with the reason where none can be offered.
     """
     recipe = line.recipes[0]
     base: FloatArray = np.array(recipe.tension_n if tension_n is None else tension_n, dtype=np.float64)
@@ -97,7 +99,7 @@ def design_experiment(
     while True:  # a longer experiment may go further, a smaller one takes longer
         experiment, foreseen = drawing.bounded(amplitude, dwell, speeds, duration)
         amplitude, before = max(experiment.amplitude_n), duration
-        duration = drawing.least_duration(told, amplitude, speeds)
+        duration = before if brief else drawing.least_duration(told, amplitude, speeds)
         if duration <= before:
             break
     least = drawing.least_amplitude(told, amplitude, duration)

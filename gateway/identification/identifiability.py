@@ -47,7 +47,8 @@ class Direction:
     def __str__(self) -> str:
         up = [_power(name, weight) for name, weight in self.weights.items() if weight > 0.0]
         down = [_power(name, -weight) for name, weight in self.weights.items() if weight < 0.0]
-        return (" ".join(up) or "1") + (f" / ({' '.join(down)})" if down else "")
+        under = " ".join(down)
+        return (" ".join(up) or "1") + (f" / ({under})" if len(down) > 1 else f" / {under}" if down else "")
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,69 @@
+"""Adaptation rehearsed: what an experiment on the simulated line tells, and what the designs on it are worth."""
+
+import pytest
+
+from gateway.cli.rehearse import cases_of, rehearse
+from gateway.core.scenario import Scenario
+from tests.closed_loop.recorded import demonstration_line, real_plant
+
+STEP = Scenario(
+    name="step",
+    tension_n=[30.0, 24.0],
+    speed_m_per_s=0.05,
+    tension_after_n=[30.0, 34.0],
+    change_at_s=0.3,
+    duration_s=2.0,
+)
+
+
+def plant_of_two(**tables):
+    plant = real_plant().model_copy(update={"spans": 2})
+    return plant.model_copy(
+        update={name: getattr(plant, name).model_copy(update=values) for name, values in tables.items()}
+    )
+
+
+@pytest.fixture(scope="module")
+def rehearsed():
+    """Two rounds on a line of two spans that believes S_sim while S_real is true."""
+    return rehearse(cases_of(demonstration_line(2), plant_of_two(), [STEP], None), 3, 1, designs=(), adaptations=2)
+
+
+def test_every_round_tells_the_truth_and_the_second_more_surely(rehearsed):
+    _, rounds = rehearsed
+    truth = {"stiffness_per_length": 2200.0 / 1.2, "radius_per_inertia": 0.035, "friction_per_inertia": 15.0}
+    assert [one.number for one in rounds] == [1, 2] and not any(one.refused for one in rounds)
+    assert [one.data_s for one in rounds] == pytest.approx([10.0, 20.0], rel=0.01)
+    widths = []
+    for one in rounds:
+        found = {name: one.intervals[name] for name in truth}
+        # Three times the half width: one seed, and three quantities twice.
+        assert all(abs(i.value - truth[name]) < 1.5 * (i.high - i.low) for name, i in found.items())
+        assert all(i.high - i.low < 0.03 * i.value for i in found.values())
+        assert one.valid and one.normalised_innovation == pytest.approx(1.0, abs=0.1)
+        widths.append(sum((i.high - i.low) / i.value for i in found.values()))
+    assert widths[1] < 0.85 * widths[0]
+
+
+def test_designs_on_what_was_found_are_worth_those_on_the_truth(rehearsed):
+    configurations, _ = rehearsed
+    assert [one.name for one in configurations] == [
+        "adapt1-lqi", "adapt1-mpc-observer", "adapt2-lqi", "adapt2-mpc-observer",
+    ]  # fmt: skip
+    assert [one.model for one in configurations] == 2 * ["identified-1"] + 2 * ["identified-2"]
+    from gateway.cli.rehearse_designs import DESIGNS
+
+    on_truth = [design for design in DESIGNS if design.name in ("truth-lqi", "truth-mpc-observer")]
+    best, _ = rehearse(cases_of(demonstration_line(2), plant_of_two(), [STEP], None), 3, 1, designs=on_truth)
+    rmse = {one.name: one.cases[0].rmse_n for one in best}
+    for one in configurations:
+        assert one.cases[0].unsafe_events == 0
+        assert one.cases[0].rmse_n < 1.02 * rmse[f"truth-{one.name[7:]}"]
+
+
+def test_a_line_that_tells_nothing_brings_no_model_and_no_designs():
+    frozen = plant_of_two(sensors={"tension_step_n": 5.0})  # load cells that show whole steps of 5 N
+    configurations, (only,) = rehearse(
+        cases_of(demonstration_line(2), frozen, [STEP], None), 3, 1, designs=(), adaptations=2
+    )
+    assert configurations == [] and only.refused and only.intervals == {} and only.structure is None
