@@ -2,7 +2,7 @@
 
 import os
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
 from contextlib import contextmanager
 from multiprocessing import get_context
@@ -26,6 +26,16 @@ class Workers(ProcessPoolExecutor):
     def submit(self, fn: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> Future[T]:
         with _interrupt_later():  # a process that is started here has the mask for good
             return super().submit(fn, *args, **kwargs)
+
+    def map(
+        self, fn: Callable[..., T], *iterables: Iterable[Any], timeout: float | None = None, chunksize: int = 1
+    ) -> Iterator[T]:
+        """As the executor's, but that an interruption cancels nothing here: only the pool itself may, at its end.
+
+        Work that somebody else has cancelled is what the pool trips over when its processes end.
+        """
+        futures = [self.submit(fn, *given) for given in zip(*iterables, strict=False)]
+        return (future.result(timeout) for future in futures)
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
