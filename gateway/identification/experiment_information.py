@@ -92,7 +92,7 @@ def closed_loop(config: Controller, models: list[WebModel], course: Course, setu
     state = begin
     for k, unwind in enumerate(course.unwind_speed_m_per_s.tolist()):
         states[:, k] = state
-        state = _period(plants, state, acting[:, k], np.full(plants.count, unwind), ideal.step_s)
+        state = period_ahead(plants, state, acting[:, k], np.full(plants.count, unwind), ideal.step_s)
     return Run(plants, states, acting, course.unwind_speed_m_per_s)
 
 
@@ -117,12 +117,14 @@ def sensitivities(
     n = run.plants.n
     measured = [*(i for i in range(n) if i not in draw), *range(n, 2 * n)]
     model = run.plants.model(index)
-    F, gain, root = _filter(model, state[0, :n], float(np.median(unwind)), noise, setup.period_s, measured)
+    F, gain, root = stationary_filter(model, state[0, :n], float(np.median(unwind)), noise, setup.period_s, measured)
     driven = np.stack(
         [
             (
-                _period(_moved(run.plants, index, j, FACTOR), state, _pulled(acting, j, FACTOR), unwind, setup.step_s)
-                - _period(
+                period_ahead(
+                    _moved(run.plants, index, j, FACTOR), state, _pulled(acting, j, FACTOR), unwind, setup.step_s
+                )
+                - period_ahead(
                     _moved(run.plants, index, j, -FACTOR), state, _pulled(acting, j, -FACTOR), unwind, setup.step_s
                 )
             )
@@ -158,12 +160,12 @@ def _pulled(acting_nm: FloatArray, parameter: int, by: float) -> FloatArray:
     return acting_nm - by if PARAMETERS[parameter] == "coulomb_nm" else acting_nm
 
 
-def _filter(
-    model: WebModel, tension_n: FloatArray, unwind: float, noise: Noise, period_s: float, measured: list[int]
+def stationary_filter(
+    model: WebModel, tension_n: FloatArray, unwind_m_per_s: float, noise: Noise, period_s: float, measured: list[int]
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """F (2n, 2n), the gain K (2n, m) on the innovation, and S^-1/2 (m, m)."""
+    """Kalman filter around tensions (n,): F (2n, 2n), the gain K (2n, m) on the innovation, and S^-1/2 (m, m)."""
     n = model.n
-    A, B = linearise(model, tension_n, reference_speeds(model, tension_n, unwind), unwind)
+    A, B = linearise(model, tension_n, reference_speeds(model, tension_n, unwind_m_per_s), unwind_m_per_s)
     F, _ = sampled(A, B, period_s)
     # Van Loan 1978: what white noise on the accelerations adds up to over a period.
     block = np.zeros((4 * n, 4 * n))
@@ -180,14 +182,16 @@ def _filter(
     return F, gain, root
 
 
-def _period(plants: Plants, state: FloatArray, acting_nm: FloatArray, unwind: FloatArray, step_s: float) -> FloatArray:
+def period_ahead(
+    plants: Plants, state: FloatArray, acting_nm: FloatArray, unwind_m_per_s: FloatArray, step_s: float
+) -> FloatArray:
     """States (m, 2n) a period later, with torques (m, substeps, n); plants are m, or one for all."""
     for j in range(acting_nm.shape[1]):
         torque = acting_nm[:, j]
-        k1 = _rate(plants, state, torque, unwind)
-        k2 = _rate(plants, state + 0.5 * step_s * k1, torque, unwind)
-        k3 = _rate(plants, state + 0.5 * step_s * k2, torque, unwind)
-        k4 = _rate(plants, state + step_s * k3, torque, unwind)
+        k1 = _rate(plants, state, torque, unwind_m_per_s)
+        k2 = _rate(plants, state + 0.5 * step_s * k1, torque, unwind_m_per_s)
+        k3 = _rate(plants, state + 0.5 * step_s * k2, torque, unwind_m_per_s)
+        k4 = _rate(plants, state + step_s * k3, torque, unwind_m_per_s)
         state = state + step_s / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
     return state
 

@@ -168,7 +168,7 @@ def test_what_a_tape_says_narrows_what_the_data_leave_open_and_an_offset_is_take
     assert "taken out: tension_2_n was +10.00 ms late" in out and "R = 0.035 (±0.5 %)" in out
     model = parse_model((folder / "new" / "model.json").read_bytes())
     assert [one.channel for one in model.alignment] == ["tension_2_n"] and model.alignment[0].late_s == 0.010
-    free = next(one.model for one in run[1].found.parameters if one.name == "inertia_kg_m2")  # type: ignore[union-attr]
+    free = next(one.model for one in run[1].found.parameters if one.name == "inertia_kg_m2")
     told = model.intervals["inertia_kg_m2"]
     assert told.high - told.low < 0.5 * (free.high - free.low) and told.low < 1.0 < told.high
     assert "not stored" in out and not (folder / "state").exists()

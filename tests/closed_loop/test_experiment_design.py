@@ -89,7 +89,7 @@ def test_one_step_of_the_best_fit_from_the_truth_scatters_as_the_information_say
     noise = Noise(acceleration_m_per_s1_5=5e-2 * 0.001**0.5)
     parts, told = predicted(experiment, noise=noise)
     plants = information.plants_of([S_REAL])
-    _, gain, root = information._filter(S_REAL, BASE, SPEED, noise, 0.01, list(range(12)))  # noqa: SLF001
+    _, gain, root = information.stationary_filter(S_REAL, BASE, SPEED, noise, 0.01, list(range(12)))
     scores, squares = [], []
     lead = 300  # after which the filter has forgotten how it began
     for seed in range(10):
@@ -98,7 +98,7 @@ def test_one_step_of_the_best_fit_from_the_truth_scatters_as_the_information_say
         x, score, square = y[0], 0.0, []
         for k in range(1, recording.samples):
             acting = recording.torque_nm[k - 2 if k > 1 else 0]
-            x = information._period(plants, x[None], acting[None, None], np.array([SPEED]), 0.01)[0]  # noqa: SLF001
+            x = information.period_ahead(plants, x[None], acting[None, None], np.array([SPEED]), 0.01)[0]
             whitened = root @ (y[k] - x)
             if k >= lead:
                 score = score + parts[k - lead + 1].T @ whitened

@@ -71,7 +71,7 @@ def test_coulomb_friction_changes_no_design() -> None:
 @pytest.mark.parametrize("design", [design_lqi, design_lqg])
 def test_any_identified_latency_can_be_designed_for(latency_s: float, design: object) -> None:
     task = task_on(demo(), theta_of(changed(latency_s=latency_s)))
-    found = margins(design(task), task)  # type: ignore[operator]
+    found = margins(design(task), task)
     require_margin(found)
     assert found.spectral_radius < 1.0
 

@@ -181,7 +181,7 @@ def test_a_foreign_file_is_named_and_left_as_it_is(tmp_path: Path, kind: str, be
     before = path.read_bytes()
     says = "has schema 3, this program knows 2: update" if kind == "a newer schema" else "belongs to another program"
     with pytest.raises(ModelsError, match=says):
-        begin(path)  # type: ignore[operator]
+        begin(path)
     assert path.read_bytes() == before
 
 
