@@ -5,9 +5,9 @@ the unwinder, which the line PLC drives at v0 and which is not listed. What sing
 what several tables must satisfy together stands in `line_checks`.
 """
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 Name = Annotated[str, Field(pattern=r"^[a-z0-9]([a-z0-9-]{0,30}[a-z0-9])?$")]
 Positive = Annotated[float, Field(gt=0.0)]
@@ -167,6 +167,54 @@ class Priorities(Strict):
     compute_per_s: NonNegative = 100.0
 
 
+class Gate(Strict):
+    """What a change must show before it may reach a drive, and who decides. Changed only here, by an engineer."""
+
+    autonomy: Literal["approve-all", "approve-first", "closed"] = "approve-all"
+    authors: Annotated[list[Name], Field(max_length=32)] = ["rules", "agents", "engineer"]  #: who may propose
+    proposal_max_bytes: Annotated[int, Field(ge=1024, le=16_777_216)] = 65_536
+    expiry_max_s: Positive = 86_400.0  #: a proposal stands no longer
+    cool_down_s: NonNegative = 30.0  #: from one change to the next
+    verdict_max_s: Positive = 30.0  #: no verdict in time is a refusal
+    probation_s: Positive = 30.0  #: under watch before a change is kept
+    # The model by which proposals are judged
+    innovation_low: Positive = 0.8  #: normalised innovation squared, on excited data
+    innovation_high: Positive = 1.2
+    data_max_age_s: Positive = 604_800.0
+    alignment_max_s: Positive = 0.002  #: by which a channel may tell late, as its interval has it
+    # Stability
+    decay_min_per_s: NonNegative = 0.05  #: of the slowest mode, at the vertices of what the model leaves open
+    delay_margin_min_s: Positive = 0.004  #: beyond the measured latency
+    # Simulated corners of what the model leaves open
+    corners: Annotated[int, Field(ge=8, le=1024)] = 32
+    corner_sigmas: Positive = 3.0
+    corner_least: Fraction = 0.05  #: of each parameter, either way, whatever the intervals say
+    stress_torque_lag_s: NonNegative = 0.005  #: what every simulated line has beside its model
+    stress_late_share: Annotated[float, Field(ge=0.0, le=0.5)] = 0.05  #: of commands, late by a period
+    stress_coulomb_nm: NonNegative = 2.0
+    stress_eccentricity: Annotated[float, Field(ge=0.0, le=0.05)] = 0.005  #: of the radius
+    tail_oscillation_max_n: Positive = 1.0
+    tail_error_max_n: Positive = 3.0
+    chatter_max_nm: Positive = 5.0  #: root mean square of the change of torque from period to period
+    # Improvement: by how much a metric may be worse than in service, and than the baseline
+    tolerance_share: NonNegative = 0.02
+    tolerance_n: NonNegative = 0.1  #: a floor of the same, for tracking errors
+    tolerance_settling_s: NonNegative = 0.1
+    tolerance_overshoot_pct: NonNegative = 2.0
+    # A line without an accepted model
+    first_speed_max_m_per_s: Positive = 0.02
+    first_step_max_n: Positive = 4.0
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if not self.innovation_low < 1.0 < self.innovation_high:
+            raise ValueError(
+                f"innovation_low is {self.innovation_low:g} and innovation_high {self.innovation_high:g}; allowed: "
+                "below 1 and above 1, which a true model has"
+            )
+        return self
+
+
 class Line(Strict):
     format: Annotated[int, Field(ge=1, le=1)]  #: not Literal: that takes `true` and 1.0 for 1
     site: Name
@@ -184,6 +232,7 @@ class Line(Strict):
     plc: LinePlc
     history: History = History()
     priorities: Priorities = Priorities()
+    gate: Gate = Gate()
     recipes: Annotated[list[Recipe], Field(min_length=1)]  #: the first is the one a line starts with
 
     @property

@@ -1,5 +1,8 @@
 """The commented line description that `init` writes: a demonstration line, valid as it is, to be filled in."""
 
+import json
+
+from gateway.core.line import Gate
 from gateway.core.line_template_tables import entries, parameter, table, tables
 from gateway.core.line_template_wiring import DEMONSTRATION, Wiring, wired_tables
 
@@ -27,7 +30,7 @@ def line_template(spans: int = 6, out: str = "line.toml", wiring: Wiring = DEMON
     more = {1: "", 2: " ~~span 2~~ roller 2"}.get(spans, f" ~~span 2~~ ... ~~span {spans}~~ roller {spans}")
     parts = [_HEAD.format(more=more, out=out), _line(spans), _process(spans), _web()]
     parts += [_rollers(spans), _spans(spans), *wired_tables(wiring, spans)]
-    return "\n".join([*parts, _history(), _priorities(), _recipes(spans)])
+    return "\n".join([*parts, _history(), _priorities(), _gate(), _recipes(spans)])
 
 
 def _line(spans: int) -> str:
@@ -115,6 +118,14 @@ def _priorities() -> str:
         "compute_per_s": "100.0",
     }
     return table("priorities", "Priorities", values)
+
+
+def _gate() -> str:
+    """Who decides stands open; the thresholds are there to be found, commented out at their defaults."""
+    thresholds = {key: value for key, value in Gate().model_dump(mode="json").items() if key != "autonomy"}
+    return table(
+        "gate", "Gate", {"autonomy": '"approve-all"', **{k: f"#{json.dumps(v)}" for k, v in thresholds.items()}}
+    )
 
 
 def _recipes(spans: int) -> str:

@@ -18,9 +18,12 @@ from gateway.cli.identify_result import IdentifyResult
 from gateway.cli.rehearse_result import RehearseResult
 from gateway.core.controller import ControllerConfig, parse_controller
 from gateway.core.experiment import Experiment, parse_experiment
+from gateway.core.judge_context import JudgeContext, parse_context
 from gateway.core.line_model import LineModel, parse_model
 from gateway.core.messages import Command, Event, Reply
+from gateway.core.proposal import Proposal, parse_proposal
 from gateway.core.scenario import Scenario, scenario_of
+from gateway.core.verdict import Verdict
 from sim_plant.plant import Plant, plant_of
 from tests.bench.figures import BenchResult
 
@@ -43,6 +46,9 @@ FORMATS: dict[str, tuple[TypeAdapter[Any], Callable[[bytes], object], str]] = {
     "identify": (TypeAdapter(IdentifyResult), _json(TypeAdapter(IdentifyResult)), "json"),
     "bench": (TypeAdapter(BenchResult), _json(TypeAdapter(BenchResult)), "json"),
     "experiment": (TypeAdapter(Experiment), parse_experiment, "json"),
+    "proposal": (TypeAdapter(Proposal), parse_proposal, "json"),
+    "judge-context": (TypeAdapter(JudgeContext), parse_context, "json"),
+    "verdict": (TypeAdapter(Verdict), _json(TypeAdapter(Verdict)), "json"),
     "command": (TypeAdapter(Command), _json(TypeAdapter(Command)), "json"),
     "reply": (TypeAdapter(Reply), _json(TypeAdapter(Reply)), "json"),
     "event": (TypeAdapter(Event), _json(TypeAdapter(Event)), "json"),

@@ -1,0 +1,76 @@
+"""A verdict: what every rule found of a proposal, with number, limit and margin. Accepted where every rule passes."""
+
+import hashlib
+import json
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, model_validator
+
+from gateway.core.deployment import Region
+from gateway.core.line import NonNegative, Strict
+from gateway.core.line_model import Digest, Instant
+
+Text = Annotated[str, Field(max_length=2000)]
+
+
+class RuleFinding(Strict):
+    """Of one rule. `margin` is above 0 where it passes by a number: the distance to the limit, in the rule's unit."""
+
+    rule: Annotated[str, Field(min_length=1, max_length=60)]
+    passed: bool
+    text: Text  #: for a person: what was found, where, what is allowed
+    value: float | None = None
+    limit: float | None = None
+    margin: float | None = None
+    unit: Annotated[str, Field(max_length=20)] = ""
+
+
+class ScenarioFigures(Strict):
+    """Of a simulated scenario at the model's mean. null: not settled, or the line ran away."""
+
+    scenario: Annotated[str, Field(min_length=1, max_length=60)]
+    configuration: Literal["in service", "baseline", "proposed"]
+    rmse_n: NonNegative | None
+    overshoot_pct: NonNegative | None
+    settling_s: NonNegative | None
+    effort_n2m2s: NonNegative | None
+
+
+class Verdict(Strict):
+    format: Annotated[int, Field(ge=1, le=1)]
+    proposal: Digest | None  #: null: the bytes were no proposal
+    payload: Digest  #: SHA-256 of the bytes as they came
+    context: Digest
+    line: Digest  #: SHA-256 of the line's file in its canonical form
+    kind: Literal["gains", "experiment", "model"] | None
+    seed: Annotated[int, Field(ge=0)]  #: drawn anew for each proposal
+    accepted: bool
+    findings: list[RuleFinding]  #: of the rules that decide, each
+    reported: list[RuleFinding] = []  #: beside them: S_robust, the paper's criteria
+    figures: list[ScenarioFigures] = []
+    region: Region | None = None  #: for which it was judged; null: nothing was accepted
+    judged: Instant  #: the context's `now`
+    program_version: Annotated[str, Field(min_length=1, max_length=60)]
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if not self.findings:
+            raise ValueError("findings is empty; allowed: what each rule found")
+        if self.accepted != all(finding.passed for finding in self.findings):
+            raise ValueError(f"accepted is {self.accepted}; allowed: true where every rule passed, and only there")
+        return self
+
+    @property
+    def reasons(self) -> list[str]:
+        """Against the proposal."""
+        return [finding.text for finding in self.findings if not finding.passed]
+
+
+def canonical(verdict: Verdict) -> bytes:
+    """The one byte representation of a verdict."""
+    return json.dumps(verdict.model_dump(mode="json"), sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
+
+
+def verdict_hash(verdict: Verdict) -> str:
+    """SHA-256 of the canonical bytes, in hexadecimal."""
+    return hashlib.sha256(canonical(verdict)).hexdigest()
