@@ -5,12 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from gateway.core.web_model import equilibrium_torque, reference_speeds
 from gateway.control.judged_courses import Judged
 from gateway.control.rollout import Course, Plants, Setup, plants_of_thetas
 from gateway.core.line import Gate, Line
 from gateway.core.signals import FloatArray
 from gateway.core.theta import Noise, Theta
+from gateway.core.web_model import equilibrium_torque, reference_speeds
 from safety.case import Case
 
 LONGEST_STEP_S = 0.005  #: of the integration; latencies are rounded up to whole ones

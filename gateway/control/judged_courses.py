@@ -1,4 +1,4 @@
-"""What a judged configuration is put through, and what a proposal's promises are of: steps, shaped moves, speed changes.
+"""What a judged configuration is put through, and what promises are of: steps, shaped moves, changes of speed.
 
 Set-points go between two levels around those of the line, as far apart as the region permits in one step, with a
 quarter of the step left to the limits of the set-points wherever there is room. Three courses have a name that a
