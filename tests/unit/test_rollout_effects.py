@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from gateway.control.design import DesignTask, design_lqg, design_lqi, design_mpc, design_pid
+from gateway.control.laws import make_law
 from gateway.control.mpc_linear import fallback, unconstrained
 from gateway.control.rollout import (
     Course,
@@ -22,10 +23,11 @@ from gateway.control.rollout import (
     with_effects,
 )
 from gateway.control.rollout_line import RealLine
+from gateway.control.rollout_slow import run_plant
 from gateway.core.controller_schedule import ScheduledConfig
 from gateway.core.metrics import overshoot_pct, settling_time_s
 from gateway.core.theta import Theta
-from gateway.core.web_model import equilibrium_torque, linearise, reference_speeds
+from gateway.core.web_model import linearise, reference_speeds
 from sim_plant.world import World
 from tests.unit.control_support import model
 from tests.unit.sim_effects_support import plant as truth
@@ -51,15 +53,25 @@ def real(plants, lag_s=0.005, coulomb_nm=2.0, share=0.005, latency_s=None, seed=
     )
 
 
-def several_changes(n=6, tail_s=0.5):
+def picked(plants, rows):
+    """Some of the plants: laws themselves take a thousand times as long."""
+    values = {name: value[rows] for name, value in vars(plants).items() if name != "effects"}
+    effects = plants.effects
+    if effects is not None:
+        effects = Effects(**{name: None if value is None else value[rows] for name, value in vars(effects).items()})
+    return replace(plants, **values, effects=effects)
+
+
+def several_changes(n=6, tail_s=0.4):
     base, stepped = np.full(n, 30.0), 30.0 + 14.0 * (np.arange(n) == n // 2)
-    parts = [(0.3, base, 0.01), (0.7, stepped, 0.01), (0.7, stepped, 0.05), (1.3, base, 0.01)]
+    parts = [(0.1, base, 0.01), (0.6, stepped, 0.01), (0.5, stepped, 0.05), (0.8, base, 0.01)]
     return course_through(0.01, parts, tail_s)
 
 
-def assert_alike(fast, slow, rtol=1e-9):
+def assert_alike(fast, slow, rows=slice(None), rtol=1e-9):
+    """All figures and recordings, of some `rows` of the first."""
     for name in vars(slow):
-        a, b = getattr(fast, name), getattr(slow, name)
+        a, b = getattr(fast, name)[rows], getattr(slow, name)
         if name == "settled":  # a sample on the edge of the band may fall on either side
             assert (a == b).mean() > 0.95
         else:
@@ -74,18 +86,14 @@ def scheduled(task: DesignTask):
 
 
 @pytest.mark.parametrize("design", [*LINEAR, scheduled])
-@pytest.mark.parametrize("extra_s", [None, 0.003])
-def test_the_kernel_does_what_the_laws_do_with_all_effects(design, extra_s):
-    plants = random_plants(11)
-    latency_s = None if extra_s is None else 0.01 + extra_s * np.arange(11) / 11.0
-    plants = real(plants, latency_s=latency_s)
-    setup = replace(NOISY, late_share=0.1, torque_nm=40.0)
-    fast, slow = (
-        run(design(task()), plants, several_changes(), setup, record=True) for run in (simulate, simulate_slowly)
-    )
+def test_the_kernel_does_what_the_laws_do_with_all_effects(design):
+    plants = real(random_plants(11), latency_s=0.01 + 0.0005 * np.arange(11))
+    setup, rows = replace(NOISY, substeps=2, late_share=0.1, torque_nm=40.0), [1, 10]
+    fast = simulate(design(task()), plants, several_changes(), setup, record=True)
+    slow = simulate_slowly(design(task()), picked(plants, rows), several_changes(), setup, record=True)
     assert not fast.diverged.any()
     assert (fast.torque_max_nm == 40.0).any() and (fast.torque_step_max_nm > 9.99).any()  # limits do act
-    assert_alike(fast, slow)
+    assert_alike(fast, slow, rows)
 
 
 @pytest.mark.parametrize("design", [design_lqi, design_lqg])
@@ -203,7 +211,7 @@ def test_an_eccentric_roller_moves_tensions_once_a_turn_as_linear_analysis_has_i
     basis = np.column_stack((np.cos(omega * t), np.sin(omega * t), np.ones(periods), t))[last]
     fitted = np.linalg.lstsq(basis, found.tension_n[0, last], rcond=None)[0]
     assert np.hypot(*fitted[:2]) == pytest.approx(expected, rel=2e-3)
-    assert expected[1:].min() > 0.01  # it is to be seen
+    assert expected[1:].min() > 0.005  # it is to be seen
     assert found.tail_swing_n[0, 1:] == pytest.approx(expected[1:], rel=0.02)
 
 
@@ -252,24 +260,31 @@ def test_the_tail_is_told_as_recorded():
     assert found.tail_swing_n == pytest.approx(0.5 * np.ptp(tensions, axis=1), rel=1e-9)
     assert found.tail_error_n == pytest.approx(np.abs((tensions - course.tension_n[-40:]).mean(axis=1)), rel=1e-9)
     assert found.chatter_nm == pytest.approx(np.sqrt((np.diff(torques, axis=1) ** 2).mean(axis=1)), rel=1e-9)
-    assert found.tail_swing_n.min() > 0.05 and found.chatter_nm.min() > 0.01
+    assert found.tail_swing_n.min() > 0.01 and found.chatter_nm.min() > 0.01
 
 
-def test_extremes_between_the_samples_count():
-    # Torques of 10 Nm from period to period, on a web so stiff that tension swings within one.
-    stiff = plants_of([replace(model(), stiffness_n=2e5)])
-    config, course = design_lqi(task()), several_changes()
-    found = simulate(config, stiff, course, replace(NOISY, substeps=10), record=True)
+@pytest.mark.parametrize("effects", [False, True])
+def test_extremes_between_the_samples_count(effects):
+    plants, quick = real(random_plants(1)) if effects else random_plants(1), QUIET
+    found = simulate(design_lqi(task()), plants, several_changes(), quick, record=True)
+    stepped, _ = run_plant(make_law(design_lqi(task())), plants, 0, several_changes(), quick, drawn(quick))
+    assert np.allclose(stepped[::5], found.tension_n[0], atol=1e-9)
+    assert np.allclose(found.tension_max_n[0], stepped.max(axis=0), atol=1e-9)
+    assert np.allclose(found.tail_swing_n[0], 0.5 * np.ptp(stepped[-200:], axis=0), atol=1e-9)
     assert (found.tension_max_n > found.tension_n.max(axis=1) + 1e-3).any()
+
+
+def drawn(setup, periods=200, n=6):
+    return (*setup.draw(periods, n), setup.late(periods, n))
 
 
 def test_every_change_is_settled_for_itself():
     course = several_changes()
-    assert course.changes.tolist() == [30, 100, 170, 300]
+    assert course.changes.tolist() == [10, 70, 120, 200]
     found = simulate(design_lqi(task()), real(random_plants(4), share=0.0), course, QUIET, record=True)
     for b in range(4):
         settled, beyond = np.zeros(6), np.zeros(6)
-        for begin, end in ((30, 100), (100, 170), (170, 300)):
+        for begin, end in ((10, 70), (70, 120), (120, 200)):
             part = slice(begin - 1, end)
             time_s, run, asked = 0.01 * np.arange(begin - 1, end), found.tension_n[b, part], course.tension_n[part]
             settled = np.maximum(settled, settling_time_s(time_s, run, asked, 0.01 * begin - 0.005) / 0.01)
@@ -288,14 +303,15 @@ def test_a_plant_that_runs_away_is_told_and_the_others_are_what_they_were(effect
         plants = real(plants)
     wild = replace(plants, inertia_kg_m2=plants.inertia_kg_m2 / np.where(np.arange(19) % 3 == 2, 12.0, 1.0)[:, None])
     free = replace(NOISY, torque_nm=np.inf, torque_rate_nm_per_s=np.inf)
-    fast, slow = (run(config, wild, several_changes(), free, record=True) for run in (simulate, simulate_slowly))
-    assert fast.diverged.tolist() == slow.diverged.tolist() == (np.arange(19) % 3 == 2).tolist()
+    fast, rows = simulate(config, wild, several_changes(), free, record=True), [1, 2]
+    slow = simulate_slowly(config, picked(wild, rows), several_changes(), free, record=True)
+    assert fast.diverged.tolist() == (np.arange(19) % 3 == 2).tolist() and slow.diverged.tolist() == [False, True]
     assert np.isinf(fast.tail_swing_n[fast.diverged]).all() and (fast.tension_min_n[fast.diverged] == -np.inf).all()
     assert not any(
         np.isnan(values).any() for name, values in vars(fast).items() if name not in ("tension_n", "torque_nm")
     )
     good = ~fast.diverged
-    assert np.allclose(fast.tension_n[good], slow.tension_n[good], rtol=1e-9)
+    assert np.allclose(fast.tension_n[1], slow.tension_n[0], rtol=1e-9)
     assert (fast.rmse_n[good] == simulate(config, plants, several_changes(), free).rmse_n[good]).all()
 
 
@@ -320,8 +336,8 @@ def test_effects_that_no_plant_has_are_refused(change, says):
 @pytest.mark.parametrize(
     ("course", "setup", "says"),
     [
-        (replace(several_changes(), later=(20,)), QUIET, "ascending"),
-        (replace(several_changes(), tail=301), QUIET, "tail of 301"),
+        (replace(several_changes(), later=(5,)), QUIET, "ascending"),
+        (replace(several_changes(), tail=201), QUIET, "tail of 201"),
         (several_changes(), replace(QUIET, late_share=1.5), "share of 1.5"),
     ],
 )
@@ -333,28 +349,21 @@ def test_courses_and_loops_that_cannot_be_are_refused(course, setup, says):
 
 
 def test_mpc_far_from_its_limits_is_its_unconstrained_law():
-    config, wide = design_mpc(task()), replace(NOISY, torque_rate_nm_per_s=1e5, torque_nm=200.0, late_share=0.05)
-    config = config.model_copy(update={"torque_nm": 200.0, "torque_rate_nm_per_s": 1e5, "weight_tension_limit": 0.0})
-    course = course_through(0.01, [(0.1, np.full(6, 30.0), 0.05), (0.4, np.full(6, 30.5), 0.05)], 0.1)
-    plants = real(random_plants(1))
-    slow, fast = (
-        simulate(config, plants, course, wide, record=True),
-        simulate(unconstrained(config), plants, course, wide, record=True),
-    )
-    assert np.abs(slow.tension_n - fast.tension_n).max() < 0.02 and np.ptp(fast.tension_n) > 0.4
+    wide = {"torque_nm": 500.0, "torque_rate_nm_per_s": 1e6}
+    config, plants = design_mpc(task(3)).model_copy(update=wide), real(random_plants(1, 3))
+    course = course_through(0.01, [(0.1, np.full(3, 30.0), 0.05), (0.2, np.full(3, 31.0), 0.05)], 0.1)
+    setup = replace(QUIET, late_share=0.05, **wide)
+    slow, fast = (simulate(law, plants, course, setup, record=True) for law in (config, unconstrained(config)))
+    assert_alike(fast, slow, rtol=1e-6)
+    assert np.ptp(fast.tension_n) > 0.5
 
 
 def test_mpc_without_a_solution_is_its_fallback():
-    config = design_mpc(task())
-    unsolved = config.model_copy(update={"most_iterations": 1})
-    nominal, course = (
-        plants_of([model()]),
-        course_through(0.01, [(0.1, np.full(6, 30.0), 0.05), (0.4, np.full(6, 44.0), 0.05)]),
-    )
-    law = fallback(config)
-    assert equilibrium_torque(model(), course.tension_n[0], start(nominal, course)[0][0, 6:]).max() < 60.0
-    slow, fast = (
-        simulate(unsolved, nominal, course, QUIET, record=True),
-        simulate(law, nominal, course, QUIET, record=True),
-    )
-    assert np.abs(slow.torque_nm - fast.torque_nm).max() < 1e-6
+    """A programme whose limits the line is beyond from the start, and a solver that may not begin."""
+    config = design_mpc(task(3))
+    hopeless = config.model_copy(update={"torque_nm": 0.01, "torque_rate_nm_per_s": 0.01, "most_iterations": 1})
+    course = course_through(0.01, [(0.1, np.full(3, 30.0), 0.05), (0.2, np.full(3, 44.0), 0.05)])
+    nominal = plants_of([model(3)])
+    slow, fast = (simulate(law, nominal, course, QUIET, record=True) for law in (hopeless, fallback(config)))
+    other = simulate(unconstrained(config), nominal, course, QUIET, record=True)
+    assert np.abs(slow.torque_nm - fast.torque_nm).max() < 1e-6 < np.abs(other.torque_nm - fast.torque_nm).max()
