@@ -136,7 +136,7 @@ def earlier_of(model: LineModel, line: Line) -> Earlier:
 def agreement_of(fitted: Fit) -> Agreement:
     """Of the data of a fit with its prior."""
     prior = fitted.prior
-    whiten: FloatArray = np.linalg.inv(np.linalg.cholesky(prior.covariance))
+    whiten: FloatArray = np.asarray(np.linalg.inv(np.linalg.cholesky(prior.covariance)), dtype=np.float64)
     left = whiten @ fitted.covariance @ whiten.T
     left_shares, axes = np.linalg.eigh(0.5 * (left + left.T))
     shares = 1.0 - left_shares
