@@ -205,8 +205,8 @@ def test_a_channel_that_is_late_is_found(of, context, redesigned, channel):
     given = gains(redesigned, late.context())
     found = alignment.check(case_of(given, late.context(), late))[0]
     assert not found.passed and found.value > 0.004
-    name = "tension 3" if channel == "tension_n" else "speed 3"
-    assert name in found.text
+    # A speed that is late and a torque that is early are one and the same to its roller.
+    assert found.text.startswith("tension 3" if channel == "tension_n" else ("speed 3", "torque 3"))
 
 
 def test_alignment_at_its_limit_and_data_that_do_not_tell(of, context, case, redesigned):
@@ -234,7 +234,7 @@ def test_delay_margin_at_its_limit_for_a_law_and_for_a_schedule(of, context, red
     assert stood(redesigned, delay_margin_min_s=found.value).passed
     assert not stood(redesigned, delay_margin_min_s=found.value + 5e-4).passed
     assert stood(redesigned).passed and "or more" in stood(redesigned).text
-    schedule = design_scheduled(of.task(), [0.02, 0.05], design_lqi)
+    schedule = design_scheduled(of.task(), design_lqi, [0.02, 0.05])
     assert stood(schedule).passed
     assert decay.check(case_of(gains(schedule, context), context, of))[0].passed
 
@@ -263,11 +263,11 @@ def test_corners_at_each_limit(of, context, redesigned, monkeypatch):
 
 
 def test_corners_that_nobody_could_hold_are_left_out_and_told(of, context, redesigned):
-    weak = of.line.limits.model_copy(update={"torque_nm": 26.0})
+    weak = of.line.limits.model_copy(update={"torque_nm": 27.0})
     line = of.line.model_copy(update={"limits": weak})
     case = replace(case_of(gains(redesigned, context), context, of), line=line)
     text = corners.check(case)[-1].text
-    assert "left out, because no controller holds them with 26 Nm" in text
+    assert "left out, because no controller holds them with 27 Nm" in text
     none = replace(case, line=of.line.model_copy(update={"limits": weak.model_copy(update={"torque_nm": 5.0})}))
     assert "none of 8 plants" in refused(corners.check(none))[0]
 
@@ -311,7 +311,7 @@ def test_a_promise_that_nobody_can_break(of, context, redesigned):
         return promises.check(case_of(given, context, of))
 
     assert refused(found()) == [] == refused(found(rmse_n=1e6, overshoot_pct=1e6, settling_s=1e6))
-    assert len(refused(found(rmse_n=0.0, overshoot_pct=0.0, settling_s=0.0))) == 3
+    assert len(refused(found(rmse_n=0.0, settling_s=0.0))) == 2
 
 
 def test_a_line_that_permits_no_steps_is_judged_standing(of, context, redesigned):
