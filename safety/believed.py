@@ -22,16 +22,14 @@ class Unbelievable(ValueError):
 
 def corners_of_model(model: LineModel, gate: Gate, latency_s: float, seed: int) -> list[Theta]:
     """Of the joint posterior, or of intervals taken for independent where the file has none. Raises Unbelievable."""
-    whole = model if model.posterior is not None else _of_intervals(model)
+    whole = model.model_copy(update={"posterior": posterior_of(model)})
     found = corners(whole, gate.corner_sigmas, gate.corner_least, gate.corners, seed)
     return [replace(theta, latency_s=latency_s) for theta in found]
 
 
 def stated(model: LineModel) -> tuple[list[str], FloatArray]:
     """Names, and the covariance (k, k) of their logarithms, as the model states them. Raises Unbelievable."""
-    posterior = model.posterior or _of_intervals(model).posterior
-    if posterior is None:
-        raise Unbelievable("the model does not say how sure it is")
+    posterior = posterior_of(model)
     return posterior.names, np.array(posterior.covariance)
 
 
@@ -66,8 +64,10 @@ def _narrowed(line: Line, share: float) -> Line:
     return line.model_copy(update={"rollers": rollers, "spans": spans, "web": web})
 
 
-def _of_intervals(model: LineModel) -> LineModel:
-    """With a posterior of independent parameters, as its intervals have them."""
+def posterior_of(model: LineModel) -> ModelPosterior:
+    """The model's, or one of independent parameters, as its intervals have them. Raises Unbelievable."""
+    if model.posterior is not None:
+        return model.posterior
     names = [name for name in model.intervals if name.split("[")[0] in PHYSICAL and model.intervals[name].low > 0.0]
     if missing := [base for base in PHYSICAL if not any(name.split("[")[0] == base for name in names)]:
         raise Unbelievable(
@@ -75,5 +75,4 @@ def _of_intervals(model: LineModel) -> LineModel:
             "may be; identify again"
         )
     spread = [(log(model.intervals[n].high) - log(model.intervals[n].low)) / (2.0 * TWO_SIDED_95) for n in names]
-    posterior = ModelPosterior(names=names, covariance=np.diag(np.square(spread)).tolist())
-    return model.model_copy(update={"posterior": posterior})
+    return ModelPosterior(names=names, covariance=np.diag(np.square(spread)).tolist())

@@ -7,11 +7,9 @@ from typing import Literal
 import numpy as np
 
 from gateway.control.judged_courses import improvement_courses, way_of_moves
-from gateway.control.mpc_linear import unconstrained
 from gateway.control.rollout import Course, Rollouts, Setup, plants_of_thetas, simulate
 from gateway.control.shaped_run import Way, follow
 from gateway.core.controller import Controller
-from gateway.core.controller_laws import MpcConfig
 from gateway.core.signals import FloatArray
 from gateway.core.theta import Noise
 from gateway.core.verdict import ScenarioFigures
@@ -36,20 +34,18 @@ Performance = dict[str, Figures]  #: by the name of the course
 
 
 def performance(config: Controller, case: Case) -> Performance:
-    """RMSE and effort under the model's noise; overshoot and settling without, where they are no matter of luck.
-
-    A predictive controller is taken for the law that it is where no limit is reached.
-    """
-    law = unconstrained(config) if isinstance(config, MpcConfig) else config
+    """RMSE and effort under the model's noise; overshoot and settling without, where they are no matter of luck."""
     noisy = setup_of(case.line, case.noise, case.seed, 0.0)
     quiet = setup_of(case.line, QUIET, case.seed, 0.0)
     plants, judged = plants_of_thetas([case.believed]), judged_of(case)
     found = {
-        name: _figures(simulate(law, plants, course, noisy), simulate(law, plants, course, quiet), course, noisy, case)
+        name: _figures(
+            simulate(config, plants, course, noisy), simulate(config, plants, course, quiet), course, noisy, case
+        )
         for name, course in improvement_courses(judged).items()
     }
     way = way_of_moves(judged)
-    return found if way is None else found | {"moves": _moved(follow(law, plants, way, quiet), way, quiet, case)}
+    return found if way is None else found | {"moves": _moved(follow(config, plants, way, quiet), way, quiet, case)}
 
 
 def _moved(tensions: FloatArray, way: Way, setup: Setup, case: Case) -> Figures:

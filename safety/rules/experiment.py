@@ -7,7 +7,6 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from gateway.control.mpc_linear import unconstrained
 from gateway.control.prediction import Unpredictable
 from gateway.control.rollout import Course
 from gateway.core.controller_laws import MpcConfig
@@ -23,6 +22,7 @@ from safety.simulated import holdable, stressed
 
 RULE, LIMITS_RULE, ABORT_RULE = "experiment", "experiment: limits", "experiment: abort"
 LEG_S = 8.0  #: of a leg are simulated; what comes after is more of the same
+CORNERS_MPC, LEG_MPC_S = 4, 2.5  #: with a predictive controller, which takes a millisecond a period
 
 
 def check_limits(case: Case) -> list[RuleFinding]:
@@ -53,9 +53,9 @@ def check_corners(case: Case) -> list[RuleFinding]:
     kept = holdable([stressed(theta, case.line.gate) for theta in plants], asked, case.line.limits.torque_nm)
     if not kept:
         return [told(RULE, False, f"none of {len(plants)} {where} is held by the torque at these speeds: go slower")]
-    config = case.context.in_service
-    law = unconstrained(config) if isinstance(config, MpcConfig) else config
-    found = rollouts(case.line, law, kept, asked, case.noise, case.seed)
+    if isinstance(case.context.in_service, MpcConfig):
+        kept = kept[:CORNERS_MPC]
+    found = rollouts(case.line, case.context.in_service, kept, asked, case.noise, case.seed)
     lowest, highest = float(found.tension_min_n.min()), float(found.tension_max_n.max())
     deviation = max(
         float((case.tension_n - found.tension_min_n).max()), float((found.tension_max_n - case.tension_n).max())
@@ -80,18 +80,22 @@ def check_corners(case: Case) -> list[RuleFinding]:
 
 def _plants(case: Case) -> tuple[list[Theta], str]:
     """Corners of the accepted model where recent data bear it out, else of the line's file."""
-    if case.context.model is not None:
-        try:
-            if all(finding.passed for finding in check_validity(case)):
-                return case.corners, "corners of the accepted model"
-        except (Unpredictable, ValueError, ArithmeticError):
-            pass  # a model that cannot be looked at is none that may be believed
+    if not case.first and _borne_out(case):
+        return case.corners, "corners of the accepted model"
     return prior_corners(case.line, case.latency_s, case.seed), "corners of the line's file"
+
+
+def _borne_out(case: Case) -> bool:
+    try:
+        return all(finding.passed for finding in check_validity(case))
+    except (Unpredictable, ValueError, ArithmeticError):
+        return False  # a model that cannot be looked at is none that may be believed
 
 
 def _course(case: Case, experiment: Experiment) -> Course:
     """Its begin of each leg, with the way from speed to speed at the line's rate."""
-    legs = [leg.model_copy(update={"duration_s": min(leg.duration_s, LEG_S)}) for leg in experiment.legs]
+    most_s = LEG_MPC_S if isinstance(case.context.in_service, MpcConfig) else LEG_S
+    legs = [leg.model_copy(update={"duration_s": min(leg.duration_s, most_s)}) for leg in experiment.legs]
     shorter = experiment.model_copy(update={"legs": legs})
     state, period_s = case.context.state, case.line.control.period_s
     asked = list(course(shorter, case.tension_n, state.speed_m_per_s, period_s))

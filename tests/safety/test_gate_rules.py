@@ -6,7 +6,8 @@ from math import inf, nan
 import numpy as np
 import pytest
 
-from gateway.control.design import MpcWeights, design_lqi, design_mpc, design_scheduled, task_of
+from gateway.control.design import MpcWeights, design_lqg, design_lqi, design_mpc, design_scheduled, task_of
+from gateway.control.judged_courses import corner_courses
 from gateway.control.rollout import Rollouts
 from gateway.core.line import Span
 from gateway.core.proposal import proposal_hash
@@ -14,6 +15,7 @@ from safety.believed import Unbelievable, corners_of_model, stated
 from safety.case import Case
 from safety.excitation import excited_parts, newest, recent, same_speed
 from safety.findings import at_least, at_most, told
+from safety.judge import warm_up
 from safety.rules import (
     alignment,
     authority,
@@ -29,11 +31,13 @@ from safety.rules import (
     model_data,
     model_fits,
     model_likelihood,
+    paper,
     promises,
     validity,
 )
 from safety.rules.corners import Worst
-from tests.safety.case_support import CREATED, EXPIRES, NOW, case_of, gains, proposal, published, refused
+from safety.simulated import holdable, judged_of, stressed
+from tests.safety.case_support import EXPIRES, NOW, case_of, gains, proposal, published, refused
 
 
 @pytest.fixture(scope="module")
@@ -263,13 +267,21 @@ def test_corners_at_each_limit(of, context, redesigned, monkeypatch):
 
 
 def test_corners_that_nobody_could_hold_are_left_out_and_told(of, context, redesigned):
-    weak = of.line.limits.model_copy(update={"torque_nm": 27.0})
-    line = of.line.model_copy(update={"limits": weak})
-    case = replace(case_of(gains(redesigned, context), context, of), line=line)
-    text = corners.check(case)[-1].text
-    assert "left out, because no controller holds them with 27 Nm" in text
-    none = replace(case, line=of.line.model_copy(update={"limits": weak.model_copy(update={"torque_nm": 5.0})}))
-    assert "none of 8 plants" in refused(corners.check(none))[0]
+    case = case_of(gains(redesigned, context), context, of)
+    plants, courses = [stressed(theta, of.line.gate) for theta in case.corners], corner_courses(judged_of(case))
+
+    def kept(torque_nm):
+        return [len(holdable(plants, course, torque_nm)) for course in courses.values()]
+
+    some_nm = next(torque for torque in np.arange(20.0, 40.0, 0.02).tolist() if min(kept(torque)) > 0)
+    assert min(kept(some_nm)) < 8
+    weak = of.line.limits.model_copy(update={"torque_nm": some_nm})
+    text = corners.check(replace(case, line=of.line.model_copy(update={"limits": weak})))[-1].text
+    assert "left out, because no controller holds them with 2" in text
+    none = of.line.limits.model_copy(update={"torque_nm": 5.0})
+    assert (
+        "none of 8 plants" in refused(corners.check(replace(case, line=of.line.model_copy(update={"limits": none}))))[0]
+    )
 
 
 def test_a_predictive_controller_runs_whole_on_some_corners_and_says_what_is_lost(of, context, monkeypatch):
@@ -278,12 +290,13 @@ def test_a_predictive_controller_runs_whole_on_some_corners_and_says_what_is_los
 
     def slowly(config, plants, course, setup):
         whole.append(plants.count)
-        return corners.simulate(corners.unconstrained(config), plants, course, setup)
+        return corners.simulate(design_lqi(of.task()), plants, course, setup)
 
     monkeypatch.setattr(corners, "simulate_slowly", slowly)
     found = corners.check(case_of(gains(mpc, context), context, of))
-    assert sorted(whole) == [1, 2]
+    assert whole == [4] * 4
     assert found[-1].rule == "corners: what is lost"
+    assert refused(found) == []
 
 
 def test_improvement_at_each_tolerance(of):
@@ -325,8 +338,6 @@ def test_a_line_that_permits_no_steps_is_judged_standing(of, context, redesigned
 def test_spans_without_a_load_cell_keep_their_set_point(of, context, case):
     spans = [span if i else Span(name=span.name, length_m=span.length_m, control="draw")
              for i, span in enumerate(of.line.spans)]  # fmt: skip
-    from safety.simulated import judged_of
-
     low, high = judged_of(replace(case, line=of.line.model_copy(update={"spans": spans}))).levels()
     assert low[0] == high[0] == context.state.tension_n[0] and (high[1:] - low[1:] == 24.0).all()
 
@@ -461,5 +472,47 @@ def test_an_experiment_on_a_model_that_cannot_be_looked_at_is_judged_on_the_line
     assert "corners of the line's file" in experiment.check_corners(case)[0].text
 
 
-def test_created_is_before_now():
-    assert CREATED < NOW < EXPIRES
+def test_corners_that_torque_does_not_hold_leave_the_papers_criterion_open(of, context, case):
+    weak = of.line.model_copy(update={"limits": of.line.limits.model_copy(update={"torque_nm": 5.0})})
+    assert any("no corner is held" in text for text in refused(paper.check(replace(case, line=weak))))
+
+
+def test_gains_without_end_have_no_decay(of, context):
+    lqg = design_lqg(of.task())
+    inputs = [(1e200 * np.array(matrix)).tolist() for matrix in lqg.predictor.inputs]
+    endless = lqg.model_copy(
+        update={
+            "gain_state": (1e200 * np.array(lqg.gain_state)).tolist(),
+            "predictor": lqg.predictor.model_copy(update={"inputs": inputs}),
+        }
+    )
+    with np.errstate(all="ignore"):
+        found = decay.check(case_of(gains(endless, context), context, of))[0]
+    assert not found.passed and found.value is None
+
+
+def test_an_experiment_where_recent_data_speak_against_the_model_is_judged_on_the_lines_file(of, context):
+    stiff = of.model.parameters.model_copy(update={"friction_nms_per_rad": [12.0] * 6})
+    now = context.model_copy(update={"model": of.model.model_copy(update={"parameters": stiff})})
+    small = {
+        "format": 1, "amplitude_n": [1.0] * 6, "dwell_s": 0.1, "legs": [{"duration_s": 1.0}],
+        "abort": {"deviation_n": 8.0},
+    }  # fmt: skip
+    case = case_of(proposal({"kind": "experiment", "experiment": small}, context), now, of)
+    assert "corners of the line's file" in experiment.check_corners(case)[0].text
+
+
+def test_set_points_of_another_number_than_spans_are_no_place_to_judge_from(of, context, redesigned):
+    case = case_of(gains(redesigned, context), with_state(context, tension_n=[30.0]), of)
+    with pytest.raises(ValueError, match="state.tension_n has 1 entries"):
+        _ = case.tension_n
+
+
+def test_parts_at_one_speed_are_judged_together(of, context, redesigned):
+    twice = of.context(data=[*context.data, *context.data])
+    found = validity.check(case_of(gains(redesigned, context), twice, of))
+    assert len(found) == 2 and "over 5.2 s" in found[0].text
+
+
+def test_a_judge_that_is_warm_has_compiled_what_it_needs(of):
+    warm_up(of.line)
