@@ -21,6 +21,7 @@ from safety.believed import corners_of_model, prior_corners
 from safety.excitation import Excited, excited_parts, recent
 
 T = TypeVar("T")
+NOISIER = 1.1
 NEAR_M_PER_S = 1e-3  #: above the speed of data: a measured mean is not the round number that was asked for
 
 
@@ -89,6 +90,19 @@ class Case:
         """The accepted model's; what is expected of any line where it says nothing."""
         model = self.context.model
         return Noise() if model is None else noise_of(model) or Noise()
+
+    @cached_property
+    def stress_noise(self) -> Noise:
+        """For simulations under stress: the greater of the model's and what is expected, and a tenth more.
+
+        Seconds of data tell a noise to some 5 to 10 %, and chatter grows with it.
+        """
+        expected, own = Noise(), self.noise
+        return Noise(
+            NOISIER * max(expected.tension_n, own.tension_n),
+            NOISIER * max(expected.speed_m_per_s, own.speed_m_per_s),
+            NOISIER * max(expected.acceleration_m_per_s1_5, own.acceleration_m_per_s1_5),
+        )
 
     @cached_property
     def corners(self) -> list[Theta]:

@@ -65,7 +65,7 @@ def check(case: Case) -> list[RuleFinding]:
 def _of_law(case: Case, config: Controller, kept: dict[str, list[Theta]], courses: Courses) -> Worst:
     worst = Worst()
     for name, course in courses.items():
-        worst.take(rollouts(case.line, config, kept[name], course, case.noise, case.seed), name)
+        worst.take(rollouts(case.line, config, kept[name], course, case.stress_noise, case.seed), name)
     return worst
 
 
@@ -78,10 +78,10 @@ def _of_mpc(case: Case, config: MpcConfig, kept: dict[str, list[Theta]]) -> Wors
         speed_step_m_per_s=min(judged.speed_step_m_per_s, SMALL_STEP_M_PER_S),
     )
     for name, course in corner_courses(small).items():
-        found = rollouts(case.line, unconstrained(config), kept[name], course, case.noise, case.seed)
+        found = rollouts(case.line, unconstrained(config), kept[name], course, case.stress_noise, case.seed)
         worst.take(found, f"{name}, small")
         badness[name] = found.tail_swing_n.max(axis=1) + found.chatter_nm.max(axis=1) + found.beyond_n.max(axis=1)
-    setup = setup_of(case.line, case.noise, case.seed, case.line.gate.stress_late_share)
+    setup = setup_of(case.line, case.stress_noise, case.seed, case.line.gate.stress_late_share)
     for name, course in corner_courses(judged, WHOLE_LASTING_S, WHOLE_TAIL_S).items():
         order: list[int] = np.argsort(np.nan_to_num(badness[name], nan=inf))[::-1][:WHOLE_MPC].tolist()
         plants = plants_under_stress([kept[name][i] for i in order], case.line.gate, case.seed)

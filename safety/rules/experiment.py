@@ -55,7 +55,7 @@ def check_corners(case: Case) -> list[RuleFinding]:
         return [told(RULE, False, f"none of {len(plants)} {where} is held by the torque at these speeds: go slower")]
     if isinstance(case.context.in_service, MpcConfig):
         kept = kept[:CORNERS_MPC]
-    found = rollouts(case.line, case.context.in_service, kept, asked, case.noise, case.seed)
+    found = rollouts(case.line, case.context.in_service, kept, asked, case.stress_noise, case.seed)
     lowest, highest = float(found.tension_min_n.min()), float(found.tension_max_n.max())
     deviation = max(
         float((case.tension_n - found.tension_min_n).max()), float((found.tension_max_n - case.tension_n).max())
