@@ -139,6 +139,11 @@ class Case:
         """Spans (from 0) without a load cell."""
         return [i for i, span in enumerate(self.line.spans) if span.control == "draw"]
 
+    @property
+    def tension_spans(self) -> list[int]:
+        """The others. A draw span's tension follows from what its web is like: no controller keeps it."""
+        return [i for i, span in enumerate(self.line.spans) if span.control == "tension"]
+
     @cached_property
     def speed_max_m_per_s(self) -> float:
         """Up to which the change is judged, and which the verdict's region carries."""

@@ -50,7 +50,7 @@ def performance(config: Controller, case: Case) -> Performance:
 
 def _moved(tensions: FloatArray, way: Way, setup: Setup, case: Case) -> Figures:
     """The tracking error of a shaped move: what else there is to know, steps tell."""
-    spans = [i for i in range(case.line.n) if i not in case.draw_spans]
+    spans = case.tension_spans
     error: FloatArray = (tensions - way.course(setup.period_s).tension_n)[:, spans]
     return Figures(_sound(float(np.sqrt(np.sum(error**2) / len(error)))), 0.0, 0.0, 0.0)
 
@@ -86,7 +86,7 @@ def _performances(case: Case) -> dict[Whose, Performance]:
 
 
 def _figures(noisy: Rollouts, quiet: Rollouts, course: Course, setup: Setup, case: Case) -> Figures:
-    spans = [i for i in range(case.line.n) if i not in case.draw_spans]
+    spans = case.tension_spans
     scale = _scale(course)[spans]
     return Figures(
         rmse_n=_sound(float(np.sqrt(noisy.squared_error_n2[0, spans].sum()))),

@@ -41,12 +41,12 @@ class Worst:
     error_n: tuple[float, str] = (-inf, "")
     chatter_nm: tuple[float, str] = (-inf, "")
 
-    def take(self, found: Rollouts, name: str) -> None:
-        """A course's rollouts. What is no number is the worst there is."""
+    def take(self, found: Rollouts, name: str, spans: list[int]) -> None:
+        """A course's rollouts; the tensions of `spans` should stand. What is no number is the worst there is."""
         self.lowest_n = min(self.lowest_n, (-_greatest(-found.tension_min_n), name))
         self.highest_n = max(self.highest_n, (_greatest(found.tension_max_n), name))
-        self.swing_n = max(self.swing_n, (_greatest(found.tail_swing_n), name))
-        self.error_n = max(self.error_n, (_greatest(found.tail_error_n), name))
+        self.swing_n = max(self.swing_n, (_greatest(found.tail_swing_n[:, spans]), name))
+        self.error_n = max(self.error_n, (_greatest(found.tail_error_n[:, spans]), name))
         self.chatter_nm = max(self.chatter_nm, (_greatest(found.chatter_nm), name))
 
 
@@ -65,7 +65,9 @@ def check(case: Case) -> list[RuleFinding]:
 def _of_law(case: Case, config: Controller, kept: dict[str, list[Theta]], courses: Courses) -> Worst:
     worst = Worst()
     for name, course in courses.items():
-        worst.take(rollouts(case.line, config, kept[name], course, case.stress_noise, case.seed), name)
+        worst.take(
+            rollouts(case.line, config, kept[name], course, case.stress_noise, case.seed), name, case.tension_spans
+        )
     return worst
 
 
@@ -79,13 +81,13 @@ def _of_mpc(case: Case, config: MpcConfig, kept: dict[str, list[Theta]]) -> Wors
     )
     for name, course in corner_courses(small).items():
         found = rollouts(case.line, unconstrained(config), kept[name], course, case.stress_noise, case.seed)
-        worst.take(found, f"{name}, small")
+        worst.take(found, f"{name}, small", case.tension_spans)
         badness[name] = found.tail_swing_n.max(axis=1) + found.chatter_nm.max(axis=1) + found.beyond_n.max(axis=1)
     setup = setup_of(case.line, case.stress_noise, case.seed, case.line.gate.stress_late_share)
     for name, course in corner_courses(judged, WHOLE_LASTING_S, WHOLE_TAIL_S).items():
         order: list[int] = np.argsort(np.nan_to_num(badness[name], nan=inf))[::-1][:WHOLE_MPC].tolist()
         plants = plants_under_stress([kept[name][i] for i in order], case.line.gate, case.seed)
-        worst.take(simulate_slowly(config, plants, course, setup), name)
+        worst.take(simulate_slowly(config, plants, course, setup), name, case.tension_spans)
     return worst
 
 

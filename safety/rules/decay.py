@@ -26,15 +26,24 @@ def check(case: Case) -> list[RuleFinding]:
     judged = judged_of(case)
     speeds = sorted({judged.slow_m_per_s, judged.fast_m_per_s})
     thetas = [case.believed, *case.corners[:LOOKED_AT]]
-    rates = [(decay_per_s(case.controller, case, theta, speed), speed) for theta in thetas for speed in speeds]
-    rate, speed = min(rates)
-    least = case.line.gate.decay_min_per_s
+    found = [
+        (decay_per_s(case.controller, case, theta, speed), _least(case, theta, speed), speed)
+        for theta in thetas
+        for speed in speeds
+    ]
+    rate, least, speed = min(found, key=lambda each: each[0] - each[1])
     what = f"the slowest mode decays at {rate:.3g} 1/s" if rate > 0.0 else "the loop is unstable"
     text = (
-        f"{what} at {speed:g} m/s on the worst of {len(thetas)} plants that the line may be; allowed: "
-        f"gate.decay_min_per_s, {least:g} 1/s, and more"
+        f"{what} at {speed:g} m/s on the worst of {len(thetas)} plants that the line may be; allowed: {least:.3g} 1/s "
+        f"and more (gate.decay_min_per_s{', or half of what a draw span has by itself' if case.draw_spans else ''})"
     )
     return [at_least(RULE, rate, least, "1/s", text)]
+
+
+def _least(case: Case, theta: Theta, speed_m_per_s: float) -> float:
+    """A draw span's tension decays with its length over the speed, whatever the controller does."""
+    own = [speed_m_per_s / theta.web.length_m[i] for i in case.draw_spans]
+    return min([case.line.gate.decay_min_per_s, *(0.5 * float(rate) for rate in own)])
 
 
 def decay_per_s(config: Controller, case: Case, theta: Theta, speed_m_per_s: float, extra_s: float = 0.0) -> float:

@@ -37,7 +37,7 @@ from safety.rules import (
 )
 from safety.rules.corners import Worst
 from safety.simulated import holdable, judged_of, stressed
-from tests.safety.case_support import EXPIRES, NOW, case_of, gains, proposal, published, refused
+from tests.safety.case_support import EXPIRES, NOW, case_of, gains, proposal, published, refused, verdict_of
 
 
 @pytest.fixture(scope="module")
@@ -445,7 +445,7 @@ def test_the_worst_over_corners_knows_where_it_was():
     one = np.ones((1, 2))
     for name, swing in (("first", 0.5), ("second", 0.7)):
         worst.take(Rollouts(one, 3 * one, 9 * one, one, one, one, one, one, tail_swing_n=swing * one,
-                            tail_error_n=one, chatter_nm=one), name)  # fmt: skip
+                            tail_error_n=one, chatter_nm=one), name, [0, 1])  # fmt: skip
     assert worst.swing_n == (0.7, "second") and worst.lowest_n[0] == 3.0
 
 
@@ -508,3 +508,11 @@ def test_parts_at_one_speed_are_judged_together(of, context, redesigned):
 
 def test_a_judge_that_is_warm_has_compiled_what_it_needs(of):
     warm_up(of.line)
+
+
+def test_a_line_with_a_draw_span_takes_its_first_configuration(of):
+    spans = [span.model_copy(update={"control": "draw"}) if i == 2 else span for i, span in enumerate(of.line.spans)]
+    drawn = replace(of, line=of.line.model_copy(update={"spans": spans}))
+    context = drawn.context(model=None, data=[])
+    verdict = verdict_of(gains(context.in_service, context), context, drawn)
+    assert verdict.accepted, verdict.reasons
