@@ -21,7 +21,7 @@ from safety.believed import corners_of_model, prior_corners
 from safety.excitation import Excited, excited_parts, recent
 
 T = TypeVar("T")
-NOISIER = 1.1
+NOISIER = 1.2
 NEAR_M_PER_S = 1e-3  #: above the speed of data: a measured mean is not the round number that was asked for
 
 
@@ -93,9 +93,10 @@ class Case:
 
     @cached_property
     def stress_noise(self) -> Noise:
-        """For simulations under stress: the greater of the model's and what is expected, and a tenth more.
+        """For simulations under stress: the greater of the model's and what is expected, and a fifth more.
 
-        Seconds of data tell a noise to some 5 to 10 %, and chatter grows with it.
+        Chatter grows with it. Seconds of data tell a noise to some 5 %, and over a tail of 1.5 s the root mean square
+        itself is known to 6 %: at 1.1 a law passed whose chatter on its plant was 5.07 Nm.
         """
         expected, own = Noise(), self.noise
         return Noise(
