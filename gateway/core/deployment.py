@@ -1,0 +1,100 @@
+"""A controller's way onto a running line: what is deployed, for what it was judged, and what is in service.
+
+The gateway deploys, the loop decides: it takes a deployment only as the successor of the last one, keeps it on
+probation for as long as the lease is renewed, and goes back to the last known good by itself.
+"""
+
+from itertools import pairwise
+from typing import Annotated, Self
+
+from pydantic import Field, model_validator
+
+from gateway.core.controller import ControllerConfig
+from gateway.core.controller_laws import Matrix, Vector
+from gateway.core.line import NonNegative, Positive, Strict
+
+Hash = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]  #: `controller.config_hash`
+Epoch = Annotated[int, Field(ge=1, le=2**53)]  #: of deployments, one after the other, also over restarts
+LONGEST_LEASE_S = 60.0
+
+
+class Region(Strict):
+    """What a configuration has been judged for. None: as far as the line's own limits."""
+
+    speed_max_m_per_s: Positive | None = None
+    tension_step_max_n: NonNegative | None = None
+    speed_step_max_m_per_s: NonNegative | None = None
+
+
+class RecoveryNode(Strict):
+    """The accepted model, sampled and linear, at one speed of the unwinder: x = [T_1 .. T_n; v_1 .. v_n] in N and m/s.
+
+    x_{k+1} = transition x_k + sum_j inputs[j] u_{k-j} + constant, u_{k-j} the torque (Nm) computed j periods ago
+    """
+
+    speed_m_per_s: NonNegative
+    transition: Matrix  #: (2n, 2n)
+    inputs: Annotated[list[Matrix], Field(min_length=1)]  #: (2n, n) each
+    constant: Vector  #: (2n,)
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        states = len(self.constant)
+        shapes = {"transition": (self.transition, states)} | {
+            f"inputs[{j}]": (matrix, states // 2) for j, matrix in enumerate(self.inputs)
+        }
+        for name, (matrix, columns) in shapes.items():
+            if states % 2 or len(matrix) != states or {len(row) for row in matrix} != {columns}:
+                raise ValueError(f"{name} must be {(states, columns)} beside a constant of {states} values")
+        return self
+
+
+class RecoveryPrediction(Strict):
+    """Whether a fallback configuration would still recover the line, from any state: what the loop computes it from."""
+
+    fallback: Hash  #: the configuration that is switched to; the one in service itself: then the line stops
+    period_s: Positive
+    horizon_s: Positive  #: that is looked ahead
+    margin_n: NonNegative  #: that tensions must keep from their limits, or from nearer set-points as much as these do
+    nodes: Annotated[list[RecoveryNode], Field(min_length=1)]  #: by ascending speed; the nearest one is used
+
+    @property
+    def n(self) -> int:
+        return len(self.nodes[0].constant) // 2
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        speeds = [node.speed_m_per_s for node in self.nodes]
+        if any(low >= high for low, high in pairwise(speeds)):
+            raise ValueError(f"speeds of the nodes are {speeds}; allowed: ascending")
+        if len({(len(node.constant), len(node.inputs)) for node in self.nodes}) > 1:
+            raise ValueError("nodes of different lines: all have as many states and inputs")
+        if self.horizon_s < self.period_s:
+            raise ValueError(f"horizon_s {self.horizon_s:g} is shorter than a period of {self.period_s:g} s")
+        return self
+
+
+class Deployment(Strict):
+    """A configuration for the line that runs, on probation until it is kept."""
+
+    controller: ControllerConfig
+    hash: Hash  #: of the controller's canonical bytes
+    epoch: Epoch  #: the last one of the loop and one
+    lease_s: Annotated[float, Field(gt=0.0, le=LONGEST_LEASE_S)]  #: not renewed within it: back to the last known good
+    shaped_first: bool = True  #: on probation, set-points move shaped only, never at once
+    region: Region = Region()
+    watch: RecoveryPrediction | None = None  #: None: no model has been accepted, and nothing is predicted
+
+
+class InService(Strict):
+    """What controls the line, and how it came to."""
+
+    hash: Hash
+    kind: str  #: of the controller
+    epoch: Annotated[int, Field(ge=0)]  #: the last that was taken, whatever became of it; 0: none yet
+    on_probation: bool
+    lease_left_s: float | None = None  #: None: not on probation
+    last_known_good: Hash
+    region: Region
+    watched: bool  #: a recovery prediction looks after it
+    why: str  #: "start", "deployed", "kept", or "rolled back: .."
