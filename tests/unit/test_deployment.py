@@ -11,6 +11,7 @@ from pydantic import ValidationError
 
 from gateway.control.design import design_lqg, design_lqi, task_of
 from gateway.core.controller import config_hash
+from gateway.core.controller_laws import Feedforward
 from gateway.core.deployment import Deployment, RecoveryNode, RecoveryPrediction, Region
 from gateway.core.line_file import load_line
 from gateway.core.line_template import line_template
@@ -38,23 +39,22 @@ def deployment(spans=6, design=design_lqi, **changes):
 
 def node(n=2, speed_m_per_s=0.1):
     return RecoveryNode(
-        speed_m_per_s=speed_m_per_s,
-        transition=np.eye(2 * n).tolist(),
-        inputs=[np.eye(2 * n, n).tolist()] * 2,
-        constant=[0.0] * (2 * n),
+        speed_m_per_s=speed_m_per_s, transition=np.eye(2 * n).tolist(), inputs=[np.eye(2 * n, n).tolist()] * 2
     )
 
 
-def prediction(**changes):
-    given = {"fallback": "0" * 64, "period_s": 0.01, "horizon_s": 0.6, "margin_n": 6.0, "nodes": [node()]}
-    return RecoveryPrediction(**(given | changes))
+def prediction(n=2, **changes):
+    each = [0.1] * n
+    model = Feedforward(stiffness_n=2400.0, length_m=each, radius_m=each, inertia_kg_m2=each, friction_nms_per_rad=each)
+    given = {"fallback": "0" * 64, "period_s": 0.01, "horizon_s": 0.6, "margin_n": 6.0, "nodes": [node(n)]}
+    return RecoveryPrediction(**(given | {"model": model, "coulomb_nm": [0.0] * n} | changes))
 
 
 @pytest.mark.parametrize(
     ("spans", "design"), [(1, design_lqi), (6, design_lqi), (6, design_lqg), (20, design_lqg), (60, design_lqi)]
 )
 def test_a_deployment_arrives_as_it_was_sent_within_the_mailboxs_limit(spans, design):
-    command = Deploy(deployment=deployment(spans, design, watch=prediction(nodes=[node(spans)])))
+    command = Deploy(deployment=deployment(spans, design, watch=prediction(spans)))
     sent = command_bytes(command)
     assert len(sent) <= MAX_PAYLOAD
     assert parse_command(sent) == command
@@ -113,15 +113,11 @@ def test_a_region_of_nothing_is_the_lines_own_limits():
     [
         ({"nodes": []}, "nodes"),
         ({"nodes": [node(speed_m_per_s=0.1), node(speed_m_per_s=0.1)]}, "ascending"),
-        ({"nodes": [node(2, 0.1), node(3, 0.2)]}, "different lines"),
+        ({"nodes": [node(3)]}, r"transition must be \(4, 4\)"),
+        ({"coulomb_nm": [0.0]}, "coulomb_nm for 2 rollers"),
         ({"horizon_s": 0.001}, "shorter than a period"),
     ],
 )
 def test_a_recovery_prediction_says_what_is_wrong(wrong, said):
     with pytest.raises(ValidationError, match=said):
         prediction(**wrong)
-
-
-def test_a_recovery_node_has_matrices_of_one_line():
-    with pytest.raises(ValidationError, match=r"inputs\[0\] must be \(4, 2\)"):
-        RecoveryNode(speed_m_per_s=0.0, transition=np.eye(4).tolist(), inputs=[np.eye(4).tolist()], constant=[0.0] * 4)
