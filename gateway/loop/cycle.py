@@ -231,8 +231,9 @@ class Cycle:
         measured = self._estimate()
         try:
             found = path.control(measured, self.setpoints, applied_nm, interval_s)
-        except LawFailed as failed:
-            if not configurations.roll_back(failed.finding.text):
+        except Exception as failed:  # whatever a law on probation may raise
+            reason = failed.finding.text if isinstance(failed, LawFailed) else f"{type(failed).__name__}: {failed}"
+            if not configurations.roll_back(f"the law failed: {reason}"):
                 raise
             return path.control(measured, self.setpoints, applied_nm, interval_s)
         if self.machine.phase not in SUPERVISED:
