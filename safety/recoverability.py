@@ -1,16 +1,21 @@
 """Would the fallback configuration still bring the line back, if it took over with the next sample?
 
 Its closed loop with the accepted model is linear until a torque meets its limit or its rate, and so one product says
-where tensions and torques go over the horizon. Only where a torque would meet a limit is the way gone step by step,
-with the limit. Pure; numpy only, for it runs in the loop.
+where tensions, speeds and torques go over the horizon. Only where a torque would meet a limit is the way gone step by
+step, with the limit. Pure; numpy only, for it runs in the loop.
 
 With x~ = x - x_eq and u~ = u - u_eq away from the model's equilibrium, u~ in flight newest first, and z what the law
 remembers (see `linear_form`), s = [x~; u~ in flight; z]:
 
     u = K s + c,    s_next = A s + B u + d
+
+where s at the next sample, c and d follow from q = [x; in flight; u; x_eq; u_eq; x_ref; u_ref] of now, and z where the
+fallback runs already, by one matrix.
 """
 
+from bisect import bisect_right
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,27 +31,39 @@ from gateway.core.controller_schedule import LinearConfig, ScheduledConfig, law_
 from gateway.core.deployment import RecoveryNode, RecoveryPrediction
 from gateway.core.line import Line
 from gateway.core.signals import FloatArray
+from safety.limits import envelope_limits
 
 CLOSELY = 10  #: periods at the beginning of which each is looked at
 STRIDE = 2  #: periods from one look to the next behind them
 NEAR_SETPOINT = 0.5  #: of what a set-point keeps from a limit, tensions may keep as well
+FAST = 0.85  #: of the roller speed at which the envelope takes torque off
 EXCUSED = 1e-6  #: of a torque's limit and rate, for rounding
 
 
 @dataclass(frozen=True, slots=True)
 class Shortfall:
-    """Where the fallback would not keep the margin: span (from 0), the tension it would come to, and when."""
+    """What the fallback would not keep: a span's tension or a roller's speed (from 0), what it comes to, and when."""
 
-    span: int
-    tension_n: float
-    allowed_n: float
+    what: str  #: "span" or "roller"
+    index: int
+    value: float  #: N or m/s
+    allowed: float
     ahead_s: float
 
     def __str__(self) -> str:
+        value, unit = (f"{self.value:.1f}", "N") if self.what == "span" else (f"{self.value:.3f}", "m/s")
         return (
-            f"span {self.span + 1} would come to {self.tension_n:.1f} N in {self.ahead_s:.2f} s if the fallback took "
-            f"over now, allowed: {self.allowed_n:.1f} N"
+            f"{self.what} {self.index + 1} would come to {value} {unit} in {self.ahead_s:.2f} s if the fallback took "
+            f"over now, allowed: {self.allowed:g} {unit}"
         )
+
+
+@dataclass(frozen=True)
+class _Way:
+    """From q (with z behind it where the fallback runs already): where everything goes."""
+
+    begin: FloatArray  #: (2 s + n, q), [s; d; c]
+    looks: FloatArray  #: (k 3n, q), tensions, speeds and torques asked for, at each look
 
 
 @dataclass(frozen=True)
@@ -56,10 +73,8 @@ class _Loop:
     A: FloatArray  #: (s, s), without control
     B: FloatArray  #: (s, n)
     K: FloatArray  #: (n, s)
-    form: LinearForm
-    engaged: FloatArray  #: see `engagement`
-    tension: FloatArray  #: (k n, 2 s), on [s; B c + d]: tensions at `looks`, less those of the equilibrium
-    torque: FloatArray  #: (k n, 2 s), the same of K s
+    taking_over: _Way
+    running: _Way
 
 
 class Recovery:
@@ -73,9 +88,10 @@ class Recovery:
         self._n = watch.n
         self._period_s = watch.period_s
         self._margin_n = watch.margin_n
-        limits = line.limits
+        limits, envelope = line.limits, envelope_limits(line)
         self._low_n, self._high_n = limits.tension_min_n, limits.tension_max_n
-        self._torque_nm = limits.torque_nm
+        self._fastest = np.full(watch.n, FAST * envelope.roller_overspeed * limits.speed_max_m_per_s)
+        self._torque_nm = limits.torque_nm * (1.0 + EXCUSED)
         self._step_nm = limits.torque_rate_nm_per_s * watch.period_s
         draw = [i for i, span in enumerate(line.spans) if span.control == "draw"]
         self._draw = np.array(draw, dtype=np.intp)
@@ -83,9 +99,10 @@ class Recovery:
         self._free[draw] = np.inf
         self._each: NDArray[np.int64] = np.arange(self.periods + 1, dtype=np.int64)
         self._looks = np.concatenate((self._each[:CLOSELY], self._each[CLOSELY::STRIDE]))
-        self._between = np.diff(self._looks)[:, None].astype(np.float64)
+        # The first torque follows the one that is sent now.
+        self._steps_nm = self._step_nm * (1.0 + EXCUSED) * np.diff(self._looks, prepend=-1)[:, None]
         speeds = [node.speed_m_per_s for node in watch.nodes]
-        self._middles = [0.5 * (low + high) for low, high in zip(speeds[:-1], speeds[1:], strict=True)]
+        self._middles = [0.5 * (low + high) for low, high in pairwise(speeds)]
         self._loops = [_loop(node, _law(fallback, node.speed_m_per_s), self._looks) for node in watch.nodes]
         self._law = Deviation(fallback.feedforward, fallback.draw_spans, fallback.period_s, fallback.latency_s)
         self._model = Deviation(watch.model, draw, watch.period_s, 0.0)
@@ -104,76 +121,66 @@ class Recovery:
         `in_flight_nm` (depth, n): sent before, newest first. `remembered` (z,): the fallback runs already and
         remembers this at the next sample; None: it would take over then, without a jump.
         """
-        loop = self._loops[sum(measured.unwind_speed_m_per_s > middle for middle in self._middles)]
-        n, reference = self._n, Steady(setpoint_n)
-        unwind = measured.unwind_speed_m_per_s
-        x_ref, u_ref = self._law.state(reference, unwind), self._law.torque(reference, unwind, 0)
+        n, reference, unwind = self._n, Steady(setpoint_n), measured.unwind_speed_m_per_s
+        loop = self._loops[bisect_right(self._middles, unwind)]
         x_eq = self._model.state(reference, unwind)
         u_eq = self._model.torque(reference, unwind, 0) + self._coulomb_nm * np.sign(x_eq[n:])
-        x = np.concatenate((measured.tension_n, measured.speed_m_per_s))
-        x[self._draw] = x_eq[self._draw]
-        s = np.zeros(len(loop.A))
-        s[: 2 * n] = x - x_eq
-        physical = 2 * n + n * self.depth
-        s[2 * n : physical] = (in_flight_nm - u_eq).ravel()
-        s[:physical] = loop.A[:physical, :physical].dot(s[:physical]) + loop.B[:physical].dot(torque_nm - u_eq)
+        tension_n = measured.tension_n
+        if self._draw.size:
+            tension_n = tension_n.copy()
+            tension_n[self._draw] = setpoint_n[self._draw]
+        known = (
+            tension_n, measured.speed_m_per_s, in_flight_nm.ravel(), torque_nm, x_eq, u_eq,
+            self._law.state(reference, unwind), self._law.torque(reference, unwind, 0),
+        )  # fmt: skip
         if remembered is None:
-            now = np.concatenate((s[: 2 * n] + x_eq, x_ref, u_ref, torque_nm))
-            s[physical:] = loop.engaged.dot(now)
+            way, q = loop.taking_over, np.concatenate(known)
         else:
-            s[physical:] = remembered
-        away = np.concatenate((s[physical:] * 0.0, x_eq - x_ref, x_ref, u_ref))
-        c = loop.form.torque.dot(away)
-        d = np.zeros(len(s))
-        d[:physical] = -loop.B[:physical].dot(u_eq)
-        d[physical:] = loop.form.state.dot(away)
-        return self._judged(loop, s, c, d, torque_nm, setpoint_n)
+            way, q = loop.running, np.concatenate((*known, remembered))
+        found, looks = way.looks.dot(q).reshape(-1, 3, n), self._looks
+        asked_nm = found[:, 2]
+        change_nm = np.abs(asked_nm - np.concatenate((torque_nm[None], asked_nm[:-1])))
+        # Most periods no torque comes near a limit.
+        if np.abs(asked_nm).max() > self._torque_nm or (change_nm > self._steps_nm).any():
+            found, looks = self._step_by_step(loop, way.begin.dot(q), x_eq, torque_nm), self._each
+        return self._short(found[:, 0], found[:, 1], looks, setpoint_n)
 
-    def _judged(
-        self, loop: _Loop, s: FloatArray, c: FloatArray, d: FloatArray, before_nm: FloatArray, setpoint_n: FloatArray
-    ) -> Shortfall | None:
-        both = np.concatenate((s, loop.B.dot(c) + d))
-        torque = loop.torque.dot(both).reshape(-1, self._n) + c
-        step = 1.0 + EXCUSED
-        # Most periods no torque comes near a limit, and one product is all.
-        cut = (
-            np.abs(torque).max() > self._torque_nm * step
-            or np.abs(torque[0] - before_nm).max() > self._step_nm * step
-            or (np.abs(torque[1:] - torque[:-1]) > self._step_nm * step * self._between).any()
-        )
-        if cut:
-            tension, looks = self._step_by_step(loop, s, c, d, before_nm), self._each
-        else:
-            tension, looks = loop.tension.dot(both).reshape(-1, self._n), self._looks
-        return self._short(tension + setpoint_n, looks, setpoint_n)
-
-    def _step_by_step(
-        self, loop: _Loop, s: FloatArray, c: FloatArray, d: FloatArray, before_nm: FloatArray
-    ) -> FloatArray:
-        """Tensions (periods + 1, n) less those of the equilibrium, with torques cut as the envelope cuts them."""
+    def _step_by_step(self, loop: _Loop, begin: FloatArray, x_eq: FloatArray, before_nm: FloatArray) -> FloatArray:
+        """Tensions and speeds (periods + 1, 2, n) with torques cut as the envelope cuts them."""
         A, B, K, n = loop.A, loop.B, loop.K, self._n
-        found = np.empty((self.periods + 1, n))
+        states, step_nm, most_nm = len(A), self._step_nm, self._torque_nm
+        s, d, c = begin[:states], begin[states : 2 * states], begin[2 * states :]
+        found = np.empty((self.periods + 1, 2 * n))
         for k in range(self.periods + 1):
-            found[k] = s[:n]
-            asked = K.dot(s) + c
-            torque = np.minimum(np.maximum(asked, before_nm - self._step_nm), before_nm + self._step_nm)
-            torque = np.minimum(np.maximum(torque, -self._torque_nm), self._torque_nm)
-            s = A.dot(s) + B.dot(torque) + d
-            before_nm = torque
-        return found
+            found[k] = s[: 2 * n]
+            torque = np.minimum(np.maximum(K.dot(s) + c, before_nm - step_nm), before_nm + step_nm)
+            before_nm = np.minimum(np.maximum(torque, -most_nm), most_nm)
+            s = A.dot(s) + B.dot(before_nm) + d
+        return (found + x_eq).reshape(-1, 2, n)
 
-    def _short(self, tension_n: FloatArray, looks: NDArray[np.int64], setpoint_n: FloatArray) -> Shortfall | None:
+    def _short(
+        self, tension_n: FloatArray, speed_m_per_s: FloatArray, looks: NDArray[np.int64], setpoint_n: FloatArray
+    ) -> Shortfall | None:
         low = self._low_n + np.minimum(self._margin_n, NEAR_SETPOINT * (setpoint_n - self._low_n)) - self._free
         high = self._high_n - np.minimum(self._margin_n, NEAR_SETPOINT * (self._high_n - setpoint_n)) + self._free
-        below, above = low - tension_n.min(axis=0), tension_n.max(axis=0) - high
-        worst = np.maximum(below, above)
-        i = int(worst.argmax())
-        if not worst[i] > 0.0:
+        speed = np.abs(speed_m_per_s)
+        lowest, highest, fastest = tension_n.min(axis=0), tension_n.max(axis=0), speed.max(axis=0)
+        if not ((lowest < low) | (highest > high) | (fastest > self._fastest)).any():
             return None
-        under = bool(below[i] > above[i])
-        k = int(tension_n[:, i].argmin() if under else tension_n[:, i].argmax())
-        allowed = float(low[i] if under else high[i])
-        return Shortfall(i, float(tension_n[k, i]), allowed, float(looks[k] + 1) * self._period_s)
+        worst = max(
+            (
+                (float((low - lowest).max()), "span", int((low - lowest).argmax()), -tension_n, low),
+                (float((highest - high).max()), "span", int((highest - high).argmax()), tension_n, high),
+            ),
+            key=lambda found: found[0],
+        )
+        if not worst[0] > 0.0:
+            over = fastest - self._fastest
+            worst = (float(over.max()), "roller", int(over.argmax()), speed, self._fastest)
+        _, what, i, values, allowed = worst
+        k = int(values[:, i].argmax())
+        ahead_s = float(looks[k] + 1) * self._period_s
+        return Shortfall(what, i, abs(float(values[k, i])), float(allowed[i]), ahead_s)
 
 
 def _law(fallback: Controller, speed_m_per_s: float) -> LinearConfig | MpcConfig:
@@ -191,16 +198,41 @@ def _loop(node: RecoveryNode, law: LinearConfig | MpcConfig, looks: NDArray[np.i
     A[physical:, physical:] = form.part(form.state, "z")
     K[:, : 2 * n] = form.part(form.torque, "e")
     K[:, physical:] = form.part(form.torque, "z")
-    closed = A + B @ K
-    # s_k = M^k s_0 + (1 + M + .. + M^(k-1)) b
-    power, total = np.eye(size), np.zeros((size, size))
-    tension, torque = list[FloatArray](), list[FloatArray]()
-    wanted = set(looks.tolist())
+    taking_over, running = (_beginning(law, form, F, G, remembers) for remembers in (False, True))
+    return _Loop(A, B, K, _way(A, B, K, taking_over, looks, n), _way(A, B, K, running, looks, n))
+
+
+def _beginning(
+    law: LinearConfig | MpcConfig, form: LinearForm, F: FloatArray, G: FloatArray, remembers: bool
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """[s; d; c] and x_eq as rows on q."""
+    (physical, n), kept = G.shape, form.states if remembers else 0
+    depth = physical // n - 2
+    lengths = [2 * n, depth * n, n, 2 * n, n, 2 * n, n, kept]
+    x, sent, u, x_eq, u_eq, x_ref, u_ref, z = np.split(np.eye(sum(lengths)), np.cumsum(lengths)[:-1])
+    away = np.vstack((x - x_eq, sent - np.tile(u_eq, (depth, 1))))
+    away = F @ away + G @ (u - u_eq)
+    if not remembers:
+        z = engagement(law, form) @ np.vstack((away[: 2 * n] + x_eq, x_ref, u_ref, u))
+    given = np.vstack((x_eq - x_ref, x_ref, u_ref))  # what of the law's inputs does not change from now on
+    c, into_z = (rows[:, form.states :] @ given for rows in (form.torque, form.state))
+    return np.vstack((away, z)), np.vstack((-G @ u_eq, into_z)), c, x_eq
+
+
+def _way(
+    A: FloatArray,
+    B: FloatArray,
+    K: FloatArray,
+    beginning: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
+    looks: NDArray[np.int64],
+    n: int,
+) -> _Way:
+    s, d, c, x_eq = beginning
+    begin = np.vstack((s, d, c))
+    closed, driven, wanted = A + B @ K, B @ c + d, set(looks.tolist())
+    rows: list[FloatArray] = []
     for k in range(int(looks[-1]) + 1):
         if k in wanted:
-            both = np.hstack((power, total))
-            tension.append(both[:n])
-            torque.append(K @ both)
-        power, total = closed @ power, closed @ total + np.eye(size)
-    engaged = engagement(law, form)
-    return _Loop(A, B, K, form, engaged, np.vstack(tension), np.vstack(torque))
+            rows += [s[: 2 * n] + x_eq, K @ s + c]
+        s = closed @ s + driven
+    return _Way(begin, np.vstack(rows))

@@ -15,6 +15,7 @@ from gateway.core.deployment import Deployment
 from gateway.core.line import Line
 from gateway.core.messages import Command, Deploy, Keep, SetSpeed, SetTension
 from gateway.core.signals import BoolArray, FloatArray
+from gateway.core.states import Phase
 from gateway.core.theta import Theta
 from safety.recovery_prediction import recovery_prediction
 from sim_plant.plant import Plant, load_plant
@@ -180,8 +181,8 @@ def begun(case: Case, config: Controller) -> SteppedLoop:
     return loop
 
 
-def run_deployed(case: Case, config: Controller, duration_s: float = 4.0, watched: bool = True) -> Outcome:
-    """`config` takes over from the good one at 0.3 s, whatever a judge would say; a span moves at 1 s."""
+def run_deployed(case: Case, config: Controller, duration_s: float = 3.0, watched: bool = True) -> Outcome:
+    """`config` takes over from the good one at 0.3 s, whatever a judge would say; a span moves at 0.7 s."""
     loop = begun(case, case.good)
     loop.step(30)
     watch = recovery_prediction(case.theta, case.good, case.line, SPEEDS_M_PER_S) if watched else None
@@ -192,16 +193,16 @@ def run_deployed(case: Case, config: Controller, duration_s: float = 4.0, watche
     assert not misfits(config, case.line), misfits(config, case.line)
     reply = loop.command(Deploy.model_construct(command="deploy", deployment=deployment))
     assert reply.ok, reply
+    return _judged(case, loop, 40, duration_s, [SetTension(span=3, tension_n=26.0)])
+
+
+def run_alone(case: Case, config: Controller, duration_s: float = 3.0) -> Outcome:
+    """The same with nobody who looks after it."""
+    loop = begun(case, config)
     return _judged(case, loop, 70, duration_s, [SetTension(span=3, tension_n=26.0)])
 
 
-def run_alone(case: Case, config: Controller, duration_s: float = 4.0) -> Outcome:
-    """The same with nobody who looks after it."""
-    loop = begun(case, config)
-    return _judged(case, loop, 100, duration_s, [SetTension(span=3, tension_n=26.0)])
-
-
-def run_kept(case: Case, changes: list[Command], duration_s: float = 3.0) -> Outcome:
+def run_kept(case: Case, changes: list[Command], duration_s: float = 2.5) -> Outcome:
     """The good configuration, deployed, kept and watched with itself as fallback: then what an operator may do."""
     loop = begun(case, case.good)
     loop.step(5)
@@ -213,7 +214,7 @@ def run_kept(case: Case, changes: list[Command], duration_s: float = 3.0) -> Out
     return _judged(case, loop, 50, duration_s, changes)
 
 
-def run_probation(case: Case, config: Controller, changes: list[Command], duration_s: float = 3.0) -> Outcome:
+def run_probation(case: Case, config: Controller, changes: list[Command], duration_s: float = 2.5) -> Outcome:
     """A healthy configuration on probation, with the good one as fallback, while an operator changes set-points."""
     loop = begun(case, case.good)
     loop.step(30)
@@ -228,22 +229,23 @@ def _judged(case: Case, loop: SteppedLoop, before: int, duration_s: float, chang
     loop.now_s = loop.periods * case.line.control.period_s
     for change in changes:
         loop.command(change)
-    loop.step(round(duration_s / case.line.control.period_s) - loop.periods)
-    loop.truth.sample(duration_s)
-    recording = loop.truth.recorder.recording()
-    limits = case.line.limits
-    running = recording.time_s <= (loop.transitions[-1][0] if _off(loop) else duration_s)
-    tension_n = recording.tension_n[running]
-    lowest, highest = float(tension_n.min()), float(tension_n.max())
-    left = lowest < limits.tension_min_n or highest > limits.tension_max_n
-    stopped = loop.transitions[0][2] if loop.transitions else ""
+    limits, period_s = case.line.limits, case.line.control.period_s
+    while loop.periods * period_s < duration_s:
+        loop.step(10)
+        tension_n = loop.truth.recorder.recording().tension_n
+        lowest, highest = float(tension_n.min()), float(tension_n.max())
+        left = lowest < limits.tension_min_n or highest > limits.tension_max_n
+        if left or _off(loop):
+            break
     why = loop.cycle.configurations.why
-    return Outcome(left, lowest, highest, stopped or (why if why.startswith("rolled") else ""))
+    said = [why] if why.startswith("rolled") else []
+    said += [f"{time_s:g} s: {reason}" for time_s, _, reason in loop.transitions[:1]]
+    return Outcome(left, lowest, highest, "; ".join(said))
 
 
 def _off(loop: SteppedLoop) -> bool:
-    """Torque went off: what tensions do from then on is no question of control."""
-    return bool(loop.transitions) and loop.transitions[-1][1].name in ("UNLOADING", "OFF")
+    """Torque is off: what tensions do from then on is no question of control."""
+    return loop.cycle.machine.phase is Phase.OFF
 
 
 def steps_of(line: Line, generator: np.random.Generator, shaped: bool) -> list[Command]:
