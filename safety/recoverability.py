@@ -34,6 +34,7 @@ from gateway.core.signals import FloatArray
 from safety.limits import envelope_limits
 
 CLOSELY = 10  #: periods at the beginning of which each is looked at
+TRIED = frozenset((1, 3, 7, 15, 31))  #: periods with cut torques after which the rest is looked at in one
 STRIDE = 2  #: periods from one look to the next behind them
 NEAR_SETPOINT = 0.5  #: of what a set-point keeps from a limit, tensions may keep as well
 FAST = 0.85  #: of the roller speed at which the envelope takes torque off
@@ -73,6 +74,8 @@ class _Loop:
     A: FloatArray  #: (s, s), without control
     B: FloatArray  #: (s, n)
     K: FloatArray  #: (n, s)
+    both: FloatArray  #: (s + n, s), [A; K]
+    onward: FloatArray  #: (k 3n, 2 s), from [s; B c + d]: tensions and speeds away from equilibrium, torques less c
     taking_over: _Way
     running: _Way
 
@@ -121,6 +124,18 @@ class Recovery:
         `in_flight_nm` (depth, n): sent before, newest first. `remembered` (z,): the fallback runs already and
         remembers this at the next sample; None: it would take over then, without a jump.
         """
+        found, looks = self.ahead(measured, setpoint_n, in_flight_nm, torque_nm, remembered)
+        return self._short(found[:, 0], found[:, 1], looks, setpoint_n)
+
+    def ahead(
+        self,
+        measured: Measured,
+        setpoint_n: FloatArray,
+        in_flight_nm: FloatArray,
+        torque_nm: FloatArray,
+        remembered: FloatArray | None = None,
+    ) -> tuple[FloatArray, NDArray[np.int64]]:
+        """Tensions and speeds (k, 2 or more, n) where it is looked at, and when (k,): periods after the next sample."""
         n, reference, unwind = self._n, Steady(setpoint_n), measured.unwind_speed_m_per_s
         loop = self._loops[bisect_right(self._middles, unwind)]
         x_eq = self._model.state(reference, unwind)
@@ -137,26 +152,38 @@ class Recovery:
             way, q = loop.taking_over, np.concatenate(known)
         else:
             way, q = loop.running, np.concatenate((*known, remembered))
-        found, looks = way.looks.dot(q).reshape(-1, 3, n), self._looks
-        asked_nm = found[:, 2]
-        change_nm = np.abs(asked_nm - np.concatenate((torque_nm[None], asked_nm[:-1])))
-        # Most periods no torque comes near a limit.
-        if np.abs(asked_nm).max() > self._torque_nm or (change_nm > self._steps_nm).any():
-            found, looks = self._step_by_step(loop, way.begin.dot(q), x_eq, torque_nm), self._each
-        return self._short(found[:, 0], found[:, 1], looks, setpoint_n)
+        found = way.looks.dot(q).reshape(-1, 3, n)
+        if self._never_cut(found[:, 2], torque_nm):
+            return found, self._looks
+        return self._step_by_step(loop, way.begin.dot(q), x_eq, torque_nm)
 
-    def _step_by_step(self, loop: _Loop, begin: FloatArray, x_eq: FloatArray, before_nm: FloatArray) -> FloatArray:
-        """Tensions and speeds (periods + 1, 2, n) with torques cut as the envelope cuts them."""
-        A, B, K, n = loop.A, loop.B, loop.K, self._n
-        states, step_nm, most_nm = len(A), self._step_nm, self._torque_nm
-        s, d, c = begin[:states], begin[states : 2 * states], begin[2 * states :]
-        found = np.empty((self.periods + 1, 2 * n))
+    def _never_cut(self, asked_nm: FloatArray, before_nm: FloatArray) -> bool:
+        """Whether torques (k, n) at the looks, after `before_nm` (n,), keep limit and rate. Most periods they do."""
+        change_nm = np.abs(asked_nm - np.concatenate((before_nm[None], asked_nm[:-1])))
+        return bool(np.abs(asked_nm).max() <= self._torque_nm and (change_nm <= self._steps_nm).all())
+
+    def _step_by_step(
+        self, loop: _Loop, begin: FloatArray, x_eq: FloatArray, before_nm: FloatArray
+    ) -> tuple[FloatArray, NDArray[np.int64]]:
+        """As `ahead`, with torques cut as the envelope cuts them, for as long as any is."""
+        B, n, states = loop.B, self._n, len(loop.A)
+        step_nm, most_nm = self._step_nm, self._torque_nm
+        s, constant, c = begin[:states], begin[states:], begin[2 * states :]
+        driven = B.dot(c) + begin[states : 2 * states]
+        stepped: list[FloatArray] = []
         for k in range(self.periods + 1):
-            found[k] = s[: 2 * n]
-            torque = np.minimum(np.maximum(K.dot(s) + c, before_nm - step_nm), before_nm + step_nm)
+            if k in TRIED:
+                onward = loop.onward.dot(np.concatenate((s, driven))).reshape(-1, 3, n)
+                if self._never_cut(onward[:, 2] + c, before_nm):
+                    rest = onward[:, :2].reshape(-1, 2 * n)
+                    found, looks = np.vstack((*stepped, rest)), np.concatenate((self._each[:k], self._looks + k))
+                    return (found + x_eq).reshape(-1, 2, n), looks
+            stepped.append(s[: 2 * n])
+            following = loop.both.dot(s) + constant
+            torque = np.minimum(np.maximum(following[states:], before_nm - step_nm), before_nm + step_nm)
             before_nm = np.minimum(np.maximum(torque, -most_nm), most_nm)
-            s = A.dot(s) + B.dot(before_nm) + d
-        return (found + x_eq).reshape(-1, 2, n)
+            s = following[:states] + B.dot(before_nm)
+        return (np.array(stepped) + x_eq).reshape(-1, 2, n), self._each
 
     def _short(
         self, tension_n: FloatArray, speed_m_per_s: FloatArray, looks: NDArray[np.int64], setpoint_n: FloatArray
@@ -199,7 +226,9 @@ def _loop(node: RecoveryNode, law: LinearConfig | MpcConfig, looks: NDArray[np.i
     K[:, : 2 * n] = form.part(form.torque, "e")
     K[:, physical:] = form.part(form.torque, "z")
     taking_over, running = (_beginning(law, form, F, G, remembers) for remembers in (False, True))
-    return _Loop(A, B, K, _way(A, B, K, taking_over, looks, n), _way(A, B, K, running, looks, n))
+    eye, none = np.eye(size, 2 * size), np.zeros((n, 2 * size))
+    onward = _rows(A + B @ K, eye, np.eye(size, 2 * size, size), K, none, none[:1], looks)
+    return _Loop(A, B, K, np.vstack((A, K)), onward, _way(A, B, K, taking_over, looks), _way(A, B, K, running, looks))
 
 
 def _beginning(
@@ -225,14 +254,25 @@ def _way(
     K: FloatArray,
     beginning: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
     looks: NDArray[np.int64],
-    n: int,
 ) -> _Way:
     s, d, c, x_eq = beginning
-    begin = np.vstack((s, d, c))
-    closed, driven, wanted = A + B @ K, B @ c + d, set(looks.tolist())
+    return _Way(np.vstack((s, d, c)), _rows(A + B @ K, s, B @ c + d, K, c, x_eq, looks))
+
+
+def _rows(
+    closed: FloatArray,
+    s: FloatArray,
+    driven: FloatArray,
+    K: FloatArray,
+    c: FloatArray,
+    x_eq: FloatArray,
+    looks: NDArray[np.int64],
+) -> FloatArray:
+    """Tensions and speeds, then torques, at each look: s_next = closed s + driven, u = K s + c."""
+    physical, wanted = 2 * len(K), set(looks.tolist())
     rows: list[FloatArray] = []
     for k in range(int(looks[-1]) + 1):
         if k in wanted:
-            rows += [s[: 2 * n] + x_eq, K @ s + c]
+            rows += [s[:physical] + x_eq, K @ s + c]
         s = closed @ s + driven
-    return _Way(begin, np.vstack(rows))
+    return np.vstack(rows)

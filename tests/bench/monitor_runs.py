@@ -9,6 +9,8 @@ from gateway.cli.rehearse_designs import truth_of
 from gateway.cli.stepped import SteppedLoop
 from gateway.control.design import design_lqg, design_lqi, design_lqr, design_pid
 from gateway.control.design.task import task_on
+from gateway.control.deviation import Measured
+from gateway.control.engagement import memory
 from gateway.core.controller import Controller, config_hash
 from gateway.core.controller_fit import misfits
 from gateway.core.deployment import Deployment
@@ -16,7 +18,9 @@ from gateway.core.line import Line
 from gateway.core.messages import Command, Deploy, Keep, SetSpeed, SetTension
 from gateway.core.signals import BoolArray, FloatArray
 from gateway.core.states import Phase
+from gateway.core.telemetry import unpack
 from gateway.core.theta import Theta
+from safety.recoverability import Recovery
 from safety.recovery_prediction import recovery_prediction
 from sim_plant.plant import Plant, load_plant
 from sim_plant.stepped import SteppedLine
@@ -28,6 +32,7 @@ SPEEDS_M_PER_S = [0.01, 0.05, 0.1]
 BELIEF = 0.03  #: by which an accepted model may be wrong, each parameter
 LATE = 0.05  #: share of commands that come a cycle late under stress
 DESIGNS = {"lqi": design_lqi, "lqg": design_lqg, "lqr": design_lqr, "pid": design_pid}
+MOVED = 3  #: the span whose set-point moves on the way: no prediction knows that
 CLASSES = ("gain", "gain of one quantity", "sign", "entries", "wrong model", "delay", "chatter")
 STRESS = {
     "friction": {"coulomb_nm": 2.0},
@@ -72,6 +77,8 @@ class Outcome:
     lowest_n: float
     highest_n: float
     tripped: str  #: why the configuration was rolled back, or the line stopped; empty: neither
+    #: Tension that was predicted when the fallback took over, less the true one: the greatest either way, in N
+    error_n: tuple[float, float] | None = None
 
 
 def draw_case(line: Line, seed: int, stressed: bool) -> Case:
@@ -193,13 +200,13 @@ def run_deployed(case: Case, config: Controller, duration_s: float = 3.0, watche
     assert not misfits(config, case.line), misfits(config, case.line)
     reply = loop.command(Deploy.model_construct(command="deploy", deployment=deployment))
     assert reply.ok, reply
-    return _judged(case, loop, 40, duration_s, [SetTension(span=3, tension_n=26.0)])
+    return _judged(case, loop, 40, duration_s, [SetTension(span=MOVED, tension_n=26.0)])
 
 
 def run_alone(case: Case, config: Controller, duration_s: float = 3.0) -> Outcome:
     """The same with nobody who looks after it."""
     loop = begun(case, config)
-    return _judged(case, loop, 70, duration_s, [SetTension(span=3, tension_n=26.0)])
+    return _judged(case, loop, 70, duration_s, [SetTension(span=MOVED, tension_n=26.0)])
 
 
 def run_kept(case: Case, changes: list[Command], duration_s: float = 2.5) -> Outcome:
@@ -230,8 +237,11 @@ def _judged(case: Case, loop: SteppedLoop, before: int, duration_s: float, chang
     for change in changes:
         loop.command(change)
     limits, period_s = case.line.limits, case.line.control.period_s
+    forecast = Forecast(loop, case)
     while loop.periods * period_s < duration_s:
-        loop.step(10)
+        for _ in range(10):
+            loop.step()
+            forecast.look()
         tension_n = loop.truth.recorder.recording().tension_n
         lowest, highest = float(tension_n.min()), float(tension_n.max())
         left = lowest < limits.tension_min_n or highest > limits.tension_max_n
@@ -240,7 +250,42 @@ def _judged(case: Case, loop: SteppedLoop, before: int, duration_s: float, chang
     why = loop.cycle.configurations.why
     said = [why] if why.startswith("rolled") else []
     said += [f"{time_s:g} s: {reason}" for time_s, _, reason in loop.transitions[:1]]
-    return Outcome(left, lowest, highest, "; ".join(said))
+    return Outcome(left, lowest, highest, "; ".join(said), forecast.error_n())
+
+
+class Forecast:
+    """What the prediction says in the period in which a fallback takes over, held against what comes of it."""
+
+    def __init__(self, loop: SteppedLoop, case: Case) -> None:
+        watch = recovery_prediction(case.theta, case.good, case.line, SPEEDS_M_PER_S)
+        self._loop = loop
+        self._recovery = Recovery(watch, case.good, case.line)
+        self._said: tuple[FloatArray, FloatArray] | None = None  #: tensions (k, n), and when (k,) in s
+
+    def look(self) -> None:
+        cycle, inputs = self._loop.cycle, self._loop.cycle.inputs
+        if self._said is not None or not cycle.configurations.why.startswith("rolled"):
+            return
+        sent_nm = np.array([frame.torque_nm for frame in map(unpack, self._loop.frames[-8:])])[::-1]
+        measured = Measured(inputs.tension.value, inputs.speed.value, float(inputs.unwind_speed.value[0]))
+        found, looks = self._recovery.ahead(
+            measured, cycle.setpoints.tension_n, sent_nm[1 : 1 + self._recovery.depth], sent_nm[0],
+            memory(cycle.torque_path.state),
+        )  # fmt: skip
+        self._said = found[:, 0], self._loop.now_s + (looks + 1) * self._loop.line.control.period_s
+
+    def error_n(self) -> tuple[float, float] | None:
+        """None: no fallback took over, or the line was stopped, and control's part is over."""
+        if self._said is None or self._loop.transitions:
+            return None
+        predicted_n, time_s = self._said
+        recording = self._loop.truth.recorder.recording()
+        known = time_s <= recording.time_s[-1]
+        if not known.any():
+            return None
+        at = np.searchsorted(recording.time_s, time_s[known] - 1e-6)
+        error_n = np.delete(predicted_n[known] - recording.tension_n[at], MOVED - 1, axis=1)
+        return float(error_n.min()), float(error_n.max())
 
 
 def _off(loop: SteppedLoop) -> bool:
