@@ -64,7 +64,7 @@ class _Way:
     """From q (with z behind it where the fallback runs already): where everything goes."""
 
     begin: FloatArray  #: (2 s + n, q), [s; d; c]
-    looks: FloatArray  #: (k 3n, q), tensions, speeds and torques asked for, at each look
+    looks: FloatArray  #: (3n k, q), tensions, speeds and torques asked for, of each at every look
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class _Loop:
     B: FloatArray  #: (s, n)
     K: FloatArray  #: (n, s)
     both: FloatArray  #: (s + n, s), [A; K]
-    onward: FloatArray  #: (k 3n, 2 s), from [s; B c + d]: tensions and speeds away from equilibrium, torques less c
+    onward: FloatArray  #: (3n k, 2 s), from [s; B c + d]: tensions and speeds away from equilibrium, torques less c
     taking_over: _Way
     running: _Way
 
@@ -93,7 +93,7 @@ class Recovery:
         self._margin_n = watch.margin_n
         limits, envelope = line.limits, envelope_limits(line)
         self._low_n, self._high_n = limits.tension_min_n, limits.tension_max_n
-        self._fastest = np.full(watch.n, FAST * envelope.roller_overspeed * limits.speed_max_m_per_s)
+        self._fastest = FAST * envelope.roller_overspeed * limits.speed_max_m_per_s
         self._torque_nm = limits.torque_nm * (1.0 + EXCUSED)
         self._step_nm = limits.torque_rate_nm_per_s * watch.period_s
         draw = [i for i, span in enumerate(line.spans) if span.control == "draw"]
@@ -103,7 +103,9 @@ class Recovery:
         self._each: NDArray[np.int64] = np.arange(self.periods + 1, dtype=np.int64)
         self._looks = np.concatenate((self._each[:CLOSELY], self._each[CLOSELY::STRIDE]))
         # The first torque follows the one that is sent now.
-        self._steps_nm = self._step_nm * (1.0 + EXCUSED) * np.diff(self._looks, prepend=-1)[:, None]
+        self._steps_nm = self._step_nm * (1.0 + EXCUSED) * np.diff(self._looks, prepend=-1)
+        self._setpoints = b""  #: that the next two belong to
+        self._least = self._most = np.zeros(2 * watch.n)  #: of tensions and speeds
         speeds = [node.speed_m_per_s for node in watch.nodes]
         self._middles = [0.5 * (low + high) for low, high in pairwise(speeds)]
         self._loops = [_loop(node, _law(fallback, node.speed_m_per_s), self._looks) for node in watch.nodes]
@@ -125,7 +127,10 @@ class Recovery:
         remembers this at the next sample; None: it would take over then, without a jump.
         """
         found, looks = self.ahead(measured, setpoint_n, in_flight_nm, torque_nm, remembered)
-        return self._short(found[:, 0], found[:, 1], looks, setpoint_n)
+        least, most = self._bounds(setpoint_n)
+        if (found.min(axis=1) >= least).all() and (found.max(axis=1) <= most).all():
+            return None
+        return self._short(found, looks, least, most)
 
     def ahead(
         self,
@@ -135,7 +140,7 @@ class Recovery:
         torque_nm: FloatArray,
         remembered: FloatArray | None = None,
     ) -> tuple[FloatArray, NDArray[np.int64]]:
-        """Tensions and speeds (k, 2 or more, n) where it is looked at, and when (k,): periods after the next sample."""
+        """Tensions, then speeds (2n, k) where it is looked at, and when (k,): periods after the next sample."""
         n, reference, unwind = self._n, Steady(setpoint_n), measured.unwind_speed_m_per_s
         loop = self._loops[bisect_right(self._middles, unwind)]
         x_eq = self._model.state(reference, unwind)
@@ -152,14 +157,14 @@ class Recovery:
             way, q = loop.taking_over, np.concatenate(known)
         else:
             way, q = loop.running, np.concatenate((*known, remembered))
-        found = way.looks.dot(q).reshape(-1, 3, n)
-        if self._never_cut(found[:, 2], torque_nm):
-            return found, self._looks
+        found = way.looks.dot(q).reshape(3 * n, -1)
+        if self._never_cut(found[2 * n :], torque_nm):
+            return found[: 2 * n], self._looks
         return self._step_by_step(loop, way.begin.dot(q), x_eq, torque_nm)
 
     def _never_cut(self, asked_nm: FloatArray, before_nm: FloatArray) -> bool:
-        """Whether torques (k, n) at the looks, after `before_nm` (n,), keep limit and rate. Most periods they do."""
-        change_nm = np.abs(asked_nm - np.concatenate((before_nm[None], asked_nm[:-1])))
+        """Whether torques (n, k) at the looks, after `before_nm` (n,), keep limit and rate. Most periods they do."""
+        change_nm = np.abs(asked_nm - np.concatenate((before_nm[:, None], asked_nm[:, :-1]), axis=1))
         return bool(np.abs(asked_nm).max() <= self._torque_nm and (change_nm <= self._steps_nm).all())
 
     def _step_by_step(
@@ -173,41 +178,37 @@ class Recovery:
         stepped: list[FloatArray] = []
         for k in range(self.periods + 1):
             if k in TRIED:
-                onward = loop.onward.dot(np.concatenate((s, driven))).reshape(-1, 3, n)
-                if self._never_cut(onward[:, 2] + c, before_nm):
-                    rest = onward[:, :2].reshape(-1, 2 * n)
-                    found, looks = np.vstack((*stepped, rest)), np.concatenate((self._each[:k], self._looks + k))
-                    return (found + x_eq).reshape(-1, 2, n), looks
+                onward = loop.onward.dot(np.concatenate((s, driven))).reshape(3 * n, -1)
+                if self._never_cut(onward[2 * n :] + c[:, None], before_nm):
+                    found = np.hstack((np.array(stepped).T, onward[: 2 * n]))
+                    return found + x_eq[:, None], np.concatenate((self._each[:k], self._looks + k))
             stepped.append(s[: 2 * n])
             following = loop.both.dot(s) + constant
             torque = np.minimum(np.maximum(following[states:], before_nm - step_nm), before_nm + step_nm)
             before_nm = np.minimum(np.maximum(torque, -most_nm), most_nm)
             s = following[:states] + B.dot(before_nm)
-        return (np.array(stepped) + x_eq).reshape(-1, 2, n), self._each
+        return np.array(stepped).T + x_eq[:, None], self._each
 
-    def _short(
-        self, tension_n: FloatArray, speed_m_per_s: FloatArray, looks: NDArray[np.int64], setpoint_n: FloatArray
-    ) -> Shortfall | None:
-        low = self._low_n + np.minimum(self._margin_n, NEAR_SETPOINT * (setpoint_n - self._low_n)) - self._free
-        high = self._high_n - np.minimum(self._margin_n, NEAR_SETPOINT * (self._high_n - setpoint_n)) + self._free
-        speed = np.abs(speed_m_per_s)
-        lowest, highest, fastest = tension_n.min(axis=0), tension_n.max(axis=0), speed.max(axis=0)
-        if not ((lowest < low) | (highest > high) | (fastest > self._fastest)).any():
-            return None
-        worst = max(
-            (
-                (float((low - lowest).max()), "span", int((low - lowest).argmax()), -tension_n, low),
-                (float((highest - high).max()), "span", int((highest - high).argmax()), tension_n, high),
-            ),
-            key=lambda found: found[0],
-        )
-        if not worst[0] > 0.0:
-            over = fastest - self._fastest
-            worst = (float(over.max()), "roller", int(over.argmax()), speed, self._fastest)
-        _, what, i, values, allowed = worst
-        k = int(values[:, i].argmax())
-        ahead_s = float(looks[k] + 1) * self._period_s
-        return Shortfall(what, i, abs(float(values[k, i])), float(allowed[i]), ahead_s)
+    def _bounds(self, setpoint_n: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """What tensions and speeds (2n,) must keep."""
+        setpoints = setpoint_n.tobytes()
+        if setpoints != self._setpoints:
+            low = self._low_n + np.minimum(self._margin_n, NEAR_SETPOINT * (setpoint_n - self._low_n)) - self._free
+            high = self._high_n - np.minimum(self._margin_n, NEAR_SETPOINT * (self._high_n - setpoint_n)) + self._free
+            fastest = np.full(self._n, self._fastest)
+            self._least, self._most = np.concatenate((low, -fastest)), np.concatenate((high, fastest))
+            self._setpoints = setpoints
+        return self._least, self._most
+
+    def _short(self, found: FloatArray, looks: NDArray[np.int64], least: FloatArray, most: FloatArray) -> Shortfall:
+        """The tension that is furthest beyond its bounds, or the speed where no tension is."""
+        over = np.maximum(least[:, None] - found, found - most[:, None])
+        n = self._n
+        first = 0 if (over[:n] > 0.0).any() else n
+        i, k = np.unravel_index(int(over[first : first + n].argmax()), over[:n].shape)
+        value = float(found[first + i, k])
+        allowed = float(least[first + i] if value < least[first + i] else most[first + i])
+        return Shortfall("roller" if first else "span", int(i), value, allowed, float(looks[k] + 1) * self._period_s)
 
 
 def _law(fallback: Controller, speed_m_per_s: float) -> LinearConfig | MpcConfig:
@@ -273,6 +274,6 @@ def _rows(
     rows: list[FloatArray] = []
     for k in range(int(looks[-1]) + 1):
         if k in wanted:
-            rows += [s[:physical] + x_eq, K @ s + c]
+            rows.append(np.vstack((s[:physical] + x_eq, K @ s + c)))
         s = closed @ s + driven
-    return np.vstack(rows)
+    return np.stack(rows, axis=1).reshape(-1, s.shape[1])

@@ -1,6 +1,6 @@
 """The runtime monitor: what unsafe configurations do to the tension, and how often healthy ones are stopped.
 
-    python -m tests.bench.monitor [--unsafe 300] [--healthy 1000] [--first-seed N]
+    python -m tests.bench.monitor [--unsafe 300] [--stressed 300] [--healthy 1000] [--first-seed N]
 
 Unsafe: configurations that, alone, take a true tension out of its band; forced in past any judge. The truth judges.
 """
@@ -60,7 +60,9 @@ def unsafe_runs(line: Line, first: int, count: int, stressed: bool) -> list[tupl
         if run_alone(case, config).left:
             found.append((kind, case, run_deployed(case, config)))
             if len(found) % 25 == 0:
-                print(f"  unsafe, {'with' if stressed else 'without'} stress: {len(found)} of {count}", flush=True)
+                left = sum(outcome.left for _, _, outcome in found)
+                how = "with" if stressed else "without"
+                print(f"  unsafe, {how} stress: {len(found)} of {count}, {left} left the band", flush=True)
     return found
 
 
@@ -79,7 +81,8 @@ def healthy_runs(line: Line, first: int, count: int) -> list[tuple[str, Case, li
             config = DESIGNS[law](task_on(line, case.theta))
             found.append(("probation", case, commands, run_probation(case, config, commands)))
         if len(found) % 100 == 0:
-            print(f"  healthy: {len(found)} of {count}", flush=True)
+            tripped = sum(bool(run[3].tripped) for run in found)
+            print(f"  healthy: {len(found)} of {count}, {tripped} tripped", flush=True)
     return found
 
 
@@ -102,14 +105,16 @@ class Cost:
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m tests.bench.monitor")
     parser.add_argument("--unsafe", type=int, default=300)
+    parser.add_argument("--stressed", type=int, default=300)
     parser.add_argument("--healthy", type=int, default=1000)
     parser.add_argument("--first-seed", type=int, default=FIRST_SEED)
     asked = parser.parse_args()
     line, bench, cost = demonstration_line(), Bench("monitor"), Cost()
     bench.seeds = [asked.first_seed, asked.first_seed + 20_000, asked.first_seed + 40_000]
     errors: list[tuple[float, float]] = []
-    for name, first, stressed in (("", bench.seeds[0], False), ("_stressed", bench.seeds[1], True)):
-        runs = unsafe_runs(line, first, asked.unsafe, stressed)
+    parts = (("", bench.seeds[0], asked.unsafe, False), ("_stressed", bench.seeds[1], asked.stressed, True))
+    for name, first, count, stressed in parts:
+        runs = unsafe_runs(line, first, count, stressed)
         left = [(kind, case, outcome) for kind, case, outcome in runs if outcome.left]
         bench.figure(f"left_the_band{name}_pct", 100.0 * len(left) / len(runs), "%", len(runs))
         kinds: defaultdict[str, list[int]] = defaultdict(lambda: [0, 0])

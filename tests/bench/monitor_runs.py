@@ -188,7 +188,7 @@ def begun(case: Case, config: Controller) -> SteppedLoop:
     return loop
 
 
-def run_deployed(case: Case, config: Controller, duration_s: float = 3.0, watched: bool = True) -> Outcome:
+def run_deployed(case: Case, config: Controller, duration_s: float = 2.5, watched: bool = True) -> Outcome:
     """`config` takes over from the good one at 0.3 s, whatever a judge would say; a span moves at 0.7 s."""
     loop = begun(case, case.good)
     loop.step(30)
@@ -203,7 +203,7 @@ def run_deployed(case: Case, config: Controller, duration_s: float = 3.0, watche
     return _judged(case, loop, 40, duration_s, [SetTension(span=MOVED, tension_n=26.0)])
 
 
-def run_alone(case: Case, config: Controller, duration_s: float = 3.0) -> Outcome:
+def run_alone(case: Case, config: Controller, duration_s: float = 2.2) -> Outcome:
     """The same with nobody who looks after it."""
     loop = begun(case, config)
     return _judged(case, loop, 70, duration_s, [SetTension(span=MOVED, tension_n=26.0)])
@@ -239,7 +239,7 @@ def _judged(case: Case, loop: SteppedLoop, before: int, duration_s: float, chang
     limits, period_s = case.line.limits, case.line.control.period_s
     forecast = Forecast(loop, case)
     while loop.periods * period_s < duration_s:
-        for _ in range(10):
+        for _ in range(25):
             loop.step()
             forecast.look()
         tension_n = loop.truth.recorder.recording().tension_n
@@ -257,22 +257,23 @@ class Forecast:
     """What the prediction says in the period in which a fallback takes over, held against what comes of it."""
 
     def __init__(self, loop: SteppedLoop, case: Case) -> None:
-        watch = recovery_prediction(case.theta, case.good, case.line, SPEEDS_M_PER_S)
-        self._loop = loop
-        self._recovery = Recovery(watch, case.good, case.line)
+        self._loop, self._case = loop, case
         self._said: tuple[FloatArray, FloatArray] | None = None  #: tensions (k, n), and when (k,) in s
 
     def look(self) -> None:
         cycle, inputs = self._loop.cycle, self._loop.cycle.inputs
         if self._said is not None or not cycle.configurations.why.startswith("rolled"):
             return
+        case = self._case
+        watch = recovery_prediction(case.theta, case.good, case.line, SPEEDS_M_PER_S)
+        recovery = Recovery(watch, case.good, case.line)
         sent_nm = np.array([frame.torque_nm for frame in map(unpack, self._loop.frames[-8:])])[::-1]
         measured = Measured(inputs.tension.value, inputs.speed.value, float(inputs.unwind_speed.value[0]))
-        found, looks = self._recovery.ahead(
-            measured, cycle.setpoints.tension_n, sent_nm[1 : 1 + self._recovery.depth], sent_nm[0],
+        found, looks = recovery.ahead(
+            measured, cycle.setpoints.tension_n, sent_nm[1 : 1 + recovery.depth], sent_nm[0],
             memory(cycle.torque_path.state),
         )  # fmt: skip
-        self._said = found[:, 0], self._loop.now_s + (looks + 1) * self._loop.line.control.period_s
+        self._said = found[: self._loop.line.n].T, self._loop.now_s + (looks + 1) * self._loop.line.control.period_s
 
     def error_n(self) -> tuple[float, float] | None:
         """None: no fallback took over, or the line was stopped, and control's part is over."""
