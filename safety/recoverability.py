@@ -33,9 +33,7 @@ from gateway.core.line import Line
 from gateway.core.signals import FloatArray
 from safety.limits import envelope_limits
 
-CLOSELY = 10  #: periods at the beginning of which each is looked at
 TRIED = frozenset((1, 3, 7, 15, 31))  #: periods with cut torques after which the rest is looked at in one
-STRIDE = 2  #: periods from one look to the next behind them
 NEAR_SETPOINT = 0.5  #: of what a set-point keeps from a limit, tensions may keep as well
 FAST = 0.85  #: of the roller speed at which the envelope takes torque off
 EXCUSED = 1e-6  #: of a torque's limit and rate, for rounding
@@ -101,7 +99,7 @@ class Recovery:
         self._free = np.zeros(watch.n)  #: added to a span's bounds: nobody sees the tension of a draw span
         self._free[draw] = np.inf
         self._each: NDArray[np.int64] = np.arange(self.periods + 1, dtype=np.int64)
-        self._looks = np.concatenate((self._each[:CLOSELY], self._each[CLOSELY::STRIDE]))
+        self._looks = _looks(self._each, watch.n)
         # The first torque follows the one that is sent now.
         self._steps_nm = self._step_nm * (1.0 + EXCUSED) * np.diff(self._looks, prepend=-1)
         self._setpoints = b""  #: that the next two belong to
@@ -209,6 +207,12 @@ class Recovery:
         value = float(found[first + i, k])
         allowed = float(least[first + i] if value < least[first + i] else most[first + i])
         return Shortfall("roller" if first else "span", int(i), value, allowed, float(looks[k] + 1) * self._period_s)
+
+
+def _looks(each: NDArray[np.int64], n: int) -> NDArray[np.int64]:
+    """Every period at the beginning, then every other one; on a longer line fewer, for each takes more."""
+    closely, stride = (10, 2) if n <= 8 else (4, n // 4)
+    return np.concatenate((each[:closely], each[closely::stride]))
 
 
 def _law(fallback: Controller, speed_m_per_s: float) -> LinearConfig | MpcConfig:
