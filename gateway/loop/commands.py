@@ -4,7 +4,6 @@ from math import isfinite
 
 from drivers.port import PrepareRefused
 from gateway.core.doubts import in_words
-from gateway.core.experiment import Experiment
 from gateway.core.line import Recipe
 from gateway.core.messages import (
     AbortExperiment,
@@ -27,6 +26,7 @@ from gateway.core.states import LoopState, Phase
 from gateway.loop import machine as machines
 from gateway.loop.cycle import Cycle
 from gateway.loop.deploy import configure
+from gateway.loop.judged import least, require_judged, unjudged
 from gateway.loop.machine import STANDSTILL_M_PER_S
 from gateway.loop.refused import Refused
 
@@ -177,7 +177,7 @@ def _start(cycle: Cycle, now_s: float) -> str:
     machine = cycle.machine
     match machine.phase:
         case Phase.READY:
-            _require_judged(cycle, cycle.setpoints.speed_target_m_per_s)
+            require_judged(cycle, cycle.setpoints.speed_target_m_per_s)
             reasons = not_ready(cycle) + _moving_rollers(cycle)
             if reasons:
                 raise Refused("not started; mend what is named and start again", reasons)
@@ -236,7 +236,7 @@ def _set_tension(cycle: Cycle, command: SetTension, now_s: float) -> str:
     if command.step:
         size = abs(command.tension_n - setpoints.tension_n[i])
         judged = cycle.configurations.running.region.tension_step_max_n
-        largest = _least(line.limits.tension_step_max_n, judged)
+        largest = least(line.limits.tension_step_max_n, judged)
         _require_step(cycle, size, largest, "N", setpoints.tension_step_pause_s(i, now_s))
         setpoints.step_tension(i, command.tension_n, now_s)
     setpoints.tension_target_n[i] = command.tension_n
@@ -249,31 +249,16 @@ def _set_speed(cycle: Cycle, command: SetSpeed, now_s: float) -> str:
     high = line.limits.speed_max_m_per_s
     if not (isfinite(command.speed_m_per_s) and 0.0 <= command.speed_m_per_s <= high):
         raise Refused(f"{command.speed_m_per_s:g} m/s is outside the limits; allowed: 0 to {high:g} m/s")
-    _require_judged(cycle, command.speed_m_per_s)
+    require_judged(cycle, command.speed_m_per_s)
     if command.step:
         size = abs(command.speed_m_per_s - setpoints.speed_m_per_s)
         judged = cycle.configurations.running.region.speed_step_max_m_per_s
-        largest = _least(line.limits.speed_step_max_m_per_s, judged)
+        largest = least(line.limits.speed_step_max_m_per_s, judged)
         _require_step(cycle, size, largest, "m/s", setpoints.speed_step_pause_s(now_s))
         setpoints.step_speed(command.speed_m_per_s, now_s)
     setpoints.speed_target_m_per_s = command.speed_m_per_s
     how = "at once" if command.step else _pace(cycle, f"at {line.moves.speed_rate_m_per_s2:g} m/s2")
     return f"line speed to {command.speed_m_per_s:g} m/s {how}"
-
-
-def _least(own: float, judged: float | None) -> float:
-    """The line's limit, or what the configuration was judged for, if that is less."""
-    return own if judged is None else min(own, judged)
-
-
-def _require_judged(cycle: Cycle, speed_m_per_s: float) -> None:
-    running = cycle.configurations.running
-    most = running.region.speed_max_m_per_s
-    if most is not None and speed_m_per_s > most:
-        raise Refused(
-            f"{speed_m_per_s:g} m/s is more than controller {running.hash[:12]} was judged for; allowed: 0 to "
-            f"{most:g} m/s; a configuration that is judged for more, and approved, lifts it"
-        )
 
 
 def _pace(cycle: Cycle, rate: str) -> str:
@@ -302,7 +287,7 @@ def _select_recipe(cycle: Cycle, command: SelectRecipe) -> str:
         close = nearest(command.name, recipes)
         hint = f"; did you mean {close}?" if close else ""
         raise Refused(f"there is no recipe {command.name!r}{hint} Known: {', '.join(recipes)}")
-    _require_judged(cycle, recipe.speed_m_per_s)
+    require_judged(cycle, recipe.speed_m_per_s)
     cycle.setpoints.aim_at(recipe)
     return f"recipe {recipe.name}: tensions and speed move to it"
 
@@ -314,34 +299,13 @@ def _run_experiment(cycle: Cycle, command: RunExperiment) -> str:
     if cycle.machine.phase is not Phase.RUNNING:
         raise Refused(f"an experiment needs a running line, this one is {cycle.machine.phase.name.lower()}")
     reasons = cycle.experiments.why_not(experiment, cycle.line)
-    reasons += _unjudged(cycle, experiment)
+    reasons += unjudged(cycle, experiment)
     if doubts := in_words(int(cycle.watch.doubts)):
         reasons.append(f"the loop doubts what it measures: {', '.join(doubts)}")
     if reasons:
         raise Refused("the experiment is not run", reasons)
     cycle.experiments.begin(experiment)
     return f"experiment {experiment.name} runs for {experiment.duration_s:g} s; abort, hold, stop and set end it"
-
-
-def _unjudged(cycle: Cycle, experiment: Experiment) -> list[str]:
-    """What of it the configuration in service has not been judged for."""
-    configurations = cycle.configurations
-    probation, region = configurations.probation, configurations.running.region
-    reasons: list[str] = []
-    if probation is not None and probation.shaped_first:
-        reasons.append(f"epoch {configurations.epoch} is on probation, and set-points move shaped only")
-    step_n = experiment.step_max_n if experiment.rate_n_per_s is None else 0.0
-    if region.tension_step_max_n is not None and step_n > region.tension_step_max_n * (1.0 + 1e-9):
-        reasons.append(
-            f"set-points would step by up to {step_n:g} N; the configuration was judged for "
-            f"{region.tension_step_max_n:g} N"
-        )
-    fastest = max((leg.speed_m_per_s or 0.0 for leg in experiment.legs), default=0.0)
-    if region.speed_max_m_per_s is not None and fastest > region.speed_max_m_per_s:
-        reasons.append(
-            f"a leg runs at {fastest:g} m/s; the configuration was judged for {region.speed_max_m_per_s:g} m/s"
-        )
-    return reasons
 
 
 def _abort_experiment(cycle: Cycle) -> str:
