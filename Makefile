@@ -6,7 +6,7 @@ RUN   := $(PY) -m gateway.cli
 export PYTHONDONTWRITEBYTECODE :=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup run test system-test check format bench bench-stepped bench-wire bench-processes bench-cycle bench-control bench-identify bench-faults bench-fuzz bench-soak lock clean
+.PHONY: help setup run test system-test check format bench bench-stepped bench-wire bench-processes bench-cycle bench-monitor bench-control bench-identify bench-faults bench-fuzz bench-soak lock clean
 
 help: ## this list
 	@echo "r2rgate: make TARGET"
@@ -51,6 +51,9 @@ bench-processes: setup ## processes killed in mid-run, judged by the recorder
 
 bench-control: setup ## every law under every tier beside the oracle (about an hour; ARGS="--parts a,c --seeds 3 --tiers A,B")
 	@$(PY) -m tests.bench.control $(ARGS)
+
+bench-monitor: setup ## unsafe configurations forced in, healthy ones left alone (about 15 min; ARGS="--unsafe 50 --healthy 100")
+	@$(PY) -m tests.bench.monitor $(ARGS)
 
 bench-identify: setup ## what a line learns of itself from 5 s, against truths never seen (ARGS="--parts a,c --friction 10")
 	@$(PY) -m tests.bench.identify $(ARGS)

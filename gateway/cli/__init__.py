@@ -1,0 +1,9 @@
+"""The commands."""
+
+import os
+import sys
+
+# Before numpy is loaded. The loop's matrices are small; with more threads a product in its main thread waits for one
+# that is worked on aside, for as long as that thread of no priority takes.
+if sys.argv[1:2] == ["loop"]:
+    os.environ["OPENBLAS_NUM_THREADS"] = "1"

@@ -1,0 +1,41 @@
+"""What the configuration in service was judged for: an operator's command beyond it is refused."""
+
+from gateway.core.experiment import Experiment
+from gateway.loop.cycle import Cycle
+from gateway.loop.refused import Refused
+
+
+def least(own: float, judged: float | None) -> float:
+    """The line's limit, or what the configuration was judged for, if that is less."""
+    return own if judged is None else min(own, judged)
+
+
+def require_judged(cycle: Cycle, speed_m_per_s: float) -> None:
+    running = cycle.configurations.running
+    most = running.region.speed_max_m_per_s
+    if most is not None and speed_m_per_s > most:
+        raise Refused(
+            f"{speed_m_per_s:g} m/s is more than controller {running.hash[:12]} was judged for; allowed: 0 to "
+            f"{most:g} m/s; a configuration that is judged for more, and approved, lifts it"
+        )
+
+
+def unjudged(cycle: Cycle, experiment: Experiment) -> list[str]:
+    """What of it the configuration in service has not been judged for."""
+    configurations = cycle.configurations
+    probation, region = configurations.probation, configurations.running.region
+    reasons: list[str] = []
+    if probation is not None and probation.shaped_first:
+        reasons.append(f"epoch {configurations.epoch} is on probation, and set-points move shaped only")
+    step_n = experiment.step_max_n if experiment.rate_n_per_s is None else 0.0
+    if region.tension_step_max_n is not None and step_n > region.tension_step_max_n * (1.0 + 1e-9):
+        reasons.append(
+            f"set-points would step by up to {step_n:g} N; the configuration was judged for "
+            f"{region.tension_step_max_n:g} N"
+        )
+    fastest = max((leg.speed_m_per_s or 0.0 for leg in experiment.legs), default=0.0)
+    if region.speed_max_m_per_s is not None and fastest > region.speed_max_m_per_s:
+        reasons.append(
+            f"a leg runs at {fastest:g} m/s; the configuration was judged for {region.speed_max_m_per_s:g} m/s"
+        )
+    return reasons

@@ -1,0 +1,283 @@
+"""Would the fallback configuration still bring the line back, if it took over with the next sample?
+
+Its closed loop with the accepted model is linear until a torque meets its limit or its rate, and so one product says
+where tensions, speeds and torques go over the horizon. Only where a torque would meet a limit is the way gone step by
+step, with the limit. Pure; numpy only, for it runs in the loop.
+
+With x~ = x - x_eq and u~ = u - u_eq away from the model's equilibrium, u~ in flight newest first, and z what the law
+remembers (see `linear_form`), s = [x~; u~ in flight; z]:
+
+    u = K s + c,    s_next = A s + B u + d
+
+where s at the next sample, c and d follow from q = [x; in flight; u; x_eq; u_eq; x_ref; u_ref] of now, and z where the
+fallback runs already, by one matrix.
+"""
+
+from bisect import bisect_right
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gateway.control.deviation import Deviation, Measured
+from gateway.control.engagement import engagement
+from gateway.control.linear_form import LinearForm, linear_form
+from gateway.control.reference import Steady
+from gateway.control.sampled import Sampled
+from gateway.core.controller import Controller
+from gateway.core.controller_laws import MpcConfig
+from gateway.core.controller_schedule import LinearConfig, ScheduledConfig, law_at
+from gateway.core.deployment import RecoveryNode, RecoveryPrediction
+from gateway.core.line import Line
+from gateway.core.signals import FloatArray
+from safety.limits import envelope_limits
+
+TRIED = frozenset((1, 3, 7, 15, 31))  #: periods with cut torques after which the rest is looked at in one
+NEAR_SETPOINT = 0.5  #: of what a set-point keeps from a limit, tensions may keep as well
+FAST = 0.85  #: of the roller speed at which the envelope takes torque off
+EXCUSED = 1e-6  #: of a torque's limit and rate, for rounding
+
+
+@dataclass(frozen=True, slots=True)
+class Shortfall:
+    """What the fallback would not keep: a span's tension or a roller's speed (from 0), what it comes to, and when."""
+
+    what: str  #: "span" or "roller"
+    index: int
+    value: float  #: N or m/s
+    allowed: float
+    ahead_s: float
+
+    def __str__(self) -> str:
+        value, unit = (f"{self.value:.1f}", "N") if self.what == "span" else (f"{self.value:.3f}", "m/s")
+        return (
+            f"{self.what} {self.index + 1} would come to {value} {unit} in {self.ahead_s:.2f} s if the fallback took "
+            f"over now, allowed: {self.allowed:g} {unit}"
+        )
+
+
+@dataclass(frozen=True)
+class _Way:
+    """From q (with z behind it where the fallback runs already): where everything goes."""
+
+    begin: FloatArray  #: (2 s + n, q), [s; d; c]
+    looks: FloatArray  #: (3n k, q), tensions, speeds and torques asked for, of each at every look
+
+
+@dataclass(frozen=True)
+class _Loop:
+    """The fallback in closed loop with the model near one speed."""
+
+    A: FloatArray  #: (s, s), without control
+    B: FloatArray  #: (s, n)
+    K: FloatArray  #: (n, s)
+    both: FloatArray  #: (s + n, s), [A; K]
+    onward: FloatArray  #: (3n k, 2 s), from [s; B c + d]: tensions and speeds away from equilibrium, torques less c
+    taking_over: _Way
+    running: _Way
+
+
+class Recovery:
+    """A `RecoveryPrediction` for a line, with its fallback."""
+
+    def __init__(self, watch: RecoveryPrediction, fallback: Controller, line: Line) -> None:
+        """Takes some milliseconds."""
+        self.fallback = watch.fallback
+        self.periods = round(watch.horizon_s / watch.period_s)
+        self.depth = len(watch.nodes[0].inputs) - 1  #: torques in flight on the model's side
+        self._n = watch.n
+        self._period_s = watch.period_s
+        self._margin_n = watch.margin_n
+        limits, envelope = line.limits, envelope_limits(line)
+        self._low_n, self._high_n = limits.tension_min_n, limits.tension_max_n
+        self._fastest = FAST * envelope.roller_overspeed * limits.speed_max_m_per_s
+        self._torque_nm = limits.torque_nm * (1.0 + EXCUSED)
+        self._step_nm = limits.torque_rate_nm_per_s * watch.period_s
+        draw = [i for i, span in enumerate(line.spans) if span.control == "draw"]
+        self._draw = np.array(draw, dtype=np.intp)
+        self._free = np.zeros(watch.n)  #: added to a span's bounds: nobody sees the tension of a draw span
+        self._free[draw] = np.inf
+        self._each: NDArray[np.int64] = np.arange(self.periods + 1, dtype=np.int64)
+        self._looks = _looks(self._each, watch.n)
+        # The first torque follows the one that is sent now.
+        self._steps_nm = self._step_nm * (1.0 + EXCUSED) * np.diff(self._looks, prepend=-1)
+        self._setpoints = b""  #: that the next two belong to
+        self._least = self._most = np.zeros(2 * watch.n)  #: of tensions and speeds
+        speeds = [node.speed_m_per_s for node in watch.nodes]
+        self._middles = [0.5 * (low + high) for low, high in pairwise(speeds)]
+        self._loops = [_loop(node, _law(fallback, node.speed_m_per_s), self._looks) for node in watch.nodes]
+        self._law = Deviation(fallback.feedforward, fallback.draw_spans, fallback.period_s, fallback.latency_s)
+        self._model = Deviation(watch.model, draw, watch.period_s, 0.0)
+        self._coulomb_nm = np.array(watch.coulomb_nm)
+
+    def shortfall(
+        self,
+        measured: Measured,
+        setpoint_n: FloatArray,
+        in_flight_nm: FloatArray,
+        torque_nm: FloatArray,
+        remembered: FloatArray | None = None,
+    ) -> Shortfall | None:
+        """What goes wrong if `torque_nm` (n,) is sent now and the fallback controls from the next sample on.
+
+        `in_flight_nm` (depth, n): sent before, newest first. `remembered` (z,): the fallback runs already and
+        remembers this at the next sample; None: it would take over then, without a jump.
+        """
+        found, looks = self.ahead(measured, setpoint_n, in_flight_nm, torque_nm, remembered)
+        least, most = self._bounds(setpoint_n)
+        if (found.min(axis=1) >= least).all() and (found.max(axis=1) <= most).all():
+            return None
+        return self._short(found, looks, least, most)
+
+    def ahead(
+        self,
+        measured: Measured,
+        setpoint_n: FloatArray,
+        in_flight_nm: FloatArray,
+        torque_nm: FloatArray,
+        remembered: FloatArray | None = None,
+    ) -> tuple[FloatArray, NDArray[np.int64]]:
+        """Tensions, then speeds (2n, k) where it is looked at, and when (k,): periods after the next sample."""
+        n, reference, unwind = self._n, Steady(setpoint_n), measured.unwind_speed_m_per_s
+        loop = self._loops[bisect_right(self._middles, unwind)]
+        x_eq = self._model.state(reference, unwind)
+        u_eq = self._model.torque(reference, unwind, 0) + self._coulomb_nm * np.sign(x_eq[n:])
+        tension_n = measured.tension_n
+        if self._draw.size:
+            tension_n = tension_n.copy()
+            tension_n[self._draw] = setpoint_n[self._draw]
+        known = (
+            tension_n, measured.speed_m_per_s, in_flight_nm.ravel(), torque_nm, x_eq, u_eq,
+            self._law.state(reference, unwind), self._law.torque(reference, unwind, 0),
+        )  # fmt: skip
+        if remembered is None:
+            way, q = loop.taking_over, np.concatenate(known)
+        else:
+            way, q = loop.running, np.concatenate((*known, remembered))
+        found = way.looks.dot(q).reshape(3 * n, -1)
+        if self._never_cut(found[2 * n :], torque_nm):
+            return found[: 2 * n], self._looks
+        return self._step_by_step(loop, way.begin.dot(q), x_eq, torque_nm)
+
+    def _never_cut(self, asked_nm: FloatArray, before_nm: FloatArray) -> bool:
+        """Whether torques (n, k) at the looks, after `before_nm` (n,), keep limit and rate. Most periods they do."""
+        change_nm = np.abs(asked_nm - np.concatenate((before_nm[:, None], asked_nm[:, :-1]), axis=1))
+        return bool(np.abs(asked_nm).max() <= self._torque_nm and (change_nm <= self._steps_nm).all())
+
+    def _step_by_step(
+        self, loop: _Loop, begin: FloatArray, x_eq: FloatArray, before_nm: FloatArray
+    ) -> tuple[FloatArray, NDArray[np.int64]]:
+        """As `ahead`, with torques cut as the envelope cuts them, for as long as any is."""
+        B, n, states = loop.B, self._n, len(loop.A)
+        step_nm, most_nm = self._step_nm, self._torque_nm
+        s, constant, c = begin[:states], begin[states:], begin[2 * states :]
+        driven = B.dot(c) + begin[states : 2 * states]
+        stepped: list[FloatArray] = []
+        for k in range(self.periods + 1):
+            if k in TRIED:
+                onward = loop.onward.dot(np.concatenate((s, driven))).reshape(3 * n, -1)
+                if self._never_cut(onward[2 * n :] + c[:, None], before_nm):
+                    found = np.hstack((np.array(stepped).T, onward[: 2 * n]))
+                    return found + x_eq[:, None], np.concatenate((self._each[:k], self._looks + k))
+            stepped.append(s[: 2 * n])
+            following = loop.both.dot(s) + constant
+            torque = np.minimum(np.maximum(following[states:], before_nm - step_nm), before_nm + step_nm)
+            before_nm = np.minimum(np.maximum(torque, -most_nm), most_nm)
+            s = following[:states] + B.dot(before_nm)
+        return np.array(stepped).T + x_eq[:, None], self._each
+
+    def _bounds(self, setpoint_n: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """What tensions and speeds (2n,) must keep."""
+        setpoints = setpoint_n.tobytes()
+        if setpoints != self._setpoints:
+            low = self._low_n + np.minimum(self._margin_n, NEAR_SETPOINT * (setpoint_n - self._low_n)) - self._free
+            high = self._high_n - np.minimum(self._margin_n, NEAR_SETPOINT * (self._high_n - setpoint_n)) + self._free
+            fastest = np.full(self._n, self._fastest)
+            self._least, self._most = np.concatenate((low, -fastest)), np.concatenate((high, fastest))
+            self._setpoints = setpoints
+        return self._least, self._most
+
+    def _short(self, found: FloatArray, looks: NDArray[np.int64], least: FloatArray, most: FloatArray) -> Shortfall:
+        """The tension that is furthest beyond its bounds, or the speed where no tension is."""
+        over = np.maximum(least[:, None] - found, found - most[:, None])
+        n = self._n
+        first = 0 if (over[:n] > 0.0).any() else n
+        i, k = np.unravel_index(int(over[first : first + n].argmax()), over[:n].shape)
+        value = float(found[first + i, k])
+        allowed = float(least[first + i] if value < least[first + i] else most[first + i])
+        return Shortfall("roller" if first else "span", int(i), value, allowed, float(looks[k] + 1) * self._period_s)
+
+
+def _looks(each: NDArray[np.int64], n: int) -> NDArray[np.int64]:
+    """Every period at the beginning, then every other one; on a longer line fewer, for each takes more."""
+    closely, stride = (10, 2) if n <= 8 else (4, n // 4)
+    return np.concatenate((each[:closely], each[closely::stride]))
+
+
+def _law(fallback: Controller, speed_m_per_s: float) -> LinearConfig | MpcConfig:
+    return law_at(fallback, speed_m_per_s) if isinstance(fallback, ScheduledConfig) else fallback
+
+
+def _loop(node: RecoveryNode, law: LinearConfig | MpcConfig, looks: NDArray[np.int64]) -> _Loop:
+    form = linear_form(law)
+    F, G = Sampled(np.array(node.transition), [np.array(matrix) for matrix in node.inputs]).augmented()
+    physical, n = G.shape
+    size = physical + form.states
+    A, B, K = np.zeros((size, size)), np.vstack((G, form.applied)), np.zeros((n, size))
+    A[:physical, :physical] = F
+    A[physical:, : 2 * n] = form.part(form.state, "e")
+    A[physical:, physical:] = form.part(form.state, "z")
+    K[:, : 2 * n] = form.part(form.torque, "e")
+    K[:, physical:] = form.part(form.torque, "z")
+    taking_over, running = (_beginning(law, form, F, G, remembers) for remembers in (False, True))
+    eye, none = np.eye(size, 2 * size), np.zeros((n, 2 * size))
+    onward = _rows(A + B @ K, eye, np.eye(size, 2 * size, size), K, none, none[:1], looks)
+    return _Loop(A, B, K, np.vstack((A, K)), onward, _way(A, B, K, taking_over, looks), _way(A, B, K, running, looks))
+
+
+def _beginning(
+    law: LinearConfig | MpcConfig, form: LinearForm, F: FloatArray, G: FloatArray, remembers: bool
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """[s; d; c] and x_eq as rows on q."""
+    (physical, n), kept = G.shape, form.states if remembers else 0
+    depth = physical // n - 2
+    lengths = [2 * n, depth * n, n, 2 * n, n, 2 * n, n, kept]
+    x, sent, u, x_eq, u_eq, x_ref, u_ref, z = np.split(np.eye(sum(lengths)), np.cumsum(lengths)[:-1])
+    away = np.vstack((x - x_eq, sent - np.tile(u_eq, (depth, 1))))
+    away = F @ away + G @ (u - u_eq)
+    if not remembers:
+        z = engagement(law, form) @ np.vstack((away[: 2 * n] + x_eq, x_ref, u_ref, u))
+    given = np.vstack((x_eq - x_ref, x_ref, u_ref))  # what of the law's inputs does not change from now on
+    c, into_z = (rows[:, form.states :] @ given for rows in (form.torque, form.state))
+    return np.vstack((away, z)), np.vstack((-G @ u_eq, into_z)), c, x_eq
+
+
+def _way(
+    A: FloatArray,
+    B: FloatArray,
+    K: FloatArray,
+    beginning: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
+    looks: NDArray[np.int64],
+) -> _Way:
+    s, d, c, x_eq = beginning
+    return _Way(np.vstack((s, d, c)), _rows(A + B @ K, s, B @ c + d, K, c, x_eq, looks))
+
+
+def _rows(
+    closed: FloatArray,
+    s: FloatArray,
+    driven: FloatArray,
+    K: FloatArray,
+    c: FloatArray,
+    x_eq: FloatArray,
+    looks: NDArray[np.int64],
+) -> FloatArray:
+    """Tensions and speeds, then torques, at each look: s_next = closed s + driven, u = K s + c."""
+    physical, wanted = 2 * len(K), set(looks.tolist())
+    rows: list[FloatArray] = []
+    for k in range(int(looks[-1]) + 1):
+        if k in wanted:
+            rows.append(np.vstack((s[:physical] + x_eq, K @ s + c)))
+        s = closed @ s + driven
+    return np.stack(rows, axis=1).reshape(-1, s.shape[1])

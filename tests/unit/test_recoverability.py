@@ -1,0 +1,173 @@
+"""What is predicted of a fallback, against the same line simulated step by step with the laws that really run."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from gateway.control.design import design_lqg, design_lqi, design_lqr, design_pid, design_scheduled, task_of
+from gateway.control.design.sampling import with_dead_time
+from gateway.control.engagement import memory
+from gateway.control.law import Measured
+from gateway.control.laws import make_law
+from gateway.control.reference import Steady
+from gateway.core.line_file import load_line
+from gateway.core.line_template import line_template
+from gateway.core.theta import nominal_theta
+from gateway.core.web_model import equilibrium_torque, linearise, reference_speeds
+from safety.recoverability import Recovery
+from safety.recovery_prediction import recovery_prediction
+
+LINE = load_line(line_template(6, "line.toml"), "line.toml")
+TASK = task_of(LINE)
+THETA = nominal_theta(LINE)
+LAWS = {
+    "lqi": design_lqi(TASK),
+    "lqg": design_lqg(TASK),
+    "lqr": design_lqr(TASK),
+    "pid": design_pid(TASK),
+    "scheduled": design_scheduled(TASK, design_lqi, [0.02, 0.1]),
+}
+TENSION_N, SPEED = np.array([28.0, 36.0, 20.0, 40.0, 24.0, 32.0]), 0.05
+STEP_NM, MOST_NM = LINE.limits.torque_rate_nm_per_s * LINE.control.period_s, LINE.limits.torque_nm
+
+
+def rolled_out(config, x, before_nm, torque_nm, periods, in_use=0):
+    """Tensions (periods, n) of the linear model under the law that really runs, engaged after `in_use` periods."""
+    web, n = THETA.web, 6
+    v_eq = reference_speeds(web, TENSION_N, SPEED)
+    x_eq, u_eq = np.concatenate((TENSION_N, v_eq)), equilibrium_torque(web, TENSION_N, v_eq)
+    plant = with_dead_time(*linearise(web, TENSION_N, v_eq, SPEED), LINE.control.period_s, THETA.latency_s)
+    flight, law, state, found = [before_nm] * plant.depth, make_law(config), None, []
+    for k in range(periods + 1):
+        if k > 0:
+            measured = Measured(x[:n].copy(), x[n:].copy(), SPEED)
+            reference = Steady(TENSION_N)
+            state = law.engage(measured, reference, torque_nm) if state is None else state
+            decision = law.ask(state, measured, reference)
+            asked = np.clip(decision.torque_nm, torque_nm - STEP_NM, torque_nm + STEP_NM)
+            torque_nm = np.clip(asked, -MOST_NM, MOST_NM)
+            state = law.commit(state, decision, torque_nm)
+            found.append(x[:n])
+        sent = [torque_nm, *flight]
+        x = x_eq + plant.transition @ (x - x_eq) + sum(
+            G @ (u - u_eq) for G, u in zip(plant.inputs, sent, strict=True)
+        )  # fmt: skip
+        flight = sent[: plant.depth]
+    return np.array(found)
+
+
+def disturbed(size, seed=0):
+    dice = np.random.default_rng(seed)
+    v_eq = reference_speeds(THETA.web, TENSION_N, SPEED)
+    # Beyond what an observer takes to be at its set-point, so that prediction and law mean the same.
+    away_n = np.sign(dice.normal(size=6)) * dice.uniform(1.0, 2.0, 6) * size
+    u_eq = equilibrium_torque(THETA.web, TENSION_N, v_eq)
+    before_nm, torque_nm = u_eq + dice.normal(size=(2, 6)) * size
+    return np.concatenate((TENSION_N + away_n, v_eq + dice.normal(size=6) * 1e-3 * size)), before_nm, torque_nm
+
+
+@pytest.mark.parametrize("size", [1.0, 8.0])  # the greater one meets torque rates and limits
+@pytest.mark.parametrize("name", LAWS)
+def test_the_prediction_is_what_the_law_does_with_the_model(name, size):
+    config = LAWS[name]
+    x, before_nm, torque_nm = disturbed(size)
+    recovery = Recovery(recovery_prediction(THETA, config, LINE, [SPEED]), config, LINE)
+    found, looks = recovery.ahead(Measured(x[:6], x[6:], SPEED), TENSION_N, before_nm[None], torque_nm)
+    truth = rolled_out(config, x, before_nm, torque_nm, 100)
+    # The model is linear near the recipe's tensions in both; a schedule's law is that of the node's speed.
+    scheduled = 0.2 if name == "scheduled" else 0.0
+    np.testing.assert_allclose(found[:6].T, truth[looks], atol=1e-3 + scheduled * size)
+
+
+@pytest.mark.parametrize("name", ["lqi", "lqg", "lqr", "pid"])
+def test_a_fallback_that_runs_already_is_predicted_with_what_it_remembers(name):
+    config, reference = LAWS[name], Steady(TENSION_N)
+    x, before_nm, torque_nm = disturbed(2.0)
+    law = make_law(config)
+    measured = Measured(x[:6].copy(), x[6:].copy(), SPEED)
+    state = law.engage(measured, reference, before_nm)
+    for _ in range(3):  # it has run: nothing in it is as if it took over now
+        decision = law.ask(state, measured, reference)
+        state = law.commit(state, decision, torque_nm)
+    recovery = Recovery(recovery_prediction(THETA, config, LINE, [SPEED]), config, LINE)
+    given = (Measured(x[:6], x[6:], SPEED), TENSION_N, before_nm[None], torque_nm)
+    found, looks = recovery.ahead(*given, memory(state))
+    other, _ = recovery.ahead(*given)
+    v_eq = reference_speeds(THETA.web, TENSION_N, SPEED)
+    u_eq = equilibrium_torque(THETA.web, TENSION_N, v_eq)
+    x_eq = np.concatenate((TENSION_N, v_eq))
+    plant = with_dead_time(*linearise(THETA.web, TENSION_N, v_eq, SPEED), LINE.control.period_s, THETA.latency_s)
+    sent, truth = [torque_nm, before_nm], []
+    for _ in range(int(looks[-1]) + 1):
+        x = x_eq + plant.transition @ (x - x_eq) + sum(
+            G @ (u - u_eq) for G, u in zip(plant.inputs, sent, strict=True)
+        )  # fmt: skip
+        truth.append(x[:6])
+        decision = law.ask(state, Measured(x[:6].copy(), x[6:].copy(), SPEED), reference)
+        now = np.clip(np.clip(decision.torque_nm, sent[0] - STEP_NM, sent[0] + STEP_NM), -MOST_NM, MOST_NM)
+        state, sent = law.commit(state, decision, now), [now, sent[0]]
+    np.testing.assert_allclose(found[:6].T, np.array(truth)[looks], atol=1e-3)
+    assert np.abs(found[:6, 5:20].max() - other[:6, 5:20].max()) > 1e-3
+
+
+def recovery_of(name="lqi", line=LINE, **changes):
+    return Recovery(recovery_prediction(THETA, LAWS[name], line, [0.01, SPEED, 0.1], **changes), LAWS[name], line)
+
+
+def at_rest():
+    v_eq = reference_speeds(THETA.web, TENSION_N, SPEED)
+    u_eq = equilibrium_torque(THETA.web, TENSION_N, v_eq)
+    return Measured(TENSION_N.copy(), v_eq, SPEED), TENSION_N, u_eq[None], u_eq
+
+
+def test_a_line_at_rest_is_recoverable_and_one_that_runs_away_is_not():
+    recovery = recovery_of()
+    measured, setpoint_n, in_flight_nm, torque_nm = at_rest()
+    assert recovery.shortfall(measured, setpoint_n, in_flight_nm, torque_nm) is None
+    away = replace_speed(measured, 2, 0.4)  # roller 3 runs ahead: span 3 is pulled, span 4 goes slack
+    short = recovery.shortfall(away, setpoint_n, in_flight_nm, torque_nm)
+    assert short is not None and short.what == "span" and short.index in (2, 3)
+    assert f"span {short.index + 1}" in str(short) and "allowed" in str(short)
+
+
+def replace_speed(measured, roller, more):
+    speed = measured.speed_m_per_s.copy()
+    speed[roller] += more
+    return replace(measured, speed_m_per_s=speed)
+
+
+def test_what_is_sent_now_counts_before_it_acts():
+    measured, setpoint_n, in_flight_nm, torque_nm = at_rest()
+    recovery, wild = recovery_of(), torque_nm + np.array([0.0, 0.0, 40.0, 0.0, 0.0, 0.0])
+    away = measured
+    for more in np.arange(0.05, 0.5, 0.01):  # as far as the fallback still recovers it
+        if recovery.shortfall(replace_speed(measured, 2, more), setpoint_n, in_flight_nm, torque_nm) is not None:
+            break
+        away = replace_speed(measured, 2, more)
+    assert away is not measured
+    assert recovery.shortfall(away, setpoint_n, in_flight_nm, wild) is not None
+    assert recovery.shortfall(away, setpoint_n, wild[None], torque_nm) is not None
+
+
+def test_a_setpoint_near_a_limit_needs_half_of_what_it_keeps_itself():
+    recovery = recovery_of()
+    setpoint_n = TENSION_N.copy()
+    setpoint_n[2] = LINE.limits.tension_min_n + 2.0
+    v_eq = reference_speeds(THETA.web, setpoint_n, SPEED)
+    u_eq = equilibrium_torque(THETA.web, setpoint_n, v_eq)
+    there = Measured(setpoint_n.copy(), v_eq, SPEED)
+    assert recovery.shortfall(there, setpoint_n, u_eq[None], u_eq) is None
+    below = replace(there, tension_n=setpoint_n - np.eye(6)[2] * 1.5)
+    assert recovery.shortfall(below, setpoint_n, u_eq[None], u_eq).index == 2
+
+
+def test_a_draw_span_is_not_looked_at():
+    measured, *rest = at_rest()
+    line = LINE.model_copy(
+        update={"spans": [s.model_copy(update={"control": "draw"}) if i == 1 else s for i, s in enumerate(LINE.spans)]}
+    )
+    config = LAWS["lqi"].model_copy(update={"draw_spans": [1]})
+    recovery = Recovery(recovery_prediction(THETA, config, line, [SPEED]), config, line)
+    nobody_knows = replace(measured, tension_n=np.where(np.arange(6) == 1, np.nan, measured.tension_n))
+    assert recovery.shortfall(nobody_knows, *rest) is None
