@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gateway.control.mpc_problem import MpcProblem
 from gateway.control.takeover import fade
 from gateway.core.controller_laws import LqgConfig, LqiConfig, LqrConfig, MpcConfig, PidConfig, Predictor
 from gateway.core.controller_schedule import LinearConfig
@@ -77,6 +76,8 @@ def linear_form(config: LinearConfig | MpcConfig) -> LinearForm:
         case LqgConfig():
             return _lqg(config, config.predictor, np.array(config.gain_state), np.array(config.gain_input))
         case MpcConfig():
+            from gateway.control.mpc_problem import MpcProblem  # scipy, for those who use it
+
             gain = MpcProblem(config).gain()
             return _lqg(config, config.predictor, gain[:, : 2 * config.n], gain[:, 2 * config.n :])
 

@@ -10,7 +10,7 @@ from typing import Annotated, Self
 from pydantic import Field, model_validator
 
 from gateway.core.controller import ControllerConfig
-from gateway.core.controller_laws import Matrix, Vector
+from gateway.core.controller_laws import Feedforward, Matrix
 from gateway.core.line import NonNegative, Positive, Strict
 
 Hash = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]  #: `controller.config_hash`
@@ -27,26 +27,17 @@ class Region(Strict):
 
 
 class RecoveryNode(Strict):
-    """The accepted model, sampled and linear, at one speed of the unwinder: x = [T_1 .. T_n; v_1 .. v_n] in N and m/s.
+    """The accepted model, sampled and linear, near one speed of the unwinder.
 
-    x_{k+1} = transition x_k + sum_j inputs[j] u_{k-j} + constant, u_{k-j} the torque (Nm) computed j periods ago
+    With x~ = [T - T_eq; v - v_eq] in N and m/s and u~ = u - u_eq in Nm, away from the model's equilibrium at the
+    set-points and the unwinder's speed of the moment:
+
+        x~_{k+1} = transition x~_k + sum_j inputs[j] u~_{k-j},  u_{k-j} the torque computed j periods ago
     """
 
     speed_m_per_s: NonNegative
     transition: Matrix  #: (2n, 2n)
     inputs: Annotated[list[Matrix], Field(min_length=1)]  #: (2n, n) each
-    constant: Vector  #: (2n,)
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        states = len(self.constant)
-        shapes = {"transition": (self.transition, states)} | {
-            f"inputs[{j}]": (matrix, states // 2) for j, matrix in enumerate(self.inputs)
-        }
-        for name, (matrix, columns) in shapes.items():
-            if states % 2 or len(matrix) != states or {len(row) for row in matrix} != {columns}:
-                raise ValueError(f"{name} must be {(states, columns)} beside a constant of {states} values")
-        return self
 
 
 class RecoveryPrediction(Strict):
@@ -55,23 +46,38 @@ class RecoveryPrediction(Strict):
     fallback: Hash  #: the configuration that is switched to; the one in service itself: then the line stops
     period_s: Positive
     horizon_s: Positive  #: that is looked ahead
-    margin_n: NonNegative  #: that tensions must keep from their limits, or from nearer set-points as much as these do
+    margin_n: (
+        NonNegative  #: that tensions must keep from their limits; half of what the set-point keeps, if that is less
+    )
+    model: Feedforward  #: the accepted model, whose equilibria are meant
+    coulomb_nm: list[NonNegative]  #: (n,), its dry friction
     nodes: Annotated[list[RecoveryNode], Field(min_length=1)]  #: by ascending speed; the nearest one is used
 
     @property
     def n(self) -> int:
-        return len(self.nodes[0].constant) // 2
+        return len(self.model.radius_m)
 
     @model_validator(mode="after")
     def _check(self) -> Self:
         speeds = [node.speed_m_per_s for node in self.nodes]
         if any(low >= high for low, high in pairwise(speeds)):
             raise ValueError(f"speeds of the nodes are {speeds}; allowed: ascending")
-        if len({(len(node.constant), len(node.inputs)) for node in self.nodes}) > 1:
-            raise ValueError("nodes of different lines: all have as many states and inputs")
+        if len({len(node.inputs) for node in self.nodes}) > 1:
+            raise ValueError("nodes with different dead times: all have as many inputs")
+        if len(self.coulomb_nm) != self.n:
+            raise ValueError(f"{len(self.coulomb_nm)} values of coulomb_nm for {self.n} rollers")
         if self.horizon_s < self.period_s:
             raise ValueError(f"horizon_s {self.horizon_s:g} is shorter than a period of {self.period_s:g} s")
+        for at, node in enumerate(self.nodes):
+            _require(f"nodes[{at}].transition", node.transition, (2 * self.n, 2 * self.n))
+            for age, matrix in enumerate(node.inputs):
+                _require(f"nodes[{at}].inputs[{age}]", matrix, (2 * self.n, self.n))
         return self
+
+
+def _require(name: str, matrix: Matrix, shape: tuple[int, int]) -> None:
+    if len(matrix) != shape[0] or {len(row) for row in matrix} != {shape[1]}:
+        raise ValueError(f"{name} must be {shape}")
 
 
 class Deployment(Strict):

@@ -1,10 +1,12 @@
 """What processes say to each other: commands and their replies (JSON), events (JSON), telemetry (see `telemetry`)."""
 
 import json
+import zlib
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, TypeAdapter, ValidationError
 
+from gateway.core.deployment import Deployment, Epoch, InService, RecoveryPrediction
 from gateway.core.experiment import Experiment, experiment_hash
 from gateway.core.line import Strict
 
@@ -70,17 +72,61 @@ class AbortExperiment(Strict):
     command: Literal["experiment-abort"] = "experiment-abort"
 
 
-Command = Annotated[
-    Arm | Start | Hold | Stop | SetTension | SetSpeed | SelectRecipe | RunExperiment | AbortExperiment,
-    Field(discriminator="command"),
-]
+class Deploy(Strict):
+    """Between two periods: this configuration controls the line from now on, on probation. From the gateway only."""
+
+    command: Literal["deploy"] = "deploy"
+    deployment: Deployment
+
+
+class Renew(Strict):
+    """The gateway is there and has nothing against the deployment: its lease begins anew."""
+
+    command: Literal["renew"] = "renew"
+    epoch: Epoch
+
+
+class Keep(Strict):
+    """The deployment on probation becomes the last known good."""
+
+    command: Literal["keep"] = "keep"
+    epoch: Epoch
+    #: Its fallback is what is kept: from now on the line stops where that would not recover it. None: nothing watches.
+    watch: RecoveryPrediction | None = None
+
+
+class Rollback(Strict):
+    """Back to the last known good, now. Where that runs, nothing changes."""
+
+    command: Literal["rollback"] = "rollback"
+    reason: Annotated[str, Field(min_length=1, max_length=500)]
+
+
+class AskConfiguration(Strict):
+    """What controls the line: the reply has it as `in_service`."""
+
+    command: Literal["configuration"] = "configuration"
+
+
+Operating = Arm | Start | Hold | Stop | SetTension | SetSpeed | SelectRecipe | RunExperiment | AbortExperiment
+Configuring = Deploy | Renew | Keep | Rollback | AskConfiguration
+Command = Annotated[Operating | Configuring, Field(discriminator="command")]
 _command: TypeAdapter[Command] = TypeAdapter(Command)
+Deploying = Deploy | Renew | Keep  #: what only the gateway's deployer says, never a person directly
+
+MAX_COMMAND = 4096  #: bytes of a command as JSON
+#: The same for `deploy` and `keep`, unpacked. What parses it holds the interpreter for about 10 ms a megabyte.
+MAX_DEPLOYMENT = 2 * 1024 * 1024
 
 
 def in_words(command: Command) -> str:
     """A command as a person would type it: "set 3 44.0 step"."""
     if isinstance(command, RunExperiment):
         return f"experiment {command.experiment.name} ({experiment_hash(command.experiment)[:12]})"
+    if isinstance(command, Deploy):
+        return f"deploy {command.deployment.hash[:12]} as epoch {command.deployment.epoch}"
+    if isinstance(command, Keep):
+        return f"keep {command.epoch}"
     values = command.model_dump().items()
     return " ".join(key if value is True else str(value) for key, value in values if value is not False)
 
@@ -92,6 +138,7 @@ class Reply(Strict):
     state: str  #: the loop's state after the command
     text: str  #: one sentence for a person, with what to do next where it was refused
     reasons: list[str] = []  #: every reason of a refusal
+    in_service: InService | None = None  #: after a command about the configuration
 
 
 class Event(Strict):
@@ -129,16 +176,42 @@ def _no_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return dict(pairs)
 
 
+def command_bytes(command: Command) -> bytes:
+    """`command` as it is sent: JSON, packed with zlib where it is longer than a short one may be."""
+    payload = command.model_dump_json().encode()
+    return payload if len(payload) <= MAX_COMMAND else zlib.compress(payload)
+
+
 def parse_command(payload: bytes) -> Command:
     """A command from outside. Raises MalformedMessage with every reason."""
-    if len(payload) > 4096:
-        raise MalformedMessage(f"a command has at most 4096 bytes, this one {len(payload)}")
+    packed = payload[:1] == b"\x78"  # no JSON begins so
+    if packed:
+        payload = _unpacked(payload)
+    elif len(payload) > MAX_COMMAND:
+        raise MalformedMessage(
+            f"a command has at most {MAX_COMMAND} bytes unless it is packed, this one {len(payload)}"
+        )
     try:
         document = json.loads(payload, object_pairs_hook=_no_duplicates)
     except (ValueError, RecursionError) as error:
         raise MalformedMessage(f"not JSON: {error}") from error
     try:
-        return _command.validate_python(document)
+        command = _command.validate_python(document)
     except ValidationError as error:
         reasons = "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())
-        raise MalformedMessage(reasons) from error
+        raise MalformedMessage(reasons[:MAX_COMMAND]) from error
+    if packed and not isinstance(command, Deploy | Keep):
+        raise MalformedMessage(f"only deploy and keep may be packed; others have at most {MAX_COMMAND} bytes")
+    return command
+
+
+def _unpacked(payload: bytes) -> bytes:
+    """Never more than is allowed, however little was sent."""
+    packer = zlib.decompressobj()
+    try:
+        unpacked = packer.decompress(payload, MAX_DEPLOYMENT)
+    except zlib.error as error:
+        raise MalformedMessage(f"not packed as zlib does: {error}") from error
+    if packer.unconsumed_tail or not packer.eof:
+        raise MalformedMessage(f"longer than {MAX_DEPLOYMENT} bytes unpacked, or cut off")
+    return unpacked

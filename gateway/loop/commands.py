@@ -9,7 +9,9 @@ from gateway.core.messages import (
     AbortExperiment,
     Arm,
     Command,
+    Configuring,
     Hold,
+    Operating,
     Reply,
     RunExperiment,
     SelectRecipe,
@@ -39,6 +41,8 @@ class Refused(Exception):
 def carry_out(cycle: Cycle, command: Command, now_s: float) -> Reply:
     """Do `command` between two periods. `arm` takes longer: `prepare_to_arm` goes before it."""
     try:
+        if isinstance(command, Configuring):
+            raise Refused("this loop runs the configuration that it was started with, and takes no other yet")
         text = _do(cycle, command, now_s)
     except Refused as refusal:
         return Reply(ok=False, state=cycle.machine.state.name, text=str(refusal), reasons=refusal.reasons)
@@ -47,7 +51,7 @@ def carry_out(cycle: Cycle, command: Command, now_s: float) -> Reply:
     return Reply(ok=True, state=cycle.machine.state.name, text=text)
 
 
-def _do(cycle: Cycle, command: Command, now_s: float) -> str:
+def _do(cycle: Cycle, command: Operating, now_s: float) -> str:
     match command:
         case Arm():
             return _arm(cycle, now_s)

@@ -12,7 +12,17 @@ from typing import Any
 from pydantic import ValidationError
 
 from gateway.core.line import Line
-from gateway.core.messages import BUS_REPORTS, Arm, BusReport, Event, MalformedMessage, Reply, in_words, parse_command
+from gateway.core.messages import (
+    BUS_REPORTS,
+    Arm,
+    BusReport,
+    Deploying,
+    Event,
+    MalformedMessage,
+    Reply,
+    in_words,
+    parse_command,
+)
 from gateway.core.topics import GATEWAY_COMMAND, GATEWAY_STATUS, LOOP_BUSES, LOOP_COMMAND, LOOP_EVENT, LOOP_TELEMETRY
 from gateway.mailbox.port import PEER, Counters, Mailbox, Peer, Unreachable
 from gateway.supervisor.historian import Historian
@@ -180,7 +190,11 @@ class Gateway:
     async def _pass_on(self, payload: bytes) -> Reply:
         state = loop_status(self._line, self._sink, self._clock()).state
         try:
-            time_s = ARM_TIME_S if isinstance(parse_command(payload), Arm) else LOOP_TIME_S
+            command = parse_command(payload)
+            if isinstance(command, Deploying):
+                text = f"{in_words(command)}: only a proposal that was judged and approved changes the controller"
+                return Reply(ok=False, state=state, text=text, reasons=[text])
+            time_s = ARM_TIME_S if isinstance(command, Arm) else LOOP_TIME_S
             answer = await self._mailbox.request(LOOP_COMMAND, payload, time_s)
             return Reply.model_validate_json(answer)
         except MalformedMessage as error:

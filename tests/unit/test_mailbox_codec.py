@@ -47,9 +47,9 @@ def test_the_longest_payload_passes_and_one_byte_more_does_not(kind: Kind) -> No
     datagram = encode(longest)
     assert len(datagram) == MAX_DATAGRAM
     assert decode(datagram) == longest
-    with pytest.raises(MalformedEnvelope, match="65537 bytes"):
+    with pytest.raises(MalformedEnvelope, match=f"{MAX_PAYLOAD + 1} bytes"):
         encode(longest._replace(payload=bytes(MAX_PAYLOAD + 1)))
-    with pytest.raises(MalformedEnvelope, match="65537 bytes"):
+    with pytest.raises(MalformedEnvelope, match=f"{MAX_PAYLOAD + 1} bytes"):
         decode(datagram + b"x")
 
 
