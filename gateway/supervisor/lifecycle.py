@@ -85,7 +85,7 @@ class Book:
     entries: dict[str, Entry] = field(default_factory=dict[str, Entry])
     in_service: str | None = None
     last_known_good: str | None = None
-    epoch: int = 0  #: of the last deployment that the loop was told of, whatever became of it
+    epoch: int = 0  #: of the last deployment that the loop has taken, or is being told of
     model: str | None = None
 
     @property
@@ -99,26 +99,27 @@ class Book:
 
     def why_not(self, kind: str, what: Mapping[str, Any]) -> str:
         """Why a record of `kind` cannot come now; empty: it can."""
-        if kind == FOUND:
-            return ""
         proposal = str(what.get("proposal", ""))
         entry = self.entries.get(proposal)
-        if kind == PROPOSED:
-            return f"proposal {proposal[:12]} was made before: {entry.stage}" if entry is not None else ""
-        if kind not in STEPS:
-            return f"there is no step {kind}"
+        if kind == PROPOSED and entry is not None:
+            return f"proposal {proposal[:12]} was made before: {entry.stage}"
+        if kind in (PROPOSED, FOUND):
+            return ""
         if entry is None:
             return f"there is no proposal {proposal[:12]}"
         stages, _ = STEPS[kind]
         if entry.stage not in stages:
             return f"proposal {proposal[:12]} is {entry.stage}; {kind} comes after {' or '.join(stages)}"
-        if kind in OWN_KIND:
-            if OWN_KIND[kind] != entry.kind:
-                return f"proposal {proposal[:12]} is of {entry.kind}; {kind} is for {OWN_KIND[kind]}"
-            if (other := self.on_the_line) is not None:
-                return f"proposal {other.proposal[:12]} is {other.stage}: one change at a time"
-            if entry.base != self.in_service:
-                return f"proposal {proposal[:12]} would change a configuration that is no longer in service"
+        return self._why_not_carry_out(kind, entry, what) if kind in OWN_KIND else ""
+
+    def _why_not_carry_out(self, kind: str, entry: Entry, what: Mapping[str, Any]) -> str:
+        short = entry.proposal[:12]
+        if OWN_KIND[kind] != entry.kind:
+            return f"proposal {short} is of {entry.kind}; {kind} is for {OWN_KIND[kind]}"
+        if (other := self.on_the_line) is not None:
+            return f"proposal {other.proposal[:12]} is {other.stage}: one change at a time"
+        if entry.base != self.in_service:
+            return f"proposal {short} would change a configuration that is no longer in service"
         if kind == "deploying" and what.get("epoch") != self.epoch + 1:
             return f"epoch {what.get('epoch')} does not follow {self.epoch}"
         return ""
@@ -150,6 +151,8 @@ class Book:
     def _in_service(self, kind: str, entry: Entry, what: Mapping[str, Any]) -> None:
         if kind == "deploying":
             self.epoch = int(what["epoch"])
+        elif kind == "not-deployed":
+            self.epoch = int(what["epoch"]) - 1
         elif kind == "deployed":
             self.in_service = entry.changes
         elif kind == "kept":
@@ -163,15 +166,12 @@ class Book:
         """The loop's own word on what controls the line."""
         self.in_service = str(what["configuration"])
         self.last_known_good = str(what["last_known_good"])
-        self.epoch = max(self.epoch, int(what["epoch"]))
+        self.epoch = int(what["epoch"])
 
     def explains(self, configuration: str, epoch: int) -> bool:
         """Whether the records say how the line may have come to this configuration, at this epoch of the loop."""
-        change = self.on_the_line
-        possible = {self.in_service, self.last_known_good}
-        if change is not None and change.stage is not Stage.RUNNING and change.epoch == epoch:
-            possible.add(change.changes)
-        return configuration in possible and epoch <= self.epoch
+        deployed = {entry.changes for entry in self.entries.values() if entry.epoch == epoch}
+        return configuration in {self.in_service, self.last_known_good, *deployed}
 
 
 def reconciled(book: Book, found: InService) -> tuple[str, dict[str, Any]] | None:
@@ -182,7 +182,7 @@ def reconciled(book: Book, found: InService) -> tuple[str, dict[str, Any]] | Non
     change = book.on_the_line
     if change is not None and change.stage is not Stage.RUNNING:
         return _settled(change, found)
-    if (found.hash, found.last_known_good) != (book.in_service, book.last_known_good) or found.epoch > book.epoch:
+    if (found.hash, found.last_known_good) != (book.in_service, book.last_known_good) or found.epoch != book.epoch:
         return FOUND, {
             "configuration": found.hash,
             "last_known_good": found.last_known_good,
