@@ -1,4 +1,4 @@
-"""The one way in: proposals are judged, decided, put on the line, watched, kept or rolled back; each step audited first.
+"""The one way in: proposals are judged, decided, put on the line, watched, kept or rolled back, audited step by step.
 
 Every step is a record of the audit, stored before what it announces is done; without an audit nothing is changed, and
 the loop runs on. What the loop says of itself settles what a record left open: after a restart, after an answer that
@@ -98,7 +98,7 @@ class Deployer:
         self._payloads: dict[str, Proposal] = {}
         self._verdicts: dict[str, Verdict] = {}
         self._one_step = asyncio.Lock()
-        self._judging: set[asyncio.Task[None]] = set()
+        self._judging: dict[str, asyncio.Task[None]] = {}
         self._renewed_s = clock()
         self._probation_since_s = clock()
         self._settled = False  #: the loop has been asked since this process began
@@ -180,12 +180,15 @@ class Deployer:
         return reply.model_copy(update={"text": reply.text + recorded})
 
     async def watch(self) -> None:
-        """Proposals expire, leases are renewed, what is on probation is kept or left to fall back."""
+        """Proposals expire, leases are renewed, what is on probation is kept or left to fall back.
+
+        After a start it goes on from what the records and the loop say.
+        """
         if self._one_step.locked():
             return
         async with self._one_step:
             try:
-                await self._expire()
+                await self._tidy()
                 if self.book.on_the_line is not None or not self._settled:
                     found = await self._settle()
                     await self._look_after(found)
@@ -194,19 +197,16 @@ class Deployer:
             else:
                 self.trouble = ""
 
-    async def resume(self) -> None:
-        """After a start: what was being judged is judged again, what was approved asks for its approval again."""
-        for entry in self.book.undecided:
-            if entry.stage is Stage.RECEIVED and entry.proposal in self._payloads:
-                self._begin_judging(entry.proposal)
-            elif entry.stage is Stage.APPROVED:
-                because = "the gateway was started anew before it was carried out: decide again"
-                await self._step("approval-lapsed", {"proposal": entry.proposal, "because": because}, GATEWAY)
+    async def judged(self) -> None:
+        """Until nothing is being judged any more."""
+        while self._judging:
+            await asyncio.gather(*self._judging.values())
 
     async def close(self) -> None:
-        for task in self._judging:
+        judging = list(self._judging.values())
+        for task in judging:
             task.cancel()
-        await asyncio.gather(*self._judging, return_exceptions=True)
+        await asyncio.gather(*judging, return_exceptions=True)
 
     def listed(self, most: int) -> ProposalList:
         """The newest first."""
@@ -250,8 +250,8 @@ class Deployer:
 
     def _begin_judging(self, proposal: str) -> None:
         task = asyncio.get_running_loop().create_task(self._judged(proposal))
-        self._judging.add(task)
-        task.add_done_callback(self._judging.discard)
+        self._judging[proposal] = task
+        task.add_done_callback(lambda _: self._judging.pop(proposal, None))
 
     async def _judged(self, hash_: str) -> None:
         proposal = self._payloads[hash_]
@@ -272,7 +272,7 @@ class Deployer:
             try:
                 await self._step("accepted" if verdict.accepted else "refused", what, GATEWAY, blobs)
             except (AuditUnavailable, Impossible):
-                return  # it stays as received, and is judged again after the next start
+                return  # it stays as received, and is judged again
 
     # --- on the line -------------------------------------------------------------------------------------------
 
@@ -355,12 +355,18 @@ class Deployer:
             await self._step(*step, GATEWAY)
         raise Impossible("the book does not come to what the loop says")
 
-    async def _expire(self) -> None:
+    async def _tidy(self) -> None:
+        """What is left over: of time, of a gateway that ended before it could go on, of an audit that was not there."""
         now_s = self._wall_clock()
         for entry in self.book.undecided:
             if now_s >= entry.expires_s:
                 what = {"proposal": entry.proposal, "because": f"nobody decided until {entry.expires}"}
                 await self._step("expired", what, GATEWAY)
+            elif entry.stage is Stage.APPROVED:
+                because = "it was approved, and not carried out: decide again"
+                await self._step("approval-lapsed", {"proposal": entry.proposal, "because": because}, GATEWAY)
+            elif entry.stage is Stage.RECEIVED and entry.proposal not in self._judging:
+                self._begin_judging(entry.proposal)
 
     async def _step(
         self, kind: str, what: Mapping[str, Any], who: Who, blobs: Mapping[str, bytes] | None = None

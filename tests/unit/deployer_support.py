@@ -1,6 +1,7 @@
 """A loop, an audit and a judge for tests of the deployer: they keep their promises, fail when told to, and no more."""
 
 import hashlib
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from gateway.control.design import design_lqi, task_of
@@ -53,6 +54,7 @@ class Death:
 @dataclass
 class FakeAudit:
     death: Death
+    check: Callable[[str, dict], None]  #: of what is about to be recorded
     records: list[tuple[str, dict]] = field(default_factory=list)
     blobs: dict[str, bytes] = field(default_factory=dict)
     available: bool = True
@@ -60,6 +62,7 @@ class FakeAudit:
     async def append(self, kind, who, what, blobs=None):
         if not self.available:
             raise AuditUnavailable("the disk is full")
+        self.check(kind, what)
         due = self.death.due()
         if due and not self.death.after:
             raise Killed

@@ -37,12 +37,17 @@ class Gateway:
 
     def __init__(self) -> None:
         self.death = Death()
-        self.audit = FakeAudit(self.death)
+        self.audit = FakeAudit(self.death, self._checked)
         self.loop = FakeLoop(self.death)
         self.judge = FakeJudge()
         self.surroundings = FakeSurroundings(self.loop)
         self.proposals = {}
         self.begin()
+
+    def _checked(self, kind, what) -> None:
+        if kind == "deploying":
+            base = self.proposals[what["proposal"]].base
+            assert self.loop.runs == what["before"] == base, "it was made for another configuration"
 
     def begin(self) -> None:
         clock = lambda: self.loop.now_s  # noqa: E731
@@ -59,15 +64,10 @@ class Gateway:
             verdict = verdicts.get(hash_)
             self.deployer.remember(one, None if verdict is None else Verdict.model_validate_json(verdict))
 
-    async def settled(self) -> None:
-        """What runs in the background has come to its end."""
-        while self.deployer._judging:
-            await asyncio.gather(*self.deployer._judging)
-
     async def propose(self, one):
         self.proposals[hash_of(one)] = one
         reply = await self.deployer.propose(canonical(one), ANNA)
-        await self.settled()
+        await self.deployer.judged()
         return reply
 
     async def decide(self, one, approve=True, shown=None):
@@ -97,7 +97,6 @@ def run(test):
 
 async def started() -> Gateway:
     gateway = Gateway()
-    await gateway.deployer.resume()
     await gateway.deployer.watch()
     return gateway
 
@@ -268,9 +267,8 @@ class LifeCycle(RuleBasedStateMachine):
             self._run(self._begin())
 
     async def _begin(self) -> None:
-        await self.gateway.deployer.resume()
-        await self.gateway.settled()
         await self.gateway.deployer.watch()
+        await self.gateway.deployer.judged()
 
     def _any(self, data):
         return data.draw(st.sampled_from(sorted(self.gateway.proposals.items())))[1] if self.gateway.proposals else None
@@ -359,6 +357,14 @@ class LifeCycle(RuleBasedStateMachine):
                 entry = book_of(self.gateway.audit.records).entries[what["proposal"]]
                 kept.add(entry.changes)
         assert self.gateway.loop.good in kept
+
+    @invariant()
+    def no_approval_is_left_lying(self):
+        gateway = self.gateway
+        if gateway.audit.available:
+            self._run(gateway.deployer.watch())
+            if gateway.audit.available:
+                assert Stage.APPROVED not in {entry.stage for entry in gateway.deployer.book.entries.values()}
 
     @invariant()
     def one_change_at_a_time(self):
