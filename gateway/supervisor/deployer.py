@@ -35,6 +35,7 @@ from gateway.core.verdict import Verdict, verdict_hash
 from gateway.core.verdict import canonical as canonical_verdict
 from gateway.mailbox.port import RemoteError, Unreachable
 from gateway.supervisor.audit_file import AuditUnavailable
+from gateway.supervisor.kept_recording import packed
 from gateway.supervisor.lifecycle import PROPOSED, Book, Entry, Impossible, Stage, reconciled
 
 LEASE_S = 5.0  #: of a deployment on probation; renewed every third of it
@@ -47,6 +48,10 @@ class AuditSide(Protocol):
         self, kind: str, who: Who, what: Mapping[str, Any], blobs: Mapping[str, bytes] | None = None
     ) -> object:
         """Stored for good when it returns. Raises AuditUnavailable."""
+        ...
+
+    def blob(self, id_: str) -> bytes | None:
+        """What lies beside the records under this hash. Raises AuditUnavailable."""
         ...
 
 
@@ -66,6 +71,10 @@ class Surroundings(Protocol):
     """What the line is like now, as a verdict needs it."""
 
     async def context(self, book: Book) -> tuple[JudgeContext, list[Recording]]: ...
+
+    def begin_probation(self) -> None:
+        """A change is about to be put on the line."""
+        ...
 
     def against_keeping(self) -> str:
         """What a deployment on probation has shown against itself so far; empty: nothing."""
@@ -95,19 +104,11 @@ class Deployer:
         self._surroundings = surroundings
         self._clock = clock
         self._wall_clock = wall_clock
-        self._payloads: dict[str, Proposal] = {}
-        self._verdicts: dict[str, Verdict] = {}
         self._one_step = asyncio.Lock()
         self._judging: dict[str, asyncio.Task[None]] = {}
         self._renewed_s = clock()
         self._probation_since_s = clock()
         self._settled = False  #: the loop has been asked since this process began
-
-    def remember(self, proposal: Proposal, verdict: Verdict | None) -> None:
-        """What lies beside the records of a book that was read."""
-        self._payloads[proposal_hash(proposal)] = proposal
-        if verdict is not None:
-            self._verdicts[proposal_hash(proposal)] = verdict
 
     async def propose(self, payload: bytes, who: Who) -> Reply:
         """Take a proposal in, and judge it in the background."""
@@ -137,7 +138,6 @@ class Deployer:
         try:
             async with self._one_step:
                 await self._step(PROPOSED, what, who, {"proposal": canonical(proposal)})
-                self._payloads[hash_] = proposal
         except (Impossible, AuditUnavailable) as error:
             return self._refused("it is not judged", [str(error)])
         self._begin_judging(hash_)
@@ -150,7 +150,7 @@ class Deployer:
             entry = self.book.entries.get(decision.proposal)
             if reasons := self._why_not_decide(entry, decision):
                 return self._refused("nothing was decided", reasons)
-            assert entry is not None
+            assert entry is not None  # _why_not_decide says so
             what = {"proposal": entry.proposal, "shown": decision.shown, "comment": decision.comment}
             try:
                 if not decision.approve:
@@ -222,12 +222,12 @@ class Deployer:
     def shown(self, beginning: str) -> ProposalShown | str:
         """The proposal whose hash begins so; a sentence where there is not exactly one."""
         found = [entry for hash_, entry in self.book.entries.items() if hash_.startswith(beginning)]
-        if len(found) != 1 or found[0].proposal not in self._payloads:
+        if len(found) != 1:
             return f"{len(found)} proposals begin with {beginning}: `r2rgate proposals` lists them"
         (entry,) = found
         return ProposalShown(
             format=1, stage=entry.stage, why=entry.why, proposal_hash=entry.proposal, shown=self._shown_hash(entry),
-            epoch=self.book.epoch, proposal=self._payloads[entry.proposal], verdict=self._verdicts.get(entry.proposal),
+            epoch=self.book.epoch, proposal=self._proposal(entry), verdict=self._verdict(entry),
         )  # fmt: skip
 
     def _shown_hash(self, entry: Entry) -> str | None:
@@ -246,15 +246,27 @@ class Deployer:
             return ["what was shown is no longer what would be done: look at it again, then decide"]
         return []
 
-    # --- judging -----------------------------------------------------------------------------------------------
-
     def _begin_judging(self, proposal: str) -> None:
         task = asyncio.get_running_loop().create_task(self._judged(proposal))
         self._judging[proposal] = task
         task.add_done_callback(lambda _: self._judging.pop(proposal, None))
 
     async def _judged(self, hash_: str) -> None:
-        proposal = self._payloads[hash_]
+        try:
+            kind, what, blobs = await self._judgement(hash_)
+        except Exception as error:  # what cannot be judged is refused, whatever the reason
+            kind, blobs = "refused", dict[str, bytes]()
+            what = {"proposal": hash_, "because": f"it could not be judged: {type(error).__name__}: {error}"[:1000]}
+        async with self._one_step:
+            if self.book.entries[hash_].stage is not Stage.RECEIVED:
+                return  # it has expired meanwhile, or what it would change is gone
+            try:
+                await self._step(kind, what, GATEWAY, blobs)
+            except (AuditUnavailable, Impossible) as error:
+                self.trouble = str(error)  # it stays as received, and is judged again
+
+    async def _judgement(self, hash_: str) -> tuple[str, dict[str, Any], dict[str, bytes]]:
+        proposal = self._proposal(self.book.entries[hash_])
         context, recordings = await self._surroundings.context(self.book)
         verdict = await self._judge.judge(canonical(proposal), context, recordings)
         what = {
@@ -265,19 +277,11 @@ class Deployer:
             "because": _first_reason(verdict),
         }
         blobs = {"verdict": canonical_verdict(verdict), "context": canonical_context(context)}
-        async with self._one_step:
-            if self.book.entries[hash_].stage is not Stage.RECEIVED:
-                return  # it has expired meanwhile, or what it would change is gone
-            self._verdicts[hash_] = verdict
-            try:
-                await self._step("accepted" if verdict.accepted else "refused", what, GATEWAY, blobs)
-            except (AuditUnavailable, Impossible):
-                return  # it stays as received, and is judged again
-
-    # --- on the line -------------------------------------------------------------------------------------------
+        blobs |= {f"data-{number}": packed(one) for number, one in enumerate(recordings, start=1)}
+        return "accepted" if verdict.accepted else "refused", what, blobs
 
     async def _carry_out(self, entry: Entry, found: InService, who: Who) -> Reply:
-        proposal = self._payloads[entry.proposal]
+        proposal = self._proposal(entry)
         if isinstance(proposal.change, GainsChange):
             return await self._deploy(entry, proposal.change, found, who)
         if isinstance(proposal.change, ExperimentChange):
@@ -291,9 +295,9 @@ class Deployer:
         return self._done(f"model {entry.changes[:12]} is what proposals are judged by from now on")
 
     async def _deploy(self, entry: Entry, change: GainsChange, found: InService, who: Who) -> Reply:
-        verdict, epoch = self._verdicts[entry.proposal], found.epoch + 1
-        assert verdict.accepted and verdict.region is not None
-        assert verdict_hash(verdict) == entry.verdict
+        verdict, epoch = self._verdict(entry), found.epoch + 1
+        if verdict is None or not verdict.accepted or verdict.region is None:
+            return self._refused("it is not carried out", ["no verdict lets it through"])
         deployment = Deployment(
             controller=change.controller, hash=entry.changes, epoch=epoch, lease_s=LEASE_S, region=verdict.region
         )
@@ -303,6 +307,7 @@ class Deployer:
             {**named, "configuration": entry.changes, "before": found.hash, "region": verdict.region.model_dump()},
             who,
         )
+        self._surroundings.begin_probation()
         reply = await self._loop.tell(Deploy(deployment=deployment))
         if not reply.ok and reply.in_service is not None and reply.in_service.epoch < epoch:
             because = "; ".join([reply.text, *reply.reasons])[:1000]
@@ -355,6 +360,18 @@ class Deployer:
             await self._step(*step, GATEWAY)
         raise Impossible("the book does not come to what the loop says")
 
+    def _proposal(self, entry: Entry) -> Proposal:
+        return Proposal.model_validate_json(self._kept(entry.proposal))
+
+    def _verdict(self, entry: Entry) -> Verdict | None:
+        return None if entry.verdict is None else Verdict.model_validate_json(self._kept(entry.verdict))
+
+    def _kept(self, id_: str) -> bytes:
+        """Raises AuditUnavailable where it is no longer what was stored."""
+        if (content := self._audit.blob(id_)) is None:
+            raise AuditUnavailable(f"the audit has lost {id_[:12]}: `r2rgate audit verify` tells more")
+        return content
+
     async def _tidy(self) -> None:
         """What is left over: of time, of a gateway that ended before it could go on, of an audit that was not there."""
         now_s = self._wall_clock()
@@ -374,6 +391,7 @@ class Deployer:
         """A record, on the disk before the book knows of it. Raises Impossible, AuditUnavailable."""
         if reason := self.book.why_not(kind, what):
             raise Impossible(reason)
+        what = {**what, "at_s": self._wall_clock()}
         await self._audit.append(kind, who, what, blobs)
         self.book.apply(kind, what)
 

@@ -87,6 +87,7 @@ class Book:
     last_known_good: str | None = None
     epoch: int = 0  #: of the last deployment that the loop has taken, or is being told of
     model: str | None = None
+    changed_s: float | None = None  #: Unix time at which how the line is controlled has changed last
 
     @property
     def on_the_line(self) -> Entry | None:
@@ -149,6 +150,8 @@ class Book:
         self._in_service(kind, entry, what)
 
     def _in_service(self, kind: str, entry: Entry, what: Mapping[str, Any]) -> None:
+        if kind in ("deployed", "rolled-back") and "at_s" in what:
+            self.changed_s = float(what["at_s"])
         if kind == "deploying":
             self.epoch = int(what["epoch"])
         elif kind == "not-deployed":

@@ -71,6 +71,9 @@ class FakeAudit:
         if due:
             raise Killed
 
+    def blob(self, id_):
+        return self.blobs.get(id_)
+
 
 class FakeLoop:
     """What the loop promises: a successor is taken on probation, and left again when nobody renews it."""
@@ -168,6 +171,8 @@ class FakeSurroundings:
     async def context(self, book):
         state = LineState(state="READY", tension_n=[30.0] * LINE.n, speed_m_per_s=0.0)
         return JudgeContext(format=1, now=iso(self.loop.now_s), state=state, in_service=FIRST), []
+
+    def begin_probation(self) -> None: ...
 
     def against_keeping(self) -> str:
         return self.against

@@ -54,15 +54,6 @@ class Gateway:
         book = book_of(self.audit.records)
         args = (self.audit, self.loop, self.judge, self.surroundings, clock, clock)
         self.deployer = Deployer(LINE, book, *args)
-        verdicts = {}
-        for kind, what in self.audit.records:
-            if kind in ("accepted", "refused"):
-                verdicts[what["proposal"]] = self.audit.blobs[what["verdict"]]
-        from gateway.core.verdict import Verdict
-
-        for hash_, one in self.proposals.items():
-            verdict = verdicts.get(hash_)
-            self.deployer.remember(one, None if verdict is None else Verdict.model_validate_json(verdict))
 
     async def propose(self, one):
         self.proposals[hash_of(one)] = one
