@@ -92,6 +92,7 @@ class Deployer:
         loop: LoopSide,
         judge: JudgeSide,
         surroundings: Surroundings,
+        take_up: Callable[[Proposal, str | None], None],
         clock: Callable[[], float],
         wall_clock: Callable[[], float],
     ) -> None:
@@ -102,6 +103,7 @@ class Deployer:
         self._loop = loop
         self._judge = judge
         self._surroundings = surroundings
+        self._take_up = take_up  #: into the stores, before it is put into service
         self._clock = clock
         self._wall_clock = wall_clock
         self._one_step = asyncio.Lock()
@@ -282,6 +284,7 @@ class Deployer:
 
     async def _carry_out(self, entry: Entry, found: InService, who: Who) -> Reply:
         proposal = self._proposal(entry)
+        self._take_up(proposal, entry.verdict)
         if isinstance(proposal.change, GainsChange):
             return await self._deploy(entry, proposal.change, found, who)
         if isinstance(proposal.change, ExperimentChange):

@@ -52,7 +52,7 @@ class Gateway:
     def begin(self) -> None:
         clock = lambda: self.loop.now_s  # noqa: E731
         book = book_of(self.audit.records)
-        args = (self.audit, self.loop, self.judge, self.surroundings, clock, clock)
+        args = (self.audit, self.loop, self.judge, self.surroundings, lambda proposal, verdict: None, clock, clock)
         self.deployer = Deployer(LINE, book, *args)
 
     async def propose(self, one):
