@@ -22,11 +22,6 @@ if TYPE_CHECKING:
 #: Exit codes. `run` starts a crashed child again, but not one that was refused or that runs already.
 CRASHED, REFUSED, ALREADY_RUNNING = 1, 2, 3
 
-#: A design on an identified model has the dead time that was found, the drives' lag in it. One for somewhat more than
-#: the line's file says is slower than need be; one for less would eat its own delay margin, so that the file must be
-#: put right first. In periods.
-LESS_LATENCY, MORE_LATENCY = 0.1, 1.0
-
 LineFile = Annotated[Path, typer.Argument(help="The line description (r2rgate init writes one).")]
 RunFolder = Annotated[Path | None, typer.Option("--run-dir", help="Where the line's sockets shall lie.")]
 DataFolder = Annotated[Path | None, typer.Option("--data-dir", help="Where history and configurations are kept.")]
@@ -102,6 +97,7 @@ def loop(
                 config,
                 run_dir or default_run_folder(line),
                 lambda text: print(text, file=sys.stderr, flush=True),
+                data_dir or default_data_folder(line),
                 simulated=simulated,
             )
     except AlreadyRunning as error:
@@ -284,29 +280,9 @@ def _a_crash_is_no_refusal() -> Iterator[None]:
 
 def _require_fit(line: Line, config: "Controller", path: Path, way_out: str) -> None:
     """A configuration for another line must not run on this one."""
-    draw = [i for i, span in enumerate(line.spans) if span.control == "draw"]
-    reasons: list[str] = []
-    if config.n != line.n:
-        reasons.append(f"it is for {config.n} span{'' if config.n == 1 else 's'}, the line has {line.n}")
-    elif config.draw_spans != draw:
-        spans = [[i + 1 for i in indices] for indices in (config.draw_spans, draw)]
-        reasons.append(f"its draw-controlled spans are {spans[0]}, the line's {spans[1]}")
-    if abs(config.period_s - line.control.period_s) > 1e-9:
-        reasons.append(f"it is for a period of {config.period_s} s, the line's is {line.control.period_s} s")
-    least_s = line.control.latency_s - LESS_LATENCY * line.control.period_s - 1e-9
-    most_s = line.control.latency_s + MORE_LATENCY * line.control.period_s + 1e-9
-    if not least_s <= config.latency_s <= most_s:
-        reasons.append(
-            f"it is for a latency of {config.latency_s} s, the line's is {line.control.latency_s} s; allowed: "
-            f"{least_s:.4g} to {most_s:.4g} s"
-        )
-    if config.kind == "mpc" and (config.torque_nm, config.torque_rate_nm_per_s) != (
-        line.limits.torque_nm,
-        line.limits.torque_rate_nm_per_s,
-    ):
-        reasons.append("it plans with other limits of torque and torque rate than the line's")
-    if config.feedforward.stiffness_n <= line.limits.tension_max_n:
-        reasons.append(f"its web stiffness of {config.feedforward.stiffness_n:g} N is below the greatest tension")
+    from gateway.core.controller_fit import misfits
+
+    reasons = misfits(config, line)
     if reasons:
         _refuse(f"{path} is not used: {'; '.join(reasons)}. Design one for this line: {way_out}")
 

@@ -4,7 +4,7 @@ import time
 from collections.abc import Awaitable
 from dataclasses import dataclass, field
 from math import ceil
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -54,11 +54,13 @@ class SteppedLoop:
         self.truth = SteppedLine(self.plant, self.seed, self.line.control.latency_s)
         link = MemoryLink(self.line, self.truth)
         watch = Watch(self.line, np.zeros(self.line.n))  # the memory link carries floats
-        self.law = TimedLaw(make_law(untimed(self.config)))
         self.cycle = Cycle(
-            self.line, self.law, [link], watch, lambda: self.now_s, self._record, self._announce, self._tell,
-            simulated=True,
+            self.line, self.config, [link], watch, lambda: self.now_s, self._record, self._announce, self._tell,
+            simulated=True, law_of=lambda config: TimedLaw(make_law(untimed(config))),
         )  # fmt: skip
+        law = self.cycle.torque_path.law
+        assert isinstance(law, TimedLaw)
+        self.law: TimedLaw[Any] = law  #: the one that it starts with
         _finish(link.open())
 
     def begin_in_production(self, tension_n: FloatArray, unwind_speed_m_per_s: float) -> None:
@@ -68,6 +70,7 @@ class SteppedLoop:
         _finish(cycle.links[0].prepare())
         cycle.machine = Machine(Phase.RUNNING)
         cycle.outputs.torque_nm = torque.copy()
+        cycle.guard.begin(torque)
         recipe = Recipe(name="production", tension_n=tension_n.tolist(), speed_m_per_s=unwind_speed_m_per_s)
         cycle.setpoints.aim_at(recipe)
         cycle.setpoints.begin_at_speed(unwind_speed_m_per_s)

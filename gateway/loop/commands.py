@@ -4,6 +4,7 @@ from math import isfinite
 
 from drivers.port import PrepareRefused
 from gateway.core.doubts import in_words
+from gateway.core.experiment import Experiment
 from gateway.core.line import Recipe
 from gateway.core.messages import (
     AbortExperiment,
@@ -25,30 +26,29 @@ from gateway.core.signals import Channel, Quality
 from gateway.core.states import LoopState, Phase
 from gateway.loop import machine as machines
 from gateway.loop.cycle import Cycle
+from gateway.loop.deploy import configure
 from gateway.loop.machine import STANDSTILL_M_PER_S
+from gateway.loop.refused import Refused
 
 SILENT_PATIENCE_S = 0.25  #: without cyclic data (a silent CANopen link reads by SDO) samples are this old at most
 
 
-class Refused(Exception):
-    """A command that is not carried out; nothing was changed."""
-
-    def __init__(self, text: str, reasons: list[str] | None = None) -> None:
-        super().__init__(text)
-        self.reasons = reasons or []
-
-
 def carry_out(cycle: Cycle, command: Command, now_s: float) -> Reply:
     """Do `command` between two periods. `arm` takes longer: `prepare_to_arm` goes before it."""
+    configuring = isinstance(command, Configuring)
     try:
-        if isinstance(command, Configuring):
-            raise Refused("this loop runs the configuration that it was started with, and takes no other yet")
-        text = _do(cycle, command, now_s)
+        text = configure(cycle, command, now_s) if configuring else _do(cycle, command, now_s)
     except Refused as refusal:
-        return Reply(ok=False, state=cycle.machine.state.name, text=str(refusal), reasons=refusal.reasons)
+        reply = Reply(ok=False, state=cycle.machine.state.name, text=str(refusal), reasons=refusal.reasons)
+    else:
+        reply = Reply(ok=True, state=cycle.machine.state.name, text=text)
+    if configuring:
+        return reply.model_copy(update={"in_service": cycle.configurations.in_service(now_s)})
+    if not reply.ok:
+        return reply
     if isinstance(command, SetTension | SetSpeed | SelectRecipe):  # the operator's word goes before an experiment's
         cycle.experiments.end("a set-point was changed")
-    return Reply(ok=True, state=cycle.machine.state.name, text=text)
+    return reply
 
 
 def _do(cycle: Cycle, command: Operating, now_s: float) -> str:
@@ -177,6 +177,7 @@ def _start(cycle: Cycle, now_s: float) -> str:
     machine = cycle.machine
     match machine.phase:
         case Phase.READY:
+            _require_judged(cycle, cycle.setpoints.speed_target_m_per_s)
             reasons = not_ready(cycle) + _moving_rollers(cycle)
             if reasons:
                 raise Refused("not started; mend what is named and start again", reasons)
@@ -234,7 +235,9 @@ def _set_tension(cycle: Cycle, command: SetTension, now_s: float) -> str:
     i = command.span - 1
     if command.step:
         size = abs(command.tension_n - setpoints.tension_n[i])
-        _require_step(cycle, size, line.limits.tension_step_max_n, "N", setpoints.tension_step_pause_s(i, now_s))
+        judged = cycle.configurations.running.region.tension_step_max_n
+        largest = _least(line.limits.tension_step_max_n, judged)
+        _require_step(cycle, size, largest, "N", setpoints.tension_step_pause_s(i, now_s))
         setpoints.step_tension(i, command.tension_n, now_s)
     setpoints.tension_target_n[i] = command.tension_n
     how = "at once" if command.step else _pace(cycle, f"at {line.moves.tension_rate_n_per_s:g} N/s")
@@ -246,13 +249,31 @@ def _set_speed(cycle: Cycle, command: SetSpeed, now_s: float) -> str:
     high = line.limits.speed_max_m_per_s
     if not (isfinite(command.speed_m_per_s) and 0.0 <= command.speed_m_per_s <= high):
         raise Refused(f"{command.speed_m_per_s:g} m/s is outside the limits; allowed: 0 to {high:g} m/s")
+    _require_judged(cycle, command.speed_m_per_s)
     if command.step:
         size = abs(command.speed_m_per_s - setpoints.speed_m_per_s)
-        _require_step(cycle, size, line.limits.speed_step_max_m_per_s, "m/s", setpoints.speed_step_pause_s(now_s))
+        judged = cycle.configurations.running.region.speed_step_max_m_per_s
+        largest = _least(line.limits.speed_step_max_m_per_s, judged)
+        _require_step(cycle, size, largest, "m/s", setpoints.speed_step_pause_s(now_s))
         setpoints.step_speed(command.speed_m_per_s, now_s)
     setpoints.speed_target_m_per_s = command.speed_m_per_s
     how = "at once" if command.step else _pace(cycle, f"at {line.moves.speed_rate_m_per_s2:g} m/s2")
     return f"line speed to {command.speed_m_per_s:g} m/s {how}"
+
+
+def _least(own: float, judged: float | None) -> float:
+    """The line's limit, or what the configuration was judged for, if that is less."""
+    return own if judged is None else min(own, judged)
+
+
+def _require_judged(cycle: Cycle, speed_m_per_s: float) -> None:
+    running = cycle.configurations.running
+    most = running.region.speed_max_m_per_s
+    if most is not None and speed_m_per_s > most:
+        raise Refused(
+            f"{speed_m_per_s:g} m/s is more than controller {running.hash[:12]} was judged for; allowed: 0 to "
+            f"{most:g} m/s; a configuration that is judged for more, and approved, lifts it"
+        )
 
 
 def _pace(cycle: Cycle, rate: str) -> str:
@@ -265,6 +286,9 @@ def _require_step(cycle: Cycle, size: float, largest: float, unit: str, pause_s:
         raise Refused(f"a step needs a running line, this one is {cycle.machine.state.name}; leave out the step")
     if cycle.experiments.run is not None:
         raise Refused("an experiment moves the set-points; abort it first, or leave out the step, which ends it")
+    probation = cycle.configurations.probation
+    if probation is not None and probation.shaped_first:
+        raise Refused(f"epoch {cycle.configurations.epoch} is on probation: set-points move shaped; leave out the step")
     if size > largest * (1.0 + 1e-9):
         raise Refused(f"a step of {size:g} {unit} is too large; allowed: {largest:g} {unit}, or a ramp of any size")
     if pause_s > 0.0:
@@ -278,6 +302,7 @@ def _select_recipe(cycle: Cycle, command: SelectRecipe) -> str:
         close = nearest(command.name, recipes)
         hint = f"; did you mean {close}?" if close else ""
         raise Refused(f"there is no recipe {command.name!r}{hint} Known: {', '.join(recipes)}")
+    _require_judged(cycle, recipe.speed_m_per_s)
     cycle.setpoints.aim_at(recipe)
     return f"recipe {recipe.name}: tensions and speed move to it"
 
@@ -289,12 +314,34 @@ def _run_experiment(cycle: Cycle, command: RunExperiment) -> str:
     if cycle.machine.phase is not Phase.RUNNING:
         raise Refused(f"an experiment needs a running line, this one is {cycle.machine.phase.name.lower()}")
     reasons = cycle.experiments.why_not(experiment, cycle.line)
+    reasons += _unjudged(cycle, experiment)
     if doubts := in_words(int(cycle.watch.doubts)):
         reasons.append(f"the loop doubts what it measures: {', '.join(doubts)}")
     if reasons:
         raise Refused("the experiment is not run", reasons)
     cycle.experiments.begin(experiment)
     return f"experiment {experiment.name} runs for {experiment.duration_s:g} s; abort, hold, stop and set end it"
+
+
+def _unjudged(cycle: Cycle, experiment: Experiment) -> list[str]:
+    """What of it the configuration in service has not been judged for."""
+    configurations = cycle.configurations
+    probation, region = configurations.probation, configurations.running.region
+    reasons: list[str] = []
+    if probation is not None and probation.shaped_first:
+        reasons.append(f"epoch {configurations.epoch} is on probation, and set-points move shaped only")
+    step_n = experiment.step_max_n if experiment.rate_n_per_s is None else 0.0
+    if region.tension_step_max_n is not None and step_n > region.tension_step_max_n * (1.0 + 1e-9):
+        reasons.append(
+            f"set-points would step by up to {step_n:g} N; the configuration was judged for "
+            f"{region.tension_step_max_n:g} N"
+        )
+    fastest = max((leg.speed_m_per_s or 0.0 for leg in experiment.legs), default=0.0)
+    if region.speed_max_m_per_s is not None and fastest > region.speed_max_m_per_s:
+        reasons.append(
+            f"a leg runs at {fastest:g} m/s; the configuration was judged for {region.speed_max_m_per_s:g} m/s"
+        )
+    return reasons
 
 
 def _abort_experiment(cycle: Cycle) -> str:

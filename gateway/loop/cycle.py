@@ -7,13 +7,17 @@ from typing import Any
 import numpy as np
 
 from drivers.port import Link
-from gateway.control.law import Law, Measured
+from gateway.control.law import Measured
+from gateway.control.laws import make_law
+from gateway.core.controller import Controller
 from gateway.core.line import Line
 from gateway.core.signals import BoolArray, DriveRequest, DriveState, FloatArray, Inputs, Outputs, Quality
-from gateway.core.states import Phase
+from gateway.core.states import LoopState, Phase
 from gateway.core.telemetry import Frame
 from gateway.loop import machine as machines
+from gateway.loop.configurations import Configurations, LawOf
 from gateway.loop.experiment import Experiments, Tell
+from gateway.loop.guard import Guard
 from gateway.loop.machine import Machine, Observation, Times
 from gateway.loop.pacer import Tick
 from gateway.loop.setpoints import Setpoints
@@ -29,6 +33,7 @@ _BAD = int(Quality.BAD)
 STILL_ON_PERIODS = 10  #: a drive that is told OFF and still says ENABLED is told to stop quickly
 
 CONTROLLED = (Phase.TENSIONING, Phase.RUNNING, Phase.HOLDING, Phase.SLOWING)
+SUPERVISED = (Phase.RUNNING, Phase.HOLDING)  #: by the monitor: the web is tensioned, and nothing stops it yet
 WITH_TORQUE = (*CONTROLLED, Phase.UNLOADING)
 _PRODUCTION = Supervision(
     feedback=True, standstill=False, tension_floor=True, drives=DriveState.ENABLED, transport=True
@@ -66,7 +71,7 @@ class Cycle:
     def __init__(
         self,
         line: Line,
-        law: Law[Any],
+        config: Controller,
         links: list[Link],
         watch: Watch,
         clock: Callable[[], float],
@@ -75,15 +80,20 @@ class Cycle:
         tell: Tell | None = None,
         *,
         simulated: bool = False,
+        law_of: LawOf = make_law,
     ) -> None:
         self.line = line
         self.links = links
         self.limits = envelope_limits(line)
-        self.torque_path = TorquePath(law, self.limits, line)
         self.machine = Machine(since_s=clock())
         self.inputs = Inputs(line.n)
         self.outputs = Outputs(line.n)
         self.setpoints = Setpoints(line.recipes[0])
+        self.configurations = Configurations(
+            line, config, law_of, lambda law: TorquePath(law, self.limits, line), self.setpoints, tell
+        )
+        self.torque_path = self.configurations.path
+        self.guard = Guard(line)
         self.account = Account()
         self.watch = watch
         self.clock = clock
@@ -94,6 +104,7 @@ class Cycle:
         self._envelope = EnvelopeState()
         self._latched_s = clock()  #: when the drives latched the torque of the period before
         self._still_on = np.zeros(line.n, dtype=np.int64)  #: periods in a row ENABLED while told OFF
+        self._shaped_moves = line.moves.model_copy(update={"shape": "minimum-jerk"})
 
     async def period(self, tick: Tick) -> None:
         """Read, decide, write."""
@@ -101,8 +112,10 @@ class Cycle:
         seen = self._check(tick)
         self._step_machine(seen, tick.now_s)
         before_nm = self.outputs.torque_nm
+        self.configurations.look(tick.now_s)
         torque_nm, saturated = self._torque(seen, tick)
         self._write(torque_nm)
+        self.guard.sent(torque_nm)
         cycle_s = self.clock() - tick.now_s
         if self.machine.phase in CONTROLLED and seen.usable:  # only blocks proposals: after the commands are out
             self._alarm(self.watch.controlled(self.inputs, self.setpoints, before_nm, saturated))
@@ -178,6 +191,8 @@ class Cycle:
             return
         if machine.phase is not Phase.RUNNING:
             self.experiments.end(f"the line left RUN: {machine.reason or machine.state.name}")
+        if machine.state is LoopState.STOP and self.configurations.probation is not None:
+            self.configurations.roll_back(f"the line stopped: {machine.reason}")
         if machine.phase is Phase.OFF:  # a speed from before the stop is not taken up again
             self.setpoints.speed_target_m_per_s = self.setpoints.recipe.speed_m_per_s
         self._announce(before, machine, findings)
@@ -187,6 +202,7 @@ class Cycle:
         applied_nm = self.outputs.torque_nm
         if self.machine.phase not in CONTROLLED:
             self.torque_path.disengage()
+            self.guard.off()
             self.watch.off()
             self.account.held = 0
             unloading = self.machine.phase is Phase.UNLOADING
@@ -200,7 +216,7 @@ class Cycle:
         interval_s = tick.due_s + self.limits.period_s - self._latched_s
         before, path = self.torque_path.fallback, self.torque_path
         try:
-            found = path.control(self._estimate(), self.setpoints, applied_nm, interval_s)
+            found = self._governed(applied_nm, interval_s, tick.now_s)
             if path.fallback and not before:
                 self._alarm([Finding("fallback", Action.NONE, f"the law has no solution of its own: {path.fallback}")])
             return found
@@ -209,13 +225,36 @@ class Cycle:
             self._move_to(off, [failed.finding])
             return self._torque(seen, tick)
 
+    def _governed(self, applied_nm: FloatArray, interval_s: float, now_s: float) -> tuple[FloatArray, bool]:
+        """As `TorquePath.control`. What fails on probation, or must not go on, gives way in this very period."""
+        configurations, path = self.configurations, self.torque_path
+        measured = self._estimate()
+        try:
+            found = path.control(measured, self.setpoints, applied_nm, interval_s)
+        except LawFailed as failed:
+            if not configurations.roll_back(failed.finding.text):
+                raise
+            return path.control(measured, self.setpoints, applied_nm, interval_s)
+        if self.machine.phase not in SUPERVISED:
+            return found
+        findings = self.guard.against(configurations, path, measured, self.setpoints.tension_n, found)
+        if not findings:
+            return found
+        if configurations.roll_back("; ".join(finding.text for finding in findings)):
+            self._alarm(findings)
+            return path.control(measured, self.setpoints, applied_nm, interval_s)
+        reason = "; ".join(finding.text for finding in findings)
+        self._move_to(machines.stop(self.machine, now_s, reason), findings)
+        return found
+
     def _estimate(self) -> Measured:
         # The measured values as they are: a law that wants an observer brings its own.
         inputs = self.inputs
         return Measured(inputs.tension.value, inputs.speed.value, float(inputs.unwind_speed.value[0]))
 
     def _advance_setpoints(self) -> None:
-        moves, phase = self.line.moves, self.machine.phase
+        moves = self._shaped_moves if self.configurations.shaped else self.line.moves
+        phase = self.machine.phase
         goal = self.setpoints.speed_target_m_per_s if phase is Phase.RUNNING else 0.0
         if self.experiments.run is not None:
             goal = self.experiments.run.advance(self.setpoints)

@@ -8,14 +8,14 @@ from pathlib import Path
 
 from drivers.port import Link
 from drivers.registry import build_links, speed_steps_m_per_s
-from gateway.control.laws import make_law
-from gateway.core.controller import Controller, config_hash
+from gateway.core.controller import Controller
 from gateway.core.line import Line
 from gateway.core.signals import Outputs
 from gateway.core.states import Phase
 from gateway.core.topics import LOOP_BUSES, LOOP_COMMAND, LOOP_EVENT, LOOP_TELEMETRY
 from gateway.loop.commands import release
 from gateway.loop.cycle import Cycle
+from gateway.loop.kept import Store
 from gateway.loop.pacer import TimerPacer, monotonic
 from gateway.loop.realtime import become_punctual, freeze_collector, stay_awake
 from gateway.loop.runner import Runner
@@ -28,19 +28,28 @@ RESTING_PERIODS = 5
 
 
 def run_loop(
-    line: Line, config: Controller, run_folder: Path, say: Callable[[str], None], *, simulated: bool = False
+    line: Line,
+    config: Controller,
+    run_folder: Path,
+    say: Callable[[str], None],
+    data_folder: Path,
+    *,
+    simulated: bool = False,
 ) -> None:
     """Run until SIGTERM or SIGINT, which stop the line first.
 
-    `simulated`: the line is, for certain; then it takes experiments.
+    The last known good configuration outlives the loop in `data_folder`. `simulated`: the line is, for certain; then
+    it takes experiments.
 
     Raises AlreadyRunning before anything is sent, CannotListen, PathTooLong, and LinksRefused
     when the drivers cannot carry the line.
     """
-    asyncio.run(_main(line, config, run_folder, say, simulated))
+    asyncio.run(_main(line, config, run_folder, say, Store(data_folder, config), simulated))
 
 
-async def _main(line: Line, config: Controller, run_folder: Path, say: Callable[[str], None], simulated: bool) -> None:
+async def _main(
+    line: Line, config: Controller, run_folder: Path, say: Callable[[str], None], store: Store, simulated: bool
+) -> None:
     mailbox = UnixMailbox()
     # First the socket, whose lock makes this the only loop of the line; only then are the buses touched.
     await mailbox.listen(run_folder / LOOP_SOCKET)
@@ -48,10 +57,11 @@ async def _main(line: Line, config: Controller, run_folder: Path, say: Callable[
     links = build_links(line)
     voice = Voice(mailbox, links, line.control.period_s)
     watch = Watch(line, speed_steps_m_per_s(line))
-    cycle = Cycle(
-        line, make_law(config), links, watch, monotonic, voice.record, voice.announce, voice.tell, simulated=simulated
-    )
-    runner = Runner(cycle)
+    cycle = Cycle(line, config, links, watch, monotonic, voice.record, voice.announce, voice.tell, simulated=simulated)
+    kept = store.read(line, say)
+    if kept is not None:
+        cycle.configurations.resume(kept)
+    runner = Runner(cycle, store)
     ending = asyncio.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         asyncio.get_running_loop().add_signal_handler(number, ending.set)
@@ -60,7 +70,8 @@ async def _main(line: Line, config: Controller, run_folder: Path, say: Callable[
             say(trouble)
             voice.tell("bus", trouble)
         mailbox.serve(LOOP_COMMAND, runner.command)
-        voice.tell("start", f"loop of {line.site}/{line.line}, {config.kind} controller {config_hash(config)[:12]}")
+        running = cycle.configurations.running
+        voice.tell("start", f"loop of {line.site}/{line.line}, {running.config.kind} controller {running.hash[:12]}")
         say(f"loop of {line.site}/{line.line} is SILENT, commands on {run_folder / LOOP_SOCKET}")
         freeze_collector()
         # Last: what starts up must not take a processor from another line's loop.
@@ -73,6 +84,7 @@ async def _main(line: Line, config: Controller, run_folder: Path, say: Callable[
     finally:
         for link in links:
             await link.close()
+        runner.close()
         await mailbox.close()
 
 

@@ -3,10 +3,24 @@
 import asyncio
 from collections import deque
 
-from gateway.core.messages import Arm, Command, MalformedMessage, Reply, Stop, parse_command
+from gateway.core.controller import ControllerRefused
+from gateway.core.messages import (
+    MAX_COMMAND,
+    Arm,
+    Command,
+    Deploy,
+    Keep,
+    MalformedMessage,
+    Reply,
+    Stop,
+    parse_command,
+)
 from gateway.core.states import LoopState, Phase
+from gateway.loop.aside import Aside
 from gateway.loop.commands import carry_out, forbidden, prepare_to_arm, release, unheard
 from gateway.loop.cycle import Cycle
+from gateway.loop.deploy import against
+from gateway.loop.kept import Store
 from gateway.loop.pacer import Tick
 
 HEARD_AGAIN_S = 1.0  #: for devices that were lost to tell what speaks against arming, or that nothing does
@@ -16,8 +30,13 @@ Answer = asyncio.Future[Reply]
 
 
 class Runner:
-    def __init__(self, cycle: Cycle) -> None:
+    """`store`: where what is known to be good outlives this process; None: nowhere."""
+
+    def __init__(self, cycle: Cycle, store: Store | None = None) -> None:
         self.cycle = cycle
+        self._store = store
+        self._aside = Aside()
+        self._configuring = asyncio.Lock()
         self._waiting: deque[tuple[Command, Answer]] = deque()
         self._passed = asyncio.Event()
         self._arming: asyncio.Task[Reply | None] | None = None
@@ -48,7 +67,9 @@ class Runner:
     async def command(self, payload: bytes) -> bytes:
         """Answer a command from outside. Never raises for what is in `payload`."""
         try:
-            reply = await self.submit(parse_command(payload))
+            large = len(payload) > MAX_COMMAND
+            command = await self._aside.do(lambda: parse_command(payload)) if large else parse_command(payload)
+            reply = await self.submit(command)
         except MalformedMessage as error:
             reply = self._refused(f"not a command: {error}")
         return reply.model_dump_json().encode()
@@ -63,7 +84,21 @@ class Runner:
             return self._refused("the loop is ending")
         if len(self._waiting) >= MAX_WAITING:
             return self._refused("too many commands at once: try again")
-        return await (self._arm(command) if isinstance(command, Arm) else self._at_boundary(command))
+        match command:
+            case Arm():
+                return await self._arm(command)
+            case Deploy():
+                async with self._configuring:
+                    return await self._deploy(command)
+            case Keep():
+                async with self._configuring:
+                    return await self._keep(command)
+            case _:
+                return await self._at_boundary(command)
+
+    def close(self) -> None:
+        """What is still being worked on aside ends by itself."""
+        self._aside.close()
 
     async def _at_boundary(self, command: Command) -> Reply:
         answer: Answer = asyncio.get_running_loop().create_future()
@@ -91,6 +126,49 @@ class Runner:
         if self.cycle.machine.state is not LoopState.READY:
             return self._refused(f"not armed: {self.cycle.machine.reason}")
         return reply.model_copy(update={"state": self.cycle.machine.state.name})
+
+    async def _deploy(self, command: Deploy) -> Reply:
+        """Build and warm what is to run, and note that its epoch is used up, while periods go on; then swap."""
+        configurations, deployment = self.cycle.configurations, command.deployment
+        if reasons := against(self.cycle, deployment):
+            return self._refused("not deployed", reasons)
+        try:
+            candidate = await self._aside.do(lambda: configurations.candidate(deployment))
+        except ControllerRefused as refused:
+            return self._refused("not deployed", [str(refused)])
+        good = configurations.good
+        if self._store is not None:
+            store = self._store
+            try:
+                await self._aside.do(lambda: store.write(deployment.epoch, good.config, good.region, good.watch))
+            except OSError as error:
+                return self._refused("not deployed", [f"nothing could be kept at {store.path}: {error.strerror}"])
+        configurations.prepared = deployment, candidate
+        return await self._at_boundary(command)
+
+    async def _keep(self, command: Keep) -> Reply:
+        """The disk first: after a restart the line runs what somebody was told is kept."""
+        configurations, watch = self.cycle.configurations, command.watch
+        running, good = configurations.running, configurations.good
+        if configurations.probation is None or configurations.epoch != command.epoch:
+            return await self._at_boundary(command)  # which refuses it
+        if watch is not None:
+            try:
+                recovery = await self._aside.do(lambda: configurations.recovery(watch, running.config))
+            except ControllerRefused as refused:
+                return self._refused("not kept", [str(refused)])
+            configurations.prepared_watch = watch, recovery
+        if self._store is None:
+            return await self._at_boundary(command)
+        store, epoch = self._store, command.epoch
+        try:
+            await self._aside.do(lambda: store.write(epoch, running.config, running.region, watch))
+            reply = await self._at_boundary(command)
+            if not reply.ok:  # rolled back meanwhile
+                await self._aside.do(lambda: store.write(epoch, good.config, good.region, good.watch))
+        except OSError as error:
+            return self._refused("not kept", [f"nothing could be kept at {store.path}: {error.strerror}"])
+        return reply
 
     async def _prove(self) -> Reply | None:
         """As `prepare_to_arm`, for devices that have come back, too.
@@ -123,5 +201,5 @@ class Runner:
             if not waiting[1].done():
                 waiting[1].set_result(self._refused("not armed: it was stopped"))
 
-    def _refused(self, text: str) -> Reply:
-        return Reply(ok=False, state=self.cycle.machine.state.name, text=text)
+    def _refused(self, text: str, reasons: list[str] | None = None) -> Reply:
+        return Reply(ok=False, state=self.cycle.machine.state.name, text=text, reasons=reasons or [])

@@ -97,6 +97,16 @@ class Setpoints:
         """Whether every set-point stands at its target."""
         return self._there() and self.speed_m_per_s == self.speed_target_m_per_s
 
+    def stands(self, held: bool) -> bool:
+        """Whether nothing moves: every set-point at its target, or while `held` the speed at standstill."""
+        return self._there() and self.speed_m_per_s == (0.0 if held else self.speed_target_m_per_s)
+
+    def stand(self) -> None:
+        """The curves begin where set-points are, after these have moved on ramps."""
+        for i, value in enumerate([*self.tension_n.tolist(), self.speed_m_per_s]):
+            self._curve.put(i, value)
+        self._ramped[:] = False
+
     def begin_at_speed(self, speed_m_per_s: float) -> None:
         """It is what is asked of the line PLC from now on. The target stays."""
         self.speed_m_per_s = speed_m_per_s

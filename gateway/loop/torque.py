@@ -35,14 +35,26 @@ class TorquePath:
         self._moves = line.moves
         self._speed_lag_s = line.control.period_s if line.plc.speed_lag_s is None else line.plc.speed_lag_s
         self._state: Any = None  #: None while the law is not engaged
+        self._taking_over = False  #: from another law, while it is
 
     def any_lost(self) -> bool:
         """Whether a drive is lost."""
         return any(self.lost.tobytes())
 
+    def take_over(self, law: Law[Any]) -> None:
+        """`law` goes on from the next `control` on, without a jump; set-points stay where they are."""
+        self.law = law
+        self._taking_over = self._state is not None
+
+    @property
+    def state(self) -> Any:
+        """What the law remembers; None while it is not engaged."""
+        return self._state
+
     def disengage(self) -> None:
         """The next `control` engages anew, from what is measured then."""
         self._state = None
+        self._taking_over = False
         self.unmeasured_n.fill(0.0)
 
     def control(
@@ -56,6 +68,8 @@ class TorquePath:
             applied_nm = np.where(self.lost, 0.0, applied_nm)
         if self._state is None:
             setpoints.begin_at(np.where(self._limits.measured > 0, measured.tension_n, self.unmeasured_n))
+        if self._state is None or self._taking_over:
+            self._taking_over = False
             self._state = self.law.engage(measured, setpoints.reference(self._speed_lag_s), applied_nm)
         decision = self.law.ask(self._state, measured, setpoints.reference(self._speed_lag_s))
         self.fallback = decision.fallback

@@ -24,7 +24,6 @@ import numpy as np
 
 from drivers.memory import MemoryLink
 from gateway.control.design import design_lqi, design_pid, task_of
-from gateway.control.laws import make_law
 from gateway.core.line import Line, Recipe
 from gateway.core.line_file import load_line
 from gateway.core.line_template import line_template
@@ -86,7 +85,7 @@ class Subject:
         self.spent_us = {row: list[float]() for row in ROWS}
         record = self._timed(voice.record, "publish")
         watch = Watch(line, np.zeros(line.n))
-        self.cycle = Cycle(line, make_law(config), [link], watch, monotonic, record, voice.announce)
+        self.cycle = Cycle(line, config, [link], watch, monotonic, record, voice.announce)
         self.runner = Runner(self.cycle)
         self.period_s = line.control.period_s
         self._periods = 0

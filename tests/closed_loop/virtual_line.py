@@ -20,7 +20,6 @@ from drivers.port import Link
 from drivers.registry import build_links, speed_steps_m_per_s
 from gateway.cli.children import free_udp_port
 from gateway.control.design import design_lqi, task_of
-from gateway.control.laws import make_law
 from gateway.core.controller import Controller
 from gateway.core.line import Bus, Line, OpcUaBus, Recipe
 from gateway.core.messages import Arm, Command, Reply, Start
@@ -256,8 +255,8 @@ class VirtualLine:
 
     def _new_cycle(self) -> None:
         clock = asyncio.get_running_loop().time
-        watch, law = Watch(self.line, speed_steps_m_per_s(self.line)), make_law(self._config)
-        self.cycle = Cycle(self.line, law, self.links, watch, clock, self._record, self._announce)
+        watch = Watch(self.line, speed_steps_m_per_s(self.line))
+        self.cycle = Cycle(self.line, self._config, self.links, watch, clock, self._record, self._announce)
         self.runner = Runner(self.cycle)
 
     async def _periods(self, count: int) -> None:

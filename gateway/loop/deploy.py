@@ -1,0 +1,95 @@
+"""What commands about the configuration do to a cycle: each is done, or refused with every reason."""
+
+from gateway.core.controller import ControllerRefused
+from gateway.core.deployment import Deployment
+from gateway.core.doubts import in_words
+from gateway.core.messages import AskConfiguration, Configuring, Deploy, Keep, Renew, Rollback
+from gateway.core.states import Phase
+from gateway.loop.cycle import Cycle
+from gateway.loop.refused import Refused
+
+CHANGEABLE = (Phase.SILENT, Phase.READY, Phase.RUNNING, Phase.HOLDING)
+
+
+def configure(cycle: Cycle, command: Configuring, now_s: float) -> str:
+    """Do `command` between two periods. Raises Refused."""
+    match command:
+        case Deploy():
+            return _deploy(cycle, command.deployment, now_s)
+        case Renew():
+            _require_probation(cycle, command.epoch)
+            cycle.configurations.renew(now_s)
+            return f"the lease of epoch {command.epoch} begins anew"
+        case Keep():
+            return _keep(cycle, command)
+        case Rollback():
+            done = cycle.configurations.roll_back(command.reason)
+            return "the last known good runs again" if done else "the last known good runs already"
+        case AskConfiguration():
+            return "what controls the line"
+
+
+def against(cycle: Cycle, deployment: Deployment) -> list[str]:
+    """What speaks against a swap now, but for the configuration itself."""
+    configurations, setpoints, phase = cycle.configurations, cycle.setpoints, cycle.machine.phase
+    reasons: list[str] = []
+    if configurations.probation is not None:
+        reasons.append(f"epoch {configurations.epoch} is on probation: keep it or roll it back first")
+    if deployment.epoch != configurations.epoch + 1:
+        reasons.append(f"its epoch is {deployment.epoch}; allowed: {configurations.epoch + 1}, the next one")
+    if phase not in CHANGEABLE:
+        reasons.append(f"the line is {phase.name.lower()}; allowed: silent, ready, running, holding")
+    if cycle.experiments.run is not None:
+        reasons.append("an experiment is under way: wait for its end, or abort it")
+    elif phase in (Phase.RUNNING, Phase.HOLDING) and not setpoints.stands(phase is Phase.HOLDING):
+        reasons.append("set-points are on their way: wait until they stand")
+    if cycle.account.held:
+        reasons.append(f"signals have been missing for {cycle.account.held} periods")
+    if doubts := in_words(int(cycle.watch.doubts)):
+        reasons.append(f"the loop doubts what it measures: {', '.join(doubts)}")
+    most = deployment.region.speed_max_m_per_s
+    if most is not None and setpoints.speed_target_m_per_s > most and phase is not Phase.SILENT:
+        reasons.append(
+            f"the line shall run at {setpoints.speed_target_m_per_s:g} m/s; the configuration was judged up to {most:g}"
+        )
+    return reasons
+
+
+def _deploy(cycle: Cycle, deployment: Deployment, now_s: float) -> str:
+    if reasons := against(cycle, deployment):
+        raise Refused("not deployed", reasons)
+    configurations = cycle.configurations
+    prepared, configurations.prepared = configurations.prepared, None
+    if prepared is not None and prepared[0] is deployment:
+        candidate = prepared[1]
+    else:
+        try:
+            candidate = configurations.candidate(deployment)
+        except ControllerRefused as refused:
+            raise Refused("not deployed", [str(refused)]) from refused
+    configurations.take(candidate, deployment, now_s)
+    return f"{candidate.config.kind} controller {candidate.hash[:12]} controls the line, on probation"
+
+
+def _keep(cycle: Cycle, command: Keep) -> str:
+    _require_probation(cycle, command.epoch)
+    configurations, watch = cycle.configurations, command.watch
+    recovery = None
+    if watch is not None:
+        prepared, configurations.prepared_watch = configurations.prepared_watch, None
+        if prepared is not None and prepared[0] is watch:
+            recovery = prepared[1]
+        else:
+            try:
+                recovery = configurations.recovery(watch, configurations.running.config)
+            except ControllerRefused as refused:
+                raise Refused("not kept", [str(refused)]) from refused
+    configurations.keep(watch, recovery)
+    return f"epoch {command.epoch} is the last known good"
+
+
+def _require_probation(cycle: Cycle, epoch: int) -> None:
+    configurations = cycle.configurations
+    if configurations.probation is None or configurations.epoch != epoch:
+        now = f"epoch {configurations.epoch} is" if configurations.probation else "nothing is"
+        raise Refused(f"epoch {epoch} is not on probation ({now}); {configurations.why}")

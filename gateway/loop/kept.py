@@ -1,0 +1,70 @@
+"""What outlives the loop: the last known good configuration, in one file, all of it or the one before.
+
+Never the one on probation: a loop that starts anew starts with what is known to be good. The file belongs to the
+configuration that the loop is started with: an engineer who gives it another one gets that.
+"""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field, ValidationError
+
+from gateway.core.controller import Controller, ControllerConfig, config_hash
+from gateway.core.controller_fit import misfits
+from gateway.core.deployment import Hash, RecoveryPrediction, Region
+from gateway.core.line import Line, Strict
+
+FILE = "configuration.json"
+
+
+class Kept(Strict):
+    format: Annotated[int, Field(ge=1, le=1)] = 1
+    started_with: Hash  #: the configuration that the loop was given
+    epoch: Annotated[int, Field(ge=0)]  #: the last that was taken, whatever became of it
+    controller: ControllerConfig
+    region: Region
+    watch: RecoveryPrediction | None
+
+
+class Store:
+    """The file in `folder`, for a loop that was started with `config`."""
+
+    def __init__(self, folder: Path, config: Controller) -> None:
+        self.path = folder / FILE
+        self._started_with = config_hash(config)
+
+    def read(self, line: Line, say: Callable[[str], None]) -> Kept | None:
+        """What was kept, or None: then the loop runs what it is given. A file that is not used is told, with why."""
+        try:
+            kept = Kept.model_validate_json(self.path.read_bytes())
+        except FileNotFoundError:
+            return None
+        except (OSError, ValidationError) as error:
+            reason = str(error).partition("\n")[0]
+            say(f"{self.path} is not used, the configuration given is: {reason}")
+            return None
+        if kept.started_with != self._started_with:
+            say(f"{self.path} belongs to another configuration than the one given, which is used")
+            return None
+        if reasons := misfits(kept.controller, line):
+            say(f"{self.path} is not used, the configuration given is: {'; '.join(reasons)}")
+            return None
+        return kept
+
+    def write(self, epoch: int, config: Controller, region: Region, watch: RecoveryPrediction | None) -> None:
+        """On the disk when it returns. Raises OSError; the file before is then as it was."""
+        kept = Kept(started_with=self._started_with, epoch=epoch, controller=config, region=region, watch=watch)
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        beside = self.path.with_name(self.path.name + ".part")
+        with beside.open("wb") as file:
+            file.write(kept.model_dump_json().encode() + b"\n")
+            file.flush()
+            os.fsync(file.fileno())
+        beside.replace(self.path)
+        folder = os.open(self.path.parent, os.O_RDONLY)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)
