@@ -43,6 +43,10 @@ GATEWAY = Who(name="gateway")
 MOST_SETTLING = 1000  #: records in a row from one look at the loop; more is a fault of this program
 
 
+class NotTakenUp(Exception):
+    """What was to be put into service could not be stored; the text says why."""
+
+
 class AuditSide(Protocol):
     async def append(
         self, kind: str, who: Who, what: Mapping[str, Any], blobs: Mapping[str, bytes] | None = None
@@ -103,7 +107,7 @@ class Deployer:
         self._loop = loop
         self._judge = judge
         self._surroundings = surroundings
-        self._take_up = take_up  #: into the stores, before it is put into service
+        self._take_up = take_up  #: into the stores, before it is put into service; raises NotTakenUp
         self._clock = clock
         self._wall_clock = wall_clock
         self._one_step = asyncio.Lock()
@@ -163,7 +167,7 @@ class Deployer:
                     return self._refused("the line has changed since it was shown", reasons)
                 await self._step("approved", what, who)
                 return await self._carry_out(self.book.entries[entry.proposal], found, who)
-            except (AuditUnavailable, Unreachable, Impossible) as error:
+            except (AuditUnavailable, Unreachable, Impossible, NotTakenUp) as error:
                 return self._refused("it is not carried out", [str(error)])
 
     async def roll_back(self, comment: str, who: Who) -> Reply:

@@ -1,17 +1,20 @@
 """The gate of a gateway process: audit, stores, judge and deployer, and what of them is asked over the mailbox."""
 
+import asyncio
+import json
 import pwd
 from collections.abc import Callable, Mapping
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 from pydantic import ValidationError
 
 from gateway.core.audit_record import Who
-from gateway.core.controller import Controller
+from gateway.core.controller import Controller, ControllerRefused, config_hash, parse_controller
 from gateway.core.decisions import DECISION, QUERY, Decide, ListProposals
 from gateway.core.line import Line
-from gateway.core.messages import Command, Reply, command_bytes
+from gateway.core.messages import Command, Deploy, Keep, Reply, command_bytes
 from gateway.core.proposal import GainsChange, ModelChange, Proposal
 from gateway.core.topics import GATEWAY_DECISION, GATEWAY_PROPOSALS, GATEWAY_PROPOSE, LOOP_COMMAND
 from gateway.mailbox.port import PEER, Mailbox, Peer, RemoteError
@@ -19,14 +22,21 @@ from gateway.supervisor import configurations as configurations_store
 from gateway.supervisor import models as models_store
 from gateway.supervisor.audit import Audit
 from gateway.supervisor.audit_file import AuditFile, AuditUnavailable
-from gateway.supervisor.configurations import Origin, begin_configurations
-from gateway.supervisor.deployer import GATEWAY, Deployer, JudgeSide
+from gateway.supervisor.configurations import Configurations, ConfigurationsError, Origin, begin_configurations
+from gateway.supervisor.deployer import GATEWAY, Deployer, JudgeSide, NotTakenUp
 from gateway.supervisor.lifecycle import Book, Impossible, book_of
-from gateway.supervisor.models import begin_repository
-from gateway.supervisor.recent import Recent
+from gateway.supervisor.model_store import ModelsError
+from gateway.supervisor.models import Models, begin_repository
 from gateway.supervisor.surroundings import LineSurroundings
 
 LOOP_TIME_S = 2.5
+BUILD_TIME_S = 15.0  #: for what the loop builds and warms before it answers
+
+#: Files in the line's folder from which a loop takes its first configuration, and how they are read.
+STARTED_WITH: dict[str, Callable[[bytes], Controller]] = {
+    "controller.json": parse_controller,
+    "configuration.json": lambda content: parse_controller(json.dumps(json.loads(content)["controller"]).encode()),
+}
 
 
 class CannotBegin(Exception):
@@ -55,7 +65,8 @@ class LoopOverMailbox:
         self._mailbox = mailbox
 
     async def tell(self, command: Command) -> Reply:
-        answer = await self._mailbox.request(LOOP_COMMAND, command_bytes(command), LOOP_TIME_S)
+        time_s = BUILD_TIME_S if isinstance(command, Deploy | Keep) else LOOP_TIME_S
+        answer = await self._mailbox.request(LOOP_COMMAND, command_bytes(command), time_s)
         try:
             return Reply.model_validate_json(answer)
         except ValidationError as error:
@@ -63,70 +74,109 @@ class LoopOverMailbox:
 
 
 class Gate:
-    """`begin` after the audit has started; `look` a few times a second; `close` at the end."""
+    """`look` a few times a second, `close` at the end. It opens as soon as audit and stores are there."""
 
     def __init__(
         self,
         line: Line,
         mailbox: Mailbox,
         folder: Path,
-        audit: Audit,
         judge: JudgeSide,
-        recent: Recent,
-        surroundings: Callable[..., LineSurroundings],
+        around: Callable[[Configurations, Models], LineSurroundings],
+        note: Callable[..., None],
         clock: Callable[[], float],
         wall_clock: Callable[[], float],
-        note: Callable[..., None],
     ) -> None:
-        """Raises CannotBegin, and the stores' errors."""
+        self.deployer: Deployer | None = None
         self._line = line
-        self._wall_clock = wall_clock
+        self._folder = folder
+        self._judge = judge
+        self._around = around
         self._note = note
-        self._configurations = begin_configurations(folder / configurations_store.FILE_NAME)
-        self._models = begin_repository(folder / models_store.FILE_NAME)
+        self._clock = clock
+        self._wall_clock = wall_clock
+        self._loop = LoopOverMailbox(mailbox)
+        self._audit = Audit(folder, clock=clock, wall_clock=wall_clock)
+        self._audit.start()
+        self._stores: tuple[Configurations, Models] | None = None
+        self._shut = "the gate is about to open"  #: why it is, while it is
         self._told = ""
-        kept = KeptAudit(folder, audit)
-        around = surroundings(configurations=self._configurations, models=self._models)
-        self.deployer = Deployer(
-            line, book_in(folder), kept, LoopOverMailbox(mailbox), judge, around, self._take_up, clock, wall_clock
-        )
         mailbox.serve(GATEWAY_PROPOSE, self._answer_propose)
         mailbox.serve(GATEWAY_PROPOSALS, self._answer_query)
         mailbox.serve(GATEWAY_DECISION, self._answer_decision)
 
-    def know(self, controller: Controller, why: str) -> None:
-        """A configuration that the loop may have been started with."""
-        origin = Origin(self._wall_clock(), GATEWAY.name, why)
-        self._configurations.store(self._line.site, self._line.line, controller, origin)
-
     async def look(self) -> None:
-        await self.deployer.watch()
-        if self.deployer.trouble != self._told:
-            self._told = self.deployer.trouble
-            if self._told:
-                self._note("gate", f"the gate waits: {self._told}")
+        """Never raises for what the disk or the loop do."""
+        if self.deployer is None:
+            await self._open()
+        if self.deployer is not None:
+            await self.deployer.watch()
+        trouble = self._shut if self.deployer is None else self.deployer.trouble
+        if trouble != self._told:
+            self._told = trouble
+            self._note("gate", f"the gate waits: {trouble}" if trouble else "the gate is open")
 
     async def close(self) -> None:
-        await self.deployer.close()
-        self._configurations.close()
-        self._models.close()
+        if self.deployer is not None:
+            await self.deployer.close()
+        for store in self._stores or ():
+            store.close()
+        await asyncio.to_thread(self._audit.close)
+
+    async def _open(self) -> None:
+        """Once a record of the start is on the disk, the records before it are read."""
+        try:
+            await self._audit.append("gateway-start", GATEWAY, {"version": version("r2rgate")})
+            book = await asyncio.to_thread(book_in, self._folder)
+            if self._stores is None:
+                self._stores = (
+                    begin_configurations(self._folder / configurations_store.FILE_NAME),
+                    begin_repository(self._folder / models_store.FILE_NAME),
+                )
+            self._learn(*self._stores)
+        except (AuditUnavailable, CannotBegin, ConfigurationsError, ModelsError) as error:
+            self._shut = str(error)
+            return
+        self.deployer = Deployer(
+            self._line, book, KeptAudit(self._folder, self._audit), self._loop, self._judge,
+            self._around(*self._stores), self._take_up, self._clock, self._wall_clock,
+        )  # fmt: skip
+
+    def _learn(self, configurations: Configurations, _: Models) -> None:
+        """Store what the loop may have been started with: it tells only its hash."""
+        for name, read in STARTED_WITH.items():
+            try:
+                controller = read((self._folder / name).read_bytes())
+            except (OSError, ValueError, ControllerRefused):
+                continue  # the loop says what it runs; a proposal finds that it is not known here
+            known = {one.id for one in configurations.entries(self._line.site, self._line.line)}
+            if config_hash(controller) not in known:
+                origin = Origin(self._wall_clock(), GATEWAY.name, f"found as {name}, with which the loop starts")
+                configurations.store(self._line.site, self._line.line, controller, origin)
 
     def _take_up(self, proposal: Proposal, verdict: str | None) -> None:
-        """What is about to be put into service goes into the stores."""
-        change, now_s = proposal.change, self._wall_clock()
+        """What is about to be put into service goes into the stores. Raises NotTakenUp."""
+        assert self._stores is not None  # they are open before the gate is
+        try:
+            self._store(proposal, verdict, *self._stores)
+        except (ConfigurationsError, ModelsError) as error:
+            raise NotTakenUp(str(error)) from error
+
+    def _store(self, proposal: Proposal, verdict: str | None, configurations: Configurations, models: Models) -> None:
+        change, now_s, line = proposal.change, self._wall_clock(), self._line
         if isinstance(change, GainsChange):
             origin = Origin(now_s, proposal.author, proposal.reason[:400], proposal.base, proposal.model, verdict)
-            self._configurations.store(self._line.site, self._line.line, change.controller, origin)
+            configurations.store(line.site, line.line, change.controller, origin)
         elif isinstance(change, ModelChange):
-            entry = self._models.store(change.model, now_s)
-            for other in self._models.entries(self._line.site, self._line.line):
+            entry = models.store(change.model, now_s)
+            for other in models.entries(line.site, line.line):
                 if other.state == "accepted" and other.id != entry.id:
-                    self._models.mark(other.id, "superseded", now_s, f"by version {entry.version}")
-            self._models.mark(entry.id, "accepted", now_s, proposal.reason[:400])
+                    models.mark(other.id, "superseded", now_s, f"by version {entry.version}")
+            models.mark(entry.id, "accepted", now_s, proposal.reason[:400])
 
     async def _answer_propose(self, payload: bytes) -> bytes:
         who = _who(PEER.get())
-        reply = await self.deployer.propose(payload, who)
+        reply = self._shut_reply() if self.deployer is None else await self.deployer.propose(payload, who)
         self._note("proposal", f"{who.name}: {reply.text}", ok=reply.ok, reasons=reply.reasons)
         return reply.model_dump_json().encode()
 
@@ -135,6 +185,8 @@ class Gate:
             query = QUERY.validate_json(payload)
         except ValidationError as error:
             return _not_understood(error)
+        if self.deployer is None:
+            return self._shut_reply().model_dump_json().encode()
         if isinstance(query, ListProposals):
             return self.deployer.listed(query.most).model_dump_json().encode()
         found = self.deployer.shown(query.proposal)
@@ -148,12 +200,17 @@ class Gate:
         except ValidationError as error:
             return _not_understood(error)
         who = _who(PEER.get())
-        if isinstance(decision, Decide):
+        if self.deployer is None:
+            reply = self._shut_reply()
+        elif isinstance(decision, Decide):
             reply = await self.deployer.decide(decision, who)
         else:
             reply = await self.deployer.roll_back(decision.comment, who)
         self._note("decision", f"{who.name}: {reply.text}", ok=reply.ok, reasons=reply.reasons)
         return reply.model_dump_json().encode()
+
+    def _shut_reply(self) -> Reply:
+        return Reply(ok=False, state="", text="the gate is shut", reasons=[self._shut])
 
 
 def book_in(folder: Path) -> Book:
