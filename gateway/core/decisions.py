@@ -70,9 +70,12 @@ class ProposalLine(Strict):
 
 class ProposalList(Strict):
     format: Annotated[int, Field(ge=1, le=1)]
+    site: str
+    line: str
     in_service: Digest | None
     last_known_good: Digest | None
     epoch: int
+    model: Digest | None  #: by which proposals are judged; null: the line's file
     proposals: list[ProposalLine]
 
 
@@ -85,6 +88,7 @@ class ProposalShown(Strict):
     proposal_hash: Digest
     shown: Digest | None  #: for `Decide`; null: there is nothing to decide
     epoch: int  #: of the configuration in service
+    difference: list[str]  #: what would change, as the gateway computes it
     proposal: Proposal
     verdict: Verdict | None  #: null: not judged yet
 

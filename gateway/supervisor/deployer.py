@@ -39,6 +39,7 @@ from gateway.supervisor.kept_recording import packed
 from gateway.supervisor.lifecycle import PROPOSED, Book, Entry, Impossible, Stage, reconciled
 
 LEASE_S = 5.0  #: of a deployment on probation; renewed every third of it
+UNHEARD_S = 10.0  #: after an experiment should be over
 GATEWAY = Who(name="gateway")
 MOST_SETTLING = 1000  #: records in a row from one look at the loop; more is a fault of this program
 
@@ -75,6 +76,10 @@ class Surroundings(Protocol):
     """What the line is like now, as a verdict needs it."""
 
     async def context(self, book: Book) -> tuple[JudgeContext, list[Recording]]: ...
+
+    def difference(self, proposal: Proposal, book: Book) -> list[str]:
+        """What it would change, for a person."""
+        ...
 
     def begin_probation(self) -> None:
         """A change is about to be put on the line."""
@@ -114,6 +119,7 @@ class Deployer:
         self._judging: dict[str, asyncio.Task[None]] = {}
         self._renewed_s = clock()
         self._probation_since_s = clock()
+        self._experiment: tuple[str, float] | None = None  #: that runs, and when its end is overdue
         self._settled = False  #: the loop has been asked since this process began
 
     async def propose(self, payload: bytes, who: Who) -> Reply:
@@ -219,9 +225,12 @@ class Deployer:
         newest = list(reversed(self.book.entries.values()))[:most]
         return ProposalList(
             format=1,
+            site=self._line.site,
+            line=self._line.line,
             in_service=self.book.in_service,
             last_known_good=self.book.last_known_good,
             epoch=self.book.epoch,
+            model=self.book.model,
             proposals=[_line_of(entry) for entry in newest],
         )
 
@@ -231,9 +240,11 @@ class Deployer:
         if len(found) != 1:
             return f"{len(found)} proposals begin with {beginning}: `r2rgate proposals` lists them"
         (entry,) = found
+        proposal = self._proposal(entry)
         return ProposalShown(
             format=1, stage=entry.stage, why=entry.why, proposal_hash=entry.proposal, shown=self._shown_hash(entry),
-            epoch=self.book.epoch, proposal=self._proposal(entry), verdict=self._verdict(entry),
+            epoch=self.book.epoch, difference=self._surroundings.difference(proposal, self.book), proposal=proposal,
+            verdict=self._verdict(entry),
         )  # fmt: skip
 
     def _shown_hash(self, entry: Entry) -> str | None:
@@ -293,7 +304,7 @@ class Deployer:
             return await self._deploy(entry, proposal.change, found, who)
         if isinstance(proposal.change, ExperimentChange):
             await self._step("experiment-begins", {"proposal": entry.proposal}, who)
-            reply = await self._loop.tell(RunExperiment(experiment=proposal.change.experiment))
+            reply = await self._loop.tell(RunExperiment(experiment=proposal.change.experiment, proposal=entry.proposal))
             if not reply.ok:
                 because = "; ".join([reply.text, *reply.reasons])[:1000]
                 await self._step("experiment-ends", {"proposal": entry.proposal, "because": because}, GATEWAY)
@@ -331,10 +342,12 @@ class Deployer:
         )
 
     async def _look_after(self, found: InService) -> None:
-        entry = self.book.on_the_line
-        if entry is None or entry.stage is Stage.RUNNING:
+        entry, now_s = self.book.on_the_line, self._clock()
+        if entry is None:
             return
-        now_s = self._clock()
+        if entry.stage is Stage.RUNNING:
+            await self._end_unheard(entry, now_s)
+            return
         if against := self._surroundings.against_keeping():
             await self._loop.tell(Rollback(reason=against))
             await self._settle()
@@ -347,12 +360,26 @@ class Deployer:
             await self._loop.tell(Renew(epoch=entry.epoch or found.epoch))
             self._renewed_s = now_s
 
+    async def _end_unheard(self, entry: Entry, now_s: float) -> None:
+        """Of an experiment whose end nobody has told: the loop was started anew, or this process."""
+        if self._experiment is None or self._experiment[0] != entry.proposal:
+            change = self._proposal(entry).change
+            takes_s = change.experiment.duration_s if isinstance(change, ExperimentChange) else 0.0
+            self._experiment = (entry.proposal, now_s + takes_s + UNHEARD_S)
+        elif now_s >= self._experiment[1]:
+            what = {"proposal": entry.proposal, "because": "the loop has not told its end"}
+            await self._step("experiment-ends", what, GATEWAY)
+
     async def experiment_ended(self, hash_: str, because: str) -> None:
         """The loop has told that an experiment is over; `because` empty: complete."""
         async with self._one_step:
             entry = self.book.on_the_line
-            if entry is not None and entry.stage is Stage.RUNNING and entry.changes == hash_:
+            if entry is None or entry.stage is not Stage.RUNNING or entry.changes != hash_:
+                return
+            try:
                 await self._step("experiment-ends", {"proposal": entry.proposal, "because": because}, GATEWAY)
+            except AuditUnavailable as error:
+                self.trouble = str(error)
 
     async def _settle(self) -> InService:
         """Ask the loop what it runs, and record until the book says so too. Raises Unreachable, AuditUnavailable."""

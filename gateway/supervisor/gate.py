@@ -14,7 +14,7 @@ from gateway.core.audit_record import Who
 from gateway.core.controller import Controller, ControllerRefused, config_hash, parse_controller
 from gateway.core.decisions import DECISION, QUERY, Decide, ListProposals
 from gateway.core.line import Line
-from gateway.core.messages import Command, Deploy, Keep, Reply, command_bytes
+from gateway.core.messages import Command, Deploy, Event, Keep, Reply, command_bytes
 from gateway.core.proposal import GainsChange, ModelChange, Proposal
 from gateway.core.topics import GATEWAY_DECISION, GATEWAY_PROPOSALS, GATEWAY_PROPOSE, LOOP_COMMAND
 from gateway.mailbox.port import PEER, Mailbox, Peer, RemoteError
@@ -30,6 +30,7 @@ from gateway.supervisor.models import Models, begin_repository
 from gateway.supervisor.surroundings import LineSurroundings
 
 LOOP_TIME_S = 2.5
+EXPERIMENT_ENDS = ("experiment-end", "experiment-abort")
 BUILD_TIME_S = 15.0  #: for what the loop builds and warms before it answers
 
 #: Files in the line's folder from which a loop takes its first configuration, and how they are read.
@@ -101,6 +102,7 @@ class Gate:
         self._stores: tuple[Configurations, Models] | None = None
         self._shut = "the gate is about to open"  #: why it is, while it is
         self._told = ""
+        self._telling: set[asyncio.Task[None]] = set()
         mailbox.serve(GATEWAY_PROPOSE, self._answer_propose)
         mailbox.serve(GATEWAY_PROPOSALS, self._answer_query)
         mailbox.serve(GATEWAY_DECISION, self._answer_decision)
@@ -116,7 +118,19 @@ class Gate:
             self._told = trouble
             self._note("gate", f"the gate waits: {trouble}" if trouble else "the gate is open")
 
+    def hear(self, event: Event) -> None:
+        """What the loop tells: that an experiment is over is for the records."""
+        if self.deployer is None or event.kind not in EXPERIMENT_ENDS:
+            return
+        hash_, reason = str(event.data.get("hash", "")), str(event.data.get("reason", ""))
+        task = asyncio.get_running_loop().create_task(self.deployer.experiment_ended(hash_, reason))
+        self._telling.add(task)
+        task.add_done_callback(self._telling.discard)
+
     async def close(self) -> None:
+        for task in self._telling:
+            task.cancel()
+        await asyncio.gather(*self._telling, return_exceptions=True)
         if self.deployer is not None:
             await self.deployer.close()
         for store in self._stores or ():

@@ -5,10 +5,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 from gateway.core.controller import Controller
+from gateway.core.differences import of_controllers, of_experiment, of_models
 from gateway.core.doubts import in_words
 from gateway.core.judge_context import DataReference, JudgeContext, LineState
 from gateway.core.line import Line
 from gateway.core.line_model import LineModel
+from gateway.core.proposal import ExperimentChange, GainsChange, Proposal
 from gateway.core.recording import Recording
 from gateway.core.states import LoopState
 from gateway.core.telemetry import Frame
@@ -17,6 +19,7 @@ from gateway.supervisor.deployer import iso
 from gateway.supervisor.history import History, HistoryError
 from gateway.supervisor.history_recording import recording_between
 from gateway.supervisor.lifecycle import Book, Stage
+from gateway.supervisor.model_store import ModelsError
 from gateway.supervisor.models import Models
 from gateway.supervisor.recent import Recent
 from safety.probation import Standing, against
@@ -68,6 +71,18 @@ class LineSurroundings:
             ],
             decided=[entry.proposal for entry in book.entries.values() if entry.stage is not Stage.RECEIVED][-4096:],
         ), [one for one, _ in found]
+
+    def difference(self, proposal: Proposal, book: Book) -> list[str]:
+        """What it would change, in words and numbers; where something is not known, that."""
+        change = proposal.change
+        try:
+            if isinstance(change, GainsChange):
+                return of_controllers(self._controller(book.in_service), change.controller)
+            if isinstance(change, ExperimentChange):
+                return of_experiment(change.experiment)
+            return of_models(self._model(book), change.model)
+        except (NotKnown, ModelsError) as error:
+            return [str(error)]
 
     def begin_probation(self) -> None:
         """From now on the line is measured against how it has stood until now."""

@@ -172,6 +172,9 @@ class FakeSurroundings:
         state = LineState(state="READY", tension_n=[30.0] * LINE.n, speed_m_per_s=0.0)
         return JudgeContext(format=1, now=iso(self.loop.now_s), state=state, in_service=FIRST), []
 
+    def difference(self, one, book) -> list[str]:
+        return ["a test"]
+
     def begin_probation(self) -> None: ...
 
     def against_keeping(self) -> str:
