@@ -17,6 +17,7 @@ from gateway.cli import (
     models_commands,
     operate_commands,
     process_commands,
+    proposal_commands,
     recordings_export,
     rehearse_commands,
     scan_commands,
@@ -35,7 +36,7 @@ app = typer.Typer(
 )
 
 NUMBERS = {"ignore_unknown_options": True}  # so that -5 is a number that is refused, not an option
-ENGINEER, PROCESSES, LINE, EVIDENCE = "Engineer", "Processes", "Running the line", "Evidence"
+ENGINEER, PROCESSES, LINE, OVERSIGHT, EVIDENCE = "Engineer", "Processes", "Running the line", "Oversight", "Evidence"
 
 app.command(rich_help_panel=ENGINEER)(line_commands.init)
 app.command(rich_help_panel=ENGINEER)(line_commands.check)
@@ -61,6 +62,11 @@ app.command("set", rich_help_panel=LINE, context_settings=NUMBERS)(operate_comma
 app.command(rich_help_panel=LINE, context_settings=NUMBERS)(operate_commands.speed)
 app.command(rich_help_panel=LINE)(operate_commands.recipe)
 app.command(rich_help_panel=LINE)(status_commands.status)
+app.command(rich_help_panel=ENGINEER)(proposal_commands.propose)
+app.command(rich_help_panel=OVERSIGHT)(proposal_commands.proposals)
+app.command(rich_help_panel=OVERSIGHT)(proposal_commands.approve)
+app.command(rich_help_panel=OVERSIGHT)(proposal_commands.reject)
+app.command(rich_help_panel=OVERSIGHT)(proposal_commands.rollback)
 app.command("export", rich_help_panel=EVIDENCE)(recordings_export.export)
 
 

@@ -1,20 +1,14 @@
 """Recordings from where data are kept: the historian, CSV and MCAP files."""
 
 from pathlib import Path
-from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
 
 from gateway.cli.recordings_csv import read_csv
 from gateway.cli.recordings_mcap import read_mcap
 from gateway.cli.recordings_table import RecordingRefused
-from gateway.core.recording import Recording, recording_of
-from gateway.core.telemetry import FLOAT_FIELDS, frame_dtype
-from gateway.supervisor.history import History, HistoryError
+from gateway.core.recording import Recording
+from gateway.supervisor.history import HistoryError
+from gateway.supervisor.history_recording import recording_between
 
-#: What of a frame a recording is made from.
-FIELDS = (*FLOAT_FIELDS, "unwind_speed_m_per_s", "tension_quality", "state", "held")
 READERS = {".csv": read_csv, ".mcap": read_mcap}
 
 
@@ -30,29 +24,8 @@ def read_recording(path: Path, period_s: float | None = None) -> Recording:
 
 
 def recording_of_history(path: Path, start_s: float, end_s: float, period_s: float | None = None) -> Recording:
-    """What a historian has kept between two instants of Unix time. Raises RecordingRefused.
-
-    Without `period_s` the median interval is taken, to the microsecond.
-    """
+    """What a historian has kept between two instants of Unix time. Raises RecordingRefused."""
     try:
-        with History(path) as history:
-            columns = history.read_wall(start_s, end_s, FIELDS)
-            damaged = history.damaged
+        return recording_between(path, start_s, end_s, period_s)
     except HistoryError as error:
         raise RecordingRefused(str(error)) from error
-    if damaged:
-        raise RecordingRefused(f"{path}: part of this time is damaged ({damaged[0]}): choose a time without it")
-    frames = _frames(columns)
-    step = np.diff(frames["time_s"])
-    if len(step) == 0:
-        raise RecordingRefused(f"{path}: {len(frames)} samples from {start_s:.3f} to {end_s:.3f} s of Unix time")
-    if (step <= 0.0).any():
-        raise RecordingRefused(f"{path}: the machine was started anew in this time: choose a time before or after it")
-    return recording_of(frames, period_s or round(float(np.median(step)), 6), f"{path.name}, {len(frames)} samples")
-
-
-def _frames(columns: dict[str, NDArray[Any]]) -> NDArray[np.void]:
-    frames = np.zeros(len(columns["time_s"]), frame_dtype(columns["tension_n"].shape[1]))
-    for name, column in columns.items():
-        frames[name] = column
-    return frames

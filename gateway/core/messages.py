@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, TypeAdapter, ValidationError
 
-from gateway.core.deployment import Deployment, Epoch, InService, RecoveryPrediction
+from gateway.core.deployment import Deployment, Epoch, Hash, InService, RecoveryPrediction
 from gateway.core.experiment import Experiment, experiment_hash
 from gateway.core.line import Strict
 
@@ -64,6 +64,8 @@ class RunExperiment(Strict):
 
     command: Literal["experiment"] = "experiment"
     experiment: Experiment
+    #: Under which it was judged and approved; a line that is not simulated takes no other. From the gateway only.
+    proposal: Hash | None = None
 
 
 class AbortExperiment(Strict):

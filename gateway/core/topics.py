@@ -18,5 +18,11 @@ LOOP_BUSES = Topic("loop/buses", "publish", "1/s", kept=False)
 LOOP_COMMAND = Topic("loop/command", "request", "100/s", kept=False)
 GATEWAY_COMMAND = Topic("gateway/command", "request", "100/s", kept=True)
 GATEWAY_STATUS = Topic("gateway/status", "request", "20/s", kept=False)
+GATEWAY_PROPOSE = Topic("gateway/propose", "request", "1/s", kept=True)
+GATEWAY_PROPOSALS = Topic("gateway/proposals", "request", "20/s", kept=False)
+GATEWAY_DECISION = Topic("gateway/decision", "request", "1/s", kept=True)
 
-TOPICS = (LOOP_TELEMETRY, LOOP_EVENT, LOOP_BUSES, LOOP_COMMAND, GATEWAY_COMMAND, GATEWAY_STATUS)
+TOPICS = (
+    LOOP_TELEMETRY, LOOP_EVENT, LOOP_BUSES, LOOP_COMMAND, GATEWAY_COMMAND, GATEWAY_STATUS, GATEWAY_PROPOSE,
+    GATEWAY_PROPOSALS, GATEWAY_DECISION,
+)  # fmt: skip

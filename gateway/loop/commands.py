@@ -298,7 +298,7 @@ def _run_experiment(cycle: Cycle, command: RunExperiment) -> str:
         raise Refused("an experiment is under way; it can be aborted")
     if cycle.machine.phase is not Phase.RUNNING:
         raise Refused(f"an experiment needs a running line, this one is {cycle.machine.phase.name.lower()}")
-    reasons = cycle.experiments.why_not(experiment, cycle.line)
+    reasons = cycle.experiments.why_not(experiment, cycle.line, judged=command.proposal is not None)
     reasons += unjudged(cycle, experiment)
     if doubts := in_words(int(cycle.watch.doubts)):
         reasons.append(f"the loop doubts what it measures: {', '.join(doubts)}")

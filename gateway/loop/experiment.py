@@ -16,9 +16,9 @@ from gateway.loop.setpoints import Setpoints
 Tell = Callable[..., None]  #: kind, text, and what goes with it by name
 TOLD = 10  #: times on the way that its progress is told
 
-NO_GATE = (
-    "nothing judges an experiment yet, so this loop takes one on a simulated line only, and it does not know of one: "
-    "`r2rgate run LINE.toml --plant PLANT.toml` starts both"
+NOT_JUDGED = (
+    "on a line that is not simulated an experiment is judged and approved first: "
+    "`r2rgate propose EXPERIMENT.json --reason TEXT`"
 )
 
 
@@ -118,10 +118,10 @@ class Experiments:
         self._tell = tell
         self._simulated = simulated  #: the line is, for certain
 
-    def why_not(self, experiment: Experiment, line: Line) -> list[str]:
-        """What speaks against running it now, on a line that runs."""
-        if not self._simulated:
-            return [NO_GATE]
+    def why_not(self, experiment: Experiment, line: Line, *, judged: bool) -> list[str]:
+        """What speaks against running it now, on a line that runs. `judged`: it was, and a person has approved it."""
+        if not judged and not self._simulated:
+            return [NOT_JUDGED]
         if not self._setpoints.at_rest():
             return ["set-points are still on their way: wait until they stand"]
         return reasons_against(experiment, line, self._setpoints.tension_n, self._setpoints.speed_target_m_per_s)

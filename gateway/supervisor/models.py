@@ -12,11 +12,11 @@ from typing import Literal, NamedTuple
 import apsw
 
 from gateway.core.line_model import LineModel, ModelRefused, canonical, model_hash, parse_model
-from gateway.supervisor.model_store import ModelsError, begin_models, open_models, told, transaction
+from gateway.supervisor.find_version import find_version
+from gateway.supervisor.model_store import KIND, ModelsError, begin_models, open_models
+from gateway.supervisor.sqlite_file import snapshot, told, transaction
 
 FILE_NAME = "models.sqlite"
-LEAST_PREFIX = 6  #: letters of an id that may stand for it
-LISTED = 12  #: versions that a refusal names one by one
 
 State = Literal["accepted", "superseded", "rejected"]
 
@@ -84,7 +84,7 @@ class Models:
     def store(self, model: LineModel, stored_s: float) -> Entry:
         """Add a model as the next version of its line. One that is there already stays as it is, and is returned."""
         id_, run = model_hash(model), self._connection.execute
-        with told(self.path), transaction(self._connection):
+        with told(self.path, KIND), transaction(self._connection):
             if not run("SELECT 1 FROM model WHERE id = ?", (id_,)).get:
                 last = run("SELECT max(version) FROM model WHERE site = ? AND line = ?", (model.site, model.line)).get
                 run(
@@ -96,7 +96,7 @@ class Models:
     def mark(self, id_: str, state: State, time_s: float, reason: str) -> None:
         """Say what has become of a stored model. Earlier marks stay."""
         run = self._connection.execute
-        with told(self.path), transaction(self._connection):
+        with told(self.path, KIND), transaction(self._connection):
             if not run("SELECT 1 FROM model WHERE id = ?", (id_,)).get:
                 raise ModelsError(f"{self.path} has no model {id_[:12]}: nothing was marked")
             run("INSERT INTO mark (model, state, time_s, reason) VALUES (?, ?, ?, ?)", (id_, state, time_s, reason))
@@ -110,24 +110,7 @@ class Models:
         found = self.entries(site, line)
         if not found:
             raise ModelsError(f"{self.path} has no model{f' of {site}/{line}' if site else ''} yet")
-        by_id = [one for one in found if len(wanted) >= LEAST_PREFIX and one.id.startswith(wanted.lower())]
-        by_version = _by_version(wanted, found)
-        lines = sorted({f"{one.site}/{one.line}" for one in found})
-        if by_version and len(lines) == 1:
-            return by_version[0]
-        if len(by_id) == 1:
-            return by_id[0]
-        if by_version:
-            raise ModelsError(f"{self.path} has models of {', '.join(lines)}: name the line with --line, or an id")
-        if by_id:
-            named = ", ".join(f"{one.id[:16]} (version {one.version})" for one in by_id)
-            raise ModelsError(f"{wanted} is the beginning of several models: {named}; give more of it")
-        versions = [str(one.version) for one in found]
-        listed = ", ".join(versions if len(versions) <= LISTED else [*versions[:3], "...", versions[-1]])
-        raise ModelsError(
-            f"{self.path} has no model {wanted}; allowed: a version ({listed}), at least {LEAST_PREFIX} letters of an "
-            "id, newest, or a file"
-        )
+        return find_version(wanted, found, "model", self.path, ModelsError)
 
     def ancestors(self, entry: Entry) -> list[Entry]:
         """The models that were the prior of one another, the nearest first, as far as they lie here."""
@@ -140,28 +123,15 @@ class Models:
 
     def _entries(self, where: str, values: Iterable[str | None]) -> list[Entry]:
         run = self._connection.execute
-        with told(self.path):
-            run("BEGIN")  # one snapshot of both tables
-            try:
-                rows = run(
-                    f"SELECT id, site, line, version, stored_s, content FROM model WHERE {where}"
-                    " ORDER BY site, line, version",
-                    tuple(values),
-                )
-                stored = [_Row(*row) for row in rows]
-                marks = list(run("SELECT model, state, time_s, reason FROM mark ORDER BY id"))
-            finally:
-                run("ROLLBACK")
+        with told(self.path, KIND), snapshot(self._connection):
+            rows = run(
+                f"SELECT id, site, line, version, stored_s, content FROM model WHERE {where}"
+                " ORDER BY site, line, version",
+                tuple(values),
+            )
+            stored = [_Row(*row) for row in rows]
+            marks = list(run("SELECT model, state, time_s, reason FROM mark ORDER BY id"))
         return [_entry(row, tuple(Mark(*mark) for id_, *mark in marks if id_ == row.id)) for row in stored]
-
-
-def _by_version(wanted: str, found: list[Entry]) -> list[Entry]:
-    """Those whose version is wanted, one for each line."""
-    if wanted == "newest":
-        newest = {(one.site, one.line): one for one in found}
-        return list(newest.values())
-    number = wanted.removeprefix("v")
-    return [one for one in found if number.isdecimal() and one.version == int(number)]
 
 
 def _entry(row: _Row, marks: tuple[Mark, ...]) -> Entry:

@@ -6,6 +6,7 @@ It may start before the loop, outlive it, and die without the loop noticing.
 import asyncio
 import signal
 import sys
+import time
 from pathlib import Path
 
 from gateway.core.line import Line
@@ -13,9 +14,14 @@ from gateway.core.topics import LOOP_COMMAND
 from gateway.mailbox.listener import AlreadyRunning, CannotListen, PathTooLong
 from gateway.mailbox.paths import GATEWAY_SOCKET, LOOP_SOCKET
 from gateway.mailbox.unix import UnixMailbox
+from gateway.supervisor.configurations import Configurations
+from gateway.supervisor.gate import Gate
 from gateway.supervisor.historian import Historian
+from gateway.supervisor.judging import JudgeWorkers
+from gateway.supervisor.models import Models
 from gateway.supervisor.retention import retention_of
 from gateway.supervisor.service import Gateway
+from gateway.supervisor.surroundings import LineSurroundings
 
 EXIT_OK, EXIT_NOT_FLUSHED, EXIT_CANNOT_LISTEN, EXIT_ALREADY_RUNNING = 0, 1, 2, 3
 WATCH_S = 0.25
@@ -41,9 +47,17 @@ async def _serve(line: Line, run_folder: Path, data_folder: Path) -> int:
     mailbox.connect((LOOP_COMMAND,), run_folder / LOOP_SOCKET)
     historian = Historian(data_folder, line.site, line.line, line.n, retention=retention_of(line.history))
     gateway = Gateway(line, mailbox, historian, mailbox.counters)
+    judge = JudgeWorkers(line)
+
+    def around(configurations: Configurations, models: Models) -> LineSurroundings:
+        return LineSurroundings(line, gateway.newest, gateway.recent, historian.path, configurations, models, time.time)
+
     # First the socket, whose lock makes this the only instance; only then is the history touched.
     await mailbox.listen(run_folder / GATEWAY_SOCKET)
     historian.start()
+    gate = Gate(line, mailbox, data_folder, judge, around, gateway.note, time.monotonic, time.time)
+    gateway.on_event = gate.hear
+    looking = asyncio.create_task(_look(gate, stop))
     gateway.note("gateway-up", "the gateway has started")
     print(f"gateway of {line.site}/{line.line}: {run_folder / GATEWAY_SOCKET}, history {historian.path}", flush=True)
     try:
@@ -51,12 +65,23 @@ async def _serve(line: Line, run_folder: Path, data_folder: Path) -> int:
             gateway.watch()
             await _wait(stop, WATCH_S)
     finally:
+        stop.set()
+        await looking
+        await gate.close()
+        await judge.close()
         await mailbox.close()
         gateway.note("gateway-down", "the gateway has been stopped")
         flushed = await asyncio.to_thread(historian.close)
     if not flushed:
         print("the disk did not answer in time: the last seconds of history are lost", file=sys.stderr)
     return EXIT_OK if flushed else EXIT_NOT_FLUSHED
+
+
+async def _look(gate: Gate, stop: asyncio.Event) -> None:
+    """Beside the rest: it waits for the loop's answers."""
+    while not stop.is_set():
+        await gate.look()
+        await _wait(stop, WATCH_S)
 
 
 async def _wait(stop: asyncio.Event, timeout_s: float) -> None:

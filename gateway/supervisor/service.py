@@ -20,12 +20,15 @@ from gateway.core.messages import (
     Event,
     MalformedMessage,
     Reply,
+    RunExperiment,
     in_words,
     parse_command,
 )
+from gateway.core.telemetry import Frame
 from gateway.core.topics import GATEWAY_COMMAND, GATEWAY_STATUS, LOOP_BUSES, LOOP_COMMAND, LOOP_EVENT, LOOP_TELEMETRY
 from gateway.mailbox.port import PEER, Counters, Mailbox, Peer, Unreachable
 from gateway.supervisor.historian import Historian
+from gateway.supervisor.recent import Recent
 from gateway.supervisor.status import (
     EventStatus,
     GatewayStatus,
@@ -66,7 +69,9 @@ class Gateway:
         self._wall_clock = wall_clock
         self._started_s = clock()
         self._wall_ahead_s = wall_clock() - clock()
-        self._sink = TelemetrySink(line.n, historian.frame)
+        self.recent = Recent(line.n, line.control.period_s)
+        self._sink = TelemetrySink(line.n, self._frame)
+        self.on_event: Callable[[Event], None] | None = None  #: who else wants to know what the loop tells
         self._events: deque[EventStatus] = deque(maxlen=EVENTS_SHOWN)
         self._buses: list[BusReport] = []
         self._malformed_events = 0
@@ -77,6 +82,11 @@ class Gateway:
         mailbox.subscribe(LOOP_BUSES, self._loop_buses)
         mailbox.serve(GATEWAY_STATUS, self._answer_status)
         mailbox.serve(GATEWAY_COMMAND, self._answer_command)
+
+    def newest(self) -> Frame | None:
+        """The last frame of a loop that runs."""
+        running = loop_status(self._line, self._sink, self._clock()).running
+        return self._sink.newest() if running else None
 
     def note(self, kind: str, text: str, **data: Any) -> None:
         """An event of the gateway itself."""
@@ -149,6 +159,10 @@ class Gateway:
             moved_aside=health.moved_aside,
         )
 
+    def _frame(self, payload: bytes) -> None:
+        self._historian.frame(payload)
+        self.recent.take(payload)
+
     def _loop_buses(self, payload: bytes) -> None:
         try:
             self._buses = BUS_REPORTS.validate_json(payload)
@@ -162,6 +176,8 @@ class Gateway:
             self._malformed_events += 1
             return
         self._keep(event)
+        if self.on_event is not None:
+            self.on_event(event)
 
     def _keep(self, event: Event) -> None:
         self._historian.event(event)
@@ -191,7 +207,7 @@ class Gateway:
         state = loop_status(self._line, self._sink, self._clock()).state
         try:
             command = parse_command(payload)
-            if isinstance(command, Deploying):
+            if isinstance(command, Deploying) or (isinstance(command, RunExperiment) and command.proposal is not None):
                 text = f"{in_words(command)}: only a proposal that was judged and approved changes the controller"
                 return Reply(ok=False, state=state, text=text, reasons=[text])
             time_s = ARM_TIME_S if isinstance(command, Arm) else LOOP_TIME_S

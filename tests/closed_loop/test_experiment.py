@@ -99,7 +99,7 @@ def test_a_real_line_refuses():
     cycle = loop.cycle
     cycle.experiments = Experiments(cycle.setpoints, 0.01, lambda: loop.now_s, None, simulated=False)
     reply = loop.command(RunExperiment(experiment=asked()))
-    assert not reply.ok and "on a simulated line only" in reply.reasons[0]
+    assert not reply.ok and "is judged and approved first" in reply.reasons[0]
     loop.step(50)
     assert at_base(loop) and cycle.experiments.run is None
 

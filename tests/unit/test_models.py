@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from gateway.core.line_model import canonical, model_hash
-from gateway.supervisor import model_store
+from gateway.supervisor import model_store, sqlite_file
 from gateway.supervisor.model_store import APPLICATION_ID, SCHEMA, ModelsError
 from gateway.supervisor.models import Models, begin_repository, open_repository
 from gateway.supervisor.store import open_store
@@ -348,7 +348,7 @@ time.sleep(60.0)
 def test_a_lock_that_stays_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "models.sqlite"
     shutil.copy(OLDER, path)
-    monkeypatch.setattr(model_store, "BUSY_MS", 10)
+    monkeypatch.setattr(sqlite_file, "BUSY_MS", 10)
     with open_repository(path) as models, child(HOLD_LOCK, path) as (_, said):
         assert said == "held\n"
         with pytest.raises(ModelsError, match="another program has held .* nothing was done"):

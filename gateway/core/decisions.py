@@ -1,0 +1,99 @@
+"""What people and programs say about proposals, and what they are shown. JSON, strict.
+
+An approval is of what was shown and of nothing else: it carries the hash over proposal, verdict and epoch, and is
+good for one decision. Whatever has changed in between makes another hash.
+"""
+
+import hashlib
+import json
+from typing import Annotated, Literal
+
+from pydantic import Field, TypeAdapter
+
+from gateway.core.line import Strict
+from gateway.core.line_model import Digest
+from gateway.core.proposal import Proposal
+from gateway.core.verdict import Verdict
+
+Comment = Annotated[str, Field(max_length=1000)]
+
+
+class Decide(Strict):
+    """A person's word on a proposal that the gate has accepted."""
+
+    command: Literal["decide"] = "decide"
+    proposal: Digest
+    shown: Digest  #: `shown_hash` of what the person has seen
+    approve: bool
+    comment: Comment = ""
+
+
+class RollBackNow(Strict):
+    """Back to the last known good configuration, at once."""
+
+    command: Literal["roll-back"] = "roll-back"
+    comment: Comment = ""
+
+
+Decision = Annotated[Decide | RollBackNow, Field(discriminator="command")]
+DECISION: TypeAdapter[Decide | RollBackNow] = TypeAdapter(Decision)
+
+
+class ListProposals(Strict):
+    """The newest first."""
+
+    command: Literal["list"] = "list"
+    most: Annotated[int, Field(ge=1, le=200)] = 50
+
+
+class ShowProposal(Strict):
+    command: Literal["show"] = "show"
+    proposal: Annotated[str, Field(pattern=r"^[0-9a-f]{6,64}$")]  #: its hash, or the beginning of it
+
+
+Query = Annotated[ListProposals | ShowProposal, Field(discriminator="command")]
+QUERY: TypeAdapter[ListProposals | ShowProposal] = TypeAdapter(Query)
+
+
+class ProposalLine(Strict):
+    """A proposal in a list."""
+
+    proposal: Digest
+    kind: Literal["gains", "experiment", "model"]
+    author: str
+    stage: str
+    why: str  #: of the stage: the first reason against it, what ended it
+    created: str
+    expires: str
+    epoch: int | None  #: of the deployment; null: never deployed
+
+
+class ProposalList(Strict):
+    format: Annotated[int, Field(ge=1, le=1)]
+    site: str
+    line: str
+    in_service: Digest | None
+    last_known_good: Digest | None
+    epoch: int
+    model: Digest | None  #: by which proposals are judged; null: the line's file
+    proposals: list[ProposalLine]
+
+
+class ProposalShown(Strict):
+    """Everything on which a person decides."""
+
+    format: Annotated[int, Field(ge=1, le=1)]
+    stage: str
+    why: str
+    proposal_hash: Digest
+    shown: Digest | None  #: for `Decide`; null: there is nothing to decide
+    epoch: int  #: of the configuration in service
+    difference: list[str]  #: what would change, as the gateway computes it
+    proposal: Proposal
+    verdict: Verdict | None  #: null: not judged yet
+
+
+def shown_hash(proposal: str, verdict: str, in_service: str, epoch: int) -> str:
+    """SHA-256 over the hashes of a proposal, its verdict, the configuration in service, and its epoch."""
+    content = {"proposal": proposal, "verdict": verdict, "in_service": in_service, "epoch": epoch}
+    return hashlib.sha256(json.dumps(content, sort_keys=True, separators=(",", ":")).encode()).hexdigest()

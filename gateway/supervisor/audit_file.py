@@ -1,0 +1,133 @@
+"""The database of the audit: its tables, and reading them from any process while another writes.
+
+Reading says what is there, sound or not; `audit_verify` judges. Each read is short, because a writer waits for it.
+"""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import apsw
+
+from gateway.core.audit_record import AuditRecord, NotRecordable, head_of, parse_record
+from gateway.supervisor.sqlite_file import FileKind, open_there, told
+
+FILE_NAME = "audit.sqlite"
+APPLICATION_ID = 0x52324155  # "R2AU"
+AT_ONCE = 200  #: records read in one go
+
+_SCHEMA_1 = f"""
+CREATE TABLE record (
+    sequence INTEGER PRIMARY KEY,
+    content BLOB NOT NULL,          -- canonical JSON; see gateway/core/audit_record.py
+    head TEXT NOT NULL              -- SHA-256 of the content, in hexadecimal
+);
+CREATE TABLE blob (
+    id TEXT PRIMARY KEY NOT NULL,   -- SHA-256 of the content, in hexadecimal
+    content BLOB NOT NULL
+);
+CREATE TRIGGER record_stays BEFORE UPDATE ON record BEGIN SELECT RAISE(ABORT, 'a record never changes'); END;
+CREATE TRIGGER record_is_kept BEFORE DELETE ON record BEGIN SELECT RAISE(ABORT, 'a record is kept'); END;
+CREATE TRIGGER blob_stays BEFORE UPDATE ON blob BEGIN SELECT RAISE(ABORT, 'a blob never changes'); END;
+CREATE TRIGGER blob_is_kept BEFORE DELETE ON blob BEGIN SELECT RAISE(ABORT, 'a blob is kept'); END;
+PRAGMA application_id = {APPLICATION_ID};
+"""
+
+#: From version k (the key) to version k + 1. Every version that was ever released stays here.
+MIGRATIONS: dict[int, str] = {0: _SCHEMA_1}
+
+WHAT_TO_DO = (
+    "No change to the line's control is made until this is settled. r2rgate audit verify says what is wrong; restore "
+    "the audit's files from a copy, or have an engineer begin anew: r2rgate audit begin-anew --because TEXT keeps the "
+    "old files aside"
+)
+
+
+class AuditUnavailable(Exception):
+    """The audit takes no record, or cannot be read; the text says why and what to do. No change may be made."""
+
+
+KIND = FileKind(
+    "audit",
+    APPLICATION_ID,
+    MIGRATIONS,
+    AuditUnavailable,
+    absent="there is no audit at {path}; a gateway begins one when it starts",
+    damaged=f"It was left as it is. {WHAT_TO_DO}",
+    undone="nothing was recorded, so that nothing may be changed",
+)
+
+
+class Row(NamedTuple):
+    """A record as it lies there."""
+
+    sequence: int
+    content: bytes
+    head: str
+
+    def record(self) -> AuditRecord:
+        """Raises NotRecordable where it is not what was stored."""
+        record = parse_record(self.content)
+        if record.sequence != self.sequence:
+            raise NotRecordable(f"it says that it is record {record.sequence}")
+        if head_of(self.content) != self.head:
+            raise NotRecordable("its head is not the hash of its content")
+        return record
+
+
+class AuditFile:
+    """The database, opened for reading; `close` it, or use it as a context manager. Raises AuditUnavailable."""
+
+    def __init__(self, folder: Path, connection: apsw.Connection | None = None) -> None:
+        self.path = folder / FILE_NAME
+        self.connection = connection or open_there(self.path, KIND)
+
+    def __enter__(self) -> "AuditFile":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        self.connection.close()
+
+    def last(self) -> int:
+        """The number of the last record; 0: there is none."""
+        with told(self.path, KIND):
+            found = self.connection.execute("SELECT max(sequence) FROM record").get
+        return found or 0
+
+    def rows(self, first: int = 1) -> Iterator[Row]:
+        """From `first` on, in order."""
+        after = first - 1
+        while True:
+            with told(self.path, KIND):
+                part = self.connection.execute(
+                    "SELECT sequence, content, head FROM record WHERE sequence > ? ORDER BY sequence LIMIT ?",
+                    (after, AT_ONCE),
+                ).fetchall()
+            rows = [_row(*one) for one in part]
+            yield from rows
+            # A damaged database may say anything, also the same again.
+            if len(rows) < AT_ONCE or rows[-1].sequence <= after:
+                return
+            after = rows[-1].sequence
+
+    def blob(self, id_: str) -> bytes | None:
+        """What is called so; None: there is none, or it is not what was stored."""
+        with told(self.path, KIND):
+            found = self.connection.execute("SELECT content FROM blob WHERE id = ?", (id_,)).get
+        return found if isinstance(found, bytes) and head_of(found) == id_ else None
+
+    def blob_ids(self) -> list[str]:
+        with told(self.path, KIND):
+            return [str(id_) for (id_,) in self.connection.execute("SELECT id FROM blob").fetchall()]
+
+
+def _row(sequence: object, content: object, head: object) -> Row:
+    """Whatever types a damaged database gives."""
+    return Row(
+        sequence if isinstance(sequence, int) else 0,
+        content if isinstance(content, bytes) else str(content).encode("utf-8", "replace"),
+        str(head),
+    )

@@ -1,0 +1,254 @@
+"""The gate of a gateway process: audit, stores, judge and deployer, and what of them is asked over the mailbox."""
+
+import asyncio
+import json
+import pwd
+from collections.abc import Callable, Mapping
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from gateway.core.audit_record import Who
+from gateway.core.controller import Controller, ControllerRefused, config_hash, parse_controller
+from gateway.core.decisions import DECISION, QUERY, Decide, ListProposals
+from gateway.core.line import Line
+from gateway.core.messages import Command, Deploy, Event, Keep, Reply, command_bytes
+from gateway.core.proposal import GainsChange, ModelChange, Proposal
+from gateway.core.topics import GATEWAY_DECISION, GATEWAY_PROPOSALS, GATEWAY_PROPOSE, LOOP_COMMAND
+from gateway.mailbox.port import PEER, Mailbox, Peer, RemoteError
+from gateway.supervisor import configurations as configurations_store
+from gateway.supervisor import models as models_store
+from gateway.supervisor.audit import Audit
+from gateway.supervisor.audit_file import AuditFile, AuditUnavailable
+from gateway.supervisor.configurations import Configurations, ConfigurationsError, Origin, begin_configurations
+from gateway.supervisor.deployer import GATEWAY, Deployer, JudgeSide, NotTakenUp
+from gateway.supervisor.lifecycle import Book, Impossible, book_of
+from gateway.supervisor.model_store import ModelsError
+from gateway.supervisor.models import Models, begin_repository
+from gateway.supervisor.surroundings import LineSurroundings
+
+LOOP_TIME_S = 2.5
+EXPERIMENT_ENDS = ("experiment-end", "experiment-abort")
+BUILD_TIME_S = 15.0  #: for what the loop builds and warms before it answers
+
+#: Files in the line's folder from which a loop takes its first configuration, and how they are read.
+STARTED_WITH: dict[str, Callable[[bytes], Controller]] = {
+    "controller.json": parse_controller,
+    "configuration.json": lambda content: parse_controller(json.dumps(json.loads(content)["controller"]).encode()),
+}
+
+
+class CannotBegin(Exception):
+    """The gate stays shut: its records cannot be read, or do not fit together. The text says why."""
+
+
+class KeptAudit:
+    """The audit of a folder: written by its own thread, read where it lies."""
+
+    def __init__(self, folder: Path, audit: Audit) -> None:
+        self._folder = folder
+        self._audit = audit
+
+    async def append(
+        self, kind: str, who: Who, what: Mapping[str, Any], blobs: Mapping[str, bytes] | None = None
+    ) -> object:
+        return await self._audit.append(kind, who, what, blobs)
+
+    def blob(self, id_: str) -> bytes | None:
+        with AuditFile(self._folder) as file:
+            return file.blob(id_)
+
+
+class LoopOverMailbox:
+    def __init__(self, mailbox: Mailbox) -> None:
+        self._mailbox = mailbox
+
+    async def tell(self, command: Command) -> Reply:
+        time_s = BUILD_TIME_S if isinstance(command, Deploy | Keep) else LOOP_TIME_S
+        answer = await self._mailbox.request(LOOP_COMMAND, command_bytes(command), time_s)
+        try:
+            return Reply.model_validate_json(answer)
+        except ValidationError as error:
+            raise RemoteError("the loop answered what is no reply: it is of another version") from error
+
+
+class Gate:
+    """`look` a few times a second, `close` at the end. It opens as soon as audit and stores are there."""
+
+    def __init__(
+        self,
+        line: Line,
+        mailbox: Mailbox,
+        folder: Path,
+        judge: JudgeSide,
+        around: Callable[[Configurations, Models], LineSurroundings],
+        note: Callable[..., None],
+        clock: Callable[[], float],
+        wall_clock: Callable[[], float],
+    ) -> None:
+        self.deployer: Deployer | None = None
+        self._line = line
+        self._folder = folder
+        self._judge = judge
+        self._around = around
+        self._note = note
+        self._clock = clock
+        self._wall_clock = wall_clock
+        self._loop = LoopOverMailbox(mailbox)
+        self._audit = Audit(folder, clock=clock, wall_clock=wall_clock)
+        self._audit.start()
+        self._stores: tuple[Configurations, Models] | None = None
+        self._shut = "the gate is about to open"  #: why it is, while it is
+        self._told = ""
+        self._telling: set[asyncio.Task[None]] = set()
+        mailbox.serve(GATEWAY_PROPOSE, self._answer_propose)
+        mailbox.serve(GATEWAY_PROPOSALS, self._answer_query)
+        mailbox.serve(GATEWAY_DECISION, self._answer_decision)
+
+    async def look(self) -> None:
+        """Never raises for what the disk or the loop do."""
+        if self.deployer is None:
+            await self._open()
+        if self.deployer is not None:
+            await self.deployer.watch()
+        trouble = self._shut if self.deployer is None else self.deployer.trouble
+        if trouble != self._told:
+            self._told = trouble
+            self._note("gate", f"the gate waits: {trouble}" if trouble else "the gate is open")
+
+    def hear(self, event: Event) -> None:
+        """What the loop tells: that an experiment is over is for the records."""
+        if self.deployer is None or event.kind not in EXPERIMENT_ENDS:
+            return
+        hash_, reason = str(event.data.get("hash", "")), str(event.data.get("reason", ""))
+        task = asyncio.get_running_loop().create_task(self.deployer.experiment_ended(hash_, reason))
+        self._telling.add(task)
+        task.add_done_callback(self._telling.discard)
+
+    async def close(self) -> None:
+        for task in self._telling:
+            task.cancel()
+        await asyncio.gather(*self._telling, return_exceptions=True)
+        if self.deployer is not None:
+            await self.deployer.close()
+        for store in self._stores or ():
+            store.close()
+        await asyncio.to_thread(self._audit.close)
+
+    async def _open(self) -> None:
+        """Once a record of the start is on the disk, the records before it are read."""
+        try:
+            await self._audit.append("gateway-start", GATEWAY, {"version": version("r2rgate")})
+            book = await asyncio.to_thread(book_in, self._folder)
+            if self._stores is None:
+                self._stores = (
+                    begin_configurations(self._folder / configurations_store.FILE_NAME),
+                    begin_repository(self._folder / models_store.FILE_NAME),
+                )
+            self._learn(*self._stores)
+        except (AuditUnavailable, CannotBegin, ConfigurationsError, ModelsError) as error:
+            self._shut = str(error)
+            return
+        self.deployer = Deployer(
+            self._line, book, KeptAudit(self._folder, self._audit), self._loop, self._judge,
+            self._around(*self._stores), self._take_up, self._clock, self._wall_clock,
+        )  # fmt: skip
+
+    def _learn(self, configurations: Configurations, _: Models) -> None:
+        """Store what the loop may have been started with: it tells only its hash."""
+        for name, read in STARTED_WITH.items():
+            try:
+                controller = read((self._folder / name).read_bytes())
+            except (OSError, ValueError, ControllerRefused):
+                continue  # the loop says what it runs; a proposal finds that it is not known here
+            known = {one.id for one in configurations.entries(self._line.site, self._line.line)}
+            if config_hash(controller) not in known:
+                origin = Origin(self._wall_clock(), GATEWAY.name, f"found as {name}, with which the loop starts")
+                configurations.store(self._line.site, self._line.line, controller, origin)
+
+    def _take_up(self, proposal: Proposal, verdict: str | None) -> None:
+        """What is about to be put into service goes into the stores. Raises NotTakenUp."""
+        assert self._stores is not None  # they are open before the gate is
+        try:
+            self._store(proposal, verdict, *self._stores)
+        except (ConfigurationsError, ModelsError) as error:
+            raise NotTakenUp(str(error)) from error
+
+    def _store(self, proposal: Proposal, verdict: str | None, configurations: Configurations, models: Models) -> None:
+        change, now_s, line = proposal.change, self._wall_clock(), self._line
+        if isinstance(change, GainsChange):
+            origin = Origin(now_s, proposal.author, proposal.reason[:400], proposal.base, proposal.model, verdict)
+            configurations.store(line.site, line.line, change.controller, origin)
+        elif isinstance(change, ModelChange):
+            entry = models.store(change.model, now_s)
+            for other in models.entries(line.site, line.line):
+                if other.state == "accepted" and other.id != entry.id:
+                    models.mark(other.id, "superseded", now_s, f"by version {entry.version}")
+            models.mark(entry.id, "accepted", now_s, proposal.reason[:400])
+
+    async def _answer_propose(self, payload: bytes) -> bytes:
+        who = _who(PEER.get())
+        reply = self._shut_reply() if self.deployer is None else await self.deployer.propose(payload, who)
+        self._note("proposal", f"{who.name}: {reply.text}", ok=reply.ok, reasons=reply.reasons)
+        return reply.model_dump_json().encode()
+
+    async def _answer_query(self, payload: bytes) -> bytes:
+        try:
+            query = QUERY.validate_json(payload)
+        except ValidationError as error:
+            return _not_understood(error)
+        if self.deployer is None:
+            return self._shut_reply().model_dump_json().encode()
+        if isinstance(query, ListProposals):
+            return self.deployer.listed(query.most).model_dump_json().encode()
+        found = self.deployer.shown(query.proposal)
+        if isinstance(found, str):
+            return Reply(ok=False, state="", text=found, reasons=[found]).model_dump_json().encode()
+        return found.model_dump_json().encode()
+
+    async def _answer_decision(self, payload: bytes) -> bytes:
+        try:
+            decision = DECISION.validate_json(payload)
+        except ValidationError as error:
+            return _not_understood(error)
+        who = _who(PEER.get())
+        if self.deployer is None:
+            reply = self._shut_reply()
+        elif isinstance(decision, Decide):
+            reply = await self.deployer.decide(decision, who)
+        else:
+            reply = await self.deployer.roll_back(decision.comment, who)
+        self._note("decision", f"{who.name}: {reply.text}", ok=reply.ok, reasons=reply.reasons)
+        return reply.model_dump_json().encode()
+
+    def _shut_reply(self) -> Reply:
+        return Reply(ok=False, state="", text="the gate is shut", reasons=[self._shut])
+
+
+def book_in(folder: Path) -> Book:
+    """What the audit of a folder says. Raises CannotBegin."""
+    try:
+        with AuditFile(folder) as file:
+            records = [row.record() for row in file.rows()]
+        return book_of((record.kind, record.what) for record in records)
+    except AuditUnavailable as error:
+        raise CannotBegin(str(error)) from error
+    except (Impossible, ValueError, KeyError) as error:
+        raise CannotBegin(f"the records of the audit do not fit together: {error}; `r2rgate audit verify`") from error
+
+
+def _who(peer: Peer | None) -> Who:
+    if peer is None:
+        return GATEWAY
+    try:
+        name = pwd.getpwuid(peer.uid).pw_name
+    except KeyError:
+        name = f"user {peer.uid}"
+    return Who(name=name, uid=peer.uid, pid=peer.pid)
+
+
+def _not_understood(error: ValidationError) -> bytes:
+    reasons = [f"{'.'.join(map(str, one['loc']))}: {one['msg']}" for one in error.errors()]
+    return Reply(ok=False, state="", text="not understood", reasons=reasons[:20]).model_dump_json().encode()

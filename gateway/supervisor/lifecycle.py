@@ -1,0 +1,222 @@
+"""What becomes of proposals, as the audit has it: a fold over its records, and which record may come next. Pure.
+
+A record is stored before what it announces is done. So whatever instant a process dies at, the records say what may
+have been done, and the loop says what was: `Book.explains` holds the one against the other.
+"""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from enum import StrEnum
+from typing import Any
+
+from gateway.core.deployment import InService
+
+
+class Stage(StrEnum):
+    RECEIVED = "received"  #: it is being judged
+    REFUSED = "refused"  #: by the gate
+    WAITING = "waiting"  #: for a person
+    REJECTED = "rejected"  #: by a person
+    EXPIRED = "expired"
+    SUPERSEDED = "superseded"  #: what it would have changed is no longer in service
+    APPROVED = "approved"
+    DEPLOYING = "deploying"  #: the loop is being told, or has been
+    NOT_DEPLOYED = "not-deployed"  #: the loop did not take it
+    PROBATION = "probation"
+    KEEPING = "keeping"  #: the loop is being told to keep it
+    KEPT = "kept"
+    ROLLED_BACK = "rolled-back"
+    RUNNING = "running"  #: an experiment
+    DONE = "done"  #: an experiment, complete or not
+
+
+UNDECIDED = (Stage.RECEIVED, Stage.WAITING, Stage.APPROVED)
+ON_THE_LINE = (Stage.DEPLOYING, Stage.PROBATION, Stage.KEEPING, Stage.RUNNING)  #: one at a time
+
+#: Kinds of records: from which stages, to which.
+STEPS: dict[str, tuple[tuple[Stage, ...], Stage]] = {
+    "accepted": ((Stage.RECEIVED,), Stage.WAITING),
+    "refused": ((Stage.RECEIVED,), Stage.REFUSED),
+    "approved": ((Stage.WAITING,), Stage.APPROVED),
+    "approval-lapsed": ((Stage.APPROVED,), Stage.WAITING),
+    "rejected": ((Stage.WAITING,), Stage.REJECTED),
+    "expired": (UNDECIDED, Stage.EXPIRED),
+    "superseded": (UNDECIDED, Stage.SUPERSEDED),
+    "deploying": ((Stage.APPROVED,), Stage.DEPLOYING),
+    "not-deployed": ((Stage.DEPLOYING,), Stage.NOT_DEPLOYED),
+    "deployed": ((Stage.DEPLOYING,), Stage.PROBATION),
+    "keeping": ((Stage.PROBATION,), Stage.KEEPING),
+    "kept": ((Stage.KEEPING,), Stage.KEPT),
+    "rolled-back": ((Stage.DEPLOYING, Stage.PROBATION, Stage.KEEPING), Stage.ROLLED_BACK),
+    "experiment-begins": ((Stage.APPROVED,), Stage.RUNNING),
+    "experiment-ends": ((Stage.RUNNING,), Stage.DONE),
+    "model-in-service": ((Stage.APPROVED,), Stage.KEPT),
+}
+PROPOSED, FOUND = "proposed", "found-in-service"
+OWN_KIND = {"deploying": "gains", "experiment-begins": "experiment", "model-in-service": "model"}
+
+
+class Impossible(Exception):
+    """A record that cannot come now; the text says why."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A proposal and where it stands."""
+
+    proposal: str  #: hash
+    kind: str  #: of its change
+    author: str
+    base: str  #: hash of the configuration that it would change
+    changes: str  #: hash of the configuration, experiment or model that it brings
+    created: str
+    expires: str
+    expires_s: float  #: Unix time
+    stage: Stage = Stage.RECEIVED
+    why: str = ""
+    verdict: str | None = None  #: hash
+    epoch: int | None = None
+
+
+@dataclass
+class Book:
+    """All proposals of a line, oldest first, and what is in service as far as the records say."""
+
+    entries: dict[str, Entry] = field(default_factory=dict[str, Entry])
+    in_service: str | None = None
+    last_known_good: str | None = None
+    epoch: int = 0  #: of the last deployment that the loop has taken, or is being told of
+    model: str | None = None
+    changed_s: float | None = None  #: Unix time at which how the line is controlled has changed last
+
+    @property
+    def on_the_line(self) -> Entry | None:
+        """What is being done to the line now."""
+        return next((entry for entry in self.entries.values() if entry.stage in ON_THE_LINE), None)
+
+    @property
+    def undecided(self) -> list[Entry]:
+        return [entry for entry in self.entries.values() if entry.stage in UNDECIDED]
+
+    def why_not(self, kind: str, what: Mapping[str, Any]) -> str:
+        """Why a record of `kind` cannot come now; empty: it can."""
+        proposal = str(what.get("proposal", ""))
+        entry = self.entries.get(proposal)
+        if kind == PROPOSED and entry is not None:
+            return f"proposal {proposal[:12]} was made before: {entry.stage}"
+        if kind in (PROPOSED, FOUND):
+            return ""
+        if entry is None:
+            return f"there is no proposal {proposal[:12]}"
+        stages, _ = STEPS[kind]
+        if entry.stage not in stages:
+            return f"proposal {proposal[:12]} is {entry.stage}; {kind} comes after {' or '.join(stages)}"
+        return self._why_not_carry_out(kind, entry, what) if kind in OWN_KIND else ""
+
+    def _why_not_carry_out(self, kind: str, entry: Entry, what: Mapping[str, Any]) -> str:
+        short = entry.proposal[:12]
+        if OWN_KIND[kind] != entry.kind:
+            return f"proposal {short} is of {entry.kind}; {kind} is for {OWN_KIND[kind]}"
+        if (other := self.on_the_line) is not None:
+            return f"proposal {other.proposal[:12]} is {other.stage}: one change at a time"
+        if entry.base != self.in_service:
+            return f"proposal {short} would change a configuration that is no longer in service"
+        if kind == "deploying" and what.get("epoch") != self.epoch + 1:
+            return f"epoch {what.get('epoch')} does not follow {self.epoch}"
+        return ""
+
+    def apply(self, kind: str, what: Mapping[str, Any]) -> None:
+        """Take in a record that has been stored. Raises Impossible; other kinds of the audit are passed over."""
+        if kind not in STEPS and kind not in (PROPOSED, FOUND):
+            return
+        if reason := self.why_not(kind, what):
+            raise Impossible(reason)
+        if kind == FOUND:
+            self._found(what)
+            return
+        proposal = str(what["proposal"])
+        if kind == PROPOSED:
+            self.entries[proposal] = Entry(
+                **{key: what[key] for key in ("proposal", "author", "base", "changes", "created", "expires")},
+                kind=str(what["change"]),
+                expires_s=float(what["expires_s"]),
+            )
+            return
+        entry = self.entries[proposal]
+        more = {key: what[key] for key in ("verdict", "epoch") if key in what}
+        self.entries[proposal] = entry = replace(
+            entry, stage=STEPS[kind][1], why=str(what.get("because", entry.why)), **more
+        )
+        self._in_service(kind, entry, what)
+
+    def _in_service(self, kind: str, entry: Entry, what: Mapping[str, Any]) -> None:
+        if kind in ("deployed", "rolled-back") and "at_s" in what:
+            self.changed_s = float(what["at_s"])
+        if kind == "deploying":
+            self.epoch = int(what["epoch"])
+        elif kind == "not-deployed":
+            self.epoch = int(what["epoch"]) - 1
+        elif kind == "deployed":
+            self.in_service = entry.changes
+        elif kind == "kept":
+            self.last_known_good = entry.changes
+        elif kind == "rolled-back":
+            self.in_service = str(what["to"])
+        elif kind == "model-in-service":
+            self.model = entry.changes
+
+    def _found(self, what: Mapping[str, Any]) -> None:
+        """The loop's own word on what controls the line."""
+        self.in_service = str(what["configuration"])
+        self.last_known_good = str(what["last_known_good"])
+        self.epoch = int(what["epoch"])
+
+    def explains(self, configuration: str, epoch: int) -> bool:
+        """Whether the records say how the line may have come to this configuration, at this epoch of the loop."""
+        deployed = {entry.changes for entry in self.entries.values() if entry.epoch == epoch}
+        return configuration in {self.in_service, self.last_known_good, *deployed}
+
+
+def reconciled(book: Book, found: InService) -> tuple[str, dict[str, Any]] | None:
+    """The next record that brings the book to what the loop says of itself; None: they agree.
+
+    To be asked again after each, until there is none. What the loop says is what is: it alone applies torques.
+    """
+    change = book.on_the_line
+    if change is not None and change.stage is not Stage.RUNNING:
+        return _settled(change, found)
+    if (found.hash, found.last_known_good) != (book.in_service, book.last_known_good) or found.epoch != book.epoch:
+        return FOUND, {
+            "configuration": found.hash,
+            "last_known_good": found.last_known_good,
+            "epoch": found.epoch,
+            "because": found.why,
+            "explained": book.explains(found.hash, found.epoch),
+        }
+    stale = next((entry for entry in book.undecided if entry.base != book.in_service), None)
+    if stale is not None:
+        because = "the configuration that it would change is no longer in service"
+        return "superseded", {"proposal": stale.proposal, "because": because}
+    return None
+
+
+def _settled(change: Entry, found: InService) -> tuple[str, dict[str, Any]] | None:
+    """What has become of a change that was on its way to the line."""
+    runs = found.hash == change.changes and found.epoch == change.epoch
+    named: dict[str, Any] = {"proposal": change.proposal, "epoch": change.epoch}
+    if runs and found.on_probation:
+        return ("deployed", named) if change.stage is Stage.DEPLOYING else None
+    if runs and found.last_known_good == found.hash:
+        after = {Stage.DEPLOYING: "deployed", Stage.PROBATION: "keeping"}
+        return after.get(change.stage, "kept"), named
+    if change.stage is Stage.DEPLOYING and found.epoch != change.epoch:
+        return "not-deployed", {**named, "because": f"the loop is at epoch {found.epoch}: {found.why}"}
+    return "rolled-back", {**named, "to": found.hash, "because": found.why}
+
+
+def book_of(records: Iterable[tuple[str, Mapping[str, Any]]]) -> Book:
+    """From kinds and contents in the order of the audit. Raises Impossible."""
+    book = Book()
+    for kind, what in records:
+        book.apply(kind, what)
+    return book

@@ -1,0 +1,157 @@
+"""What the line is like now, as a verdict needs it: state, what is in service, the model, the newest data that move."""
+
+import asyncio
+from collections.abc import Callable
+from pathlib import Path
+
+from gateway.core.controller import Controller
+from gateway.core.differences import of_controllers, of_experiment, of_models
+from gateway.core.doubts import in_words
+from gateway.core.judge_context import DataReference, JudgeContext, LineState
+from gateway.core.line import Line
+from gateway.core.line_model import LineModel
+from gateway.core.proposal import ExperimentChange, GainsChange, Proposal
+from gateway.core.recording import Recording
+from gateway.core.states import LoopState
+from gateway.core.telemetry import Frame
+from gateway.supervisor.configurations import STABLE, Configurations, ConfigurationsError
+from gateway.supervisor.deployer import iso
+from gateway.supervisor.history import History, HistoryError
+from gateway.supervisor.history_recording import recording_between
+from gateway.supervisor.lifecycle import Book, Stage
+from gateway.supervisor.model_store import ModelsError
+from gateway.supervisor.models import Models
+from gateway.supervisor.recent import Recent
+from safety.probation import Standing, against
+
+MOST_EXPERIMENTS = 4  #: the newest, on which the model must hold
+ENDS = ("experiment-end", "experiment-abort")
+
+
+class NotKnown(Exception):
+    """Something without which nothing can be judged; the text says what, and what to do."""
+
+
+class LineSurroundings:
+    """Of a gateway: its telemetry, history and stores."""
+
+    def __init__(
+        self,
+        line: Line,
+        newest: Callable[[], Frame | None],
+        recent: Recent,
+        history: Path,
+        configurations: Configurations,
+        models: Models,
+        wall_clock: Callable[[], float],
+    ) -> None:
+        self._line = line
+        self._newest = newest
+        self._recent = recent
+        self._history = history
+        self._configurations = configurations
+        self._models = models
+        self._wall_clock = wall_clock
+        self._before: Standing | None = None  #: how the line stood before the change
+
+    async def context(self, book: Book) -> tuple[JudgeContext, list[Recording]]:
+        """Raises NotKnown."""
+        now_s = self._wall_clock()
+        found = await asyncio.to_thread(self._experiments, now_s)
+        return JudgeContext(
+            format=1,
+            now=iso(now_s),
+            state=self._state(book, now_s),
+            in_service=self._controller(book.in_service),
+            baseline=self._baseline(),
+            model=self._model(book),
+            data=[
+                DataReference(path=f"{one.digest()}.npz", digest=one.digest(), recorded=iso(end_s))
+                for one, end_s in found
+            ],
+            decided=[entry.proposal for entry in book.entries.values() if entry.stage is not Stage.RECEIVED][-4096:],
+        ), [one for one, _ in found]
+
+    def difference(self, proposal: Proposal, book: Book) -> list[str]:
+        """What it would change, in words and numbers; where something is not known, that."""
+        change = proposal.change
+        try:
+            if isinstance(change, GainsChange):
+                return of_controllers(self._controller(book.in_service), change.controller)
+            if isinstance(change, ExperimentChange):
+                return of_experiment(change.experiment)
+            return of_models(self._model(book), change.model)
+        except (NotKnown, ModelsError) as error:
+            return [str(error)]
+
+    def begin_probation(self) -> None:
+        """From now on the line is measured against how it has stood until now."""
+        self._before = self._recent.standing()
+        self._recent.forget()
+
+    def against_keeping(self) -> str:
+        now = self._recent.standing()
+        return "" if now is None else against(now, self._before, self._line.gate)
+
+    def _state(self, book: Book, now_s: float) -> LineState:
+        frame, change = self._newest(), book.on_the_line
+        if frame is None:
+            raise NotKnown("the loop has not told how the line stands: start it, then propose again")
+        running = change is not None and change.stage is Stage.RUNNING
+        return LineState(
+            state=LoopState(frame.state).name,
+            tension_n=[float(value) for value in frame.tension_setpoint_n],
+            speed_m_per_s=float(frame.speed_setpoint_m_per_s),
+            moving=frame.state == LoopState.RUN and not self._recent.stands(),
+            experiment=running,
+            on_probation=change is not None and not running,
+            doubts=in_words(frame.doubts),
+            since_change_s=None if book.changed_s is None else max(0.0, now_s - book.changed_s),
+        )
+
+    def _controller(self, hash_: str | None) -> Controller:
+        if hash_ is None:
+            raise NotKnown("the loop has not said what controls the line: start it, then propose again")
+        try:
+            controller = self._configurations.find(hash_, self._line.site, self._line.line).controller
+        except ConfigurationsError as error:
+            raise NotKnown(f"the configuration in service, {hash_[:12]}, is not known here: {error}") from error
+        if controller is None:
+            raise NotKnown(f"the configuration in service, {hash_[:12]}, is damaged in the store")
+        return controller
+
+    def _baseline(self) -> Controller | None:
+        try:
+            return self._configurations.find(STABLE, self._line.site, self._line.line).controller
+        except ConfigurationsError:
+            return None
+
+    def _model(self, book: Book) -> LineModel | None:
+        if book.model is None:
+            return None
+        model = self._models.find(book.model, self._line.site, self._line.line).model
+        if model is None:
+            raise NotKnown(f"the model in service, {book.model[:12]}, is damaged in the repository")
+        return model
+
+    def _experiments(self, now_s: float) -> list[tuple[Recording, float]]:
+        """The newest first, with the Unix time of their ends. In a thread: it reads from the disk."""
+        begin_s = now_s - self._line.gate.data_max_age_s
+        found: list[tuple[Recording, float]] = []
+        try:
+            with History(self._history) as history:
+                ends = [event for event in history.events(begin_s, now_s + 1.0) if event.kind in ENDS]
+        except HistoryError:
+            return []
+        for event in reversed(ends):
+            first_s, last_s = event.data.get("begin_s"), event.data.get("end_s")
+            if not isinstance(first_s, float) or not isinstance(last_s, float):
+                continue
+            ahead_s = event.wall_s - event.time_s
+            try:
+                found.append((recording_between(self._history, first_s + ahead_s, last_s + ahead_s), last_s + ahead_s))
+            except HistoryError:
+                continue  # too short, or damaged: others may do
+            if len(found) == MOST_EXPERIMENTS:
+                break
+        return found

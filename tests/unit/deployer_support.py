@@ -1,0 +1,185 @@
+"""A loop, an audit and a judge for tests of the deployer: they keep their promises, fail when told to, and no more."""
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from gateway.control.design import design_lqi, task_of
+from gateway.core.controller import config_hash
+from gateway.core.deployment import InService, Region
+from gateway.core.judge_context import JudgeContext, LineState, context_hash
+from gateway.core.messages import Command, Deploy, Keep, Renew, Reply, Rollback, RunExperiment
+from gateway.core.proposal import GainsChange, Proposal, proposal_hash
+from gateway.core.verdict import RuleFinding, Verdict
+from gateway.mailbox.port import Unreachable
+from gateway.supervisor.audit_file import AuditUnavailable
+from gateway.supervisor.deployer import iso
+from tests.unit.supervisor_support import line_of
+
+LINE = line_of(2)
+FIRST = design_lqi(task_of(LINE))
+LIFETIME_S = 600.0
+
+
+def controller(number: int):
+    """Another configuration than all others with another number."""
+    return FIRST.model_copy(update={"antiwindup": 1.0 / (2.0 + number)})
+
+
+def proposal(number: int, base: str, now_s: float, nonce: int = 0, lifetime_s: float = LIFETIME_S) -> Proposal:
+    return Proposal(
+        format=1, site=LINE.site, line=LINE.line, change=GainsChange(controller=controller(number)), base=base,
+        model=None, reason=f"trial {nonce}", author="rules", created=iso(now_s), expires=iso(now_s + lifetime_s),
+    )  # fmt: skip
+
+
+class Killed(BaseException):
+    """The process has died here."""
+
+
+@dataclass
+class Death:
+    """Comes at the n-th effect from now on, before or after it; never where n is 0."""
+
+    effects: int = 0
+    after: bool = False
+
+    def due(self) -> bool:
+        if self.effects == 0:
+            return False
+        self.effects -= 1
+        return self.effects == 0
+
+
+@dataclass
+class FakeAudit:
+    death: Death
+    check: Callable[[str, dict], None]  #: of what is about to be recorded
+    records: list[tuple[str, dict]] = field(default_factory=list)
+    blobs: dict[str, bytes] = field(default_factory=dict)
+    available: bool = True
+
+    async def append(self, kind, who, what, blobs=None):
+        if not self.available:
+            raise AuditUnavailable("the disk is full")
+        self.check(kind, what)
+        due = self.death.due()
+        if due and not self.death.after:
+            raise Killed
+        self.records.append((kind, dict(what)))
+        self.blobs |= {hashlib.sha256(blob).hexdigest(): blob for blob in (blobs or {}).values()}
+        if due:
+            raise Killed
+
+    def blob(self, id_):
+        return self.blobs.get(id_)
+
+
+class FakeLoop:
+    """What the loop promises: a successor is taken on probation, and left again when nobody renews it."""
+
+    def __init__(self, death: Death) -> None:
+        self.death = death
+        self.now_s = 0.0
+        self.runs = self.good = config_hash(FIRST)
+        self.epoch = 0
+        self.lease_end_s: float | None = None
+        self.why = "start"
+        self.reachable = True
+        self.answers = True
+        self.takes = True
+
+    async def tell(self, command: Command) -> Reply:
+        due = self.death.due()
+        if due and not self.death.after:
+            raise Killed
+        if not self.reachable:
+            raise Unreachable("loop not running")
+        reply = self._done(command)
+        if due:
+            raise Killed
+        if not self.answers:
+            raise Unreachable("no answer; what was asked may have been done all the same")
+        return reply
+
+    def pass_time(self, seconds: float) -> None:
+        self.now_s += seconds
+        if self.lease_end_s is not None and self.now_s >= self.lease_end_s:
+            self._back("rolled back: the lease is over")
+
+    def restart(self) -> None:
+        self.runs, self.lease_end_s, self.why = self.good, None, "start"
+
+    def in_service(self) -> InService:
+        probation = self.lease_end_s is not None
+        return InService(
+            hash=self.runs, kind="lqi", epoch=self.epoch, on_probation=probation,
+            lease_left_s=self.lease_end_s - self.now_s if probation else None, last_known_good=self.good,
+            region=Region(), watched=False, why=self.why,
+        )  # fmt: skip
+
+    def _back(self, why: str) -> None:
+        self.runs, self.lease_end_s, self.why = self.good, None, why
+
+    def _done(self, command: Command) -> Reply:
+        ok, text = True, "done"
+        if isinstance(command, Deploy):
+            deployment = command.deployment
+            ok = self.takes and deployment.epoch == self.epoch + 1 and self.lease_end_s is None
+            text = "deployed" if ok else "not its successor, or not now"
+            if ok:
+                self.runs, self.epoch, self.why = deployment.hash, deployment.epoch, "deployed"
+                self.lease_end_s = self.now_s + deployment.lease_s
+                self.lease_s = deployment.lease_s
+        elif isinstance(command, Renew | Keep) and (command.epoch != self.epoch or self.lease_end_s is None):
+            ok, text = False, "nothing is on probation under this epoch"
+        elif isinstance(command, Renew):
+            self.lease_end_s = self.now_s + self.lease_s
+        elif isinstance(command, Keep):
+            self.good, self.lease_end_s, self.why = self.runs, None, "kept"
+        elif isinstance(command, Rollback):
+            self._back(f"rolled back: {command.reason}")
+        elif isinstance(command, RunExperiment):
+            ok, text = False, "no experiment in these tests"
+        return Reply(ok=ok, state="RUN", text=text, in_service=self.in_service())
+
+
+@dataclass
+class FakeJudge:
+    """Accepts those whose reason it was told to accept."""
+
+    refuses: set[str] = field(default_factory=set)
+
+    async def judge(self, payload, context, recordings) -> Verdict:
+        hash_ = hashlib.sha256(payload).hexdigest()
+        accepted = hash_ not in self.refuses
+        finding = RuleFinding(rule="test", passed=accepted, text="as the test wants it")
+        return Verdict(
+            format=1, proposal=hash_, payload=hash_, context=context_hash(context), line="0" * 64, kind="gains", seed=1,
+            accepted=accepted, findings=[finding], region=Region(speed_max_m_per_s=0.1) if accepted else None,
+            judged=context.now, program_version="0",
+        )  # fmt: skip
+
+
+@dataclass
+class FakeSurroundings:
+    """A line that stands in READY."""
+
+    loop: FakeLoop
+    against: str = ""
+
+    async def context(self, book):
+        state = LineState(state="READY", tension_n=[30.0] * LINE.n, speed_m_per_s=0.0)
+        return JudgeContext(format=1, now=iso(self.loop.now_s), state=state, in_service=FIRST), []
+
+    def difference(self, one, book) -> list[str]:
+        return ["a test"]
+
+    def begin_probation(self) -> None: ...
+
+    def against_keeping(self) -> str:
+        return self.against
+
+
+def hash_of(one: Proposal) -> str:
+    return proposal_hash(one)
