@@ -7,6 +7,9 @@ import typer
 from pydantic import ValidationError
 
 from gateway.cli import (
+    audit_commands,
+    baselines_commands,
+    configurations_commands,
     design_commands,
     doctor_commands,
     experiment_commands,
@@ -60,6 +63,9 @@ app.command(rich_help_panel=LINE, context_settings=NUMBERS)(operate_commands.spe
 app.command(rich_help_panel=LINE)(operate_commands.recipe)
 app.command(rich_help_panel=LINE)(status_commands.status)
 app.command("export", rich_help_panel=EVIDENCE)(recordings_export.export)
+app.add_typer(audit_commands.app, rich_help_panel=EVIDENCE)
+app.add_typer(configurations_commands.app, rich_help_panel=EVIDENCE)
+app.command(rich_help_panel=EVIDENCE)(baselines_commands.baselines)
 
 
 @app.callback(invoke_without_command=True)

@@ -18,9 +18,9 @@ from typing import Any
 from gateway.core.audit_record import BEFORE_FIRST, NotRecordable, Who, head_of, record_of
 from gateway.supervisor.audit_anchor import NOTHING_YET, Anchor
 from gateway.supervisor.audit_file import AuditUnavailable
+from gateway.supervisor.audit_verify import MOST_AT_ONCE
 from gateway.supervisor.audit_writer import NOT_DONE, NOT_TOLD, AuditWriter, Draft, this_process
 
-TOGETHER = 64  #: records in one commit, at most
 MOST_WAITING = 1000
 MOST_BLOB_BYTES = 16 * 2**20
 WITHIN_S = 10.0  #: longer than SQLite waits for a reader
@@ -137,7 +137,7 @@ class Audit:
         """What waits, at least one; none: it is time to end."""
         with self._changed:
             self._changed.wait_for(lambda: self._queue or self._closing)
-            return [self._queue.popleft() for _ in range(min(TOGETHER, len(self._queue)))]
+            return [self._queue.popleft() for _ in range(min(MOST_AT_ONCE, len(self._queue)))]
 
     def _store(self, batch: list[_Waiting]) -> None:
         batch = [one for one in batch if not one.stored.cancelled()]

@@ -77,6 +77,7 @@ class AuditWriter:
 
     def begin(self, what: Mapping[str, Any], who: Who) -> Anchor:
         """Begin in a folder out of which the audit was moved, at a person's command."""
+        self.lock()
         self._begin(what, who)
         return self._last
 
@@ -132,7 +133,8 @@ class AuditWriter:
                 )
             self._begin({"because": "there was no audit here"}, this_process())
         elif anchor == NOTHING_YET and not self._holds_records():
-            self._begin({"because": "there was no audit here"}, this_process())  # interrupted when it was begun
+            # Interrupted when it was begun; what was moved aside then is named.
+            self._begin({"because": "there was no record here", "kept": _traces(self.folder)}, this_process())
         else:
             self._resume(anchor)
 
