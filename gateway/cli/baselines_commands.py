@@ -63,7 +63,7 @@ def baselines(
 
 def _print(shown: list[Measurement], now: set[int]) -> None:
     table = Table(box=SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 1, 0, 0))
-    for name in ("", "measured", "scenario", "phi", "model", "RMSE\nN", "overshoot\n%", "settling\ns", "effort\nN²m²s"):
+    for name in ("", "measured", "scenario", "phi", "model", "RMSE\nN", "OS\n%", "t_s\ns", "effort\nN²m²s"):
         table.add_column(name, no_wrap=True)
     for one in shown:
         run, metrics = one.run, one.run.measured

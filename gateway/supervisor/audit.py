@@ -73,10 +73,12 @@ class Audit:
         and is stored once however often it is referred to. Raises AuditUnavailable, and NotRecordable at once.
         """
         stored = self._submit(kind, who, what, blobs or {})
-        waiting = asyncio.wrap_future(stored)  # when this is cancelled, so is `stored`, unless it is settled
         try:
             async with asyncio.timeout(self._within_s):
-                return await waiting
+                return await asyncio.wrap_future(stored)
+        except asyncio.CancelledError:
+            stored.cancel()
+            raise
         except TimeoutError:
             stored.cancel()
             return self._settled(stored)
