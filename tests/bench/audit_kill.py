@@ -52,6 +52,7 @@ def main() -> None:
         shutil.rmtree(folder)
     bench.figure("acknowledged_records_lost", tally.lost, "", tally.told)
     bench.figure("acknowledged_records_called_not_done", tally.denied, "", tally.told)
+    bench.figure("unanchored_records_not_called_so", tally.unnamed, "", tally.interrupted)
     bench.figure("chains_unsound_after_kill", tally.unsound, "", tally.kills)
     bench.figure("kills_between_commit_and_anchor", tally.interrupted, "", tally.kills)
     bench.figure("commit_p50_ms", float(np.percentile(took_ms, 50)), "ms", len(took_ms))

@@ -74,30 +74,32 @@ class Tally:
     lost: int = 0  #: of these, not there or another one in their place
     denied: int = 0  #: of these, called not done
     unsound: int = 0  #: kills after which the chain does not verify
+    unnamed: int = 0  #: records beyond the anchor at a kill that are not called not done afterwards
     interrupted: int = 0  #: kills between commit and anchor
     problems: str = ""
 
 
 def campaign(folder: Path, kills: int, seed: int) -> Tally:
-    rng, tally, told = random.Random(seed), Tally(), dict[int, str]()
+    rng, tally, told, owed = random.Random(seed), Tally(), dict[int, str](), set[int]()
     for k in range(kills):
         if k % SAME_FOLDER == 0:
             shutil.rmtree(folder, ignore_errors=True)
             folder.mkdir(parents=True)
             told.clear()
+            owed.clear()
         acknowledged = rng.choice((0, rng.randint(1, 12)))
         new = killed(folder, acknowledged, rng.uniform(0.0, LATER_S if acknowledged else FIRST_S))
         told |= {at.sequence: at.head for at in new}
         tally.kills += 1
         tally.told += len(new)
         if (folder / "audit.anchor").exists() and (folder / "audit.sqlite").exists():
-            _judge(folder, told, tally)
+            _judge(folder, told, owed, tally)
         else:  # nothing can have been said
             tally.lost += len(told)
     return tally
 
 
-def _judge(folder: Path, told: dict[int, str], tally: Tally) -> None:
+def _judge(folder: Path, told: dict[int, str], owed: set[int], tally: Tally) -> None:
     found = verify(folder)
     if found.anchor is not None and found.anchor.sequence == 0 and not told:
         return  # killed while it was begun: there is nothing yet
@@ -107,8 +109,14 @@ def _judge(folder: Path, told: dict[int, str], tally: Tally) -> None:
     tally.interrupted += found.beyond_anchor > 0
     with AuditFile(folder) as file:
         rows = list(file.rows())
+    anchored = found.anchor.sequence if found.anchor else 0
     heads = {row.sequence: row.head for row in rows}
-    denied = {n for row in rows if row.record().kind == NOT_DONE for n in row.record().what["sequences"]}
+    notes = [row for row in rows if row.record().kind == NOT_DONE]
+    denied = {n for row in notes for n in row.record().what["sequences"]}
+    # The next child opens, or is killed before it has: what is anchored by then must be named.
+    tally.unnamed += len({n for n in owed if n <= anchored} - denied)
+    owed -= {n for n in owed if n <= anchored}
+    owed |= {row.sequence for row in rows if row.sequence > anchored} - {row.sequence for row in notes}
     tally.lost += sum(heads.get(sequence) != head for sequence, head in told.items())
     tally.denied += len(denied & told.keys())
 
