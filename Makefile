@@ -6,7 +6,7 @@ RUN   := $(PY) -m gateway.cli
 export PYTHONDONTWRITEBYTECODE :=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup run test system-test check format bench bench-stepped bench-wire bench-processes bench-cycle bench-monitor bench-control bench-identify bench-faults bench-fuzz bench-soak lock clean
+.PHONY: help setup run test system-test check format bench bench-stepped bench-wire bench-processes bench-cycle bench-monitor bench-control bench-identify bench-faults bench-fuzz bench-soak bench-audit lock clean
 
 help: ## this list
 	@echo "r2rgate: make TARGET"
@@ -66,6 +66,10 @@ bench-fuzz: setup ## a million hostile frames through each decoder (ARGS="--fram
 
 bench-soak: setup ## an hour of a line on three wires, with something going wrong each minute (ARGS="--minutes 10")
 	@$(PY) -m tests.bench.soak $(ARGS)
+
+bench-audit: setup ## the audit: a thousand kills of its writer, ten thousand damages (about 15 min)
+	@$(PY) -m tests.bench.audit_kill
+	@$(PY) -m tests.bench.audit_damage
 
 bench-cycle: setup ## how late the loop wakes beside cyclictest, what a cycle takes and costs; as root (about 40 min)
 	@$(PY) -m tests.bench.cycle $(ARGS)

@@ -7,6 +7,9 @@ import typer
 from pydantic import ValidationError
 
 from gateway.cli import (
+    audit_commands,
+    baselines_commands,
+    configurations_commands,
     design_commands,
     doctor_commands,
     experiment_commands,
@@ -68,6 +71,9 @@ app.command(rich_help_panel=OVERSIGHT)(proposal_commands.approve)
 app.command(rich_help_panel=OVERSIGHT)(proposal_commands.reject)
 app.command(rich_help_panel=OVERSIGHT)(proposal_commands.rollback)
 app.command("export", rich_help_panel=EVIDENCE)(recordings_export.export)
+app.add_typer(audit_commands.app, rich_help_panel=EVIDENCE)
+app.add_typer(configurations_commands.app, rich_help_panel=EVIDENCE)
+app.command(rich_help_panel=EVIDENCE)(baselines_commands.baselines)
 
 
 @app.callback(invoke_without_command=True)

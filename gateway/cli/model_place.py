@@ -3,7 +3,8 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from gateway.cli.process_commands import data_base, default_data_folder, read_line
+from gateway.cli.data_place import data_folder
+from gateway.cli.process_commands import read_line
 from gateway.core.line import Line
 from gateway.core.line_model import LineModel, ModelRefused, model_hash, parse_model
 from gateway.supervisor.model_store import ModelsError
@@ -38,22 +39,8 @@ class Chosen:
 def place_of(line_file: Path | None, data_dir: Path | None) -> Place:
     """The repository that is meant, though it may not exist. Raises ModelsError where none or several may be."""
     line = None if line_file is None else read_line(line_file)
-    return Place((data_dir or _only_folder(line)) / FILE_NAME, line)
-
-
-def _only_folder(line: Line | None) -> Path:
-    if line is not None:
-        return default_data_folder(line)
-    found = sorted(data_base().glob(f"*/{FILE_NAME}"))
-    if len(found) == 1:
-        return found[0].parent
-    if found:
-        listed = "\n".join(f"  --data-dir {path.parent}" for path in found)
-        raise ModelsError(f"{len(found)} lines have models here; say which with --line LINE.toml, or:\n{listed}")
-    raise ModelsError(
-        f"there are no models in {data_base()}: r2rgate models import FILE takes one, --line LINE.toml or --data-dir "
-        "FOLDER says where else to look"
-    )
+    folder = data_dir or data_folder(line, FILE_NAME, "models", "r2rgate models import FILE takes one", ModelsError)
+    return Place(folder / FILE_NAME, line)
 
 
 def read_model(file: Path) -> LineModel:

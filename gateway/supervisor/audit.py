@@ -18,9 +18,9 @@ from typing import Any
 from gateway.core.audit_record import BEFORE_FIRST, NotRecordable, Who, head_of, record_of
 from gateway.supervisor.audit_anchor import NOTHING_YET, Anchor
 from gateway.supervisor.audit_file import AuditUnavailable
+from gateway.supervisor.audit_verify import MOST_AT_ONCE
 from gateway.supervisor.audit_writer import NOT_DONE, NOT_TOLD, AuditWriter, Draft, this_process
 
-TOGETHER = 64  #: records in one commit, at most
 MOST_WAITING = 1000
 MOST_BLOB_BYTES = 16 * 2**20
 WITHIN_S = 10.0  #: longer than SQLite waits for a reader
@@ -73,10 +73,12 @@ class Audit:
         and is stored once however often it is referred to. Raises AuditUnavailable, and NotRecordable at once.
         """
         stored = self._submit(kind, who, what, blobs or {})
-        waiting = asyncio.wrap_future(stored)  # when this is cancelled, so is `stored`, unless it is settled
         try:
             async with asyncio.timeout(self._within_s):
-                return await waiting
+                return await asyncio.wrap_future(stored)
+        except asyncio.CancelledError:
+            stored.cancel()
+            raise
         except TimeoutError:
             stored.cancel()
             return self._settled(stored)
@@ -137,7 +139,7 @@ class Audit:
         """What waits, at least one; none: it is time to end."""
         with self._changed:
             self._changed.wait_for(lambda: self._queue or self._closing)
-            return [self._queue.popleft() for _ in range(min(TOGETHER, len(self._queue)))]
+            return [self._queue.popleft() for _ in range(min(MOST_AT_ONCE, len(self._queue)))]
 
     def _store(self, batch: list[_Waiting]) -> None:
         batch = [one for one in batch if not one.stored.cancelled()]

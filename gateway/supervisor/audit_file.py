@@ -103,7 +103,8 @@ class AuditFile:
         while True:
             with told(self.path, KIND):
                 part = self.connection.execute(
-                    "SELECT sequence, content, head FROM record WHERE sequence > ? ORDER BY sequence LIMIT ?",
+                    "SELECT sequence, content, CAST(head AS BLOB) FROM record WHERE sequence > ?"
+                    " ORDER BY sequence LIMIT ?",
                     (after, AT_ONCE),
                 ).fetchall()
             rows = [_row(*one) for one in part]
@@ -121,13 +122,17 @@ class AuditFile:
 
     def blob_ids(self) -> list[str]:
         with told(self.path, KIND):
-            return [str(id_) for (id_,) in self.connection.execute("SELECT id FROM blob").fetchall()]
+            return [_text(id_) for (id_,) in self.connection.execute("SELECT CAST(id AS BLOB) FROM blob").fetchall()]
 
 
 def _row(sequence: object, content: object, head: object) -> Row:
     """Whatever types a damaged database gives."""
     return Row(
         sequence if isinstance(sequence, int) else 0,
-        content if isinstance(content, bytes) else str(content).encode("utf-8", "replace"),
-        str(head),
+        content if isinstance(content, bytes) else b"",
+        _text(head),
     )
+
+
+def _text(given: object) -> str:
+    return given.decode("ascii", "replace") if isinstance(given, bytes) else ""

@@ -10,6 +10,8 @@ from gateway.supervisor.audit_anchor import Anchor, AnchorDamaged, read_anchor
 from gateway.supervisor.audit_file import KIND, AuditFile, AuditUnavailable, Row
 from gateway.supervisor.sqlite_file import told
 
+MOST_AT_ONCE = 64  #: records in one commit
+MOST_BEYOND = 100  #: records that an interruption may leave beyond the anchor: a commit, and attempts to note it
 MOST_PROBLEMS = 50  #: told one by one
 
 
@@ -64,6 +66,11 @@ def against_anchor(found: Anchor | None, anchor: Anchor, last: int) -> str:
         first = last + 1
         lost = f"record {first} is" if first == anchor.sequence else f"records {first} to {anchor.sequence} are"
         return f"{lost} lost: {ANCHOR} says that record {anchor.sequence} was stored"
+    if last - anchor.sequence > MOST_BEYOND:
+        return (
+            f"{ANCHOR} is older than the records: it names record {anchor.sequence} of {last}, and an interruption "
+            f"leaves at most {MOST_BEYOND} beyond it"
+        )
     if found != anchor:
         return f"record {anchor.sequence} is not the one that {ANCHOR} says was stored"
     return ""

@@ -77,6 +77,7 @@ class AuditWriter:
 
     def begin(self, what: Mapping[str, Any], who: Who) -> Anchor:
         """Begin in a folder out of which the audit was moved, at a person's command."""
+        self.lock()
         self._begin(what, who)
         return self._last
 
@@ -132,7 +133,8 @@ class AuditWriter:
                 )
             self._begin({"because": "there was no audit here"}, this_process())
         elif anchor == NOTHING_YET and not self._holds_records():
-            self._begin({"because": "there was no audit here"}, this_process())  # interrupted when it was begun
+            # Interrupted when it was begun; what was moved aside then is named.
+            self._begin({"because": "there was no record here", "kept": _traces(self.folder)}, this_process())
         else:
             self._resume(anchor)
 
@@ -150,11 +152,12 @@ class AuditWriter:
             )
         self._use(AuditFile(self.folder, open_there(self.path, KIND)), anchor)
         assert self._file is not None
-        last = _verify_tail(self._file, anchor)
+        last, not_told = _verify_tail(self._file, anchor)
         if last != anchor:
-            self._anchor(last)
-            beyond = list(range(anchor.sequence + 1, last.sequence + 1))
-            self._append(self._file, [Draft(NOT_DONE, this_process(), {"sequences": beyond, "because": NOT_TOLD})])
+            self._anchor(anchor)  # where none can be written now, no note is added at each attempt
+            # Noted first, anchored with the note: interrupted in between, it is noted again.
+            self._last = last
+            self._append(self._file, [Draft(NOT_DONE, this_process(), {"sequences": not_told, "because": NOT_TOLD})])
 
     def _use(self, file: AuditFile, last: Anchor) -> None:
         self._file, self._last = file, last
@@ -226,16 +229,21 @@ def _traces(folder: Path) -> list[str]:
     return sorted(path.name for pattern in (f"{FILE_NAME}*", "audit-*") for path in folder.glob(pattern))
 
 
-def _verify_tail(file: AuditFile, anchor: Anchor) -> Anchor:
-    """The last record. Raises AuditUnavailable where the tail is damaged, or does not reach the anchor."""
+def _verify_tail(file: AuditFile, anchor: Anchor) -> tuple[Anchor, list[int]]:
+    """The last record, and those beyond the anchor, without such as only note others.
+
+    Raises AuditUnavailable where the tail is damaged, or does not reach the anchor.
+    """
     first = max(1, anchor.sequence - TAIL)
-    last, at_anchor = NOTHING_YET, NOTHING_YET
+    last, at_anchor, beyond = NOTHING_YET, NOTHING_YET, list[int]()
     for one in chained(file.rows(first), first - 1, BEFORE_FIRST if first == 1 else None):
         if one.damage:
             raise AuditUnavailable(f"{file.path}: {one.damage}. {WHAT_TO_DO}")
         last = Anchor(one.row.sequence, one.row.head)
         if last.sequence == anchor.sequence:
             at_anchor = last
-    if wrong := against_anchor(at_anchor, anchor, last.sequence):
+        if last.sequence > anchor.sequence and one.record is not None and one.record.kind != NOT_DONE:
+            beyond.append(last.sequence)
+    if wrong := against_anchor(at_anchor, anchor, last.sequence or file.last()):
         raise AuditUnavailable(f"{file.path}: {wrong}. {WHAT_TO_DO}")
-    return last
+    return last, beyond

@@ -148,8 +148,9 @@ def told(path: Path, kind: FileKind) -> Iterator[None]:
     """What SQLite says of the file, as `kind.error` in words that say what to do."""
     try:
         yield
-    except apsw.Error as error:
-        words = next(words for type_, words in _WORDS.items() if isinstance(error, type_))
+    except (apsw.Error, UnicodeDecodeError) as error:  # the latter: text that is none any more
+        kinds = (words for type_, words in _WORDS.items() if isinstance(error, type_))
+        words = next(kinds, _WORDS[apsw.CorruptError])
         text = words.format(
             path=path, error=error, name=kind.name, damaged=kind.damaged, undone=kind.undone, busy_s=BUSY_MS // 1000
         )

@@ -73,7 +73,7 @@ def test_without_a_folder_a_model_goes_to_its_line_and_is_found_there(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("gateway.cli.models_commands.data_base", lambda: tmp_path)
-    monkeypatch.setattr("gateway.cli.model_place.data_base", lambda: tmp_path)
+    monkeypatch.setattr("gateway.cli.data_place.data_base", lambda: tmp_path)
     monkeypatch.setattr("gateway.cli.process_commands.data_base", lambda: tmp_path)
     code, _, err = r2rgate("list")
     assert code == 2 and f"there are no models in {tmp_path}" in err and "models import FILE" in err

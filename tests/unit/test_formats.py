@@ -16,6 +16,7 @@ from gateway.cli.demo_result import DemoResult
 from gateway.cli.design_result import DesignResult
 from gateway.cli.identify_result import IdentifyResult
 from gateway.cli.rehearse_result import RehearseResult
+from gateway.core.audit_export import AuditLine, wrong_in
 from gateway.core.controller import ControllerConfig, parse_controller
 from gateway.core.experiment import Experiment, parse_experiment
 from gateway.core.judge_context import JudgeContext, parse_context
@@ -34,6 +35,11 @@ def _json(adapter: TypeAdapter[Any]) -> Callable[[bytes], object]:
     return lambda payload: adapter.validate_json(payload)
 
 
+def _audit(payload: bytes) -> None:
+    if wrong := list(wrong_in(payload.splitlines())):
+        raise ValueError("; ".join(wrong))
+
+
 #: name: (schema, how a program reads the example, the example's ending)
 FORMATS: dict[str, tuple[TypeAdapter[Any], Callable[[bytes], object], str]] = {
     "controller": (TypeAdapter(ControllerConfig), parse_controller, "json"),
@@ -45,6 +51,7 @@ FORMATS: dict[str, tuple[TypeAdapter[Any], Callable[[bytes], object], str]] = {
     "design": (TypeAdapter(DesignResult), _json(TypeAdapter(DesignResult)), "json"),
     "identify": (TypeAdapter(IdentifyResult), _json(TypeAdapter(IdentifyResult)), "json"),
     "bench": (TypeAdapter(BenchResult), _json(TypeAdapter(BenchResult)), "json"),
+    "audit-export": (TypeAdapter(AuditLine), _audit, "jsonl"),
     "experiment": (TypeAdapter(Experiment), parse_experiment, "json"),
     "proposal": (TypeAdapter(Proposal), parse_proposal, "json"),
     "judge-context": (TypeAdapter(JudgeContext), parse_context, "json"),
