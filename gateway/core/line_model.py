@@ -32,6 +32,7 @@ PER_SPAN = {
     "radius_per_inertia": "1/(kg m)",
     "friction_per_inertia": "1/s",
     "radius2_per_inertia": "1/kg",
+    "eccentricity": "of R",
 }
 OF_THE_LINE = {"stiffness_n": "N", "torque_lag_s": "s", "latency_s": "s"}
 UNITS = {**OF_THE_LINE, **PER_SPAN}
@@ -76,6 +77,8 @@ class ModelParameters(Strict):
     latency_s: NonNegative
     tension_before_n: NonNegative = 0.0
     tension_after_n: NonNegative = 0.0
+    #: Amplitude over radius; null: all round. Not written then, so that models from before it keep their hash.
+    eccentricity: VectorFrom0 | None = Field(default=None, exclude_if=lambda value: value is None)
 
     @property
     def n(self) -> int:
@@ -179,6 +182,7 @@ def _wrong_lengths(model: LineModel) -> Iterator[str]:
         "parameters.inertia_kg_m2": given.inertia_kg_m2,
         "parameters.friction_nms_per_rad": given.friction_nms_per_rad,
         "parameters.coulomb_nm": given.coulomb_nm,
+        **({} if given.eccentricity is None else {"parameters.eccentricity": given.eccentricity}),
         "region.tension_from_n": region.tension_from_n,
         "region.tension_to_n": region.tension_to_n,
     }
@@ -267,6 +271,7 @@ def parameters_of(theta: Theta) -> dict[str, Any]:
         "latency_s": float(theta.latency_s),
         "tension_before_n": float(web.tension_before_n),
         "tension_after_n": float(web.tension_after_n),
+        **({"eccentricity": theta.eccentricity.tolist()} if theta.eccentricity.any() else {}),
     }
 
 
@@ -276,7 +281,9 @@ def theta_of(model: LineModel) -> Theta:
         given.stiffness_n, np.array(given.length_m), np.array(given.radius_m), np.array(given.inertia_kg_m2),
         np.array(given.friction_nms_per_rad), given.tension_before_n, given.tension_after_n,
     )  # fmt: skip
-    return Theta(web, np.array(given.coulomb_nm), given.torque_lag_s, given.latency_s)
+    return Theta(
+        web, np.array(given.coulomb_nm), given.torque_lag_s, given.latency_s, np.array(given.eccentricity or ())
+    )
 
 
 def noise_of(model: LineModel) -> Noise | None:
