@@ -35,7 +35,7 @@ from gateway.identification.findings import Assessment, Finding
 from gateway.identification.identifiability import Identifiability, identifiability, symbol
 from gateway.identification.identify import Identified
 from gateway.identification.inheritance import Inherited
-from gateway.identification.prediction_error import Z95
+from gateway.identification.prediction_error import Z95, Fit
 from gateway.identification.prior import prior_of
 from gateway.identification.structure_choice import ENOUGH, Candidate, Choice
 from gateway.identification.validation import Validation
@@ -123,7 +123,7 @@ def _found(line: Line, found: Identified, inherited: Inherited | None) -> Found:
         methods=[_method(row) for row in found.comparison.rows],
         windows=found.comparison.windows,
         failed=found.failed,
-        words=known.words,
+        words=[*out_of_round(fitted), *known.words],
         combinations=[
             CombinationRow(combination=str(one), information=float(one.information)) for one in known.directions
         ],
@@ -146,6 +146,15 @@ def _parameters(line: Line, found: Identified, known: Identifiability) -> list[P
             )
         )  # fmt: skip
     return rows
+
+
+def out_of_round(fitted: Fit) -> list[str]:
+    """Which rollers are, and by how much, as a sentence; none where all are round."""
+    told: list[str] = []
+    for roller in fitted.parameters.structure.eccentric:
+        found = fitted.eccentricity(roller)
+        told.append(f"{roller} by {found.value:.2%} of its radius ({found.low:.2%} to {found.high:.2%})")
+    return [f"out of round: roller {', roller '.join(told)}"] if told else []
 
 
 def why(choice: Choice) -> str:

@@ -27,6 +27,7 @@ NAMES = {
     "radius_per_inertia": "R/J",
     "friction_per_inertia": "f/J",
     "radius2_per_inertia": "R²/J",
+    "eccentricity": "Eccentricity",
 }
 X_LABEL = "Version"
 

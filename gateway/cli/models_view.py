@@ -85,6 +85,7 @@ def print_model(shown: Chosen, ancestors: Sequence[Entry], console: Console) -> 
 def _facts(model: LineModel, entry: Entry | None, ancestors: Sequence[Entry]) -> list[tuple[str, str]]:
     data, structure = model.data, model.structure
     named = {"per roller": structure.per_roller, "Coulomb friction": structure.coulomb, "lag": structure.torque_lag}
+    named["eccentric rollers"] = model.parameters.eccentricity is not None
     terms = ", ".join(name for name, there in named.items() if there) or "as in the paper"
     chain = " <- ".join(f"v{one.version}" for one in ancestors)
     facts = [

@@ -5,6 +5,9 @@ time move known torques, and are no states. Gains come from the Riccati recursio
 are no disturbance states: a model that is off shows in the innovations, which are then neither white nor of the size
 that the noise gives them. Normalised innovation squared, 1 for a true model, is what validity is judged by.
 
+Rollers out of round (`eccentricity`) are the exception: their angles are known from the data but for where they begin,
+and what they began with is learned along the stretch.
+
 What is taken, and what it costs: between samples the unwinder's speed is a straight line (or held); the process noise
 is white, with the speed's own measuring error at the unwinder beside it; RK4 takes steps of at most 0.35 over the
 fastest pole, whose decay is then right to 1.3e-4 of itself.
@@ -20,6 +23,7 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from gateway.control import prediction_kernel
+from gateway.control.eccentricity import SWING_STEP, Swung, learned, radii_of, swings_beside, travel
 from gateway.core.recording import Recording
 from gateway.core.signals import CountArray, FloatArray
 from gateway.core.theta import Noise, Theta
@@ -55,6 +59,8 @@ class Stretch:
     start: FloatArray  #: (2n,), state at `first`
     points: FloatArray  #: (p, 2n + 1), operating points: tensions, speeds, the unwinder's speed
     point: CountArray  #: (k,), which of them
+    travelled_m: FloatArray  #: (k, n), by each roller's surface since the stretch began
+    swing: FloatArray  #: (n, 2), of each roller here, where it is known (see `eccentricity`); 0: round
 
     @property
     def n(self) -> int:
@@ -100,17 +106,28 @@ class Predicted:
     state: FloatArray  #: (k, 2n), before each sample was seen
     innovation: FloatArray  #: (k, m), measured less predicted; N and m/s
     whitened: FloatArray  #: (k, m), of unit covariance where the model is true
+    swung: Swung | None = None  #: what was learned of eccentric rollers
 
     @property
     def log_likelihood(self) -> FloatArray:
         """Of each sample, (k,), natural logarithm."""
         m = self.innovation.shape[1]
-        return -0.5 * (np.square(self.whitened).sum(axis=1) + self.gains.log_determinant + m * log(2.0 * pi))
+        determinant = self.gains.log_determinant + (0.0 if self.swung is None else self.swung.log_determinant)
+        return -0.5 * (np.square(self.whitened).sum(axis=1) + determinant + m * log(2.0 * pi))
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Of each innovation, (k, m, m)."""
+        covariance = self.gains.covariance
+        if self.swung is None:
+            return covariance
+        factor = self.gains.factor[self.gains.which]
+        return covariance + factor @ self.swung.spread @ factor.transpose(0, 2, 1)
 
     @property
     def normalised_squared(self) -> FloatArray:
         """Per output (m,): mean square of the innovation over its variance; 1 for a true model."""
-        variance = np.diagonal(self.gains.covariance, axis1=1, axis2=2)
+        variance = np.diagonal(self.covariance, axis1=1, axis2=2)
         return np.mean(np.square(self.innovation) / variance, axis=0)
 
     @property
@@ -144,6 +161,7 @@ def stretch_of(recording: Recording, unwinder: Unwinder = "linear") -> Stretch:
     return Stretch(
         recording, outputs, measured, np.ascontiguousarray(recording.torque_nm), unwinder,
         np.column_stack((v0, following)), first, filled[first].copy(), points, point,
+        travel(recording.speed_m_per_s, recording.period_s), np.zeros((n, 2)),
     )  # fmt: skip
 
 
@@ -263,22 +281,56 @@ def gains_of(theta: Theta, noise: Noise, stretch: Stretch) -> Gains:
 
 
 def predict(theta: Theta, noise: Noise, stretch: Stretch) -> Predicted:
-    """Innovations of a model on a stretch. Raises Unpredictable."""
+    """Innovations of a model on a stretch. Raises Unpredictable.
+
+    Of a model with eccentric rollers each prediction knows of the swings what the samples before it have shown, and
+    before the first one no more than their amplitudes. Else the rollers swing as the stretch says.
+    """
     gains = gains_of(theta, noise, stretch)
+    if theta.eccentricity.any():
+        return _learning(theta, gains, stretch)
     innovation, state = innovations([theta], stretch, gains, states=True)
     return Predicted(stretch, gains, state[0], innovation[0], whitened(innovation, gains)[0])
 
 
+def _learning(theta: Theta, gains: Gains, stretch: Stretch) -> Predicted:
+    """The separate-bias form of the predictor that has the swings as states."""
+    at = np.flatnonzero(theta.eccentricity)
+    swings = swings_beside(np.zeros_like(stretch.swing), at)
+    innovation, state = innovations([theta] * len(swings), stretch, gains, swings, states=True)
+    found = learned(theta, stretch, at, whitened(innovation, gains))
+    if found is None:
+        raise Unpredictable("the predictor has no gain: the eccentricity is extreme")
+    known = found.before[:, at].reshape(len(found.before), -1) / SWING_STEP
+
+    def swung(of: FloatArray) -> FloatArray:
+        """`of` (1 + q, k, x), round and with a step of each swing, as linear as it is."""
+        moved: FloatArray = of[0] + np.einsum("qkx,kq->kx", of[1:] - of[0], known)
+        return moved
+
+    return Predicted(stretch, gains, swung(state), swung(innovation), found.whitened, found)
+
+
 def innovations(
-    thetas: Sequence[Theta], stretch: Stretch, gains: Gains, *, states: bool = False
+    thetas: Sequence[Theta],
+    stretch: Stretch,
+    gains: Gains,
+    swings: FloatArray | None = None,
+    *,
+    states: bool = False,
 ) -> tuple[FloatArray, FloatArray]:
-    """Of b thetas under the same gains: (b, k, m), and the predicted states (b, k, 2n) where they are wanted."""
+    """Of b thetas under the same gains: (b, k, m), and the predicted states (b, k, 2n) where they are wanted.
+
+    Each with its own `swings` (b, n, 2), or all with those of the stretch.
+    """
     tables, times = coefficients_of(thetas, stretch)
+    swings = np.broadcast_to(stretch.swing, (len(thetas), *stretch.swing.shape)) if swings is None else swings
+    radii = radii_of([theta.web.radius_m for theta in thetas], stretch.travelled_m, swings)
     found = np.empty((len(thetas), stretch.predictions, len(stretch.outputs)))
     predicted = np.empty((len(thetas), stretch.predictions, 2 * stretch.n) if states else (0, 0, 0))
     prediction_kernel.follow(
-        tables, _boundary(thetas[0]), times, stretch.torque_nm, stretch.unwind_m_per_s, stretch.first, stretch.start,
-        stretch.outputs, stretch.measured, gains.gain, _padded(gains, stretch), found, predicted,
+        tables, _boundary(thetas[0]), times, radii, stretch.torque_nm, stretch.unwind_m_per_s, stretch.first,
+        stretch.start, stretch.outputs, stretch.measured, gains.gain, _padded(gains, stretch), found, predicted,
     )  # fmt: skip
     return found, predicted
 
@@ -294,9 +346,10 @@ def imagined(theta: Theta, stretch: Stretch, gains: Gains, innovation: FloatArra
     """The stretch as the model would have it with these innovations (k, m) and the same torques."""
     tables, times = coefficients_of([theta], stretch)
     outputs = np.empty_like(innovation)
+    radii = radii_of([theta.web.radius_m], stretch.travelled_m, stretch.swing[None])
     prediction_kernel.imagine(
-        tables[0], _boundary(theta), times[0], stretch.torque_nm, stretch.unwind_m_per_s, stretch.first, stretch.start,
-        stretch.outputs, gains.gain, _padded(gains, stretch), innovation, outputs,
+        tables[0], _boundary(theta), times[0], radii[0], stretch.torque_nm, stretch.unwind_m_per_s, stretch.first,
+        stretch.start, stretch.outputs, gains.gain, _padded(gains, stretch), innovation, outputs,
     )  # fmt: skip
     return replace(stretch, measured=np.vstack((stretch.measured[: stretch.first + 1], outputs)))
 
@@ -312,7 +365,8 @@ def free_run(theta: Theta, predicted: Predicted, begin: int, length: int) -> Flo
     end = first + length + 1
     part = replace(
         stretch, measured=stretch.measured[:end], torque_nm=stretch.torque_nm[:end], first=first, start=state,
-        unwind_m_per_s=stretch.unwind_m_per_s[:end],
+        unwind_m_per_s=stretch.unwind_m_per_s[:end], travelled_m=stretch.travelled_m[:end],
+        swing=stretch.swing if predicted.swung is None else predicted.swung.before[begin],
     )  # fmt: skip
     blind = np.zeros((1, 2 * stretch.n, len(stretch.outputs)))
     nothing = Gains(blind, gains.factor[:1], gains.root[:1], np.zeros(length, dtype=np.int64))

@@ -20,20 +20,24 @@ _LAG, _LATENCY, _PERIOD, _WIDTH, _STEP = range(5)
 
 
 @_inlined
-def _rate(coefficients, boundary, width, unwind, given, state, probe, rate):
-    """d[T; w]/dt, where the speeds are v = w + `given`: what the torque has added since the step began."""
+def _rate(coefficients, boundary, width, round_, unwind, given, state, probe, rate):
+    """d[T; w]/dt, where the speeds are w + `given`: what the torque has added since the step began.
+
+    The web runs at `round_` times a roller's mean surface speed, and pulls at as much of its mean radius.
+    """
     n = coefficients.shape[1]
     for i in range(n):
         probe[i] = state[n + i] + given[i]
     for i in range(n):
         tension_up = state[i - 1] if i > 0 else boundary[0]
-        speed_up = probe[i - 1] if i > 0 else unwind
+        speed_up = round_[i - 1] * probe[i - 1] if i > 0 else unwind
         tension_down = state[i + 1] if i + 1 < n else boundary[1]
-        tension, speed = state[i], probe[i]
+        tension, speed, web_speed = state[i], probe[i], round_[i] * probe[i]
         rate[i] = coefficients[_PER_LENGTH, i] * (
-            coefficients[_STIFFNESS, i] * (speed - speed_up) + tension_up * speed_up - tension * speed
+            coefficients[_STIFFNESS, i] * (web_speed - speed_up) + tension_up * speed_up - tension * web_speed
         )
-        rate[n + i] = coefficients[_WEB, i] * (tension_down - tension) - coefficients[_FRICTION, i] * speed
+        pulled = coefficients[_WEB, i] * round_[i] * (tension_down - tension)
+        rate[n + i] = pulled - coefficients[_FRICTION, i] * speed
         if coefficients[_COULOMB, i] > 0.0:
             rate[n + i] -= coefficients[_COULOMB, i] * tanh(speed / width)
 
@@ -46,24 +50,24 @@ def _impulse(coefficients, lag, fade, span, acting, sent, given):
 
 
 @_inlined
-def _step(coefficients, boundary, width, lag, span, fades, unwinds, acting, sent, state, work):
+def _step(coefficients, boundary, width, lag, span, fades, round_, unwinds, acting, sent, state, work):
     """One step of RK4 over `span` seconds. The torque, a lag behind `sent`, is integrated exactly."""
     k1, k2, k3, k4, trial, probe = work[0], work[1], work[2], work[3], work[4], work[5]
     given, n = work[6], acting.size
     for i in range(n):
         given[i] = 0.0
-    _rate(coefficients, boundary, width, unwinds[0], given, state, probe, k1)
+    _rate(coefficients, boundary, width, round_, unwinds[0], given, state, probe, k1)
     _impulse(coefficients, lag, fades[0], 0.5 * span, acting, sent, given)
     for j in range(2 * n):
         trial[j] = state[j] + 0.5 * span * k1[j]
-    _rate(coefficients, boundary, width, unwinds[1], given, trial, probe, k2)
+    _rate(coefficients, boundary, width, round_, unwinds[1], given, trial, probe, k2)
     for j in range(2 * n):
         trial[j] = state[j] + 0.5 * span * k2[j]
-    _rate(coefficients, boundary, width, unwinds[1], given, trial, probe, k3)
+    _rate(coefficients, boundary, width, round_, unwinds[1], given, trial, probe, k3)
     _impulse(coefficients, lag, fades[1], span, acting, sent, given)
     for j in range(2 * n):
         trial[j] = state[j] + span * k3[j]
-    _rate(coefficients, boundary, width, unwinds[2], given, trial, probe, k4)
+    _rate(coefficients, boundary, width, round_, unwinds[2], given, trial, probe, k4)
     for j in range(2 * n):
         state[j] += span / 6.0 * (k1[j] + 2.0 * k2[j] + 2.0 * k3[j] + k4[j])
     for i in range(n):
@@ -77,11 +81,12 @@ def _fade(span, lag):
 
 
 @_inlined
-def _period(coefficients, boundary, times, before, now, unwind, acting, state, work):
-    """A period: the torques `before` act until `now` have arrived. `unwind` (2,): v0 at its begin and end."""
+def _period(coefficients, boundary, times, before, now, unwind, turned, acting, state, work):
+    """A period: the torques `before` act until `now` have arrived. `unwind` (2,): v0 at its begin and end; `turned`
+    (2, n): the radii under the web over their means."""
     lag, period = times[_LAG], times[_PERIOD]
     arrival = times[_LATENCY] % period
-    fades, unwinds = np.empty(2), np.empty(3)
+    fades, unwinds, round_ = np.empty(2), np.empty(3), work[7]
     for piece in range(2):
         begin, end = (0.0, arrival) if piece == 0 else (arrival, period)
         sent = before if piece == 0 else now
@@ -94,21 +99,26 @@ def _period(coefficients, boundary, times, before, now, unwind, acting, state, w
             for stage in range(3):
                 share = (begin + (step + 0.5 * stage) * span) / period
                 unwinds[stage] = unwind[0] + share * (unwind[1] - unwind[0])
-            _step(coefficients, boundary, times[_WIDTH], lag, span, fades, unwinds, acting, sent, state, work)
+            share = (begin + (step + 0.5) * span) / period
+            for i in range(acting.size):
+                round_[i] = turned[0, i] + share * (turned[1, i] - turned[0, i])
+            _step(coefficients, boundary, times[_WIDTH], lag, span, fades, round_, unwinds, acting, sent, state, work)
 
 
 @_compiled
 def follow(
-    coefficients, boundary, times, torque, unwind, first, start, seen, measured, gains, which, innovations, predicted
+    coefficients, boundary, times, radii, torque, unwind, first, start, seen, measured, gains, which, innovations,
+    predicted,
 ):  # fmt: skip
-    """For every column b of `coefficients` (b, 6, n) and `times` (b, 5), from sample `first` to the last one.
+    """For every column b of `coefficients` (b, 6, n), `times` (b, 5) and `radii` (b, k, n), those under the web at the
+    samples over their means, from sample `first` to the last one.
 
     `torque` (k, n), `unwind` (k, 2) in the period from each sample on, `start` (2n,) the state at `first`, `seen` (m,)
     which states are measured, `measured` (k, m), `gains` (g, 2n, m), `which` (k,) of them at each sample. Fills
     `innovations` (b, k - first - 1, m) and, where it is not empty, `predicted` (b, k - first - 1, 2n).
     """
     columns, samples, n = coefficients.shape[0], torque.shape[0], torque.shape[1]
-    state, acting, work = np.empty(2 * n), np.empty(n), np.empty((7, 2 * n))
+    state, acting, work = np.empty(2 * n), np.empty(n), np.empty((8, 2 * n))
     for column in range(columns):
         own, clock = coefficients[column], times[column]
         depth = int(np.floor(clock[_LATENCY] / clock[_PERIOD] + 1e-9))
@@ -116,7 +126,10 @@ def follow(
         _settle(own, clock, torque, first, depth, acting)
         state[:] = start
         for k in range(first, samples - 1):
-            _period(own, boundary, clock, torque[k - depth - 1], torque[k - depth], unwind[k], acting, state, work)
+            _period(
+                own, boundary, clock, torque[k - depth - 1], torque[k - depth], unwind[k], radii[column, k : k + 2],
+                acting, state, work,
+            )  # fmt: skip
             row = k - first
             if predicted.size > 0:
                 predicted[column, row] = state
@@ -141,19 +154,22 @@ def _settle(coefficients, clock, torque, first, depth, acting):
 
 
 @_compiled
-def imagine(coefficients, boundary, times, torque, unwind, first, start, seen, gains, which, innovations, outputs):
+def imagine(
+    coefficients, boundary, times, radii, torque, unwind, first, start, seen, gains, which, innovations, outputs
+):  # fmt: skip
     """As `follow` for one column, the other way about: the outputs (k - first - 1, m) of a line with these innovations.
 
     It is the innovations form of the model, whose outputs are distributed as those of the line itself.
     """
     n = torque.shape[1]
-    state, acting, work = start.copy(), np.empty(n), np.empty((7, 2 * n))
+    state, acting, work = start.copy(), np.empty(n), np.empty((8, 2 * n))
     depth = int(np.floor(times[_LATENCY] / times[_PERIOD] + 1e-9))
     times[_LATENCY] = max(times[_LATENCY] - depth * times[_PERIOD], 0.0)
     _settle(coefficients, times, torque, first, depth, acting)
     for k in range(first, torque.shape[0] - 1):
         _period(
-            coefficients, boundary, times, torque[k - depth - 1], torque[k - depth], unwind[k], acting, state, work
+            coefficients, boundary, times, torque[k - depth - 1], torque[k - depth], unwind[k], radii[k : k + 2],
+            acting, state, work,
         )  # fmt: skip
         row = k - first
         gain = gains[which[k + 1]]
@@ -228,6 +244,35 @@ def kalman(transitions, intensities, point, noise, seen, covariance, first, tole
         for j in range(s):
             rests = rests and abs(covariance[j, j] - before[j, j]) <= tolerance * covariance[j, j]
     return found
+
+
+@_compiled
+def estimate_swing(white, response, drift, covariance, swing, found, spread, after):
+    """The separate-bias estimator along whitened innovations (k, m) that belong to no swing at all.
+
+    `response` (k, m, q): what one of each swing would add to them; `covariance` (q, q) of the swings before any sample,
+    which grows by `drift` (k, q) on its diagonal from sample to sample; `swing` (q,) the mean, which is moved on. Fills
+    `found` (k, m), the innovations that are left, of unit covariance; `spread` (k, m, m), what the doubt about the
+    swings adds to the unit covariance; and `after` (k, q), the swings once each sample is seen.
+    """
+    samples, m, q = response.shape
+    total, root, inverse = np.empty((m, m)), np.empty((m, m)), np.empty((m, m))
+    for k in range(samples):
+        for j in range(q):
+            covariance[j, j] += drift[k, j]
+        crossed = response[k] @ covariance
+        spread[k] = crossed @ response[k].T
+        total[:] = spread[k]
+        for i in range(m):
+            total[i, i] += 1.0
+        if not _inverse_cholesky(total, root, inverse):
+            return False
+        found[k] = inverse @ (white[k] + response[k] @ swing)
+        gain = inverse @ crossed
+        swing -= gain.T @ found[k]
+        covariance -= gain.T @ gain
+        after[k] = swing
+    return True
 
 
 @_compiled

@@ -19,9 +19,6 @@ from gateway.core.line_model_posterior import ModelPosterior, wrong_names
 from gateway.core.theta import Noise, Theta
 from gateway.core.web_model import WebModel
 
-#: Fields that came later: where a model has none of it, its bytes, and so its hash, are those that it had before.
-LATER = ("posterior",)
-
 
 def _instant(text: str) -> str:
     try:
@@ -61,6 +58,8 @@ class ModelParameters(Strict):
     latency_s: NonNegative
     tension_before_n: NonNegative = 0.0
     tension_after_n: NonNegative = 0.0
+    #: Amplitude over radius; null: all round. Not written then, so that models from before it keep their hash.
+    eccentricity: VectorFrom0 | None = Field(default=None, exclude_if=lambda value: value is None)
 
     @property
     def n(self) -> int:
@@ -144,7 +143,8 @@ class LineModel(Strict):
     validation: ModelValidation | None = None
     alignment: list[ChannelDelay] = []
     parent: Digest | None = None  #: the model that was the prior; null: the line's file
-    posterior: ModelPosterior | None = None  #: null: the method gives none, or the file is older
+    #: null: the method gives none, or the file is older. Not written then, so that models from before it keep their hash.
+    posterior: ModelPosterior | None = Field(default=None, exclude_if=lambda value: value is None)
 
     @property
     def n(self) -> int:
@@ -175,6 +175,7 @@ def _wrong_lengths(model: LineModel) -> Iterator[str]:
         "parameters.inertia_kg_m2": given.inertia_kg_m2,
         "parameters.friction_nms_per_rad": given.friction_nms_per_rad,
         "parameters.coulomb_nm": given.coulomb_nm,
+        **({} if given.eccentricity is None else {"parameters.eccentricity": given.eccentricity}),
         "region.tension_from_n": region.tension_from_n,
         "region.tension_to_n": region.tension_to_n,
     }
@@ -212,9 +213,7 @@ def _wrong_order(model: LineModel) -> Iterator[str]:
 
 def canonical(model: LineModel) -> bytes:
     """The one byte representation of a model, the same whoever writes it."""
-    fields = model.model_dump(mode="json")
-    present = {key: value for key, value in fields.items() if value is not None or key not in LATER}
-    return json.dumps(present, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
+    return json.dumps(model.model_dump(mode="json"), sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
 
 
 def model_hash(model: LineModel) -> str:
@@ -252,6 +251,7 @@ def parameters_of(theta: Theta) -> dict[str, Any]:
         "latency_s": float(theta.latency_s),
         "tension_before_n": float(web.tension_before_n),
         "tension_after_n": float(web.tension_after_n),
+        **({"eccentricity": theta.eccentricity.tolist()} if theta.eccentricity.any() else {}),
     }
 
 
@@ -261,7 +261,9 @@ def theta_of(model: LineModel) -> Theta:
         given.stiffness_n, np.array(given.length_m), np.array(given.radius_m), np.array(given.inertia_kg_m2),
         np.array(given.friction_nms_per_rad), given.tension_before_n, given.tension_after_n,
     )  # fmt: skip
-    return Theta(web, np.array(given.coulomb_nm), given.torque_lag_s, given.latency_s)
+    return Theta(
+        web, np.array(given.coulomb_nm), given.torque_lag_s, given.latency_s, np.array(given.eccentricity or ())
+    )
 
 
 def noise_of(model: LineModel) -> Noise | None:

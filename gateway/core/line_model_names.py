@@ -18,6 +18,7 @@ PER_SPAN = {
     "radius_per_inertia": "1/(kg m)",
     "friction_per_inertia": "1/s",
     "radius2_per_inertia": "1/kg",
+    "eccentricity": "of R",
 }
 OF_THE_LINE = {"stiffness_n": "N", "torque_lag_s": "s", "latency_s": "s"}
 UNITS = {**OF_THE_LINE, **PER_SPAN}

@@ -22,6 +22,7 @@ SYMBOLS = {
     "radius_per_inertia": "R/J",
     "friction_per_inertia": "f/J",
     "radius2_per_inertia": "R²/J",
+    "eccentricity": "eccentricity",
 }
 
 
@@ -62,6 +63,7 @@ def values_of(model: LineModel) -> dict[str, FloatArray]:
         "radius_per_inertia": web.radius_m / web.inertia_kg_m2,
         "friction_per_inertia": web.friction_nms_per_rad / web.inertia_kg_m2,
         "radius2_per_inertia": web.radius_m**2 / web.inertia_kg_m2,
+        "eccentricity": theta.eccentricity,
     }
 
 

@@ -1,6 +1,8 @@
 """theta: everything that is believed of a line's physics; what the paper leaves out stands beside its two equations."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+
+import numpy as np
 
 from gateway.core.line import Line
 from gateway.core.signals import FloatArray
@@ -23,13 +25,21 @@ class Theta:
         torque_lag dm_i/dt = u_i(t - latency) - m_i
         dv_i/dt = R_i^2/J_i (T_{i+1} - T_i) - f_i/J_i v_i + R_i/J_i (m_i - c_i sign(v_i))
 
-    and the tensions follow as in `web_model`. c is the Coulomb friction of the bearings.
+    and the tensions follow as in `web_model`. c is the Coulomb friction of the bearings. The radius under the web is
+    R_i (1 + e_i cos(angle_i + phase_i)), v_i the surface speed that a round roller would have; the phases are nobody's
+    belief, but what the data at hand show.
     """
 
     web: WebModel
     coulomb_nm: FloatArray  #: (n,), 0 and above
     torque_lag_s: float  #: 0: none
     latency_s: float  #: from a sample to the torque that it causes
+    #: e (n,), amplitude over radius; nothing given: none
+    eccentricity: FloatArray = field(default_factory=lambda: np.zeros(0))
+
+    def __post_init__(self) -> None:
+        if not self.eccentricity.size:
+            object.__setattr__(self, "eccentricity", np.zeros(self.n))
 
     @property
     def n(self) -> int:

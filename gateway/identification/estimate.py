@@ -25,10 +25,15 @@ class Structure:
     per_roller: bool = False  #: radius, inertia, friction and length each by itself; else one factor for all
     coulomb: bool = False
     torque_lag: bool = False
+    eccentric: tuple[int, ...] = ()  #: rollers, from 1, that run out of true
 
     def __str__(self) -> str:
         named = {"per roller": self.per_roller, "Coulomb friction": self.coulomb, "torque lag": self.torque_lag}
-        return ", ".join(name for name, there in named.items() if there) or "as in the paper"
+        said = [name for name, there in named.items() if there]
+        if self.eccentric:
+            several = "s" if len(self.eccentric) > 1 else ""
+            said.append(f"eccentric roller{several} {' '.join(str(i) for i in self.eccentric)}")
+        return ", ".join(said) or "as in the paper"
 
 
 @dataclass(frozen=True)
@@ -41,8 +46,8 @@ class Estimate:
     noise: Noise | None  #: None: the method says nothing of it
     #: By name: stiffness_n, length_m, radius_m, inertia_kg_m2, friction_nms_per_rad, coulomb_nm, torque_lag_s,
     #: latency_s, and the combinations stiffness_per_length (EA/L, N/m), radius_per_inertia (R/J), friction_per_inertia
-    #: (f/J) and radius2_per_inertia (R^2/J); "inertia_kg_m2[3]" (from 1) where rollers differ. Of what the data do not
-    #: tell, as wide as the prior.
+    #: (f/J) and radius2_per_inertia (R^2/J); "inertia_kg_m2[3]" (from 1) where rollers differ; "eccentricity[3]" of
+    #: each eccentric roller. Of what the data do not tell, as wide as the prior.
     intervals: dict[str, Interval]
     samples: int
     posterior: Posterior | None = None  #: of all parameters together; None: the method does not say

@@ -122,7 +122,7 @@ def parts(recordings: Sequence[Recording]) -> tuple[list[Recording], list[Record
 
 def _others(line: Line, choice: Choice) -> dict[str, Callable[[Sequence[Recording]], Estimate]]:
     """The methods beside prediction error. Each takes one recording; several are one with gaps."""
-    noise, structure = choice.fitted.noise, replace(choice.fitted.parameters.structure, torque_lag=False)
+    noise, structure = choice.fitted.noise, replace(choice.fitted.parameters.structure, torque_lag=False, eccentric=())
     return {
         "recursive least squares": lambda before: estimated_recursively(live(line, noise), joined(before), structure),
         "subspace": lambda before: estimated_by_subspace(line, joined(before)),

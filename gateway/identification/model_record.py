@@ -37,7 +37,7 @@ def model_from(
             "format": 1,
             **asdict(origin),
             "method": estimate.method,
-            "structure": asdict(estimate.structure),
+            "structure": {key: value for key, value in asdict(estimate.structure).items() if key != "eccentric"},
             "parameters": parameters_of(estimate.theta),
             "noise": None if estimate.noise is None else asdict(estimate.noise),
             "intervals": {name: asdict(interval) for name, interval in estimate.intervals.items()},

@@ -18,6 +18,7 @@ SYMBOLS = {
     "stiffness_n": "EA", "length_m": "L", "radius_m": "R", "inertia_kg_m2": "J", "friction_nms_per_rad": "f",
     "coulomb_nm": "c", "torque_lag_s": "torque lag", "latency_s": "latency", "stiffness_per_length": "EA/L",
     "radius_per_inertia": "R/J", "friction_per_inertia": "f/J", "radius2_per_inertia": "R^2/J",
+    "eccentricity": "eccentricity",
 }  # fmt: skip
 COMBINATIONS: dict[str, dict[str, float]] = {
     "stiffness_per_length": {"stiffness_n": 1.0, "length_m": -1.0},

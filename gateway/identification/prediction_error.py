@@ -5,6 +5,9 @@ predictor, whitened by their own covariance, and the distance from the prior, by
 belong to the theta of each step and are not differentiated: their derivative only multiplies past innovations, which
 at the truth are uncorrelated with the present one, so that neither the estimate nor its covariance depends on it. The
 noise follows by scoring between the steps.
+
+Swings of eccentric rollers belong to a stretch, not to the line: they are linear, and are eliminated from each
+stretch's part of the normal equations (Schur's complement), which is what integrating over them amounts to.
 """
 
 from collections.abc import Sequence
@@ -14,6 +17,7 @@ from math import log, pi
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
+from gateway.control.eccentricity import SWING_STEP, swings_beside
 from gateway.control.prediction import (
     Gains,
     Stretch,
@@ -28,13 +32,14 @@ from gateway.control.prediction import (
 )
 from gateway.core.posterior import Posterior
 from gateway.core.recording import Recording
-from gateway.core.signals import FloatArray
-from gateway.core.theta import Noise
+from gateway.core.signals import CountArray, FloatArray
+from gateway.core.theta import Noise, Theta
 from gateway.identification.estimate import Estimate, Interval
 from gateway.identification.noise import improved_noise
 from gateway.identification.parameters import Parameters
 from gateway.identification.prior import Prior
 
+SWING_SD = 3e-3  #: of either part of a swing, before any data: 0.3 % of the radius
 LEAST_S = 0.5  #: a stretch that is shorter tells too little to be used
 Z95 = 1.959964  #: quantile of the normal distribution
 _STEP = 1e-5  #: of a log-parameter, for sensitivities
@@ -55,7 +60,8 @@ class Fit:
     covariance: FloatArray  #: (p, p) of the log-parameters, posterior (Laplace)
     information: FloatArray  #: (p, p), Fisher's, of the data alone
     noise: Noise
-    stretches: list[Stretch]
+    stretches: list[Stretch]  #: with the swings that were found in them
+    swing_covariances: list[FloatArray]  #: of each stretch, (2r, 2r), of its swings' cosines and sines in turn
     log_likelihood: float  #: of the data, at the estimate
     evidence: float  #: log marginal likelihood of the structure (Laplace), the noise at its best
     iterations: int
@@ -68,6 +74,27 @@ class Fit:
     @property
     def samples(self) -> int:
         return sum(stretch.predictions for stretch in self.stretches)
+
+    @property
+    def theta(self) -> Theta:
+        amplitudes = np.zeros(self.parameters.base.n)
+        for i in self.parameters.structure.eccentric:
+            amplitudes[i - 1] = self.eccentricity(i).value
+        return replace(self.parameters.theta(self.logs), eccentricity=amplitudes)
+
+    def eccentricity(self, roller: int) -> Interval:
+        """Of a roller, from 1, that the structure has as eccentric: amplitude over radius. Raises ValueError.
+
+        The mean of its stretches, each with the weight that its deviation gives it.
+        """
+        j = 2 * self.parameters.structure.eccentric.index(roller)
+        swings = np.array([stretch.swing[roller - 1] for stretch in self.stretches])
+        amplitudes = np.hypot(swings[:, 0], swings[:, 1])
+        along = swings / np.maximum(amplitudes, 1e-12)[:, None]
+        covariances = np.array([covariance[j : j + 2, j : j + 2] for covariance in self.swing_covariances])
+        weights = 1.0 / np.maximum(np.einsum("si,sij,sj->s", along, covariances, along), 1e-18)
+        middle, deviation = float(np.average(amplitudes, weights=weights)), float(weights.sum()) ** -0.5
+        return Interval(middle, max(middle - Z95 * deviation, 0.0), middle + Z95 * deviation)
 
     def interval(self, name: str) -> Interval:
         """Of 95 %. Raises KeyError."""
@@ -82,9 +109,10 @@ class Fit:
         return Estimate(
             method="prediction error",
             structure=parameters.structure,
-            theta=parameters.theta(self.logs),
+            theta=self.theta,
             noise=self.noise,
-            intervals={name: self.interval(name) for name in parameters.maps},
+            intervals={name: self.interval(name) for name in parameters.maps}
+            | {f"eccentricity[{i}]": self.eccentricity(i) for i in parameters.structure.eccentric},
             samples=self.samples,
             posterior=Posterior(tuple(parameters.names), self.logs, self.covariance),
         )
@@ -120,48 +148,59 @@ def fit(recordings: Sequence[Recording], prior: Prior, noise0: Noise, unwinder: 
 def fit_stretches(
     stretches: list[Stretch], prior: Prior, noise0: Noise, *, start: FloatArray | None = None, know_noise: bool = False
 ) -> Fit:
-    """From log-parameters `start` (p,), else from the prior's mean; `know_noise`: it is noise0."""
+    """From log-parameters `start` (p,), else from the prior's mean; `know_noise`: it is noise0.
+
+    Swings begin with those of the stretches.
+    """
     parameters, weight = prior.parameters, np.linalg.inv(prior.covariance)
+    at = np.array(parameters.structure.eccentric, dtype=np.int64) - 1
+    stretches = [replace(stretch, swing=_only(stretch.swing, at)) for stretch in stretches]
     reach = _BOUND * np.sqrt(np.diag(prior.covariance))
     logs = prior.mean.copy() if start is None else start.copy()
     noise, converged, iterations = noise0, False, 0
     while True:
         gains = [gains_of(parameters.theta(logs), noise, stretch) for stretch in stretches]
-        cost, gradient, information = _normal_equations(parameters, logs, stretches, gains)
+        found = normal_equations(parameters, logs, stretches, gains, at)
+        gradient, information = found.reduced
         posterior = cho_factor(information + weight)
         if converged or iterations == _ITERATIONS:
             break
         iterations += 1
         step = -cho_solve(posterior, gradient + weight @ (logs - prior.mean))
-        length = float(np.sqrt(step @ (information + weight) @ step))
-        step *= min(1.0, _REACH / max(float(np.abs(step).max()), 1e-12))
-        before = cost + 0.5 * (logs - prior.mean) @ weight @ (logs - prior.mean)
+        length = float(np.sqrt(step @ (information + weight) @ step + found.swings_reduce))
+        swing_steps = [part.step(step) for part in found.swings]
+        shorter = min(1.0, _REACH / max(float(np.abs(step).max()), 1e-12))
+        before = found.cost + 0.5 * (logs - prior.mean) @ weight @ (logs - prior.mean)
         for _ in range(8):
-            tried = np.clip(logs + step, prior.mean - reach, prior.mean + reach)
+            tried = np.clip(logs + shorter * step, prior.mean - reach, prior.mean + reach)
             away = tried - prior.mean
-            if _cost(parameters, tried, stretches, gains) + 0.5 * away @ weight @ away <= before + 1e-9 * abs(before):
-                logs = tried
+            moved = [
+                replace(stretch, swing=_moved(stretch.swing, at, shorter * swing_step))
+                for stretch, swing_step in zip(stretches, swing_steps, strict=True)
+            ]
+            if _cost(parameters, tried, moved, gains) + 0.5 * away @ weight @ away <= before + 1e-9 * abs(before):
+                logs, stretches = tried, moved
                 break
-            step = 0.5 * step
+            shorter = 0.5 * shorter
         noise_length = 0.0
         if not know_noise:
             noise, noise_length = improved_noise(parameters.theta(logs), noise, noise0, stretches)
         converged = length < _SETTLED and noise_length < _NOISE_SETTLED
     covariance = cho_solve(posterior, np.eye(parameters.size))
-    likelihood = -cost - _constant(stretches, gains)
+    likelihood = -found.cost - _constant(stretches, gains)
     away = logs - prior.mean
     _, scale = np.linalg.slogdet(prior.covariance @ (information + weight))
-    evidence = likelihood - 0.5 * float(away @ weight @ away) - 0.5 * float(scale)
+    evidence = likelihood - 0.5 * float(away @ weight @ away) - 0.5 * float(scale) - 0.5 * found.swings_scale
+    covariance = 0.5 * (covariance + covariance.T)
     return Fit(
-        prior, logs, 0.5 * (covariance + covariance.T), information, noise, stretches, likelihood, evidence, iterations,
-        converged,
+        prior, logs, covariance, information, noise, stretches, [part.covariance(covariance) for part in found.swings],
+        likelihood, evidence, iterations, converged,
     )  # fmt: skip
 
 
 def score(fitted: Fit, stretches: Sequence[Stretch]) -> float:
     """Mean log-likelihood of a sample of data that the fit has not seen."""
-    theta = fitted.parameters.theta(fitted.logs)
-    found = np.concatenate([predict(theta, fitted.noise, stretch).log_likelihood for stretch in stretches])
+    found = np.concatenate([predict(fitted.theta, fitted.noise, stretch).log_likelihood for stretch in stretches])
     return float(found.mean())
 
 
@@ -186,26 +225,101 @@ def bootstrap(fitted: Fit, draws: int, seed: int = 0) -> FloatArray:
     return np.array(found)
 
 
-def _normal_equations(
-    parameters: Parameters, logs: FloatArray, stretches: list[Stretch], gains: list[Gains]
-) -> tuple[float, FloatArray, FloatArray]:
-    """Half the sum of squared whitened innovations, its gradient (p,), and J'J (p, p)."""
+@dataclass(frozen=True)
+class SwingEquations:
+    """One stretch's normal equations of its 2r swings, the prior's part among them."""
+
+    crossed: FloatArray  #: (p, 2r), with the log-parameters
+    information: FloatArray  #: (2r, 2r)
+    gradient: FloatArray  #: (2r,)
+
+    def step(self, of_logs: FloatArray) -> FloatArray:
+        """Of the swings, (r, 2), that belongs to a step of the log-parameters."""
+        found = np.linalg.solve(self.information, self.gradient + self.crossed.T @ of_logs)
+        return -np.asarray(found, dtype=np.float64).reshape(-1, 2)
+
+    def covariance(self, of_logs: FloatArray) -> FloatArray:
+        """Posterior (2r, 2r), from that of the log-parameters."""
+        along = np.linalg.solve(self.information, self.crossed.T)
+        found: FloatArray = np.linalg.inv(self.information) + along @ of_logs @ along.T
+        return found
+
+
+@dataclass(frozen=True)
+class NormalEquations:
+    cost: float  #: half the sum of squared whitened innovations, and of swings over their prior deviation
+    gradient: FloatArray  #: (p,)
+    information: FloatArray  #: J'J (p, p)
+    swings: list[SwingEquations]  #: of each stretch
+
+    @property
+    def reduced(self) -> tuple[FloatArray, FloatArray]:
+        """Gradient and information of the log-parameters with the swings eliminated."""
+        gradient, information = self.gradient.copy(), self.information.copy()
+        for part in self.swings:
+            solved = np.linalg.solve(part.information, np.column_stack((part.gradient, part.crossed.T)))
+            gradient -= part.crossed @ solved[:, 0]
+            information -= part.crossed @ solved[:, 1:]
+        return gradient, information
+
+    @property
+    def swings_reduce(self) -> float:
+        """Squared length of the swings' steps by themselves, in standard deviations."""
+        return sum(float(part.gradient @ np.linalg.solve(part.information, part.gradient)) for part in self.swings)
+
+    @property
+    def swings_scale(self) -> float:
+        """Logarithm of how much smaller than the prior's the volume is that the data leave to the swings."""
+        return sum(float(np.linalg.slogdet(SWING_SD**2 * part.information)[1]) for part in self.swings)
+
+
+def normal_equations(
+    parameters: Parameters, logs: FloatArray, stretches: list[Stretch], gains: list[Gains], at: CountArray
+) -> NormalEquations:
+    """Around log-parameters (p,) and the stretches' swings, of the eccentric rollers `at` (r,), from 0."""
     p = parameters.size
-    columns = [parameters.theta(row) for row in np.vstack((logs, logs + _STEP * np.eye(p)))]
+    theta = parameters.theta(logs)
+    columns = [theta, *(parameters.theta(logs + _STEP * row) for row in np.eye(p)), *[theta] * (2 * len(at))]
     cost, gradient, information = 0.0, np.zeros(p), np.zeros((p, p))
+    swings: list[SwingEquations] = []
     for stretch, own in zip(stretches, gains, strict=True):
-        residuals = whitened(innovations(columns, stretch, own)[0], own).reshape(p + 1, -1)
-        jacobian = (residuals[1:] - residuals[0]) / _STEP
-        cost += 0.5 * float(residuals[0] @ residuals[0])
+        beside = swings_beside(stretch.swing, at)
+        every = np.concatenate((np.repeat(stretch.swing[None], p, axis=0), beside))
+        residuals = whitened(innovations(columns, stretch, own, every)[0], own).reshape(len(columns), -1)
+        jacobian = (residuals[1 : p + 1] - residuals[0]) / _STEP
         gradient += jacobian @ residuals[0]
         information += jacobian @ jacobian.T
-    return cost, gradient, information
+        swing = stretch.swing[at].ravel()
+        cost += 0.5 * float(residuals[0] @ residuals[0]) + 0.5 * float(swing @ swing) / SWING_SD**2
+        response = (residuals[p + 1 :] - residuals[0]) / SWING_STEP
+        swings.append(
+            SwingEquations(
+                jacobian @ response.T,
+                response @ response.T + np.eye(len(response)) / SWING_SD**2,
+                response @ residuals[0] + swing / SWING_SD**2,
+            )
+        )
+    return NormalEquations(cost, gradient, information, swings)
+
+
+def _only(swing: FloatArray, at: CountArray) -> FloatArray:
+    """Of the rollers `at`; the others are round."""
+    found = np.zeros_like(swing)
+    found[at] = swing[at]
+    return found
+
+
+def _moved(swing: FloatArray, at: CountArray, by: FloatArray) -> FloatArray:
+    found = swing.copy()
+    found[at] += by
+    return found
 
 
 def _cost(parameters: Parameters, logs: FloatArray, stretches: list[Stretch], gains: list[Gains]) -> float:
-    """As the first of `_normal_equations`; what overflows is no candidate."""
+    """As that of `normal_equations`; what overflows is no candidate."""
     total = 0.0
     for stretch, own in zip(stretches, gains, strict=True):
+        total += 0.5 * float(np.square(stretch.swing).sum()) / SWING_SD**2
         total += 0.5 * float(np.square(whitened(innovations([parameters.theta(logs)], stretch, own)[0], own)).sum())
     return total if np.isfinite(total) else np.inf
 

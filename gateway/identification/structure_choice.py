@@ -5,7 +5,7 @@ that explains nothing costs the volume of prior that it excludes. Held-out likel
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import sqrt
 
 import numpy as np
@@ -15,6 +15,7 @@ from gateway.core.line import Line
 from gateway.core.recording import Recording
 from gateway.core.signals import FloatArray
 from gateway.core.theta import Noise
+from gateway.identification.eccentric_rollers import ENOUGH, eccentric_rollers
 from gateway.identification.estimate import Structure
 from gateway.identification.prediction_error import Fit, fit, fit_stretches, score, stretches_of
 from gateway.identification.prior import Prior, prior_of
@@ -22,8 +23,8 @@ from gateway.identification.prior import Prior, prior_of
 SHARED = (
     Structure(), Structure(coulomb=True), Structure(torque_lag=True), Structure(coulomb=True, torque_lag=True)
 )  # fmt: skip
-ENOUGH = 3.0  #: log evidence, 20 to 1, that a richer structure needs beyond a simpler one
 SURE = 3.0  #: standard errors by which held-out data must prefer another structure
+_LOOKS = 3  #: for eccentric rollers, each with the noise that is left without those found before
 ONE_SPEED = 1.3  #: the fastest over the slowest: less is one speed
 
 
@@ -62,9 +63,9 @@ def choose(
 ) -> Choice:
     """Fit the structures of the paper, with Coulomb friction and with torque lag, then with rollers that differ.
 
-    Where rollers differ is only asked of the structure that was best without it, and of what that adds to it: each
-    question is of one term. `measured` as in `Prior.measured`; `priors` in place of the line's file. Raises
-    Unpredictable.
+    Each with the rollers that are eccentric, where the data show any. Where rollers differ is only asked of the
+    structure that was best without it, and of what that adds to it: each question is of one term. `measured` as in
+    `Prior.measured`; `priors` in place of the line's file. Raises Unpredictable.
     """
 
     def prior(structure: Structure) -> Prior:
@@ -72,26 +73,33 @@ def choose(
         return own.measured(measured or {})
 
     first = fit(recordings, prior(SHARED[-1]), noise0, unwinder)
-    stretches = first.stretches
-    held = stretches_of(held_out, stretches[0].unwinder) if held_out else None
-    candidates = [_candidate(SHARED[-1], first, held)]
+    held = stretches_of(held_out, first.stretches[0].unwinder) if held_out else None
+    candidates = [_candidate(first, held)]
+    for _ in range(_LOOKS):
+        eccentric = eccentric_rollers(first)
+        if eccentric == first.parameters.structure.eccentric:
+            break
+        own = prior(replace(SHARED[-1], eccentric=eccentric))
+        first = fit_stretches(first.stretches, own, first.noise, start=first.logs)
+        candidates = [*candidates[:1], _candidate(first, held)]
+    eccentric, stretches = first.parameters.structure.eccentric, first.stretches
     for structure in SHARED[:-1]:
-        candidates.append(_candidate(structure, fit_stretches(stretches, prior(structure), first.noise), held))
+        own = prior(replace(structure, eccentric=eccentric))
+        candidates.append(_candidate(fit_stretches(stretches, own, first.noise), held))
     best = _chosen(candidates)
-    apart = Structure(True, best.structure.coulomb, best.structure.torque_lag)
-    own = prior(apart)
+    own = prior(replace(best.structure, per_roller=True))
     start = own.parameters.logs(best.fitted.parameters.theta(best.fitted.logs))
-    candidates.append(_candidate(apart, fit_stretches(stretches, own, best.fitted.noise, start=start), held))
+    candidates.append(_candidate(fit_stretches(best.fitted.stretches, own, best.fitted.noise, start=start), held))
     candidates.sort(key=lambda candidate: -candidate.evidence)
     chosen = _chosen(candidates)
     return Choice(candidates, chosen, _cautions(candidates, chosen, stretches, held or []))
 
 
-def _candidate(structure: Structure, fitted: Fit, held: list[Stretch] | None) -> Candidate:
+def _candidate(fitted: Fit, held: list[Stretch] | None) -> Candidate:
+    structure = fitted.parameters.structure
     if held is None:
         return Candidate(structure, fitted, None, None)
-    theta = fitted.parameters.theta(fitted.logs)
-    white = np.concatenate([predict(theta, fitted.noise, stretch).whitened.ravel() for stretch in held])
+    white = np.concatenate([predict(fitted.theta, fitted.noise, stretch).whitened.ravel() for stretch in held])
     return Candidate(structure, fitted, score(fitted, held), float(np.mean(np.square(white))))
 
 
@@ -126,5 +134,5 @@ def _cautions(
 
 def _log_likelihood(candidate: Candidate, held: list[Stretch]) -> FloatArray:
     """Of every sample, (k,)."""
-    theta = candidate.fitted.parameters.theta(candidate.fitted.logs)
+    theta = candidate.fitted.theta
     return np.concatenate([predict(theta, candidate.fitted.noise, stretch).log_likelihood for stretch in held])

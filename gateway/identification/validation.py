@@ -183,7 +183,7 @@ def _name_line(theta: Theta, predicted: list[Predicted], findings: list[str], ad
     findings.append(f"innovations of {name} have a spectral line at {line.frequency_hz:.2f} Hz")
     if len(near):
         which = f"roller {near[0] + 1}" if len(near) == 1 else "the rollers"
-        advice.append(f"that is a turn of {which}: eccentricity, which the model does not have")
+        advice.append(f"that is a turn of {which}: eccentricity beyond what the model has")
     else:
         advice.append("something turns or swings at that frequency: the unwinder, a gear, a dancer")
 

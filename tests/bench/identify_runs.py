@@ -154,7 +154,7 @@ def chosen(plant: Plant, data: list[Recording], held_out: dict[float, list[Recor
     unseen = [one for some in held_out.values() for one in some]
     choice = choose(data, line, Noise(), unseen)
     fitted = choice.fitted
-    theta = fitted.parameters.theta(fitted.logs)
+    theta = fitted.theta
     normalised = {
         speed: float(np.mean([predict(theta, fitted.noise, part).normalised for part in stretches_of(some, "held")]))
         for speed, some in held_out.items()

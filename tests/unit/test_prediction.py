@@ -169,6 +169,25 @@ def test_what_the_model_imagines_it_predicts():
     assert np.allclose(found.normalised_squared, 1.0, atol=0.35)
 
 
+def test_a_swing_is_learned_from_what_the_model_imagines():
+    """0.4 % at roller 2, which nobody is told but by its amplitude: it is found, and innovations are as they should be;
+    a model of round rollers has larger ones."""
+    believed = theta()
+    stretch = stretch_of(recording(samples=1500, speed=0.1))
+    swing = np.zeros((3, 2))
+    swing[1] = 2.4e-3, -3.2e-3
+    stretch = replace(stretch, swing=swing)
+    gains = gains_of(believed, NOISE, stretch)
+    white = np.random.default_rng(1).standard_normal((stretch.predictions, 6))
+    drawn = np.linalg.solve(gains.root[gains.which], white[:, :, None])[:, :, 0]
+    line = replace(imagined(believed, stretch, gains, drawn), swing=np.zeros((3, 2)))
+    found = predict(replace(believed, eccentricity=np.array([0.0, 4e-3, 0.0])), NOISE, line)
+    assert found.swung is not None
+    assert np.allclose(found.swung.before[-1], swing, atol=4e-4)
+    assert found.normalised == pytest.approx(1.0, abs=0.05)
+    assert found.log_likelihood.sum() > predict(believed, NOISE, line).log_likelihood.sum() + 10.0
+
+
 def test_a_change_of_speed_is_a_new_operating_point():
     made = recording(samples=400)
     v0 = np.where(np.arange(400) < 200, 0.05, 0.1)
