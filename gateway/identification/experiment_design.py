@@ -32,7 +32,7 @@ from gateway.identification.experiment_words import percent, speeds_text, too_li
 
 PREFERRED_S = 5.0  #: at each speed
 LONGEST_LEG_S = 60.0
-KNOWN_S = 10.0  #: of a leg are simulated; what a longer one tells is as its second half goes on
+KNOWN_S = 10.0  #: of a leg are simulated, unless it is brief; what a longer one tells is as its second half goes on
 GRID_S = 0.5  #: of durations
 GRID_N = 0.25  #: of amplitudes; no experiment has a smaller one
 UNIT_N = 2.0  #: amplitude of the run from which others are scaled
@@ -91,6 +91,7 @@ def design_experiment(
     drawing = _Drawing(
         Foresight(line, config, base, recipe.speed_m_per_s if speed_m_per_s is None else speed_m_per_s),
         wanted or Wanted(),
+        PREFERRED_S if brief else KNOWN_S,
         seed,
     )
     speeds = drawing.speeds(speeds_m_per_s)
@@ -124,7 +125,7 @@ def design_experiment(
 
 @dataclass(frozen=True)
 class _Told:
-    """Information of all legs of one plant up to KNOWN_S: I = I_00 + a (I_01 + I_01') + a^2 I_11, (times, p, p)."""
+    """Information of all legs of one plant by time: I = I_00 + a (I_01 + I_01') + a^2 I_11, (times, p, p)."""
 
     still: FloatArray
     mixed: FloatArray
@@ -145,6 +146,7 @@ class _Drawing:
 
     foresight: Foresight
     wanted: Wanted
+    known_s: float  #: of a leg that are simulated
     seed: int
 
     @property
@@ -204,7 +206,7 @@ class _Drawing:
         period_s, task, base = self.line.control.period_s, self.foresight.task, self.foresight.base_n
         config, setup = self.foresight.config, self.foresight.setup
         unit = self.experiment(UNIT_N, dwell, speeds, PREFERRED_S)
-        moves = setpoints(unit.model_copy(update={"legs": [Leg(duration_s=KNOWN_S)]}), base, period_s)
+        moves = setpoints(unit.model_copy(update={"legs": [Leg(duration_s=self.known_s)]}), base, period_s)
         tension, grid = np.vstack((base, moves)), round(GRID_S / period_s)
         sums: list[list[tuple[FloatArray, ...]]] = [[] for _ in models]
         for speed in speeds:
