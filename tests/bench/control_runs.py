@@ -16,7 +16,7 @@ import numpy as np
 from rich.progress import Progress
 
 from gateway.cli.rehearse_designs import mpc_without_observer, truth_of
-from gateway.cli.stepped import SteppedResult, run_scenario
+from gateway.cli.stepped import CommandRefused, SteppedResult, run_scenario
 from gateway.cli.tiers import TIERS, Tier
 from gateway.control.design import (
     DesignRefused,
@@ -92,7 +92,7 @@ class Trace:
 
 @dataclass(frozen=True)
 class Outcome:
-    metrics: RunMetrics | None  #: None: no design was offered
+    metrics: RunMetrics | None  #: None: no design was offered, or the change was refused
     unsafe: int = 0
     refused: str = ""
     stopped: str | None = None  #: when and why the gateway stopped the line: an RMSE that is worth nothing
@@ -138,14 +138,17 @@ def task_on(tier: Tier, case: Scenario, model: WebModel) -> DesignTask:
 
 
 def run(job: Job) -> Outcome:
-    """One run. A design that is refused is an outcome too."""
+    """One run. A design that is refused is an outcome too, and a line that is stopped before anything has changed."""
     tier, case = TIERS[job.tier], CASES[job.case]
     known, truth = (plant_named(name, job.boundary, job.case) for name in (job.known, job.truth))
     try:
         config = LAWS[job.law](task_on(tier, case, truth_of(known)))
     except DesignRefused as refusal:
         return Outcome(None, refused=str(refusal))
-    found = run_scenario(line_of(tier, case), config, tier.plant(truth), tier.scenario(case), job.seed)
+    try:
+        found = run_scenario(line_of(tier, case), config, tier.plant(truth), tier.scenario(case), job.seed)
+    except CommandRefused as refused:
+        return Outcome(None, refused=str(refused))
     traced = job.seed == 0 and job.boundary == "free" and job.truth.partition("-")[0] not in DRAWN
     return Outcome(found.metrics, found.unsafe_events, stopped=found.stopped, trace=_trace(found) if traced else None)
 
