@@ -49,7 +49,7 @@ bench-wire: setup ## the demonstration in real time, both laws, three seeds
 bench-processes: setup ## processes killed in mid-run, judged by the recorder
 	@$(PY) -m tests.bench.processes $(ARGS)
 
-bench-control: setup ## every law under every tier beside the oracle (about an hour; ARGS="--parts a,c --seeds 3 --tiers A,B")
+bench-control: setup ## every law under every tier beside the oracle (about an hour and a half; ARGS="--parts a,c --seeds 3 --tiers A,B")
 	@$(PY) -m tests.bench.control $(ARGS)
 
 bench-monitor: setup ## unsafe configurations forced in, healthy ones left alone (about 15 min; ARGS="--unsafe 50 --healthy 100")

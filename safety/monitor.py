@@ -10,7 +10,6 @@ from math import ceil
 import numpy as np
 
 from gateway.control.deviation import Measured
-from gateway.core.experiment import turns
 from gateway.core.line import Line
 from gateway.core.signals import BoolArray, FloatArray
 from safety.actions import Action, Finding
@@ -56,7 +55,7 @@ def look(limits: MonitorLimits, state: MonitorState, torque_nm: FloatArray, cut:
         state.before_nm = torque_nm
         state.way, state.counts = np.zeros(limits.n), np.zeros(limits.n)
         return []
-    state.way, turned = turns(state.way, torque_nm - state.before_nm, limits.reversal_nm)
+    state.way, turned = _turns(state.way, torque_nm - state.before_nm, limits.reversal_nm)
     state.before_nm = torque_nm
     state.turned.append(turned)
     state.counts += turned
@@ -92,3 +91,9 @@ def recoverable(
         return []
     short = recovery.shortfall(measured, setpoint_n, in_flight_nm[: recovery.depth], torque_nm, remembered)
     return [] if short is None else [Finding("recoverability", Action.STOP, str(short))]
+
+
+def _turns(way: FloatArray, move_nm: FloatArray, reversal_nm: float) -> tuple[FloatArray, BoolArray]:
+    """Which torques turn round by a period's `move_nm`, and -1 or 1 for the last move of each that counts; (n,) each."""
+    now = np.where(np.abs(move_nm) > reversal_nm, np.sign(move_nm), way)
+    return now, now * way < 0.0

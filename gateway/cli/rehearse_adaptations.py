@@ -34,7 +34,11 @@ IN_SERVICE = "lqi"  #: of a round's designs, the one under which the next round'
 
 
 class NoExperiment(Exception):
-    """The experiment could not be run; the text says why."""
+    """The experiment could not be run, or not to its end; the text says why."""
+
+    def __init__(self, text: str, unsafe_events: int = 0) -> None:
+        super().__init__(text)
+        self.unsafe_events = unsafe_events  #: until then
 
 
 @dataclass(frozen=True)
@@ -52,29 +56,33 @@ def adapt(
     seed: int,
     rounds: int,
     tell: Callable[[str], None] = lambda text: None,
+    first: Experiment | None = None,
 ) -> list[Adapted]:
     """Round after round, each on the data of all before it as well. Ends early where a round brings no model.
 
-    The line stands as `scenario` has it at the begin when an experiment is made.
+    The line stands as `scenario` has it at the begin when an experiment is made. `first` is the first experiment, where
+    `first_experiment` has designed it already: it depends on nothing that is true of the plant.
     """
     found: list[Adapted] = []
     recordings: list[Recording] = []
     in_service: Controller = design_lqi(task_of(line))
     believed = line  #: by whose values and tolerances the next experiment is designed
     for number in range(1, rounds + 1):
-        began_s = time.perf_counter()
+        began_s, unsafe = time.perf_counter(), 0
 
         def doing(text: str, number: int = number) -> None:
             tell(f"adaptation {number}: {text}")
 
         try:
             doing("experiment")
-            experiment = _experiment(believed, in_service, scenario, number)
-            recordings.append(_recorded(line, in_service, plant, scenario, experiment, seed + SEEDS_APART * number))
+            experiment = first if first and number == 1 else _experiment(believed, in_service, scenario, number)
+            recording, unsafe = _recorded(line, in_service, plant, scenario, experiment, seed + SEEDS_APART * number)
+            recordings.append(recording)
             identified = identify(recordings, line, Noise(), time.perf_counter, tell=doing)
         except (NoExperiment, NotIdentified) as refused:
             reasons = refused.reasons if isinstance(refused, NotIdentified) else [str(refused)]
-            found.append(Adapted(_result(number, recordings, None, reasons, time.perf_counter() - began_s), []))
+            unsafe = refused.unsafe_events if isinstance(refused, NoExperiment) else unsafe
+            found.append(Adapted(_result(number, recordings, None, reasons, unsafe, time.perf_counter() - began_s), []))
             break
         estimate = identified.estimate
         task = task_on(line, estimate.theta, estimate.noise)
@@ -85,12 +93,17 @@ def adapt(
         ]
         found.append(
             Adapted(
-                _result(number, recordings, identified, [], time.perf_counter() - began_s),
+                _result(number, recordings, identified, [], unsafe, time.perf_counter() - began_s),
                 [(design, task) for design in designs],
             )
         )
         in_service, believed = _next_in_service(designs, task, in_service), _believing(line, estimate.theta)
     return found
+
+
+def first_experiment(line: Line, scenario: Scenario) -> Experiment:
+    """That of the first round. Raises NoExperiment."""
+    return _experiment(line, design_lqi(task_of(line)), scenario, 1)
 
 
 def _next_in_service(designs: Sequence[Design], task: DesignTask, before: Controller) -> Controller:
@@ -132,15 +145,15 @@ def _experiment(believed: Line, config: Controller, scenario: Scenario, seed: in
 
 def _recorded(
     line: Line, config: Controller, plant: Plant, scenario: Scenario, experiment: Experiment, seed: int
-) -> Recording:
-    """Raises NoExperiment where the line refuses it or it is aborted."""
+) -> tuple[Recording, int]:
+    """And unsafe events at the drives. Raises NoExperiment where the line refuses it or it is aborted."""
     loop = SteppedLoop(line, config, plant, seed)
     loop.begin_in_production(np.array(scenario.tension_n), scenario.speed_m_per_s)
     loop.step(round(SETTLE_S / line.control.period_s))
     try:
-        return run_experiment(loop, experiment)
+        return run_experiment(loop, experiment), loop.truth.recorder.unsafe_total
     except CommandRefused as refused:
-        raise NoExperiment(str(refused)) from refused
+        raise NoExperiment(str(refused), loop.truth.recorder.unsafe_total) from refused
 
 
 def _no_longer(experiment: Experiment) -> Experiment:
@@ -150,11 +163,14 @@ def _no_longer(experiment: Experiment) -> Experiment:
 
 
 def _result(
-    number: int, recordings: Sequence[Recording], identified: Identified | None, refused: list[str], wall_s: float
-) -> AdaptationResult:
+    number: int, recordings: Sequence[Recording], identified: Identified | None, refused: list[str], unsafe: int,
+    wall_s: float,
+) -> AdaptationResult:  # fmt: skip
     data_s = sum(recording.samples * recording.period_s for recording in recordings)
     if identified is None:
-        return AdaptationResult(number=number, data_s=data_s, refused=refused, wall_s=round(wall_s, 1))
+        return AdaptationResult(
+            number=number, data_s=data_s, refused=refused, unsafe_events=unsafe, wall_s=round(wall_s, 1)
+        )
     estimate = identified.estimate
     return AdaptationResult(
         number=number,
@@ -168,5 +184,6 @@ def _result(
         valid=identified.validation.valid,
         findings=[*identified.validation.findings, *identified.choice.cautions],
         refused=[],
+        unsafe_events=unsafe,
         wall_s=round(wall_s, 1),
     )

@@ -177,7 +177,8 @@ def _result(
         without_term=without_term(plant),
         rounds=rounds,
         configurations=found,
-        unsafe_events=sum(case.unsafe_events for one in found for case in one.cases),
+        unsafe_events=sum(case.unsafe_events for one in found for case in one.cases)
+        + sum(one.unsafe_events for one in rounds),
         wall_s=round(wall_s, 1),
     )
 

@@ -76,6 +76,7 @@ class AdaptationResult(Strict):
     valid: bool = False  #: whether the model holds there
     findings: list[str] = []  #: what speaks against it
     refused: list[str]  #: why there is no model
+    unsafe_events: int = 0  #: in the experiment
     wall_s: float
 
 
@@ -96,5 +97,5 @@ class RehearseResult(Strict):
     without_term: list[str]  #: what the plant's file has and no model of a design: the truth's designs lack it, too
     rounds: list[AdaptationResult] = []  #: of adaptation, as far as they came
     configurations: list[ConfigurationResult]
-    unsafe_events: int  #: in all runs
+    unsafe_events: int  #: in all runs and experiments
     wall_s: float

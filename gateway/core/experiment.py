@@ -17,7 +17,7 @@ import numpy as np
 from pydantic import Field, TypeAdapter, ValidationError, model_validator
 
 from gateway.core.line import Line, Name, NonNegative, Positive, Strict
-from gateway.core.signals import BoolArray, FloatArray
+from gateway.core.signals import FloatArray
 
 LONGEST_S = 600.0
 Share = Annotated[float, Field(gt=0.0, le=1.0)]
@@ -38,9 +38,11 @@ class Abort(Strict):
 
     deviation_n: Positive  #: of a measured tension from its set-point before the experiment
     window_s: Annotated[float, Field(gt=0.0, le=60.0)] = 1.0
-    saturated_share: Share = 0.5  #: periods in which a limit cuts a torque
-    #: Periods in which the torque of a drive moves by more than `reversal_nm` after its last such move was the other
-    #: way: what a loop does that chatters or swings. Noise and the steps themselves do it now and then.
+    #: Periods in which a torque is at its greatest, or has gone one way as fast as it may for 10 ms (or a period, if
+    #: that is longer).
+    saturated_share: Share = 0.5
+    #: Periods in which the torque of a drive has come back by more than `reversal_nm` from the farthest it had gone
+    #: since it last did: what a loop does that chatters or swings. Noise and the steps themselves do it now and then.
     reversal_share: Share = 0.5
     reversal_nm: Positive = 5.0
     held_periods: Annotated[int, Field(ge=0, le=2)] = 1  #: in a row without a usable signal; more end it
@@ -200,15 +202,6 @@ def reasons_against(
     if max(speeds) > limits.speed_max_m_per_s:
         found.append(f"a leg runs at {max(speeds):g} m/s; allowed: 0 to {limits.speed_max_m_per_s:g} m/s")
     return found
-
-
-def turns(way: FloatArray, move_nm: FloatArray, reversal_nm: float) -> tuple[FloatArray, BoolArray]:
-    """Which torques have turned round by a period's `move_nm`, and -1 or 1 for the last move of each that counts.
-
-    Any shape; `way` begins as 0.
-    """
-    now = np.where(np.abs(move_nm) > reversal_nm, np.sign(move_nm), way)
-    return now, now * way < 0.0
 
 
 def _whole(time_s: float, period_s: float) -> int:

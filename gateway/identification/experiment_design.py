@@ -32,11 +32,12 @@ from gateway.identification.experiment_words import percent, speeds_text, too_li
 
 PREFERRED_S = 5.0  #: at each speed
 LONGEST_LEG_S = 60.0
-KNOWN_S = 10.0  #: of a leg are simulated; what a longer one tells is as its second half goes on
+KNOWN_S = 10.0  #: of a leg are simulated, unless it is brief; what a longer one tells is as its second half goes on
 GRID_S = 0.5  #: of durations
 GRID_N = 0.25  #: of amplitudes; no experiment has a smaller one
 UNIT_N = 2.0  #: amplitude of the run from which others are scaled
-DWELL_PERIODS = (5, 10, 20, 40)
+DWELLS_S = (0.05, 0.1, 0.2, 0.4)  #: in whole periods, at least:
+DWELL_PERIODS = 5
 FAST = 0.8  #: of the greatest speed: the faster leg, unless speeds are given; the other has half of it
 STRONG = ("stiffness_per_length", "radius_per_inertia", "friction_per_inertia")
 
@@ -90,6 +91,7 @@ def design_experiment(
     drawing = _Drawing(
         Foresight(line, config, base, recipe.speed_m_per_s if speed_m_per_s is None else speed_m_per_s),
         wanted or Wanted(),
+        PREFERRED_S if brief else KNOWN_S,
         seed,
     )
     speeds = drawing.speeds(speeds_m_per_s)
@@ -106,11 +108,15 @@ def design_experiment(
     if least < amplitude:  # what took the time was not for want of movement
         amplitude = least
         experiment, foreseen = drawing.bounded(amplitude, dwell, speeds, duration)
+    quiet_n = amplitude
+    experiment, foreseen = drawing.above_noise(experiment, foreseen, dwell, speeds, duration)
+    amplitude = max(experiment.amplitude_n)
     experiment = drawing.with_abort(experiment, foreseen)
     expected, *corners = (drawing.widths(one, amplitude, duration) for one in told)
     worst = {name: max(widths[name] for widths in (expected, *corners)) for name in COMBINATIONS}
     reasons = why(
-        experiment, line, speeds=speeds, duration_s=duration, least=duration == PREFERRED_S, most_n=most_n,
+        experiment, line, speeds=speeds, duration_s=duration, least=duration == PREFERRED_S,
+        quiet_n=quiet_n, most_n=most_n,
         needs={dwell * line.control.period_s: need for dwell, need in needs.items()}, expected=expected, worst=worst,
         foreseen=foreseen.text(), saturated_share=foreseen.saturated_share, drawn_in=drawing.foresight.drawn_in,
     )  # fmt: skip
@@ -119,7 +125,7 @@ def design_experiment(
 
 @dataclass(frozen=True)
 class _Told:
-    """Information of all legs of one plant up to KNOWN_S: I = I_00 + a (I_01 + I_01') + a^2 I_11, (times, p, p)."""
+    """Information of all legs of one plant by time: I = I_00 + a (I_01 + I_01') + a^2 I_11, (times, p, p)."""
 
     still: FloatArray
     mixed: FloatArray
@@ -140,6 +146,7 @@ class _Drawing:
 
     foresight: Foresight
     wanted: Wanted
+    known_s: float  #: of a leg that are simulated
     seed: int
 
     @property
@@ -199,7 +206,7 @@ class _Drawing:
         period_s, task, base = self.line.control.period_s, self.foresight.task, self.foresight.base_n
         config, setup = self.foresight.config, self.foresight.setup
         unit = self.experiment(UNIT_N, dwell, speeds, PREFERRED_S)
-        moves = setpoints(unit.model_copy(update={"legs": [Leg(duration_s=KNOWN_S)]}), base, period_s)
+        moves = setpoints(unit.model_copy(update={"legs": [Leg(duration_s=self.known_s)]}), base, period_s)
         tension, grid = np.vstack((base, moves)), round(GRID_S / period_s)
         sums: list[list[tuple[FloatArray, ...]]] = [[] for _ in models]
         for speed in speeds:
@@ -262,6 +269,28 @@ class _Drawing:
                 )
             amplitude_n = max(_down(0.75 * amplitude_n), GRID_N)
 
+    def above_noise(
+        self, experiment: Experiment, foreseen: Foreseen, dwell: int, speeds: Sequence[float], duration_s: float
+    ) -> tuple[Experiment, Foreseen]:
+        """The experiment, or one that is larger by as much as it takes for its data not to be refused as quiet."""
+        needs_n, most_n = self.foresight.needs_change_n, _most_n(self.line, self.foresight.base_n)
+        while foreseen.change_n < needs_n:
+            amplitude_n = max(experiment.amplitude_n)
+            steps = max(ceil(amplitude_n * needs_n / foreseen.change_n / GRID_N), round(amplitude_n / GRID_N) + 1)
+            if steps * GRID_N <= most_n:
+                wider, foreseen_then = self.bounded(steps * GRID_N, dwell, speeds, duration_s)
+                if max(wider.amplitude_n) > amplitude_n:
+                    experiment, foreseen = wider, foreseen_then
+                    continue
+            if foreseen.nominal_change_n < needs_n:
+                raise ExperimentRefused(
+                    f"with {amplitude_n:g} N either way a tension would change by {foreseen.nominal_change_n:.2g} N in "
+                    f"0.1 s, and it takes {needs_n:.2g} N to tell that from noise; limits leave no room for more: "
+                    "wider limits, another set-point, narrower tolerances, or a calmer controller"
+                )
+            break  # as far as limits allow on a lively corner of the tolerances: a slow corner may be too quiet
+        return experiment, foreseen
+
     def with_abort(self, experiment: Experiment, foreseen: Foreseen) -> Experiment:
         """Halfway from what is foreseen at worst to the tension limits, but not beyond twice what is foreseen."""
         limits, base, spans = self.line.limits, self.foresight.base_n, self.foresight.task.tension_spans
@@ -315,11 +344,11 @@ def _best_dwell(drawing: _Drawing, speeds: Sequence[float], most_n: float) -> tu
     """Periods, and what each dwell that was tried needs: an amplitude in N, or where none is enough infinity."""
     needs: dict[int, float] = {}
     lacks: dict[int, float] = {}
-    for dwell in DWELL_PERIODS:
+    for dwell in sorted({max(DWELL_PERIODS, round(dwell_s / drawing.line.control.period_s)) for dwell_s in DWELLS_S}):
         told = drawing.told(drawing.foresight.models[:1], speeds, dwell)
         needs[dwell] = drawing.least_amplitude(told, most_n)
         lacks[dwell] = drawing.lack(told, min(needs[dwell], most_n), PREFERRED_S)
-    return min(DWELL_PERIODS, key=lambda dwell: (needs[dwell], lacks[dwell])), needs
+    return min(needs, key=lambda dwell: (needs[dwell], lacks[dwell])), needs
 
 
 def _sums(left: FloatArray, right: FloatArray, per_grid: int) -> FloatArray:

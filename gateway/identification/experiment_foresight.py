@@ -18,10 +18,13 @@ from gateway.control.mpc_linear import unconstrained
 from gateway.control.rollout import Course, Setup, plants_of, simulate
 from gateway.core.controller import Controller
 from gateway.core.controller_laws import MpcConfig
-from gateway.core.experiment import Experiment, ExperimentRefused, setpoints, speed_goals, turns
+from gateway.core.experiment import Experiment, ExperimentRefused, setpoints, speed_goals
+from gateway.core.experiment_torques import Turns, at_limit, lasting_periods
 from gateway.core.line import Line
 from gateway.core.signals import FloatArray
 from gateway.core.web_model import WebModel, equilibrium_torque, reference_speeds
+from gateway.identification.regressions import MOVING, MOVING_SHARE
+from gateway.identification.regressions import WINDOW_S as MOVED_S
 
 HELD = 0.9  #: of the torque limit, for a line within the tolerances that goes at a speed
 STANDS_S = 5.0  #: for which a corner must be held before anything moves
@@ -30,6 +33,7 @@ STANDS_DELAY_S = 0.002  #: more than the line's
 AFTER_S = 1.0  #: that are watched after the end
 FASTEST_MODE = 0.5  #: of an integration step, as |eigenvalue| times its length
 WINDOW_S = 1.0  #: over which shares of periods are taken
+CLEARLY = 1.1  #: times what the assessment of data wants: noise of tensions that move is told a little too high
 
 
 @dataclass(frozen=True)
@@ -41,6 +45,8 @@ class Foreseen:
     tension_max_n: float
     saturated_share: float  #: of the periods of the worst second: a torque is at a limit
     reversal_share: float  #: a torque turns round
+    change_n: float  #: what the tension that moves least changes by in `MOVED_S`, as the assessment of data takes it
+    nominal_change_n: float  #: the same on the nominal line
 
     def text(self) -> str:
         return f"tensions from {self.tension_min_n:.1f} to {self.tension_max_n:.1f} N"
@@ -60,9 +66,9 @@ class Foresight:
         limits = line.limits
         self.low_n = limits.tension_min_n + limits.tension_margin_n  #: where tensions and set-points may go
         self.high_n = limits.tension_max_n - limits.tension_margin_n
-        # Half of what a torque may move in a period, and from a twentieth to a tenth of its limit: at short periods
-        # noise alone does the half.
-        swing_nm = max(0.5 * limits.torque_rate_nm_per_s * self.setup.period_s, 0.05 * limits.torque_nm)
+        # Half of what a torque may move in 10 ms or a period, and from a twentieth to a tenth of its limit.
+        lasting_s = lasting_periods(self.setup.period_s) * self.setup.period_s
+        swing_nm = max(0.5 * limits.torque_rate_nm_per_s * lasting_s, 0.05 * limits.torque_nm)
         self.reversal_nm = min(swing_nm, 0.1 * limits.torque_nm)
         signs = [(0.0,) * 5, *product((-1.0, 1.0), repeat=5)]
         reached = [self._reached(one) for one in signs]
@@ -88,6 +94,12 @@ class Foresight:
             for model, speed in zip(self.models, speeds, strict=True)
         )
 
+    @property
+    def needs_change_n(self) -> float:
+        """What `Foreseen.change_n` must be: with less, data are refused, since nothing moves but by noise."""
+        by_noise_n = float(np.sqrt(2.0)) * self.setup.tension_noise_n
+        return float(np.sqrt((CLEARLY * MOVING) ** 2 - 1.0)) * by_noise_n
+
     def can_go(self, speed_m_per_s: float) -> bool:
         return self.needs_nm(speed_m_per_s) <= HELD * self.line.limits.torque_nm
 
@@ -96,20 +108,23 @@ class Foresight:
         run = simulate(self.config, plants_of(self.models), self._course(experiment), self.setup, record=True)
         spans, limits = self.task.tension_spans, self.line.limits
         tension = np.nan_to_num(run.tension_n[:, :, spans], nan=inf)
-        move: FloatArray = np.diff(run.torque_nm, axis=1)
-        reach = limits.torque_rate_nm_per_s * self.setup.period_s
-        cut = (np.abs(move) >= reach * (1.0 - 1e-9)) | (np.abs(run.torque_nm[:, 1:]) >= limits.torque_nm)
-        way, turned = np.zeros((move.shape[0], move.shape[2])), np.zeros(move.shape[:2])
-        for k in range(move.shape[1]):
-            way, now = turns(way, move[:, k], self.reversal_nm)
-            turned[:, k] = now.any(axis=1)
-        window = round(WINDOW_S / self.setup.period_s)
+        torque, period_s = run.torque_nm, self.setup.period_s
+        lasting = lasting_periods(period_s)
+        reach_nm = lasting * limits.torque_rate_nm_per_s * period_s
+        cut = at_limit(torque[:, lasting:], torque[:, :-lasting], limits.torque_nm, reach_nm)
+        turns, turned = Turns(torque[:, 0], self.reversal_nm), np.zeros(torque.shape[:2])
+        for k in range(1, torque.shape[1]):
+            turned[:, k] = turns.after(torque[:, k]).any(axis=1)
+        window = round(WINDOW_S / period_s)
+        change = _changes(tension[:, 1 : 1 + experiment.periods(period_s)], max(1, round(MOVED_S / period_s)))
         return Foreseen(
             float(np.abs(tension - self.base_n[spans]).max()),
             float(tension.min()),
             float(tension.max()),
             _worst_share(np.asarray(cut.any(axis=2), dtype=np.float64), window),
             _worst_share(turned, window),
+            float(change.min()),
+            float(change[0].min()),
         )
 
     def _course(self, experiment: Experiment) -> Course:
@@ -190,6 +205,14 @@ def _setup(line: Line) -> Setup:
 
 def _is_whole(number: float) -> bool:
     return abs(number - round(number)) < 1e-6
+
+
+def _changes(tension_n: FloatArray, window: int) -> FloatArray:
+    """Of (b, k, n): root mean square over a window, of the fifth of the windows with most (b, n)."""
+    change = np.abs(tension_n[:, window:] - tension_n[:, :-window])
+    most = max(1, round(MOVING_SHARE * change.shape[1]))
+    found: FloatArray = np.sqrt(np.mean(np.partition(change, -most, axis=1)[:, -most:] ** 2, axis=1))
+    return found
 
 
 def _worst_share(had: FloatArray, window: int) -> float:

@@ -19,6 +19,7 @@ def why(
     speeds: Sequence[float],
     duration_s: float,
     least: bool,
+    quiet_n: float,
     most_n: float,
     needs: Mapping[float, float],
     expected: Mapping[str, float],
@@ -27,7 +28,8 @@ def why(
     saturated_share: float,
     drawn_in: int,
 ) -> tuple[str, ...]:
-    """`least`: the amplitude is the least that tells enough in the preferred time; `needs`: by dwell in s."""
+    """`least`: the amplitude is the least that tells enough in the preferred time; `quiet_n`: what it would be, were
+    there no noise to move tensions out of; `needs`: by dwell in s."""
     amplitude, limits, abort = max(experiment.amplitude_n), line.limits, experiment.abort
     moved = (
         "at once" if experiment.rate_n_per_s is None else f"at {experiment.rate_n_per_s:g} N/s: no steps are allowed"
@@ -36,11 +38,17 @@ def why(
         f"{1e3 * dwell_s:g} ms {'more than is allowed' if need == inf else f'{need:g} N'}"
         for dwell_s, need in needs.items()
     )
-    amplitude_why = (
-        "the least that tells what is wanted in the preferred time, on the nominal line and corners of its tolerances"
-        if least
-        else f"what keeps tensions in their band (set-points may have {most_n:g} N); time makes up for the rest"
-    )
+    if quiet_n < amplitude:
+        amplitude_why = f"{quiet_n:g} N would tell what is wanted, but tensions would move hardly more than by noise"
+    elif least:
+        amplitude_why = (
+            "the least that tells what is wanted in the preferred time, on the nominal line and corners of its "
+            "tolerances"
+        )
+    else:
+        amplitude_why = (
+            f"what keeps tensions in their band (set-points may have {most_n:g} N); time makes up for the rest"
+        )
     speeds_why = (
         "at one speed viscous and dry friction act alike, and EA and L part only through T v / L"
         if len(speeds) > 1

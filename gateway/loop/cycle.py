@@ -97,7 +97,7 @@ class Cycle:
         self.account = Account()
         self.watch = watch
         self.clock = clock
-        self.experiments = Experiments(self.setpoints, self.limits.period_s, clock, tell, simulated=simulated)
+        self.experiments = Experiments(self.setpoints, self.limits, clock, tell, simulated=simulated)
         self._record = record
         self._announce = announce
         self._times = Times(line.limits.tensioning_time_s, line.moves.stop_time_s)
@@ -119,7 +119,7 @@ class Cycle:
         cycle_s = self.clock() - tick.now_s
         if self.machine.phase in CONTROLLED and seen.usable:  # only blocks proposals: after the commands are out
             self._alarm(self.watch.controlled(self.inputs, self.setpoints, before_nm, saturated))
-        self.experiments.look(self.inputs, torque_nm, saturated, self.account.held, tick.due_s)
+        self.experiments.look(self.inputs, torque_nm, self.account.held, tick.due_s)
         self._frame(tick, saturated, cycle_s)
 
     def any_enabled(self) -> bool:

@@ -4,14 +4,17 @@ It lies over the operator's set-points and changes none of them: once it is gone
 back to them as to any other target.
 """
 
+from collections import deque
 from collections.abc import Callable
 
 import numpy as np
 
-from gateway.core.experiment import Experiment, course, experiment_hash, reasons_against, turns
+from gateway.core.experiment import Experiment, course, experiment_hash, reasons_against
+from gateway.core.experiment_torques import Turns, at_limit, lasting_periods
 from gateway.core.line import Line
 from gateway.core.signals import FloatArray, Inputs
 from gateway.loop.setpoints import Setpoints
+from safety.limits import EnvelopeLimits
 
 Tell = Callable[..., None]  #: kind, text, and what goes with it by name
 TOLD = 10  #: times on the way that its progress is told
@@ -41,8 +44,8 @@ class Share:
 class ExperimentRun:
     """An experiment from these set-points on."""
 
-    def __init__(self, experiment: Experiment, setpoints: Setpoints, period_s: float) -> None:
-        base_n = setpoints.tension_n.copy()
+    def __init__(self, experiment: Experiment, setpoints: Setpoints, limits: EnvelopeLimits) -> None:
+        period_s, base_n = limits.period_s, setpoints.tension_n.copy()
         window = max(1, round(experiment.abort.window_s / period_s))
         self.experiment = experiment
         self.hash = experiment_hash(experiment)
@@ -51,8 +54,11 @@ class ExperimentRun:
         self.begin_s: float | None = None  #: when its first period was due, as that period's frame has it
         self._base_n = base_n
         self._course = course(experiment, base_n, setpoints.speed_target_m_per_s, period_s)
-        self._torque_nm: FloatArray | None = None
-        self._way: FloatArray = np.zeros(experiment.n)  #: -1 or 1: of each drive's last move that counts
+        self._limits = limits
+        lasting = lasting_periods(period_s)
+        self._reach_nm = lasting * limits.torque_rate_nm_per_s * period_s
+        self._torque_nm: deque[FloatArray] = deque(maxlen=lasting)  #: of the periods before
+        self._turns: Turns | None = None
         self._saturated, self._reversed = Share(window), Share(window)
         self._tell_at = [-(-self.periods * part // TOLD) for part in range(1, TOLD)]
 
@@ -63,7 +69,7 @@ class ExperimentRun:
         self.done += 1
         return speed_m_per_s
 
-    def against(self, inputs: Inputs, torque_nm: FloatArray, saturated: bool, held: int) -> str:
+    def against(self, inputs: Inputs, torque_nm: FloatArray, held: int) -> str:
         """Why it must not go on after this period; empty: it may. `torque_nm` (n,) is what was applied in it."""
         abort = self.experiment.abort
         if held > abort.held_periods:
@@ -77,9 +83,10 @@ class ExperimentRun:
                 f"the tension of span {i + 1} is {away_n[i]:.1f} N away from {self._base_n[i]:g} N, "
                 f"allowed: {abort.deviation_n:g} N"
             )
+        saturated, turned = self._seen(torque_nm)
         if self._saturated.after(saturated) > abort.saturated_share:
             return _share_text("a torque was at a limit", abort.saturated_share, abort.window_s)
-        if self._reversed.after(self._turns(torque_nm)) > abort.reversal_share:
+        if self._reversed.after(turned) > abort.reversal_share:
             return _share_text(f"a torque reversed by {abort.reversal_nm:g} Nm", abort.reversal_share, abort.window_s)
         return ""
 
@@ -90,13 +97,16 @@ class ExperimentRun:
         self._tell_at.pop(0)
         return f"experiment {self.experiment.name}: {100 * self.done // self.periods} %"
 
-    def _turns(self, torque_nm: FloatArray) -> bool:
-        """Whether a drive's torque has turned round in this period, by as much as counts."""
-        before, self._torque_nm = self._torque_nm, torque_nm
-        if before is None:
-            return False
-        self._way, turned = turns(self._way, torque_nm - before, self.experiment.abort.reversal_nm)
-        return any(turned.tobytes())
+    def _seen(self, torque_nm: FloatArray) -> tuple[bool, bool]:
+        """Whether a torque is at a limit, and whether one has turned round in this period."""
+        if self._turns is None:
+            self._turns = Turns(torque_nm, self.experiment.abort.reversal_nm)
+            self._torque_nm.append(torque_nm)
+            return False, False
+        # Before there are enough, the first stands for those that were not seen.
+        saturated = at_limit(torque_nm, self._torque_nm[0], self._limits.torque_nm, self._reach_nm)
+        self._torque_nm.append(torque_nm)
+        return any(saturated.tobytes()), any(self._turns.after(torque_nm).tobytes())
 
 
 class Experiments:
@@ -105,7 +115,7 @@ class Experiments:
     def __init__(
         self,
         setpoints: Setpoints,
-        period_s: float,
+        limits: EnvelopeLimits,
         clock: Callable[[], float],
         tell: Tell | None,
         *,
@@ -113,7 +123,7 @@ class Experiments:
     ) -> None:
         self.run: ExperimentRun | None = None
         self._setpoints = setpoints
-        self._period_s = period_s
+        self._limits = limits
         self._clock = clock
         self._tell = tell
         self._simulated = simulated  #: the line is, for certain
@@ -128,7 +138,7 @@ class Experiments:
 
     def begin(self, experiment: Experiment) -> None:
         """With the next period. Between two periods only, in RUN, on set-points that stand."""
-        run = self.run = ExperimentRun(experiment, self._setpoints, self._period_s)
+        run = self.run = ExperimentRun(experiment, self._setpoints, self._limits)
         text = f"experiment {experiment.name} begins: {experiment.duration_s:g} s"
         self._say("experiment", text, run, experiment=experiment.model_dump(mode="json"))
 
@@ -144,14 +154,14 @@ class Experiments:
         kind = "experiment-abort" if reason else "experiment-end"
         self._say(kind, text, run, begin_s=run.begin_s, end_s=now_s, reason=reason)
 
-    def look(self, inputs: Inputs, torque_nm: FloatArray, saturated: bool, held: int, due_s: float) -> None:
+    def look(self, inputs: Inputs, torque_nm: FloatArray, held: int, due_s: float) -> None:
         """After a period: an experiment that is under way goes on, is complete, or must end."""
         run = self.run
         if run is None:
             return
         if run.begin_s is None:
             run.begin_s = due_s
-        if reason := run.against(inputs, torque_nm, saturated, held):
+        if reason := run.against(inputs, torque_nm, held):
             self.end(reason)
         elif run.done == run.periods:
             self.end()

@@ -7,6 +7,7 @@
     e  rollouts a second
     f  growth with the number of spans
     g  independent checks of solver and designs
+    h  after one and two adaptations: S_real under every tier, the ensemble, rollers that differ, lines beyond
 
 Writes out/bench/control.json, .md and .html; of a part of it, out/bench/control-part.*.
 """
@@ -19,6 +20,7 @@ from math import isfinite
 
 from gateway.cli.report import Section
 from gateway.cli.tiers import TIERS
+from tests.bench.control_adaptation import after_adaptation, rmse_after
 from tests.bench.control_checks import checks
 from tests.bench.control_compute import compute, p50_ms
 from tests.bench.control_ensemble import on_ensemble
@@ -32,7 +34,7 @@ from tests.bench.control_runs import LAWS, Runs
 from tests.bench.control_tables import SEEDS, Given, Part
 from tests.bench.figures import LIBRARIES, Bench
 
-PARTS = "abcdefg"
+PARTS = "abcdefgh"
 SOLVERS = ("osqp", "piqp", "clarabel", "control")
 
 
@@ -56,7 +58,12 @@ def main() -> None:
             else:
                 print(f"{name}: no figure, {value}")
         bench.tables |= {table.caption: {"heads": table.heads, "rows": table.rows} for table in part.section.tables}
-    for letter, name in (("a", "unsafe_events"), ("b", "ensemble_unsafe_events"), ("c", "sim_unsafe_events")):
+    for letter, name in (
+        ("a", "unsafe_events"),
+        ("b", "ensemble_unsafe_events"),
+        ("c", "sim_unsafe_events"),
+        ("h", "adapted_unsafe_events"),
+    ):
         if letter in parts and parts[letter].runs:
             bench.figure(name, parts[letter].unsafe, "", parts[letter].runs)
     write(given, bench, [parts[letter] for letter in sorted(parts)], drawn)
@@ -80,10 +87,14 @@ def _measured(given: Given, wanted: set[str]) -> tuple[dict[str, Part], list[Sec
         if "b" in wanted:
             with _Timed("b"):
                 parts["b"] = on_ensemble(given, runs)
+        if "h" in wanted:
+            with _Timed("h"):
+                parts["h"] = after_adaptation(given, runs)
         if "c" in wanted:
             with _Timed("c"):
                 compute_ms = p50_ms(parts["d"]) if "d" in parts else {}
-                parts["c"] = beside_the_paper(given, runs, compute_ms)
+                adapted_n = rmse_after(parts["h"]) if "h" in parts else {}
+                parts["c"] = beside_the_paper(given, runs, compute_ms, adapted_n)
     return parts, drawn
 
 

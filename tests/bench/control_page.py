@@ -13,6 +13,8 @@ from tests.bench.figures import GOALS, Bench
 
 DRAWN = ("A", "P")
 HEADLINES = {
+    "a_adapt1_s_real_tension_to_oracle": "after one adaptation on S_real, tension case",
+    "a_adapt1_s_real_velocity_to_oracle": "after one adaptation on S_real, velocity case",
     "a_mpc_observer_s_real_tension_to_oracle": "MPC with observer on S_real, tension case",
     "a_mpc_observer_s_real_velocity_to_oracle": "MPC with observer on S_real, velocity case",
     "a_lqi_s_real_tension_to_oracle": "LQI on S_real, tension case",

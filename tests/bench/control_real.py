@@ -61,8 +61,8 @@ def on_real(given: Given, runs: Runs) -> Part:
             "time mean of the squared 2-norm over the six spans. The oracle knows the plant exactly, without noise, "
             "under the same limits, sampling and latency: no controller can do better, but for noise that happens to "
             'help in a single run. The column "study" is what an independent study of the same equations found.',
-            "LQR on S_sim is the paper's Initial, MPC on S_sim its baseline. What comes after adaptation is not here "
-            "yet; the design on S_real is where it leads.",
+            "LQR on S_sim is the paper's Initial, MPC on S_sim its baseline. The design on S_real is where adaptation "
+            "leads; how far it gets is told under After adaptation.",
         ),
         tuple(tables),
     )

@@ -16,7 +16,7 @@ import numpy as np
 from rich.progress import Progress
 
 from gateway.cli.rehearse_designs import mpc_without_observer, truth_of
-from gateway.cli.stepped import SteppedResult, run_scenario
+from gateway.cli.stepped import CommandRefused, SteppedResult, run_scenario
 from gateway.cli.tiers import TIERS, Tier
 from gateway.control.design import (
     DesignRefused,
@@ -38,10 +38,11 @@ from gateway.core.signals import FloatArray
 from gateway.core.web_model import WebModel
 from sim_plant.physics import STEP_S, equilibrium
 from sim_plant.plant import Plant, load_plant
-from tests.bench.control_plants import FASTEST_M_PER_S, random_plant
+from tests.bench.control_plants import FASTEST_M_PER_S, random_plant, stressed_plant, uneven_plant
 from tests.bench.oracle import Terms, by_clarabel, by_piqp, oracle
 
 Boundary = Literal["free", "continued"]  #: T_0 = T_{n+1} = 0; or those of the first and the last span
+DRAWN = {"random": random_plant, "uneven": uneven_plant}
 CASES = {case.name: case for case in PAPER}
 
 # What charts show of a run: densely around the change, sparsely until the line is at rest.
@@ -91,9 +92,10 @@ class Trace:
 
 @dataclass(frozen=True)
 class Outcome:
-    metrics: RunMetrics | None  #: None: no design was offered
+    metrics: RunMetrics | None  #: None: no design was offered, or the change was refused
     unsafe: int = 0
     refused: str = ""
+    stopped: str | None = None  #: when and why the gateway stopped the line: an RMSE that is worth nothing
     trace: Trace | None = None  #: of the first seed on a plant of the paper
 
     @property
@@ -109,9 +111,12 @@ class Best:
 
 @cache
 def plant_named(name: str, boundary: Boundary = "free", case: str = "") -> Plant:
-    """A plant of the paper by the name of its file, or `random-SEED` of the ensemble."""
-    if name.startswith("random-"):
-        plant = random_plant(int(name.removeprefix("random-")))
+    """A plant by the name of its file, `stressed`, or `random-SEED` and `uneven-SEED` of the ensemble."""
+    kind, _, seed = name.partition("-")
+    if kind in DRAWN:
+        plant = DRAWN[kind](int(seed))
+    elif name == "stressed":
+        plant = stressed_plant()
     else:
         plant = load_plant(f"sim_plant/plants/{name}.toml")
     if boundary == "free":
@@ -133,16 +138,19 @@ def task_on(tier: Tier, case: Scenario, model: WebModel) -> DesignTask:
 
 
 def run(job: Job) -> Outcome:
-    """One run. A design that is refused is an outcome too."""
+    """One run. A design that is refused is an outcome too, and a line that is stopped before anything has changed."""
     tier, case = TIERS[job.tier], CASES[job.case]
     known, truth = (plant_named(name, job.boundary, job.case) for name in (job.known, job.truth))
     try:
         config = LAWS[job.law](task_on(tier, case, truth_of(known)))
     except DesignRefused as refusal:
         return Outcome(None, refused=str(refusal))
-    found = run_scenario(line_of(tier, case), config, tier.plant(truth), tier.scenario(case), job.seed)
-    traced = job.seed == 0 and job.boundary == "free" and not job.truth.startswith("random")
-    return Outcome(found.metrics, found.unsafe_events, trace=_trace(found) if traced else None)
+    try:
+        found = run_scenario(line_of(tier, case), config, tier.plant(truth), tier.scenario(case), job.seed)
+    except CommandRefused as refused:
+        return Outcome(None, refused=str(refused))
+    traced = job.seed == 0 and job.boundary == "free" and job.truth.partition("-")[0] not in DRAWN
+    return Outcome(found.metrics, found.unsafe_events, stopped=found.stopped, trace=_trace(found) if traced else None)
 
 
 def bound(asked: Bound) -> Best:
@@ -174,10 +182,13 @@ class Runs:
     """Runs in other processes. What was run before is not run again. Use as a context."""
 
     def __init__(self, workers: int | None = None) -> None:
+        # What they compute is small: threads of linear algebra would only stand in each other's way.
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
         # Fresh processes: threads of compiled code do not survive a fork.
         self._pool = ProcessPoolExecutor(workers or os.cpu_count(), mp_context=get_context("spawn"))
         self._outcomes: dict[Job, Outcome] = {}
         self._bests: dict[Bound, Best] = {}
+        self._others: dict[Callable[[Any], Any], dict[Any, Any]] = {}
 
     def __enter__(self) -> Self:
         return self
@@ -192,6 +203,10 @@ class Runs:
     def best(self, asked: Sequence[Bound], title: str = "oracle") -> list[Best]:
         """The oracle's answers, in the order of the questions."""
         return _all(self._bests, asked, self.each, bound, title)
+
+    def every(self, function: Callable[[Any], Any], asked: Sequence[Any], title: str) -> list[Any]:
+        """`function` of each of `asked`, in their order."""
+        return _all(self._others.setdefault(function, {}), asked, self.each, function, title)
 
     def each(self, function: Callable[[Any], Any], given: Sequence[Any], title: str) -> Iterable[Any]:
         """`function` of each, in its order."""

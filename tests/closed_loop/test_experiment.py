@@ -97,7 +97,7 @@ def test_what_was_foreseen_is_sent_period_by_period_and_then_the_base(shape, rat
 def test_a_real_line_refuses():
     loop = producing()
     cycle = loop.cycle
-    cycle.experiments = Experiments(cycle.setpoints, 0.01, lambda: loop.now_s, None, simulated=False)
+    cycle.experiments = Experiments(cycle.setpoints, cycle.limits, lambda: loop.now_s, None, simulated=False)
     reply = loop.command(RunExperiment(experiment=asked()))
     assert not reply.ok and "is judged and approved first" in reply.reasons[0]
     loop.step(50)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gateway.cli.stepped import CommandRefused
+from gateway.cli.stepped import CommandRefused, SteppedLoop
 from gateway.cli.stepped_experiment import run_experiment
 from gateway.control.design import design_lqg, design_lqi, task_of
 from gateway.control.rollout import Course, Setup
@@ -13,6 +13,7 @@ from gateway.core.telemetry import frame_dtype
 from gateway.core.theta import Noise
 from gateway.core.web_model import WebModel
 from gateway.identification import experiment_information as information
+from gateway.identification.assessment import assess
 from gateway.identification.experiment_design import PREFERRED_S, Wanted, design_experiment
 from tests.closed_loop.conftest import demo_line
 from tests.closed_loop.recorded import per_roller, real_plant
@@ -150,6 +151,20 @@ def test_more_precision_takes_more_movement_or_time():
     fine = design_experiment(line, config, wanted=Wanted(0.0045, 0.03))
     assert cost(coarse) < cost(fine)
     assert coarse.experiment.legs[1].duration_s - 1.0 == PREFERRED_S
+
+
+def test_tensions_move_by_more_than_noise_though_less_would_tell_enough():
+    line = demo_line(2)
+    config = design_lqi(task_of(line))
+    found = design_experiment(line, config, wanted=Wanted(0.05, 0.5))
+    needs_n = 5.0 * np.sqrt(2.0) * 0.1  # what the assessment of data wants
+    assert found.foreseen.change_n > needs_n and found.experiment.amplitude_n[0] > 0.25
+    assert "0.25 N would tell what is wanted, but tensions would move hardly more than by noise" in found.reasons[0]
+    plant = real_plant().model_copy(update={"spans": 2})
+    loop = SteppedLoop(line, config, plant, 0)
+    loop.begin_in_production(np.array(line.recipes[0].tension_n), line.recipes[0].speed_m_per_s)
+    loop.step(20)
+    assert assess(run_experiment(loop, found.experiment), line).refusals == ()
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,8 @@
 import pytest
 
 from gateway.cli.rehearse import cases_of, rehearse
+from gateway.cli.rehearse_adaptations import adapt, first_experiment
+from gateway.cli.tiers import A_FAST
 from gateway.core.scenario import Scenario
 from tests.closed_loop.recorded import demonstration_line, real_plant
 
@@ -59,6 +61,14 @@ def test_designs_on_what_was_found_are_worth_those_on_the_truth(rehearsed):
     for one in configurations:
         assert one.cases[0].unsafe_events == 0
         assert one.cases[0].rmse_n < 1.02 * rmse[f"truth-{one.name[7:]}"]
+
+
+def test_at_a_short_period_noise_ends_no_experiment():
+    case = cases_of(demonstration_line(2), plant_of_two(), [STEP], A_FAST)[0]
+    first = first_experiment(case.line, case.scenario)
+    assert first.abort.saturated_share < 0.7 and first.abort.reversal_share < 0.7  # noise is not what it ends by
+    (only,) = adapt(case.line, case.plant, case.scenario, 3, 1, first=first)
+    assert only.result.refused == [] and only.result.unsafe_events == 0 and only.result.valid
 
 
 def test_a_line_that_tells_nothing_brings_no_model_and_no_designs():

@@ -21,8 +21,8 @@ from gateway.core.experiment import (
     setpoints,
     signs,
     speed_goals,
-    turns,
 )
+from gateway.core.experiment_torques import Turns, at_limit, lasting_periods
 from gateway.core.line_file import load_line
 from gateway.core.line_template import line_template
 from gateway.core.messages import RunExperiment, in_words, parse_command
@@ -148,12 +148,40 @@ def test_a_line_has_a_say_in_what_is_sent():
     assert "span 1 is draw-controlled" in " ".join(reasons_against(experiment(), drawn, BASE, 0.01))
 
 
-def test_a_torque_turns_round_when_a_move_that_counts_goes_the_other_way():
-    way, seen = np.zeros(1), []
-    for move in (3.0, 0.5, -0.5, 3.0, -3.0, 0.0, 0.9, 3.0):
-        way, turned = turns(way, np.array([move]), 1.0)
-        seen.append(bool(turned[0]))
-    assert seen == [False, False, False, False, True, False, False, True]
+def test_a_torque_turns_round_when_it_comes_back_by_what_counts_in_however_many_periods():
+    turns, seen = Turns(np.zeros(1), 1.0), []
+    for torque in (3.0, 3.5, 3.0, 6.0, 5.4, 4.9, 4.0, 4.9, 5.1, 1.0):
+        seen.append(bool(turns.after(np.array([torque]))[0]))
+    assert seen == [False, False, False, False, False, True, False, False, True, True]
+
+
+def test_noise_turns_torques_round_no_more_than_it_does_and_each_by_itself():
+    """Against a zigzag that is counted by its extremes."""
+    torque = np.cumsum(np.random.default_rng(3).normal(size=(400, 2)), axis=0)
+    turns = Turns(torque[0], 2.0)
+    found = np.sum([turns.after(row) for row in torque[1:]], axis=0)
+    for column, count in zip(torque.T.tolist(), found.tolist(), strict=True):
+        extremes, way = [column[0]], 0
+        for value in column:
+            if way * (value - extremes[-1]) > 0 or (way == 0 and abs(value - extremes[0]) > 2.0):
+                if way == 0:
+                    way = 1 if value > extremes[0] else -1
+                    extremes.append(value)
+                else:
+                    extremes[-1] = value
+            elif way and abs(value - extremes[-1]) > 2.0:
+                extremes.append(value)
+                way = -way
+        assert count == len(extremes) - 2 > 20
+
+
+@pytest.mark.parametrize(("period_s", "lasting"), [(0.001, 10), (0.002, 5), (0.01, 1), (0.05, 1)])
+def test_a_torque_is_at_a_limit_after_a_way_of_10_ms_whatever_the_period(period_s, lasting):
+    assert lasting_periods(period_s) == lasting
+    reach = lasting * period_s * 1000.0
+    before = np.array([0.0, 0.0, 0.0, 60.0])
+    moved = np.array([reach, -reach, 0.9 * reach, 60.0])
+    assert at_limit(moved, before, 60.0, reach).tolist() == [True, True, False, True]
 
 
 def test_the_largest_experiment_fits_into_a_command():
