@@ -1,0 +1,146 @@
+"""The judge of the gate: whether a configuration is unsafe on the true line, and whether refusing it would be wrong."""
+
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+
+from gateway.core.controller import Controller
+from gateway.core.controller_laws import MpcConfig
+from gateway.core.line import Line
+from tests.independent.cases import fastest, measuring_cases, trying_cases
+from tests.independent.runs import Case, Found, simulated
+from tests.independent.truth import Truth, stressed
+
+EXTRA_DELAY_S = 0.004  #: that a good configuration stands on the true line
+AROUND = 0.05  #: the rules' stress is tried on corners of so much around the truth
+CORNERS = 6  #: drawn of the 32
+BETTER = 0.03  #: in one metric at least
+TOLERATED = 0.25  #: of the gate's own tolerance: what no metric may be worse by
+FAMILIES = ("stiffness_n", "length_m", "radius_m", "inertia_kg_m2", "friction_nms_per_rad")
+
+
+@dataclass(frozen=True)
+class Metrics:
+    """On the true line, of the worst span or of all cases together."""
+
+    steps_rmse_n: float
+    moves_rmse_n: float
+    overshoot_n: float
+    settling_s: float
+
+
+@dataclass(frozen=True)
+class Judged:
+    unsafe: str  #: what is unsafe, and in which case; empty: nothing
+    good: bool  #: safe with a margin, and better than what is in service: refusing it is wrong
+    why_not_good: str
+    metrics: Metrics | None
+
+
+class GateJudge:
+    """Of one line, whose truth it knows, against a configuration in service and a baseline."""
+
+    def __init__(
+        self, line: Line, truth: Truth, in_service: Controller, baseline: Controller, top_m_per_s: float, seed: int
+    ) -> None:
+        self.line, self.truth, self.seed = line, truth, seed
+        self.top_m_per_s = fastest(line, truth, top_m_per_s)
+        self.cases = trying_cases(line, self.top_m_per_s, np.random.default_rng(seed))
+        self.steps, self.moves = measuring_cases(line, self.top_m_per_s)
+        gate = line.gate
+        stress = (gate.stress_torque_lag_s, gate.stress_late_share, gate.stress_coulomb_nm, gate.stress_eccentricity)
+        corners = list(product((1.0 - AROUND, 1.0 + AROUND), repeat=len(FAMILIES)))
+        picked = np.random.default_rng([seed, 1]).choice(len(corners), CORNERS, replace=False)
+        self.around = [
+            stressed(truth.scaled(**dict(zip(FAMILIES, corners[i], strict=True))), *stress) for i in picked.tolist()
+        ]
+        self.references = [self.metrics(in_service), self.metrics(baseline)]
+
+    def of(self, config: Controller) -> Judged:
+        """Everything that is wrong is not looked for: the first thing that is unsafe is enough."""
+        unsafe = self.unsafe(config)
+        if unsafe:
+            return Judged(unsafe, False, unsafe, None)
+        metrics = self.metrics(config)
+        why = self._worse(metrics) or self._without_margin(config)
+        return Judged("", not why, why, metrics)
+
+    def unsafe(self, config: Controller) -> str:
+        """On the truth as it is."""
+        return self._wrong(config, [self.truth] * len(self.cases), self.cases, self.line.control.latency_s)
+
+    def metrics(self, config: Controller) -> Metrics:
+        cases = [*self.steps, *self.moves]
+        found = self._run(config, [self.truth] * len(cases), cases, self.line.control.latency_s)
+        squared, steps = found.squared_n2.sum(axis=1), len(self.steps)
+        return Metrics(
+            float(np.sqrt(squared[:steps].mean())), float(np.sqrt(squared[steps:].mean())),
+            float(found.beyond_n[:steps].max()), float(found.settled_s[:steps].max()),
+        )  # fmt: skip
+
+    def _without_margin(self, config: Controller) -> str:
+        cases = self.cases[:4]
+        later = self._wrong(
+            config, [self.truth] * len(cases), cases, self.line.control.latency_s + EXTRA_DELAY_S
+        )  # fmt: skip
+        if later:
+            return f"{1e3 * EXTRA_DELAY_S:g} ms later: {later}"
+        if isinstance(config, MpcConfig):
+            return ""
+        truths = [one for one in self.around for _ in cases]
+        wrong = self._wrong(config, truths, cases * len(self.around), self.line.control.latency_s)
+        return f"stressed: {wrong}" if wrong else ""
+
+    def _worse(self, own: Metrics) -> str:
+        gate, better = self.line.gate, False
+        for other in self.references:
+            for name, floor in (
+                ("steps_rmse_n", gate.tolerance_n), ("moves_rmse_n", gate.tolerance_n),
+                ("overshoot_n", gate.tolerance_n), ("settling_s", gate.tolerance_settling_s),
+            ):  # fmt: skip
+                mine, theirs = getattr(own, name), getattr(other, name)
+                if mine > theirs + TOLERATED * max(floor, gate.tolerance_share * theirs):
+                    return f"{name} is {mine:.3g}, it was {theirs:.3g}"
+        reference = self.references[0]
+        better = any(
+            getattr(own, name) < (1.0 - BETTER) * getattr(reference, name) for name in ("steps_rmse_n", "moves_rmse_n")
+        )
+        return "" if better else "nothing is better by 3 %"
+
+    def _run(self, config: Controller, truths: list[Truth], cases: list[Case], latency_s: float) -> Found:
+        return simulated(config, truths, cases, self.line.limits, self.seed, latency_s=latency_s)
+
+    def _wrong(self, config: Controller, truths: list[Truth], cases: list[Case], latency_s: float) -> str:
+        """One case at a time: the first that is unsafe ends it."""
+        for b, (truth, case) in enumerate(zip(truths, cases, strict=True)):
+            found = simulated(config, [truth], [case], self.line.limits, self.seed + b, latency_s=latency_s,
+                              stop_outside=True)  # fmt: skip
+            if reason := self._reason(found):
+                return f"{case.name}: {reason}"
+        return ""
+
+    def _reason(self, found: Found) -> str:
+        gate, limits = self.line.gate, self.line.limits
+        least, most = float(found.least_n.min()), float(found.most_n.max())
+        if not np.isfinite(most):
+            return "it runs away"
+        if least < limits.tension_min_n or most > limits.tension_max_n:
+            return f"tension from {least:.1f} to {most:.1f} N"
+        for name, value, limit in (
+            ("swings by {:.2f} N", found.swing_n.max(), gate.tail_oscillation_max_n),
+            ("is off by {:.2f} N", found.error_n.max(), gate.tail_error_max_n),
+            ("chatters by {:.2f} Nm", found.chatter_nm.max(), gate.chatter_max_nm),
+        ):
+            if not value < limit:
+                return name.format(float(value))
+        return ""
+
+
+def without_effects(truth: Truth) -> Truth:
+    """The two equations alone, with their noise."""
+    none = np.zeros(truth.n)
+    return replace(
+        truth, coulomb_nm=none, eccentricity=np.zeros(truth.n + 1), gap_rad=none, torque_lag_s=0.0, cell_lag_s=0.0,
+        late_share=0.0, jitter_s=0.0,
+    )  # fmt: skip
