@@ -19,7 +19,7 @@ from gateway.cli.identify_table import (
 )
 from gateway.cli.report.page import Chart, Page, Section, Series, Table
 from gateway.control.prediction import Predicted, free_run, predict
-from gateway.core.line_model import UNITS
+from gateway.core.line_model_names import UNITS
 from gateway.core.line_model_quantities import symbol_of
 from gateway.core.signals import FloatArray
 from gateway.core.theta import Theta

@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.table import Table
 
 from gateway.cli.identify_result import Found, IdentifyResult, IntervalRow, MethodRow, RecordingRow, ValidationRow
-from gateway.core.line_model import UNITS
+from gateway.core.line_model_names import UNITS
 from gateway.core.line_model_quantities import symbol_of
 from gateway.core.line_problem import printable
 

@@ -3,7 +3,8 @@
 from dataclasses import dataclass
 from typing import Any
 
-from gateway.core.line_model import UNITS, LineModel, ModelRegion, ModelValidation, split_name
+from gateway.core.line_model import LineModel, ModelRegion, ModelValidation
+from gateway.core.line_model_names import UNITS, split_name
 from gateway.core.line_model_quantities import SYMBOLS, Quantity, quantities, symbol_of
 
 NOISE = {

@@ -8,7 +8,8 @@ import numpy as np
 from gateway.cli.models_compare import compared, figures, spread, verdict
 from gateway.cli.models_view import SHORT, STRONG, prior
 from gateway.cli.report.page import Chart, Page, Section, Series, Table
-from gateway.core.line_model import PER_SPAN, UNITS, LineModel
+from gateway.core.line_model import LineModel
+from gateway.core.line_model_names import PER_SPAN, UNITS
 from gateway.core.line_model_quantities import SYMBOLS, Quantity, quantities, symbol_of, typical
 from gateway.core.signals import FloatArray
 from gateway.supervisor.models import Entry

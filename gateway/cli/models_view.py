@@ -10,7 +10,8 @@ from rich.table import Table
 
 from gateway.cli.model_place import Chosen
 from gateway.cli.models_compare import NOISE, Compared, compared, figures, seen, verdict
-from gateway.core.line_model import UNITS, LineModel, split_name
+from gateway.core.line_model import LineModel
+from gateway.core.line_model_names import UNITS, split_name
 from gateway.core.line_model_quantities import Quantity, quantities, symbol_of, typical
 from gateway.core.line_problem import printable
 from gateway.supervisor.models import Entry

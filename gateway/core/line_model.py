@@ -5,7 +5,6 @@ A model is known by the SHA-256 of its canonical bytes: whoever holds the file c
 
 import hashlib
 import json
-import re
 from collections.abc import Iterator, Sequence
 from datetime import datetime
 from typing import Annotated, Any, Literal, Self
@@ -15,27 +14,13 @@ from pydantic import AfterValidator, Field, ValidationError, model_validator
 
 from gateway.core.json_problems import NotJson, document_of, problems
 from gateway.core.line import Name, NonNegative, Positive, Strict
-from gateway.core.nearest import nearest
+from gateway.core.line_model_names import MOST_SPANS, UNITS, wrong_name
+from gateway.core.line_model_posterior import ModelPosterior, wrong_names
 from gateway.core.theta import Noise, Theta
 from gateway.core.web_model import WebModel
 
-MOST_SPANS = 60
-
-#: What an interval may be of, with its unit. Those per span or roller may carry a number: "inertia_kg_m2[3]".
-PER_SPAN = {
-    "length_m": "m",
-    "radius_m": "m",
-    "inertia_kg_m2": "kg m²",
-    "friction_nms_per_rad": "Nm s/rad",
-    "coulomb_nm": "Nm",
-    "stiffness_per_length": "N/m",
-    "radius_per_inertia": "1/(kg m)",
-    "friction_per_inertia": "1/s",
-    "radius2_per_inertia": "1/kg",
-}
-OF_THE_LINE = {"stiffness_n": "N", "torque_lag_s": "s", "latency_s": "s"}
-UNITS = {**OF_THE_LINE, **PER_SPAN}
-COMBINATIONS = ("stiffness_per_length", "radius_per_inertia", "friction_per_inertia", "radius2_per_inertia")
+#: Fields that came later: where a model has none of it, its bytes, and so its hash, are those that it had before.
+LATER = ("posterior",)
 
 
 def _instant(text: str) -> str:
@@ -159,6 +144,7 @@ class LineModel(Strict):
     validation: ModelValidation | None = None
     alignment: list[ChannelDelay] = []
     parent: Digest | None = None  #: the model that was the prior; null: the line's file
+    posterior: ModelPosterior | None = None  #: null: the method gives none, or the file is older
 
     @property
     def n(self) -> int:
@@ -166,9 +152,19 @@ class LineModel(Strict):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        if wrong := [*_wrong_lengths(self), *_wrong_intervals(self), *_wrong_order(self)]:
+        lengths = [*_wrong_lengths(self)]
+        wrong = [*lengths, *_wrong_intervals(self), *_wrong_order(self)]
+        if self.posterior is not None and not lengths:
+            wrong += wrong_names(self.posterior, self.n, _by_base(self.parameters))
+        if wrong:
             raise ValueError("; ".join(wrong))
         return self
+
+
+def _by_base(given: ModelParameters) -> dict[str, list[float]]:
+    """Values by name: one for the line, n for rollers and spans."""
+    fields: dict[str, Any] = given.model_dump()
+    return {name: value if isinstance(value, list) else [value] for name, value in fields.items()}
 
 
 def _wrong_lengths(model: LineModel) -> Iterator[str]:
@@ -192,14 +188,7 @@ def _wrong_lengths(model: LineModel) -> Iterator[str]:
 
 def _wrong_intervals(model: LineModel) -> Iterator[str]:
     for name, interval in model.intervals.items():
-        base, number = split_name(name)
-        if base not in UNITS:
-            like = nearest(base, UNITS)
-            hint = f"; did you mean {like}?" if like else ""
-            yield f"intervals.{name}: there is no such parameter; allowed: {', '.join(UNITS)}{hint}"
-        elif number is not None and (base in OF_THE_LINE or not 1 <= number <= model.n):
-            allowed = base if base in OF_THE_LINE else f"{base}, or {base}[1] to {base}[{model.n}]"
-            yield f"intervals.{name}: there is no such one; allowed: {allowed}"
+        yield from (f"intervals.{name}: {fault}" for fault in wrong_name(name, model.n, tuple(UNITS)))
         if not interval.low <= interval.value <= interval.high:
             yield (
                 f"intervals.{name} is {interval.value:g} from {interval.low:g} to {interval.high:g}; allowed: a value "
@@ -221,15 +210,11 @@ def _wrong_order(model: LineModel) -> Iterator[str]:
     yield from (f"{key} is {low:g}, the end of its range {high:g}: below it" for key, low, high in ranges if low > high)
 
 
-def split_name(name: str) -> tuple[str, int | None]:
-    """("inertia_kg_m2", 3) of "inertia_kg_m2[3]"; no number where there is none."""
-    found = re.fullmatch(r"(.*)\[([1-9][0-9]{0,3})\]", name)
-    return (found[1], int(found[2])) if found else (name, None)
-
-
 def canonical(model: LineModel) -> bytes:
     """The one byte representation of a model, the same whoever writes it."""
-    return json.dumps(model.model_dump(mode="json"), sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
+    fields = model.model_dump(mode="json")
+    present = {key: value for key, value in fields.items() if value is not None or key not in LATER}
+    return json.dumps(present, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
 
 
 def model_hash(model: LineModel) -> str:

@@ -4,7 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gateway.core.line_model import PER_SPAN, LineModel, ModelInterval, theta_of
+from gateway.core.line_model import LineModel, ModelInterval, theta_of
+from gateway.core.line_model_names import PER_SPAN
 from gateway.core.signals import FloatArray
 
 #: How a person writes them.

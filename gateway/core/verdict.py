@@ -7,7 +7,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from gateway.core.deployment import Region
-from gateway.core.line import NonNegative, Strict
+from gateway.core.line import Line, NonNegative, Strict
 from gateway.core.line_model import Digest, Instant
 
 Text = Annotated[str, Field(max_length=2000)]
@@ -74,3 +74,9 @@ def canonical(verdict: Verdict) -> bytes:
 def verdict_hash(verdict: Verdict) -> str:
     """SHA-256 of the canonical bytes, in hexadecimal."""
     return hashlib.sha256(canonical(verdict)).hexdigest()
+
+
+def line_hash(line: Line) -> str:
+    """SHA-256 of a line's file in its canonical form, with everything that it leaves to defaults; in hexadecimal."""
+    text = json.dumps(line.model_dump(mode="json"), sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()

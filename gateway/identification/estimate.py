@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+from gateway.core.posterior import Posterior
 from gateway.core.theta import Noise, Theta
 
 
@@ -44,3 +45,4 @@ class Estimate:
     #: tell, as wide as the prior.
     intervals: dict[str, Interval]
     samples: int
+    posterior: Posterior | None = None  #: of all parameters together; None: the method does not say

@@ -14,10 +14,10 @@ import numpy as np
 
 from gateway.control.design.margins import is_stable
 from gateway.control.design.task import linear, task_of
-from gateway.control.mpc_problem import MpcProblem
+from gateway.control.mpc_linear import unconstrained
 from gateway.control.rollout import Course, Setup, plants_of, simulate
 from gateway.core.controller import Controller
-from gateway.core.controller_laws import LqgConfig, MpcConfig
+from gateway.core.controller_laws import MpcConfig
 from gateway.core.experiment import Experiment, ExperimentRefused, setpoints, speed_goals, turns
 from gateway.core.line import Line
 from gateway.core.signals import FloatArray
@@ -163,14 +163,7 @@ class Foresight:
 
 def _without_limits(config: Controller) -> Controller:
     """Of MPC its feedback where no limit is reached: its rollouts would take minutes. The loop's limits stay."""
-    if not isinstance(config, MpcConfig):
-        return config
-    gain = MpcProblem(config).gain()
-    return LqgConfig(
-        period_s=config.period_s, latency_s=config.latency_s, draw_spans=config.draw_spans,
-        feedforward=config.feedforward, predictor=config.predictor,
-        gain_state=gain[:, : 2 * config.n].tolist(), gain_input=gain[:, 2 * config.n :].tolist(),
-    )  # fmt: skip
+    return unconstrained(config) if isinstance(config, MpcConfig) else config
 
 
 def _is_some(signs: Sequence[float]) -> bool:

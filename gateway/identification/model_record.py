@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from gateway.core.line_model import ChannelDelay, LineModel, ModelValidation, model_of, parameters_of
+from gateway.core.posterior import Posterior
 from gateway.core.recording import Recording
 from gateway.core.signals import BoolArray, FloatArray
 from gateway.identification.estimate import Estimate
@@ -49,8 +50,14 @@ def model_from(
             "region": _region(recording),
             "validation": None if validation is None else validation.model_dump(),
             "alignment": [delay.model_dump() for delay in alignment],
+            "posterior": None if estimate.posterior is None else _posterior(estimate.posterior),
         }
     )
+
+
+def _posterior(posterior: Posterior) -> dict[str, Any]:
+    """Its mean is the parameters' own."""
+    return {"names": list(posterior.names), "covariance": posterior.covariance.tolist()}
 
 
 def _region(recording: Recording) -> dict[str, Any]:

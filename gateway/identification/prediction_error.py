@@ -26,6 +26,7 @@ from gateway.control.prediction import (
     stretch_of,
     whitened,
 )
+from gateway.core.posterior import Posterior
 from gateway.core.recording import Recording
 from gateway.core.signals import FloatArray
 from gateway.core.theta import Noise
@@ -85,6 +86,7 @@ class Fit:
             noise=self.noise,
             intervals={name: self.interval(name) for name in parameters.maps},
             samples=self.samples,
+            posterior=Posterior(tuple(parameters.names), self.logs, self.covariance),
         )
 
 

@@ -8,13 +8,11 @@ import numpy as np
 from gateway.core.line import Line, Parameter
 from gateway.core.signals import FloatArray
 from gateway.core.theta import nominal_theta
+from gateway.core.unnamed_terms import COULOMB_SD, COULOMB_SHARE, LAG_S, LAG_SD, LATENCY_SD_S
 from gateway.identification.estimate import Structure
 from gateway.identification.parameters import EACH, Parameters
 
 SPREAD = 0.1  #: between rollers, as a fraction either way
-COULOMB_SHARE, COULOMB_SD = 0.02, 1.0  #: median over the torque limit; standard deviation of the logarithm
-LAG_S, LAG_SD = 0.003, 0.7
-LATENCY_SD_S = 0.002
 
 
 @dataclass(frozen=True)

@@ -3,10 +3,13 @@
 from datetime import UTC, timedelta, timezone
 from typing import Any
 
+import numpy as np
 from hypothesis import strategies as st
 
-from gateway.core.line_model import COMBINATIONS, OF_THE_LINE, PER_SPAN, LineModel
+from gateway.core.line_model import LineModel
+from gateway.core.line_model_names import COMBINATIONS, OF_THE_LINE, PER_SPAN
 
+PHYSICAL = ("stiffness_n", "length_m", "radius_m", "inertia_kg_m2", "friction_nms_per_rad")
 CREATED = "2026-08-03T14:05:00+00:00"
 ZONES = (UTC, timezone(timedelta(hours=-5)), timezone(timedelta(hours=9)))
 
@@ -91,6 +94,22 @@ def _ranges(draw: st.DrawFn, count: int = 2) -> list[float]:
 
 
 @st.composite
+def any_posterior(draw: st.DrawFn, n: int, deviation: float = 0.5) -> dict[str, Any]:
+    """Names for n spans, shared or each, and a covariance of any rank; deviations up to `deviation`."""
+    names: list[str] = []
+    for base in PHYSICAL:
+        each = base != "stiffness_n" and draw(st.booleans())
+        names += [f"{base}[{i}]" for i in range(1, n + 1)] if each else [base]
+    names = draw(st.permutations(names))[: draw(st.integers(1, len(names)))]
+    k = len(names)
+    factor = np.random.default_rng(draw(st.integers(0, 2**32))).standard_normal((k, draw(st.integers(1, k + 1))))
+    covariance = factor @ factor.T
+    scale = deviation * np.array(draw(_lists(st.floats(0.0, 1.0), k))) / np.sqrt(np.diag(covariance))
+    covariance = covariance * np.outer(scale, scale)
+    return {"names": names, "covariance": (0.5 * (covariance + covariance.T)).tolist()}
+
+
+@st.composite
 def any_fields(draw: st.DrawFn) -> dict[str, Any]:
     """Whatever the format allows."""
     n = draw(st.integers(1, 5))
@@ -128,7 +147,7 @@ def any_fields(draw: st.DrawFn) -> dict[str, Any]:
             "length_m": draw(_lists(positive, n)),
             "radius_m": draw(_lists(positive, n)),
             "inertia_kg_m2": draw(_lists(positive, n)),
-            "friction_nms_per_rad": draw(_lists(from_0, n)),
+            "friction_nms_per_rad": draw(_lists(positive, n)),
             "coulomb_nm": draw(_lists(from_0, n)),
             "torque_lag_s": draw(from_0),
             "latency_s": draw(from_0),
@@ -152,4 +171,5 @@ def any_fields(draw: st.DrawFn) -> dict[str, Any]:
         },
         "validation": draw(st.sampled_from([None, validation])),
         "parent": draw(digests | st.none()),
+        "posterior": draw(st.none() | any_posterior(n)),
     }

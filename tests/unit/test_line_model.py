@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from gateway.cli.model_place import LARGEST_BYTES
 from gateway.core.line_model import (
     ModelRefused,
     ModelValidation,
@@ -18,15 +19,16 @@ from gateway.core.line_model import (
     noise_of,
     parameters_of,
     parse_model,
-    split_name,
     theta_of,
 )
+from gateway.core.line_model_names import split_name
+from gateway.core.posterior import Posterior, posterior_of
 from gateway.core.recording import Recording
 from gateway.core.theta import Noise, Theta
 from gateway.core.web_model import WebModel
 from gateway.identification.estimate import Estimate, Interval, Structure
 from gateway.identification.model_record import Origin, model_from
-from tests.unit.model_support import CREATED, any_fields, fields, model
+from tests.unit.model_support import CREATED, PHYSICAL, any_fields, fields, model
 
 
 @given(any_fields())
@@ -202,6 +204,66 @@ def test_names_of_intervals_come_apart() -> None:
     assert split_name("inertia_kg_m2[0]") == ("inertia_kg_m2[0]", None)
 
 
+# The posterior
+
+TWO = {"names": ["stiffness_n", "length_m"], "covariance": [[4e-4, 3e-4], [3e-4, 4e-4]]}
+
+
+def test_a_file_without_a_posterior_is_read_and_has_the_hash_that_it_had_before_there_were_any() -> None:
+    document = model().model_dump(mode="json")
+    del document["posterior"]
+    before = json.dumps(document, sort_keys=True, separators=(",", ":")).encode()
+    assert canonical(parse_model(before)) == before
+    assert posterior_of(parse_model(before)) is None
+
+
+def test_the_posterior_stands_around_the_parameters_of_the_file() -> None:
+    parameters = {**fields()["parameters"], "length_m": [1.0, 1.44]}
+    found = posterior_of(model(parameters=parameters, posterior=TWO))
+    assert found is not None
+    np.testing.assert_allclose(found.mean, [np.log(2200.0), np.log(1.2)])
+    np.testing.assert_equal(found.covariance, TWO["covariance"])
+    np.testing.assert_allclose(found.deviations, 0.02)
+
+
+def test_the_largest_line_has_room_and_its_file_can_be_read() -> None:
+    names = ["stiffness_n"]
+    for base in PHYSICAL[1:]:
+        names += [f"{base}[{i}]" for i in range(1, 61)]
+    k = len(names)
+    factor = np.random.default_rng(0).standard_normal((k, k)) * 0.01
+    covariance = 0.5 * (factor @ factor.T + (factor @ factor.T).T)
+    large = model(60, posterior={"names": names, "covariance": covariance.tolist()})
+    assert len(canonical(large)) < LARGEST_BYTES
+    assert parse_model(canonical(large)) == large
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"names": ["stiffness_n"]}, "covariance has 2 rows of 2 to 2 entries; allowed: 1 of 1"),
+        ({"covariance": [[1e-4, 0.0], [0.0]]}, "covariance has 2 rows of 1 to 2 entries; allowed: 2 of 2"),
+        ({"covariance": [[1e-4, 1e-5], [0.0, 1e-4]]}, "not symmetric: 1e-05 and 0 between stiffness_n and length_m"),
+        ({"covariance": [[1e-4, 2e-4], [2e-4, 1e-4]]}, "not positive semidefinite: it has the eigenvalue -0.0001"),
+        ({"covariance": [[1e-4, 0.0], [0.0, 9.1]]}, "length_m has the variance 9.1; allowed: 0 to 9"),
+        ({"covariance": [[-1e-4, 0.0], [0.0, 1.0]]}, "stiffness_n has the variance -0.0001; allowed: 0 to 9"),
+        ({"covariance": [[NAN, 0.0], [0.0, 1.0]]}, "is not a finite number"),
+        ({"names": ["stiffness_n", "lenght_m"]}, "lenght_m: there is no such parameter.*did you mean length_m"),
+        ({"names": ["stiffness_n", "radius_per_inertia"]}, "radius_per_inertia: there is no such parameter"),
+        ({"names": ["stiffness_n", "length_m[3]"]}, r"length_m\[3\]: there is no such one; allowed: length_m, or"),
+        ({"names": ["stiffness_n[1]", "length_m"]}, r"stiffness_n\[1\]: there is no such one; allowed: stiffness_n"),
+        ({"names": ["length_m", "length_m"]}, "length_m: it is there already"),
+        ({"names": ["length_m[1]", "length_m"]}, "length_m: it is there already"),
+        ({"names": ["length_m", "length_m[2]"]}, r"length_m\[2\]: it is there already"),
+        ({"names": ["length_m", "coulomb_nm[2]"]}, r"coulomb_nm\[2\]: its value is 0, which has no logarithm"),
+        ({"names": []}, "posterior.names"),
+    ],
+)
+def test_what_is_no_posterior_is_refused(changes: dict[str, Any], says: str) -> None:
+    with pytest.raises(ModelRefused, match=says):
+        model_of(fields(posterior={**TWO, **changes}))
+
+
 # From an estimate
 
 
@@ -240,8 +302,18 @@ def test_an_estimate_becomes_a_record_of_all_that_it_says() -> None:
     assert noise_of(found) == Noise(0.11)
     assert {name: Interval(**vars(one)) for name, one in found.intervals.items()} == estimate().intervals
     assert found.data.digest == data.digest() and found.data.source == "a test" and found.data.samples == 4
+    assert found.posterior is None
     assert found.parent == ORIGIN.parent and found.created == CREATED and found.validation == validation
     assert parse_model(canonical(found)) == found
+
+
+def test_the_record_has_the_posterior_of_the_estimate() -> None:
+    covariance = np.array([[4e-4, 1e-4], [1e-4, 9e-4]])
+    own = Posterior(("stiffness_n", "radius_m"), np.log([2200.0, 0.035]), covariance)
+    found = posterior_of(model_from(replace(estimate(), posterior=own), recording(), ORIGIN))
+    assert found is not None and found.names == own.names
+    np.testing.assert_allclose(found.mean, own.mean)
+    np.testing.assert_equal(found.covariance, covariance)
 
 
 def test_the_region_is_what_the_loop_went_through_and_no_more() -> None:

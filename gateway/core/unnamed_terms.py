@@ -1,0 +1,8 @@
+"""What is believed, before any data, of what a line's file does not name: Coulomb friction, lag, error of the latency.
+
+Normal in the logarithm where a standard deviation has no unit.
+"""
+
+COULOMB_SHARE, COULOMB_SD = 0.02, 1.0  #: median over the torque limit; standard deviation of the logarithm
+LAG_S, LAG_SD = 0.003, 0.7  #: median of the drives' torque lag; standard deviation of the logarithm
+LATENCY_SD_S = 0.002  #: the truth against the file's

@@ -1,0 +1,134 @@
+"""What the rules are asked about: one proposal, and what is believed of the line that it is for."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from gateway.control.design import DesignTask, task_on
+from gateway.core.controller import Controller
+from gateway.core.experiment import Experiment
+from gateway.core.judge_context import JudgeContext
+from gateway.core.line import Line
+from gateway.core.line_model import LineModel, noise_of, theta_of
+from gateway.core.proposal import ExperimentChange, GainsChange, ModelChange, Proposal
+from gateway.core.recording import Recording
+from gateway.core.signals import FloatArray
+from gateway.core.theta import Noise, Theta, nominal_theta
+from safety.believed import corners_of_model, prior_corners
+from safety.excitation import Excited, excited_parts, recent
+
+
+@dataclass(frozen=True)
+class Case:
+    """Of one verdict. What several rules need is computed once, by the rule that asks for it first."""
+
+    line: Line
+    context: JudgeContext
+    proposal: Proposal
+    hash: str  #: of the proposal
+    recordings: Sequence[Recording]  #: as `context.data` names them, in that order
+    seed: int
+
+    @property
+    def controller(self) -> Controller:
+        """Proposed. Raises TypeError where something else is."""
+        if not isinstance(self.proposal.change, GainsChange):
+            raise TypeError(f"a proposal of kind {self.proposal.kind} has no controller")
+        return self.proposal.change.controller
+
+    @property
+    def experiment(self) -> Experiment:
+        """Proposed. Raises TypeError where something else is."""
+        if not isinstance(self.proposal.change, ExperimentChange):
+            raise TypeError(f"a proposal of kind {self.proposal.kind} has no experiment")
+        return self.proposal.change.experiment
+
+    @property
+    def model(self) -> LineModel:
+        """Proposed. Raises TypeError where something else is."""
+        if not isinstance(self.proposal.change, ModelChange):
+            raise TypeError(f"a proposal of kind {self.proposal.kind} has no model")
+        return self.proposal.change.model
+
+    @property
+    def first(self) -> bool:
+        """Whether no model has been accepted yet, so that the tolerances of the line's file are all there is."""
+        return self.context.model is None
+
+    @cached_property
+    def latency_s(self) -> float:
+        """From a sample to its torque: as measured; else the longer of what file and model say."""
+        if self.context.latency_s is not None:
+            return self.context.latency_s
+        model = self.context.model
+        return max(self.line.control.latency_s, 0.0 if model is None else model.parameters.latency_s)
+
+    @cached_property
+    def believed(self) -> Theta:
+        """The accepted model's parameters, or those of the line's file; the latency as measured."""
+        model = self.context.model
+        return replace(nominal_theta(self.line) if model is None else theta_of(model), latency_s=self.latency_s)
+
+    @cached_property
+    def noise(self) -> Noise:
+        """The accepted model's, but no less than is expected of sensors: what chatters under noise must show it."""
+        model = self.context.model
+        return Noise() if model is None else noise_of(model) or Noise()
+
+    @cached_property
+    def corners(self) -> list[Theta]:
+        """What the truth may be, as far as anybody knows. Raises Unbelievable."""
+        if self.context.model is None:
+            return prior_corners(self.line, self.latency_s, self.seed)
+        return corners_of_model(self.context.model, self.line.gate, self.latency_s, self.seed)
+
+    @cached_property
+    def data(self) -> list[Recording]:
+        """The recordings that are not too old."""
+        return recent(self.context, self.recordings, self.line.gate.data_max_age_s)
+
+    @cached_property
+    def excited(self) -> list[Excited]:
+        """The parts of the recent recordings in which every measured tension moves, each at one speed."""
+        return [part for recording in self.data for part in excited_parts(recording)]
+
+    @cached_property
+    def tension_n(self) -> FloatArray:
+        """Set-points (n,) of the line now. Raises ValueError where the context has another number of them."""
+        tension = np.array(self.context.state.tension_n)
+        if len(tension) != self.line.n:
+            raise ValueError(f"state.tension_n has {len(tension)} entries; allowed: {self.line.n}, one per span")
+        return tension
+
+    @property
+    def validated_m_per_s(self) -> float:
+        """The highest speed at which excited data have been recorded; 0: none."""
+        return max((part.speed_m_per_s for part in self.excited), default=0.0)
+
+    @cached_property
+    def speed_max_m_per_s(self) -> float:
+        """Up to which the change is judged, and which the verdict's region carries."""
+        if self.first:
+            return min(self.line.gate.first_speed_max_m_per_s, self.line.limits.speed_max_m_per_s)
+        # Without data the model rule refuses; the others still tell what they find at the speed of now.
+        wanted = self.validated_m_per_s or self.context.state.speed_m_per_s or self.line.gate.first_speed_max_m_per_s
+        return min(wanted, self.line.limits.speed_max_m_per_s)
+
+    @cached_property
+    def tension_step_n(self) -> float:
+        """The largest set-point step that the region permits."""
+        most = self.line.limits.tension_step_max_n
+        return min(most, self.line.gate.first_step_max_n) if self.first else most
+
+    @cached_property
+    def speed_step_m_per_s(self) -> float:
+        """The largest speed step that the region permits."""
+        return min(self.line.limits.speed_step_max_m_per_s, self.speed_max_m_per_s)
+
+    def task(self, theta: Theta, speed_m_per_s: float) -> DesignTask:
+        """The linear loop's task on a plant at a speed, at the set-points of now."""
+        return replace(
+            task_on(self.line, theta, self.noise), tension_n=self.tension_n, unwind_speed_m_per_s=speed_m_per_s
+        )

@@ -1,0 +1,110 @@
+"""The judge: what every rule finds of a proposal, and nothing else. Pure: no clock, no files, no chance of its own.
+
+The same bytes, context, line, recordings and seed give the same verdict. A rule that fails is a refusal.
+"""
+
+from collections.abc import Callable, Sequence
+from hashlib import sha256
+from importlib.metadata import version
+
+from gateway.core.deployment import Region
+from gateway.core.judge_context import JudgeContext, context_hash
+from gateway.core.line import Line
+from gateway.core.proposal import Proposal, ProposalRefused, parse_proposal, proposal_hash
+from gateway.core.recording import Recording
+from gateway.core.verdict import RuleFinding, ScenarioFigures, Verdict, line_hash
+from safety.case import Case
+from safety.findings import told
+from safety.rules.table import FIGURES, REPORTED, RULES, Rule
+
+FORMAT_RULE, DATA_RULE = "format", "data"
+
+
+def judge(
+    payload: bytes, context: JudgeContext, line: Line, recordings: Sequence[Recording], seed: int
+) -> Verdict:
+    """`recordings` as `context.data` names them, one for each, in that order."""
+    try:
+        proposal = parse_proposal(payload, line.gate.proposal_max_bytes)
+    except ProposalRefused as refused:
+        return _verdict(payload, context, line, seed, None, [told(FORMAT_RULE, False, why) for why in refused.reasons])
+    except Exception as error:  # whatever the parser stumbles over is no proposal
+        return _verdict(payload, context, line, seed, None, [_failed(FORMAT_RULE, error)])
+    case = Case(line, context, proposal, proposal_hash(proposal), recordings, seed)
+    if wrong := _wrong_data(context, recordings):
+        return _verdict(payload, context, line, seed, proposal, [told(DATA_RULE, False, text) for text in wrong])
+    findings = [finding for rule in RULES[proposal.kind] for finding in _asked(rule, case)]
+    reported = [finding for rule in REPORTED[proposal.kind] for finding in _asked(rule, case)]
+    accepted = all(finding.passed for finding in findings)
+    region = _region(case) if accepted and proposal.kind == "gains" else None
+    return _verdict(payload, context, line, seed, proposal, findings, reported, _figures(case), region)
+
+
+def _asked(rule: Rule, case: Case) -> list[RuleFinding]:
+    """What it finds; that it failed, where it fails or finds nothing."""
+    try:
+        return rule.check(case) or [told(rule.name, False, f"rule {rule.name} found nothing, which is no yes")]
+    except Exception as error:  # whatever it is, it is no yes
+        return [_failed(rule.name, error)]
+
+
+def _failed(name: str, error: Exception) -> RuleFinding:
+    return told(name, False, f"rule {name} failed: {type(error).__name__}: {error}")
+
+
+def _figures(case: Case) -> list[ScenarioFigures]:
+    figures: Callable[[Case], list[ScenarioFigures]] | None = FIGURES.get(case.proposal.kind)
+    try:
+        return [] if figures is None else figures(case)
+    except Exception:  # the rule that needs them has told why
+        return []
+
+
+def _region(case: Case) -> Region:
+    """For what it was judged."""
+    return Region(
+        speed_max_m_per_s=case.speed_max_m_per_s,
+        tension_step_max_n=case.tension_step_n,
+        speed_step_max_m_per_s=case.speed_step_m_per_s,
+    )
+
+
+def _wrong_data(context: JudgeContext, recordings: Sequence[Recording]) -> list[str]:
+    """Recordings that are not those that the context names."""
+    if len(recordings) != len(context.data):
+        return [f"{len(recordings)} recordings were given; allowed: {len(context.data)}, as the context names them"]
+    return [
+        f"{one.path} is not the recording that the context names: its digest is {recording.digest()[:12]}; allowed: "
+        f"{one.digest[:12]}"
+        for one, recording in zip(context.data, recordings, strict=True)
+        if one.digest != recording.digest()
+    ]
+
+
+def _verdict(
+    payload: bytes,
+    context: JudgeContext,
+    line: Line,
+    seed: int,
+    proposal: Proposal | None,
+    findings: list[RuleFinding],
+    reported: Sequence[RuleFinding] = (),
+    figures: Sequence[ScenarioFigures] = (),
+    region: Region | None = None,
+) -> Verdict:
+    return Verdict(
+        format=1,
+        proposal=None if proposal is None else proposal_hash(proposal),
+        payload=sha256(payload).hexdigest(),
+        context=context_hash(context),
+        line=line_hash(line),
+        kind=None if proposal is None else proposal.kind,
+        seed=seed,
+        accepted=all(finding.passed for finding in findings),
+        findings=findings,
+        reported=list(reported),
+        figures=list(figures),
+        region=region,
+        judged=context.now,
+        program_version=version("r2rgate"),
+    )
