@@ -7,7 +7,9 @@ import numpy as np
 
 from gateway.core.controller import Controller
 from gateway.core.controller_laws import MpcConfig
+from gateway.core.experiment import Experiment, course
 from gateway.core.line import Line
+from gateway.core.line_model import LineModel
 from tests.independent.cases import fastest, measuring_cases, trying_cases
 from tests.independent.runs import Case, Found, simulated
 from tests.independent.truth import Truth, stressed
@@ -144,3 +146,46 @@ def without_effects(truth: Truth) -> Truth:
         truth, coulomb_nm=none, eccentricity=np.zeros(truth.n + 1), gap_rad=none, torque_lag_s=0.0, cell_lag_s=0.0,
         late_share=0.0, jitter_s=0.0,
     )  # fmt: skip
+
+
+def unsafe_experiment(
+    experiment: Experiment,
+    line: Line,
+    truth: Truth,
+    config: Controller,
+    tension_n: list[float],
+    speed_m_per_s: float,
+    seed: int,
+) -> str:
+    """What goes wrong on the true line while it runs from here under `config`; empty: nothing.
+
+    The speed goes where a leg wants it at the rate of the line's moves. The abort condition is not relied on.
+    """
+    base, h = np.array(tension_n), line.control.period_s
+    rows = list(course(experiment, base, speed_m_per_s, h))
+    tensions = np.array([tension for tension, _ in rows])
+    speeds, now, reach = np.empty(len(rows)), speed_m_per_s, line.moves.speed_rate_m_per_s2 * h
+    for k, (_, goal) in enumerate(rows):
+        now += min(max(goal - now, -reach), reach)
+        speeds[k] = now
+    case = Case(experiment.name, tensions, speeds, np.zeros_like(tensions), 0, 1)
+    found = simulated(config, [truth], [case], line.limits, seed, latency_s=line.control.latency_s, stop_outside=True)
+    least, most = float(found.least_n.min()), float(found.most_n.max())
+    if not np.isfinite(most):
+        return "it runs away"
+    if least < line.limits.tension_min_n or most > line.limits.tension_max_n:
+        return f"tension from {least:.1f} to {most:.1f} N"
+    return ""
+
+
+def model_error(model: LineModel, truth: Truth) -> float:
+    """The greatest error, as a fraction, of what decides how a line moves: EA/L, R/J, f/J, R^2/J, of any roller."""
+    p = model.parameters
+    radius, inertia = np.array(p.radius_m), np.array(p.inertia_kg_m2)
+    pairs = (
+        (p.stiffness_n / np.array(p.length_m), truth.stiffness_n / truth.length_m),
+        (radius / inertia, truth.radius_m / truth.inertia_kg_m2),
+        (np.array(p.friction_nms_per_rad) / inertia, truth.friction_nms_per_rad / truth.inertia_kg_m2),
+        (radius**2 / inertia, truth.radius_m**2 / truth.inertia_kg_m2),
+    )
+    return max(float(np.abs(found / true - 1.0).max()) for found, true in pairs)
