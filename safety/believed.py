@@ -6,12 +6,11 @@ from math import log
 import numpy as np
 
 from gateway.control.corners import corners, corners_of_line
-from gateway.core.line import Gate, Line
+from gateway.core.line import Gate, Line, Parameter
 from gateway.core.line_model import LineModel
 from gateway.core.line_model_posterior import ModelPosterior
-from gateway.core.theta import Theta
+from gateway.core.theta import Theta, nominal_theta
 
-PRIOR_CORNERS = 32  #: of the line's file
 TWO_SIDED_95 = 1.96  #: standard deviations to the ends of an interval
 PHYSICAL = ("stiffness_n", "length_m", "radius_m", "inertia_kg_m2", "friction_nms_per_rad")
 
@@ -28,10 +27,34 @@ def corners_of_model(model: LineModel, gate: Gate, latency_s: float, seed: int) 
 
 
 def prior_corners(line: Line, latency_s: float, seed: int) -> list[Theta]:
-    """Of the tolerances of the line's file, around the measured latency."""
-    shift_s = latency_s - line.control.latency_s
-    found = corners_of_line(line, PRIOR_CORNERS, seed)
-    return [replace(theta, latency_s=max(0.0, theta.latency_s + shift_s)) for theta in found]
+    """At a share of the tolerances of the line's file; friction, lag and latency are what the gate stresses."""
+    share, count = line.gate.first_corner_share, line.gate.corners
+    nominal = nominal_theta(line)
+    return [
+        replace(nominal, web=theta.web, latency_s=latency_s)
+        for theta in corners_of_line(_narrowed(line, share), count, seed)
+    ]
+
+
+def _narrowed(line: Line, share: float) -> Line:
+    """With a share of its tolerances."""
+
+    def of(parameter: Parameter) -> Parameter:
+        return Parameter(value=parameter.value, tolerance=share * parameter.tolerance)
+
+    rollers = [
+        roller.model_copy(
+            update={
+                "radius_m": of(roller.radius_m),
+                "inertia_kg_m2": of(roller.inertia_kg_m2),
+                "friction_nms_per_rad": of(roller.friction_nms_per_rad),
+            }
+        )
+        for roller in line.rollers
+    ]
+    spans = [span.model_copy(update={"length_m": of(span.length_m)}) for span in line.spans]
+    web = line.web.model_copy(update={"stiffness_n": of(line.web.stiffness_n)})
+    return line.model_copy(update={"rollers": rollers, "spans": spans, "web": web})
 
 
 def _of_intervals(model: LineModel) -> LineModel:

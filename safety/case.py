@@ -1,8 +1,9 @@
 """What the rules are asked about: one proposal, and what is believed of the line that it is for."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -19,6 +20,8 @@ from gateway.core.theta import Noise, Theta, nominal_theta
 from safety.believed import corners_of_model, prior_corners
 from safety.excitation import Excited, excited_parts, recent
 
+T = TypeVar("T")
+
 
 @dataclass(frozen=True)
 class Case:
@@ -30,6 +33,15 @@ class Case:
     hash: str  #: of the proposal
     recordings: Sequence[Recording]  #: as `context.data` names them, in that order
     seed: int
+
+    _kept: dict[str, object] = field(default_factory=dict[str, object], init=False, repr=False, compare=False)
+
+    def once(self, name: str, compute: "Callable[[Case], T]") -> T:
+        """What `compute` finds of this case, the first time; the same again after that."""
+        if name not in self._kept:
+            self._kept[name] = compute(self)
+        found: Any = self._kept[name]
+        return found
 
     @property
     def controller(self) -> Controller:
@@ -73,7 +85,7 @@ class Case:
 
     @cached_property
     def noise(self) -> Noise:
-        """The accepted model's, but no less than is expected of sensors: what chatters under noise must show it."""
+        """The accepted model's; what is expected of any line where it says nothing."""
         model = self.context.model
         return Noise() if model is None else noise_of(model) or Noise()
 
@@ -106,6 +118,11 @@ class Case:
     def validated_m_per_s(self) -> float:
         """The highest speed at which excited data have been recorded; 0: none."""
         return max((part.speed_m_per_s for part in self.excited), default=0.0)
+
+    @property
+    def draw_spans(self) -> list[int]:
+        """Spans (from 0) without a load cell."""
+        return [i for i, span in enumerate(self.line.spans) if span.control == "draw"]
 
     @cached_property
     def speed_max_m_per_s(self) -> float:

@@ -23,9 +23,7 @@ def at_most(rule: str, value: float, limit: float, unit: str, text: str) -> Rule
     return _of_number(rule, value <= limit, value, limit, limit - value, unit, text)
 
 
-def _of_number(
-    rule: str, passed: bool, value: float, limit: float, margin: float, unit: str, text: str
-) -> RuleFinding:
+def _of_number(rule: str, passed: bool, value: float, limit: float, margin: float, unit: str, text: str) -> RuleFinding:
     return RuleFinding(
         rule=rule, passed=bool(passed), text=_short(text), value=_finite(value), limit=_finite(limit),
         margin=_finite(margin), unit=unit,

@@ -7,6 +7,8 @@ from collections.abc import Callable, Sequence
 from hashlib import sha256
 from importlib.metadata import version
 
+import numpy as np
+
 from gateway.core.deployment import Region
 from gateway.core.judge_context import JudgeContext, context_hash
 from gateway.core.line import Line
@@ -20,9 +22,7 @@ from safety.rules.table import FIGURES, REPORTED, RULES, Rule
 FORMAT_RULE, DATA_RULE = "format", "data"
 
 
-def judge(
-    payload: bytes, context: JudgeContext, line: Line, recordings: Sequence[Recording], seed: int
-) -> Verdict:
+def judge(payload: bytes, context: JudgeContext, line: Line, recordings: Sequence[Recording], seed: int) -> Verdict:
     """`recordings` as `context.data` names them, one for each, in that order."""
     try:
         proposal = parse_proposal(payload, line.gate.proposal_max_bytes)
@@ -33,15 +33,19 @@ def judge(
     case = Case(line, context, proposal, proposal_hash(proposal), recordings, seed)
     if wrong := _wrong_data(context, recordings):
         return _verdict(payload, context, line, seed, proposal, [told(DATA_RULE, False, text) for text in wrong])
-    findings = [finding for rule in RULES[proposal.kind] for finding in _asked(rule, case)]
-    reported = [finding for rule in REPORTED[proposal.kind] for finding in _asked(rule, case)]
+    with np.errstate(all="ignore"):  # numbers that run away are found by the rules, not by warnings
+        findings = [finding for rule in RULES[proposal.kind] for finding in _asked(rule, case)]
+        reported = [finding for rule in REPORTED[proposal.kind] for finding in _asked(rule, case)]
+        figures = _figures(case)
     accepted = all(finding.passed for finding in findings)
     region = _region(case) if accepted and proposal.kind == "gains" else None
-    return _verdict(payload, context, line, seed, proposal, findings, reported, _figures(case), region)
+    return _verdict(payload, context, line, seed, proposal, findings, reported, figures, region)
 
 
 def _asked(rule: Rule, case: Case) -> list[RuleFinding]:
     """What it finds; that it failed, where it fails or finds nothing."""
+    if rule.with_model_only and case.first:
+        return []
     try:
         return rule.check(case) or [told(rule.name, False, f"rule {rule.name} found nothing, which is no yes")]
     except Exception as error:  # whatever it is, it is no yes
@@ -55,7 +59,7 @@ def _failed(name: str, error: Exception) -> RuleFinding:
 def _figures(case: Case) -> list[ScenarioFigures]:
     figures: Callable[[Case], list[ScenarioFigures]] | None = FIGURES.get(case.proposal.kind)
     try:
-        return [] if figures is None else figures(case)
+        return [] if figures is None or case.first else figures(case)
     except Exception:  # the rule that needs them has told why
         return []
 

@@ -6,7 +6,22 @@ from typing import Literal
 
 from gateway.core.verdict import RuleFinding, ScenarioFigures
 from safety.case import Case
-from safety.rules import authority, cool_down, fits_line, freshness, line_state
+from safety.performance import figures_of
+from safety.rules import (
+    alignment,
+    authority,
+    cool_down,
+    corners,
+    decay,
+    delay_margin,
+    fits_line,
+    freshness,
+    improvement,
+    line_state,
+    paper,
+    promises,
+    validity,
+)
 
 Kind = Literal["gains", "experiment", "model"]
 
@@ -15,6 +30,7 @@ Kind = Literal["gains", "experiment", "model"]
 class Rule:
     name: str
     check: Callable[[Case], list[RuleFinding]]
+    with_model_only: bool = False  #: not asked of a first configuration, for which no model is accepted yet
 
 
 RULES: dict[Kind, tuple[Rule, ...]] = {
@@ -24,6 +40,13 @@ RULES: dict[Kind, tuple[Rule, ...]] = {
         Rule(cool_down.RULE, cool_down.check),
         Rule(line_state.RULE, line_state.check_gains),
         Rule(fits_line.RULE, fits_line.check),
+        Rule(validity.RULE, validity.check, with_model_only=True),
+        Rule(alignment.RULE, alignment.check, with_model_only=True),
+        Rule(decay.RULE, decay.check),
+        Rule(delay_margin.RULE, delay_margin.check),
+        Rule(corners.RULE, corners.check),
+        Rule(improvement.RULE, improvement.check, with_model_only=True),
+        Rule(promises.RULE, promises.check, with_model_only=True),
     ),
     "experiment": (
         Rule(authority.RULE, authority.check),
@@ -37,6 +60,10 @@ RULES: dict[Kind, tuple[Rule, ...]] = {
     ),
 }
 
-REPORTED: dict[Kind, tuple[Rule, ...]] = {"gains": (), "experiment": (), "model": ()}
+REPORTED: dict[Kind, tuple[Rule, ...]] = {
+    "gains": (Rule(paper.RULE, paper.check, with_model_only=True),),
+    "experiment": (),
+    "model": (),
+}
 
-FIGURES: dict[Kind, Callable[[Case], list[ScenarioFigures]]] = {}
+FIGURES: dict[Kind, Callable[[Case], list[ScenarioFigures]]] = {"gains": figures_of}

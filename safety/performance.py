@@ -1,0 +1,103 @@
+"""How good a configuration is at the mean of what is believed: the figures that are compared and promised."""
+
+from dataclasses import dataclass
+from math import inf, isfinite
+from typing import Literal
+
+import numpy as np
+
+from gateway.control.judged_courses import improvement_courses
+from gateway.control.mpc_linear import unconstrained
+from gateway.control.rollout import Course, Rollouts, Setup, plants_of_thetas, simulate
+from gateway.core.controller import Controller
+from gateway.core.controller_laws import MpcConfig
+from gateway.core.signals import FloatArray
+from gateway.core.theta import Noise
+from gateway.core.verdict import ScenarioFigures
+from safety.case import Case
+from safety.simulated import judged_of, setup_of
+
+Whose = Literal["in service", "baseline", "proposed"]
+
+
+@dataclass(frozen=True)
+class Figures:
+    """Of one configuration in one course. Infinite: it never settled, or the line ran away."""
+
+    rmse_n: float
+    overshoot_pct: float  #: of the worst span
+    settling_s: float  #: of the worst span
+    effort_n2m2s: float
+
+
+Performance = dict[str, Figures]  #: by the name of the course
+
+
+def performance(config: Controller, case: Case) -> Performance:
+    """RMSE and effort under the model's noise; overshoot and settling without, where they are no matter of luck.
+
+    A predictive controller is taken for the law that it is where no limit is reached.
+    """
+    law = unconstrained(config) if isinstance(config, MpcConfig) else config
+    noisy = setup_of(case.line, case.noise, case.seed, 0.0)
+    quiet = setup_of(case.line, Noise(0.0, 0.0, 0.0), case.seed, 0.0)
+    plants = plants_of_thetas([case.believed])
+    return {
+        name: _figures(simulate(law, plants, course, noisy), simulate(law, plants, course, quiet), course, noisy, case)
+        for name, course in improvement_courses(judged_of(case)).items()
+    }
+
+
+def figures_of(case: Case) -> list[ScenarioFigures]:
+    """Of all configurations and courses, as the verdict has them."""
+    return [
+        ScenarioFigures(
+            scenario=name,
+            configuration=whose,
+            rmse_n=_finite(one.rmse_n),
+            overshoot_pct=_finite(one.overshoot_pct),
+            settling_s=_finite(one.settling_s),
+            effort_n2m2s=_finite(one.effort_n2m2s),
+        )
+        for whose, found in performances(case).items()
+        for name, one in found.items()
+    ]
+
+
+def performances(case: Case) -> dict[Whose, Performance]:
+    """In service, baseline where there is one, proposed; computed once for a case."""
+    return case.once("performances", _performances)
+
+
+def _performances(case: Case) -> dict[Whose, Performance]:
+    context = case.context
+    found: dict[Whose, Performance] = {"in service": performance(context.in_service, case)}
+    if context.baseline is not None:
+        found["baseline"] = performance(context.baseline, case)
+    return found | {"proposed": performance(case.controller, case)}
+
+
+def _figures(noisy: Rollouts, quiet: Rollouts, course: Course, setup: Setup, case: Case) -> Figures:
+    spans = [i for i in range(case.line.n) if i not in case.draw_spans]
+    scale = _scale(course)[spans]
+    return Figures(
+        rmse_n=_sound(np.sqrt(noisy.squared_error_n2[0, spans].sum())),
+        overshoot_pct=_sound((100.0 * quiet.beyond_n[0, spans] / scale).max()),
+        settling_s=_sound(setup.period_s * quiet.settled[0, spans].max()),
+        effort_n2m2s=_sound(noisy.effort_n2m2s[0].sum()),
+    )
+
+
+def _scale(course: Course) -> FloatArray:
+    """What an overshoot is a share of (n,): the step; the set-point where it does not step."""
+    settled = course.settled_at_n
+    step = np.abs(settled[0] - course.tension_n[0])
+    return np.where(step > 0.0, step, settled[0])
+
+
+def _sound(value: float) -> float:
+    return inf if np.isnan(value) else float(value)
+
+
+def _finite(value: float) -> float | None:
+    return value if isfinite(value) else None

@@ -1,0 +1,96 @@
+"""Whether every channel tells its value at the time that it is given: a few milliseconds late, and a loop swings.
+
+A channel that is late by d shows y - d y'. What that does to the innovations w (white, of size 1) is linear, w = d s:
+least squares give d = s'w / s's with the variance 1 / s's. y' is taken from what was predicted up to the sample before,
+which no innovation has touched yet: of a true model the mean of d is 0.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from gateway.control.prediction import Predicted, Stretch, innovations, whitened
+from gateway.core.line_model import LineModel, noise_of, theta_of
+from gateway.core.signals import FloatArray
+from gateway.core.theta import Theta
+from gateway.core.verdict import RuleFinding
+from safety.case import Case
+from safety.excitation import newest
+from safety.findings import at_most, told
+from safety.predicting import Foretold, foretold
+
+RULE = "alignment"
+MOST_S = 20.0  #: of data are looked at
+SURE = 1.96  #: standard deviations
+PROBE_S = 1e-3
+
+
+def check(case: Case) -> list[RuleFinding]:
+    """By how much a channel tells late at the least, in seconds, against gate.alignment_max_s."""
+    if case.context.model is None:
+        return [told(RULE, False, "no model is accepted by which channels could be compared")]
+    return of_model(case, case.context.model)
+
+
+def of_model(case: Case, model: LineModel, name: str = RULE) -> list[RuleFinding]:
+    """By any model."""
+    noise, most_s = noise_of(model), case.line.gate.alignment_max_s
+    if noise is None or not case.excited:
+        return [told(name, False, "there are no data by which channels could be compared: see model validity")]
+    found = foretold(theta_of(model), noise, newest(case.excited, MOST_S))
+    names = channels(found[0].predicted.stretch)
+    late_s, spread_s = lateness(theta_of(model), found)
+    known = np.flatnonzero(SURE * spread_s <= most_s)
+    if not len(known):
+        return [told(name, False, "the data do not tell whether channels are aligned: a longer or larger experiment")]
+    at_least_s = np.maximum(np.abs(late_s) - SURE * spread_s, 0.0)[known]
+    worst = known[int(at_least_s.argmax())]
+    text = (
+        f"{names[worst]} tells {1e3 * late_s[worst]:+.1f} ms late, within {1e3 * SURE * spread_s[worst]:.1f} ms; "
+        f"allowed: gate.alignment_max_s, {1e3 * most_s:g} ms either way, as far as its interval goes; "
+        f"{len(known)} of {len(names)} channels tell"
+    )
+    return [at_most(name, float(at_least_s.max()), most_s, "s", text)]
+
+
+def channels(stretch: Stretch) -> list[str]:
+    """In the order of `lateness`."""
+    return [*stretch.names, *(f"torque {i + 1}" for i in range(stretch.n))]
+
+
+def lateness(theta: Theta, found: list[Foretold]) -> tuple[FloatArray, FloatArray]:
+    """Of each channel by itself, the others taken for right: seconds, and their standard deviation (c,)."""
+    information = gradient = np.zeros(len(channels(found[0].predicted.stretch)))
+    for one in found:
+        shown = sensitivities(theta, one.predicted)
+        information = information + np.square(shown).sum(axis=(1, 2))
+        gradient = gradient + (shown * one.predicted.whitened).sum(axis=(1, 2))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        late, spread = gradient / information, 1.0 / np.sqrt(information)
+    return np.where(information > 0.0, late, 0.0), spread
+
+
+def sensitivities(theta: Theta, predicted: Predicted) -> FloatArray:
+    """What a second's lateness of each channel does to the whitened innovations, (c, k, m)."""
+    stretch, period_s = predicted.stretch, predicted.stretch.recording.period_s
+    before = np.zeros_like(stretch.measured)
+    states = predicted.state[:, stretch.outputs]
+    before[stretch.first + 2 :] = np.diff(states, axis=0) / period_s
+    rows = [_changed(theta, predicted, replace(stretch, measured=_moved(stretch.measured, before, j)))
+            for j in range(before.shape[1])]  # fmt: skip
+    turned = np.zeros_like(stretch.torque_nm)
+    turned[1:] = np.diff(stretch.torque_nm, axis=0) / period_s
+    rows += [_changed(theta, predicted, replace(stretch, torque_nm=_moved(stretch.torque_nm, turned, j)))
+             for j in range(stretch.n)]  # fmt: skip
+    return np.array(rows)
+
+
+def _moved(values: FloatArray, rate: FloatArray, column: int) -> FloatArray:
+    moved = values.copy()
+    moved[:, column] -= PROBE_S * rate[:, column]
+    return moved
+
+
+def _changed(theta: Theta, predicted: Predicted, stretch: Stretch) -> FloatArray:
+    innovation, _ = innovations([theta], stretch, predicted.gains)
+    return (whitened(innovation, predicted.gains)[0] - predicted.whitened) / PROBE_S

@@ -1,0 +1,65 @@
+"""Whether the line would be no worse off on the accepted model: against what is in service, and against a fixed
+baseline, so that many small steps do not walk away.
+"""
+
+from gateway.core.line import Gate
+from gateway.core.verdict import RuleFinding
+from safety.case import Case
+from safety.findings import at_most
+from safety.performance import Figures, Performance, performances
+
+RULE = "improvement"
+UNITS = {"rmse_n": "N", "overshoot_pct": "%", "settling_s": "s"}
+NAMES = {"rmse_n": "tracking error", "overshoot_pct": "overshoot", "settling_s": "settling time"}
+
+
+def check(case: Case) -> list[RuleFinding]:
+    """Of each metric the course in which it does worst, against each reference, with gate.tolerance_*."""
+    found = performances(case)
+    proposed = found["proposed"]
+    return [
+        _worst(case.line.gate, metric, whose, found[whose], proposed)
+        for whose in ("in service", "baseline")
+        if whose in found
+        for metric in UNITS
+    ]
+
+
+def allowed(gate: Gate, metric: str, reference: float) -> float:
+    """How large a metric may be beside that of a reference."""
+    floor = {
+        "rmse_n": gate.tolerance_n,
+        "overshoot_pct": gate.tolerance_overshoot_pct,
+        "settling_s": gate.tolerance_settling_s,
+    }
+    return reference + max(gate.tolerance_share * reference, floor[metric])
+
+
+def value_of(figures: Figures, metric: str) -> float:
+    """By the name of a metric."""
+    return {
+        "rmse_n": figures.rmse_n, "overshoot_pct": figures.overshoot_pct, "settling_s": figures.settling_s,
+    }[metric]  # fmt: skip
+
+
+def in_words(value: float, metric: str) -> str:
+    """With its unit; a settling time without end in words."""
+    if value == float("inf"):
+        return "never" if metric == "settling_s" else "without end"
+    return f"{value:.3g} {UNITS[metric]}"
+
+
+def _worst(gate: Gate, metric: str, whose: str, reference: Performance, proposed: Performance) -> RuleFinding:
+    pairs = [(name, value_of(proposed[name], metric), value_of(reference[name], metric)) for name in proposed]
+    name, value, before = max(pairs, key=lambda pair: _excess(pair[1], allowed(gate, metric, pair[2])))
+    limit = allowed(gate, metric, before)
+    text = (
+        f"{NAMES[metric]} in {name}: {in_words(value, metric)}, {whose} {in_words(before, metric)}; allowed: up to "
+        f"{in_words(limit, metric)}"
+    )
+    return at_most(f"{RULE}: {NAMES[metric]}, {whose}", value, limit, UNITS[metric], text)
+
+
+def _excess(value: float, limit: float) -> float:
+    """By how much it is too large; where both have no end, not at all."""
+    return 0.0 if value == limit else value - limit

@@ -1,0 +1,88 @@
+"""The paper's filter as it is written, reported beside the verdict: it decides nothing.
+
+    C_safe       |u| <= u_max and |du/dt| <= du_max at all times, of what the law asks for
+    P_improved   ||P_proposed|| < ||P_current||, P = [e_RMSE, OS, t_s] (eqs. rmse, overshoot, settling_time)
+    S_robust     max over ||dtheta|| <= eps of ||y - y_ref||_inf < delta_tol
+
+on the model at its mean, for the course "tension". eps and delta_tol, which the paper leaves open: the gate's corners
+of the model, and the largest permitted step with the tolerated overshoot of the paper's convergence criterion.
+"""
+
+import numpy as np
+
+from gateway.control.judged_courses import corner_courses, improvement_courses
+from gateway.control.mpc_linear import unconstrained
+from gateway.control.rollout import Course, plants_of_thetas, simulate
+from gateway.core.controller import Controller
+from gateway.core.controller_laws import MpcConfig
+from gateway.core.verdict import RuleFinding
+from safety.case import Case
+from safety.findings import at_most, told
+from safety.performance import Figures, performances
+from safety.simulated import holdable, judged_of, setup_of
+
+RULE = "paper"
+CONVERGED_OVERSHOOT = 0.2  #: of a step: eq. convergence_criteria
+CORNERS = 8
+
+
+def check(case: Case) -> list[RuleFinding]:
+    """C_safe, P_improved, S_robust, and their conjunction."""
+    found = [_safe(case), _improved(case), _robust(case)]
+    passed = all(one.passed for one in found)
+    return [*found, told("paper: approve", passed, f"the paper's filter would {'approve' if passed else 'reject'} it")]
+
+
+def _law(config: Controller) -> Controller:
+    return unconstrained(config) if isinstance(config, MpcConfig) else config
+
+
+def _safe(case: Case) -> RuleFinding:
+    """Torque and rate of the loop on the mean model, nothing limited: what the law asks for."""
+    limits, period_s = case.line.limits, case.line.control.period_s
+    setup = setup_of(case.line, case.noise, case.seed, 0.0)
+    free = type(setup)(**{**vars(setup), "torque_nm": np.inf, "torque_rate_nm_per_s": np.inf})
+    torque = rate = 0.0
+    for course in improvement_courses(judged_of(case)).values():
+        run = simulate(_law(case.controller), plants_of_thetas([case.believed]), course, free)
+        torque = max(torque, float(run.torque_max_nm.max()))
+        rate = max(rate, float(run.torque_step_max_nm.max()) / period_s)
+    share = max(torque / limits.torque_nm, rate / limits.torque_rate_nm_per_s)
+    text = (
+        f"C_safe: the law asks for up to {torque:.1f} Nm and {rate:.0f} Nm/s; allowed: {limits.torque_nm:g} Nm and "
+        f"{limits.torque_rate_nm_per_s:g} Nm/s"
+    )
+    return at_most("paper: C_safe", share, 1.0, "", text)
+
+
+def _improved(case: Case) -> RuleFinding:
+    found = performances(case)
+    course = "tension" if "tension" in found["proposed"] else next(iter(found["proposed"]))
+    now, proposed = _norm(found["in service"][course]), _norm(found["proposed"][course])
+    text = f"P_improved: ||P|| is {proposed:.3g} in {course}; allowed: below {now:.3g}, as in service"
+    finding = at_most("paper: P_improved", proposed, now, "", text)
+    return finding.model_copy(update={"passed": proposed < now})
+
+
+def _norm(figures: Figures) -> float:
+    """Of what has units of its own, as the paper takes it."""
+    return float(np.linalg.norm([figures.rmse_n, figures.overshoot_pct, figures.settling_s]))
+
+
+def _robust(case: Case) -> RuleFinding:
+    name, course = next(reversed(corner_courses(judged_of(case)).items()))
+    thetas = holdable(case.corners[:CORNERS], course, case.line.limits.torque_nm)
+    if not thetas:
+        return told("paper: S_robust", False, "S_robust: no corner is held by the torque")
+    setup = setup_of(case.line, case.noise, case.seed, 0.0)
+    run = simulate(_law(case.controller), plants_of_thetas(thetas), course, setup, record=True)
+    error = float(np.nan_to_num(np.abs(run.tension_n - course.tension_n), nan=np.inf).max())
+    limit = _tolerated(course)
+    text = f"S_robust: tension is up to {error:.1f} N from its set-point ({name}); allowed: below {limit:.1f} N"
+    return at_most("paper: S_robust", error, limit, "N", text)
+
+
+def _tolerated(course: Course) -> float:
+    """The largest step and its overshoot; where there is none, the same share of the set-point."""
+    step = float(np.abs(np.diff(course.tension_n, axis=0)).max(initial=0.0))
+    return (1.0 + CONVERGED_OVERSHOOT) * step if step else CONVERGED_OVERSHOOT * float(course.tension_n.min())

@@ -1,0 +1,71 @@
+"""Closed loops for the rules: stressed plants, and how the loop is closed around them."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from gateway.control.judged_courses import Judged
+from gateway.control.rollout import Course, Plants, Setup, plants_of_thetas
+from gateway.core.line import Gate, Line
+from gateway.core.signals import FloatArray
+from gateway.core.theta import Noise, Theta
+from gateway.core.web_model import equilibrium_torque, reference_speeds
+from safety.case import Case
+
+LONGEST_STEP_S = 0.005  #: of the integration; latencies are rounded up to whole ones
+HOLDABLE = 0.95  #: of the torque limit, at equilibrium: beyond it nobody could bring the line back
+
+
+def judged_of(case: Case) -> Judged:
+    """What the proposal is judged for."""
+    return Judged(case.line, case.tension_n, case.speed_max_m_per_s, case.tension_step_n, case.speed_step_m_per_s)
+
+
+def stressed(theta: Theta, gate: Gate) -> Theta:
+    """With the lag and the Coulomb friction that every simulated line has, where the model knows of less."""
+    return replace(
+        theta,
+        coulomb_nm=np.maximum(theta.coulomb_nm, gate.stress_coulomb_nm),
+        torque_lag_s=max(theta.torque_lag_s, gate.stress_torque_lag_s),
+    )
+
+
+def plants_under_stress(thetas: Sequence[Theta], gate: Gate, seed: int) -> Plants:
+    """Stressed, and with rollers out of round, each from another angle on."""
+    n = thetas[0].n
+    phases = np.random.default_rng([seed, 2]).uniform(0.0, 2.0 * np.pi, (len(thetas), n))
+    return plants_of_thetas([stressed(theta, gate) for theta in thetas], gate.stress_eccentricity, phases)
+
+
+def setup_of(line: Line, noise: Noise, seed: int, late_share: float) -> Setup:
+    """The loop of the line; latencies are those of the plants."""
+    period_s, limits = line.control.period_s, line.limits
+    return Setup(
+        period_s=period_s,
+        latency_s=0.0,
+        substeps=max(1, round(np.ceil(period_s / LONGEST_STEP_S - 1e-9))),
+        torque_nm=limits.torque_nm,
+        torque_rate_nm_per_s=limits.torque_rate_nm_per_s,
+        tension_noise_n=noise.tension_n,
+        speed_noise_m_per_s=noise.speed_m_per_s,
+        acceleration_m_per_s1_5=noise.acceleration_m_per_s1_5,
+        seed=seed,
+        late_share=late_share,
+    )
+
+
+def holdable(thetas: Sequence[Theta], course: Course, torque_nm: float) -> list[Theta]:
+    """Those that the torque holds wherever the course stands: beyond that no controller can, and none is to blame."""
+    return [theta for theta in thetas if _needed_nm(theta, course) <= HOLDABLE * torque_nm]
+
+
+def _needed_nm(theta: Theta, course: Course) -> float:
+    """The greatest torque at the equilibria of a course."""
+    changes: FloatArray = np.column_stack((course.tension_n, course.unwind_speed_m_per_s))
+    needed = 0.0
+    for row in np.unique(changes, axis=0):
+        speed = reference_speeds(theta.web, row[:-1], float(row[-1]))
+        torque = equilibrium_torque(theta.web, row[:-1], speed) + theta.coulomb_nm * np.sign(speed)
+        needed = max(needed, float(np.abs(torque).max()))
+    return needed
