@@ -126,7 +126,7 @@ def _unlike(value: Any, like: Any, where: str) -> str:
     if isinstance(like, list):
         if not isinstance(value, list) or (len(value) != len(like) and not (value and where in ANY_LENGTH)):
             return f"{where} has another length"
-        pairs = zip_longest(value, like[: len(value)], fillvalue=like[0])
+        pairs = zip_longest(value, like[: len(value)], fillvalue=like[0] if like else None)
         return next((found for one, other in pairs if (found := _unlike(one, other, f"{where}[]"))), "")
     if isinstance(like, str):
         return "" if isinstance(value, str) and (value or not like) else f"{where} is no text"

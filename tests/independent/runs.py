@@ -61,10 +61,12 @@ def simulated(
     *,
     latency_s: float | None = None,
     stop_outside: bool = False,
+    slowly: bool = False,
     traced: list[FloatArray] | None = None,
 ) -> Found:
     """Case b on truth b. `latency_s`: the line's own; the law's, where it is not given. `stop_outside` the band.
 
+    `slowly` with the product's own law, as a law that is not linear is run anyway.
     `traced` is given the true tensions (k, n) at the samples, and the torques (k, n), of each case.
     """
     n, count = truths[0].n, len(truths)
@@ -77,7 +79,7 @@ def simulated(
     bounds = np.array(
         [limits.torque_nm, limits.torque_rate_nm_per_s * config.period_s, limits.tension_min_n, limits.tension_max_n]
     )
-    law = None if isinstance(config, MpcConfig) else laws.law_of(config)
+    law = None if slowly or isinstance(config, MpcConfig) else laws.law_of(config)
     for b, case in enumerate(cases):
         k = longest if b == 0 else case.periods
         chances = (
