@@ -21,6 +21,7 @@ from safety.believed import corners_of_model, prior_corners
 from safety.excitation import Excited, excited_parts, recent
 
 T = TypeVar("T")
+NEAR_M_PER_S = 1e-3  #: above the speed of data: a measured mean is not the round number that was asked for
 
 
 @dataclass(frozen=True)
@@ -131,7 +132,7 @@ class Case:
             return min(self.line.gate.first_speed_max_m_per_s, self.line.limits.speed_max_m_per_s)
         # Without data the model rule refuses; the others still tell what they find at the speed of now.
         wanted = self.validated_m_per_s or self.context.state.speed_m_per_s or self.line.gate.first_speed_max_m_per_s
-        return min(wanted, self.line.limits.speed_max_m_per_s)
+        return min(wanted + NEAR_M_PER_S, self.line.limits.speed_max_m_per_s)
 
     @cached_property
     def tension_step_n(self) -> float:

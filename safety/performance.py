@@ -6,9 +6,10 @@ from typing import Literal
 
 import numpy as np
 
-from gateway.control.judged_courses import improvement_courses
+from gateway.control.judged_courses import improvement_courses, way_of_moves
 from gateway.control.mpc_linear import unconstrained
 from gateway.control.rollout import Course, Rollouts, Setup, plants_of_thetas, simulate
+from gateway.control.shaped_run import Way, follow
 from gateway.core.controller import Controller
 from gateway.core.controller_laws import MpcConfig
 from gateway.core.signals import FloatArray
@@ -17,6 +18,7 @@ from gateway.core.verdict import ScenarioFigures
 from safety.case import Case
 from safety.simulated import judged_of, setup_of
 
+QUIET = Noise(0.0, 0.0, 0.0)
 Whose = Literal["in service", "baseline", "proposed"]
 
 
@@ -40,12 +42,21 @@ def performance(config: Controller, case: Case) -> Performance:
     """
     law = unconstrained(config) if isinstance(config, MpcConfig) else config
     noisy = setup_of(case.line, case.noise, case.seed, 0.0)
-    quiet = setup_of(case.line, Noise(0.0, 0.0, 0.0), case.seed, 0.0)
-    plants = plants_of_thetas([case.believed])
-    return {
+    quiet = setup_of(case.line, QUIET, case.seed, 0.0)
+    plants, judged = plants_of_thetas([case.believed]), judged_of(case)
+    found = {
         name: _figures(simulate(law, plants, course, noisy), simulate(law, plants, course, quiet), course, noisy, case)
-        for name, course in improvement_courses(judged_of(case)).items()
+        for name, course in improvement_courses(judged).items()
     }
+    way = way_of_moves(judged)
+    return found if way is None else found | {"moves": _moved(follow(law, plants, way, quiet), way, quiet, case)}
+
+
+def _moved(tensions: FloatArray, way: Way, setup: Setup, case: Case) -> Figures:
+    """The tracking error of a shaped move: what else there is to know, steps tell."""
+    spans = [i for i in range(case.line.n) if i not in case.draw_spans]
+    error = (tensions - way.course(setup.period_s).tension_n)[:, spans]
+    return Figures(_sound(np.sqrt(np.mean(np.square(error).sum(axis=1)))), 0.0, 0.0, 0.0)
 
 
 def figures_of(case: Case) -> list[ScenarioFigures]:

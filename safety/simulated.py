@@ -8,7 +8,6 @@ import numpy as np
 from gateway.control.judged_courses import Judged
 from gateway.control.rollout import Course, Plants, Setup, plants_of_thetas
 from gateway.core.line import Gate, Line
-from gateway.core.signals import FloatArray
 from gateway.core.theta import Noise, Theta
 from gateway.core.web_model import equilibrium_torque, reference_speeds
 from safety.case import Case
@@ -61,11 +60,11 @@ def holdable(thetas: Sequence[Theta], course: Course, torque_nm: float) -> list[
 
 
 def _needed_nm(theta: Theta, course: Course) -> float:
-    """The greatest torque at the equilibria of a course."""
-    changes: FloatArray = np.column_stack((course.tension_n, course.unwind_speed_m_per_s))
+    """The greatest torque at the equilibria between the changes of a course."""
     needed = 0.0
-    for row in np.unique(changes, axis=0):
-        speed = reference_speeds(theta.web, row[:-1], float(row[-1]))
-        torque = equilibrium_torque(theta.web, row[:-1], speed) + theta.coulomb_nm * np.sign(speed)
+    for k in (0, *(course.changes[1:] - 1).tolist()):
+        tension = course.tension_n[k]
+        speed = reference_speeds(theta.web, tension, float(course.unwind_speed_m_per_s[k]))
+        torque = equilibrium_torque(theta.web, tension, speed) + theta.coulomb_nm * np.sign(speed)
         needed = max(needed, float(np.abs(torque).max()))
     return needed

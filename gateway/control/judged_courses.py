@@ -5,8 +5,8 @@ quarter of the step left to the limits of the set-points wherever there is room.
 promise may use:
 
     tension     all set-points at once: up, and down again
-    moves       the same way, along minimum-jerk moves of `MOVE_S`
     velocity    the unwinder's speed, down by the largest step and up again, in one period each
+    moves       a quarter of that, along a minimum-jerk move (`way_of_moves`), without noise
 """
 
 from dataclasses import dataclass
@@ -15,11 +15,13 @@ import numpy as np
 
 from gateway.control.reference import MinimumJerk
 from gateway.control.rollout_terms import Course, course_through
+from gateway.control.shaped_run import Way
 from gateway.core.line import Line
 from gateway.core.signals import FloatArray
 
 STAND_S = 0.3  #: before the first change
-MOVE_S = 0.5  #: a shaped move
+MOVE_S = 0.5  #: a shaped move, or longer where the line's rate asks for it
+MOVED = 0.25  #: of the largest step: more in so short a time is a matter of the torque limit
 LEAST_SPEED_M_PER_S = 0.005  #: the slowest that is looked at, where the line is to run faster
 SLOW = 0.1  #: the slow speed, of the fast one
 ROOM = 0.25  #: of a step, to the set-points' limits
@@ -64,14 +66,13 @@ class Judged:
 
 
 def improvement_courses(judged: Judged, lasting_s: float = 2.5) -> Courses:
-    """The named ones, each change standing for `lasting_s`; none of a step that the region does not permit."""
+    """The named ones but moves, each change standing for `lasting_s`; of steps that the region permits."""
     low, high = judged.levels()
     period_s, fast = judged.line.control.period_s, judged.fast_m_per_s
     found: Courses = {}
     if judged.tension_step_n > 0.0:
         parts = [(STAND_S, low, fast), (lasting_s, high, fast), (lasting_s, low, fast)]
         found["tension"] = course_through(period_s, parts)
-        found["moves"] = _moves(judged, low, high, lasting_s)
     if judged.speed_step_m_per_s > 0.0:
         now, before = judged.tension_n, judged.before_m_per_s
         found["velocity"] = course_through(
@@ -81,10 +82,11 @@ def improvement_courses(judged: Judged, lasting_s: float = 2.5) -> Courses:
 
 
 def corner_courses(judged: Judged, lasting_s: float = 2.5, tail_s: float = 1.5) -> Courses:
-    """Up and down slow and fast, neighbours against each other, speed down and up; each with a tail that stands."""
+    """Up and down slow and fast, every second span alone, speed down and up; each with a tail that stands."""
     low, high = judged.levels()
-    odd = np.arange(len(low)) % 2 == 0
-    one, other = np.where(odd, low, high), np.where(odd, high, low)
+    second = np.arange(len(low)) % 2 == 0
+    center = 0.5 * (low + high)
+    one, other = np.where(second, low, center), np.where(second, high, center)
     period_s, fast, slow = judged.line.control.period_s, judged.fast_m_per_s, judged.slow_m_per_s
     now, before = judged.tension_n, judged.before_m_per_s
     step = judged.tension_step_n > 0.0
@@ -97,20 +99,15 @@ def corner_courses(judged: Judged, lasting_s: float = 2.5, tail_s: float = 1.5) 
         found |= {
             "steps, fast": of((low, fast), (high, fast)),
             "steps, slow": of((low, slow), (high, slow)),
-            "neighbours apart": of((one, fast), (other, fast)),
+            "every second span": of((one, fast), (other, fast)),
         }
     return found
 
 
-def _moves(judged: Judged, low: FloatArray, high: FloatArray, lasting_s: float) -> Course:
-    """Set-points along minimum-jerk moves, as a course; changes count from the begin of each."""
-    period_s = judged.line.control.period_s
-    way = MinimumJerk(np.array([0.0]))
-    times = np.arange(0.0, MOVE_S, period_s)
-    way.move(0, 1.0, 1e9, 0.0, MOVE_S)
-    shape = np.array([float(way.at(t)[0, 0]) for t in times.tolist()])
-    stand, rest = round(STAND_S / period_s), max(1, round(lasting_s / period_s) - len(shape))
-    share = np.concatenate((np.zeros(stand), shape, np.ones(rest), 1.0 - shape, np.zeros(rest)))
-    tension = low + share[:, None] * (high - low)
-    speed = np.full(len(share), judged.fast_m_per_s)
-    return Course(tension, speed, stand, (stand + len(shape) + rest,))
+def way_of_moves(judged: Judged, rest_s: float = 1.0) -> Way | None:
+    """The shaped move; None where no set-point may move at once."""
+    low, high = judged.levels()
+    middle, half = 0.5 * (low + high), 0.5 * MOVED * (high - low)
+    time_s = max(MOVE_S, MinimumJerk.PEAK * MOVED * judged.tension_step_n / judged.line.moves.tension_rate_n_per_s)
+    way = Way(middle - half, middle + half, judged.fast_m_per_s, STAND_S, time_s, rest_s)
+    return way if judged.tension_step_n > 0.0 else None

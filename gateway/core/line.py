@@ -204,7 +204,7 @@ class Gate(Strict):
     # A line without an accepted model
     first_speed_max_m_per_s: Positive = 0.02
     first_step_max_n: Positive = 4.0
-    first_corner_share: Fraction = 0.5  #: of the tolerances: at its corners a first configuration is simulated
+    first_corner_share: Fraction = 0.4  #: of the tolerances: at its corners a first configuration is simulated
 
     @model_validator(mode="after")
     def _check(self) -> Self:

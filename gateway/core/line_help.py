@@ -168,6 +168,7 @@ HELP: dict[str, dict[str, str]] = {
         "tolerance_overshoot_pct": "the same of overshoot",
         "first_speed_max_m_per_s": "fastest speed before a model is accepted",
         "first_step_max_n": "largest set-point step before a model is accepted",
+        "first_corner_share": "of the tolerances: at its corners a first configuration and an experiment are simulated",
     },
     "Recipe": {
         "name": "name of the grade",

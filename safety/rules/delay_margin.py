@@ -9,7 +9,7 @@ from safety.rules.decay import decay_per_s
 from safety.simulated import judged_of
 
 RULE = "delay margin"
-STEP_S = 0.0005
+STEP_S = 0.001
 BEYOND = 2.0  #: times the limit is looked at; more is more
 
 
