@@ -139,14 +139,21 @@ def trying_cases(line: Line, top_m_per_s: float, generator: np.random.Generator)
     for _ in range(4):
         course.step(stepped(base, 1, 0.2)).stand(float(generator.uniform(0.15, 0.5)))
     found.append(course.step(base).case("one-after-another"))
+    base, course = at(0.8 * top_m_per_s)
+    apart = base.copy()
+    span = int(generator.integers(n - 1)) if n > 1 else 0
+    for i, sign in ((span, 1.0), (span + 1, -1.0)):
+        if i < n:
+            apart[i] = np.clip(base[i] + 0.7 * sign * limits.tension_step_max_n, LEAST_N, MOST_N)
+    found.append(course.step(apart).case("neighbours-apart"))
     _, course = at(0.7 * top_m_per_s)
     pushed = PUSH_NM * generator.choice([-1.0, 1.0], n) * generator.uniform(0.3, 1.0, n)
     found.append(course.push(pushed, 0.25).case("push", 3.0))
     return found
 
 
-def measuring_cases(line: Line, top_m_per_s: float) -> tuple[list[Case], list[Case]]:
-    """The cases by which configurations are compared: steps, and shaped moves."""
+def measuring_cases(line: Line, top_m_per_s: float) -> list[Case]:
+    """The cases by which configurations are compared: steps of one, of all, of the speed, and shaped moves."""
     n, limits = line.n, line.limits
     slow, middle = min(0.01, 0.3 * top_m_per_s), 0.5 * top_m_per_s
     rise = min(limits.speed_step_max_m_per_s, top_m_per_s - slow)
@@ -157,13 +164,12 @@ def measuring_cases(line: Line, top_m_per_s: float) -> tuple[list[Case], list[Ca
     shaped[0] += 8.0
     shaped[-1] -= 10.0
     level = np.full(n, 30.0)
-    steps = [
+    half = 0.5 * min(limits.tension_step_max_n, 24.0)
+    return [
         Course(line, base, slow).stand(0.5).step(high).case("up", 4.0),
         Course(line, base, middle).stand(0.5).step(low).case("down", 4.0),
         Course(line, level, slow).stand(0.5).step(unwind_m_per_s=slow + rise).case("faster", 4.0),
-    ]
-    moves = [
+        Course(line, level - half / 2, top_m_per_s).stand(0.5).step(level + half / 2).case("all", 4.0),
         Course(line, base, middle).stand(0.5).glide(shaped, middle, 0.5).case("shaped", 4.0),
         Course(line, level, slow).stand(0.5).glide(level, slow + rise, 1.0).case("shaped-faster", 4.0),
     ]
-    return steps, moves

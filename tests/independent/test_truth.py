@@ -164,7 +164,7 @@ def all_laws() -> dict[str, Controller]:
         "lqi": lqi, "lqg": design_lqg(late), "lqr": design_lqr(task),
         "draw": lqi.model_copy(update={"draw_spans": [3]}),
         "pid": slow.model_copy(update={"gain_derivative": (0.02 * np.eye(6)).tolist()}),
-        "scheduled": design_scheduled(design_lqi, task, [0.02, 0.08]),
+        "scheduled": design_scheduled(task, design_lqi, [0.02, 0.08]),
     }  # fmt: skip
 
 
