@@ -6,7 +6,7 @@ RUN   := $(PY) -m gateway.cli
 export PYTHONDONTWRITEBYTECODE :=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup run test system-test check format bench bench-stepped bench-wire bench-processes bench-cycle bench-control bench-identify bench-faults bench-fuzz bench-soak lock clean
+.PHONY: help setup run test system-test check format bench bench-stepped bench-wire bench-processes bench-cycle bench-control bench-identify bench-faults bench-fuzz bench-gate bench-soak lock clean
 
 help: ## this list
 	@echo "r2rgate: make TARGET"
@@ -63,6 +63,9 @@ bench-fuzz: setup ## a million hostile frames through each decoder (ARGS="--fram
 
 bench-soak: setup ## an hour of a line on three wires, with something going wrong each minute (ARGS="--minutes 10")
 	@$(PY) -m tests.bench.soak $(ARGS)
+
+bench-gate: setup ## proposals of every way of going wrong, judged by the gate and by the truth (ARGS="--parts a --plants 5 --proposals 200")
+	@$(PY) -m tests.bench.gate $(ARGS)
 
 bench-cycle: setup ## how late the loop wakes beside cyclictest, what a cycle takes and costs; as root (about 40 min)
 	@$(PY) -m tests.bench.cycle $(ARGS)

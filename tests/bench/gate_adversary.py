@@ -8,7 +8,7 @@ from gateway.core.controller import Controller, ControllerRefused
 from gateway.core.judge_context import JudgeContext
 from tests.bench.gate_contexts import context_of, instant
 from tests.bench.gate_mutations import changed, controller_of, document_of, matrices
-from tests.bench.gate_runs import Bench
+from tests.bench.gate_runs import LineBench
 from tests.independent.cases import trying_cases
 from tests.independent.gate_judge import GateJudge
 from tests.independent.runs import Case, simulated
@@ -26,7 +26,7 @@ class Chain:
     unsafe: str
 
 
-def chain(bench: Bench, index: int) -> Chain:
+def chain(bench: LineBench, index: int) -> Chain:
     """One of them. The baseline stays what it was; what is accepted is in service for the next step."""
     given, generator = bench.given, np.random.default_rng([bench.given.number, index, 9])
     config: Controller = given.adapted if index % 2 == 0 else given.initial
@@ -56,7 +56,7 @@ def chain(bench: Bench, index: int) -> Chain:
     return Chain(given.number, steps, badness, truth.unsafe(config))
 
 
-def _context(bench: Bench, config: Controller, baseline: Controller, step: int) -> JudgeContext:
+def _context(bench: LineBench, config: Controller, baseline: Controller, step: int) -> JudgeContext:
     context = context_of(bench.given, config, baseline)
     # Time goes on between the changes.
     return context.model_copy(update={"now": instant(10.0 * step)})

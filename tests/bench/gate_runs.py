@@ -16,7 +16,7 @@ from tests.bench.gate_proposals import Asked
 from tests.independent.gate_judge import GateJudge, model_error, unsafe_experiment
 
 MISLEADS = 0.1  #: a model farther from the truth than this
-ROLLOUT_RULE = "stress"  #: in the names of the rules that simulate
+ROLLOUT_RULE = "corners"  #: in the names of the rule that simulates
 FIRST_TOP_M_PER_S = 0.02
 
 
@@ -41,7 +41,7 @@ class Tried:
     texts: list[str] = field(default_factory=list)  #: of the rules that do not pass
 
 
-class Bench:
+class LineBench:
     """One line with its contexts; judges are made when they are first asked for."""
 
     def __init__(self, given: GateLine) -> None:
@@ -71,6 +71,10 @@ class Bench:
             line = creeping(given.line) if first else given.line
             self._judges[context] = GateJudge(line, given.truth, in_service, baseline, top, given.number)
         return self._judges[context]
+
+    def in_service(self) -> dict[str, str]:
+        """By context, what is unsafe on the truth about what runs there: nobody would propose anything better there."""
+        return {name: self.truth(name).unsafe(context.in_service) for name, context in self.contexts.items()}
 
     def tried(self, asked: Asked, seed: int) -> Tried:
         given, context = self.given, self.contexts[asked.context]
@@ -105,6 +109,11 @@ class Bench:
         """A verdict on gains in a context of one's own, on the line's data."""
         payload = payload_of(GainsChange(controller=config), context, self.given.line)
         return judge(payload, context, self.given.line, [self.given.recording], seed)
+
+
+def measured(one: Tried) -> bool:
+    """Whether the rule that simulates has come to a figure."""
+    return any(rule.startswith(ROLLOUT_RULE) and value is not None for rule, _, _, value in one.findings)
 
 
 def creeping(line: Line) -> Line:
