@@ -9,6 +9,7 @@ from gateway.control.corners import corners, corners_of_line
 from gateway.core.line import Gate, Line, Parameter
 from gateway.core.line_model import LineModel
 from gateway.core.line_model_posterior import ModelPosterior
+from gateway.core.signals import FloatArray
 from gateway.core.theta import Theta, nominal_theta
 
 TWO_SIDED_95 = 1.96  #: standard deviations to the ends of an interval
@@ -24,6 +25,14 @@ def corners_of_model(model: LineModel, gate: Gate, latency_s: float, seed: int) 
     whole = model if model.posterior is not None else _of_intervals(model)
     found = corners(whole, gate.corner_sigmas, gate.corner_least, gate.corners, seed)
     return [replace(theta, latency_s=latency_s) for theta in found]
+
+
+def stated(model: LineModel) -> tuple[list[str], FloatArray]:
+    """Names, and the covariance (k, k) of their logarithms, as the model states them. Raises Unbelievable."""
+    posterior = model.posterior or _of_intervals(model).posterior
+    if posterior is None:
+        raise Unbelievable("the model does not say how sure it is")
+    return posterior.names, np.array(posterior.covariance)
 
 
 def prior_corners(line: Line, latency_s: float, seed: int) -> list[Theta]:

@@ -9,15 +9,19 @@ from importlib.metadata import version
 
 import numpy as np
 
+from gateway.control.design import design_lqi, task_of
+from gateway.control.rollout import course_through, simulate
 from gateway.core.deployment import Region
 from gateway.core.judge_context import JudgeContext, context_hash
 from gateway.core.line import Line
 from gateway.core.proposal import Proposal, ProposalRefused, parse_proposal, proposal_hash
 from gateway.core.recording import Recording
+from gateway.core.theta import Noise, nominal_theta
 from gateway.core.verdict import RuleFinding, ScenarioFigures, Verdict, line_hash
 from safety.case import Case
 from safety.findings import told
 from safety.rules.table import FIGURES, REPORTED, RULES, Rule
+from safety.simulated import plants_under_stress, setup_of
 
 FORMAT_RULE, DATA_RULE = "format", "data"
 
@@ -40,6 +44,28 @@ def judge(payload: bytes, context: JudgeContext, line: Line, recordings: Sequenc
     accepted = all(finding.passed for finding in findings)
     region = _region(case) if accepted and proposal.kind == "gains" else None
     return _verdict(payload, context, line, seed, proposal, findings, reported, figures, region)
+
+
+def refusal(payload: bytes, context: JudgeContext, line: Line, seed: int, rule: str, text: str) -> Verdict:
+    """Of a proposal that could not be judged."""
+    try:
+        proposal = parse_proposal(payload, line.gate.proposal_max_bytes)
+    except Exception:  # that it is none as well changes nothing
+        proposal = None
+    return _verdict(payload, context, line, seed, proposal, [told(rule, False, text)])
+
+
+def failed(payload: bytes, context: JudgeContext, line: Line, seed: int, error: Exception) -> Verdict:
+    """Of a proposal over which the judge itself has stumbled."""
+    return _verdict(payload, context, line, seed, None, [_failed("judge", error)])
+
+
+def warm_up(line: Line) -> None:
+    """Compile and load what verdicts need, so that the first one is as quick as the others."""
+    config = design_lqi(task_of(line))
+    plants = plants_under_stress([nominal_theta(line)], line.gate, 0)
+    course = course_through(line.control.period_s, [(0.1, np.array(line.recipes[0].tension_n), 0.01)], 0.05)
+    simulate(config, plants, course, setup_of(line, Noise(), 0, line.gate.stress_late_share))
 
 
 def _asked(rule: Rule, case: Case) -> list[RuleFinding]:

@@ -10,8 +10,8 @@ import numpy as np
 
 from gateway.core.line import Line
 from gateway.core.line_model import ChannelDelay, LineModel, ModelValidation
-from gateway.core.recording import Recording
-from gateway.identification.identify import Identified, joined
+from gateway.core.recording import Recording, joined
+from gateway.identification.identify import Identified
 from gateway.identification.model_record import Origin, model_from
 from gateway.identification.validation import Validation
 from gateway.supervisor.models import Entry, begin_repository

@@ -12,6 +12,7 @@ from gateway.cli import (
     experiment_commands,
     fault_commands,
     identify_commands,
+    judge_commands,
     line_commands,
     models_commands,
     operate_commands,
@@ -45,6 +46,7 @@ app.command(rich_help_panel=ENGINEER)(design_commands.design)
 app.add_typer(models_commands.app, rich_help_panel=ENGINEER)
 app.command(rich_help_panel=ENGINEER)(rehearse_commands.rehearse)
 app.add_typer(experiment_commands.app, rich_help_panel=ENGINEER)
+app.command(rich_help_panel=ENGINEER)(judge_commands.judge)
 app.command(rich_help_panel=PROCESSES)(process_commands.run)
 app.command(rich_help_panel=PROCESSES)(process_commands.loop)
 app.command(rich_help_panel=PROCESSES)(process_commands.gateway)

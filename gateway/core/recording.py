@@ -1,6 +1,7 @@
 """What was measured and sent on a line over some time: the data of identification, validity and diagnosis."""
 
 import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +14,7 @@ ARRAYS = (
     "time_s", "tension_n", "tension_setpoint_n", "speed_m_per_s", "torque_nm", "torque_actual_nm",
     "unwind_speed_m_per_s", "controlled",
 )  # fmt: skip
+GAP_PERIODS = 10  #: between recordings that are joined
 
 
 @dataclass(frozen=True)
@@ -91,3 +93,18 @@ def recording_of(frames: NDArray[np.void], period_s: float, source: str) -> Reco
         period_s=period_s,
         source=source,
     )
+
+
+def joined(recordings: Sequence[Recording]) -> Recording:
+    """Recordings one after another, each after a gap. Raises ValueError where sizes or periods differ."""
+    first = recordings[0]
+    if any((one.n, one.period_s) != (first.n, first.period_s) for one in recordings):
+        raise ValueError("the recordings differ in spans or period; those of one line are wanted")
+    times: list[FloatArray] = []
+    begin_s = 0.0
+    for one in recordings:
+        times.append(one.time_s - one.time_s[0] + begin_s)
+        begin_s = float(times[-1][-1]) + GAP_PERIODS * first.period_s
+    arrays = {name: np.concatenate([getattr(one, name) for one in recordings]) for name in ARRAYS[1:]}
+    source = ", ".join(dict.fromkeys(one.source for one in recordings))
+    return Recording(time_s=np.concatenate(times), **arrays, period_s=first.period_s, source=source)

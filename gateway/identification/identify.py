@@ -7,12 +7,9 @@ does on data that it has not seen is told of the same structure, made from the p
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
-
 from gateway.control.prediction import Unpredictable
 from gateway.core.line import Line
-from gateway.core.recording import ARRAYS, Recording
-from gateway.core.signals import FloatArray
+from gateway.core.recording import Recording, joined
 from gateway.core.theta import Noise
 from gateway.identification.assessment import assess
 from gateway.identification.comparison import WINDOW_S, Comparison, compare
@@ -26,7 +23,6 @@ from gateway.identification.validation import Validation, validate
 
 HELD_OUT = 0.3  #: of each stretch, its end
 LEAST_HELD_OUT_S = WINDOW_S + 0.2  #: a window of the comparison, and what comes before it
-GAP_PERIODS = 10  #: between recordings that are joined
 
 
 class NotIdentified(Exception):
@@ -127,21 +123,6 @@ def _others(line: Line, choice: Choice) -> dict[str, Callable[[Sequence[Recordin
         "recursive least squares": lambda before: estimated_recursively(live(line, noise), joined(before), structure),
         "subspace": lambda before: estimated_by_subspace(line, joined(before)),
     }
-
-
-def joined(recordings: Sequence[Recording]) -> Recording:
-    """Recordings one after another, each after a gap. Raises ValueError where sizes or periods differ."""
-    first = recordings[0]
-    if any((one.n, one.period_s) != (first.n, first.period_s) for one in recordings):
-        raise ValueError("the recordings differ in spans or period; those of one line are wanted")
-    times: list[FloatArray] = []
-    begin_s = 0.0
-    for one in recordings:
-        times.append(one.time_s - one.time_s[0] + begin_s)
-        begin_s = float(times[-1][-1]) + GAP_PERIODS * first.period_s
-    arrays = {name: np.concatenate([getattr(one, name) for one in recordings]) for name in ARRAYS[1:]}
-    source = ", ".join(dict.fromkeys(one.source for one in recordings))
-    return Recording(time_s=np.concatenate(times), **arrays, period_s=first.period_s, source=source)
 
 
 def _too_short(recordings: Sequence[Recording]) -> str:

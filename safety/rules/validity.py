@@ -6,7 +6,7 @@ The predictor has no disturbance states: with them quiet data pass everything.
 from gateway.core.line_model import LineModel, noise_of, theta_of
 from gateway.core.verdict import RuleFinding
 from safety.case import Case
-from safety.excitation import LEAST_S, MOVING, newest
+from safety.excitation import LEAST_S, MOVING, SAME_M_PER_S, SAME_SPEED, newest
 from safety.findings import at_least, at_most, told
 from safety.predicting import Foretold, by_speed, foretold, normalised, normalised_by_output, seconds
 
@@ -18,7 +18,8 @@ def check(case: Case) -> list[RuleFinding]:
     """Normalised innovation squared within [gate.innovation_low, innovation_high] at each speed of the data."""
     if case.context.model is None:
         return [told(RULE, False, "no model is accepted, and none is needed for a first configuration")]
-    return of_model(case, case.context.model)
+    found = of_model(case, case.context.model)
+    return [*found, _fast_enough(case)] if case.excited else found
 
 
 def of_model(case: Case, model: LineModel, name: str = RULE) -> list[RuleFinding]:
@@ -29,8 +30,7 @@ def of_model(case: Case, model: LineModel, name: str = RULE) -> list[RuleFinding
     if not case.excited:
         return [told(name, False, _asks_for_data(case))]
     found = foretold(theta_of(model), noise, newest(case.excited))
-    groups = by_speed(found)
-    return [*(_at_speed(case, speed, of, name) for speed, of in groups), _fast_enough(case, groups[-1][0], name)]
+    return [_at_speed(case, speed, of, name) for speed, of in by_speed(found)]
 
 
 def _at_speed(case: Case, speed: float, found: list[Foretold], name: str) -> RuleFinding:
@@ -53,14 +53,14 @@ def _at_speed(case: Case, speed: float, found: list[Foretold], name: str) -> Rul
     return at_most(name, value, high, "", text)
 
 
-def _fast_enough(case: Case, fastest: float, name: str) -> RuleFinding:
+def _fast_enough(case: Case) -> RuleFinding:
     """The line does not run faster than where the model has been seen to hold."""
-    speed = case.context.state.speed_m_per_s
-    near = max(1.05 * fastest, fastest + 2e-3)
-    text = f"the line runs at {speed:g} m/s; data have shown the model up to {fastest:.3g} m/s: {_experiment(speed)}"
-    if speed <= near:
-        text = f"data have shown the model up to {fastest:.3g} m/s; the line runs at {speed:g} m/s"
-    return at_most(name, speed, near, "m/s", text)
+    speed, fastest = case.context.state.speed_m_per_s, case.validated_m_per_s
+    near = max((1.0 + SAME_SPEED) * fastest, fastest + SAME_M_PER_S)
+    text = f"data have shown the model up to {fastest:.3g} m/s; the line runs at {speed:g} m/s"
+    if speed > near:
+        text += f": {_experiment(speed)}"
+    return at_most(RULE, speed, near, "m/s", text)
 
 
 def _asks_for_data(case: Case) -> str:

@@ -1,0 +1,201 @@
+"""The judge in processes of its own: at low priority, each at one proposal at a time, and for no longer than allowed.
+
+They are started here and by nobody else, and speak to this process alone: a verdict that comes from them is the
+judge's. One that dies, hangs or answers what is no verdict is replaced, and the proposal that it had is refused.
+"""
+
+import asyncio
+import os
+import secrets
+import signal
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
+from typing import Any
+
+from gateway.core.judge_context import JudgeContext
+from gateway.core.line import Line
+from gateway.core.recording import Recording
+from gateway.core.verdict import Verdict
+
+NICER = 10  #: than the process that starts them
+BEGIN_S = 600.0  #: until one is ready: on a new machine it compiles first
+LARGEST_SEED = 2**53  #: below it every number is one in JSON, too
+SINGLE = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+#: Rules under which this process refuses by itself.
+TIME_RULE, WORKER_RULE = "time", "judge process"
+
+
+class NoVerdict(Exception):
+    """Why none came; `rule` is what the refusal goes by."""
+
+    def __init__(self, rule: str, text: str) -> None:
+        super().__init__(text)
+        self.rule = rule
+
+
+class _Worker:
+    """One process, and the pipe to it. Its methods block: they are for threads."""
+
+    def __init__(self, line: Line) -> None:
+        context = get_context("spawn")
+        self._ours, theirs = context.Pipe()
+        self._process: BaseProcess = context.Process(target=_work, args=(theirs, line), daemon=True)
+        with _one_thread_each(), _interrupt_later():
+            self._process.start()
+        theirs.close()
+        self._ready = False
+
+    @property
+    def pid(self) -> int | None:
+        return self._process.pid
+
+    def wait_ready(self) -> None:
+        """Raises NoVerdict."""
+        if not self._ready:
+            self._answer(BEGIN_S, "has not begun")
+            self._ready = True
+
+    def ask(self, job: tuple[Any, ...], limit_s: float) -> Verdict:
+        """Raises NoVerdict; the worker is not to be used again then."""
+        self.wait_ready()
+        try:
+            self._ours.send(job)
+        except OSError as error:
+            raise NoVerdict(WORKER_RULE, f"the judge's process has ended: {error}") from error
+        answer = self._answer(limit_s, "has given no verdict")
+        if not isinstance(answer, Verdict):
+            raise NoVerdict(WORKER_RULE, "the judge's process failed, and has said nothing else")
+        return answer
+
+    def end(self) -> None:
+        """At once, whatever it is at."""
+        self._process.kill()
+        self._process.join()
+        self._ours.close()
+        self._process.close()
+
+    def _answer(self, limit_s: float, missing: str) -> object:
+        try:
+            if not self._ours.poll(limit_s):
+                raise NoVerdict(TIME_RULE, f"the judge {missing} within {limit_s:g} s, and none in time is a refusal")
+            return self._ours.recv()
+        except (EOFError, OSError) as error:
+            raise NoVerdict(WORKER_RULE, "the judge's process has ended before it gave a verdict") from error
+
+
+class JudgeWorkers:
+    """Processes begin with the first proposal that needs them, or with `async with`; `close` ends them."""
+
+    def __init__(self, line: Line, count: int = 1) -> None:
+        self._line = line
+        self._idle: asyncio.Queue[_Worker | None] = asyncio.Queue()
+        for _ in range(count):
+            self._idle.put_nowait(None)
+        self._all: set[_Worker] = set()
+
+    async def __aenter__(self) -> "JudgeWorkers":
+        for _ in range(self._idle.qsize()):
+            self._idle.get_nowait()
+            self._idle.put_nowait(self._begun())
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await self.close()
+
+    async def close(self) -> None:
+        """End all of them, whatever they are at."""
+        workers, self._all = self._all, set()
+        for worker in workers:
+            await asyncio.to_thread(worker.end)
+
+    async def judge(
+        self,
+        payload: bytes,
+        context: JudgeContext,
+        recordings: Sequence[Recording],
+        seed: int | None = None,
+        limit_s: float | None = None,
+    ) -> Verdict:
+        """Always a verdict: where none comes within `limit_s` (gate.verdict_max_s), a refusal that says so.
+
+        `seed` None: drawn anew, so that nobody can prepare a proposal for it.
+        """
+        from safety.judge import refusal
+
+        seed = secrets.randbelow(LARGEST_SEED) if seed is None else seed
+        limit_s = self._line.gate.verdict_max_s if limit_s is None else limit_s
+        worker = await self._idle.get() or await asyncio.to_thread(self._begun)
+        asked = asyncio.ensure_future(
+            asyncio.to_thread(worker.ask, (payload, context, list(recordings), seed), limit_s)
+        )
+        good = False
+        try:
+            verdict = await asyncio.shield(asked)
+            good = True
+        except NoVerdict as none:
+            return refusal(payload, context, self._line, seed, none.rule, str(none))
+        finally:
+            if not good:  # it is at something, or dead: another one takes its place when there is need
+                self._all.discard(worker)
+                await asyncio.to_thread(worker.end)
+                asked.add_done_callback(_forgotten)
+            self._idle.put_nowait(worker if good else None)
+        return verdict
+
+    def _begun(self) -> _Worker:
+        worker = _Worker(self._line)
+        self._all.add(worker)
+        return worker
+
+
+def _forgotten(asked: "asyncio.Future[Verdict]") -> None:
+    """Nobody waits for this answer any more."""
+    if not asked.cancelled():
+        asked.exception()
+
+
+def _work(pipe: Connection, line: Line) -> None:
+    """A worker's life: ready, then a verdict for each job, until the other end is gone."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the process that has started this one
+    os.nice(NICER)
+    from safety.judge import failed, judge, warm_up
+
+    warm_up(line)
+    try:
+        pipe.send("ready")
+        while True:
+            payload, context, recordings, seed = pipe.recv()
+            try:
+                verdict = judge(payload, context, line, recordings, seed)
+            except Exception as error:  # whatever it is, it is no yes
+                verdict = failed(payload, context, line, seed, error)
+            pipe.send(verdict)
+    except (EOFError, OSError):
+        return
+
+
+@contextmanager
+def _one_thread_each() -> Iterator[None]:
+    """What begins here computes in one thread: the loop has the other processors."""
+    before = {name: os.environ.get(name) for name in SINGLE}
+    os.environ.update(dict.fromkeys(SINGLE, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+@contextmanager
+def _interrupt_later() -> Iterator[None]:
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)

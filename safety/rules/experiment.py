@@ -1,0 +1,105 @@
+"""Whether an experiment may move the line: with the controller in service, on the corners of what the line may be.
+
+No valid model is needed: without one the corners are those of the line's file.
+"""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from gateway.control.mpc_linear import unconstrained
+from gateway.control.rollout import Course
+from gateway.core.controller_laws import MpcConfig
+from gateway.core.experiment import Experiment, course, reasons_against
+from gateway.core.theta import Theta
+from gateway.core.verdict import RuleFinding
+from safety.believed import prior_corners
+from safety.case import Case
+from safety.findings import at_least, at_most, told
+from safety.rules.corners import rollouts
+from safety.rules.validity import check as check_validity
+from safety.simulated import holdable, stressed
+
+RULE, LIMITS_RULE, ABORT_RULE = "experiment", "experiment: limits", "experiment: abort"
+LEG_S = 8.0  #: of a leg are simulated; what comes after is more of the same
+
+
+def check_limits(case: Case) -> list[RuleFinding]:
+    """Set-points, steps, rates, speeds and duration against the line's limits."""
+    state = case.context.state
+    reasons = reasons_against(case.experiment, case.line, case.tension_n, state.speed_m_per_s)
+    if reasons:
+        return [told(LIMITS_RULE, False, text) for text in reasons]
+    return [told(LIMITS_RULE, True, f"it takes {case.experiment.duration_s:g} s within the limits of the line")]
+
+
+def check_abort(case: Case) -> list[RuleFinding]:
+    """It ends before a tension leaves its band, wherever the set-points stand."""
+    limits, allowed_n = case.line.limits, case.experiment.abort.deviation_n
+    low, high = float(case.tension_n.min()), float(case.tension_n.max())
+    most = min(low - limits.tension_min_n, limits.tension_max_n - high)
+    text = (
+        f"it is aborted when a tension is {allowed_n:g} N from where it stood; allowed: up to {most:g} N, which is the "
+        f"nearest limit of {limits.tension_min_n:g} to {limits.tension_max_n:g} N"
+    )
+    return [at_most(ABORT_RULE, allowed_n, most, "N", text)]
+
+
+def check_corners(case: Case) -> list[RuleFinding]:
+    """Peak deviation on the worst corner, against the abort condition; tension against its band."""
+    plants, where = _plants(case)
+    asked = _course(case, case.experiment)
+    kept = holdable([stressed(theta, case.line.gate) for theta in plants], asked, case.line.limits.torque_nm)
+    if not kept:
+        return [told(RULE, False, f"none of {len(plants)} {where} is held by the torque at these speeds: go slower")]
+    config = case.context.in_service
+    law = unconstrained(config) if isinstance(config, MpcConfig) else config
+    found = rollouts(case.line, law, kept, asked, case.noise, case.seed)
+    lowest, highest = float(found.tension_min_n.min()), float(found.tension_max_n.max())
+    deviation = max(
+        float((case.tension_n - found.tension_min_n).max()), float((found.tension_max_n - case.tension_n).max())
+    )
+    limits, abort_n = case.line.limits, case.experiment.abort.deviation_n
+    on = f"on {len(kept)} {where}" + (f", {len(plants) - len(kept)} left out" if len(kept) < len(plants) else "")
+    return [
+        at_most(
+            f"{RULE}: deviation", deviation, abort_n, "N",
+            f"tension goes up to {deviation:.1f} N from where it stood ({on}); allowed: {abort_n:g} N, where it aborts",
+        ),
+        at_least(
+            f"{RULE}: lowest tension", lowest, limits.tension_min_n, "N",
+            f"tension falls to {lowest:.1f} N ({on}); allowed: down to {limits.tension_min_n:g} N",
+        ),
+        at_most(
+            f"{RULE}: highest tension", highest, limits.tension_max_n, "N",
+            f"tension rises to {highest:.1f} N ({on}); allowed: up to {limits.tension_max_n:g} N",
+        ),
+    ]  # fmt: skip
+
+
+def _plants(case: Case) -> tuple[list[Theta], str]:
+    """Corners of the accepted model where recent data bear it out, else of the line's file."""
+    if case.context.model is not None:
+        try:
+            if all(finding.passed for finding in check_validity(case)):
+                return case.corners, "corners of the accepted model"
+        except (ValueError, ArithmeticError):
+            pass  # a model that cannot be looked at is none that may be believed
+    return prior_corners(case.line, case.latency_s, case.seed), "corners of the line's file"
+
+
+def _course(case: Case, experiment: Experiment) -> Course:
+    """Its begin of each leg, with the way from speed to speed at the line's rate."""
+    legs = [leg.model_copy(update={"duration_s": min(leg.duration_s, LEG_S)}) for leg in experiment.legs]
+    shorter = experiment.model_copy(update={"legs": legs})
+    state, period_s = case.context.state, case.line.control.period_s
+    asked = list(course(shorter, case.tension_n, state.speed_m_per_s, period_s))
+    reach = case.line.moves.speed_rate_m_per_s2 * period_s
+    speeds = list(_ramped(state.speed_m_per_s, [speed for _, speed in asked], reach))
+    return Course(np.array([tension for tension, _ in asked]), np.array(speeds))
+
+
+def _ramped(now: float, asked: list[float], reach: float) -> Iterator[float]:
+    for goal in asked:
+        now += min(max(goal - now, -reach), reach)
+        yield now

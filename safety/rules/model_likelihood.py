@@ -1,0 +1,171 @@
+"""What the data themselves say of a model: that no other one near it explains them better than it admits.
+
+With w the innovations (white, of size 1), J their derivative by the logarithms of what the model says it knows, F = J'J
+and P the precision of the tolerances in the line's file:
+
+    shift      d = -(F + P)^-1 J'w, a Gauss-Newton step, in units of what model and data leave open:
+               d' (C + (F + P)^-1)^-1 d, C the covariance that the model states; of a true model chi-squared
+    sureness   the least eigenvalue of C against (F + P)^-1: how much surer the model is than the data can make it
+    noise      the gain in log-likelihood when one noise is taken half as large again, or as much smaller
+    others     the log-likelihood against the model in service, or the line's file
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from math import log, sqrt
+
+import numpy as np
+
+from gateway.control.corners import moved
+from gateway.control.prediction import Predicted, innovations, predict, whitened
+from gateway.core.line import Line
+from gateway.core.line_model import LineModel, noise_of, theta_of
+from gateway.core.line_model_names import split_name
+from gateway.core.signals import FloatArray
+from gateway.core.theta import Noise, Theta, nominal_theta
+from gateway.core.verdict import RuleFinding
+from safety.believed import Unbelievable, stated
+from safety.case import Case
+from safety.excitation import newest
+from safety.findings import at_least, at_most, told
+from safety.predicting import Foretold, foretold, normalised
+
+SHIFT, SURENESS, NOISE, OTHERS = "model: shift", "model: sureness", "model: noise", "model: held-out prediction"
+MOST_S = 20.0  #: of data are looked at
+SHIFT_MOST = 4.0  #: times the number of parameters
+SURENESS_LEAST = 0.25  #: of the covariance that data and tolerances support: half the standard deviation
+NOISE_FACTOR = 1.5
+INSISTS = 10.0  #: a gain in log-likelihood with which data insist
+PROBE = 1e-4
+UNNAMED = 1.7  #: tolerance of what the line's file does not name: friction that is dry, lag, latency
+
+
+@dataclass(frozen=True)
+class Look:
+    """A model on the recent, excited data."""
+
+    theta: Theta
+    noise: Noise
+    found: list[Foretold]
+
+
+def look_at(case: Case) -> Look:
+    """Raises Unbelievable where there is nothing to look at."""
+    noise = noise_of(case.model)
+    if noise is None or not case.excited:
+        raise Unbelievable("without the noise in the model, and data in which tensions move, nothing can be said")
+    theta = theta_of(case.model)
+    return Look(theta, noise, foretold(theta, noise, newest(case.excited, MOST_S)))
+
+
+def check_sureness(case: Case) -> list[RuleFinding]:
+    """Shift and sureness."""
+    look, names, covariance = look_at(case), *stated(case.model)
+    information, gradient = derivatives(look, names)
+    scale = max(normalised(look.found), 1.0)  # what the noise does not explain is noise as well
+    supported = np.linalg.inv(information / scale + prior_precision(case.line, names))
+    step = -supported @ gradient / scale
+    shift = float(step @ np.linalg.solve(covariance + supported, step))
+    worst = int(np.argmax(np.abs(step) / np.sqrt(np.diag(covariance + supported))))
+    more = max(1.0, _samples(case) / max(1, sum(one.predicted.stretch.predictions for one in look.found)))
+    root = np.linalg.cholesky(np.linalg.inv(supported) * more)
+    least = float(np.linalg.eigvalsh(root.T @ covariance @ root)[0])
+    most = SHIFT_MOST * len(names)
+    return [
+        at_most(
+            SHIFT, shift, most, "",
+            f"the data want {names[worst]} {100.0 * step[worst]:+.2f} % from where the model has it; in units of what "
+            f"is open {shift:.1f}, allowed: up to {most:g}",
+        ),
+        at_least(
+            SURENESS, least, SURENESS_LEAST, "",
+            f"the model states {least:.2g} of the variance that its data support, in the direction of which it is "
+            f"surest; allowed: {SURENESS_LEAST:g} and more",
+        ),
+        *_narrow_intervals(case.model, names, covariance),
+    ]  # fmt: skip
+
+
+def check_noise(case: Case) -> list[RuleFinding]:
+    """Each noise of the model, against half as large again and as much smaller."""
+    look = look_at(case)
+    gains = {
+        (name, factor): _gain(look, replace(look.noise, **{name: getattr(look.noise, name) * factor}))
+        for name in vars(look.noise)
+        for factor in (NOISE_FACTOR, 1.0 / NOISE_FACTOR)
+    }
+    (name, factor), gain = max(gains.items(), key=lambda each: each[1])
+    way = "larger" if factor > 1.0 else "smaller"
+    text = (
+        f"with noise.{name} {NOISE_FACTOR:g} times {way} than {getattr(look.noise, name):.3g} the data are likelier by "
+        f"{gain:.3g} in the logarithm; allowed: up to {INSISTS:g}"
+    )
+    return [at_most(NOISE, gain, INSISTS, "", text)]
+
+
+def check_others(case: Case) -> list[RuleFinding]:
+    """Predictions of the same data by the model in service, or by the line's file."""
+    look, before = look_at(case), case.context.model
+    theta = nominal_theta(case.line) if before is None else theta_of(before)
+    noise = look.noise if before is None else noise_of(before) or look.noise
+    others = foretold(theta, noise, [one.part for one in look.found])
+    gain = _log_likelihood(look.found) - _log_likelihood(others)
+    whose = "the line's file" if before is None else "the model in service"
+    text = f"the data are likelier by {gain:.4g} in the logarithm than by {whose}; allowed: {-INSISTS:g} and more"
+    return [at_least(OTHERS, gain, -INSISTS, "", text)]
+
+
+def derivatives(look: Look, names: Sequence[str]) -> tuple[FloatArray, FloatArray]:
+    """F (p, p) and J'w (p,) over all parts."""
+    information, gradient = np.zeros((len(names), len(names))), np.zeros(len(names))
+    thetas = [look.theta, *(moved(look.theta, {name: PROBE}) for name in names)]
+    for one in look.found:
+        predicted: Predicted = one.predicted
+        found, _ = innovations(thetas, predicted.stretch, predicted.gains)
+        white = whitened(found, predicted.gains).reshape(len(thetas), -1)
+        J = (white[1:] - white[0]) / PROBE
+        information += J @ J.T
+        gradient += J @ white[0]
+    return information, gradient
+
+
+def prior_precision(line: Line, names: Sequence[str]) -> FloatArray:
+    """P (p, p), diagonal: uniform within the tolerance, as a variance; hardly any of what the file does not name."""
+    roller, span = line.rollers[0], line.spans[0]
+    tolerances = {
+        "stiffness_n": line.web.stiffness_n.tolerance,
+        "length_m": span.length_m.tolerance,
+        "radius_m": roller.radius_m.tolerance,
+        "inertia_kg_m2": roller.inertia_kg_m2.tolerance,
+        "friction_nms_per_rad": roller.friction_nms_per_rad.tolerance,
+    }
+    deviations = [log(1.0 + tolerances.get(split_name(name)[0], UNNAMED)) / sqrt(3.0) for name in names]
+    return np.diag(1.0 / np.square(deviations))
+
+
+def _narrow_intervals(model: LineModel, names: Sequence[str], covariance: FloatArray) -> list[RuleFinding]:
+    """Intervals that are narrower than the posterior beside them."""
+    narrow = [
+        name
+        for name, variance in zip(names, np.diag(covariance).tolist(), strict=True)
+        if name in model.intervals
+        and model.intervals[name].low > 0.0
+        and log(model.intervals[name].high / model.intervals[name].low) < 2.0 * 1.96 * sqrt(SURENESS_LEAST * variance)
+    ]
+    if not narrow:
+        return []
+    return [told(SURENESS, False, f"intervals of {', '.join(narrow)} are narrower than the model's own posterior")]
+
+
+def _samples(case: Case) -> int:
+    """That the model may have been made from: those of the context, and no more."""
+    return sum(recording.samples for recording in case.recordings)
+
+
+def _gain(look: Look, noise: Noise) -> float:
+    others = [predict(look.theta, noise, one.predicted.stretch) for one in look.found]
+    return sum(float(one.log_likelihood.sum()) for one in others) - _log_likelihood(look.found)
+
+
+def _log_likelihood(found: Sequence[Foretold]) -> float:
+    return sum(float(one.predicted.log_likelihood.sum()) for one in found)
