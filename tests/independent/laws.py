@@ -60,7 +60,7 @@ class Memory(NamedTuple):
     error_before_n: FloatArray
     rate_n_per_s: FloatArray
     predicted: FloatArray  #: (2n,)
-    disturbance_nm: FloatArray
+    disturbance_nm: FloatArray  #: 0 of a law that estimates none
     sent_nm: FloatArray  #: (d, n)
     bump_nm: FloatArray
 
@@ -150,18 +150,16 @@ def _apply(matrices, low, share, i, vector):
 
 
 @compiled
-def _flight(matrices, low, share, i, offset, law, memory, now, with_disturbance):
-    """Row i of a matrix on torques in flight, from column `offset` on."""
-    n, total = now.torque.size, 0.0
-    for age in range(law.depth):
-        for j in range(n):
-            entry = matrices[low, i, offset + age * n + j]
+def _flight(matrices, low, share, i, offset, sent, torque_ref, disturbance):
+    """Row i of a matrix, from column `offset` on, times the torques in flight as deviations."""
+    total = 0.0
+    for age in range(sent.shape[0]):
+        for j in range(torque_ref.size):
+            column = offset + age * torque_ref.size + j
+            entry = matrices[low, i, column]
             if share > 0.0:
-                entry += share * (matrices[low + 1, i, offset + age * n + j] - entry)
-            away = memory.sent_nm[age, j] - now.torque_ref[j]
-            if with_disturbance:
-                away += memory.disturbance_nm[j]
-            total += entry * away
+                entry += share * (matrices[low + 1, i, column] - entry)
+            total += entry * (sent[age, j] - torque_ref[j] + disturbance[j])
     return total
 
 
@@ -200,7 +198,9 @@ def _ask_observer(law, memory, setpoint, low, share, seen, now):
     for i in range(n):
         now.torque[i] = now.torque_ref[i] - memory.disturbance_nm[i] + memory.bump_nm[i]
         now.torque[i] -= _apply(law.gain, low, share, i, now.state)
-        now.torque[i] -= _flight(law.gain_flight, low, share, i, 0, law, memory, now, True)
+        now.torque[i] -= _flight(
+            law.gain_flight, low, share, i, 0, memory.sent_nm, now.torque_ref, memory.disturbance_nm
+        )
 
 
 @compiled
@@ -222,7 +222,9 @@ def ask(law, memory, setpoint, unwind, seen, now):
         if law.kind == PID:
             now.torque[i] += memory.integral_nm[i] - _apply(law.gain_rate, low, share, i, memory.rate_n_per_s)
         else:
-            now.torque[i] -= _flight(law.gain_flight, low, share, i, 0, law, memory, now, False)
+            now.torque[i] -= _flight(
+                law.gain_flight, low, share, i, 0, memory.sent_nm, now.torque_ref, memory.disturbance_nm
+            )
             now.torque[i] += memory.integral_nm[i] if law.kind == LQI else memory.bump_nm[i]
 
 
@@ -239,7 +241,9 @@ def commit(law, memory, setpoint, unwind, now, applied):
             reference = setpoint[i] if i < n else now.speed_ref[i - n]
             memory.predicted[i] = reference + _apply(law.transition, low, share, i, now.state)
             memory.predicted[i] += _apply(law.inputs, low, share, i, away)
-            memory.predicted[i] += _flight(law.inputs, low, share, i, n, law, memory, now, True)
+            memory.predicted[i] += _flight(
+                law.inputs, low, share, i, n, memory.sent_nm, now.torque_ref, memory.disturbance_nm
+            )
     elif law.kind == PID or law.kind == LQI:
         for i in range(n):
             step = law.period_s * _apply(law.gain_integral, low, share, i, now.controlled)

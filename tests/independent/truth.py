@@ -13,7 +13,6 @@ torque meanwhile, and at the other flank it leaves its momentum to the roller.
 """
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,31 +25,55 @@ FloatArray = NDArray[np.float64]
 CREEP_M_PER_S = 2e-4  #: s
 
 
-class Truths(NamedTuple):
-    """Lines of equal size, for the kernel: (t, n), or (t, n+1) with the unwinder first, or (t,)."""
-
-    stiffness_n: FloatArray
-    length_m: FloatArray
-    radius_m: FloatArray
-    inertia_kg_m2: FloatArray
-    friction_nms_per_rad: FloatArray
-    disturbance_m_per_s2: FloatArray
-    coulomb_nm: FloatArray
-    eccentricity: FloatArray
-    phase_rad: FloatArray
-    gap_rad: FloatArray
-    drive_inertia_kg_m2: FloatArray
-    boundary_n: FloatArray  #: (t, 2)
-    torque_lag_s: FloatArray
-    cell_lag_s: FloatArray
-    late_share: FloatArray  #: of commands that reach their drive a period late
-    jitter_s: FloatArray  #: a sample is up to so much older than its time
-    tension_noise_n: FloatArray
-    speed_noise_m_per_s: FloatArray
-    tension_step_n: FloatArray  #: quantisation; 0: none
-    speed_step_m_per_s: FloatArray
-    torque_step_nm: FloatArray
-    unwinder_radius_m: FloatArray
+# Rows of the table that the kernel works on, (t, rows, n + 1): by the names of `Truth`, a place for each roller.
+(
+    STIFFNESS_N,
+    LENGTH_M,
+    RADIUS_M,
+    INERTIA_KG_M2,
+    FRICTION_NMS_PER_RAD,
+    DISTURBANCE_M_PER_S2,
+    COULOMB_NM,
+    ECCENTRICITY,
+    PHASE_RAD,
+    GAP_RAD,
+    DRIVE_INERTIA_KG_M2,
+    BOUNDARY_N,
+    TORQUE_LAG_S,
+    CELL_LAG_S,
+    LATE_SHARE,
+    JITTER_S,
+    TENSION_NOISE_N,
+    SPEED_NOISE_M_PER_S,
+    TENSION_STEP_N,
+    SPEED_STEP_M_PER_S,
+    TORQUE_STEP_NM,
+    UNWINDER_RADIUS_M,
+) = range(22)
+ROWS = (
+    "stiffness_n",
+    "length_m",
+    "radius_m",
+    "inertia_kg_m2",
+    "friction_nms_per_rad",
+    "disturbance_m_per_s2",
+    "coulomb_nm",
+    "eccentricity",
+    "phase_rad",
+    "gap_rad",
+    "drive_inertia_kg_m2",
+    "boundary_n",
+    "torque_lag_s",
+    "cell_lag_s",
+    "late_share",
+    "jitter_s",
+    "tension_noise_n",
+    "speed_noise_m_per_s",
+    "tension_step_n",
+    "speed_step_m_per_s",
+    "torque_step_nm",
+    "unwinder_radius_m",
+)
 
 
 @dataclass(frozen=True)
@@ -145,10 +168,14 @@ def stressed(truth: Truth, lag_s: float, late_share: float, coulomb_nm: float, e
     )
 
 
-def stacked(truths: list[Truth]) -> Truths:
-    """For the kernel. All have as many spans."""
-    return Truths(*(np.ascontiguousarray([getattr(one, name) for one in truths], dtype=np.float64)
-                    for name in Truths._fields))  # fmt: skip
+def stacked(truths: list[Truth]) -> FloatArray:
+    """(t, rows, n + 1) for the kernel. All have as many spans."""
+    table = np.zeros((len(truths), len(ROWS), max(truths[0].n + 1, 2)))
+    for t, truth in enumerate(truths):
+        for row, name in enumerate(ROWS):
+            value = np.atleast_1d(getattr(truth, name))
+            table[t, row, : len(value)] = value
+    return table
 
 
 def equilibrium(truth: Truth, tension_n: FloatArray, unwind_m_per_s: float) -> tuple[FloatArray, FloatArray]:
