@@ -32,6 +32,7 @@ from tests.bench.identify_runs import Workers
 PARTS = "abc"
 SEED = 6100
 CANDIDATES = 60  #: numbers of lines from which those are taken that the file's own controller holds
+PAPER_RULE = "paper: approve"
 PIECE = 20_000  #: mutations that a worker makes at a time
 
 
@@ -130,8 +131,8 @@ def _proposals(bench: Bench, workers: Workers, sizes: Sizes, half: str) -> None:
             bench.figure(f"{name}_p50_s", float(np.percentile(times, 50)), "s", len(times))
             bench.figure(f"{name}_p99_s", float(np.percentile(times, 99)), "s", len(times))
     _paper(bench, gains)
-    bench.tables["class by class, the half that is scored"] = _by_class(scored)
-    bench.tables["which rule stopped what"] = _by_rule(scored)
+    bench.tables["class by class, the half that is scored"] = by_class(scored)
+    bench.tables["which rule stopped what"] = by_rule(scored)
     bench.tables["unsafe and accepted"] = _listed(leaked)
     bench.tables["known good and refused"] = _listed([one for one in good if not one.accepted])
     bench.tables["lines"] = {
@@ -142,14 +143,14 @@ def _proposals(bench: Bench, workers: Workers, sizes: Sizes, half: str) -> None:
 
 def _paper(bench: Bench, gains: Sequence[Tried]) -> None:
     """The filter of the paper, as the verdicts report it: what it would have decided."""
-    told = [one for one in gains if one.reported]
-    passed = {id(one): all(passed for _, passed, _, _ in one.reported) for one in told}
+    passed = {id(one): passed for one in gains for rule, passed, _, _ in one.reported if rule == PAPER_RULE}
+    told = [one for one in gains if id(one) in passed]
     unsafe, good = [one for one in told if one.unsafe], [one for one in told if one.good]
     bench.figure("paper_unsafe_accepted", sum(passed[id(one)] for one in unsafe), "", len(unsafe))
     bench.figure("paper_good_accepted_pct", 100.0 * _share([passed[id(one)] for one in good]), "%", len(good))
 
 
-def _by_class(tried: Sequence[Tried]) -> dict[str, object]:
+def by_class(tried: Sequence[Tried]) -> dict[str, object]:
     rows = []
     for name in [*CLASSES, "predictive"]:
         own = [one for one in tried if one.class_name == name]
@@ -164,7 +165,7 @@ def _by_class(tried: Sequence[Tried]) -> dict[str, object]:
     }
 
 
-def _by_rule(tried: Sequence[Tried]) -> dict[str, object]:
+def by_rule(tried: Sequence[Tried]) -> dict[str, object]:
     """Rules in the rows: how many unsafe ones it stopped, alone, and how many known good."""
     rules = sorted({rule for one in tried for rule in one.against})
     rows = []

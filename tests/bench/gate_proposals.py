@@ -23,7 +23,7 @@ from gateway.control.design.lq import design_predictor, feedback, shared
 from gateway.core.controller import Controller, ControllerRefused
 from gateway.core.controller_laws import LqgConfig
 from gateway.core.experiment import Abort, Experiment, Leg
-from gateway.core.line_model import LineModel, model_of
+from gateway.core.line_model import LineModel, ModelRefused, model_of
 from gateway.core.proposal import Change, ExperimentChange, GainsChange, ModelChange
 from tests.bench.gate_contexts import GateLine
 from tests.bench.gate_mutations import (
@@ -193,8 +193,8 @@ def _poisoned(line: GateLine, generator: Generator) -> LineModel:
         covariance = np.array(document["posterior"]["covariance"]) * 1e-4
         document["posterior"]["covariance"] = covariance.tolist()
     if how == 2:
-        document["parameters"]["torque_lag_s"] = 0.0
-        document["parameters"]["coulomb_nm"] = [0.0] * line.line.n
+        document["parameters"]["torque_lag_s"] *= 0.1
+        document["parameters"]["coulomb_nm"] = [0.1 * value for value in document["parameters"]["coulomb_nm"]]
     return model_of(document)
 
 
@@ -281,7 +281,7 @@ def _change(line: GateLine, maker: Maker, generator: Generator) -> Change:
     for _ in range(TRIES):
         try:
             made = maker(line, generator)
-        except (DesignRefused, ControllerRefused, ValueError, np.linalg.LinAlgError):
+        except (DesignRefused, ControllerRefused, ModelRefused, ValueError, np.linalg.LinAlgError):
             continue
         if isinstance(made, LineModel):
             return ModelChange(model=made)

@@ -124,7 +124,9 @@ def _unlike(value: Any, like: Any, where: str) -> str:
             return f"{where} has other keys"
         return next((found for key in value if (found := _unlike(value[key], like[key], f"{where}.{key}"))), "")
     if isinstance(like, list):
-        if not isinstance(value, list) or (len(value) != len(like) and not (value and where in ANY_LENGTH)):
+        if not isinstance(value, list) or (
+            len(value) != len(like) and not ((value or where == IN_FLIGHT) and where in ANY_LENGTH)
+        ):
             return f"{where} has another length"
         pairs = zip_longest(value, like[: len(value)], fillvalue=like[0] if like else None)
         return next((found for one, other in pairs if (found := _unlike(one, other, f"{where}[]"))), "")
@@ -137,8 +139,9 @@ def _unlike(value: Any, like: Any, where: str) -> str:
     return "" if math.isfinite(value) else f"{where} is not finite"
 
 
-#: Legs of an experiment, and torques in flight (as many as the law likes, one row for each span).
-ANY_LENGTH = (".change.experiment.legs", ".change.controller.gain_input[]")
+#: Legs of an experiment, and torques in flight (as many as the law likes, or none).
+IN_FLIGHT = ".change.controller.gain_input[]"
+ANY_LENGTH = (".change.experiment.legs", IN_FLIGHT)
 #: Keys that have a default, so that a proposal may do without them.
 OPTIONAL = frozenset(
     {
