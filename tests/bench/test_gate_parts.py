@@ -10,7 +10,7 @@ from gateway.control.design import design_lqg, design_lqi, design_pid, task_of
 from gateway.core.controller import Controller, ControllerRefused
 from gateway.core.controller_laws import LqiConfig
 from gateway.core.line_model import model_of
-from gateway.core.proposal import parse_proposal
+from gateway.core.proposal import ProposalRefused, parse_proposal
 from gateway.core.recording import Recording
 from tests.bench import gate, gate_mutations, gate_schema
 from tests.bench.gate_contexts import GateLine, context_of, payload_of
@@ -103,6 +103,7 @@ def test_mutated_bytes_are_taken_only_where_they_are_a_proposal() -> None:
     found = gate_schema.mutated(3, 1500)
     assert found.tried == found.refused + found.right + len(found.wrong) + len(found.failed)
     assert found.wrong == []
+    assert found.failed == []
     assert found.right > 0 and found.refused > 1000
 
 
@@ -136,3 +137,14 @@ def test_tables_count_what_was_accepted_by_class_and_stopped_by_rule() -> None:
     assert rows["wrong model"] == ("wrong model", 4, "0/2", "1/2", "0/0")
     by_rule = {row[0]: row[1:5] for row in gate.by_rule(tried)["rows"]}  # type: ignore[attr-defined]
     assert by_rule == {"decay": (2, 1, 0, 0), "corners": (1, 0, 1, 1)}
+
+
+def test_a_proposal_nested_without_end_is_refused_not_stumbled_over() -> None:
+    with pytest.raises(ProposalRefused, match="64 deep"):
+        parse_proposal(b'{"x":' + b"[" * 500 + b"]" * 500 + b"}")
+
+
+def test_a_wrong_choice_deep_inside_a_proposal_is_refused_in_words() -> None:
+    experiment = gate_schema.valid_proposals()[-1]
+    with pytest.raises(ProposalRefused, match="shape"):
+        parse_proposal(experiment.replace(b'"shape":"binary"', b'"shape":"binry"'))
