@@ -13,6 +13,7 @@ LEAST_N, MOST_N = 12.0, 44.0  #: set-points
 TAIL_S, STANDS_S = 2.0, 4.0
 MOST_TORQUE_SHARE = 0.85  #: of the limit, at the equilibria of the fastest case
 PUSH_NM = 3.0
+BAND_N = 0.6  #: 2 % of a middling set-point: what has settled stays within
 
 
 class Course:
@@ -69,7 +70,7 @@ class Course:
         self._pushed = np.zeros(len(torque_nm))
         return self
 
-    def case(self, name: str, stands_s: float = STANDS_S, band_n: float = 1.0) -> Case:
+    def case(self, name: str, stands_s: float = STANDS_S, band_n: float = BAND_N) -> Case:
         """Standing at the end."""
         self.stand(stands_s)
         rows = np.array(self._rows)
@@ -146,6 +147,14 @@ def trying_cases(line: Line, top_m_per_s: float, generator: np.random.Generator)
         if i < n:
             apart[i] = np.clip(base[i] + 0.7 * sign * limits.tension_step_max_n, LEAST_N, MOST_N)
     found.append(course.step(apart).case("neighbours-apart"))
+    step = 0.9 * limits.tension_step_max_n
+    few = generator.permutation(n)[: n // 3]
+    low = generator.uniform(LEAST_N, max(MOST_N - step, LEAST_N + 1.0), n)
+    high = np.minimum(low + step * generator.uniform(0.8, 1.0, n), MOST_N)
+    high[few] = low[few]
+    found.append(
+        Course(line, low, 0.9 * top_m_per_s).stand(0.5).step(high).stand(2.0).step(low).case("most-up-and-down")
+    )
     _, course = at(0.7 * top_m_per_s)
     pushed = PUSH_NM * generator.choice([-1.0, 1.0], n) * generator.uniform(0.3, 1.0, n)
     found.append(course.push(pushed, 0.25).case("push", 3.0))
