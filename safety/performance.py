@@ -55,8 +55,8 @@ def performance(config: Controller, case: Case) -> Performance:
 def _moved(tensions: FloatArray, way: Way, setup: Setup, case: Case) -> Figures:
     """The tracking error of a shaped move: what else there is to know, steps tell."""
     spans = [i for i in range(case.line.n) if i not in case.draw_spans]
-    error = (tensions - way.course(setup.period_s).tension_n)[:, spans]
-    return Figures(_sound(np.sqrt(np.mean(np.square(error).sum(axis=1)))), 0.0, 0.0, 0.0)
+    error: FloatArray = (tensions - way.course(setup.period_s).tension_n)[:, spans]
+    return Figures(_sound(float(np.sqrt(np.sum(error**2) / len(error)))), 0.0, 0.0, 0.0)
 
 
 def figures_of(case: Case) -> list[ScenarioFigures]:
@@ -85,14 +85,15 @@ def _performances(case: Case) -> dict[Whose, Performance]:
     found: dict[Whose, Performance] = {"in service": performance(context.in_service, case)}
     if context.baseline is not None:
         found["baseline"] = performance(context.baseline, case)
-    return found | {"proposed": performance(case.controller, case)}
+    found["proposed"] = performance(case.controller, case)
+    return found
 
 
 def _figures(noisy: Rollouts, quiet: Rollouts, course: Course, setup: Setup, case: Case) -> Figures:
     spans = [i for i in range(case.line.n) if i not in case.draw_spans]
     scale = _scale(course)[spans]
     return Figures(
-        rmse_n=_sound(np.sqrt(noisy.squared_error_n2[0, spans].sum())),
+        rmse_n=_sound(float(np.sqrt(noisy.squared_error_n2[0, spans].sum()))),
         overshoot_pct=_sound((100.0 * quiet.beyond_n[0, spans] / scale).max()),
         settling_s=_sound(setup.period_s * quiet.settled[0, spans].max()),
         effort_n2m2s=_sound(noisy.effort_n2m2s[0].sum()),
@@ -101,8 +102,8 @@ def _figures(noisy: Rollouts, quiet: Rollouts, course: Course, setup: Setup, cas
 
 def _scale(course: Course) -> FloatArray:
     """What an overshoot is a share of (n,): the step; the set-point where it does not step."""
-    settled = course.settled_at_n
-    step = np.abs(settled[0] - course.tension_n[0])
+    settled: FloatArray = course.settled_at_n
+    step: FloatArray = np.abs(settled[0] - course.tension_n[0])
     return np.where(step > 0.0, step, settled[0])
 
 

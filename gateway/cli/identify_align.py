@@ -7,7 +7,7 @@ from gateway.core.line import Line
 from gateway.core.line_model import ChannelDelay
 from gateway.core.recording import Recording
 from gateway.identification.alignment import Alignment, aligned
-from gateway.identification.assessment import OFFSET_WARNED_S, assess
+from gateway.identification.assessment import OFFSET_WARNED_PERIODS, assess
 from gateway.identification.findings import Severity
 
 
@@ -18,7 +18,7 @@ class Moved:
 
 
 def without_offsets(recording: Recording, line: Line) -> Moved:
-    """With every channel moved whose interval lies beyond 1 ms; by whole periods where its interval has one in it.
+    """With every channel moved whose interval lies beyond a tenth of a period; by whole periods where one is in it.
 
     Torques stay: what acts late there is the model's latency and lag. Where the data are refused for anything but
     offsets they stay as they are: offsets mean nothing then.
@@ -26,7 +26,7 @@ def without_offsets(recording: Recording, line: Line) -> Moved:
     said = assess(recording, line)
     if said.kinds(Severity.REFUSAL) - {"offset"}:
         return Moved(recording, [])
-    late = [_whole(one, recording.period_s) for one in said.alignments if _is_late(one)]
+    late = [_whole(one, recording.period_s) for one in said.alignments if _is_late(one, recording.period_s)]
     delays = [
         ChannelDelay(channel=one.channel, late_s=one.offset_s, low_s=one.low_s, high_s=one.high_s) for one in late
     ]
@@ -42,9 +42,10 @@ def all_delays(delays: Sequence[Sequence[ChannelDelay]]) -> list[ChannelDelay]:
     return list(found.values())
 
 
-def _is_late(one: Alignment) -> bool:
+def _is_late(one: Alignment, period_s: float) -> bool:
     beyond_s = max(one.low_s, -one.high_s)
-    return one.known and not one.reference and not one.channel.startswith("torque") and beyond_s > OFFSET_WARNED_S
+    measured = not one.reference and not one.channel.startswith("torque")
+    return one.known and measured and beyond_s > OFFSET_WARNED_PERIODS * period_s
 
 
 def _whole(one: Alignment, period_s: float) -> Alignment:

@@ -20,12 +20,17 @@ LONGEST_SOURCE = 200  #: letters, as the model file has them
 
 
 def model_of_found(
-    line: Line, recordings: Sequence[Recording], found: Identified, created: str, delays: Sequence[ChannelDelay] = ()
+    line: Line,
+    recordings: Sequence[Recording],
+    found: Identified,
+    created: str,
+    delays: Sequence[ChannelDelay] = (),
+    parent: str | None = None,
 ) -> LineModel:
-    """Raises ModelRefused. The prior was the line's file, so that there is no parent; `delays` were taken out."""
+    """Raises ModelRefused. `delays` were taken out; `parent`: hash of the model that was the prior, None: the file."""
     whole = recordings[0] if len(recordings) == 1 else joined(recordings)
     whole = replace(whole, source=whole.source[:LONGEST_SOURCE])
-    origin = Origin(line.site, line.line, created, version("r2rgate"))
+    origin = Origin(line.site, line.line, created, version("r2rgate"), parent)
     return model_from(found.estimate, whole, origin, recorded(found.validation, line.n), delays)
 
 

@@ -34,6 +34,7 @@ from gateway.identification.estimate import Interval, Structure
 from gateway.identification.findings import Assessment, Finding
 from gateway.identification.identifiability import Identifiability, identifiability, symbol
 from gateway.identification.identify import Identified
+from gateway.identification.inheritance import Inherited
 from gateway.identification.prediction_error import Z95
 from gateway.identification.prior import prior_of
 from gateway.identification.structure_choice import ENOUGH, Candidate, Choice
@@ -53,7 +54,11 @@ class Data:
 
 
 def result_of(
-    data: Data, assessments: Sequence[Assessment], refused: Sequence[str], found: Identified | None
+    data: Data,
+    assessments: Sequence[Assessment],
+    refused: Sequence[str],
+    found: Identified | None,
+    inherited: Inherited | None = None,
 ) -> IdentifyResult:
     """`assessments` may be fewer than recordings, where no data were looked at."""
     measured = {name: (value, value * (1.0 - t), value * (1.0 + t)) for name, (value, t) in data.measured.items()}
@@ -70,7 +75,7 @@ def result_of(
             for k, (one, said) in enumerate(zip(data.recordings, assessments, strict=False))
         ],
         refused=list(refused),
-        found=None if found is None else _found(data.line, found),
+        found=None if found is None else _found(data.line, found, inherited),
     )
 
 
@@ -105,7 +110,7 @@ def _finding(one: Finding) -> FindingRow:
     )  # fmt: skip
 
 
-def _found(line: Line, found: Identified) -> Found:
+def _found(line: Line, found: Identified, inherited: Inherited | None) -> Found:
     known, fitted = identifiability(found.fitted), found.fitted
     return Found(
         parameters=_parameters(line, found, known),
@@ -113,6 +118,8 @@ def _found(line: Line, found: Identified) -> Found:
         structures=[_structure(one, found.choice) for one in found.choice.candidates],
         why=why(found.choice),
         cautions=found.choice.cautions,
+        prior=[] if inherited is None else inherited.words,
+        parent=None if inherited is None else inherited.parent,
         methods=[_method(row) for row in found.comparison.rows],
         windows=found.comparison.windows,
         failed=found.failed,

@@ -222,7 +222,8 @@ def _structures(told: Found) -> Section:
         note="Held-out likelihood: its logarithm per sample. Innovation²: normalised, 1 is right.",
     )  # fmt: skip
     cautions = tuple(f"Caution: {caution}." for caution in told.cautions)
-    return Section("Structures", (f"Chosen: {told.why}.", *cautions), (table,))
+    prior = tuple(f"Prior: {word}." for word in told.prior)
+    return Section("Structures", (f"Chosen: {told.why}.", *prior, *cautions), (table,))
 
 
 def _methods(told: Found) -> Section:

@@ -137,6 +137,8 @@ class Found(Strict):
     structures: list[StructureRow]  #: the most evidence first
     why: str  #: this one was chosen
     cautions: list[str]
+    prior: list[str] = []  #: what is to be said of a model that should be the prior; empty: it was the line's file
+    parent: str | None = None  #: hash of the model that was the prior; null: the line's file
     methods: list[MethodRow]  #: the best first
     windows: int  #: of 1 s, free runs that judge the methods
     failed: dict[str, str]  #: methods that gave no estimate, and why

@@ -18,7 +18,7 @@ SHOWN = (
 )  # fmt: skip
 SHORT_METHODS = {"recursive least squares": "recursive LS"}
 SHORT_SYMBOLS = {"coulomb_nm": "c", "torque_lag_s": "lag"}  #: names would be too long for 80 columns
-SOME_OFFSET_S = 1e-3  #: an interval that lies wholly beyond this counts; findings name its channel
+SOME_OFFSET_PERIODS = 0.1  #: an interval that lies wholly beyond this counts; findings name its channel
 AS_GOOD = 2.0  #: standard errors behind the best, up to which nothing can be said
 
 
@@ -52,6 +52,8 @@ def print_result(result: IdentifyResult, found: Found, console: Console) -> None
     _say(console, "Structures", "bold")
     console.print(_structures(found))
     _say(console, f"chosen: {found.why}")
+    for word in found.prior:
+        _say(console, f"prior: {word}")
     for caution in found.cautions:
         _say(console, f"caution: {caution}")
     console.print()
@@ -102,10 +104,12 @@ def offset_words(row: RecordingRow) -> list[str]:
     if not known:
         return ["time offsets between channels: the data do not say"] if row.offsets else []
     widest_ms = max(500.0 * ((one.high_s or 0.0) - (one.low_s or 0.0)) for one in known)
-    far = [one for one in known if max(one.low_s or 0.0, -(one.high_s or 0.0)) > SOME_OFFSET_S]
+    some_s = SOME_OFFSET_PERIODS * row.period_s
+    far = [one for one in known if max(one.low_s or 0.0, -(one.high_s or 0.0)) > some_s]
     unknown = [one.channel for one in row.offsets if one.low_s is None]
     said = [
-        f"time offsets of {len(known)} channels known to ±{widest_ms:.2g} ms or better; surely beyond 1 ms: {len(far)}"
+        f"time offsets of {len(known)} channels known to ±{widest_ms:.2g} ms or better; surely beyond "
+        f"{1e3 * some_s:.2g} ms: {len(far)}"
     ]
     return said + ([f"not known of: {', '.join(unknown)}"] if unknown else [])
 

@@ -30,7 +30,8 @@ def run(
     fill = np.minimum(np.arange(blocks * kernel.LANES), count - 1)  # the last block repeats the last plant
     states, torques = start(plants, course)
     samples, moved = setup.draw(course.periods, n)
-    memory = _engaged(laws[which[0]], course, setup, states, torques, samples[0])
+    unwinds = np.ascontiguousarray(course.unwind_speed_m_per_s, dtype=np.float64)  # of another kind: compiled anew
+    memory = _engaged(laws[int(which[0])], course, setup, states, torques, samples[0])
     gain = plants.radius_m / plants.inertia_kg_m2
     coefficients = np.hstack(
         (
@@ -48,7 +49,7 @@ def run(
         np.array(delay_steps(plants, setup))[fill].reshape(blocks, kernel.LANES),
         _lanes(states, fill), _lanes(torques, fill), _lanes(memory, fill),
         *_entries([form.torque for form in forms]), *_entries([np.hstack((f.state, f.applied)) for f in forms]), which,
-        references(config, course), course.unwind_speed_m_per_s, samples, moved, setup.late(course.periods, n),
+        references(config, course), unwinds, samples, moved, setup.late(course.periods, n),
         np.array([setup.tension_step_n] * n + [setup.speed_step_m_per_s] * n),
         BAND * course.settled_at_n, course.direction, course.changes, course.periods - course.tail,
         setup.substeps, setup.step_s, setup.torque_nm, setup.torque_rate_nm_per_s * setup.period_s,
@@ -107,9 +108,9 @@ def _laws(config: LinearConfig | ScheduledConfig, course: Course) -> tuple[list[
 
 def _entries(matrices: list[FloatArray]) -> tuple[Any, Any, FloatArray]:
     """Where each row begins, columns, and values (matrices, entries) of what is non-zero in any of them."""
-    every = np.array(matrices)
+    every: Any = np.array(matrices)
     rows, columns = np.nonzero(every.any(axis=0))
-    begins = np.searchsorted(rows, np.arange(every.shape[1] + 1))
+    begins = np.searchsorted(rows, np.arange(len(matrices[0]) + 1))
     # Unsigned: a signed index may count from the end, and asking for it each time costs six times the sum itself.
     return begins.astype(np.uint64), columns.astype(np.uint64), np.ascontiguousarray(every[:, rows, columns])
 

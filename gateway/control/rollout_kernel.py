@@ -132,11 +132,18 @@ def _account_tail(state, reference, applied, before, sums, n):
 
 @_part
 def _extremes(state, least, most, n):
-    """Tensions of a step."""
     for i in range(n):
         for w in range(LANES):
             least[i, w] = min(least[i, w], state[i, w])
             most[i, w] = max(most[i, w], state[i, w])
+
+
+@_part
+def _account_step(state, sums, in_tail, n):
+    """Tensions of a step of the integration."""
+    _extremes(state, sums[LEAST], sums[MOST], n)
+    if in_tail:
+        _extremes(state, sums[TAIL_LEAST], sums[TAIL_MOST], n)
 
 
 @_part
@@ -202,10 +209,10 @@ def _sine(x):
     turns = np.floor(x * (1.0 / pi) + 0.5)
     y = x - turns * pi
     z = y * y
-    series = 1.0 - z / 156.0 * (1.0 - z / 210.0)
-    series = 1.0 - z / 72.0 * (1.0 - z / 110.0 * series)
-    series = 1.0 - z / 20.0 * (1.0 - z / 42.0 * series)
-    return (1.0 - 2.0 * (turns - 2.0 * np.floor(0.5 * turns))) * y * (1.0 - z / 6.0 * series)
+    series = 1.0 - z * (1.0 / 156.0) * (1.0 - z * (1.0 / 210.0))
+    series = 1.0 - z * (1.0 / 72.0) * (1.0 - z * (1.0 / 110.0) * series)
+    series = 1.0 - z * (1.0 / 20.0) * (1.0 - z * (1.0 / 42.0) * series)
+    return (1.0 - 2.0 * (turns - 2.0 * np.floor(0.5 * turns))) * y * (1.0 - z * (1.0 / 6.0) * series)
 
 
 @_part
@@ -325,6 +332,24 @@ def _real_step(
     _lag(own, acting, torque, n)
 
 
+@_part
+def _advance(
+    coefficients, boundary, own, block, eccentric, delays, sent, now, state, acting, unwind, moved, sub, substeps,
+    step_s, slopes, probe, work, n,
+):  # fmt: skip
+    """A step of a block. Of the two branches only one is compiled: `own` is None, or it is not."""
+    if own is None:
+        row = now - max(-(-(delays[0] - sub) // substeps), 0)
+        torque = sent[row if row >= 0 else row + sent.shape[0]]
+        _step(coefficients, boundary, state, torque, unwind, moved, step_s, slopes, probe, n)
+    else:
+        _arriving(sent, delays, now, sub, substeps, work[7], n)
+        _real_step(
+            coefficients, boundary, own[block], state, acting, work[7], unwind, moved, step_s, slopes, probe, work,
+            eccentric, n,
+        )  # fmt: skip
+
+
 @_parallel
 def simulate(
     coefficients, boundary, own, eccentric, delays, states, torques, memories,
@@ -347,7 +372,7 @@ def simulate(
         slopes, probe = np.empty((4, width, LANES)), np.empty((width, LANES))
         sent = np.empty((ring, n, LANES))
         sent[:] = before
-        acting, arriving, work = before.copy(), np.empty((n, LANES)), np.zeros((7, n, LANES))
+        acting, work = before.copy(), np.zeros((8, n, LANES))
         work[4] = 1.0  # round, until a roller is said to be eccentric
         change = 0
         for k in range(periods):
@@ -373,17 +398,11 @@ def simulate(
             _product(state_begins, state_columns, state_values[which[k]], signals, following)
             signals[:size] = following
             for sub in range(substeps):
-                _extremes(state, sums[LEAST], sums[MOST], n)
-                if k >= tail:
-                    _extremes(state, sums[TAIL_LEAST], sums[TAIL_MOST], n)
-                if own is None:
-                    age = max(-(-(delays[block, 0] - sub) // substeps), 0)
-                    _step(coefficients[block], boundary[block], state, sent[(k - age) % ring], unwinds[k],
-                          moved[k * substeps + sub], step_s, slopes, probe, n)  # fmt: skip
-                else:
-                    _arriving(sent, delays[block], now, sub, substeps, arriving, n)
-                    _real_step(coefficients[block], boundary[block], own[block], state, acting, arriving, unwinds[k],
-                               moved[k * substeps + sub], step_s, slopes, probe, work, eccentric, n)  # fmt: skip
+                _account_step(state, sums, k >= tail, n)
+                _advance(
+                    coefficients[block], boundary[block], own, block, eccentric, delays[block], sent, now, state,
+                    acting, unwinds[k], moved[k * substeps + sub], sub, substeps, step_s, slopes, probe, work, n,
+                )  # fmt: skip
             if k % LOOKED_AT == LOOKED_AT - 1 and _gone(sums[LEAST], sums[MOST], n):
                 break
     return found

@@ -16,7 +16,8 @@ from gateway.core.recording import Recording
 from gateway.core.signals import FloatArray
 from gateway.identification.regressions import EquationFit, equation_fits, moving
 
-UNKNOWN_S = 0.005  #: an offset whose standard deviation is above this is not known
+#: An offset whose standard deviation is above this is not known: half a period, where it may as well be a sample more.
+UNKNOWN_PERIODS = 0.5
 _VAGUE_S = 0.1
 
 
@@ -52,7 +53,7 @@ def estimate_alignment(recording: Recording, line: Line, fits: Sequence[Equation
     covariance: FloatArray = np.asarray(np.linalg.inv(information), dtype=np.float64)
     offset = covariance @ gradient
     found: list[Alignment] = []
-    for group in _linked(fits, n, covariance):
+    for group in _linked(fits, n, covariance, UNKNOWN_PERIODS * recording.period_s):
         found += _relative(group, n, names, offset, covariance)
     found = [_wider(a, 0.5 * recording.period_s) if a.channel == names[0] else a for a in found]
     absent = {names[1 + n + i] for i in range(n) if i not in there}
@@ -104,14 +105,14 @@ def _links(fit: EquationFit, n: int) -> FloatArray:
     return links
 
 
-def _linked(fits: Sequence[EquationFit], n: int, covariance: FloatArray) -> list[list[int]]:
-    """Channels in groups within which offsets are known relative to each other."""
+def _linked(fits: Sequence[EquationFit], n: int, covariance: FloatArray, unknown_s: float) -> list[list[int]]:
+    """Channels in groups within which offsets are known relative to each other, to better than `unknown_s`."""
     group = list(range(3 * n + 1))
     for fit in fits:
         for link in _links(fit, n):
             a, b = np.flatnonzero(link).tolist()
             spread = covariance[a, a] + covariance[b, b] - 2.0 * covariance[a, b]
-            if spread < UNKNOWN_S**2:
+            if spread < unknown_s**2:
                 old, new = group[b], group[a]
                 group = [new if g == old else g for g in group]
     return [[k for k in range(len(group)) if group[k] == g] for g in sorted(set(group))]

@@ -10,7 +10,11 @@ from gateway.identification.assess_time import assess_time
 from gateway.identification.findings import Assessment, Finding, Severity, gravest_first
 from gateway.identification.regressions import equation_fits
 
-OFFSET_WARNED_S, OFFSET_REFUSED_S = 1e-3, 3.5e-3  #: which the whole interval exceeds; 5 ms gave 7.6 N
+#: In periods, which the whole interval of an offset exceeds. A prediction one sample ahead is wrong by the offset times
+#: the rate of the signal, and the shorter the period the less noise there is in it to hide this: a tension that is late
+#: by 3.5 ms on a line of 10 ms, and by 1 ms on one of 2 ms, leaves innovations equally coloured (4 times what is white)
+#: and shifts EA/L by two and a half, and by half, of its interval. At 10 ms a delay of 5 ms gave errors of 7.6 N.
+OFFSET_WARNED_PERIODS, OFFSET_REFUSED_PERIODS = 0.1, 0.35
 DELAY_REFUSED_PERIODS = 3.0  #: of a torque beyond the line's latency; less, the model's latency and lag take up
 
 
@@ -51,7 +55,7 @@ def _offsets(alignments: list[Alignment], period_s: float) -> list[Finding]:
     found: list[Finding] = []
     for alignment in alignments:
         beyond_s = max(alignment.low_s, -alignment.high_s)
-        if not alignment.known or beyond_s <= OFFSET_WARNED_S:
+        if not alignment.known or beyond_s <= OFFSET_WARNED_PERIODS * period_s:
             continue
         late = alignment.offset_s > 0.0
         interval = f"{1e3 * alignment.low_s:.1f} to {1e3 * alignment.high_s:.1f} ms"
@@ -60,7 +64,7 @@ def _offsets(alignments: list[Alignment], period_s: float) -> list[Finding]:
             what = f"it acts {-1e3 * alignment.offset_s:.1f} ms later than the line's latency says ({interval})"
             mend = "let the model have a torque lag, or correct control.latency_s in the line's file"
         else:
-            limit_s = OFFSET_REFUSED_S
+            limit_s = OFFSET_REFUSED_PERIODS * period_s
             what = f"it is {abs(1e3 * alignment.offset_s):.1f} ms {'late' if late else 'early'} ({interval})"
             mend = "align it (identify --align), or take the times where the channel is sampled"
         severity = Severity.REFUSAL if beyond_s > limit_s else Severity.WARNING

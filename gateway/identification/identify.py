@@ -13,9 +13,10 @@ from gateway.core.recording import Recording, joined
 from gateway.core.theta import Noise
 from gateway.identification.assessment import assess
 from gateway.identification.comparison import WINDOW_S, Comparison, compare
-from gateway.identification.estimate import Estimate
+from gateway.identification.estimate import Estimate, Structure
 from gateway.identification.findings import Assessment, Finding
 from gateway.identification.prediction_error import LEAST_S, Fit, fit_stretches, stretches_of
+from gateway.identification.prior import Prior
 from gateway.identification.recursive import estimated_recursively, live
 from gateway.identification.structure_choice import Choice, choose
 from gateway.identification.subspace import estimated_by_subspace
@@ -60,8 +61,11 @@ def identify(
     *,
     measured: Mapping[str, tuple[float, float]] | None = None,
     tell: Callable[[str], None] = lambda text: None,
+    priors: Callable[[Structure], Prior] | None = None,
 ) -> Identified:
     """`clock` in s, for what each method takes; `measured`: {name: (value, tolerance)} known by other means.
+
+    `priors`: of a structure; without them the line's file speaks.
 
     Raises NotIdentified.
     """
@@ -78,7 +82,7 @@ def identify(
     try:
         tell("prediction error, structure by structure")
         began_s = clock()
-        choice = choose(before, line, noise0, held_out, measured=dict(measured or {}))
+        choice = choose(before, line, noise0, held_out, measured=dict(measured or {}), priors=priors)
         estimates.append((choice.fitted.estimate, clock() - began_s))
         for name, method in _others(line, choice).items():
             tell(name)

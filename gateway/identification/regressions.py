@@ -94,7 +94,8 @@ def reach_s(period_s: float) -> float:
 def stretches_of(recording: Recording, line: Line) -> list[Stretch]:
     """The longest stretches under control, of all that are long enough."""
     beyond = int(np.ceil((reach_s(recording.period_s) + line.control.latency_s) / recording.period_s)) + 2
-    parts = recording.stretches(max(LEAST_SAMPLES, 3 * beyond))
+    window = round(WINDOW_S / recording.period_s)  # at short periods a window is many samples, and two are to fit
+    parts = recording.stretches(max(LEAST_SAMPLES, 3 * beyond, 2 * (beyond + window)))
     longest = sorted(parts, key=lambda part: -part.samples)[:MOST_STRETCHES]
     return [Stretch(part, np.arange(beyond, part.samples - 1 - beyond)) for part in longest]
 

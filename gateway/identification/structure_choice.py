@@ -4,7 +4,7 @@ The evidence is the likelihood of the data under a structure with its parameters
 that explains nothing costs the volume of prior that it excludes. Held-out likelihood needs no prior, and less care.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import sqrt
 
@@ -58,15 +58,18 @@ def choose(
     *,
     unwinder: Unwinder | None = None,
     measured: dict[str, tuple[float, float]] | None = None,
+    priors: Callable[[Structure], Prior] | None = None,
 ) -> Choice:
     """Fit the structures of the paper, with Coulomb friction and with torque lag, then with rollers that differ.
 
     Where rollers differ is only asked of the structure that was best without it, and of what that adds to it: each
-    question is of one term. `measured` as in `Prior.measured`. Raises Unpredictable.
+    question is of one term. `measured` as in `Prior.measured`; `priors` in place of the line's file. Raises
+    Unpredictable.
     """
 
     def prior(structure: Structure) -> Prior:
-        return prior_of(line, structure).measured(measured or {})
+        own = prior_of(line, structure) if priors is None else priors(structure)
+        return own.measured(measured or {})
 
     first = fit(recordings, prior(SHARED[-1]), noise0, unwinder)
     stretches = first.stretches

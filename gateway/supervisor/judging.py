@@ -105,6 +105,11 @@ class JudgeWorkers:
     async def __aexit__(self, *_: object) -> None:
         await self.close()
 
+    @property
+    def pids(self) -> set[int]:
+        """Of the processes that have begun."""
+        return {worker.pid for worker in self._all if worker.pid is not None}
+
     async def close(self) -> None:
         """End all of them, whatever they are at."""
         workers, self._all = self._all, set()

@@ -51,7 +51,7 @@ def check(case: Case) -> list[RuleFinding]:
     judged, config = judged_of(case), case.controller
     worst, left_out = Worst(), dict[str, int]()
     for name, course in corner_courses(judged).items():
-        kept = [theta for theta in _holdable(case, course)]
+        kept = _holdable(case, course)
         left_out[name] = len(case.corners) - len(kept)
         if not kept:
             return [_nobody_holds(case, name)]
@@ -82,9 +82,10 @@ def _run_whole(case: Case, config: MpcConfig, thetas: list[Theta], linear: Rollo
         return
     course = corner_courses(judged_of(case), WHOLE_LASTING_S, WHOLE_TAIL_S)[name]
     badness = linear.tail_swing_n.max(axis=1) + linear.chatter_nm.max(axis=1) + linear.beyond_n.max(axis=1)
-    order = np.argsort(np.nan_to_num(badness, nan=inf))[::-1][: 1 if name == "speed change" else WHOLE_MPC]
+    most = 1 if name == "speed change" else WHOLE_MPC
+    order: list[int] = np.argsort(np.nan_to_num(badness, nan=inf))[::-1][:most].tolist()
     setup = setup_of(case.line, case.noise, case.seed, case.line.gate.stress_late_share)
-    plants = plants_under_stress([thetas[i] for i in order.tolist()], case.line.gate, case.seed)
+    plants = plants_under_stress([thetas[i] for i in order], case.line.gate, case.seed)
     worst.take(simulate_slowly(config, plants, course, setup), f"{name}, solved at each sample")
 
 

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from gateway.control.mpc_linear import unconstrained
+from gateway.control.prediction import Unpredictable
 from gateway.control.rollout import Course
 from gateway.core.controller_laws import MpcConfig
 from gateway.core.experiment import Experiment, course, reasons_against
@@ -83,7 +84,7 @@ def _plants(case: Case) -> tuple[list[Theta], str]:
         try:
             if all(finding.passed for finding in check_validity(case)):
                 return case.corners, "corners of the accepted model"
-        except (ValueError, ArithmeticError):
+        except (Unpredictable, ValueError, ArithmeticError):
             pass  # a model that cannot be looked at is none that may be believed
     return prior_corners(case.line, case.latency_s, case.seed), "corners of the line's file"
 

@@ -8,6 +8,9 @@ on the model at its mean, for the course "tension". eps and delta_tol, which the
 of the model, and the largest permitted step with the tolerated overshoot of the paper's convergence criterion.
 """
 
+from dataclasses import replace
+from math import inf
+
 import numpy as np
 
 from gateway.control.judged_courses import corner_courses, improvement_courses
@@ -41,7 +44,7 @@ def _safe(case: Case) -> RuleFinding:
     """Torque and rate of the loop on the mean model, nothing limited: what the law asks for."""
     limits, period_s = case.line.limits, case.line.control.period_s
     setup = setup_of(case.line, case.noise, case.seed, 0.0)
-    free = type(setup)(**{**vars(setup), "torque_nm": np.inf, "torque_rate_nm_per_s": np.inf})
+    free = replace(setup, torque_nm=inf, torque_rate_nm_per_s=inf)
     torque = rate = 0.0
     for course in improvement_courses(judged_of(case)).values():
         run = simulate(_law(case.controller), plants_of_thetas([case.believed]), course, free)

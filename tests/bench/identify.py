@@ -5,6 +5,8 @@
     c  Coulomb friction and torque lag: the structure chosen, and whether it is valid at two speeds
     d  rollers that differ
     e  what the model does not have: true white noise, eccentricity, the realistic line
+    f  normal operation, no experiment: with an operator's moves, and with none
+    g  the same experiment over the wires in real time and in stepped time (the machine should do nothing else)
 
 Writes out/bench/identify.json; of a part of it, out/bench/identify-part.json. Two processes at a time.
 """
@@ -21,9 +23,11 @@ import numpy as np
 from gateway.identification.parameters import COMBINATIONS
 from tests.bench import identify_runs as runs
 from tests.bench.figures import Bench
+from tests.bench.identify_passive import DURATION_S, MOVES, Passive, counted, passive
 from tests.bench.identify_runs import STRONG, Chosen, Found, Workers
+from tests.bench.identify_wire import over_the_wire
 
-PARTS = "abcde"
+PARTS = "abcdefg"
 NORMALISED = (0.8, 1.2)  #: the gate's validity test
 STRUCTURE_C = "Coulomb friction, torque lag"
 PAPER = "1.4 to 8.6 % (the paper's S_real_ID)"
@@ -38,6 +42,8 @@ class Sizes:
     covered: int = 500
     friction: int = 100
     shown: int = 10  #: e
+    passive: int = 6  #: f
+    wire: int = 3  #: g
 
 
 def main() -> None:
@@ -47,7 +53,7 @@ def main() -> None:
         "identify" if whole else "identify-part", list(range(sizes.seeds)), goals_of="identify",
         command=f'make bench-identify ARGS="{more}"' if more else "make bench-identify",
     )  # fmt: skip
-    parts = {"a": _commissioning, "b": _coverage, "c": _friction, "d": _spread, "e": _shown}
+    parts = {"a": _commissioning, "b": _coverage, "c": _friction, "d": _spread, "e": _shown, "f": _passive, "g": _wire}
     if "a" in wanted:
         _fit_times(bench, sizes)  # with nothing beside it
     with Workers() as workers:
@@ -168,6 +174,50 @@ def _shown(bench: Bench, workers: Workers, sizes: Sizes) -> None:
     }  # fmt: skip
 
 
+def _passive(bench: Bench, workers: Workers, sizes: Sizes) -> None:
+    rows = []
+    for moves in MOVES:
+        given = [(moves, seed) for seed in range(sizes.passive)]
+        every: list[Passive] = list(workers.each(passive, given, f"production, moves: {moves}"))
+        found, label = [one.found for one in every], moves.replace(" ", "_")
+        offered = 100.0 * float(np.mean([one.offered for one in every]))
+        covered = 100.0 * float(np.mean([list(one.covered.values()) for one in found]))
+        bench.figure(f"passive_{label}_offered_pct", offered, "%", len(every))
+        bench.figure(f"passive_{label}_covered_pct", covered, "%", len(every))
+        strong = [f"{_rms(found, name):.2f} (±{_mean_width(found, name):.2f})" for name in STRONG]
+        apart = [f"{_rms(found, name):.2f} (±{_mean_width(found, name):.2f})" for name in PHYSICAL]
+        refused, warned = counted([one.refused for one in every]), counted([one.warned for one in every])
+        rows.append((moves, f"{offered:.0f}", refused, warned, *strong, *apart, f"{covered:.0f}"))
+    bench.tables[f"normal operation, {DURATION_S:g} s without an experiment"] = {
+        "heads": ("moves", "models offered, %", "refused for", "warned of", *STRONG, *PHYSICAL, "covered, %"),
+        "rows": rows,
+        "note": "rms error in % (half width of 95 %); of data that were refused too, to see whether rightly",
+    }
+
+
+def _wire(bench: Bench, _: Workers, sizes: Sizes) -> None:
+    every = [over_the_wire(seed) for seed in range(1, sizes.wire + 1)]
+    names = (*STRONG, *PHYSICAL)
+    of_each = {name: [one.ratios[name] for one in every] for name in names}
+    bench.figure("wire_half_width_ratio_worst", max(map(max, of_each.values())), "x stepped", len(every))
+    middle = float(np.median(list(of_each.values())))
+    bench.figure("wire_half_width_ratio_p50", middle, "x stepped", len(every) * len(names))
+    covered = 100.0 * float(np.mean([list(one.wire.covered.values()) for one in every]))
+    bench.figure("wire_covered_pct", covered, "%", len(every))
+    bench.tables["the same experiment over the wires and in stepped time"] = {
+        "heads": ("parameter", "half width over stepped: median", "worst", "rms error wire, %", "stepped, %"),
+        "rows": [
+            (
+                name, f"{np.median(of_each[name]):.3f}", f"{max(of_each[name]):.3f}",
+                f"{_rms([one.wire for one in every], name):.3f}", f"{_rms([one.stepped for one in every], name):.3f}",
+            )
+            for name in names
+        ],
+        "note": f"samples (wire, stepped): {[one.samples for one in every]}; speed noise found over the wires: "
+        f"{[one.wire.noise.speed_m_per_s for one in every]} m/s",
+    }  # fmt: skip
+
+
 def _rms(found: Sequence[Found], name: str) -> float:
     return 100.0 * float(np.sqrt(np.mean([one.error[name] ** 2 for one in found])))
 
@@ -208,11 +258,14 @@ def _arguments() -> tuple[Sizes, set[str], str]:
     parser.add_argument("--covered", type=int, default=usual.covered, help="plants of part b")
     parser.add_argument("--friction", type=int, default=usual.friction, help="seeds of part c")
     parser.add_argument("--shown", type=int, default=usual.shown, help="seeds of each case of part e")
+    parser.add_argument("--passive", type=int, default=usual.passive, help="seeds of each case of part f")
+    parser.add_argument("--wire", type=int, default=usual.wire, help="runs of part g")
     args = parser.parse_args()
     wanted = set(args.parts) - {","}
-    if not wanted <= set(PARTS) or min(args.seeds, args.covered, args.friction, args.shown) < 1:
+    numbers = (args.seeds, args.covered, args.friction, args.shown, args.passive, args.wire)
+    if not wanted <= set(PARTS) or min(numbers) < 1:
         parser.error(f"parts are some of {PARTS}, numbers 1 or more")
-    return Sizes(args.seeds, args.covered, args.friction, args.shown), wanted, " ".join(sys.argv[1:])
+    return Sizes(*numbers), wanted, " ".join(sys.argv[1:])
 
 
 if __name__ == "__main__":

@@ -6,9 +6,13 @@ from functools import cache
 import numpy as np
 import pytest
 
+from gateway.cli.identify_align import without_offsets
+from gateway.core.line import Line
 from gateway.core.recording import Recording
 from gateway.identification.alignment import Alignment, aligned, estimate_alignment
-from tests.closed_loop.recorded import demonstration_line, real_plant, recorded
+from gateway.identification.assessment import assess
+from gateway.identification.findings import Severity
+from tests.closed_loop.recorded import demonstration_line, real_plant, recorded, without
 from tests.closed_loop.spoiled import shifted
 
 LINE = demonstration_line()
@@ -151,3 +155,65 @@ def test_beside_a_gap_nothing_is_moved_into_it():
     gap = replace(recording.part(0, 490), time_s=recording.time_s[order], tension_n=recording.tension_n[order])
     moved = aligned(gap, [Alignment("tension_1_n", 0.5 * PERIOD_S, 0.0, 0.1)])
     assert np.flatnonzero(np.isnan(moved.tension_n[:, 0])).tolist() == [99, 489]
+
+
+# Lines of other periods
+
+
+def of_period(period_s: float) -> Line:
+    """With drives that move their torque as far in a period: at short ones noise alone would take a slow one's rate."""
+    control = LINE.control.model_copy(update={"period_s": period_s, "latency_s": period_s})
+    rate = LINE.limits.torque_rate_nm_per_s * PERIOD_S / period_s
+    limits = LINE.limits.model_copy(update={"torque_rate_nm_per_s": rate})
+    return LINE.model_copy(update={"control": control, "limits": limits})
+
+
+FAST = of_period(0.002)
+
+
+@cache
+def fast() -> Recording:
+    return recorded(real_plant(), 3, 2.0, line=FAST)
+
+
+def late_by(recording: Recording, channel: str, late_s: float) -> Recording:
+    """Between samples in straight lines."""
+    return aligned(recording, [Alignment(channel, -late_s, -late_s, -late_s)])
+
+
+def test_a_line_of_2_ms_knows_its_offsets_to_a_part_of_its_period():
+    found = [a for a in estimate_alignment(fast(), FAST) if a.known and not a.reference]
+    assert len(found) == 17
+    assert np.mean([a.low_s <= 0.0 <= a.high_s for a in found]) >= 0.9
+    assert max(a.high_s - a.low_s for a in found) < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("line", "data", "late_s", "said"),
+    [
+        (FAST, fast, 0.0, None),
+        (FAST, fast, 0.6e-3, Severity.WARNING),
+        (FAST, fast, 1.6e-3, Severity.REFUSAL),  # of which a line of 10 ms would only warn
+        (LINE, lambda: good(3), 2.5e-3, Severity.WARNING),
+        (LINE, lambda: good(3), 6e-3, Severity.REFUSAL),
+    ],
+)
+def test_what_a_model_bears_of_an_offset_goes_with_the_period(line, data, late_s, said):
+    found = assess(late_by(data(), "tension_3_n", late_s), line)
+    of_it = [f.severity for f in found.findings if f.kind == "offset" and f.where == "tension_3_n"]
+    assert of_it == ([] if said is None else [said])
+
+
+def test_what_is_late_by_a_part_of_a_short_period_is_taken_out():
+    moved = without_offsets(late_by(fast(), "tension_3_n", 1.6e-3), FAST)
+    assert [delay.channel for delay in moved.delays] == ["tension_3_n"]
+    assert moved.delays[0].late_s == pytest.approx(1.6e-3, abs=4e-4)
+
+
+def test_stretches_of_a_short_period_that_no_window_fits_in_tell_nothing():
+    """Of 0.14 s, which has room for the window of changes at 10 ms, but not for its many samples at 2 ms."""
+    short = fast()
+    for begin in range(short.samples - 80, 0, -80):
+        short = without(short, begin, begin + 10)
+    found = assess(short, FAST)
+    assert "short" in found.kinds() and not found.fits

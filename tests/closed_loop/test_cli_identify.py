@@ -2,6 +2,7 @@
 
 import io
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,12 +17,14 @@ from gateway.cli.identify_result import IdentifyResult
 from gateway.cli.identify_table import print_result
 from gateway.cli.main import app
 from gateway.cli.recordings_csv import write_csv
-from gateway.core.line_model import canonical, model_hash, parse_model
+from gateway.core.line_model import LineModel, canonical, model_hash, parse_model
 from gateway.core.line_template import line_template
 from gateway.core.recording import Recording
 from gateway.core.signals import DriveState, Quality
 from gateway.core.states import LoopState
 from gateway.identification import identify as pipeline
+from gateway.identification import inheritance
+from gateway.identification.identify import NotIdentified
 from gateway.supervisor.models import open_repository
 from tests.closed_loop.recorded import demonstration_line, real_plant, recorded
 from tests.closed_loop.spoiled import shifted, swapped
@@ -252,6 +255,35 @@ def test_options_that_make_no_sense_are_refused(recording: Recording, folder: Pa
     place = str(folder / "line.toml" / "x.json")
     result = CliRunner().invoke(app, ["identify", str(folder / "line.toml"), str(good), "--out", place])
     assert result.exit_code == 2 and "is no folder" in result.stderr
+
+
+def test_the_model_in_service_is_the_prior_only_when_it_is_asked_for_and_one_was_accepted(
+    run: tuple[Path, IdentifyResult, str], recording: Recording, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[LineModel] = []
+
+    def recorded_only(parent: LineModel, *_: object, **__: object) -> None:
+        asked.append(parent)
+        raise NotIdentified(["far enough"])
+
+    monkeypatch.setattr(inheritance, "identify_after", recorded_only)
+    good, data = file_of(folder, recording), folder / "data"
+    code, _, err = identify(folder, good, "--data-dir", data, "--prior", "in-service")
+    assert code == 2 and "--prior in-service: there are no models at" in err
+    shutil.copytree(run[0] / "data", data)
+    code, _, err = identify(folder, good, "--data-dir", data, "--prior", "in-service")
+    assert code == 2 and "no model of demo/line-1 was accepted; allowed: line, a model" in err and not asked
+    with open_repository(data / "models.sqlite") as models:
+        (entry,) = models.entries()
+        models.mark(entry.id, "accepted", 1.0, "a test")
+    for prior in ("in-service", "1", str(run[0] / "new" / "model.json")):
+        code, _, err = identify(folder, good, "--data-dir", data, "--prior", prior)
+        assert code == 2 and "far enough" in err
+    assert [model_hash(one) for one in asked] == [entry.id] * 3
+    without = {**json.loads((run[0] / "new" / "model.json").read_bytes()), "posterior": None}
+    (folder / "old.json").write_text(json.dumps(without))
+    code, _, err = identify(folder, good, "--prior", folder / "old.json")
+    assert code == 2 and "has no posterior, which a prior is made from" in err and len(asked) == 3
 
 
 def test_ctrl_c_leaves_nothing_behind(recording: Recording, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

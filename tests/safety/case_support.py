@@ -1,13 +1,16 @@
 """Proposals and what they are judged against, from simulated lines whose truth is known."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 from typing import Any
 
-from gateway.control.design import design_lqg, design_lqi, task_of, task_on
+from gateway.cli.recordings import read_recording
+from gateway.control.design import DesignTask, design_lqi, task_of, task_on
 from gateway.core.controller import Controller, config_hash
-from gateway.core.judge_context import DataReference, JudgeContext, LineState
+from gateway.core.judge_context import DataReference, JudgeContext, LineState, parse_context
 from gateway.core.line import Line
+from gateway.core.line_file import load_line
 from gateway.core.line_model import LineModel, model_hash, noise_of, theta_of
 from gateway.core.proposal import Proposal, canonical
 from gateway.core.recording import Recording
@@ -19,12 +22,13 @@ from gateway.identification.prediction_error import fit
 from gateway.identification.prior import prior_of
 from safety.case import Case
 from safety.judge import judge
-from tests.closed_loop.recorded import TENSION_N, demonstration_line, real_plant, recorded
+from tests.closed_loop.recorded import TENSION_N
 
 NOW = "2026-08-03T14:06:00+00:00"
 CREATED, EXPIRES = "2026-08-03T14:05:00+00:00", "2026-08-03T15:05:00+00:00"
 MADE = "2026-08-03T14:00:00+00:00"
-SPEEDS = (0.05, 0.1)
+SPEED_M_PER_S = 0.05
+EXAMPLES = Path("docs/examples")
 DIGEST = "0" * 64
 
 
@@ -37,7 +41,7 @@ class Setting:
     model: LineModel
 
     def context(self, **changes: Any) -> JudgeContext:
-        state = LineState(state="RUN", tension_n=list(TENSION_N), speed_m_per_s=SPEEDS[0])
+        state = LineState(state="RUN", tension_n=list(TENSION_N), speed_m_per_s=SPEED_M_PER_S)
         fields: dict[str, Any] = {
             "format": 1, "now": NOW, "state": state, "in_service": design_lqi(task_of(self.line)),
             "model": self.model,
@@ -45,7 +49,7 @@ class Setting:
         }  # fmt: skip
         return JudgeContext(**{**fields, **changes})
 
-    def task(self):
+    def task(self) -> DesignTask:
         """What a good redesign is made for."""
         return task_on(self.line, theta_of(self.model), noise_of(self.model))
 
@@ -57,11 +61,13 @@ def modelled(recording: Recording, line: Line, structure: Structure | None = Non
 
 
 @cache
-def setting(plant: str = "s_real", seed: int = 5) -> Setting:
-    """Five seconds at each of two speeds."""
-    line = demonstration_line()
-    recording = recorded(real_plant(plant), seed, speeds_m_per_s=SPEEDS, line=line)
-    return Setting(line, recording, modelled(recording, line))
+def published() -> Setting:
+    """The published context: S_real, under the LQI of the line's file, at 0.05 m/s."""
+    line = load_line((EXAMPLES / "line.toml").read_text(), "line.toml")
+    line = line.model_copy(update={"gate": line.gate.model_copy(update={"corners": 8})})  # for the time that it takes
+    context = parse_context((EXAMPLES / "judge-context.json").read_bytes())
+    assert context.model is not None
+    return Setting(line, read_recording(EXAMPLES / context.data[0].path), context.model)
 
 
 def proposal(change: Any, context: JudgeContext, **changes: Any) -> Proposal:
@@ -91,17 +97,3 @@ def case_of(given: Proposal, context: JudgeContext, of: Setting, seed: int = 1, 
 def refused(found: list[RuleFinding]) -> list[str]:
     """What is against it."""
     return [one.text for one in found if not one.passed]
-
-
-def redesigns(of: Setting) -> dict[str, Controller]:
-    """Good ones, on the identified model."""
-    task = of.task()
-    return {"lqi": design_lqi(task), "lqg": design_lqg(task)}
-
-
-def with_latency(context: JudgeContext, latency_s: float) -> JudgeContext:
-    return context.model_copy(update={"latency_s": latency_s})
-
-
-def untouched(of: Setting, **changes: Any) -> Setting:
-    return replace(of, **changes)
