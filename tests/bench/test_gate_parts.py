@@ -2,6 +2,7 @@
 
 import json
 from contextlib import suppress
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,10 +14,11 @@ from gateway.core.line_model import model_of
 from gateway.core.proposal import ProposalRefused, parse_proposal
 from gateway.core.recording import Recording
 from tests.bench import gate, gate_mutations, gate_schema
+from tests.bench.gate_adversary import STEPS, chain
 from tests.bench.gate_contexts import GateLine, context_of, payload_of
 from tests.bench.gate_plants import is_for_tuning
 from tests.bench.gate_proposals import CLASSES, proposals
-from tests.bench.gate_runs import Tried
+from tests.bench.gate_runs import LineBench, Tried
 from tests.closed_loop.recorded import demonstration_line, real_plant
 from tests.independent.gate_judge import model_error
 from tests.independent.truth import plain_truth, truth_of
@@ -148,3 +150,15 @@ def test_a_wrong_choice_deep_inside_a_proposal_is_refused_in_words() -> None:
     experiment = gate_schema.valid_proposals()[-1]
     with pytest.raises(ProposalRefused, match="shape"):
         parse_proposal(experiment.replace(b'"shape":"binary"', b'"shape":"binry"'))
+
+
+def test_an_adversary_whom_nobody_stops_makes_a_line_unsafe(line: GateLine, monkeypatch: pytest.MonkeyPatch) -> None:
+    bench = LineBench(line)
+    monkeypatch.setattr(bench, "judged", lambda *_: SimpleNamespace(accepted=True))
+    found = chain(bench, 0)
+    assert found.unsafe
+    assert found.badness[0] < 1.0 <= found.badness[-1]
+    monkeypatch.setattr(bench, "judged", lambda *_: SimpleNamespace(accepted=False))
+    stopped = chain(bench, 0)
+    assert stopped.unsafe == ""
+    assert stopped.steps == [0] * STEPS
