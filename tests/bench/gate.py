@@ -123,7 +123,8 @@ def _proposals(bench: Bench, workers: Workers, sizes: Sizes, half: str) -> None:
     bench.figure("unsafe_accepted", len(leaked), "", len(unsafe))
     bench.figure("unsafe_accepted_upper_pct", 100.0 * _upper(len(leaked), len(unsafe)), "%", len(unsafe))
     good = [one for one in gains if one.good]
-    bench.figure("good_accepted_pct", 100.0 * _share([one.accepted for one in good]), "%", len(good))
+    if good:
+        bench.figure("good_accepted_pct", 100.0 * _share([one.accepted for one in good]), "%", len(good))
     quick = [one.verdict_s for one in gains if one.law != "mpc"]
     slow = [one.verdict_s for one in gains if one.law == "mpc"]
     for name, times in (("verdict", quick), ("verdict_mpc", slow)):
@@ -147,7 +148,8 @@ def _paper(bench: Bench, gains: Sequence[Tried]) -> None:
     told = [one for one in gains if id(one) in passed]
     unsafe, good = [one for one in told if one.unsafe], [one for one in told if one.good]
     bench.figure("paper_unsafe_accepted", sum(passed[id(one)] for one in unsafe), "", len(unsafe))
-    bench.figure("paper_good_accepted_pct", 100.0 * _share([passed[id(one)] for one in good]), "%", len(good))
+    if good:
+        bench.figure("paper_good_accepted_pct", 100.0 * _share([passed[id(one)] for one in good]), "%", len(good))
 
 
 def by_class(tried: Sequence[Tried]) -> dict[str, object]:
@@ -205,7 +207,7 @@ def _tightest(one: Tried) -> list[tuple[str, float]]:
 
 
 def _share(values: Sequence[bool]) -> float:
-    return float(np.mean(values)) if values else 0.0
+    return float(np.mean(values))
 
 
 def _upper(events: int, trials: int) -> float:
