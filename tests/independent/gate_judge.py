@@ -1,6 +1,6 @@
 """The judge of the gate: whether a configuration is unsafe on the true line, and whether refusing it would be wrong."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
@@ -12,13 +12,13 @@ from gateway.core.line import Line
 from gateway.core.line_model import LineModel
 from tests.independent.cases import fastest, measuring_cases, trying_cases
 from tests.independent.runs import Case, Found, simulated
-from tests.independent.truth import Truth, stressed
+from tests.independent.truth import FloatArray, Truth, stressed
 
 EXTRA_DELAY_S = 0.004  #: that a good configuration stands on the true line
 AROUND = 0.05  #: the rules' stress is tried on corners of so much around the truth
 CORNERS = 6  #: drawn of the 32
 BETTER = 0.03  #: in one metric at least
-TOLERATED = 0.25  #: of the gate's own tolerance: what no metric may be worse by
+TOLERATED = 0.5  #: of the gate's own tolerance: what no metric may be worse by
 MARGIN_CASES = (0, 3, 7, 8)  #: of those that are tried: where the margin is looked at
 FAMILIES = ("stiffness_n", "length_m", "radius_m", "inertia_kg_m2", "friction_nms_per_rad")
 
@@ -28,7 +28,7 @@ class Metrics:
     """On the true line, case by case: of all spans together, and of the worst span."""
 
     rmse_n: dict[str, float]
-    overshoot_n: dict[str, float]
+    overshoot_pct: dict[str, float]  #: `_overshoot_pct`
     settling_s: dict[str, float]
 
 
@@ -78,7 +78,7 @@ class GateJudge:
         rmse, names = np.sqrt(found.squared_n2.sum(axis=1)).tolist(), [case.name for case in cases]
         return Metrics(
             dict(zip(names, rmse, strict=True)),
-            dict(zip(names, found.beyond_n.max(axis=1).tolist(), strict=True)),
+            dict(zip(names, map(_overshoot_pct, found.beyond_n, cases), strict=True)),
             dict(zip(names, found.settled_s.max(axis=1).tolist(), strict=True)),
         )
 
@@ -101,7 +101,7 @@ class GateJudge:
         for other in self.references:
             for name, floor in (
                 ("rmse_n", gate.tolerance_n),
-                ("overshoot_n", gate.tolerance_n),
+                ("overshoot_pct", gate.tolerance_overshoot_pct),
                 ("settling_s", gate.tolerance_settling_s),
             ):
                 before = getattr(other, name)
@@ -141,13 +141,12 @@ class GateJudge:
         return ""
 
 
-def without_effects(truth: Truth) -> Truth:
-    """The two equations alone, with their noise."""
-    none = np.zeros(truth.n)
-    return replace(
-        truth, coulomb_nm=none, eccentricity=np.zeros(truth.n + 1), gap_rad=none, torque_lag_s=0.0, cell_lag_s=0.0,
-        late_share=0.0, jitter_s=0.0,
-    )  # fmt: skip
+def _overshoot_pct(beyond_n: FloatArray, case: Case) -> float:
+    """Of the worst span that steps; where none does, of the set-points. What a step does to others is in the RMSE."""
+    first, last = case.tension_n[0], case.tension_n[-1]
+    steps = first != last
+    share = beyond_n[steps] / np.abs(last - first)[steps] if steps.any() else beyond_n / last
+    return float(100.0 * share.max())
 
 
 def unsafe_experiment(
