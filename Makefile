@@ -6,7 +6,7 @@ RUN   := $(PY) -m gateway.cli
 export PYTHONDONTWRITEBYTECODE :=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup run test system-test check format bench bench-stepped bench-wire bench-processes bench-cycle bench-monitor bench-control bench-identify bench-faults bench-fuzz bench-soak bench-audit lock clean
+.PHONY: help setup run test system-test check format bench bench-stepped bench-wire bench-processes bench-cycle bench-monitor bench-control bench-identify bench-faults bench-fuzz bench-soak bench-gate bench-audit lock clean
 
 help: ## this list
 	@echo "r2rgate: make TARGET"
@@ -70,6 +70,9 @@ bench-soak: setup ## an hour of a line on three wires, with something going wron
 bench-audit: setup ## the audit: a thousand kills of its writer, ten thousand damages (about 15 min)
 	@$(PY) -m tests.bench.audit_kill
 	@$(PY) -m tests.bench.audit_damage
+
+bench-gate: setup ## proposals of every way of going wrong, judged by the gate and by the truth (ARGS="--parts a --plants 5 --proposals 200")
+	@$(PY) -m tests.bench.gate $(ARGS)
 
 bench-cycle: setup ## how late the loop wakes beside cyclictest, what a cycle takes and costs; as root (about 40 min)
 	@$(PY) -m tests.bench.cycle $(ARGS)

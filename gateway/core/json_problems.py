@@ -13,6 +13,7 @@ from gateway.core.nearest import nearest
 
 Schema = dict[str, Any]
 Path = tuple[str | int, ...]
+MOST_DEEP = 64  #: objects and lists in one another; no format of this program needs ten
 
 _WRONG = {
     "missing": "is missing",
@@ -48,7 +49,21 @@ def document_of(payload: bytes) -> dict[str, Any]:
         raise NotJson(f"it is no JSON: {printable(str(error))[:200]}") from None
     if not isinstance(document, dict):
         raise NotJson(f"it is {_kind(document)}; allowed: a JSON object {{ ... }}")
+    if _is_too_deep(document):  # whatever walks through it, such as what tells its mistakes, calls itself
+        raise NotJson(f"objects and lists stand in one another more than {MOST_DEEP} deep")
     return document  # pyright: ignore[reportUnknownVariableType]
+
+
+def _is_too_deep(document: Any) -> bool:
+    level: list[Any] = [document]
+    for _ in range(MOST_DEEP):
+        inner: list[Any] = []
+        for one in level:
+            inner += one.values() if isinstance(one, dict) else one  # pyright: ignore[reportUnknownVariableType]
+        level = [child for child in inner if isinstance(child, dict | list)]
+        if not level:
+            return False
+    return True
 
 
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -82,7 +97,7 @@ def _problem(error: ErrorDetails, root: Schema) -> str:
         return _sentence(path, value, "there is no such key", ", ".join(known), nearest(str(path[-1]), known))
     wrong = _WRONG.get(kind) or f"is {_kind(value)}"
     shown = None if kind == "missing" else "null" if value is None else value
-    like = nearest(value, node["enum"]) if kind == "literal_error" and isinstance(value, str) else ""
+    like = nearest(value, node.get("enum", ())) if kind == "literal_error" and isinstance(value, str) else ""
     return _sentence(path, shown, wrong, _allowed(node, path), like)
 
 

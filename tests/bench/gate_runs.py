@@ -1,0 +1,131 @@
+"""What bench-gate runs: proposals for one line, each judged by the gate and by the judge of the gate."""
+
+import time
+from dataclasses import dataclass, field
+from functools import cached_property
+
+from gateway.core.controller import Controller
+from gateway.core.judge_context import JudgeContext
+from gateway.core.line import Line
+from gateway.core.proposal import ExperimentChange, GainsChange, ModelChange
+from gateway.core.recording import Recording
+from gateway.core.verdict import Verdict
+from safety.judge import judge
+from tests.bench.gate_contexts import GateLine, context_of, payload_of
+from tests.bench.gate_proposals import Asked
+from tests.independent.gate_judge import GateJudge, model_error, unsafe_experiment
+
+MISLEADS = 0.1  #: a model farther from the truth than this
+ROLLOUT_RULE = "corners"  #: in the names of the rule that simulates
+FIRST_TOP_M_PER_S = 0.02
+
+
+@dataclass(frozen=True)
+class Tried:
+    """A proposal, its verdict and its truth."""
+
+    number: int  #: of the line
+    class_name: str
+    context: str
+    kind: str  #: of the change
+    law: str
+    accepted: bool
+    against: list[str]  #: rules that do not pass
+    findings: list[tuple[str, bool, float | None, float | None]]  #: rule, passed, margin, value
+    reported: list[tuple[str, bool, float | None, float | None]]
+    unsafe: str
+    good: bool
+    why_not_good: str
+    verdict_s: float  #: on the wall
+    processor_s: float
+    texts: list[str] = field(default_factory=list)  #: of the rules that do not pass
+
+
+class LineBench:
+    """One line with its contexts; judges are made when they are first asked for."""
+
+    def __init__(self, given: GateLine) -> None:
+        self.given = given
+        self._judges: dict[str, GateJudge] = {}
+
+    @cached_property
+    def contexts(self) -> dict[str, JudgeContext]:
+        given = self.given
+        return {
+            "plain": context_of(given, given.plain, given.plain),
+            "initial": context_of(given, given.initial, given.initial),
+            "adapted": context_of(given, given.adapted, given.initial),
+            "first": context_of(given, given.initial, given.initial, first=True),
+        }
+
+    def recordings(self, context: str) -> list[Recording]:
+        return [] if context == "first" else [self.given.recording]
+
+    def truth(self, context: str) -> GateJudge:
+        """The judge of the gate for a context."""
+        if context not in self._judges:
+            given, first = self.given, context == "first"
+            in_service, baseline = self.contexts[context].in_service, self.contexts[context].baseline
+            assert baseline is not None
+            top = FIRST_TOP_M_PER_S if first else given.model.region.speed_to_m_per_s
+            line = creeping(given.line) if first else given.line
+            self._judges[context] = GateJudge(line, given.truth, in_service, baseline, top, given.number)
+        return self._judges[context]
+
+    def in_service(self) -> dict[str, str]:
+        """By context, what is unsafe on the truth about what runs there: nobody would propose anything better there."""
+        return {name: self.truth(name).unsafe(context.in_service) for name, context in self.contexts.items()}
+
+    def tried(self, asked: Asked, seed: int) -> Tried:
+        given, context = self.given, self.contexts[asked.context]
+        payload = payload_of(asked.change, context, given.line)
+        began_s, worked_s = time.perf_counter(), time.process_time()
+        verdict = judge(payload, context, given.line, self.recordings(asked.context), seed)
+        took_s, processor_s = time.perf_counter() - began_s, time.process_time() - worked_s
+        unsafe, good, why, law = self._truth_of(asked)
+        return Tried(
+            given.number, asked.class_name, asked.context, asked.change.kind, law, verdict.accepted,
+            sorted({one.rule for one in verdict.findings if not one.passed}), _rows(verdict, "findings"),
+            _rows(verdict, "reported"), unsafe, good, why, took_s, processor_s, [t[:300] for t in verdict.reasons],
+        )  # fmt: skip
+
+    def _truth_of(self, asked: Asked) -> tuple[str, bool, str, str]:
+        """What is unsafe, whether refusing it is wrong, why it is not, and the law."""
+        given, change = self.given, asked.change
+        if isinstance(change, GainsChange):
+            found = self.truth(asked.context).of(change.controller)
+            return found.unsafe, found.good, found.why_not_good, change.controller.kind
+        if isinstance(change, ModelChange):
+            error = model_error(change.model, given.truth)
+            return (f"off by {100.0 * error:.0f} %" if error > MISLEADS else ""), False, "a model", "model"
+        assert isinstance(change, ExperimentChange)
+        state, config = self.contexts[asked.context].state, self.contexts[asked.context].in_service
+        unsafe = unsafe_experiment(
+            change.experiment, given.line, given.truth, config, list(state.tension_n), state.speed_m_per_s, given.number
+        )
+        return unsafe, False, "an experiment", "experiment"
+
+    def judged(self, config: Controller, context: JudgeContext, seed: int) -> Verdict:
+        """A verdict on gains in a context of one's own, on the line's data."""
+        payload = payload_of(GainsChange(controller=config), context, self.given.line)
+        return judge(payload, context, self.given.line, [self.given.recording], seed)
+
+
+def measured(one: Tried) -> bool:
+    """Whether the rule that simulates has come to a figure."""
+    return any(rule.startswith(ROLLOUT_RULE) and value is not None for rule, _, _, value in one.findings)
+
+
+def creeping(line: Line) -> Line:
+    """With the limits of a line that has no accepted model."""
+    limits = line.limits.model_copy(
+        update={
+            "tension_step_max_n": line.gate.first_step_max_n,
+            "speed_max_m_per_s": line.gate.first_speed_max_m_per_s,
+        }
+    )
+    return line.model_copy(update={"limits": limits})
+
+
+def _rows(verdict: Verdict, name: str) -> list[tuple[str, bool, float | None, float | None]]:
+    return [(one.rule, one.passed, one.margin, one.value) for one in getattr(verdict, name)]
