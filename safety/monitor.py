@@ -94,6 +94,6 @@ def recoverable(
 
 
 def _turns(way: FloatArray, move_nm: FloatArray, reversal_nm: float) -> tuple[FloatArray, BoolArray]:
-    """Which torques turn round by a period's `move_nm`, and -1 or 1 for the last move of each that counts; (n,) each."""
+    """Which torques turn round by a period's `move_nm`, and the sign of the last move of each that counts; (n,)."""
     now = np.where(np.abs(move_nm) > reversal_nm, np.sign(move_nm), way)
     return now, now * way < 0.0

@@ -143,7 +143,7 @@ class LineModel(Strict):
     validation: ModelValidation | None = None
     alignment: list[ChannelDelay] = []
     parent: Digest | None = None  #: the model that was the prior; null: the line's file
-    #: null: the method gives none, or the file is older. Not written then, so that models from before it keep their hash.
+    #: null: the method gives none, or the file is older. Not written then: models from before it keep their hash.
     posterior: ModelPosterior | None = Field(default=None, exclude_if=lambda value: value is None)
 
     @property
