@@ -69,7 +69,7 @@ def test_the_statistic_is_that_of_chi_square_where_the_truth_comes_from_the_prio
 
     def drawn() -> Fit:
         logs = prior.mean + spread @ generator.standard_normal(5)
-        return Fit(prior, logs, covariance, information, Noise(), [], 0.0, 0.0, 1, True)
+        return Fit(prior, logs, covariance, information, Noise(), [], [], 0.0, 0.0, 1, True)
 
     found = [agreement_of(drawn()) for _ in range(2000)]
     degrees = found[0].degrees

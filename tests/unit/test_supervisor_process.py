@@ -107,7 +107,8 @@ def test_a_second_instance_ends_with_3_and_a_sentence_and_touches_nothing() -> N
             assert f"by process {process.pid}" in said
             assert "Traceback" not in said
             async with loop_and_client(folder) as (_, client):
-                assert [event.kind for event in (await ask(client)).events] == ["gateway-up"]
+                kinds = [event.kind for event in (await ask(client)).events]
+                assert kinds.count("gateway-up") == 1
 
     run(story)
 
