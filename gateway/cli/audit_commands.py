@@ -64,7 +64,7 @@ def verify(
     if export_file is not None:
         _verify_export(export_file, as_json)
         return
-    folder = _folder(line, data_dir)
+    folder = audit_folder(line, data_dir)
     found = verify_audit(folder)
     if head is not None:
         _require_head(folder, head, found)
@@ -99,13 +99,13 @@ def show(
 
     Example: r2rgate audit show --id 08067a72 --json
     """
-    folder = _folder(line, data_dir)
+    folder = audit_folder(line, data_dir)
     since_s = None if since is None else _instant(since)
     try:
         with AuditFile(folder) as file:
             records = list(chained(file.rows(), 0, BEFORE_FIRST))
     except AuditUnavailable as error:
-        _refuse(error)
+        refuse(error)
     if kind is not None:
         _require_kind(kind, records)
     chosen = [one for one in records if found_in(one, kind, since_s, id_)][-last:]
@@ -131,9 +131,9 @@ def export(
 
     Example: r2rgate audit export --out audit.jsonl
     """
-    folder = _folder(line, data_dir)
+    folder = audit_folder(line, data_dir)
     if str(out) != "-" and out.exists() and not force:
-        _refuse(f"{out} exists and was left as it was; use another --out, or --force to overwrite it")
+        refuse(f"{out} exists and was left as it was; use another --out, or --force to overwrite it")
     found = verify_audit(folder)
     if not found.sound:
         print_verification(found, folder)
@@ -149,9 +149,9 @@ def export(
                 stream.writelines(text + "\n" for text in _lines(file, found.records))
             part.replace(out)
     except (AuditUnavailable, NotRecordable) as error:
-        _refuse(error)
+        refuse(error)
     except OSError as error:
-        _refuse(f"--out {out} cannot be written: {error.strerror}; name a file in a folder that you may write")
+        refuse(f"--out {out} cannot be written: {error.strerror}; name a file in a folder that you may write")
     typer.echo(f"{out}: {found.records} records, {found.blobs} blobs, head {found.head}")
 
 
@@ -167,18 +167,18 @@ def begin_anew(
 
     Example: r2rgate audit begin-anew --because "disk replaced, last copy from 3 November lost"
     """
-    folder = _folder(line, data_dir)
+    folder = audit_folder(line, data_dir)
     try:
         begun = begin_audit_anew(folder, because, this_user())
     except (AuditUnavailable, NotRecordable) as error:
-        _refuse(error)
+        refuse(error)
     before = begun.before
     typer.echo(f"begun: {folder / FILE_NAME}, record 1, head {begun.first.head}")
     typer.echo(f"kept: {begun.kept}, {before.records} records, {'sound' if before.sound else 'not sound'}")
     typer.echo(f"  r2rgate audit verify --data-dir {begun.kept}")
 
 
-def _folder(line: Path | None, data_dir: Path | None) -> Path:
+def audit_folder(line: Path | None, data_dir: Path | None) -> Path:
     described = None if line is None else read_line(line)
     advice = "a gateway begins one when it starts"
     try:
@@ -186,7 +186,7 @@ def _folder(line: Path | None, data_dir: Path | None) -> Path:
         if not folder.is_dir():
             raise AuditUnavailable(f"there is no folder {folder}, so no audit: {advice}")
     except AuditUnavailable as error:
-        _refuse(error)
+        refuse(error)
     return folder
 
 
@@ -209,7 +209,7 @@ def _verify_export(path: Path, as_json: bool) -> None:
         with path.open("rb") as stream:
             wrong = list(wrong_in(stream))
     except OSError as error:
-        _refuse(f"{path} cannot be read: {error.strerror}")
+        refuse(f"{path} cannot be read: {error.strerror}")
     if as_json:
         typer.echo(json.dumps({"file": str(path), "sound": not wrong, "problems": wrong}, indent=2))
     else:
@@ -223,7 +223,7 @@ def _require_head(folder: Path, given: str, found: Verification) -> None:
     """Adds a problem where a record that somebody has noted elsewhere is not there."""
     number, _, head = given.partition(":")
     if not number.isdecimal() or not re.fullmatch(r"[0-9a-f]{64}", head):
-        _refuse(f"--head {given}: allowed is NUMBER:HEAD, as verify prints them")
+        refuse(f"--head {given}: allowed is NUMBER:HEAD, as verify prints them")
     try:
         with AuditFile(folder) as file:
             there = next(file.rows(int(number)), None)
@@ -238,7 +238,7 @@ def _require_kind(kind: str, records: list[Chained]) -> None:
     if kind not in known:
         like = nearest(kind, known)
         hint = f"; did you mean {like}?" if like else ""
-        _refuse(f"--kind {kind}: there is no such record; kinds here: {', '.join(known)}{hint}")
+        refuse(f"--kind {kind}: there is no such record; kinds here: {', '.join(known)}{hint}")
 
 
 def _instant(text: str) -> float:
@@ -249,7 +249,7 @@ def _instant(text: str) -> float:
     try:
         return datetime.fromisoformat(text).astimezone().timestamp()  # without a zone: that of this machine
     except (ValueError, OverflowError):
-        _refuse(f"--since {text}: allowed is a date and time such as 2026-11-22T14:00, or 30min, 8h, 7d (ago)")
+        refuse(f"--since {text}: allowed is a date and time such as 2026-11-22T14:00, or 30min, 8h, 7d (ago)")
 
 
 def _data(one: Chained) -> dict[str, Any]:
@@ -266,7 +266,7 @@ def this_user() -> Who:
     return Who(name=name, uid=uid, pid=os.getpid())
 
 
-def _refuse(why: object) -> NoReturn:
+def refuse(why: object) -> NoReturn:
     for text in str(why).splitlines():
         typer.echo(printable(text), err=True)
     raise typer.Exit(REFUSED)

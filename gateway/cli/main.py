@@ -8,6 +8,7 @@ from pydantic import ValidationError
 
 from gateway.cli import (
     audit_commands,
+    audit_replay,
     baselines_commands,
     configurations_commands,
     design_commands,
@@ -71,6 +72,7 @@ app.command(rich_help_panel=OVERSIGHT)(proposal_commands.approve)
 app.command(rich_help_panel=OVERSIGHT)(proposal_commands.reject)
 app.command(rich_help_panel=OVERSIGHT)(proposal_commands.rollback)
 app.command("export", rich_help_panel=EVIDENCE)(recordings_export.export)
+audit_commands.app.command()(audit_replay.replay)
 app.add_typer(audit_commands.app, rich_help_panel=EVIDENCE)
 app.add_typer(configurations_commands.app, rich_help_panel=EVIDENCE)
 app.command(rich_help_panel=EVIDENCE)(baselines_commands.baselines)

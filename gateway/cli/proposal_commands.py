@@ -10,9 +10,12 @@ import typer
 from pydantic import ValidationError
 from rich.console import Console
 
+from gateway.cli.data_place import data_folder
 from gateway.cli.operate_commands import REFUSED, UNREACHABLE, Json, RunFolder
+from gateway.cli.process_commands import DataFolder
 from gateway.cli.proposal_view import print_list, print_shown
 from gateway.core.controller import ControllerRefused, parse_controller
+from gateway.core.controller import canonical as canonical_controller
 from gateway.core.decisions import Decide, ListProposals, ProposalList, ProposalShown, RollBackNow, ShowProposal
 from gateway.core.experiment import ExperimentRefused, parse_experiment
 from gateway.core.line_model import ModelRefused, parse_model
@@ -32,6 +35,7 @@ from gateway.mailbox.listener import PathTooLong
 from gateway.mailbox.paths import GATEWAY_SOCKET
 from gateway.mailbox.port import Unreachable
 from gateway.mailbox.unix import UnixMailbox
+from gateway.supervisor.configurations import FILE_NAME, ConfigurationsError, open_configurations
 
 REPLY_TIME_S = 20.0  #: a deployment is built and read back before it is answered
 POLL_S = 0.25
@@ -43,21 +47,35 @@ Yes = Annotated[bool, typer.Option("--yes", help="Do not ask again.")]
 
 
 def propose(
-    file: Annotated[Path, typer.Argument(help="A controller, an experiment, a model, or a whole proposal, as JSON.")],
+    file: Annotated[
+        Path | None, typer.Argument(help="A controller, an experiment, a model, or a whole proposal, as JSON.")
+    ] = None,
+    configuration: Annotated[
+        str | None,
+        typer.Option("--configuration", help="In place of a file: one of `r2rgate configurations`, by name or hash."),
+    ] = None,
     reason: Annotated[str, typer.Option("--reason", help="Why; whoever decides reads it.")] = "",
     author: Annotated[str, typer.Option("--author", help="Of those that the line's file allows.")] = "engineer",
     hours: Annotated[float, typer.Option("--hours", min=0.01, help="For how long it stands.")] = 8.0,
     wait: Annotated[bool, typer.Option("--wait/--no-wait", help="Until it has been judged.")] = True,
     run_dir: RunFolder = None,
+    data_dir: DataFolder = None,
     as_json: Json = False,
 ) -> None:
     """Put a change before the gate. Nothing reaches the line before it is accepted there and approved by a person.
 
     Example: r2rgate propose controller.json --reason "redesigned on model v3"
+
+    Example: r2rgate propose --configuration phi_stable --reason "back to what ran in spring"
     """
-    content = _read(file)
+    if (file is None) is (configuration is None):
+        _refuse("name a file, or --configuration NAME; one of them")
     listed = _listed(run_dir)
-    payload = content if _is_proposal(content) else canonical(_made(file, content, reason, author, hours, listed))
+    content = _read(file) if file is not None else _stored(str(configuration), data_dir, listed)
+    if _is_proposal(content):
+        payload = content
+    else:
+        payload = canonical(_made(str(file or configuration), content, reason, author, hours, listed))
     reply = Reply.model_validate_json(_ask(run_dir, GATEWAY_PROPOSE, payload))
     if not reply.ok or not wait:
         _end_with(reply, as_json)
@@ -134,6 +152,20 @@ def _read(file: Path) -> bytes:
         _refuse(f"{file} cannot be read: {error.strerror}")
 
 
+def _stored(which: str, data_dir: Path | None, listed: ProposalList) -> bytes:
+    """A configuration of this line out of the store."""
+    advice = "the gateway stores each that is put into service"
+    try:
+        folder = data_dir or data_folder(None, FILE_NAME, "configurations", advice, ConfigurationsError)
+        with open_configurations(folder / FILE_NAME) as storage:
+            one = storage.find(which, listed.site, listed.line)
+    except ConfigurationsError as error:
+        _refuse(str(error))
+    if one.controller is None:
+        _refuse(f"version {one.version} is damaged: {one.damage}")
+    return canonical_controller(one.controller)
+
+
 def _is_proposal(content: bytes) -> bool:
     try:
         document: Any = json.loads(content)
@@ -142,7 +174,7 @@ def _is_proposal(content: bytes) -> bool:
     return isinstance(document, dict) and "change" in document
 
 
-def _made(file: Path, content: bytes, reason: str, author: str, hours: float, listed: ProposalList) -> Proposal:
+def _made(source: str, content: bytes, reason: str, author: str, hours: float, listed: ProposalList) -> Proposal:
     """A proposal of what is in a file, on what is in service now."""
     if not reason.strip():
         _refuse("--reason is missing: whoever decides wants to know why")
@@ -153,7 +185,7 @@ def _made(file: Path, content: bytes, reason: str, author: str, hours: float, li
         "format": 1,
         "site": listed.site,
         "line": listed.line,
-        "change": _change(file, content),
+        "change": _change(source, content),
         "base": listed.in_service,
         "model": listed.model,
         "reason": reason,
@@ -167,7 +199,7 @@ def _made(file: Path, content: bytes, reason: str, author: str, hours: float, li
         _refuse("; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors()))
 
 
-def _change(file: Path, content: bytes) -> GainsChange | ExperimentChange | ModelChange:
+def _change(source: str, content: bytes) -> GainsChange | ExperimentChange | ModelChange:
     refusals: list[str] = []
     for what, read in (
         ("controller", lambda: GainsChange(controller=parse_controller(content))),
@@ -178,7 +210,7 @@ def _change(file: Path, content: bytes) -> GainsChange | ExperimentChange | Mode
             return read()
         except (ControllerRefused, ExperimentRefused, ModelRefused) as refused:
             refusals.append(f"  as a {what}: {str(refused)[:200]}")
-    _refuse(f"{file} is neither controller, experiment, model nor proposal:\n" + "\n".join(refusals))
+    _refuse(f"{source} is neither controller, experiment, model nor proposal:\n" + "\n".join(refusals))
 
 
 def _hash_of(payload: bytes) -> str:

@@ -25,6 +25,11 @@ class Region(Strict):
     tension_step_max_n: NonNegative | None = None
     speed_step_max_m_per_s: NonNegative | None = None
 
+    def within(self, other: "Region") -> bool:
+        """Whether it goes nowhere beyond `other`."""
+        mine, its = self.model_dump(), other.model_dump()
+        return all(its[name] is None or (mine[name] is not None and mine[name] <= its[name]) for name in its)
+
 
 class RecoveryNode(Strict):
     """The accepted model, sampled and linear, near one speed of the unwinder.

@@ -18,7 +18,7 @@ def of_controllers(before: Controller, after: Controller) -> list[str]:
     if before.kind != after.kind:
         told = [f"the law changes from {before.kind} to {after.kind}"]
     else:
-        told = _fields(_parts(before.model_dump()), _parts(after.model_dump()))
+        told = _fields(*(parts(one.model_dump(exclude={"feedforward", "kind"})) for one in (before, after)))
     told += _parameters(before.feedforward.model_dump(), after.feedforward.model_dump(), "feed-forward")
     return told or ["nothing differs"]
 
@@ -63,14 +63,12 @@ def _parameters(before: dict[str, Any], after: dict[str, Any], whose: str) -> li
 Part = FloatArray | float | str | None
 
 
-def _parts(config: dict[str, Any], under: str = "") -> dict[str, Part]:
-    """Everything but the feed-forward, matrices as arrays, by dotted names."""
+def parts(config: dict[str, Any], under: str = "") -> dict[str, Part]:
+    """Of fields, and fields of fields, matrices as arrays, by dotted names."""
     found: dict[str, Part] = {}
     for key, value in config.items():
-        if key in ("feedforward", "kind"):
-            continue
         if isinstance(value, dict):
-            found |= _parts(cast("dict[str, Any]", value), f"{under}{key}.")
+            found |= parts(cast("dict[str, Any]", value), f"{under}{key}.")
         else:
             found[f"{under}{key}"] = _part(value)
     return found
@@ -92,14 +90,14 @@ def _fields(before: dict[str, Part], after: dict[str, Part]) -> list[str]:
         if isinstance(old, np.ndarray) and isinstance(new, np.ndarray):
             if old.shape != new.shape:
                 told.append(f"{name} is {new.shape} in place of {old.shape}")
-            elif (change := _relative(old, new)) > SAME:
+            elif (change := relative(old, new)) > SAME:
                 told.append(f"{name} changes by {100.0 * change:.1f} %{_signs(old, new)}")
         elif isinstance(old, np.ndarray) or isinstance(new, np.ndarray) or old != new:
             told.append(f"{name} is {str(new)[:60]} in place of {str(old)[:60]}")
     return sorted(told)
 
 
-def _relative(old: FloatArray, new: FloatArray) -> float:
+def relative(old: FloatArray, new: FloatArray) -> float:
     """Of the Frobenius norm."""
     size = float(np.linalg.norm(old))
     return float(np.linalg.norm(new - old)) / size if size > 0.0 else float(np.linalg.norm(new) > 0.0)

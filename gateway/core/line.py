@@ -171,6 +171,7 @@ class Gate(Strict):
     """What a change must show before it may reach a drive, and who decides. Changed only here, by an engineer."""
 
     autonomy: Literal["approve-all", "approve-first", "closed"] = "approve-all"
+    small_share: Fraction = 0.1  #: approve-first: from what a person approved to what needs none
     authors: Annotated[list[Name], Field(max_length=32)] = ["rules", "agents", "engineer"]  #: who may propose
     proposal_max_bytes: Annotated[int, Field(ge=1024, le=16_777_216)] = 65_536
     expiry_max_s: Positive = 86_400.0  #: a proposal stands no longer

@@ -140,6 +140,7 @@ HELP: dict[str, dict[str, str]] = {
     },
     "Gate": {
         "autonomy": '"approve-all": a person decides each change; "approve-first": the first of a kind; "closed": none',
+        "small_share": "approve-first: what differs by no more from what a person approved last needs no person",
         "authors": "who may propose a change",
         "proposal_max_bytes": "largest proposal",
         "expiry_max_s": "longest time that a proposal stands",

@@ -76,7 +76,11 @@ def verdict_hash(verdict: Verdict) -> str:
     return hashlib.sha256(canonical(verdict)).hexdigest()
 
 
+def canonical_line(line: Line) -> bytes:
+    """A line's file in the one byte representation, with everything that it leaves to defaults."""
+    return json.dumps(line.model_dump(mode="json"), sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
+
+
 def line_hash(line: Line) -> str:
-    """SHA-256 of a line's file in its canonical form, with everything that it leaves to defaults; in hexadecimal."""
-    text = json.dumps(line.model_dump(mode="json"), sort_keys=True, separators=(",", ":"), allow_nan=False)
-    return hashlib.sha256(text.encode()).hexdigest()
+    """SHA-256 of the canonical bytes, in hexadecimal."""
+    return hashlib.sha256(canonical_line(line)).hexdigest()

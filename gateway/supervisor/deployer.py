@@ -31,12 +31,13 @@ from gateway.core.proposal import (
     proposal_hash,
 )
 from gateway.core.recording import Recording
-from gateway.core.verdict import Verdict, verdict_hash
+from gateway.core.small_change import beyond_small
+from gateway.core.verdict import Verdict, canonical_line, verdict_hash
 from gateway.core.verdict import canonical as canonical_verdict
 from gateway.mailbox.port import RemoteError, Unreachable
 from gateway.supervisor.audit_file import AuditUnavailable
 from gateway.supervisor.kept_recording import packed
-from gateway.supervisor.lifecycle import PROPOSED, Book, Entry, Impossible, Stage, reconciled
+from gateway.supervisor.lifecycle import PERSON, PROPOSED, VERDICT, Book, Entry, Impossible, Stage, reconciled
 
 LEASE_S = 5.0  #: of a deployment on probation; renewed every third of it
 UNHEARD_S = 10.0  #: after an experiment should be over
@@ -120,6 +121,7 @@ class Deployer:
         self._renewed_s = clock()
         self._probation_since_s = clock()
         self._experiment: tuple[str, float] | None = None  #: that runs, and when its end is overdue
+        self._looked_at: set[str] = set()  #: proposals that would pass without a person, or not
         self._settled = False  #: the loop has been asked since this process began
 
     async def propose(self, payload: bytes, who: Who) -> Reply:
@@ -163,7 +165,7 @@ class Deployer:
             if reasons := self._why_not_decide(entry, decision):
                 return self._refused("nothing was decided", reasons)
             assert entry is not None  # _why_not_decide says so
-            what = {"proposal": entry.proposal, "shown": decision.shown, "comment": decision.comment}
+            what = {"proposal": entry.proposal, "shown": decision.shown, "comment": decision.comment, "by": PERSON}
             try:
                 if not decision.approve:
                     await self._step("rejected", {**what, "because": decision.comment or f"by {who.name}"}, who)
@@ -201,6 +203,7 @@ class Deployer:
         async with self._one_step:
             try:
                 await self._tidy()
+                await self._approve_small()
                 if self.book.on_the_line is not None or not self._settled:
                     found = await self._settle()
                     await self._look_after(found)
@@ -240,9 +243,11 @@ class Deployer:
         if len(found) != 1:
             return f"{len(found)} proposals begin with {beginning}: `r2rgate proposals` lists them"
         (entry,) = found
-        proposal = self._proposal(entry)
+        proposal, why = self._proposal(entry), entry.why
+        if entry.stage is Stage.WAITING and self._line.gate.autonomy == "approve-first":
+            why = "; ".join(self._why_a_person(entry))
         return ProposalShown(
-            format=1, stage=entry.stage, why=entry.why, proposal_hash=entry.proposal, shown=self._shown_hash(entry),
+            format=1, stage=entry.stage, why=why, proposal_hash=entry.proposal, shown=self._shown_hash(entry),
             epoch=self.book.epoch, difference=self._surroundings.difference(proposal, self.book), proposal=proposal,
             verdict=self._verdict(entry),
         )  # fmt: skip
@@ -293,7 +298,11 @@ class Deployer:
             "seed": verdict.seed,
             "because": _first_reason(verdict),
         }
-        blobs = {"verdict": canonical_verdict(verdict), "context": canonical_context(context)}
+        blobs = {
+            "verdict": canonical_verdict(verdict),
+            "context": canonical_context(context),
+            "line": canonical_line(self._line),
+        }
         blobs |= {f"data-{number}": packed(one) for number, one in enumerate(recordings, start=1)}
         return "accepted" if verdict.accepted else "refused", what, blobs
 
@@ -418,6 +427,35 @@ class Deployer:
                 await self._step("approval-lapsed", {"proposal": entry.proposal, "because": because}, GATEWAY)
             elif entry.stage is Stage.RECEIVED and entry.proposal not in self._judging:
                 self._begin_judging(entry.proposal)
+
+    async def _approve_small(self) -> None:
+        """Where the line's file allows it: what is like enough to what a person approved passes by its verdict alone.
+
+        One a look, and each once: what could not be carried out waits for a person.
+        """
+        if self._line.gate.autonomy != "approve-first" or self.book.on_the_line is not None:
+            return
+        for entry in self.book.entries.values():
+            if entry.stage is Stage.WAITING and entry.proposal not in self._looked_at:
+                self._looked_at.add(entry.proposal)
+                if not self._why_a_person(entry):
+                    found = await self._settle()
+                    what = {"proposal": entry.proposal, "by": VERDICT, "like": self.book.trusted[entry.kind]}
+                    await self._step("approved", what, GATEWAY)
+                    await self._carry_out(self.book.entries[entry.proposal], found, GATEWAY)
+                return
+
+    def _why_a_person(self, entry: Entry) -> list[str]:
+        """Why a person must decide; empty: the verdict is enough."""
+        if (trusted := self.book.trusted.get(entry.kind)) is None:
+            return [f"no person has approved a change of {entry.kind} yet, or one was rolled back since"]
+        before, now = self.book.entries[trusted], self._proposal(entry)
+        reasons = beyond_small(self._proposal(before).change, now.change, self._line.gate.small_share)
+        if isinstance(now.change, GainsChange):
+            regions = [verdict and verdict.region for verdict in (self._verdict(before), self._verdict(entry))]
+            if regions[0] is None or regions[1] is None or not regions[1].within(regions[0]):
+                reasons.append("it would be in service further than what a person approved")
+        return reasons
 
     async def _step(
         self, kind: str, what: Mapping[str, Any], who: Who, blobs: Mapping[str, bytes] | None = None

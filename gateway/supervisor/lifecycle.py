@@ -52,6 +52,8 @@ STEPS: dict[str, tuple[tuple[Stage, ...], Stage]] = {
     "experiment-ends": ((Stage.RUNNING,), Stage.DONE),
     "model-in-service": ((Stage.APPROVED,), Stage.KEPT),
 }
+WELL = ("kept", "model-in-service", "experiment-ends")  #: the ends of changes that went well
+PERSON, VERDICT = "person", "verdict"  #: who approved
 PROPOSED, FOUND = "proposed", "found-in-service"
 OWN_KIND = {"deploying": "gains", "experiment-begins": "experiment", "model-in-service": "model"}
 
@@ -76,6 +78,7 @@ class Entry:
     why: str = ""
     verdict: str | None = None  #: hash
     epoch: int | None = None
+    by_person: bool = False  #: approved by one, not by its verdict alone
 
 
 @dataclass
@@ -88,6 +91,8 @@ class Book:
     epoch: int = 0  #: of the last deployment that the loop has taken, or is being told of
     model: str | None = None
     changed_s: float | None = None  #: Unix time at which how the line is controlled has changed last
+    #: By kind the proposal that a person approved last, and that went well; empty after anything was rolled back.
+    trusted: dict[str, str] = field(default_factory=dict[str, str])
 
     @property
     def on_the_line(self) -> Entry | None:
@@ -144,10 +149,19 @@ class Book:
             return
         entry = self.entries[proposal]
         more = {key: what[key] for key in ("verdict", "epoch") if key in what}
+        if kind == "approved":
+            more["by_person"] = what.get("by", PERSON) == PERSON
         self.entries[proposal] = entry = replace(
             entry, stage=STEPS[kind][1], why=str(what.get("because", entry.why)), **more
         )
         self._in_service(kind, entry, what)
+        self._trust(kind, entry)
+
+    def _trust(self, kind: str, entry: Entry) -> None:
+        if kind == "rolled-back":
+            self.trusted.clear()
+        elif entry.by_person and kind in WELL and not (kind == "experiment-ends" and entry.why):
+            self.trusted[entry.kind] = entry.proposal
 
     def _in_service(self, kind: str, entry: Entry, what: Mapping[str, Any]) -> None:
         if kind in ("deployed", "rolled-back") and "at_s" in what:

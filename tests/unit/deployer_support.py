@@ -57,7 +57,12 @@ class FakeAudit:
     check: Callable[[str, dict], None]  #: of what is about to be recorded
     records: list[tuple[str, dict]] = field(default_factory=list)
     blobs: dict[str, bytes] = field(default_factory=dict)
+    whos: list[str] = field(default_factory=list)  #: of the records
     available: bool = True
+
+    @property
+    def kinds(self) -> list[str]:
+        return [kind for kind, _ in self.records]
 
     async def append(self, kind, who, what, blobs=None):
         if not self.available:
@@ -67,6 +72,7 @@ class FakeAudit:
         if due and not self.death.after:
             raise Killed
         self.records.append((kind, dict(what)))
+        self.whos.append(who.name)
         self.blobs |= {hashlib.sha256(blob).hexdigest(): blob for blob in (blobs or {}).values()}
         if due:
             raise Killed
@@ -149,6 +155,7 @@ class FakeJudge:
     """Accepts those whose reason it was told to accept."""
 
     refuses: set[str] = field(default_factory=set)
+    region: Region = Region(speed_max_m_per_s=0.1)
 
     async def judge(self, payload, context, recordings) -> Verdict:
         hash_ = hashlib.sha256(payload).hexdigest()
@@ -156,7 +163,7 @@ class FakeJudge:
         finding = RuleFinding(rule="test", passed=accepted, text="as the test wants it")
         return Verdict(
             format=1, proposal=hash_, payload=hash_, context=context_hash(context), line="0" * 64, kind="gains", seed=1,
-            accepted=accepted, findings=[finding], region=Region(speed_max_m_per_s=0.1) if accepted else None,
+            accepted=accepted, findings=[finding], region=self.region if accepted else None,
             judged=context.now, program_version="0",
         )  # fmt: skip
 

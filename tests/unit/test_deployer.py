@@ -10,6 +10,7 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 from gateway.core.audit_record import Who
 from gateway.core.controller import config_hash
 from gateway.core.decisions import Decide
+from gateway.core.deployment import Region
 from gateway.core.proposal import canonical
 from gateway.supervisor.deployer import LEASE_S, Deployer
 from gateway.supervisor.lifecycle import Stage, book_of
@@ -30,12 +31,17 @@ from tests.unit.deployer_support import (
 
 ANNA = Who(name="anna", uid=1000, pid=1)
 PROBATION_S = LINE.gate.probation_s
+#: From controller 1 to 2 is a quarter of a number, from 1 to 3 two fifths.
+TRUSTING = LINE.model_copy(
+    update={"gate": LINE.gate.model_copy(update={"autonomy": "approve-first", "small_share": 0.3})}
+)
 
 
 class Gateway:
     """A deployer and everything around it, in one process that can die and begin anew."""
 
-    def __init__(self) -> None:
+    def __init__(self, line=LINE) -> None:
+        self.line = line
         self.death = Death()
         self.audit = FakeAudit(self.death, self._checked)
         self.loop = FakeLoop(self.death)
@@ -53,7 +59,7 @@ class Gateway:
         clock = lambda: self.loop.now_s  # noqa: E731
         book = book_of(self.audit.records)
         args = (self.audit, self.loop, self.judge, self.surroundings, lambda proposal, verdict: None, clock, clock)
-        self.deployer = Deployer(LINE, book, *args)
+        self.deployer = Deployer(self.line, book, *args)
 
     async def propose(self, one):
         self.proposals[hash_of(one)] = one
@@ -86,8 +92,8 @@ def run(test):
     return synchronous
 
 
-async def started() -> Gateway:
-    gateway = Gateway()
+async def started(line=LINE) -> Gateway:
+    gateway = Gateway(line)
     await gateway.deployer.watch()
     return gateway
 
@@ -158,6 +164,64 @@ async def test_without_an_audit_nothing_is_changed():
     reply = await gateway.decide(one)
     assert not reply.ok and "disk is full" in " ".join(reply.reasons)
     assert gateway.loop.epoch == 0
+
+
+async def kept_one_by_hand() -> Gateway:
+    gateway = await started(TRUSTING)
+    one = proposal(1, config_hash(FIRST), 0.0)
+    await gateway.propose(one)
+    await gateway.pass_time(1.0)
+    assert gateway.stage(one) is Stage.WAITING  # the first of its kind is a person's
+    assert "no person has approved" in gateway.deployer.shown(hash_of(one)).why
+    assert (await gateway.decide(one)).ok
+    await gateway.pass_time(PROBATION_S + 1.0)
+    assert gateway.stage(one) is Stage.KEPT
+    return gateway
+
+
+async def offered(gateway: Gateway, number: int):
+    one = proposal(number, gateway.loop.runs, gateway.loop.now_s, nonce=len(gateway.proposals))
+    await gateway.propose(one)
+    await gateway.pass_time(1.0)
+    return one
+
+
+@run
+async def test_small_changes_pass_by_their_verdict_once_a_person_has_approved_one():
+    gateway = await kept_one_by_hand()
+    small = await offered(gateway, 2)
+    assert gateway.stage(small) is Stage.PROBATION
+    assert [who for kind, who in zip(gateway.audit.kinds, gateway.audit.whos, strict=True) if kind == "approved"] == [
+        "anna", "gateway",
+    ]  # fmt: skip
+    await gateway.pass_time(PROBATION_S + 1.0)
+    assert gateway.stage(small) is Stage.KEPT
+    far = await offered(gateway, 3)  # near 2, which is in service, and not near 1, which a person approved
+    assert gateway.stage(far) is Stage.WAITING
+    assert "antiwindup differs by 40.0%, allowed: 30.0%" in gateway.deployer.shown(hash_of(far)).why
+    refused = proposal(2, gateway.loop.runs, gateway.loop.now_s, nonce=99)
+    gateway.judge.refuses.add(hash_of(refused))
+    await gateway.propose(refused)
+    await gateway.pass_time(1.0)
+    assert gateway.stage(refused) is Stage.REFUSED
+
+
+@run
+async def test_after_a_rollback_a_person_decides_again():
+    gateway = await kept_one_by_hand()
+    gateway.surroundings.against = "tension 1 swings"
+    small = await offered(gateway, 2)
+    assert gateway.stage(small) is Stage.ROLLED_BACK
+    gateway.surroundings.against = ""
+    again = await offered(gateway, 2)
+    assert gateway.stage(again) is Stage.WAITING
+
+
+@run
+async def test_a_wider_region_than_the_approved_is_a_persons():
+    gateway = await kept_one_by_hand()
+    gateway.judge.region = Region(speed_max_m_per_s=0.2)
+    assert gateway.stage(await offered(gateway, 2)) is Stage.WAITING
 
 
 @run
@@ -243,9 +307,11 @@ async def test_bytes_that_are_no_proposal_are_refused_and_on_record():
 class LifeCycle(RuleBasedStateMachine):
     """Any order of everything, and death between any two effects."""
 
+    line = LINE
+
     def __init__(self) -> None:
         super().__init__()
-        self.gateway = Gateway()
+        self.gateway = Gateway(self.line)
         self.count = 0
         self._run(self._begin())
 
@@ -364,6 +430,31 @@ class LifeCycle(RuleBasedStateMachine):
 
 
 LifeCycle.TestCase.settings = settings(
-    max_examples=60, stateful_step_count=30, deadline=None, suppress_health_check=list(HealthCheck)
+    max_examples=30, stateful_step_count=25, deadline=None, suppress_health_check=list(HealthCheck)
 )
 TestLifeCycle = LifeCycle.TestCase
+
+
+class TrustingLifeCycle(LifeCycle):
+    """The same where small changes pass by their verdict."""
+
+    line = TRUSTING
+
+    @invariant()
+    def what_passes_by_its_verdict_is_like_what_a_person_approved(self):
+        proposals, well, by = self.gateway.proposals, set(), {}
+        for kind, what in self.gateway.audit.records:
+            if kind == "rolled-back":
+                well.clear()
+            elif kind == "kept" and by[what["proposal"]] == "person":
+                well.add(what["proposal"])
+            elif kind == "approved":
+                by[what["proposal"]] = what["by"]
+                if what["by"] == "verdict":
+                    assert what["like"] in well
+                    like, new = (proposals[what[name]].change.controller for name in ("like", "proposal"))
+                    assert abs(new.antiwindup / like.antiwindup - 1.0) <= 0.3
+
+
+TestTrustingLifeCycle = TrustingLifeCycle.TestCase
+TestTrustingLifeCycle.settings = LifeCycle.TestCase.settings
