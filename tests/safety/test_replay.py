@@ -63,8 +63,8 @@ def test_the_same_verdict_again_from_what_was_stored(tmp_path: Path) -> None:
     asyncio.run(judged_into(tmp_path, payload))
     hash_ = proposal_hash(parse_proposal(payload, len(payload)))
     code, said, err = replayed(hash_[:10], "--data-dir", tmp_path)
-    assert code == 0 and said.startswith(f"the same verdict: accepted (record 2, seed {SEED}"), said + err
-    code, said, _ = replayed("2", "--data-dir", tmp_path, "--json")
+    assert code == 0 and said.startswith(f"the same verdict: accepted (record 3, seed {SEED}"), said + err
+    code, said, _ = replayed("3", "--data-dir", tmp_path, "--json")
     assert code == 0 and json.loads(said)["same"] and json.loads(said)["verdict"]["seed"] == SEED
     code, _, err = replayed("0123456789", "--data-dir", tmp_path)
     assert code == 2 and "of the 1 verdicts in the audit none is meant" in err
