@@ -6,7 +6,7 @@ RUN   := $(PY) -m gateway.cli
 export PYTHONDONTWRITEBYTECODE :=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup run test system-test check format bench bench-stepped bench-wire bench-processes bench-cycle bench-monitor bench-control bench-identify bench-faults bench-fuzz bench-soak bench-gate bench-audit lock clean
+.PHONY: help setup run test system-test check format bench bench-stepped bench-wire bench-processes bench-cycle bench-monitor bench-control bench-identify bench-faults bench-fuzz bench-soak bench-gate bench-lifecycle bench-audit lock clean
 
 help: ## this list
 	@echo "r2rgate: make TARGET"
@@ -74,6 +74,9 @@ bench-audit: setup ## the audit: a thousand kills of its writer, ten thousand da
 
 bench-gate: setup ## proposals of every way of going wrong, judged by the gate and by the truth (ARGS="--parts a --plants 5 --proposals 200")
 	@$(PY) -m tests.bench.gate $(ARGS)
+
+bench-lifecycle: setup ## the life of a proposal in any order of everything, 10,000 sequences (about 15 min; ARGS="--sequences 1000")
+	@$(PY) -m tests.bench.lifecycle $(ARGS)
 
 bench-cycle: setup ## how late the loop wakes beside cyclictest, what a cycle takes and costs; as root (about 40 min)
 	@$(PY) -m tests.bench.cycle $(ARGS)
