@@ -6,7 +6,7 @@ RUN   := $(PY) -m gateway.cli
 export PYTHONDONTWRITEBYTECODE :=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup run test system-test check format bench bench-stepped bench-wire bench-processes bench-cycle bench-monitor bench-control bench-identify bench-faults bench-fuzz bench-soak bench-gate bench-lifecycle bench-audit lock clean
+.PHONY: help setup run test coverage system-test check format bench bench-stepped bench-wire bench-processes bench-cycle bench-monitor bench-control bench-identify bench-faults bench-fuzz bench-soak bench-gate bench-lifecycle bench-audit lock clean
 
 help: ## this list
 	@echo "r2rgate: make TARGET"
@@ -27,6 +27,10 @@ test: setup ## set up, then all tests: those about time itself alone, the others
 system-test: setup ## a real CAN kernel and foreign protocol stacks; as root, installs Debian and npm packages (about 6 min)
 	@$(PY) -m tests.system.needs
 	@$(PY) -m pytest tests/system $(ARGS)
+
+coverage: setup ## every line and branch of safety/, run by its own tests (about 3 min)
+	@$(PY) -m coverage run -m pytest tests/safety tests/unit/test_monitor.py tests/unit/test_recoverability.py
+	@$(PY) -m coverage report
 
 check: setup ## lint, types, import contracts
 	@$(PY) -m ruff check .
