@@ -190,10 +190,30 @@ def timing(*skipped):
     return most_severe(found)
 
 
+def test_a_web_that_breaks_is_told_from_slack():
+    broken = healthy()
+    broken.tension.put(1, 0.0, 1.0)
+    (finding,) = findings_after(2, broken)
+    assert finding.rule == "slack" and finding.action is Action.TORQUE_OFF
+    broken.speed.put(1, 0.08, 1.0)
+    found = [finding for finding in findings_after(2, broken) if finding.rule == "web break"]
+    assert len(found) == 1 and found[0].action is Action.TORQUE_OFF and "roller 2 runs away" in found[0].text
+
+
+def test_missing_signals_without_a_gap_are_told_as_a_range():
+    inputs = healthy()
+    for i in range(3):
+        inputs.speed.miss(i)
+    inputs.tension.miss(0)
+    (finding,) = findings_after(1, inputs)
+    assert "tension 1, speed 1 to 3 " in finding.text
+
+
 def test_overruns_stop_the_line_when_they_are_long_or_many():
     assert timing(5) is Action.NONE and timing(6) is Action.STOP
     assert timing(1, 1) is Action.NONE and timing(1, 1, 1) is Action.STOP
     assert timing(1, 1, 0, 1, 1) is Action.NONE
+    assert check_timing(LIMITS, EnvelopeState(), 0) == ([], EnvelopeState())
 
 
 @given(st.lists(st.sampled_from([np.nan, np.inf, -np.inf, 1.0]), min_size=3, max_size=3))

@@ -6,7 +6,8 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from gateway.core.signals import Inputs
-from safety.frozen import REPEATS, FrozenState, find_frozen, restart
+from safety.frozen import REPEATS, FrozenState, find_frozen, restart, turning_m_per_s
+from tests.closed_loop.conftest import demo_line
 
 TURNING_FROM_M_PER_S = 0.002
 COUNT_M_PER_S = 1e-6
@@ -53,6 +54,11 @@ def test_a_frozen_drive_is_named_after_its_repeats_and_no_other(seed: int, rolle
     told = texts_of(speeds)
     assert not any(told[:-1])
     assert len(told[-1]) == 1 and f"roller {roller + 1} " in told[-1][0]
+
+
+def test_rollers_are_judged_from_a_fiftieth_of_the_lines_speed() -> None:
+    line = demo_line()
+    assert turning_m_per_s(line) == pytest.approx(0.02 * line.limits.speed_max_m_per_s)
 
 
 def test_samples_that_do_not_come_neither_count_nor_excuse() -> None:

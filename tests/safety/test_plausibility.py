@@ -9,7 +9,7 @@ from gateway.core.signals import FloatArray, Inputs, Quality
 from safety.actions import Action
 from safety.drift import DRIFT_ALONE_N, DRIFT_N, DriftState, drift_limits, drift_of, restart, watch_balance
 from safety.jumps import NOISE_M_PER_S, JumpState, jump_limits, reject_jumps, reject_unwinder
-from safety.stuck import LEARNT_REVERSALS, StuckLimits, StuckState, find_stuck
+from safety.stuck import LEARNT_REVERSALS, StuckLimits, StuckState, find_stuck, stuck_limits
 from tests.closed_loop.conftest import demo_line
 
 LINE = demo_line()
@@ -144,6 +144,21 @@ def test_v0_lies_between_standstill_its_last_value_and_its_request(
     reject_unwinder(limits, state, inputs, asked)
     assert (inputs.unwind_speed.quality[0] == Quality.GOOD) == believed
     assert inputs.unwind_speed.value[0] == (value if believed else last)
+
+
+def test_a_v0_that_did_not_come_says_nothing() -> None:
+    limits, state, inputs = jump_limits(LINE, np.zeros(6)), JumpState(), Inputs(6)
+    inputs.unwind_speed.put(0, 0.05, 0.0)
+    reject_unwinder(limits, state, inputs, 0.05)
+    inputs.unwind_speed.miss(0)
+    reject_unwinder(limits, state, inputs, 0.05)
+    assert inputs.unwind_speed.quality[0] == Quality.STALE and state.unwind_speed_m_per_s == 0.05
+
+
+def test_cells_of_tension_spans_are_judged_after_the_time_of_the_lines_file() -> None:
+    limits = stuck_limits(LINE)
+    assert limits.measured.tolist() == [span.control == "tension" for span in LINE.spans]
+    assert limits.stuck_periods == round(LINE.limits.stuck_s / LINE.control.period_s)
 
 
 STUCK = StuckLimits(np.array([True, True, False]), stuck_periods=5)
