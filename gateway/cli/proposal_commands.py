@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
@@ -12,6 +13,7 @@ from rich.console import Console
 
 from gateway.cli.operate_commands import REFUSED, UNREACHABLE, Json, RunFolder
 from gateway.cli.proposal_view import print_list, print_shown
+from gateway.cli.waiting import interruptible, progress
 from gateway.core.controller import ControllerRefused, parse_controller
 from gateway.core.decisions import Decide, ListProposals, ProposalList, ProposalShown, RollBackNow, ShowProposal
 from gateway.core.experiment import ExperimentRefused, parse_experiment
@@ -35,7 +37,8 @@ from gateway.mailbox.unix import UnixMailbox
 
 REPLY_TIME_S = 20.0  #: a deployment is built and read back before it is answered
 POLL_S = 0.25
-JUDGED_WITHIN_S = 120.0
+JUDGED_WITHIN_S = 240.0
+LONG_S = 30.0  #: no verdict takes that long once the judge has begun
 
 Which = Annotated[str, typer.Argument(help="The proposal's hash, or its first letters (at least 6).")]
 Comment = Annotated[str, typer.Option("--comment", help="Why; it stands in the audit.")]
@@ -43,7 +46,14 @@ Yes = Annotated[bool, typer.Option("--yes", help="Do not ask again.")]
 
 
 def propose(
-    file: Annotated[Path, typer.Argument(help="A controller, an experiment, a model, or a whole proposal, as JSON.")],
+    what: Annotated[
+        str,
+        typer.Argument(
+            metavar="FILE",
+            help="A controller, an experiment, a model, or a whole proposal, as JSON; or a controller that is stored: "
+            "its version, hash or name (r2rgate configurations list).",
+        ),
+    ],
     reason: Annotated[str, typer.Option("--reason", help="Why; whoever decides reads it.")] = "",
     author: Annotated[str, typer.Option("--author", help="Of those that the line's file allows.")] = "engineer",
     hours: Annotated[float, typer.Option("--hours", min=0.01, help="For how long it stands.")] = 8.0,
@@ -54,15 +64,19 @@ def propose(
     """Put a change before the gate. Nothing reaches the line before it is accepted there and approved by a person.
 
     Example: r2rgate propose controller.json --reason "redesigned on model v3"
+
+    Example, back to an earlier one: r2rgate propose v2 --reason "as it was before the reel was changed"
     """
-    content = _read(file)
+    file = Path(what)
+    content = _read(file) if _names_file(file) else _stored(run_dir, what)
     listed = _listed(run_dir)
     payload = content if _is_proposal(content) else canonical(_made(file, content, reason, author, hours, listed))
     reply = Reply.model_validate_json(_ask(run_dir, GATEWAY_PROPOSE, payload))
     if not reply.ok or not wait:
         _end_with(reply, as_json)
         return
-    found = asyncio.run(_judged(run_dir, _hash_of(payload)))
+    with interruptible(f"`r2rgate proposals {_hash_of(payload)[:12]}` shows the verdict"), progress() as show:
+        found = asyncio.run(_judged(run_dir, _hash_of(payload), show))
     _show(found, as_json)
     if found.verdict is not None and not found.verdict.accepted:
         raise typer.Exit(REFUSED)
@@ -119,7 +133,8 @@ def rollback(comment: Comment = "", run_dir: RunFolder = None, as_json: Json = F
 def _decide(which: str, approve: bool, comment: str, yes: bool, run_dir: Path | None, as_json: bool) -> None:
     found = _shown(run_dir, which)
     if found.shown is None:
-        _refuse(f"proposal {found.proposal_hash[:12]} is {found.stage}: there is nothing to decide")
+        why = f" ({found.why})" if found.why else ""
+        _refuse(f"proposal {found.proposal_hash[:12]} is {found.stage}{why}: there is nothing to decide")
     if not yes:
         print_shown(found, Console(highlight=False, stderr=True))
         typer.confirm("approve it?" if approve else "reject it?", abort=True, err=True)
@@ -132,6 +147,30 @@ def _read(file: Path) -> bytes:
         return file.read_bytes()
     except OSError as error:
         _refuse(f"{file} cannot be read: {error.strerror}")
+
+
+def _names_file(file: Path) -> bool:
+    return file.exists() or file.suffix == ".json" or len(file.parts) > 1
+
+
+def _stored(run_dir: Path | None, which: str) -> bytes:
+    """The configuration with this version, hash or name, out of the store of the line that runs."""
+    from gateway.cli.status_commands import ask_status, choose_run_folder
+    from gateway.core.controller import canonical as canonical_controller
+    from gateway.supervisor.configurations import FILE_NAME, ConfigurationsError, open_configurations
+
+    try:
+        status = asyncio.run(ask_status(choose_run_folder(run_dir)))
+    except (Unreachable, PathTooLong) as error:
+        _refuse(str(error), UNREACHABLE)
+    try:
+        with open_configurations(Path(status.historian.path).parent / FILE_NAME) as configurations:
+            found = configurations.find(which, status.site, status.line)
+    except ConfigurationsError as error:
+        _refuse(f"{which} is no file, and of the stored configurations: {error}")
+    if found.controller is None:
+        _refuse(f"configuration {which} is damaged in the store: {found.damage}")
+    return canonical_controller(found.controller)
 
 
 def _is_proposal(content: bytes) -> bool:
@@ -188,11 +227,14 @@ def _hash_of(payload: bytes) -> str:
         _refuse(str(refused))
 
 
-async def _judged(run_dir: Path | None, hash_: str) -> ProposalShown:
+async def _judged(run_dir: Path | None, hash_: str, show: Callable[[str], None]) -> ProposalShown:
     """Once it is. Ends the program where that takes too long."""
-    mailbox, deadline_s = _mailbox(run_dir), asyncio.get_running_loop().time() + JUDGED_WITHIN_S
+    clock = asyncio.get_running_loop().time
+    mailbox, began_s = _mailbox(run_dir), clock()
     try:
-        while asyncio.get_running_loop().time() < deadline_s:
+        while (waited_s := clock() - began_s) < JUDGED_WITHIN_S:
+            first = ": on a new machine the judge compiles once, which takes a minute" if waited_s > LONG_S else ""
+            show(f"proposal {hash_[:12]} is being judged, {waited_s:.0f} s{first}")
             query = ShowProposal(proposal=hash_).model_dump_json().encode()
             found = _parsed_shown(await mailbox.request(GATEWAY_PROPOSALS, query, REPLY_TIME_S))
             if found.stage != "received":

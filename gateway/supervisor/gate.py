@@ -14,7 +14,7 @@ from gateway.core.audit_record import Who
 from gateway.core.controller import Controller, ControllerRefused, config_hash, parse_controller
 from gateway.core.decisions import DECISION, QUERY, Decide, ListProposals
 from gateway.core.line import Line
-from gateway.core.messages import Command, Deploy, Event, Keep, Reply, command_bytes
+from gateway.core.messages import Command, Deploy, Event, Keep, Reply, WatchGood, command_bytes
 from gateway.core.proposal import GainsChange, ModelChange, Proposal
 from gateway.core.topics import GATEWAY_DECISION, GATEWAY_PROPOSALS, GATEWAY_PROPOSE, LOOP_COMMAND
 from gateway.mailbox.port import PEER, Mailbox, Peer, RemoteError
@@ -23,14 +23,16 @@ from gateway.supervisor import models as models_store
 from gateway.supervisor.audit import Audit
 from gateway.supervisor.audit_file import AuditFile, AuditUnavailable
 from gateway.supervisor.configurations import Configurations, ConfigurationsError, Origin, begin_configurations
-from gateway.supervisor.deployer import GATEWAY, Deployer, JudgeSide, NotTakenUp
+from gateway.supervisor.deployer import GATEWAY, Deployer
+from gateway.supervisor.deployer_sides import JudgeSide, NotTakenUp
+from gateway.supervisor.experiments import ENDS as EXPERIMENT_ENDS
 from gateway.supervisor.lifecycle import Book, Impossible, book_of
 from gateway.supervisor.model_store import ModelsError
 from gateway.supervisor.models import Models, begin_repository
 from gateway.supervisor.surroundings import LineSurroundings
 
 LOOP_TIME_S = 2.5
-EXPERIMENT_ENDS = ("experiment-end", "experiment-abort")
+CONFIGURATION_CHANGES = ("start", "rolled-back")
 BUILD_TIME_S = 15.0  #: for what the loop builds and warms before it answers
 
 #: Files in the line's folder from which a loop takes its first configuration, and how they are read.
@@ -66,7 +68,7 @@ class LoopOverMailbox:
         self._mailbox = mailbox
 
     async def tell(self, command: Command) -> Reply:
-        time_s = BUILD_TIME_S if isinstance(command, Deploy | Keep) else LOOP_TIME_S
+        time_s = BUILD_TIME_S if isinstance(command, Deploy | Keep | WatchGood) else LOOP_TIME_S
         answer = await self._mailbox.request(LOOP_COMMAND, command_bytes(command), time_s)
         try:
             return Reply.model_validate_json(answer)
@@ -119,8 +121,12 @@ class Gate:
             self._note("gate", f"the gate waits: {trouble}" if trouble else "the gate is open")
 
     def hear(self, event: Event) -> None:
-        """What the loop tells: that an experiment is over is for the records."""
-        if self.deployer is None or event.kind not in EXPERIMENT_ENDS:
+        """What the loop tells: that an experiment is over, or that it runs something else, is for the records."""
+        if self.deployer is None:
+            return
+        if event.kind in CONFIGURATION_CHANGES:
+            self.deployer.look_again()
+        if event.kind not in EXPERIMENT_ENDS:
             return
         hash_, reason = str(event.data.get("hash", "")), str(event.data.get("reason", ""))
         task = asyncio.get_running_loop().create_task(self.deployer.experiment_ended(hash_, reason))

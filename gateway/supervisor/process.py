@@ -55,6 +55,7 @@ async def _serve(line: Line, run_folder: Path, data_folder: Path) -> int:
     # First the socket, whose lock makes this the only instance; only then is the history touched.
     await mailbox.listen(run_folder / GATEWAY_SOCKET)
     historian.start()
+    judge.begin()
     gate = Gate(line, mailbox, data_folder, judge, around, gateway.note, time.monotonic, time.time)
     gateway.on_event = gate.hear
     looking = asyncio.create_task(_look(gate, stop))
