@@ -38,6 +38,7 @@ BUILD_TIME_S = 15.0  #: for what the loop builds and warms before it answers
 #: Files in the line's folder from which a loop takes its first configuration, and how they are read.
 STARTED_WITH: dict[str, Callable[[bytes], Controller]] = {
     "controller.json": parse_controller,
+    "started-with.json": parse_controller,
     "configuration.json": lambda content: parse_controller(json.dumps(json.loads(content)["controller"]).encode()),
 }
 
@@ -104,6 +105,7 @@ class Gate:
         self._stores: tuple[Configurations, Models] | None = None
         self._shut = "the gate is about to open"  #: why it is, while it is
         self._told = ""
+        self._learned: str | None = None  #: what ran when `_learn` looked last
         self._telling: set[asyncio.Task[None]] = set()
         mailbox.serve(GATEWAY_PROPOSE, self._answer_propose)
         mailbox.serve(GATEWAY_PROPOSALS, self._answer_query)
@@ -115,6 +117,7 @@ class Gate:
             await self._open()
         if self.deployer is not None:
             await self.deployer.watch()
+            self._learn_again(self.deployer)
         trouble = self._shut if self.deployer is None else self.deployer.trouble
         if trouble != self._told:
             self._told = trouble
@@ -153,7 +156,7 @@ class Gate:
                     begin_configurations(self._folder / configurations_store.FILE_NAME),
                     begin_repository(self._folder / models_store.FILE_NAME),
                 )
-            self._learn(*self._stores)
+            self._learn(self._stores[0])
         except (AuditUnavailable, CannotBegin, ConfigurationsError, ModelsError) as error:
             self._shut = str(error)
             return
@@ -162,7 +165,18 @@ class Gate:
             self._around(*self._stores), self._take_up, self._clock, self._wall_clock,
         )  # fmt: skip
 
-    def _learn(self, configurations: Configurations, _: Models) -> None:
+    def _learn_again(self, deployer: Deployer) -> None:
+        """A loop that was started later has been given something else."""
+        runs = deployer.book.in_service
+        if self._stores is None or runs == self._learned:
+            return
+        try:
+            self._learn(self._stores[0])
+        except ConfigurationsError as error:
+            self._note("gate", f"what the loop was started with is not stored: {error}")
+        self._learned = runs
+
+    def _learn(self, configurations: Configurations) -> None:
         """Store what the loop may have been started with: it tells only its hash."""
         for name, read in STARTED_WITH.items():
             try:

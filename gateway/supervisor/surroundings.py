@@ -28,6 +28,7 @@ from safety.probation import Standing, against
 
 MOST_EXPERIMENTS = 4  #: the newest, on which the model must hold
 LEAST_STANDING_S = SETTLE_S + WINDOW_S
+PATIENCE_S, LOOK_S = LEAST_STANDING_S + 1.0, 0.1
 NODES = (0.1, 0.5, 1.0)  #: of the fastest speed: where recovery is predicted
 
 
@@ -55,7 +56,8 @@ class LineSurroundings:
         self._stood = False  #: since the change, so that it could be measured
 
     async def context(self, book: Book) -> tuple[JudgeContext, list[Recording]]:
-        """Raises NotKnown."""
+        """Of a line that runs once it stands, or in some seconds as it is then. Raises NotKnown."""
+        await self._stands()
         now_s = self._wall_clock()
         found = await asyncio.to_thread(self._experiments, now_s)
         return JudgeContext(
@@ -71,6 +73,14 @@ class LineSurroundings:
             ],
             decided=[entry.proposal for entry in book.entries.values() if entry.stage is not Stage.RECEIVED][-4096:],
         ), [one for one, _ in found]
+
+    async def _stands(self) -> None:
+        """Until it does, or does not for longer than that takes at a line that is left alone."""
+        for _ in range(round(PATIENCE_S / LOOK_S)):
+            frame = self._newest()
+            if frame is None or frame.state != LoopState.RUN or self._recent.stands():
+                return
+            await asyncio.sleep(LOOK_S)
 
     def difference(self, proposal: Proposal, book: Book) -> list[str]:
         """What it would change, in words and numbers; where something is not known, that."""
