@@ -22,6 +22,7 @@ from gateway.supervisor import configurations as configurations_store
 from gateway.supervisor import models as models_store
 from gateway.supervisor.audit import Audit
 from gateway.supervisor.audit_file import AuditFile, AuditUnavailable
+from gateway.supervisor.audit_writer import NOT_DONE
 from gateway.supervisor.configurations import Configurations, ConfigurationsError, Origin, begin_configurations
 from gateway.supervisor.deployer import GATEWAY, Deployer
 from gateway.supervisor.deployer_sides import JudgeSide, NotTakenUp
@@ -248,11 +249,12 @@ class Gate:
 
 
 def book_in(folder: Path) -> Book:
-    """What the audit of a folder says. Raises CannotBegin."""
+    """What the audit of a folder says; what a record calls not done was not. Raises CannotBegin."""
     try:
         with AuditFile(folder) as file:
             records = [row.record() for row in file.rows()]
-        return book_of((record.kind, record.what) for record in records)
+        not_done = {number for one in records if one.kind == NOT_DONE for number in one.what["sequences"]}
+        return book_of((record.kind, record.what) for record in records if record.sequence not in not_done)
     except AuditUnavailable as error:
         raise CannotBegin(str(error)) from error
     except (Impossible, ValueError, KeyError) as error:
