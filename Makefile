@@ -6,7 +6,7 @@ RUN   := $(PY) -m gateway.cli
 export PYTHONDONTWRITEBYTECODE :=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup run test coverage system-test check format bench bench-stepped bench-wire bench-processes bench-cycle bench-monitor bench-control bench-identify bench-faults bench-fuzz bench-soak bench-gate bench-lifecycle bench-audit lock clean
+.PHONY: help setup run test coverage system-test check format bench bench-stepped bench-wire bench-processes bench-cycle bench-monitor bench-control bench-identify bench-faults bench-fuzz bench-soak bench-gate bench-lifecycle bench-audit bench-kill bench-gate-live lock clean
 
 help: ## this list
 	@echo "r2rgate: make TARGET"
@@ -75,6 +75,12 @@ bench-soak: setup ## an hour of a line on three wires, with something going wron
 bench-audit: setup ## the audit: a thousand kills of its writer, ten thousand damages (about 15 min)
 	@$(PY) -m tests.bench.audit_kill
 	@$(PY) -m tests.bench.audit_damage
+
+bench-kill: setup ## the gateway process killed a thousand times while proposals are made and decided (about 20 min; ARGS="--kills 100")
+	@$(PY) -m tests.bench.gate_kill $(ARGS)
+
+bench-gate-live: setup ## the gate on a running line: rollback, swaps, and the loop while verdicts are computed (about 5 min)
+	@$(PY) -m tests.bench.gate_live $(ARGS)
 
 bench-gate: setup ## proposals of every way of going wrong, judged by the gate and by the truth (ARGS="--parts a --plants 5 --proposals 200")
 	@$(PY) -m tests.bench.gate $(ARGS)

@@ -5,6 +5,7 @@ import time
 from enum import StrEnum
 from os import W_OK, access
 from pathlib import Path
+from shlex import quote
 from typing import Annotated, NoReturn
 
 import typer
@@ -185,7 +186,11 @@ def _phase(
             f"no configuration was written{'; the one in ' + str(out) + ' is left as it was' if out.exists() else ''}"
         )
     elif not as_json:
-        typer.echo(f"configuration: {out}, hash {result.controller[:12]}; r2rgate run FILE --controller {out} uses it")
+        typer.echo(
+            f"configuration: {out}, hash {result.controller[:12]}\n"
+            f"on a line that runs: r2rgate propose {quote(str(out))} --reason TEXT; on one that does not: "
+            f"r2rgate run FILE --controller {quote(str(out))}"
+        )
 
 
 def _beside(out: Path) -> tuple[Path, Path]:

@@ -51,6 +51,7 @@ def design(
 
     Example: r2rgate experiment design line.toml --out experiment.json
     """
+    from gateway.cli.waiting import interruptible, progress
     from gateway.core.experiment import ExperimentRefused, canonical, experiment_hash
     from gateway.identification.experiment_design import Wanted, design_experiment
 
@@ -61,15 +62,17 @@ def design(
         _refuse(f"there is no recipe {recipe!r}; known: {', '.join(recipes)}")
     config, said = _controller(line, file, controller, data_dir)
     try:
-        found = design_experiment(
-            line,
-            config,
-            tension_n=stands.tension_n,
-            speed_m_per_s=stands.speed_m_per_s,
-            speeds_m_per_s=speed or None,
-            wanted=Wanted(0.01 * strong, 0.01 * rest),
-            seed=seed,
-        )
+        with interruptible(f"{out} is as before"), progress() as show:
+            show("simulating amplitudes, dwells and durations on corners of the tolerances: a minute")
+            found = design_experiment(
+                line,
+                config,
+                tension_n=stands.tension_n,
+                speed_m_per_s=stands.speed_m_per_s,
+                speeds_m_per_s=speed or None,
+                wanted=Wanted(0.01 * strong, 0.01 * rest),
+                seed=seed,
+            )
     except ExperimentRefused as refused:
         _refuse(f"no experiment for {file}: {refused}")
     try:
@@ -80,14 +83,17 @@ def design(
         typer.echo(json.dumps(_document(found), indent=2))
         return
     typer.echo("\n".join([f"for {said}", *found.reasons]))
-    typer.echo(f"{out}: {experiment_hash(found.experiment)[:12]}; r2rgate experiment run {quote(str(out))}")
+    typer.echo(f"{out}: {experiment_hash(found.experiment)[:12]}")
+    name = quote(str(out))
+    typer.echo(f"next: r2rgate propose {name} --reason TEXT; a simulated line takes r2rgate experiment run {name}, too")
 
 
 @app.command()
 def run(file: ExperimentFile, run_dir: RunFolder = None, as_json: Json = False) -> None:
     """Run an experiment on the line that runs, and wait for its end. Ctrl-C aborts it.
 
-    The line must be in RUN with set-points that stand. Until experiments are judged, only a simulated line takes one.
+    The line must be in RUN with set-points that stand. Only a simulated line takes one in this way; on a real one it is
+    judged and approved first (r2rgate propose).
 
     Exit code: 0 complete, 2 refused, 3 not reachable, 4 aborted.
 

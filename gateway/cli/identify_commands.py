@@ -28,7 +28,11 @@ def identify(
         list[Path] | None, typer.Argument(help="Recordings, .csv or .mcap. Without: the running line's history.")
     ] = None,
     last: Annotated[
-        str | None, typer.Option("--last", help="Of the history: 60, 60s, 10min or 2h before now. Without: 60s.")
+        str | None,
+        typer.Option(
+            "--last",
+            help="Of the history: 60, 60s, 10min or 2h before now. Without: the newest experiment, or 60s if none.",
+        ),
     ] = None,
     measured: Annotated[
         list[str] | None,
@@ -69,7 +73,7 @@ def identify(
 
     Example, on the last ten minutes of the running line: r2rgate identify line.toml --last 10min
     """
-    from gateway.cli.identify_data import LAST, Asked, DataRefused, measured_of, recordings_of
+    from gateway.cli.identify_data import Asked, DataRefused, measured_of, recordings_of
     from gateway.cli.identify_outcome import Data
     from gateway.mailbox.listener import PathTooLong
     from gateway.mailbox.port import Unreachable
@@ -83,7 +87,7 @@ def identify(
         _refuse(f"--out and --report are both {out}; name two files")
     try:
         known = measured_of(measured or [], line)
-        recordings = recordings_of(line, files, Asked(last or LAST, history, run_dir))
+        recordings = recordings_of(line, files, Asked(last, history, run_dir))
     except DataRefused as refused:
         _refuse(str(refused))
     except (Unreachable, PathTooLong) as error:
@@ -213,6 +217,7 @@ def _tell_kept(kept: "Kept", problem: str, valid: bool, took_s: float) -> None:
     elif not problem:
         typer.echo(f"not stored in the line's models: --store does, and r2rgate models import {kept.out}")
     if valid:
+        typer.echo(f"r2rgate propose {kept.out} --reason TEXT: the gate judges by it once it is accepted and approved")
         typer.echo(f"r2rgate design FILE --model {kept.out} designs on it")
 
 

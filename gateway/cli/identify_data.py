@@ -4,7 +4,8 @@ import asyncio
 import re
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
 from pathlib import Path
 
 from gateway.cli.recordings import read_recording, recording_of_history
@@ -16,9 +17,12 @@ from gateway.core.nearest import nearest
 from gateway.core.recording import Recording
 from gateway.identification.parameters import EACH
 from gateway.mailbox.paths import default_run_folder, running_lines
+from gateway.supervisor.experiments import newest_experiments
+from gateway.supervisor.history import HistoryError
 
 MEASURABLE = ("stiffness_n", *EACH)
 LAST = "60s"
+EXPERIMENTS_S = 604_800.0  #: back in the history, for one to identify on
 _MEASURED = re.compile(r"\s*(\w+)\s*=\s*([^,\s]+)\s*,\s*([0-9.eE+-]+)\s*%\s*")
 
 
@@ -30,7 +34,7 @@ class DataRefused(Exception):
 class Asked:
     """Where to look where no file is named."""
 
-    last: str
+    last: str | None  #: None: the newest experiment, or LAST where there is none
     history: Path | None
     run_dir: Path | None
 
@@ -58,7 +62,7 @@ def recordings_of(line: Line, files: Sequence[Path], asked: Asked) -> list[Recor
 
 
 def _from_history(line: Line, asked: Asked) -> Recording:
-    seconds = seconds_of(asked.last)
+    seconds = seconds_of(asked.last or LAST)
     path = asked.history
     if path is None:
         own = default_run_folder(line)
@@ -71,6 +75,8 @@ def _from_history(line: Line, asked: Asked) -> Recording:
             )
         path = Path(status.historian.path)
     now_s = time.time()
+    if asked.last is None and (newest := _newest_experiment(path, now_s)) is not None:
+        return newest
     try:
         return recording_of_history(path, now_s - seconds, now_s)
     except RecordingRefused as error:
@@ -78,6 +84,19 @@ def _from_history(line: Line, asked: Asked) -> Recording:
             f"{error}; the last {seconds:g} s were asked for: --last takes more, r2rgate export makes a file of a "
             "while that is worth keeping"
         ) from error
+
+
+def _newest_experiment(path: Path, now_s: float) -> Recording | None:
+    """As the gate reads it, so that it finds a model made of it to be made of it."""
+    try:
+        found = newest_experiments(path, now_s - EXPERIMENTS_S, now_s + 1.0, 1)
+    except HistoryError as error:
+        raise DataRefused(str(error)) from error
+    if not found:
+        return None
+    recording, ended_s = found[0]
+    ended = datetime.fromtimestamp(ended_s, UTC).isoformat(timespec="seconds")
+    return replace(recording, source=f"experiment until {ended}, {recording.samples} samples")
 
 
 def measured_of(given: Sequence[str], line: Line) -> dict[str, tuple[float, float]]:

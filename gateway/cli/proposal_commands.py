@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
@@ -10,12 +11,10 @@ import typer
 from pydantic import ValidationError
 from rich.console import Console
 
-from gateway.cli.data_place import data_folder
 from gateway.cli.operate_commands import REFUSED, UNREACHABLE, Json, RunFolder
-from gateway.cli.process_commands import DataFolder
 from gateway.cli.proposal_view import print_list, print_shown
+from gateway.cli.waiting import interruptible, progress
 from gateway.core.controller import ControllerRefused, parse_controller
-from gateway.core.controller import canonical as canonical_controller
 from gateway.core.decisions import Decide, ListProposals, ProposalList, ProposalShown, RollBackNow, ShowProposal
 from gateway.core.experiment import ExperimentRefused, parse_experiment
 from gateway.core.line_model import ModelRefused, parse_model
@@ -35,11 +34,11 @@ from gateway.mailbox.listener import PathTooLong
 from gateway.mailbox.paths import GATEWAY_SOCKET
 from gateway.mailbox.port import Unreachable
 from gateway.mailbox.unix import UnixMailbox
-from gateway.supervisor.configurations import FILE_NAME, ConfigurationsError, open_configurations
 
 REPLY_TIME_S = 20.0  #: a deployment is built and read back before it is answered
 POLL_S = 0.25
-JUDGED_WITHIN_S = 120.0
+JUDGED_WITHIN_S = 240.0
+LONG_S = 30.0  #: no verdict takes that long once the judge has begun
 
 Which = Annotated[str, typer.Argument(help="The proposal's hash, or its first letters (at least 6).")]
 Comment = Annotated[str, typer.Option("--comment", help="Why; it stands in the audit.")]
@@ -47,40 +46,37 @@ Yes = Annotated[bool, typer.Option("--yes", help="Do not ask again.")]
 
 
 def propose(
-    file: Annotated[
-        Path | None, typer.Argument(help="A controller, an experiment, a model, or a whole proposal, as JSON.")
-    ] = None,
-    configuration: Annotated[
-        str | None,
-        typer.Option("--configuration", help="In place of a file: one of `r2rgate configurations`, by name or hash."),
-    ] = None,
+    what: Annotated[
+        str,
+        typer.Argument(
+            metavar="FILE",
+            help="A controller, an experiment, a model, or a whole proposal, as JSON; or a controller that is stored: "
+            "its version, hash or name (r2rgate configurations list).",
+        ),
+    ],
     reason: Annotated[str, typer.Option("--reason", help="Why; whoever decides reads it.")] = "",
     author: Annotated[str, typer.Option("--author", help="Of those that the line's file allows.")] = "engineer",
     hours: Annotated[float, typer.Option("--hours", min=0.01, help="For how long it stands.")] = 8.0,
     wait: Annotated[bool, typer.Option("--wait/--no-wait", help="Until it has been judged.")] = True,
     run_dir: RunFolder = None,
-    data_dir: DataFolder = None,
     as_json: Json = False,
 ) -> None:
     """Put a change before the gate. Nothing reaches the line before it is accepted there and approved by a person.
 
     Example: r2rgate propose controller.json --reason "redesigned on model v3"
 
-    Example: r2rgate propose --configuration phi_stable --reason "back to what ran in spring"
+    Example, back to an earlier one: r2rgate propose v2 --reason "as it was before the reel was changed"
     """
-    if (file is None) is (configuration is None):
-        _refuse("name a file, or --configuration NAME; one of them")
+    file = Path(what)
+    content = _read(file) if _names_file(file) else _stored(run_dir, what)
     listed = _listed(run_dir)
-    content = _read(file) if file is not None else _stored(str(configuration), data_dir, listed)
-    if _is_proposal(content):
-        payload = content
-    else:
-        payload = canonical(_made(str(file or configuration), content, reason, author, hours, listed))
+    payload = content if _is_proposal(content) else canonical(_made(file, content, reason, author, hours, listed))
     reply = Reply.model_validate_json(_ask(run_dir, GATEWAY_PROPOSE, payload))
     if not reply.ok or not wait:
         _end_with(reply, as_json)
         return
-    found = asyncio.run(_judged(run_dir, _hash_of(payload)))
+    with interruptible(f"`r2rgate proposals {_hash_of(payload)[:12]}` shows the verdict"), progress() as show:
+        found = asyncio.run(_judged(run_dir, _hash_of(payload), show))
     _show(found, as_json)
     if found.verdict is not None and not found.verdict.accepted:
         raise typer.Exit(REFUSED)
@@ -137,7 +133,8 @@ def rollback(comment: Comment = "", run_dir: RunFolder = None, as_json: Json = F
 def _decide(which: str, approve: bool, comment: str, yes: bool, run_dir: Path | None, as_json: bool) -> None:
     found = _shown(run_dir, which)
     if found.shown is None:
-        _refuse(f"proposal {found.proposal_hash[:12]} is {found.stage}: there is nothing to decide")
+        why = f" ({found.why})" if found.why else ""
+        _refuse(f"proposal {found.proposal_hash[:12]} is {found.stage}{why}: there is nothing to decide")
     if not yes:
         print_shown(found, Console(highlight=False, stderr=True))
         typer.confirm("approve it?" if approve else "reject it?", abort=True, err=True)
@@ -152,18 +149,28 @@ def _read(file: Path) -> bytes:
         _refuse(f"{file} cannot be read: {error.strerror}")
 
 
-def _stored(which: str, data_dir: Path | None, listed: ProposalList) -> bytes:
-    """A configuration of this line out of the store."""
-    advice = "the gateway stores each that is put into service"
+def _names_file(file: Path) -> bool:
+    return file.exists() or file.suffix == ".json" or len(file.parts) > 1
+
+
+def _stored(run_dir: Path | None, which: str) -> bytes:
+    """The configuration with this version, hash or name, out of the store of the line that runs."""
+    from gateway.cli.status_commands import ask_status, choose_run_folder
+    from gateway.core.controller import canonical as canonical_controller
+    from gateway.supervisor.configurations import FILE_NAME, ConfigurationsError, open_configurations
+
     try:
-        folder = data_dir or data_folder(None, FILE_NAME, "configurations", advice, ConfigurationsError)
-        with open_configurations(folder / FILE_NAME) as storage:
-            one = storage.find(which, listed.site, listed.line)
+        status = asyncio.run(ask_status(choose_run_folder(run_dir)))
+    except (Unreachable, PathTooLong) as error:
+        _refuse(str(error), UNREACHABLE)
+    try:
+        with open_configurations(Path(status.historian.path).parent / FILE_NAME) as configurations:
+            found = configurations.find(which, status.site, status.line)
     except ConfigurationsError as error:
-        _refuse(str(error))
-    if one.controller is None:
-        _refuse(f"version {one.version} is damaged: {one.damage}")
-    return canonical_controller(one.controller)
+        _refuse(f"{which} is no file, and of the stored configurations: {error}")
+    if found.controller is None:
+        _refuse(f"configuration {which} is damaged in the store: {found.damage}")
+    return canonical_controller(found.controller)
 
 
 def _is_proposal(content: bytes) -> bool:
@@ -174,7 +181,7 @@ def _is_proposal(content: bytes) -> bool:
     return isinstance(document, dict) and "change" in document
 
 
-def _made(source: str, content: bytes, reason: str, author: str, hours: float, listed: ProposalList) -> Proposal:
+def _made(file: Path, content: bytes, reason: str, author: str, hours: float, listed: ProposalList) -> Proposal:
     """A proposal of what is in a file, on what is in service now."""
     if not reason.strip():
         _refuse("--reason is missing: whoever decides wants to know why")
@@ -185,7 +192,7 @@ def _made(source: str, content: bytes, reason: str, author: str, hours: float, l
         "format": 1,
         "site": listed.site,
         "line": listed.line,
-        "change": _change(source, content),
+        "change": _change(file, content),
         "base": listed.in_service,
         "model": listed.model,
         "reason": reason,
@@ -199,7 +206,7 @@ def _made(source: str, content: bytes, reason: str, author: str, hours: float, l
         _refuse("; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors()))
 
 
-def _change(source: str, content: bytes) -> GainsChange | ExperimentChange | ModelChange:
+def _change(file: Path, content: bytes) -> GainsChange | ExperimentChange | ModelChange:
     refusals: list[str] = []
     for what, read in (
         ("controller", lambda: GainsChange(controller=parse_controller(content))),
@@ -210,7 +217,7 @@ def _change(source: str, content: bytes) -> GainsChange | ExperimentChange | Mod
             return read()
         except (ControllerRefused, ExperimentRefused, ModelRefused) as refused:
             refusals.append(f"  as a {what}: {str(refused)[:200]}")
-    _refuse(f"{source} is neither controller, experiment, model nor proposal:\n" + "\n".join(refusals))
+    _refuse(f"{file} is neither controller, experiment, model nor proposal:\n" + "\n".join(refusals))
 
 
 def _hash_of(payload: bytes) -> str:
@@ -220,11 +227,14 @@ def _hash_of(payload: bytes) -> str:
         _refuse(str(refused))
 
 
-async def _judged(run_dir: Path | None, hash_: str) -> ProposalShown:
+async def _judged(run_dir: Path | None, hash_: str, show: Callable[[str], None]) -> ProposalShown:
     """Once it is. Ends the program where that takes too long."""
-    mailbox, deadline_s = _mailbox(run_dir), asyncio.get_running_loop().time() + JUDGED_WITHIN_S
+    clock = asyncio.get_running_loop().time
+    mailbox, began_s = _mailbox(run_dir), clock()
     try:
-        while asyncio.get_running_loop().time() < deadline_s:
+        while (waited_s := clock() - began_s) < JUDGED_WITHIN_S:
+            first = ": on a new machine the judge compiles once, which takes a minute" if waited_s > LONG_S else ""
+            show(f"proposal {hash_[:12]} is being judged, {waited_s:.0f} s{first}")
             query = ShowProposal(proposal=hash_).model_dump_json().encode()
             found = _parsed_shown(await mailbox.request(GATEWAY_PROPOSALS, query, REPLY_TIME_S))
             if found.stage != "received":

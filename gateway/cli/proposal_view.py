@@ -27,6 +27,8 @@ def print_list(found: ProposalList, console: Console) -> None:
     service = "unknown" if found.in_service is None else found.in_service[:SHORT]
     good = "unknown" if found.last_known_good is None else found.last_known_good[:SHORT]
     console.print(f"in service: {service} (epoch {found.epoch}), last known good: {good}", markup=False)
+    judged_by = "what the line's file says" if found.model is None else f"model {found.model[:SHORT]}"
+    console.print(f"judged by {judged_by}", markup=False)
 
 
 def print_shown(found: ProposalShown, console: Console) -> None:

@@ -97,6 +97,13 @@ class Keep(Strict):
     watch: RecoveryPrediction | None = None
 
 
+class WatchGood(Strict):
+    """The last known good, which runs, is watched by this from now on: another model has been accepted."""
+
+    command: Literal["watch-good"] = "watch-good"
+    watch: RecoveryPrediction
+
+
 class Rollback(Strict):
     """Back to the last known good, now. Where that runs, nothing changes."""
 
@@ -111,13 +118,13 @@ class AskConfiguration(Strict):
 
 
 Operating = Arm | Start | Hold | Stop | SetTension | SetSpeed | SelectRecipe | RunExperiment | AbortExperiment
-Configuring = Deploy | Renew | Keep | Rollback | AskConfiguration
+Configuring = Deploy | Renew | Keep | WatchGood | Rollback | AskConfiguration
 Command = Annotated[Operating | Configuring, Field(discriminator="command")]
 _command: TypeAdapter[Command] = TypeAdapter(Command)
-Deploying = Deploy | Renew | Keep  #: what only the gateway's deployer says, never a person directly
+Deploying = Deploy | Renew | Keep | WatchGood  #: what only the gateway's deployer says, never a person directly
 
 MAX_COMMAND = 4096  #: bytes of a command as JSON
-#: The same for `deploy` and `keep`, unpacked. What parses it holds the interpreter for about 10 ms a megabyte.
+#: The same for those with matrices, unpacked. What parses it holds the interpreter for about 10 ms a megabyte.
 MAX_DEPLOYMENT = 2 * 1024 * 1024
 
 
@@ -129,6 +136,8 @@ def in_words(command: Command) -> str:
         return f"deploy {command.deployment.hash[:12]} as epoch {command.deployment.epoch}"
     if isinstance(command, Keep):
         return f"keep {command.epoch}"
+    if isinstance(command, WatchGood):
+        return f"watch-good {command.watch.fallback[:12]}"
     values = command.model_dump().items()
     return " ".join(key if value is True else str(value) for key, value in values if value is not False)
 
@@ -202,8 +211,10 @@ def parse_command(payload: bytes) -> Command:
     except ValidationError as error:
         reasons = "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())
         raise MalformedMessage(reasons[:MAX_COMMAND]) from error
-    if packed and not isinstance(command, Deploy | Keep):
-        raise MalformedMessage(f"only deploy and keep may be packed; others have at most {MAX_COMMAND} bytes")
+    if packed and not isinstance(command, Deploy | Keep | WatchGood):
+        raise MalformedMessage(
+            f"only deploy, keep and watch-good may be packed; others have at most {MAX_COMMAND} bytes"
+        )
     return command
 
 

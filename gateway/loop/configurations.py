@@ -5,7 +5,7 @@ between two periods, or at the beginning of a period's control, and each is told
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -128,6 +128,11 @@ class Configurations:
         self.probation = None
         self.why = "kept"
         self._say("kept", "is the last known good from now on")
+
+    def watch_good(self, watch: RecoveryPrediction, recovery: Recovery) -> None:
+        """What runs and is good is watched by another model. Only where nothing is on probation."""
+        self.running = self.good = replace(self.good, watch=watch, recovery=recovery)
+        self._say("watched", "is watched by the model that was accepted last")
 
     def roll_back(self, reason: str) -> bool:
         """Back to the last known good; False where that runs already."""

@@ -1,12 +1,14 @@
 """What commands about the configuration do to a cycle: each is done, or refused with every reason."""
 
-from gateway.core.controller import ControllerRefused
-from gateway.core.deployment import Deployment
+from gateway.core.controller import Controller, ControllerRefused
+from gateway.core.deployment import Deployment, RecoveryPrediction
 from gateway.core.doubts import in_words
-from gateway.core.messages import AskConfiguration, Configuring, Deploy, Keep, Renew, Rollback
+from gateway.core.messages import AskConfiguration, Configuring, Deploy, Keep, Renew, Rollback, WatchGood
 from gateway.core.states import Phase
+from gateway.loop.configurations import Configurations
 from gateway.loop.cycle import Cycle
 from gateway.loop.refused import Refused
+from safety.recoverability import Recovery
 
 CHANGEABLE = (Phase.SILENT, Phase.READY, Phase.RUNNING, Phase.HOLDING)
 
@@ -22,9 +24,12 @@ def configure(cycle: Cycle, command: Configuring, now_s: float) -> str:
             return f"the lease of epoch {command.epoch} begins anew"
         case Keep():
             return _keep(cycle, command)
+        case WatchGood():
+            return _watch_good(cycle, command)
         case Rollback():
             done = cycle.configurations.roll_back(command.reason)
-            return "the last known good runs again" if done else "the last known good runs already"
+            runs = f"{cycle.configurations.good.hash[:12]}, the last known good, runs"
+            return f"{runs} again" if done else f"{runs} already"
         case AskConfiguration():
             return "what controls the line"
 
@@ -76,16 +81,31 @@ def _keep(cycle: Cycle, command: Keep) -> str:
     configurations, watch = cycle.configurations, command.watch
     recovery = None
     if watch is not None:
-        prepared, configurations.prepared_watch = configurations.prepared_watch, None
-        if prepared is not None and prepared[0] is watch:
-            recovery = prepared[1]
-        else:
-            try:
-                recovery = configurations.recovery(watch, configurations.running.config)
-            except ControllerRefused as refused:
-                raise Refused("not kept", [str(refused)]) from refused
+        recovery = _recovery(configurations, watch, configurations.running.config, "not kept")
     configurations.keep(watch, recovery)
     return f"epoch {command.epoch} is the last known good"
+
+
+def _watch_good(cycle: Cycle, command: WatchGood) -> str:
+    configurations = cycle.configurations
+    if configurations.probation is not None:
+        raise Refused(f"epoch {configurations.epoch} is on probation: it is kept by the newest model, or not")
+    good = configurations.good
+    configurations.watch_good(
+        command.watch, _recovery(configurations, command.watch, good.config, "not watched by another model")
+    )
+    return f"{good.hash[:12]} is watched by the model that was accepted last"
+
+
+def _recovery(configurations: Configurations, watch: RecoveryPrediction, fallback: Controller, not_: str) -> Recovery:
+    """Prepared ahead, or made now. Raises Refused."""
+    prepared, configurations.prepared_watch = configurations.prepared_watch, None
+    if prepared is not None and prepared[0] is watch:
+        return prepared[1]
+    try:
+        return configurations.recovery(watch, fallback)
+    except ControllerRefused as refused:
+        raise Refused(not_, [str(refused)]) from refused
 
 
 def _require_probation(cycle: Cycle, epoch: int) -> None:

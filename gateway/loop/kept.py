@@ -11,12 +11,13 @@ from typing import Annotated
 
 from pydantic import Field, ValidationError
 
-from gateway.core.controller import Controller, ControllerConfig, config_hash
+from gateway.core.controller import Controller, ControllerConfig, canonical, config_hash
 from gateway.core.controller_fit import misfits
 from gateway.core.deployment import Hash, RecoveryPrediction, Region
 from gateway.core.line import Line, Strict
 
 FILE = "configuration.json"
+GIVEN = "started-with.json"  #: what the loop was given, for the gateway: its messages name configurations by hash
 
 
 class Kept(Strict):
@@ -53,17 +54,24 @@ class Store:
             return None
         return kept
 
+    def write_given(self, config: Controller) -> None:
+        """Before the first period. Raises OSError."""
+        self._write(self.path.with_name(GIVEN), canonical(config))
+
     def write(self, epoch: int, config: Controller, region: Region, watch: RecoveryPrediction | None) -> None:
         """On the disk when it returns. Raises OSError; the file before is then as it was."""
         kept = Kept(started_with=self._started_with, epoch=epoch, controller=config, region=region, watch=watch)
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        beside = self.path.with_name(self.path.name + ".part")
+        self._write(self.path, kept.model_dump_json().encode())
+
+    def _write(self, path: Path, content: bytes) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        beside = path.with_name(path.name + ".part")
         with beside.open("wb") as file:
-            file.write(kept.model_dump_json().encode() + b"\n")
+            file.write(content + b"\n")
             file.flush()
             os.fsync(file.fileno())
-        beside.replace(self.path)
-        folder = os.open(self.path.parent, os.O_RDONLY)
+        beside.replace(path)
+        folder = os.open(path.parent, os.O_RDONLY)
         try:
             os.fsync(folder)
         finally:

@@ -58,6 +58,10 @@ async def _main(
     voice = Voice(mailbox, links, line.control.period_s)
     watch = Watch(line, speed_steps_m_per_s(line))
     cycle = Cycle(line, config, links, watch, monotonic, voice.record, voice.announce, voice.tell, simulated=simulated)
+    try:
+        store.write_given(config)
+    except OSError as error:
+        say(f"the gateway cannot know what this loop was given: {store.path.parent}: {error.strerror}")
     kept = store.read(line, say)
     if kept is not None:
         cycle.configurations.resume(kept)

@@ -13,6 +13,7 @@ from gateway.core.messages import (
     MalformedMessage,
     Reply,
     Stop,
+    WatchGood,
     parse_command,
 )
 from gateway.core.states import LoopState, Phase
@@ -93,6 +94,9 @@ class Runner:
             case Keep():
                 async with self._configuring:
                     return await self._keep(command)
+            case WatchGood():
+                async with self._configuring:
+                    return await self._watch_good(command)
             case _:
                 return await self._at_boundary(command)
 
@@ -169,6 +173,23 @@ class Runner:
         except OSError as error:
             return self._refused("not kept", [f"nothing could be kept at {store.path}: {error.strerror}"])
         return reply
+
+    async def _watch_good(self, command: WatchGood) -> Reply:
+        """Made, and on the disk, while periods go on."""
+        configurations, watch = self.cycle.configurations, command.watch
+        good, epoch = configurations.good, configurations.epoch
+        if configurations.probation is not None:
+            return await self._at_boundary(command)  # which refuses it
+        try:
+            recovery = await self._aside.do(lambda: configurations.recovery(watch, good.config))
+            if (store := self._store) is not None:
+                await self._aside.do(lambda: store.write(epoch, good.config, good.region, watch))
+        except ControllerRefused as refused:
+            return self._refused("not watched by another model", [str(refused)])
+        except OSError as error:
+            return self._refused("not watched by another model", [f"nothing could be kept: {error.strerror}"])
+        configurations.prepared_watch = watch, recovery
+        return await self._at_boundary(command)
 
     async def _prove(self) -> Reply | None:
         """As `prepare_to_arm`, for devices that have come back, too.

@@ -9,18 +9,18 @@ import asyncio
 import hashlib
 from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
-from typing import Any, Protocol
+from typing import Any
 
 from gateway.core.audit_record import Who
 from gateway.core.controller import config_hash
 from gateway.core.decisions import Decide, ProposalLine, ProposalList, ProposalShown, shown_hash
 from gateway.core.deployment import Deployment, InService
 from gateway.core.experiment import experiment_hash
-from gateway.core.judge_context import JudgeContext, context_hash
 from gateway.core.judge_context import canonical as canonical_context
+from gateway.core.judge_context import context_hash
 from gateway.core.line import Line
 from gateway.core.line_model import model_hash
-from gateway.core.messages import AskConfiguration, Command, Deploy, Keep, Renew, Reply, Rollback, RunExperiment
+from gateway.core.messages import AskConfiguration, Deploy, Keep, Renew, Reply, Rollback, RunExperiment, WatchGood
 from gateway.core.proposal import (
     ExperimentChange,
     GainsChange,
@@ -30,65 +30,20 @@ from gateway.core.proposal import (
     parse_proposal,
     proposal_hash,
 )
-from gateway.core.recording import Recording
 from gateway.core.small_change import beyond_small
 from gateway.core.verdict import Verdict, canonical_line, verdict_hash
 from gateway.core.verdict import canonical as canonical_verdict
 from gateway.mailbox.port import RemoteError, Unreachable
 from gateway.supervisor.audit_file import AuditUnavailable
+from gateway.supervisor.deployer_sides import AuditSide, JudgeSide, LoopSide, NotKnown, NotTakenUp, Surroundings
 from gateway.supervisor.kept_recording import packed
 from gateway.supervisor.lifecycle import PERSON, PROPOSED, VERDICT, Book, Entry, Impossible, Stage, reconciled
 
 LEASE_S = 5.0  #: of a deployment on probation; renewed every third of it
 UNHEARD_S = 10.0  #: after an experiment should be over
+LONGEST_REASON = 500  #: characters of one for the loop
 GATEWAY = Who(name="gateway")
 MOST_SETTLING = 1000  #: records in a row from one look at the loop; more is a fault of this program
-
-
-class NotTakenUp(Exception):
-    """What was to be put into service could not be stored; the text says why."""
-
-
-class AuditSide(Protocol):
-    async def append(
-        self, kind: str, who: Who, what: Mapping[str, Any], blobs: Mapping[str, bytes] | None = None
-    ) -> object:
-        """Stored for good when it returns. Raises AuditUnavailable."""
-        ...
-
-    def blob(self, id_: str) -> bytes | None:
-        """What lies beside the records under this hash. Raises AuditUnavailable."""
-        ...
-
-
-class LoopSide(Protocol):
-    async def tell(self, command: Command) -> Reply:
-        """Raises Unreachable."""
-        ...
-
-
-class JudgeSide(Protocol):
-    async def judge(self, payload: bytes, context: JudgeContext, recordings: list[Recording]) -> Verdict:
-        """Always a verdict: none in time is a refusal."""
-        ...
-
-
-class Surroundings(Protocol):
-    """What the line is like now, as a verdict needs it."""
-
-    async def context(self, book: Book) -> tuple[JudgeContext, list[Recording]]: ...
-
-    def difference(self, proposal: Proposal, book: Book) -> list[str]:
-        """What it would change, for a person."""
-        ...
-
-    def begin_probation(self) -> None:
-        """A change is about to be put on the line."""
-        ...
-
-    def against_keeping(self) -> str:
-        """What a deployment on probation has shown against itself so far; empty: nothing."""
-        ...
 
 
 class Deployer:
@@ -123,6 +78,9 @@ class Deployer:
         self._experiment: tuple[str, float] | None = None  #: that runs, and when its end is overdue
         self._looked_at: set[str] = set()  #: proposals that would pass without a person, or not
         self._settled = False  #: the loop has been asked since this process began
+        #: Model and configuration by which, and for which, this process has told the loop what can be recovered.
+        self._looked_after: tuple[str | None, str] | None = None
+        self._unwatched = ""  #: why the loop has not taken that
 
     async def propose(self, payload: bytes, who: Who) -> Reply:
         """Take a proposal in, and judge it in the background."""
@@ -175,13 +133,15 @@ class Deployer:
                     return self._refused("the line has changed since it was shown", reasons)
                 await self._step("approved", what, who)
                 return await self._carry_out(self.book.entries[entry.proposal], found, who)
-            except (AuditUnavailable, Unreachable, Impossible, NotTakenUp) as error:
+            except (AuditUnavailable, Unreachable, Impossible, NotTakenUp, NotKnown) as error:
                 return self._refused("it is not carried out", [str(error)])
 
     async def roll_back(self, comment: str, who: Who) -> Reply:
         """To the last known good configuration, now. Done even where the audit is not there: it is the safe side."""
         recorded = ""
         async with self._one_step:
+            on_the_line = self.book.on_the_line
+            given_up = on_the_line is not None and on_the_line.stage is not Stage.RUNNING
             try:
                 await self._audit.append("rollback-asked", who, {"comment": comment})
             except AuditUnavailable as error:
@@ -191,7 +151,14 @@ class Deployer:
                 await self._settle()
             except (Unreachable, AuditUnavailable, Impossible) as error:
                 return self._refused("not confirmed", [f"{error}{recorded}"])
-        return reply.model_copy(update={"text": reply.text + recorded})
+        further = ""
+        if reply.in_service is not None and not given_up:
+            further = "; to go further back, propose what ran before (`r2rgate configurations list`)"
+        return reply.model_copy(update={"text": reply.text + further + recorded})
+
+    def look_again(self) -> None:
+        """The loop has told of a change that this process did not order, or of its start."""
+        self._settled = False
 
     async def watch(self) -> None:
         """Proposals expire, leases are renewed, what is on probation is kept or left to fall back.
@@ -204,13 +171,13 @@ class Deployer:
             try:
                 await self._tidy()
                 await self._approve_small()
-                if self.book.on_the_line is not None or not self._settled:
+                if self.book.on_the_line is not None or not self._settled or self._to_look_after():
                     found = await self._settle()
                     await self._look_after(found)
             except (AuditUnavailable, Unreachable, Impossible) as error:
                 self.trouble = str(error)  # without a renewal the loop falls back by itself; the next look settles it
             else:
-                self.trouble = ""
+                self.trouble = self._unwatched
 
     async def judged(self) -> None:
         """Until nothing is being judged any more."""
@@ -234,7 +201,7 @@ class Deployer:
             last_known_good=self.book.last_known_good,
             epoch=self.book.epoch,
             model=self.book.model,
-            proposals=[_line_of(entry) for entry in newest],
+            proposals=[_line_of(entry, self._why(entry)) for entry in newest],
         )
 
     def shown(self, beginning: str) -> ProposalShown | str:
@@ -243,14 +210,21 @@ class Deployer:
         if len(found) != 1:
             return f"{len(found)} proposals begin with {beginning}: `r2rgate proposals` lists them"
         (entry,) = found
-        proposal, why = self._proposal(entry), entry.why
-        if entry.stage is Stage.WAITING and self._line.gate.autonomy == "approve-first":
-            why = "; ".join(self._why_a_person(entry))
+        proposal = self._proposal(entry)
         return ProposalShown(
-            format=1, stage=entry.stage, why=why, proposal_hash=entry.proposal, shown=self._shown_hash(entry),
-            epoch=self.book.epoch, difference=self._surroundings.difference(proposal, self.book), proposal=proposal,
+            format=1, stage=entry.stage, why=self._why(entry), proposal_hash=entry.proposal,
+            shown=self._shown_hash(entry), epoch=self.book.epoch,
+            difference=self._surroundings.difference(proposal, self.book), proposal=proposal,
             verdict=self._verdict(entry),
         )  # fmt: skip
+
+    def _why(self, entry: Entry) -> str:
+        """What there is to say of its stage."""
+        if entry.stage is Stage.PROBATION:
+            return f"not kept yet: {self._unseen(self._clock()) or 'about to be'}"
+        if entry.stage is Stage.WAITING and self._line.gate.autonomy == "approve-first":
+            return "; ".join(self._why_a_person(entry))
+        return entry.why
 
     def _shown_hash(self, entry: Entry) -> str | None:
         if entry.stage is not Stage.WAITING or entry.verdict is None or self.book.in_service is None:
@@ -317,7 +291,8 @@ class Deployer:
             if not reply.ok:
                 because = "; ".join([reply.text, *reply.reasons])[:1000]
                 await self._step("experiment-ends", {"proposal": entry.proposal, "because": because}, GATEWAY)
-            return reply
+                return reply
+            return self._done(f"{reply.text}; `r2rgate proposals {entry.proposal[:12]}` shows when it is done")
         await self._step("model-in-service", {"proposal": entry.proposal, "model": entry.changes}, who)
         return self._done(f"model {entry.changes[:12]} is what proposals are judged by from now on")
 
@@ -325,15 +300,14 @@ class Deployer:
         verdict, epoch = self._verdict(entry), found.epoch + 1
         if verdict is None or not verdict.accepted or verdict.region is None:
             return self._refused("it is not carried out", ["no verdict lets it through"])
+        watch = await self._surroundings.recovery(found.last_known_good, verdict.region, self.book)
         deployment = Deployment(
-            controller=change.controller, hash=entry.changes, epoch=epoch, lease_s=LEASE_S, region=verdict.region
-        )
+            controller=change.controller, hash=entry.changes, epoch=epoch, lease_s=LEASE_S, region=verdict.region,
+            watch=watch,
+        )  # fmt: skip
         named = {"proposal": entry.proposal, "epoch": epoch}
-        await self._step(
-            "deploying",
-            {**named, "configuration": entry.changes, "before": found.hash, "region": verdict.region.model_dump()},
-            who,
-        )
+        what = {"configuration": entry.changes, "before": found.hash, "region": verdict.region.model_dump()}
+        await self._step("deploying", {**named, **what, "watched": watch is not None}, who)
         self._surroundings.begin_probation()
         reply = await self._loop.tell(Deploy(deployment=deployment))
         if not reply.ok and reply.in_service is not None and reply.in_service.epoch < epoch:
@@ -345,14 +319,16 @@ class Deployer:
         now = self.book.entries[entry.proposal]
         if now.stage is not Stage.PROBATION:
             return self._refused(f"it is {now.stage}", [now.why])
+        unwatched = "" if watch else "; no model is accepted yet, by which the loop would see what can be recovered"
         return self._done(
-            f"{entry.changes[:12]} controls the line as epoch {epoch}, under watch for "
-            f"{self._line.gate.probation_s:g} s; `r2rgate rollback` takes it back at once"
+            f"{entry.changes[:12]} controls the line as epoch {epoch}, on probation for {self._line.gate.probation_s:g}"
+            f" s of running; `r2rgate rollback` takes it back at once, `r2rgate proposals` shows how it does{unwatched}"
         )
 
     async def _look_after(self, found: InService) -> None:
         entry, now_s = self.book.on_the_line, self._clock()
         if entry is None:
+            await self._look_after_good(found)
             return
         if entry.stage is Stage.RUNNING:
             await self._end_unheard(entry, now_s)
@@ -360,14 +336,59 @@ class Deployer:
         if against := self._surroundings.against_keeping():
             await self._loop.tell(Rollback(reason=against))
             await self._settle()
-        elif entry.stage is Stage.KEEPING or now_s - self._probation_since_s >= self._line.gate.probation_s:
-            if entry.stage is Stage.PROBATION:
-                await self._step("keeping", {"proposal": entry.proposal, "epoch": entry.epoch}, GATEWAY)
-            await self._loop.tell(Keep(epoch=entry.epoch or found.epoch))
-            await self._settle()
+        elif entry.stage is Stage.KEEPING or not self._unseen(now_s):
+            await self._keep(entry, found)
         elif now_s - self._renewed_s >= LEASE_S / 3.0:
             await self._loop.tell(Renew(epoch=entry.epoch or found.epoch))
             self._renewed_s = now_s
+
+    def _to_look_after(self) -> bool:
+        book = self.book
+        return book.model is not None and (book.model, book.last_known_good) != self._looked_after
+
+    def _unseen(self, now_s: float) -> str:
+        """Why what is on probation is not kept yet."""
+        since_s, probation_s = now_s - self._probation_since_s, self._line.gate.probation_s
+        if since_s < probation_s:
+            return f"it has been watched for {since_s:.0f} s of {probation_s:g} s"
+        return self._surroundings.unseen()
+
+    async def _keep(self, entry: Entry, found: InService) -> None:
+        """What cannot be kept is taken back."""
+        if entry.stage is Stage.PROBATION:
+            await self._step("keeping", {"proposal": entry.proposal, "epoch": entry.epoch}, GATEWAY)
+        watch = None
+        try:
+            watch = await self._surroundings.recovery(entry.changes, found.region, self.book)
+            reply = await self._loop.tell(Keep(epoch=entry.epoch or found.epoch, watch=watch))
+            because = "" if reply.ok else "; ".join([reply.text, *reply.reasons])
+        except NotKnown as error:
+            because = str(error)
+        if because:
+            await self._loop.tell(Rollback(reason=f"it could not be kept: {because}"[:LONGEST_REASON]))
+        elif watch is not None:
+            self._looked_after = self.book.model, entry.changes
+        await self._settle()
+
+    async def _look_after_good(self, found: InService) -> None:
+        """A model that is new in service looks after what runs, too."""
+        pair = self.book.model, found.last_known_good
+        if self.book.model is None or pair == self._looked_after:
+            return
+        self._looked_after, self._unwatched = pair, ""  # a refusal would be the same again
+        try:
+            watch = await self._surroundings.recovery(found.last_known_good, found.region, self.book)
+            if watch is None:
+                return
+            reply = await self._loop.tell(WatchGood(watch=watch))
+            because = "" if reply.ok else "; ".join([reply.text, *reply.reasons])
+        except NotKnown as error:
+            because = str(error)
+        except Unreachable:
+            self._looked_after = None
+            raise
+        if because:
+            self._unwatched = f"the loop does not watch by the model in service: {because}"
 
     async def _end_unheard(self, entry: Entry, now_s: float) -> None:
         """Of an experiment whose end nobody has told: the loop was started anew, or this process."""
@@ -496,9 +517,9 @@ def _first_reason(verdict: Verdict) -> str:
     return (reasons[0] + more)[:1000] if reasons else ""
 
 
-def _line_of(entry: Entry) -> ProposalLine:
+def _line_of(entry: Entry, why: str) -> ProposalLine:
     return ProposalLine(
-        proposal=entry.proposal, kind=entry.kind, author=entry.author, stage=entry.stage, why=entry.why,  # type: ignore[arg-type]
+        proposal=entry.proposal, kind=entry.kind, author=entry.author, stage=entry.stage, why=why,  # type: ignore[arg-type]
         created=entry.created, expires=entry.expires, epoch=entry.epoch,
     )  # fmt: skip
 

@@ -6,7 +6,7 @@ import pwd
 from collections.abc import Callable, Mapping
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from pydantic import ValidationError
 
@@ -14,7 +14,7 @@ from gateway.core.audit_record import Who
 from gateway.core.controller import Controller, ControllerRefused, config_hash, parse_controller
 from gateway.core.decisions import DECISION, QUERY, Decide, ListProposals
 from gateway.core.line import Line
-from gateway.core.messages import Command, Deploy, Event, Keep, Reply, command_bytes
+from gateway.core.messages import Command, Deploy, Event, Keep, Reply, WatchGood, command_bytes
 from gateway.core.proposal import GainsChange, ModelChange, Proposal
 from gateway.core.topics import GATEWAY_DECISION, GATEWAY_PROPOSALS, GATEWAY_PROPOSE, LOOP_COMMAND
 from gateway.mailbox.port import PEER, Mailbox, Peer, RemoteError
@@ -22,20 +22,24 @@ from gateway.supervisor import configurations as configurations_store
 from gateway.supervisor import models as models_store
 from gateway.supervisor.audit import Audit
 from gateway.supervisor.audit_file import AuditFile, AuditUnavailable
+from gateway.supervisor.audit_writer import NOT_DONE
 from gateway.supervisor.configurations import Configurations, ConfigurationsError, Origin, begin_configurations
-from gateway.supervisor.deployer import GATEWAY, Deployer, JudgeSide, NotTakenUp
+from gateway.supervisor.deployer import GATEWAY, Deployer
+from gateway.supervisor.deployer_sides import JudgeSide, NotTakenUp
+from gateway.supervisor.experiments import ENDS as EXPERIMENT_ENDS
 from gateway.supervisor.lifecycle import Book, Impossible, book_of
 from gateway.supervisor.model_store import ModelsError
 from gateway.supervisor.models import Models, begin_repository
 from gateway.supervisor.surroundings import LineSurroundings
 
 LOOP_TIME_S = 2.5
-EXPERIMENT_ENDS = ("experiment-end", "experiment-abort")
+CONFIGURATION_CHANGES = ("start", "rolled-back")
 BUILD_TIME_S = 15.0  #: for what the loop builds and warms before it answers
 
 #: Files in the line's folder from which a loop takes its first configuration, and how they are read.
 STARTED_WITH: dict[str, Callable[[bytes], Controller]] = {
     "controller.json": parse_controller,
+    "started-with.json": parse_controller,
     "configuration.json": lambda content: parse_controller(json.dumps(json.loads(content)["controller"]).encode()),
 }
 
@@ -66,7 +70,7 @@ class LoopOverMailbox:
         self._mailbox = mailbox
 
     async def tell(self, command: Command) -> Reply:
-        time_s = BUILD_TIME_S if isinstance(command, Deploy | Keep) else LOOP_TIME_S
+        time_s = BUILD_TIME_S if isinstance(command, Deploy | Keep | WatchGood) else LOOP_TIME_S
         answer = await self._mailbox.request(LOOP_COMMAND, command_bytes(command), time_s)
         try:
             return Reply.model_validate_json(answer)
@@ -102,6 +106,7 @@ class Gate:
         self._stores: tuple[Configurations, Models] | None = None
         self._shut = "the gate is about to open"  #: why it is, while it is
         self._told = ""
+        self._learned: str | None = None  #: what ran when `_learn` looked last
         self._telling: set[asyncio.Task[None]] = set()
         mailbox.serve(GATEWAY_PROPOSE, self._answer_propose)
         mailbox.serve(GATEWAY_PROPOSALS, self._answer_query)
@@ -113,14 +118,19 @@ class Gate:
             await self._open()
         if self.deployer is not None:
             await self.deployer.watch()
+            self._learn_again(self.deployer)
         trouble = self._shut if self.deployer is None else self.deployer.trouble
         if trouble != self._told:
             self._told = trouble
             self._note("gate", f"the gate waits: {trouble}" if trouble else "the gate is open")
 
     def hear(self, event: Event) -> None:
-        """What the loop tells: that an experiment is over is for the records."""
-        if self.deployer is None or event.kind not in EXPERIMENT_ENDS:
+        """What the loop tells: that an experiment is over, or that it runs something else, is for the records."""
+        if self.deployer is None:
+            return
+        if event.kind in CONFIGURATION_CHANGES:
+            self.deployer.look_again()
+        if event.kind not in EXPERIMENT_ENDS:
             return
         hash_, reason = str(event.data.get("hash", "")), str(event.data.get("reason", ""))
         task = asyncio.get_running_loop().create_task(self.deployer.experiment_ended(hash_, reason))
@@ -147,7 +157,7 @@ class Gate:
                     begin_configurations(self._folder / configurations_store.FILE_NAME),
                     begin_repository(self._folder / models_store.FILE_NAME),
                 )
-            self._learn(*self._stores)
+            self._learn(self._stores[0])
         except (AuditUnavailable, CannotBegin, ConfigurationsError, ModelsError) as error:
             self._shut = str(error)
             return
@@ -156,7 +166,18 @@ class Gate:
             self._around(*self._stores), self._take_up, self._clock, self._wall_clock,
         )  # fmt: skip
 
-    def _learn(self, configurations: Configurations, _: Models) -> None:
+    def _learn_again(self, deployer: Deployer) -> None:
+        """A loop that was started later has been given something else."""
+        runs = deployer.book.in_service
+        if self._stores is None or runs == self._learned:
+            return
+        try:
+            self._learn(self._stores[0])
+        except ConfigurationsError as error:
+            self._note("gate", f"what the loop was started with is not stored: {error}")
+        self._learned = runs
+
+    def _learn(self, configurations: Configurations) -> None:
         """Store what the loop may have been started with: it tells only its hash."""
         for name, read in STARTED_WITH.items():
             try:
@@ -228,15 +249,22 @@ class Gate:
 
 
 def book_in(folder: Path) -> Book:
-    """What the audit of a folder says. Raises CannotBegin."""
+    """What the audit of a folder says; what a record calls not done was not. Raises CannotBegin."""
     try:
         with AuditFile(folder) as file:
             records = [row.record() for row in file.rows()]
-        return book_of((record.kind, record.what) for record in records)
+        not_done = {number for one in records if one.kind == NOT_DONE for number in _numbers(one.what["sequences"])}
+        return book_of((record.kind, record.what) for record in records if record.sequence not in not_done)
     except AuditUnavailable as error:
         raise CannotBegin(str(error)) from error
     except (Impossible, ValueError, KeyError) as error:
         raise CannotBegin(f"the records of the audit do not fit together: {error}; `r2rgate audit verify`") from error
+
+
+def _numbers(value: object) -> list[object]:
+    if not isinstance(value, list):
+        raise ValueError("a record names records by something else than their numbers")
+    return cast("list[object]", value)
 
 
 def _who(peer: Peer | None) -> Who:

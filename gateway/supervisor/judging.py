@@ -97,10 +97,14 @@ class JudgeWorkers:
         self._all: set[_Worker] = set()
 
     async def __aenter__(self) -> "JudgeWorkers":
-        for _ in range(self._idle.qsize()):
-            self._idle.get_nowait()
-            self._idle.put_nowait(self._begun())
+        self.begin()
         return self
+
+    def begin(self) -> None:
+        """All that idle and have not begun: the first verdict does not wait for them to load, and to compile."""
+        for _ in range(self._idle.qsize()):
+            worker = self._idle.get_nowait()
+            self._idle.put_nowait(worker or self._begun())
 
     async def __aexit__(self, *_: object) -> None:
         await self.close()
@@ -128,8 +132,6 @@ class JudgeWorkers:
 
         `seed` None: drawn anew, so that nobody can prepare a proposal for it.
         """
-        from safety.judge import refusal
-
         seed = secrets.randbelow(LARGEST_SEED) if seed is None else seed
         limit_s = self._line.gate.verdict_max_s if limit_s is None else limit_s
         worker = await self._idle.get() or await asyncio.to_thread(self._begun)
@@ -141,7 +143,7 @@ class JudgeWorkers:
             verdict = await asyncio.shield(asked)
             good = True
         except NoVerdict as none:
-            return refusal(payload, context, self._line, seed, none.rule, str(none))
+            return await asyncio.to_thread(_refusal, payload, context, self._line, seed, none)
         finally:
             if not good:  # it is at something, or dead: another one takes its place when there is need
                 self._all.discard(worker)
@@ -154,6 +156,12 @@ class JudgeWorkers:
         worker = _Worker(self._line)
         self._all.add(worker)
         return worker
+
+
+def _refusal(payload: bytes, context: JudgeContext, line: Line, seed: int, none: NoVerdict) -> Verdict:
+    from safety.judge import refusal  # loads all that the judge needs, which takes its time
+
+    return refusal(payload, context, line, seed, none.rule, str(none))
 
 
 def _forgotten(asked: "asyncio.Future[Verdict]") -> None:

@@ -225,7 +225,7 @@ def _settled(change: Entry, found: InService) -> tuple[str, dict[str, Any]] | No
         return after.get(change.stage, "kept"), named
     if change.stage is Stage.DEPLOYING and found.epoch != change.epoch:
         return "not-deployed", {**named, "because": f"the loop is at epoch {found.epoch}: {found.why}"}
-    return "rolled-back", {**named, "to": found.hash, "because": found.why}
+    return "rolled-back", {**named, "to": found.hash, "because": found.why.removeprefix("rolled back: ")}
 
 
 def book_of(records: Iterable[tuple[str, Mapping[str, Any]]]) -> Book:

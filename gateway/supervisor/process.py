@@ -7,7 +7,9 @@ import asyncio
 import signal
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Protocol
 
 from gateway.core.line import Line
 from gateway.core.topics import LOOP_COMMAND
@@ -15,6 +17,7 @@ from gateway.mailbox.listener import AlreadyRunning, CannotListen, PathTooLong
 from gateway.mailbox.paths import GATEWAY_SOCKET, LOOP_SOCKET
 from gateway.mailbox.unix import UnixMailbox
 from gateway.supervisor.configurations import Configurations
+from gateway.supervisor.deployer_sides import JudgeSide
 from gateway.supervisor.gate import Gate
 from gateway.supervisor.historian import Historian
 from gateway.supervisor.judging import JudgeWorkers
@@ -30,7 +33,7 @@ WATCH_S = 0.25
 def run_gateway(line: Line, run_folder: Path, data_folder: Path) -> int:
     """Serve until SIGTERM or SIGINT. Returns the process's exit code."""
     try:
-        return asyncio.run(_serve(line, run_folder, data_folder))
+        return asyncio.run(serve(line, run_folder, data_folder, JudgeWorkers(line)))
     except AlreadyRunning as error:
         print(f"a gateway runs here already, this one ends: {error}", file=sys.stderr)
         return EXIT_ALREADY_RUNNING
@@ -39,31 +42,53 @@ def run_gateway(line: Line, run_folder: Path, data_folder: Path) -> int:
         return EXIT_CANNOT_LISTEN
 
 
-async def _serve(line: Line, run_folder: Path, data_folder: Path) -> int:
+class Judging(JudgeSide, Protocol):
+    def begin(self) -> None:
+        """So that the first verdict does not wait for it."""
+        ...
+
+    async def close(self) -> None: ...
+
+
+async def serve(
+    line: Line,
+    run_folder: Path,
+    data_folder: Path,
+    judge: Judging,
+    clock: Callable[[], float] = time.monotonic,
+    wall_clock: Callable[[], float] = time.time,
+    watch_s: float = WATCH_S,
+) -> int:
+    """All of it, in one event loop. Raises AlreadyRunning, CannotListen and PathTooLong."""
     stop = asyncio.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
     mailbox = UnixMailbox()
     mailbox.connect((LOOP_COMMAND,), run_folder / LOOP_SOCKET)
-    historian = Historian(data_folder, line.site, line.line, line.n, retention=retention_of(line.history))
-    gateway = Gateway(line, mailbox, historian, mailbox.counters)
-    judge = JudgeWorkers(line)
+    historian = Historian(
+        data_folder, line.site, line.line, line.n, retention=retention_of(line.history), clock=clock,
+        wall_clock=wall_clock,
+    )  # fmt: skip
+    gateway = Gateway(line, mailbox, historian, mailbox.counters, clock, wall_clock)
 
     def around(configurations: Configurations, models: Models) -> LineSurroundings:
-        return LineSurroundings(line, gateway.newest, gateway.recent, historian.path, configurations, models, time.time)
+        return LineSurroundings(
+            line, gateway.newest, gateway.recent, historian.path, configurations, models, wall_clock
+        )
 
     # First the socket, whose lock makes this the only instance; only then is the history touched.
     await mailbox.listen(run_folder / GATEWAY_SOCKET)
     historian.start()
-    gate = Gate(line, mailbox, data_folder, judge, around, gateway.note, time.monotonic, time.time)
+    judge.begin()
+    gate = Gate(line, mailbox, data_folder, judge, around, gateway.note, clock, wall_clock)
     gateway.on_event = gate.hear
-    looking = asyncio.create_task(_look(gate, stop))
+    looking = asyncio.create_task(_look(gate, stop, watch_s))
     gateway.note("gateway-up", "the gateway has started")
     print(f"gateway of {line.site}/{line.line}: {run_folder / GATEWAY_SOCKET}, history {historian.path}", flush=True)
     try:
         while not stop.is_set():
             gateway.watch()
-            await _wait(stop, WATCH_S)
+            await _wait(stop, watch_s)
     finally:
         stop.set()
         await looking
@@ -77,11 +102,11 @@ async def _serve(line: Line, run_folder: Path, data_folder: Path) -> int:
     return EXIT_OK if flushed else EXIT_NOT_FLUSHED
 
 
-async def _look(gate: Gate, stop: asyncio.Event) -> None:
+async def _look(gate: Gate, stop: asyncio.Event, watch_s: float) -> None:
     """Beside the rest: it waits for the loop's answers."""
     while not stop.is_set():
         await gate.look()
-        await _wait(stop, WATCH_S)
+        await _wait(stop, watch_s)
 
 
 async def _wait(stop: asyncio.Event, timeout_s: float) -> None:

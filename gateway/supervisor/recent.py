@@ -21,14 +21,22 @@ class Recent:
         self._dtype = frame_dtype(spans)
         self._period_s = period_s
         self._frames: deque[bytes] = deque(maxlen=round((SETTLE_S + WINDOW_S) / period_s))
+        self._ran = 0  #: frames
+
+    @property
+    def ran_s(self) -> float:
+        """How long the line has run, all in all, since the last `forget`."""
+        return self._ran * self._period_s
 
     def take(self, payload: bytes) -> None:
         """A well-formed frame."""
         self._frames.append(payload)
+        self._ran += np.frombuffer(payload, self._dtype)["state"][0] == LoopState.RUN
 
     def forget(self) -> None:
         """What was before says nothing of what is now."""
         self._frames.clear()
+        self._ran = 0
 
     def stands(self) -> bool:
         """Whether set-points and speed have stood since some seconds, in RUN."""

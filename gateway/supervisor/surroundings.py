@@ -5,31 +5,31 @@ from collections.abc import Callable
 from pathlib import Path
 
 from gateway.core.controller import Controller
+from gateway.core.deployment import RecoveryPrediction, Region
 from gateway.core.differences import of_controllers, of_experiment, of_models
 from gateway.core.doubts import in_words
 from gateway.core.judge_context import DataReference, JudgeContext, LineState
 from gateway.core.line import Line
-from gateway.core.line_model import LineModel
+from gateway.core.line_model import LineModel, theta_of
 from gateway.core.proposal import ExperimentChange, GainsChange, Proposal
 from gateway.core.recording import Recording
 from gateway.core.states import LoopState
 from gateway.core.telemetry import Frame
 from gateway.supervisor.configurations import STABLE, Configurations, ConfigurationsError
 from gateway.supervisor.deployer import iso
-from gateway.supervisor.history import History, HistoryError
-from gateway.supervisor.history_recording import recording_between
+from gateway.supervisor.deployer_sides import NotKnown
+from gateway.supervisor.experiments import newest_experiments
+from gateway.supervisor.history import HistoryError
 from gateway.supervisor.lifecycle import Book, Stage
 from gateway.supervisor.model_store import ModelsError
 from gateway.supervisor.models import Models
-from gateway.supervisor.recent import Recent
+from gateway.supervisor.recent import SETTLE_S, WINDOW_S, Recent
 from safety.probation import Standing, against
 
 MOST_EXPERIMENTS = 4  #: the newest, on which the model must hold
-ENDS = ("experiment-end", "experiment-abort")
-
-
-class NotKnown(Exception):
-    """Something without which nothing can be judged; the text says what, and what to do."""
+LEAST_STANDING_S = SETTLE_S + WINDOW_S
+PATIENCE_S, LOOK_S = LEAST_STANDING_S + 1.0, 0.1
+NODES = (0.1, 0.5, 1.0)  #: of the fastest speed: where recovery is predicted
 
 
 class LineSurroundings:
@@ -53,9 +53,11 @@ class LineSurroundings:
         self._models = models
         self._wall_clock = wall_clock
         self._before: Standing | None = None  #: how the line stood before the change
+        self._stood = False  #: since the change, so that it could be measured
 
     async def context(self, book: Book) -> tuple[JudgeContext, list[Recording]]:
-        """Raises NotKnown."""
+        """Of a line that runs once it stands, or in some seconds as it is then. Raises NotKnown."""
+        await self._stands()
         now_s = self._wall_clock()
         found = await asyncio.to_thread(self._experiments, now_s)
         return JudgeContext(
@@ -72,6 +74,14 @@ class LineSurroundings:
             decided=[entry.proposal for entry in book.entries.values() if entry.stage is not Stage.RECEIVED][-4096:],
         ), [one for one, _ in found]
 
+    async def _stands(self) -> None:
+        """Until it does, or does not for longer than that takes at a line that is left alone."""
+        for _ in range(round(PATIENCE_S / LOOK_S)):
+            frame = self._newest()
+            if frame is None or frame.state != LoopState.RUN or self._recent.stands():
+                return
+            await asyncio.sleep(LOOK_S)
+
     def difference(self, proposal: Proposal, book: Book) -> list[str]:
         """What it would change, in words and numbers; where something is not known, that."""
         change = proposal.change
@@ -81,17 +91,32 @@ class LineSurroundings:
             if isinstance(change, ExperimentChange):
                 return of_experiment(change.experiment)
             return of_models(self._model(book), change.model)
-        except (NotKnown, ModelsError) as error:
+        except NotKnown as error:
             return [str(error)]
+
+    async def recovery(self, fallback: str, region: Region, book: Book) -> RecoveryPrediction | None:
+        """Of the accepted model, in a thread: it takes a while. Raises NotKnown."""
+        model, controller = self._model(book), self._controller(fallback)
+        if model is None:
+            return None
+        return await asyncio.to_thread(_prediction, model, controller, self._line, region)
 
     def begin_probation(self) -> None:
         """From now on the line is measured against how it has stood until now."""
         self._before = self._recent.standing()
         self._recent.forget()
+        self._stood = False
 
     def against_keeping(self) -> str:
         now = self._recent.standing()
+        self._stood = self._stood or now is not None
         return "" if now is None else against(now, self._before, self._line.gate)
+
+    def unseen(self) -> str:
+        probation_s, ran_s = self._line.gate.probation_s, self._recent.ran_s
+        if ran_s < probation_s:
+            return f"it has controlled the line for {ran_s:.0f} s of {probation_s:g} s"
+        return "" if self._stood else f"the line has not stood for {LEAST_STANDING_S:g} s in a row"
 
     def _state(self, book: Book, now_s: float) -> LineState:
         frame, change = self._newest(), book.on_the_line
@@ -129,7 +154,10 @@ class LineSurroundings:
     def _model(self, book: Book) -> LineModel | None:
         if book.model is None:
             return None
-        model = self._models.find(book.model, self._line.site, self._line.line).model
+        try:
+            model = self._models.find(book.model, self._line.site, self._line.line).model
+        except ModelsError as error:
+            raise NotKnown(f"the model in service, {book.model[:12]}, is not known here: {error}") from error
         if model is None:
             raise NotKnown(f"the model in service, {book.model[:12]}, is damaged in the repository")
         return model
@@ -137,21 +165,16 @@ class LineSurroundings:
     def _experiments(self, now_s: float) -> list[tuple[Recording, float]]:
         """The newest first, with the Unix time of their ends. In a thread: it reads from the disk."""
         begin_s = now_s - self._line.gate.data_max_age_s
-        found: list[tuple[Recording, float]] = []
         try:
-            with History(self._history) as history:
-                ends = [event for event in history.events(begin_s, now_s + 1.0) if event.kind in ENDS]
+            return newest_experiments(self._history, begin_s, now_s + 1.0, MOST_EXPERIMENTS)
         except HistoryError:
             return []
-        for event in reversed(ends):
-            first_s, last_s = event.data.get("begin_s"), event.data.get("end_s")
-            if not isinstance(first_s, float) or not isinstance(last_s, float):
-                continue
-            ahead_s = event.wall_s - event.time_s
-            try:
-                found.append((recording_between(self._history, first_s + ahead_s, last_s + ahead_s), last_s + ahead_s))
-            except HistoryError:
-                continue  # too short, or damaged: others may do
-            if len(found) == MOST_EXPERIMENTS:
-                break
-        return found
+
+
+def _prediction(model: LineModel, fallback: Controller, line: Line, region: Region) -> RecoveryPrediction:
+    from safety.recovery_prediction import recovery_prediction  # needs scipy, which takes its time to load
+
+    fastest = line.limits.speed_max_m_per_s
+    if region.speed_max_m_per_s is not None:
+        fastest = min(fastest, region.speed_max_m_per_s)
+    return recovery_prediction(theta_of(model), fallback, line, [share * fastest for share in NODES])

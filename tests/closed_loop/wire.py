@@ -31,18 +31,22 @@ CHANNEL = "239.74.163.2"
 class WireLine:
     """Context: everything it started is ended at its end."""
 
-    def __init__(self, folder: Path, seed: int = 1) -> None:
+    def __init__(self, folder: Path, seed: int = 1, spans: int = 6, gate: str = "") -> None:
+        """`gate`: more rows for the line's `[gate]`."""
         (folder / "logs").mkdir()
         self.folder = folder
         self.children = Children(folder / "logs")
         self.can_port = free_udp_port()
+        plant = Path("sim_plant/plants/s_real.toml").read_text().replace("spans = 6", f"spans = {spans}")
+        (folder / "plant.toml").write_text(plant)
         ready = self.children.start_sim(
-            "sim_plant/plants/s_real.toml", "--record", folder / "recording", "--seed", str(seed),
+            folder / "plant.toml", "--record", folder / "recording", "--seed", str(seed),
             "--can-port", str(self.can_port), "--modbus-port", "0", "--priority", "40",
         )  # fmt: skip
         self.world_start_s: float = ready["monotonic_start_s"]
-        text = line_template(6, "line.toml").replace("port = 43113", f"port = {self.can_port}")
+        text = line_template(spans, "line.toml").replace("port = 43113", f"port = {self.can_port}")
         text = text.replace("port = 5020", f"port = {ready['modbus_port']}")
+        text = text.replace('autonomy = "approve-all" ', f'{gate}\nautonomy = "approve-all" ')
         (folder / "line.toml").write_text(text)
         self.line = load_line(text, "line.toml")
         (folder / "controller.json").write_bytes(canonical(design_lqi(task_of(self.line))))

@@ -174,6 +174,7 @@ class FakeSurroundings:
 
     loop: FakeLoop
     against: str = ""
+    hidden: str = ""
 
     async def context(self, book):
         state = LineState(state="READY", tension_n=[30.0] * LINE.n, speed_m_per_s=0.0)
@@ -182,7 +183,13 @@ class FakeSurroundings:
     def difference(self, one, book) -> list[str]:
         return ["a test"]
 
+    async def recovery(self, fallback, region, book):
+        return None
+
     def begin_probation(self) -> None: ...
+
+    def unseen(self) -> str:
+        return self.hidden
 
     def against_keeping(self) -> str:
         return self.against

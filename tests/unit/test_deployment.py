@@ -84,7 +84,7 @@ def test_what_is_too_long_packed_or_not_is_refused_before_it_is_read():
 
 
 def test_only_deployments_may_be_packed():
-    with pytest.raises(MalformedMessage, match="deploy and keep"):
+    with pytest.raises(MalformedMessage, match="deploy, keep and watch-good"):
         parse_command(zlib.compress(b'{"command": "stop"}'))
 
 

@@ -1,0 +1,74 @@
+"""What the deployer works with: an audit, a loop, a judge, and what the line is like."""
+
+from collections.abc import Mapping
+from typing import Any, Protocol
+
+from gateway.core.audit_record import Who
+from gateway.core.deployment import RecoveryPrediction, Region
+from gateway.core.judge_context import JudgeContext
+from gateway.core.messages import Command, Reply
+from gateway.core.proposal import Proposal
+from gateway.core.recording import Recording
+from gateway.core.verdict import Verdict
+from gateway.supervisor.lifecycle import Book
+
+
+class NotTakenUp(Exception):
+    """What was to be put into service could not be stored; the text says why."""
+
+
+class NotKnown(Exception):
+    """Something without which nothing can be judged or deployed; the text says what, and what to do."""
+
+
+class AuditSide(Protocol):
+    async def append(
+        self, kind: str, who: Who, what: Mapping[str, Any], blobs: Mapping[str, bytes] | None = None
+    ) -> object:
+        """Stored for good when it returns. Raises AuditUnavailable."""
+        ...
+
+    def blob(self, id_: str) -> bytes | None:
+        """What lies beside the records under this hash. Raises AuditUnavailable."""
+        ...
+
+
+class LoopSide(Protocol):
+    async def tell(self, command: Command) -> Reply:
+        """Raises Unreachable."""
+        ...
+
+
+class JudgeSide(Protocol):
+    async def judge(self, payload: bytes, context: JudgeContext, recordings: list[Recording]) -> Verdict:
+        """Always a verdict: none in time is a refusal."""
+        ...
+
+
+class Surroundings(Protocol):
+    """What the line is like now, as a verdict needs it."""
+
+    async def context(self, book: Book) -> tuple[JudgeContext, list[Recording]]: ...
+
+    def difference(self, proposal: Proposal, book: Book) -> list[str]:
+        """What it would change, for a person."""
+        ...
+
+    async def recovery(self, fallback: str, region: Region, book: Book) -> RecoveryPrediction | None:
+        """Whether configuration `fallback` would recover the line, for the loop to see; None: no model is accepted.
+
+        Raises NotKnown.
+        """
+        ...
+
+    def begin_probation(self) -> None:
+        """A change is about to be put on the line."""
+        ...
+
+    def against_keeping(self) -> str:
+        """What a deployment on probation has shown against itself so far; empty: nothing."""
+        ...
+
+    def unseen(self) -> str:
+        """What it has not shown yet, and must before it is kept; empty: it may be kept."""
+        ...
