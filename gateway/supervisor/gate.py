@@ -8,7 +8,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from pydantic import ValidationError
+from pydantic import TypeAdapter, ValidationError
 
 from gateway.core.audit_record import Who
 from gateway.core.controller import Controller, ControllerRefused, config_hash, parse_controller
@@ -42,6 +42,9 @@ STARTED_WITH: dict[str, Callable[[bytes], Controller]] = {
     "started-with.json": parse_controller,
     "configuration.json": lambda content: parse_controller(json.dumps(json.loads(content)["controller"]).encode()),
 }
+
+
+_SEQUENCES: TypeAdapter[set[int]] = TypeAdapter(set[int])
 
 
 class CannotBegin(Exception):
@@ -253,7 +256,10 @@ def book_in(folder: Path) -> Book:
     try:
         with AuditFile(folder) as file:
             records = [row.record() for row in file.rows()]
-        not_done = {number for one in records if one.kind == NOT_DONE for number in one.what["sequences"]}
+        not_done: set[int] = set()
+        for record in records:
+            if record.kind == NOT_DONE:
+                not_done |= _SEQUENCES.validate_python(record.what["sequences"])
         return book_of((record.kind, record.what) for record in records if record.sequence not in not_done)
     except AuditUnavailable as error:
         raise CannotBegin(str(error)) from error
