@@ -107,12 +107,17 @@ class GateLine(WireLine):
         assert self.in_service() == config_hash(controller)
         return proposal
 
-    def command(self, *words: str) -> str:
-        """What a command of `r2rgate` says of this line's data."""
-        done = subprocess.run(
-            [sys.executable, "-m", "gateway.cli", *words, "--data-dir", self.folder / "data"],
-            capture_output=True, text=True, timeout=30, check=False,
-        )  # fmt: skip
+    def audit(self, *words: str) -> str:
+        """What `r2rgate audit` says of this line."""
+        return self._command("audit", *words, "--data-dir", self.folder / "data")
+
+    def command(self, *words: str | Path) -> str:
+        """What a command of `r2rgate` to this line says."""
+        return self._command(*words, "--run-dir", self.children.run_folder)
+
+    def _command(self, *words: str | Path) -> str:
+        arguments = [sys.executable, "-m", "gateway.cli", *words]
+        done = subprocess.run(arguments, capture_output=True, text=True, timeout=60, check=False)
         assert done.returncode == 0, done.stderr
         return done.stdout
 
