@@ -6,9 +6,9 @@ import pwd
 from collections.abc import Callable, Mapping
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
-from pydantic import ValidationError
+from pydantic import TypeAdapter, ValidationError
 
 from gateway.core.audit_record import Who
 from gateway.core.controller import Controller, ControllerRefused, config_hash, parse_controller
@@ -42,6 +42,9 @@ STARTED_WITH: dict[str, Callable[[bytes], Controller]] = {
     "started-with.json": parse_controller,
     "configuration.json": lambda content: parse_controller(json.dumps(json.loads(content)["controller"]).encode()),
 }
+
+
+_SEQUENCES: TypeAdapter[set[int]] = TypeAdapter(set[int])
 
 
 class CannotBegin(Exception):
@@ -253,18 +256,15 @@ def book_in(folder: Path) -> Book:
     try:
         with AuditFile(folder) as file:
             records = [row.record() for row in file.rows()]
-        not_done = {number for one in records if one.kind == NOT_DONE for number in _numbers(one.what["sequences"])}
+        not_done: set[int] = set()
+        for record in records:
+            if record.kind == NOT_DONE:
+                not_done |= _SEQUENCES.validate_python(record.what["sequences"])
         return book_of((record.kind, record.what) for record in records if record.sequence not in not_done)
     except AuditUnavailable as error:
         raise CannotBegin(str(error)) from error
     except (Impossible, ValueError, KeyError) as error:
         raise CannotBegin(f"the records of the audit do not fit together: {error}; `r2rgate audit verify`") from error
-
-
-def _numbers(value: object) -> list[object]:
-    if not isinstance(value, list):
-        raise ValueError("a record names records by something else than their numbers")
-    return cast("list[object]", value)
 
 
 def _who(peer: Peer | None) -> Who:

@@ -18,6 +18,7 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -351,9 +352,9 @@ async def site(tally: Tally, rng: random.Random) -> AsyncIterator[Site]:
         shutil.rmtree(folder)
 
 
-async def _campaign(kills: int, seed: int) -> Tally:
-    rng, tally = random.Random(seed), Tally()
-    while tally.kills < kills:
+async def _campaign(kills: int, seed: int, minutes: float) -> Tally:
+    rng, tally, end_s = random.Random(seed), Tally(), time.monotonic() + 60.0 * minutes
+    while tally.kills < kills and time.monotonic() < end_s:
         async with site(tally, rng) as one:
             for _ in range(min(SAME_FOLDER, kills - tally.kills)):
                 pid = await one.fork()
@@ -372,9 +373,9 @@ def _started(arguments: list[Any]) -> subprocess.Popen[str]:
     return subprocess.Popen(arguments, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 
 
-def campaign(kills: int, seed: int) -> Tally:
-    """Raises TimeoutError where no gateway comes up."""
-    return asyncio.run(_campaign(kills, seed))
+def campaign(kills: int, seed: int, minutes: float = inf) -> Tally:
+    """As many as come within `minutes`, about. Raises TimeoutError where no gateway comes up."""
+    return asyncio.run(_campaign(kills, seed, minutes))
 
 
 def _alive(pid: int) -> bool:

@@ -13,7 +13,8 @@ import numpy as np
 
 from gateway.core.controller import Controller, config_hash, parse_controller
 from gateway.core.decisions import Decide, ListProposals, ProposalList, ProposalShown, RollBackNow, ShowProposal
-from gateway.core.messages import AskConfiguration, Reply, command_bytes
+from gateway.core.deployment import Deployment, InService
+from gateway.core.messages import AskConfiguration, Deploy, Reply, command_bytes
 from gateway.core.proposal import GainsChange, Proposal, canonical, proposal_hash
 from gateway.core.topics import GATEWAY_DECISION, GATEWAY_PROPOSALS, GATEWAY_PROPOSE, LOOP_COMMAND, Topic
 from gateway.mailbox.paths import GATEWAY_SOCKET, LOOP_SOCKET
@@ -85,10 +86,17 @@ class GateLine(WireLine):
         return found
 
     def in_service(self) -> str:
+        return self.configuration().hash
+
+    def configuration(self) -> InService:
         """The loop's own word, straight from it."""
         reply = Reply.model_validate_json(self._ask(LOOP_COMMAND, command_bytes(AskConfiguration())))
         assert reply.in_service is not None
-        return reply.in_service.hash
+        return reply.in_service
+
+    def deploy(self, deployment: Deployment) -> Reply:
+        """Past the gate, straight into the loop."""
+        return Reply.model_validate_json(self._ask(LOOP_COMMAND, command_bytes(Deploy(deployment=deployment))))
 
     def approved(self, controller: Controller) -> str:
         """Proposed, accepted, approved: it runs, on probation."""
@@ -99,12 +107,17 @@ class GateLine(WireLine):
         assert self.in_service() == config_hash(controller)
         return proposal
 
-    def command(self, *words: str) -> str:
-        """What a command of `r2rgate` says of this line's data."""
-        done = subprocess.run(
-            [sys.executable, "-m", "gateway.cli", *words, "--data-dir", self.folder / "data"],
-            capture_output=True, text=True, timeout=30, check=False,
-        )  # fmt: skip
+    def audit(self, *words: str) -> str:
+        """What `r2rgate audit` says of this line."""
+        return self._command("audit", *words, "--data-dir", self.folder / "data")
+
+    def command(self, *words: str | Path) -> str:
+        """What a command of `r2rgate` to this line says."""
+        return self._command(*words, "--run-dir", self.children.run_folder)
+
+    def _command(self, *words: str | Path) -> str:
+        arguments = [sys.executable, "-m", "gateway.cli", *words]
+        done = subprocess.run(arguments, capture_output=True, text=True, timeout=60, check=False)
         assert done.returncode == 0, done.stderr
         return done.stdout
 

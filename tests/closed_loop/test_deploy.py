@@ -22,6 +22,7 @@ from gateway.core.messages import (
     SetSpeed,
     SetTension,
     Stop,
+    WatchGood,
 )
 from gateway.core.states import LoopState, Phase
 from gateway.core.theta import nominal_theta
@@ -199,6 +200,22 @@ def test_a_watch_for_another_fallback_is_refused():
     loop.command(deployment())
     reply = loop.command(Keep(epoch=1, watch=recovery_prediction(nominal_theta(LINE), GOOD, LINE, [0.05])))
     assert not reply.ok and in_service(loop).on_probation
+
+
+def test_what_is_good_is_watched_by_a_model_that_is_accepted_later():
+    loop = producing()
+    watch = recovery_prediction(nominal_theta(LINE), GOOD, LINE, [0.05])
+    assert not in_service(loop).watched
+    other = loop.command(WatchGood(watch=recovery_prediction(nominal_theta(LINE), CANDIDATE, LINE, [0.05])))
+    assert not other.ok and "fallback" in other.reasons[0]
+    reply = loop.command(WatchGood(watch=watch))
+    assert reply.ok and reply.in_service.watched and reply.in_service.hash == config_hash(GOOD), reply
+    loop.step(100)
+    assert loop.cycle.machine.phase is Phase.RUNNING
+    assert loop.command(deployment()).ok
+    refused = loop.command(WatchGood(watch=watch))
+    assert not refused.ok and "probation" in refused.text
+    assert loop.command(Rollback(reason="a test")).ok and in_service(loop).watched
 
 
 def test_what_was_not_judged_is_refused_with_what_lifts_it():

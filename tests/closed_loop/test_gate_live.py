@@ -3,6 +3,7 @@
 The recorder inside the simulated line judges what reached the web, the audit what anybody was told.
 """
 
+import json
 import time
 
 import numpy as np
@@ -41,11 +42,16 @@ def test_a_proposal_is_judged_approved_runs_is_kept_and_another_is_taken_back(li
     assert reply.ok and "no model is accepted" in reply.text, reply
     assert line.in_service() == config_hash(better)
     line.until(proposal, "kept")
-    # Another one is taken back by a person.
-    again = line.approved(line.first)
-    assert line.roll_back().ok
+    # Another one is taken back by a person, with the commands that people have.
+    first_file = line.folder / "controller.json"
+    shown = json.loads(line.command("propose", first_file, "--reason", "as it was", "--json"))
+    again = shown["proposal_hash"]
+    assert "on probation" in line.command("approve", again[:12], "--yes")
+    assert line.in_service() == first
+    assert "not kept yet" in line.command("proposals", again[:12])
+    assert config_hash(better)[:12] in line.command("rollback", "--comment", "tension 3 hums")
     assert line.in_service() == config_hash(better)
-    assert line.until(again, "rolled-back").why.startswith("asked for by")
+    assert line.until(again, "rolled-back").why == "tension 3 hums"
     line.wait(settled)
     ended_s = world_s(line)
     recording = line.recording()
@@ -55,8 +61,8 @@ def test_a_proposal_is_judged_approved_runs_is_kept_and_another_is_taken_back(li
     tension_n = np.array(line.line.recipes[0].tension_n)
     assert np.abs(recording.tension_n[here] - tension_n).max() < NEAR_N
     assert not any(line.unsafe().values()), line.unsafe()
-    assert "sound" in line.command("audit", "verify")
-    told = line.command("audit", "show", "--id", proposal[:12])
+    assert "sound" in line.audit("verify")
+    told = line.audit("show", "--id", proposal[:12])
     kinds = ["proposed", "accepted", "approved", "deploying", "deployed", "keeping", "kept"]
     places = [told.index(f"  {kind}  by ") for kind in kinds]
     assert places == sorted(places)
@@ -82,6 +88,6 @@ def test_the_gateway_dies_on_probation_the_loop_goes_back_by_itself_and_the_audi
     limits = line.line.limits
     assert largest_step_nm(recording, began_s, ended_s) <= limits.torque_rate_nm_per_s * line.line.control.period_s
     assert not any(line.unsafe().values()), line.unsafe()
-    assert "sound" in line.command("audit", "verify")
-    told = line.command("audit", "show", "--id", proposal[:12])
+    assert "sound" in line.audit("verify")
+    told = line.audit("show", "--id", proposal[:12])
     assert "rolled-back" in told and "was not renewed" in told

@@ -6,14 +6,15 @@ from dataclasses import dataclass, field
 
 from gateway.control.design import design_lqi, task_of
 from gateway.core.controller import config_hash
-from gateway.core.deployment import InService, Region
+from gateway.core.deployment import InService, RecoveryNode, RecoveryPrediction, Region
 from gateway.core.judge_context import JudgeContext, LineState, context_hash
-from gateway.core.messages import Command, Deploy, Keep, Renew, Reply, Rollback, RunExperiment
+from gateway.core.messages import Command, Deploy, Keep, Renew, Reply, Rollback, RunExperiment, WatchGood
 from gateway.core.proposal import GainsChange, Proposal, proposal_hash
 from gateway.core.verdict import RuleFinding, Verdict
 from gateway.mailbox.port import Unreachable
 from gateway.supervisor.audit_file import AuditUnavailable
 from gateway.supervisor.deployer import iso
+from gateway.supervisor.deployer_sides import NotKnown
 from tests.unit.supervisor_support import line_of
 
 LINE = line_of(2)
@@ -94,6 +95,7 @@ class FakeLoop:
         self.reachable = True
         self.answers = True
         self.takes = True
+        self.watches: list[tuple[str, RecoveryPrediction | None]] = []  #: by command
 
     async def tell(self, command: Command) -> Reply:
         due = self.death.due()
@@ -129,8 +131,11 @@ class FakeLoop:
 
     def _done(self, command: Command) -> Reply:
         ok, text = True, "done"
+        if isinstance(command, WatchGood | Keep):
+            self.watches.append((command.command, command.watch))
         if isinstance(command, Deploy):
             deployment = command.deployment
+            self.watches.append(("deploy", deployment.watch))
             ok = self.takes and deployment.epoch == self.epoch + 1 and self.lease_end_s is None
             text = "deployed" if ok else "not its successor, or not now"
             if ok:
@@ -174,7 +179,8 @@ class FakeSurroundings:
 
     loop: FakeLoop
     against: str = ""
-    hidden: str = ""
+    hidden: str = ""  #: what it has not shown yet
+    unknown: str = ""  #: why no recovery can be predicted
 
     async def context(self, book):
         state = LineState(state="READY", tension_n=[30.0] * LINE.n, speed_m_per_s=0.0)
@@ -184,7 +190,9 @@ class FakeSurroundings:
         return ["a test"]
 
     async def recovery(self, fallback, region, book):
-        return None
+        if self.unknown:
+            raise NotKnown(self.unknown)
+        return None if book.model is None else prediction(fallback)
 
     def begin_probation(self) -> None: ...
 
@@ -193,6 +201,17 @@ class FakeSurroundings:
 
     def against_keeping(self) -> str:
         return self.against
+
+
+def prediction(fallback: str) -> RecoveryPrediction:
+    """Of the fake line, as an accepted model would have it; nobody computes with it."""
+    n, period_s = LINE.n, LINE.control.period_s
+    zeros = [[0.0] * n for _ in range(2 * n)]
+    node = RecoveryNode(speed_m_per_s=0.01, transition=[[0.0] * (2 * n) for _ in range(2 * n)], inputs=[zeros, zeros])
+    return RecoveryPrediction(
+        fallback=fallback, period_s=period_s, horizon_s=0.6, margin_n=6.0, model=FIRST.feedforward,
+        coulomb_nm=[0.0] * n, nodes=[node],
+    )  # fmt: skip
 
 
 def hash_of(one: Proposal) -> str:

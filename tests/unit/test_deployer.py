@@ -304,6 +304,64 @@ async def test_bytes_that_are_no_proposal_are_refused_and_on_record():
     assert gateway.audit.records[-1][0] == "malformed-proposal"
 
 
+@run
+async def test_what_has_not_shown_enough_stays_on_probation_and_says_so():
+    gateway, one = await deployed()
+    gateway.surroundings.hidden = "the line has not stood for 5 s in a row"
+    await gateway.pass_time(3 * PROBATION_S)
+    assert gateway.stage(one) is Stage.PROBATION and gateway.loop.lease_end_s is not None
+    assert "has not stood" in gateway.deployer.shown(hash_of(one)).why
+    gateway.surroundings.hidden = ""
+    await gateway.pass_time(1.0)
+    assert gateway.stage(one) is Stage.KEPT
+
+
+@run
+async def test_without_a_model_nothing_is_watched_with_one_the_fallback_is():
+    gateway, _ = await deployed()
+    await gateway.pass_time(PROBATION_S + 1.0)
+    assert gateway.loop.watches == [("deploy", None), ("keep", None)]
+    # A model is accepted: what runs is looked after, once; then a change by its fallback, and by itself when kept.
+    gateway.loop.watches.clear()
+    gateway.deployer.book.model = "7" * 64
+    await gateway.pass_time(2.0)
+    assert [(what, watch.fallback) for what, watch in gateway.loop.watches] == [("watch-good", gateway.loop.good)]
+    before = gateway.loop.good
+    gateway.loop.watches.clear()
+    two = proposal(2, before, gateway.loop.now_s)
+    await gateway.propose(two)
+    assert (await gateway.decide(two)).ok
+    await gateway.pass_time(PROBATION_S + 1.0)
+    fallbacks = [(what, watch.fallback) for what, watch in gateway.loop.watches]
+    assert fallbacks == [("deploy", before), ("keep", config_hash(controller(2)))]
+
+
+@run
+async def test_what_cannot_be_watched_is_not_deployed_and_not_kept():
+    gateway = await started()
+    one = proposal(1, config_hash(FIRST), 0.0)
+    await gateway.propose(one)
+    gateway.surroundings.unknown = "the model in service is damaged"
+    reply = await gateway.decide(one)
+    assert not reply.ok and "damaged" in reply.reasons[0] and gateway.loop.epoch == 0
+    gateway.surroundings.unknown = ""
+    await gateway.deployer.watch()
+    assert (await gateway.decide(one)).ok
+    gateway.surroundings.unknown = "the model in service is damaged"
+    await gateway.pass_time(PROBATION_S + 1.0)
+    assert gateway.stage(one) is Stage.ROLLED_BACK and gateway.loop.runs == config_hash(FIRST)
+    assert "could not be kept: the model in service is damaged" in gateway.deployer.book.entries[hash_of(one)].why
+
+
+@run
+async def test_a_loop_that_was_started_with_something_else_is_asked_again():
+    gateway = await started()
+    gateway.loop.runs = gateway.loop.good = config_hash(controller(5))
+    gateway.deployer.look_again()
+    await gateway.deployer.watch()
+    assert gateway.deployer.book.in_service == config_hash(controller(5))
+
+
 class LifeCycle(RuleBasedStateMachine):
     """Any order of everything, and death between any two effects."""
 
