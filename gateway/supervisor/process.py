@@ -10,11 +10,13 @@ import time
 from pathlib import Path
 
 from gateway.core.line import Line
+from gateway.core.recording import Recording
 from gateway.core.topics import LOOP_COMMAND
 from gateway.mailbox.listener import AlreadyRunning, CannotListen, PathTooLong
 from gateway.mailbox.paths import GATEWAY_SOCKET, LOOP_SOCKET
 from gateway.mailbox.unix import UnixMailbox
 from gateway.supervisor.configurations import Configurations
+from gateway.supervisor.experiments_kept import experiments_kept
 from gateway.supervisor.gate import Gate
 from gateway.supervisor.historian import Historian
 from gateway.supervisor.judging import JudgeWorkers
@@ -49,8 +51,12 @@ async def _serve(line: Line, run_folder: Path, data_folder: Path) -> int:
     gateway = Gateway(line, mailbox, historian, mailbox.counters)
     judge = JudgeWorkers(line)
 
+    def experiments(most_s: float) -> list[tuple[Recording, float]]:
+        now_s = time.time()
+        return experiments_kept(historian.path, now_s - most_s, now_s)
+
     def around(configurations: Configurations, models: Models) -> LineSurroundings:
-        return LineSurroundings(line, gateway.newest, gateway.recent, historian.path, configurations, models, time.time)
+        return LineSurroundings(line, gateway.newest, gateway.recent, experiments, configurations, models, time.time)
 
     # First the socket, whose lock makes this the only instance; only then is the history touched.
     await mailbox.listen(run_folder / GATEWAY_SOCKET)

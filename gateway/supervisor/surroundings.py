@@ -2,7 +2,6 @@
 
 import asyncio
 from collections.abc import Callable
-from pathlib import Path
 
 from gateway.core.controller import Controller
 from gateway.core.differences import of_controllers, of_experiment, of_models
@@ -16,16 +15,11 @@ from gateway.core.states import LoopState
 from gateway.core.telemetry import Frame
 from gateway.supervisor.configurations import STABLE, Configurations, ConfigurationsError
 from gateway.supervisor.deployer import iso
-from gateway.supervisor.history import History, HistoryError
-from gateway.supervisor.history_recording import recording_between
 from gateway.supervisor.lifecycle import Book, Stage
 from gateway.supervisor.model_store import ModelsError
 from gateway.supervisor.models import Models
 from gateway.supervisor.recent import Recent
 from safety.probation import Standing, against
-
-MOST_EXPERIMENTS = 4  #: the newest, on which the model must hold
-ENDS = ("experiment-end", "experiment-abort")
 
 
 class NotKnown(Exception):
@@ -33,14 +27,14 @@ class NotKnown(Exception):
 
 
 class LineSurroundings:
-    """Of a gateway: its telemetry, history and stores."""
+    """Of a gateway: its telemetry, the experiments in its history, and its stores."""
 
     def __init__(
         self,
         line: Line,
         newest: Callable[[], Frame | None],
         recent: Recent,
-        history: Path,
+        experiments: Callable[[float], list[tuple[Recording, float]]],
         configurations: Configurations,
         models: Models,
         wall_clock: Callable[[], float],
@@ -48,7 +42,7 @@ class LineSurroundings:
         self._line = line
         self._newest = newest
         self._recent = recent
-        self._history = history
+        self._experiments = experiments  #: of so many seconds, the newest first; it may block
         self._configurations = configurations
         self._models = models
         self._wall_clock = wall_clock
@@ -57,7 +51,7 @@ class LineSurroundings:
     async def context(self, book: Book) -> tuple[JudgeContext, list[Recording]]:
         """Raises NotKnown."""
         now_s = self._wall_clock()
-        found = await asyncio.to_thread(self._experiments, now_s)
+        found = await asyncio.to_thread(self._experiments, self._line.gate.data_max_age_s)
         return JudgeContext(
             format=1,
             now=iso(now_s),
@@ -133,25 +127,3 @@ class LineSurroundings:
         if model is None:
             raise NotKnown(f"the model in service, {book.model[:12]}, is damaged in the repository")
         return model
-
-    def _experiments(self, now_s: float) -> list[tuple[Recording, float]]:
-        """The newest first, with the Unix time of their ends. In a thread: it reads from the disk."""
-        begin_s = now_s - self._line.gate.data_max_age_s
-        found: list[tuple[Recording, float]] = []
-        try:
-            with History(self._history) as history:
-                ends = [event for event in history.events(begin_s, now_s + 1.0) if event.kind in ENDS]
-        except HistoryError:
-            return []
-        for event in reversed(ends):
-            first_s, last_s = event.data.get("begin_s"), event.data.get("end_s")
-            if not isinstance(first_s, float) or not isinstance(last_s, float):
-                continue
-            ahead_s = event.wall_s - event.time_s
-            try:
-                found.append((recording_between(self._history, first_s + ahead_s, last_s + ahead_s), last_s + ahead_s))
-            except HistoryError:
-                continue  # too short, or damaged: others may do
-            if len(found) == MOST_EXPERIMENTS:
-                break
-        return found
