@@ -14,13 +14,14 @@ from gateway.cli.rehearse_designs import Design, offered
 from gateway.cli.rehearse_result import AdaptationResult, Found
 from gateway.cli.stepped import CommandRefused, SteppedLoop
 from gateway.cli.stepped_experiment import run_experiment
+from gateway.commissioning.belief import believing
 from gateway.control.design import DesignRefused, DesignTask, design_lqi, design_mpc, task_of, task_on
 from gateway.core.controller import Controller
 from gateway.core.experiment import Experiment, ExperimentRefused
-from gateway.core.line import Line, Parameter
+from gateway.core.line import Line
 from gateway.core.recording import Recording
 from gateway.core.scenario import Scenario
-from gateway.core.theta import Noise, Theta
+from gateway.core.theta import Noise
 from gateway.identification.experiment_design import design_experiment
 from gateway.identification.identify import Identified, NotIdentified, identify
 from sim_plant.plant import Plant
@@ -28,7 +29,6 @@ from sim_plant.plant import Plant
 AT_EACH_SPEED_S = 5.0  #: of data, at most
 SETTLE_S = 0.5  #: that the line runs before an experiment
 LEFT_OPEN = 0.05  #: of a value that was found: what data leave open, and what drifts until the next experiment
-OF_A_ROLLER = ("radius_m", "inertia_kg_m2", "friction_nms_per_rad")
 SEEDS_APART = 1000  #: the noise of an experiment is that of no scenario
 IN_SERVICE = "lqi"  #: of a round's designs, the one under which the next round's experiment runs
 
@@ -97,7 +97,7 @@ def adapt(
                 [(design, task) for design in designs],
             )
         )
-        in_service, believed = _next_in_service(designs, task, in_service), _believing(line, estimate.theta)
+        in_service, believed = _next_in_service(designs, task, in_service), believing(line, estimate.theta, LEFT_OPEN)
     return found
 
 
@@ -114,22 +114,6 @@ def _next_in_service(designs: Sequence[Design], task: DesignTask, before: Contro
             except DesignRefused:
                 break
     return before
-
-
-def _believing(line: Line, theta: Theta) -> Line:
-    """The line with what was found in place of its file's values, and `LEFT_OPEN` either way in place of tolerances."""
-    web = theta.web
-    each = {name: [_known(value) for value in getattr(web, name).tolist()] for name in (*OF_A_ROLLER, "length_m")}
-    rollers = [
-        roller.model_copy(update={name: each[name][i] for name in OF_A_ROLLER}) for i, roller in enumerate(line.rollers)
-    ]
-    spans = [span.model_copy(update={"length_m": each["length_m"][i]}) for i, span in enumerate(line.spans)]
-    known = line.web.model_copy(update={"stiffness_n": _known(web.stiffness_n)})
-    return line.model_copy(update={"web": known, "rollers": rollers, "spans": spans})
-
-
-def _known(value: float) -> Parameter:
-    return Parameter(value=value, tolerance=LEFT_OPEN)
 
 
 def _experiment(believed: Line, config: Controller, scenario: Scenario, seed: int) -> Experiment:

@@ -13,7 +13,7 @@ from gateway.cli.timed_law import TimedLaw
 from gateway.control.laws import make_law, untimed
 from gateway.core.controller import Controller
 from gateway.core.line import Line, Recipe
-from gateway.core.messages import Arm, Command, Reply
+from gateway.core.messages import Arm, Command, Event, Reply
 from gateway.core.metrics import RunMetrics, run_metrics
 from gateway.core.scenario import Scenario
 from gateway.core.signals import FloatArray
@@ -47,6 +47,7 @@ class SteppedLoop:
     transitions: list[tuple[float, Phase, str]] = field(default_factory=list[tuple[float, Phase, str]])
     alarms: list[tuple[float, Finding]] = field(default_factory=list[tuple[float, Finding]])
     told: list[tuple[str, str]] = field(default_factory=list[tuple[str, str]])  #: kind and text
+    events: list[Event] = field(default_factory=list[Event])  #: the same with their data
 
     def __post_init__(self) -> None:
         self.now_s = 0.0
@@ -107,6 +108,7 @@ class SteppedLoop:
 
     def _tell(self, kind: str, text: str, **data: object) -> None:
         self.told.append((kind, text))
+        self.events.append(Event(time_s=self.now_s, kind=kind, text=text, data=data))
 
     def _announce(self, before: Machine, after: Machine, findings: list[Finding]) -> None:
         if after.phase is before.phase:

@@ -9,6 +9,7 @@ from gateway.core.line_model import LineModel, theta_of
 from gateway.core.line_model_quantities import interval_at
 from gateway.core.scenario import Scenario
 from gateway.core.signals import FloatArray
+from gateway.core.theta import Theta
 from gateway.core.web_model import WebModel
 
 #: Intervals cover what the data leave open, not what the model's structure leaves out or what drifts until the next
@@ -16,6 +17,7 @@ from gateway.core.web_model import WebModel
 #: so that they spread by 5 %, as the corners do for which the gate accepts the good designs of an identified plant.
 LEAST_SPREAD = 0.025
 LEAST_FACTOR = 0.05  #: of a value whose interval reaches 0 or below
+OF_A_ROLLER = ("radius_m", "inertia_kg_m2", "friction_nms_per_rad")
 SLACK_N, SLACK_M_PER_S = 0.5, 1e-3  #: within which a scenario is no further than the data
 
 Draw = Callable[[np.random.Generator], WebModel]
@@ -83,6 +85,22 @@ def _ends(model: LineModel, name: str, otherwise: Sequence[Parameter]) -> tuple[
         ends.append((max(LEAST_FACTOR, min(low, 1.0 - LEAST_SPREAD)), max(high, 1.0 + LEAST_SPREAD)))
     lows, highs = np.array(ends).T
     return lows, highs
+
+
+def believing(line: Line, theta: Theta, left_open: float) -> Line:
+    """The line with what was found in place of its file's values, and `left_open` in place of every tolerance."""
+    web = theta.web
+
+    def known(value: float) -> Parameter:
+        return Parameter(value=value, tolerance=left_open)
+
+    each = {name: [known(value) for value in getattr(web, name).tolist()] for name in (*OF_A_ROLLER, "length_m")}
+    rollers = [
+        roller.model_copy(update={name: each[name][i] for name in OF_A_ROLLER}) for i, roller in enumerate(line.rollers)
+    ]
+    spans = [span.model_copy(update={"length_m": each["length_m"][i]}) for i, span in enumerate(line.spans)]
+    material = line.web.model_copy(update={"stiffness_n": known(web.stiffness_n)})
+    return line.model_copy(update={"web": material, "rollers": rollers, "spans": spans})
 
 
 def words_on(model: LineModel, name: str, scenarios: Sequence[Scenario]) -> list[str]:

@@ -26,7 +26,7 @@ from gateway.core.states import LoopState, Phase
 from gateway.loop import machine as machines
 from gateway.loop.cycle import Cycle
 from gateway.loop.deploy import configure
-from gateway.loop.judged import least, require_judged, unjudged
+from gateway.loop.judged import least, on_probation, require_judged, unjudged
 from gateway.loop.machine import STANDSTILL_M_PER_S
 from gateway.loop.refused import Refused
 
@@ -299,7 +299,9 @@ def _run_experiment(cycle: Cycle, command: RunExperiment) -> str:
     if cycle.machine.phase is not Phase.RUNNING:
         raise Refused(f"an experiment needs a running line, this one is {cycle.machine.phase.name.lower()}")
     reasons = cycle.experiments.why_not(experiment, cycle.line, judged=command.proposal is not None)
-    reasons += unjudged(cycle, experiment)
+    reasons += on_probation(cycle)
+    if command.proposal is None:
+        reasons += unjudged(cycle, experiment)
     if doubts := in_words(int(cycle.watch.doubts)):
         reasons.append(f"the loop doubts what it measures: {', '.join(doubts)}")
     if reasons:

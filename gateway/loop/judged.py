@@ -21,12 +21,13 @@ def require_judged(cycle: Cycle, speed_m_per_s: float) -> None:
 
 
 def unjudged(cycle: Cycle, experiment: Experiment) -> list[str]:
-    """What of it the configuration in service has not been judged for."""
-    configurations = cycle.configurations
-    probation, region = configurations.probation, configurations.running.region
+    """What of it the configuration in service has not been judged for.
+
+    Asked of an experiment that has no verdict of its own. One that has was simulated at its own speeds and steps with
+    the configuration in service: it is how a line comes to data beyond what was judged before.
+    """
+    region = cycle.configurations.running.region
     reasons: list[str] = []
-    if probation is not None and probation.shaped_first:
-        reasons.append(f"epoch {configurations.epoch} is on probation, and set-points move shaped only")
     step_n = experiment.step_max_n if experiment.rate_n_per_s is None else 0.0
     if region.tension_step_max_n is not None and step_n > region.tension_step_max_n * (1.0 + 1e-9):
         reasons.append(
@@ -39,3 +40,11 @@ def unjudged(cycle: Cycle, experiment: Experiment) -> list[str]:
             f"a leg runs at {fastest:g} m/s; the configuration was judged for {region.speed_max_m_per_s:g} m/s"
         )
     return reasons
+
+
+def on_probation(cycle: Cycle) -> list[str]:
+    """Why no experiment may move set-points: what controls the line is under watch."""
+    probation = cycle.configurations.probation
+    if probation is None or not probation.shaped_first:
+        return []
+    return [f"epoch {cycle.configurations.epoch} is on probation, and set-points move shaped only"]

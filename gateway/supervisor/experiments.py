@@ -6,6 +6,7 @@ from gateway.core.recording import Recording
 from gateway.supervisor.history import History, HistoryError, StoredEvent
 from gateway.supervisor.history_recording import recording_between
 
+MOST_EXPERIMENTS = 4  #: the newest, by which proposals are judged
 ENDS = ("experiment-end", "experiment-abort")  #: kinds of events
 
 

@@ -12,14 +12,17 @@ from pathlib import Path
 from typing import Protocol
 
 from gateway.core.line import Line
+from gateway.core.recording import Recording
 from gateway.core.topics import LOOP_COMMAND
 from gateway.mailbox.listener import AlreadyRunning, CannotListen, PathTooLong
 from gateway.mailbox.paths import GATEWAY_SOCKET, LOOP_SOCKET
 from gateway.mailbox.unix import UnixMailbox
 from gateway.supervisor.configurations import Configurations
 from gateway.supervisor.deployer_sides import JudgeSide
+from gateway.supervisor.experiments import MOST_EXPERIMENTS, newest_experiments
 from gateway.supervisor.gate import Gate
 from gateway.supervisor.historian import Historian
+from gateway.supervisor.history import HistoryError
 from gateway.supervisor.judging import JudgeWorkers
 from gateway.supervisor.models import Models
 from gateway.supervisor.retention import retention_of
@@ -71,10 +74,15 @@ async def serve(
     )  # fmt: skip
     gateway = Gateway(line, mailbox, historian, mailbox.counters, clock, wall_clock)
 
+    def experiments(most_s: float) -> list[tuple[Recording, float]]:
+        now_s = wall_clock()
+        try:
+            return newest_experiments(historian.path, now_s - most_s, now_s + 1.0, MOST_EXPERIMENTS)
+        except HistoryError:
+            return []  # there is no history yet
+
     def around(configurations: Configurations, models: Models) -> LineSurroundings:
-        return LineSurroundings(
-            line, gateway.newest, gateway.recent, historian.path, configurations, models, wall_clock
-        )
+        return LineSurroundings(line, gateway.newest, gateway.recent, experiments, configurations, models, wall_clock)
 
     # First the socket, whose lock makes this the only instance; only then is the history touched.
     await mailbox.listen(run_folder / GATEWAY_SOCKET)

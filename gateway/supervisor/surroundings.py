@@ -2,7 +2,6 @@
 
 import asyncio
 from collections.abc import Callable
-from pathlib import Path
 
 from gateway.core.controller import Controller
 from gateway.core.deployment import RecoveryPrediction, Region
@@ -18,29 +17,26 @@ from gateway.core.telemetry import Frame
 from gateway.supervisor.configurations import STABLE, Configurations, ConfigurationsError
 from gateway.supervisor.deployer import iso
 from gateway.supervisor.deployer_sides import NotKnown
-from gateway.supervisor.experiments import newest_experiments
-from gateway.supervisor.history import HistoryError
 from gateway.supervisor.lifecycle import Book, Stage
 from gateway.supervisor.model_store import ModelsError
 from gateway.supervisor.models import Models
 from gateway.supervisor.recent import SETTLE_S, WINDOW_S, Recent
 from safety.probation import Standing, against
 
-MOST_EXPERIMENTS = 4  #: the newest, on which the model must hold
 LEAST_STANDING_S = SETTLE_S + WINDOW_S
 PATIENCE_S, LOOK_S = LEAST_STANDING_S + 1.0, 0.1
 NODES = (0.1, 0.5, 1.0)  #: of the fastest speed: where recovery is predicted
 
 
 class LineSurroundings:
-    """Of a gateway: its telemetry, history and stores."""
+    """Of a gateway: its telemetry, the experiments in its history, and its stores."""
 
     def __init__(
         self,
         line: Line,
         newest: Callable[[], Frame | None],
         recent: Recent,
-        history: Path,
+        experiments: Callable[[float], list[tuple[Recording, float]]],
         configurations: Configurations,
         models: Models,
         wall_clock: Callable[[], float],
@@ -48,7 +44,7 @@ class LineSurroundings:
         self._line = line
         self._newest = newest
         self._recent = recent
-        self._history = history
+        self._experiments = experiments  #: of so many seconds, the newest first; it may block
         self._configurations = configurations
         self._models = models
         self._wall_clock = wall_clock
@@ -59,7 +55,7 @@ class LineSurroundings:
         """Of a line that runs once it stands, or in some seconds as it is then. Raises NotKnown."""
         await self._stands()
         now_s = self._wall_clock()
-        found = await asyncio.to_thread(self._experiments, now_s)
+        found = await asyncio.to_thread(self._experiments, self._line.gate.data_max_age_s)
         return JudgeContext(
             format=1,
             now=iso(now_s),
@@ -161,14 +157,6 @@ class LineSurroundings:
         if model is None:
             raise NotKnown(f"the model in service, {book.model[:12]}, is damaged in the repository")
         return model
-
-    def _experiments(self, now_s: float) -> list[tuple[Recording, float]]:
-        """The newest first, with the Unix time of their ends. In a thread: it reads from the disk."""
-        begin_s = now_s - self._line.gate.data_max_age_s
-        try:
-            return newest_experiments(self._history, begin_s, now_s + 1.0, MOST_EXPERIMENTS)
-        except HistoryError:
-            return []
 
 
 def _prediction(model: LineModel, fallback: Controller, line: Line, region: Region) -> RecoveryPrediction:

@@ -11,6 +11,7 @@ from gateway.control.design import design_lqg, design_lqi, design_lqr, design_pi
 from gateway.core.controller import config_hash
 from gateway.core.deployment import Deployment, Region
 from gateway.core.doubts import Doubt
+from gateway.core.experiment import Abort, Experiment, Leg
 from gateway.core.messages import (
     AskConfiguration,
     Deploy,
@@ -18,6 +19,7 @@ from gateway.core.messages import (
     Keep,
     Renew,
     Rollback,
+    RunExperiment,
     SelectRecipe,
     SetSpeed,
     SetTension,
@@ -230,6 +232,24 @@ def test_what_was_not_judged_is_refused_with_what_lifts_it():
     assert "allowed: 3 N" in loop.command(SetTension(span=1, tension_n=34.0, step=True)).text
     assert loop.command(SetTension(span=1, tension_n=30.0, step=True)).ok
     assert "allowed: 0.01 m/s" in loop.command(SetSpeed(speed_m_per_s=0.02, step=True)).text
+
+
+def test_an_experiment_with_a_verdict_of_its_own_may_leave_the_region_but_not_on_probation():
+    loop = producing()
+    faster = Experiment(
+        format=1, amplitude_n=[1.0] * LINE.n, dwell_s=0.1, legs=[Leg(duration_s=1.0, speed_m_per_s=0.08)],
+        abort=Abort(deviation_n=10.0),
+    )  # fmt: skip
+    judged, unjudged = RunExperiment(experiment=faster, proposal="a" * 64), RunExperiment(experiment=faster)
+    assert loop.command(deployment(region=Region(speed_max_m_per_s=0.06), lease_s=60.0)).ok
+    assert "on probation" in loop.command(judged).reasons[0]
+    assert loop.command(Keep(epoch=1)).ok
+    assert "0.06 m/s" in loop.command(unjudged).reasons[0]
+    assert loop.command(judged).ok
+    loop.step(100)
+    assert loop.truth.world.unwind_speed_m_per_s == pytest.approx(0.08)
+    loop.step(200)
+    assert loop.truth.world.unwind_speed_m_per_s == pytest.approx(0.05)
 
 
 def test_on_probation_set_points_move_along_curves_and_afterwards_on_ramps_again():

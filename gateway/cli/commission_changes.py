@@ -1,0 +1,107 @@
+"""What the commissioning chain's steps bring, made from the line as it is now: configurations, experiments, models."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import datetime
+
+from gateway.cli.identify_model import model_of_found
+from gateway.commissioning.candidates import FIRST_LAWS, Law, NotOffered, configuration, experiment
+from gateway.commissioning.chain import AS_IT_IS, Next, Step
+from gateway.commissioning.redesign import redesigns
+from gateway.core.controller import Controller
+from gateway.core.deployment import Region
+from gateway.core.line import Line
+from gateway.core.line_model import LineModel, ModelRefused, model_hash
+from gateway.core.proposal import Change, ExperimentChange, GainsChange, ModelChange
+from gateway.core.recording import Recording
+from gateway.core.theta import Noise
+from gateway.identification.identify import NotIdentified, identify
+
+MOST_REASON = 1000  #: letters
+
+
+@dataclass(frozen=True)
+class LineNow:
+    """What a proposal is made from."""
+
+    in_service: Controller
+    model: LineModel | None  #: accepted; None: the line's file
+    tension_n: Sequence[float]  #: set-points
+    speed_m_per_s: float  #: the same
+    at: datetime
+
+
+def first_speed_m_per_s(line: Line) -> float:
+    """Up to which a first configuration is judged."""
+    return min(line.gate.first_speed_max_m_per_s, line.limits.speed_max_m_per_s)
+
+
+class Changes:
+    """Of a line."""
+
+    def __init__(self, line: Line) -> None:
+        self.line = line
+        self._designed: tuple[LineNow, list[tuple[Law, Controller]]] | None = None  #: and what it was designed from
+
+    def made(
+        self, step: Next, now: LineNow, recordings: Sequence[Recording], region: Region | None
+    ) -> tuple[Change, str]:
+        """The change, and the reason for it. `recordings`: the newest first. Raises NotOffered."""
+        match step.step:
+            case Step.FIRST:
+                return self._first(step)
+            case Step.EXPERIMENT:
+                return self._experiment(step, now, region)
+            case Step.MODEL:
+                return self._model(step, now, recordings)
+            case Step.REDESIGN:
+                return self._redesign(step, now)
+
+    def _first(self, step: Next) -> tuple[Change, str]:
+        law = FIRST_LAWS[step.rung]
+        controller = configuration(self.line, None, first_speed_m_per_s(self.line), law)
+        return GainsChange(controller=controller), f"{law.text} on the line's file, to begin with"
+
+    def _experiment(self, step: Next, now: LineNow, region: Region | None) -> tuple[Change, str]:
+        """Before there is a model within the region of the configuration in service, which is all that is known."""
+        asked = experiment(
+            self.line, now.model, now.in_service, region if now.model is None else None, now.tension_n,
+            now.speed_m_per_s, step.speeds_m_per_s, step.size, seed=step.number,
+        )  # fmt: skip
+        speeds = " and ".join(f"{speed:.3g}" for speed in step.speeds_m_per_s)
+        moves = f"set-points move by {max(asked.amplitude_n):g} N for {asked.duration_s:g} s"
+        return ExperimentChange(experiment=asked), f"to identify the line at {speeds} m/s: {moves}"
+
+    def _model(self, step: Next, now: LineNow, recordings: Sequence[Recording]) -> tuple[Change, str]:
+        """Of all experiments, or on the second rung of the newest alone."""
+        used = list(recordings if step.rung == 0 else recordings[:1])
+        if not used or (step.rung > 0 and len(recordings) == 1):
+            raise NotOffered("there is no other recording" if used else "there is no recording of an experiment")
+        try:
+            found = identify(used, self.line, Noise(), time.perf_counter)
+            parent = None if now.model is None else model_hash(now.model)
+            model = model_of_found(self.line, used, found, now.at.isoformat(timespec="milliseconds"), parent=parent)
+        except (NotIdentified, ModelRefused) as refused:
+            raise NotOffered("; ".join(refused.reasons)[:MOST_REASON]) from refused
+        which = "the last experiment" if len(used) == 1 else f"the last {len(used)} experiments"
+        speed = model.region.speed_to_m_per_s
+        return ModelChange(model=model), f"from {which}: {found.estimate.structure}, up to {speed:.3g} m/s"
+
+    def _redesign(self, step: Next, now: LineNow) -> tuple[Change, str]:
+        """On the accepted model; in the end the configuration in service, for what data have shown since."""
+        assert now.model is not None  # a redesign follows a model
+        on = f"on model {model_hash(now.model)[:12]}, whose data go up to {now.model.region.speed_to_m_per_s:.3g} m/s"
+        if step.rung == AS_IT_IS:
+            return GainsChange(controller=now.in_service), f"the configuration in service, {on}"
+        if self._designed is None or not _same(self._designed[0], now):
+            self._designed = now, redesigns(self.line, now.model, now.in_service, now.tension_n)
+        found = self._designed[1]
+        if step.rung >= len(found):
+            raise NotOffered(f"{len(found)} designs do no worse on the model than the configuration in service")
+        law, controller = found[step.rung]
+        return GainsChange(controller=controller), f"{law.text} {on}"
+
+
+def _same(one: LineNow, other: LineNow) -> bool:
+    return (one.in_service, one.model, list(one.tension_n)) == (other.in_service, other.model, list(other.tension_n))

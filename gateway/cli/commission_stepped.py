@@ -1,0 +1,207 @@
+"""The commissioning chain on a simulated line in stepped time, through a whole gate: audit, stores, judge, deployer.
+
+Everything is what a gateway has, but for the clock, which only this moves, and the judge, which is in this process.
+"""
+
+from collections.abc import Callable
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+
+from gateway.cli.commission import CannotGoOn
+from gateway.cli.commission_changes import LineNow
+from gateway.cli.stepped import SteppedLoop
+from gateway.core.audit_record import Who
+from gateway.core.controller import canonical as canonical_controller
+from gateway.core.decisions import Decide, ProposalShown
+from gateway.core.judge_context import JudgeContext
+from gateway.core.messages import Reply, parse_command
+from gateway.core.recording import Recording, recording_of
+from gateway.core.states import Phase
+from gateway.core.telemetry import Frame, frame_dtype, unpack
+from gateway.core.topics import LOOP_COMMAND
+from gateway.core.verdict import Verdict
+from gateway.mailbox.inprocess import Hub, InProcessMailbox
+from gateway.supervisor.configurations import Configurations
+from gateway.supervisor.deployer import Deployer
+from gateway.supervisor.experiments import ENDS, MOST_EXPERIMENTS
+from gateway.supervisor.gate import Gate
+from gateway.supervisor.judging import LARGEST_SEED
+from gateway.supervisor.lifecycle import Stage
+from gateway.supervisor.models import Models
+from gateway.supervisor.recent import Recent
+from gateway.supervisor.surroundings import LineSurroundings
+from safety.judge import failed, judge
+
+BEGIN = datetime(2026, 1, 5, 6, 0, tzinfo=UTC)  #: of the stepped clock
+LOOK_S = 0.5  #: from one look of the gate to the next
+READY_WITHIN_S = 300.0
+MOST_DECISIONS = 3  #: on one proposal, where carrying it out is refused for the moment
+ENGINEER, RULES = Who(name="engineer"), Who(name="rules")
+
+Approves = Callable[[ProposalShown], bool]
+
+
+def approve_all(shown: ProposalShown) -> bool:
+    """What the verdict has let through."""
+    return True
+
+
+class SteppedJudge:
+    """The judge in this process; each verdict has a seed of its own, drawn from one."""
+
+    def __init__(self, loop: SteppedLoop, seed: int) -> None:
+        self._line = loop.line
+        self._seeds = np.random.default_rng([seed, 11])
+
+    async def judge(self, payload: bytes, context: JudgeContext, recordings: list[Recording]) -> Verdict:
+        seed = int(self._seeds.integers(LARGEST_SEED))
+        try:
+            return judge(payload, context, self._line, recordings, seed)
+        except Exception as error:  # whatever it is, it is no yes
+            return failed(payload, context, self._line, seed, error)
+
+
+class SteppedGate:
+    """A gate over `loop`, which is in production, with its records in `folder`. `async with`; see GateSide."""
+
+    def __init__(self, loop: SteppedLoop, folder: Path, seed: int = 0, approves: Approves = approve_all) -> None:
+        self.loop = loop
+        self.line = loop.line
+        self._folder = folder
+        self._approves = approves
+        self._recent = Recent(self.line.n, self.line.control.period_s)
+        self._seen_frames = self._seen_events = 0
+        self._experiments: list[tuple[Recording, float]] = []
+        self._refused: dict[str, int] = {}
+        (folder / "controller.json").write_bytes(canonical_controller(loop.config))
+        hub = Hub()
+        self._mailboxes = InProcessMailbox(hub), InProcessMailbox(hub)
+        self._mailboxes[0].serve(LOOP_COMMAND, self._answer)
+        self._gate = Gate(
+            self.line, self._mailboxes[1], folder, SteppedJudge(loop, seed), self._around, _unnoted,
+            lambda: loop.now_s, self._wall_s,
+        )  # fmt: skip
+
+    async def __aenter__(self) -> "SteppedGate":
+        await self._gate.look()
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await self._gate.close()
+        for mailbox in self._mailboxes:
+            await mailbox.close()
+
+    @property
+    def deployer(self) -> Deployer:
+        """Raises CannotGoOn where the gate is shut."""
+        if self._gate.deployer is None:
+            raise CannotGoOn(f"the gate is shut: see the audit in {self._folder}")
+        return self._gate.deployer
+
+    async def proposals(self) -> list[ProposalShown]:
+        found = [self.deployer.shown(hash_) for hash_ in self.deployer.book.entries]
+        return [one for one in found if isinstance(one, ProposalShown)]
+
+    async def now(self) -> LineNow:
+        book, setpoints = self.deployer.book, self.loop.cycle.setpoints
+        site, name = self.line.site, self.line.line
+        controller = self._configurations.find(book.in_service or "", site, name).controller
+        if controller is None:
+            raise CannotGoOn("the configuration in service is damaged in the store")
+        model = None if book.model is None else self._models.find(book.model, site, name).model
+        return LineNow(
+            controller, model, setpoints.tension_target_n.tolist(), setpoints.speed_target_m_per_s,
+            datetime.fromtimestamp(self._wall_s(), UTC),
+        )  # fmt: skip
+
+    async def recordings(self) -> list[Recording]:
+        return [one for one, _ in self._kept(self.line.gate.data_max_age_s)]
+
+    async def ready(self) -> None:
+        began_s = self.loop.now_s
+        while True:
+            book = self.deployer.book
+            changed_s = -np.inf if book.changed_s is None else book.changed_s
+            cool = self._wall_s() - changed_s >= self.line.gate.cool_down_s
+            if cool and book.on_the_line is None and self._recent.stands():
+                return
+            if self.loop.now_s - began_s > READY_WITHIN_S:
+                raise CannotGoOn(f"the line does not come to rest within {READY_WITHIN_S:g} s")
+            await self.pass_time(LOOK_S)
+
+    async def propose(self, payload: bytes) -> Reply:
+        reply = await self.deployer.propose(payload, RULES)
+        await self.deployer.judged()
+        return reply
+
+    async def wait_for(self, proposal: str) -> None:
+        shown = self.deployer.shown(proposal)
+        if isinstance(shown, str):
+            raise CannotGoOn(shown)
+        if shown.stage == Stage.RECEIVED:
+            await self.deployer.judged()
+        elif shown.stage == Stage.WAITING and shown.shown is not None:
+            await self._decide(shown, shown.shown)
+        else:
+            await self.pass_time(LOOK_S)
+
+    async def pass_time(self, seconds: float) -> None:
+        """The line runs on, with the gate looking at it. Raises CannotGoOn where it stops."""
+        period_s = self.line.control.period_s
+        for _ in range(max(1, round(seconds / LOOK_S))):
+            self.loop.step(round(LOOK_S / period_s))
+            for frame in self.loop.frames[self._seen_frames :]:
+                self._recent.take(frame)
+            self._seen_frames = len(self.loop.frames)
+            await self._hear()
+            await self._gate.look()
+        if self.loop.cycle.machine.phase is not Phase.RUNNING:
+            raise CannotGoOn(f"the line has stopped: {self.loop.cycle.machine.reason}")
+
+    async def _decide(self, shown: ProposalShown, hash_: str) -> None:
+        await self.ready()
+        tries = self._refused.get(shown.proposal_hash, 0)
+        approve = self._approves(shown) and tries < MOST_DECISIONS
+        decision = Decide(proposal=shown.proposal_hash, shown=hash_, approve=approve)
+        reply = await self.deployer.decide(decision, ENGINEER)
+        if not reply.ok:
+            self._refused[shown.proposal_hash] = tries + 1
+
+    async def _hear(self) -> None:
+        events = self.loop.events[self._seen_events :]
+        self._seen_events += len(events)
+        for event in events:
+            if event.kind in ENDS:
+                begin_s, end_s = event.data["begin_s"], event.data["end_s"]
+                if begin_s is not None:
+                    self._experiments.append((self._between(begin_s, end_s), BEGIN.timestamp() + end_s))
+                await self.deployer.experiment_ended(str(event.data["hash"]), str(event.data["reason"]))
+
+    def _between(self, begin_s: float, end_s: float) -> Recording:
+        period_s = self.line.control.period_s
+        first, last = round(begin_s / period_s), round(end_s / period_s)
+        frames = np.frombuffer(b"".join(self.loop.frames[first : last + 1]), frame_dtype(self.line.n))
+        return recording_of(frames, period_s, f"experiment on {self.loop.plant.name} at {begin_s:.1f} s")
+
+    def _kept(self, most_s: float) -> list[tuple[Recording, float]]:
+        least_s = self._wall_s() - most_s
+        return [one for one in reversed(self._experiments) if one[1] >= least_s][:MOST_EXPERIMENTS]
+
+    def _around(self, configurations: Configurations, models: Models) -> LineSurroundings:
+        self._configurations, self._models = configurations, models
+        return LineSurroundings(self.line, self._newest, self._recent, self._kept, configurations, models, self._wall_s)
+
+    def _newest(self) -> Frame | None:
+        return unpack(self.loop.frames[-1]) if self.loop.frames else None
+
+    def _wall_s(self) -> float:
+        return BEGIN.timestamp() + self.loop.now_s
+
+    async def _answer(self, payload: bytes) -> bytes:
+        return self.loop.command(parse_command(payload)).model_dump_json().encode()
+
+
+def _unnoted(*_: object, **__: object) -> None:
+    """The audit has it."""

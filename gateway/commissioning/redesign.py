@@ -1,0 +1,125 @@
+"""Configurations on an accepted model, the one that promises most first, then calmer ones. Pure.
+
+A design is worth proposing where it does no worse on the model than the configuration in service, in any figure by
+which the gate compares the two (docs/gate.md, improvement): tracking error, overshoot and settling time in the gate's
+courses. Of those the tracking error decides. What holds on the model's corners is the gate's own to find: where it
+refuses one, the next of the ladder is a calmer one.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from gateway.commissioning.candidates import Law, NotOffered, configuration
+from gateway.control.judged_courses import Judged, improvement_courses
+from gateway.control.rollout import Course, Setup, plants_of_thetas, simulate
+from gateway.core.controller import Controller
+from gateway.core.line import Line
+from gateway.core.line_model import LineModel, noise_of, theta_of
+from gateway.core.signals import FloatArray
+from gateway.core.theta import Noise
+
+LAWS = (
+    *(
+        Law("lqi", (("torque_per_nm2", torque), ("integral_per_n2s2", integral)))
+        for torque in (0.5, 1.0, 2.0, 4.0)
+        for integral in (1.0, 0.3)
+    ),
+    *(
+        Law("lqg", (("torque_per_nm2", torque), ("disturbance_nm_per_sqrt_s", disturbance)))
+        for torque in (0.5, 1.0, 2.0)
+        for disturbance in (1.0, 2.0)
+    ),
+    Law("pid"),
+)
+RUNGS = 4  #: of all that are worth it: the best, and others at even distances down to the calmest
+OF_TOLERANCE = 0.9  #: that is used of what the gate lets a figure be worse: it meets another noise
+LONGEST_STEP_S = 0.005  #: of the integration
+QUIET = Noise(0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Figures:
+    """Of one course on the model."""
+
+    rmse_n: float
+    overshoot_pct: float
+    settling_s: float
+
+
+def redesigns(
+    line: Line, model: LineModel, in_service: Controller, tension_n: Sequence[float]
+) -> list[tuple[Law, Controller]]:
+    """At most `RUNGS`, for speeds up to those of the model's data and steps as the line's file permits."""
+    speed = min(model.region.speed_to_m_per_s, line.limits.speed_max_m_per_s)
+    limits = line.limits
+    judged = Judged(
+        line, np.array(tension_n), speed, limits.tension_step_max_n, min(limits.speed_step_max_m_per_s, speed)
+    )
+    before = predicted(in_service, line, model, judged)
+    found: list[tuple[float, Law, Controller]] = []
+    for law in LAWS:
+        try:
+            config = configuration(line, model, speed, law)
+        except NotOffered:
+            continue
+        figures = predicted(config, line, model, judged)
+        if all(_no_worse(line, figures[name], before[name]) for name in before):
+            found.append((sum(figures[name].rmse_n / max(before[name].rmse_n, 1e-9) for name in before), law, config))
+    found.sort(key=lambda each: each[0])
+    places = np.unique(np.round(np.linspace(0.0, len(found) - 1.0, RUNGS)).astype(int)).tolist() if found else []
+    return [found[place][1:] for place in places]
+
+
+def predicted(config: Controller, line: Line, model: LineModel, judged: Judged) -> dict[str, Figures]:
+    """On the model's mean: tracking error under its noise, overshoot and settling without."""
+    plants = plants_of_thetas([theta_of(model)])
+    noisy, quiet = _setup(line, noise_of(model) or Noise()), _setup(line, QUIET)
+    spans = [i for i, span in enumerate(line.spans) if span.control == "tension"]
+    found: dict[str, Figures] = {}
+    for name, course in improvement_courses(judged).items():
+        error = simulate(config, plants, course, noisy).squared_error_n2[0, spans]
+        still = simulate(config, plants, course, quiet)
+        found[name] = Figures(
+            rmse_n=float(np.sqrt(error.sum())),
+            overshoot_pct=float((100.0 * still.beyond_n[0, spans] / _scale(course)[spans]).max()),
+            settling_s=float(quiet.period_s * still.settled[0, spans].max()),
+        )
+    return found
+
+
+def _no_worse(line: Line, one: Figures, before: Figures) -> bool:
+    """As the gate compares them, but with a part of its tolerances. What is no number is worse."""
+    gate = line.gate
+    pairs = (
+        (one.rmse_n, before.rmse_n, gate.tolerance_n),
+        (one.overshoot_pct, before.overshoot_pct, gate.tolerance_overshoot_pct),
+        (one.settling_s, before.settling_s, gate.tolerance_settling_s),
+    )
+    return all(
+        value == reference or value <= reference + OF_TOLERANCE * max(gate.tolerance_share * reference, floor)
+        for value, reference, floor in pairs
+    )
+
+
+def _scale(course: Course) -> FloatArray:
+    """What an overshoot is a share of (n,): the step; the set-point where it does not step."""
+    settled: FloatArray = course.settled_at_n
+    step: FloatArray = np.abs(settled[0] - course.tension_n[0])
+    return np.where(step > 0.0, step, settled[0])
+
+
+def _setup(line: Line, noise: Noise) -> Setup:
+    """The line's loop; the latency is that of the plants."""
+    period_s, limits = line.control.period_s, line.limits
+    return Setup(
+        period_s=period_s,
+        latency_s=0.0,
+        substeps=max(1, int(np.ceil(period_s / LONGEST_STEP_S - 1e-9))),
+        torque_nm=limits.torque_nm,
+        torque_rate_nm_per_s=limits.torque_rate_nm_per_s,
+        tension_noise_n=noise.tension_n,
+        speed_noise_m_per_s=noise.speed_m_per_s,
+        acceleration_m_per_s1_5=noise.acceleration_m_per_s1_5,
+    )

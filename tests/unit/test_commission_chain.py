@@ -1,0 +1,217 @@
+"""The policy of the commissioning chain: whatever the gate says, it ends, and goes on after a restart."""
+
+from dataclasses import replace
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gateway.commissioning.candidates import (
+    FIRST_LAWS,
+    NotOffered,
+    configuration,
+    experiment,
+    fastest_m_per_s,
+)
+from gateway.commissioning.chain import (
+    LADDERS,
+    MOST_AGAIN,
+    MOST_EXPERIMENTS,
+    STRETCH,
+    Ended,
+    Next,
+    Outcome,
+    Past,
+    Pending,
+    Step,
+    named,
+    next_step,
+    past_of,
+    refused_at_once,
+)
+from gateway.commissioning.redesign import LAWS
+from gateway.control.design import design_lqi, is_stable, task_of
+from gateway.core.controller import config_hash
+from gateway.core.decisions import ProposalShown
+from gateway.core.deployment import Region
+from gateway.core.proposal import GainsChange, Proposal, proposal_hash
+from gateway.core.verdict import RuleFinding, Verdict
+from tests.unit.supervisor_support import line_of
+
+FIRST_M_PER_S, WANTED_M_PER_S = 0.02, 0.12
+KINDS = {Step.FIRST: "gains", Step.EXPERIMENT: "experiment", Step.MODEL: "model", Step.REDESIGN: "gains"}
+LINE = line_of(2)
+
+
+def asked(past):
+    return next_step(past, FIRST_M_PER_S, WANTED_M_PER_S)
+
+
+def after(step: Next, past, outcome=Outcome.DONE) -> Past:
+    """What the gate's list has of a proposal. A configuration is let through for what the last experiment has shown."""
+    shown = max((one.speed_m_per_s for one in past if one.kind == "experiment" and one.outcome is Outcome.DONE),
+                default=FIRST_M_PER_S)  # fmt: skip
+    speed = {Step.FIRST: FIRST_M_PER_S, Step.REDESIGN: shown, Step.EXPERIMENT: max(step.speeds_m_per_s, default=None)}
+    done = outcome is Outcome.DONE or step.step is Step.EXPERIMENT
+    return Past(KINDS[step.step], outcome, step.step, step.rung, "why", speed.get(step.step) if done else None, "p")
+
+
+def test_where_everything_gets_through_each_round_goes_faster_until_the_range_is_covered():
+    past: list[Past] = []
+    steps: list[Next] = []
+    while isinstance(step := asked(past), Next):
+        steps.append(step)
+        past.append(after(step, past))
+    assert isinstance(step, Ended) and step.reached
+    assert [one.step for one in steps] == [Step.FIRST, *3 * [Step.EXPERIMENT, Step.MODEL, Step.REDESIGN]]
+    tops = [max(one.speeds_m_per_s) for one in steps if one.step is Step.EXPERIMENT]
+    assert tops == pytest.approx([0.02, 0.06, 0.12])  # no faster than data have shown, times STRETCH
+    assert all(one.rung == 0 and one.size == 1.0 for one in steps)
+
+
+def test_what_is_refused_is_followed_by_the_next_candidate_and_by_the_reason_in_the_end():
+    past: list[Past] = []
+    for rung in range(LADDERS[Step.FIRST]):
+        step = asked(past)
+        assert step == Next(Step.FIRST, rung)
+        past.append(replace(after(step, past, Outcome.FAILED), why=f"corner {rung}"))
+    assert asked(past) == asked(past)
+    assert (
+        isinstance(asked(past), Ended)
+        and not asked(past).reached
+        and f"corner {LADDERS[Step.FIRST] - 1}" in asked(past).text
+    )
+
+
+def test_a_refused_experiment_is_smaller_then_slower():
+    past = [Past("gains", Outcome.DONE, Step.FIRST, 0, speed_m_per_s=0.02)]
+    first = asked(past)
+    past.append(after(first, past, Outcome.FAILED))
+    assert asked(past).size == 0.5 * first.size and asked(past).speeds_m_per_s == first.speeds_m_per_s
+    adapted = [
+        Past("gains", Outcome.DONE, Step.FIRST, 0, speed_m_per_s=0.02), Past("experiment", Outcome.DONE),
+        Past("model", Outcome.DONE), Past("gains", Outcome.DONE, Step.REDESIGN, 0, speed_m_per_s=0.02),
+    ]  # fmt: skip
+    tops = []
+    while isinstance(step := asked(adapted), Next):
+        tops.append((max(step.speeds_m_per_s), step.size))
+        adapted.append(after(step, adapted, Outcome.FAILED))
+    assert tops == [(0.06, 1.0), (0.06, 0.5), (pytest.approx(0.0346, rel=0.01), 1.0),
+                    (pytest.approx(0.0346, rel=0.01), 0.5)]  # fmt: skip
+
+
+def test_data_that_give_no_model_are_followed_by_a_larger_experiment_a_few_times():
+    past = [Past("gains", Outcome.DONE, Step.FIRST, 0, speed_m_per_s=0.02)]
+    sizes = []
+    while isinstance(step := asked(past), Next):
+        failed = step.step is Step.MODEL
+        sizes += [] if failed else [(step.size, step.number)]
+        past.append(after(step, past, Outcome.FAILED if failed else Outcome.DONE))
+    assert sizes == [(1.0, 0), (1.0, 1), (2.0, 2)] and len(sizes) == MOST_EXPERIMENTS and not step.reached
+
+
+def test_nothing_is_proposed_while_something_is_on_its_way_and_a_wrong_moment_costs_no_candidate():
+    assert asked([Past("gains", Outcome.OPEN, proposal="a" * 64)]) == Pending("a" * 64, "gains")
+    past = [Past("gains", Outcome.AGAIN, Step.FIRST, 0)]
+    assert asked(past) == Next(Step.FIRST, 0)
+    assert isinstance(asked(past * (MOST_AGAIN + 1)), Ended)
+
+
+def test_what_an_engineer_has_done_meanwhile_counts():
+    past = [Past("gains", Outcome.DONE, speed_m_per_s=0.02)]
+    assert asked(past).step is Step.EXPERIMENT
+    past += [Past("model", Outcome.DONE)]
+    assert asked(past).step is Step.REDESIGN
+    past += [Past("gains", Outcome.DONE, speed_m_per_s=0.12)]
+    assert asked(past).reached
+
+
+@given(
+    st.lists(st.sampled_from([Outcome.DONE, Outcome.DONE, Outcome.FAILED, Outcome.AGAIN]), min_size=600, max_size=600),
+    st.floats(0.2, 1.0),
+)
+def test_it_ends_whatever_the_gate_says(outcomes, share):
+    """`share` of the speed that an experiment has shown is what a configuration is then let through for."""
+    past: list[Past] = []
+    for outcome in outcomes:
+        step = asked(past)
+        if isinstance(step, Ended):
+            return
+        assert isinstance(step, Next) and step.rung < LADDERS[step.step]
+        reached = max((one.speed_m_per_s or 0.0 for one in past if one.kind == "gains"), default=FIRST_M_PER_S)
+        assert all(speed <= max(STRETCH * reached, FIRST_M_PER_S) * (1.0 + 1e-9) for speed in step.speeds_m_per_s)
+        one = after(step, past, outcome)
+        speed = None if one.speed_m_per_s is None else share * one.speed_m_per_s
+        past.append(replace(one, speed_m_per_s=speed) if one.kind == "gains" else one)
+    raise AssertionError(f"{len(past)} proposals, and no end")
+
+
+def shown(stage, rules=(), why=""):
+    """As the gate shows a proposal of the chain; `rules` are those that fail."""
+    config = design_lqi(task_of(LINE))
+    proposal = Proposal(
+        format=1, site=LINE.site, line=LINE.line, change=GainsChange(controller=config), base=config_hash(config),
+        model=None, reason="to begin with", evidence=[named(Step.FIRST, 2)], author="rules",
+        created="2026-01-05T06:00:00+00:00", expires="2026-01-05T07:00:00+00:00",
+    )  # fmt: skip
+    findings = [RuleFinding(rule=rule, passed=False, text="no") for rule in rules]
+    verdict = Verdict(
+        format=1, proposal=proposal_hash(proposal), payload="0" * 64, context="0" * 64, line="0" * 64, kind="gains",
+        seed=1, accepted=not rules, findings=findings or [RuleFinding(rule="decay", passed=True, text="yes")],
+        region=None if rules else Region(speed_max_m_per_s=0.02), judged=proposal.created, program_version="0",
+    )  # fmt: skip
+    return ProposalShown(
+        format=1, stage=stage, why=why, proposal_hash=proposal_hash(proposal), shown=None, epoch=0, difference=[],
+        proposal=proposal, verdict=verdict,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("stage", "rules", "why", "outcome"),
+    [
+        ("kept", (), "", Outcome.DONE),
+        ("done", (), "", Outcome.DONE),
+        ("done", (), "a torque was at a limit", Outcome.FAILED),
+        ("waiting", (), "", Outcome.OPEN),
+        ("probation", (), "", Outcome.OPEN),
+        ("refused", ("cool-down",), "", Outcome.AGAIN),
+        ("refused", ("cool-down", "corners: error"), "", Outcome.FAILED),
+        ("rejected", (), "by anna", Outcome.FAILED),
+        ("rolled-back", (), "tension 1 swings", Outcome.FAILED),
+        ("superseded", (), "", Outcome.AGAIN),
+    ],
+)
+def test_a_proposal_says_of_itself_where_in_the_chain_it_belongs(stage, rules, why, outcome):
+    found = past_of(shown(stage, rules, why))
+    assert (found.step, found.rung, found.outcome, found.why) == (Step.FIRST, 2, outcome, why)
+    assert found.speed_m_per_s == (None if rules else 0.02)
+
+
+def test_a_closed_line_is_told_at_once():
+    gate = LINE.gate.model_copy(update={"autonomy": "closed"})
+    assert "closed" in refused_at_once(LINE.model_copy(update={"gate": gate})) and refused_at_once(LINE) == ""
+
+
+@pytest.mark.parametrize("law", [*FIRST_LAWS, *LAWS], ids=lambda law: law.text)
+def test_every_candidate_holds_the_line_that_it_is_made_for(law):
+    assert is_stable(configuration(LINE, None, 0.02, law), task_of(LINE))
+
+
+def test_the_line_goes_as_fast_as_its_drives_hold():
+    most = fastest_m_per_s(LINE, None)
+    weak = LINE.model_copy(update={"limits": LINE.limits.model_copy(update={"torque_nm": 20.0})})
+    assert 0.0 < fastest_m_per_s(weak, None) < most <= LINE.limits.speed_max_m_per_s
+    roller = LINE.rollers[0]
+    omega_per_s = fastest_m_per_s(weak, None) / roller.radius_m.value
+    assert roller.friction_nms_per_rad.value * omega_per_s < 0.9 * 20.0
+
+
+def test_an_experiment_keeps_to_the_region_and_is_refused_where_it_cannot():
+    config = configuration(LINE, None, 0.02, FIRST_LAWS[0])
+    region = Region(speed_max_m_per_s=0.02, tension_step_max_n=2.0)
+    given = (LINE, None, config, region, LINE.recipes[0].tension_n, 0.01)
+    found = experiment(*given, [0.01, 0.02], size=8.0)
+    assert found.step_max_n == 2.0 and [leg.speed_m_per_s for leg in found.legs] == [0.01, 0.02]
+    assert found.abort.deviation_n > max(found.amplitude_n)
+    with pytest.raises(NotOffered, match="allowed"):
+        experiment(*given, [0.01, 2.0 * LINE.limits.speed_max_m_per_s])
