@@ -80,7 +80,8 @@ def _performances(case: Case) -> dict[Whose, Performance]:
     context = case.context
     found: dict[Whose, Performance] = {"in service": performance(context.in_service, case)}
     if context.baseline is not None:
-        found["baseline"] = performance(context.baseline, case)
+        same = context.baseline == context.in_service
+        found["baseline"] = found["in service"] if same else performance(context.baseline, case)
     found["proposed"] = performance(case.controller, case)
     return found
 

@@ -1,14 +1,19 @@
 """How well a model predicts the excited parts of recordings, one sample ahead."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
 
 import numpy as np
 
-from gateway.control.prediction import Predicted, predict, stretch_of
+from gateway.control.prediction import Predicted, Stretch, predict, stretch_of
+from gateway.core.line_model import LineModel, model_hash, theta_of
 from gateway.core.signals import FloatArray
 from gateway.core.theta import Noise, Theta
-from safety.excitation import Excited, same_speed
+from safety.case import Case
+from safety.excitation import MOST_S, Excited, newest, same_speed
+
+KEPT = 12  #: parts of predictions, of a megabyte each
 
 
 @dataclass(frozen=True)
@@ -26,6 +31,38 @@ def foretold(theta: Theta, noise: Noise, parts: Sequence[Excited]) -> list[Foret
         both = [predict(theta, noise, stretch_of(part.recording, way)) for way in ("linear", "held")]
         found.append(Foretold(part, max(both, key=lambda one: float(one.log_likelihood.sum()))))
     return found
+
+
+def foretold_of(case: Case, model: LineModel, noise: Noise, most_s: float = MOST_S) -> list[Foretold]:
+    """The newest excited parts of the case by a model with its noise. Raises Unpredictable.
+
+    Several rules ask for it, and one proposal after another about the same model and data: it is kept.
+    """
+    theta, whose = theta_of(model), model_hash(model)
+    return [
+        _kept(_Asked((whose, part.recording.digest()), theta, noise, part)) for part in newest(case.excited, most_s)
+    ]
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """Equal where model and numbers are."""
+
+    key: tuple[str, str]
+    theta: Theta = field(compare=False)
+    noise: Noise = field(compare=False)
+    part: Excited = field(compare=False)
+
+
+@lru_cache(maxsize=KEPT)
+def _kept(asked: _Asked) -> Foretold:
+    return foretold(asked.theta, asked.noise, [asked.part])[0]
+
+
+def with_swings(predicted: Predicted) -> Stretch:
+    """Its stretch, with the rollers as far out of round as was learned by its end."""
+    swung = predicted.swung
+    return predicted.stretch if swung is None else replace(predicted.stretch, swing=swung.before[-1])
 
 
 def normalised(found: Sequence[Foretold]) -> float:

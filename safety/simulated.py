@@ -37,13 +37,13 @@ def plants_under_stress(thetas: Sequence[Theta], gate: Gate, seed: int) -> Plant
     return plants_of_thetas([stressed(theta, gate) for theta in thetas], gate.stress_eccentricity, phases)
 
 
-def setup_of(line: Line, noise: Noise, seed: int, late_share: float) -> Setup:
-    """The loop of the line; latencies are those of the plants."""
+def setup_of(line: Line, noise: Noise, seed: int, late_share: float, longest_step_s: float = LONGEST_STEP_S) -> Setup:
+    """The loop of the line; latencies are those of the plants, rounded up to whole steps of the integration."""
     period_s, limits = line.control.period_s, line.limits
     return Setup(
         period_s=period_s,
         latency_s=0.0,
-        substeps=max(1, round(np.ceil(period_s / LONGEST_STEP_S - 1e-9))),
+        substeps=max(1, round(np.ceil(period_s / longest_step_s - 1e-9))),
         torque_nm=limits.torque_nm,
         torque_rate_nm_per_s=limits.torque_rate_nm_per_s,
         tension_noise_n=noise.tension_n,

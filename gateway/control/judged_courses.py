@@ -1,14 +1,16 @@
 """What a judged configuration is put through, and what promises are of: steps, shaped moves, changes of speed.
 
 Set-points go between two levels around those of the line, as far apart as the region permits in one step, with a
-quarter of the step left to the limits of the set-points wherever there is room. Three courses have a name that a
-promise may use:
+third of the step left to the limits of the set-points wherever there is room. Steps of several spans at once come to
+no more together than the loop lets them (`limits.steps_together`): a roller's speed has to follow the sum of what is
+asked of the spans before it. Three courses have a name that a promise may use:
 
     tension     all set-points at once: up, and down again
     velocity    the unwinder's speed, down by the largest step and up again, in one period each
     moves       a quarter of that, along a minimum-jerk move (`way_of_moves`), without noise
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,7 +26,8 @@ MOVE_S = 0.5  #: a shaped move, or longer where the line's rate asks for it
 MOVED = 0.25  #: of the largest step: more in so short a time is a matter of the torque limit
 LEAST_SPEED_M_PER_S = 0.005  #: the slowest that is looked at, where the line is to run faster
 SLOW = 0.1  #: the slow speed, of the fast one
-ROOM = 0.25  #: of a step, to the set-points' limits
+TURN_S = 0.25  #: from one step to that of the next span
+ROOM = 1.0 / 3.0  #: of a step, to the set-points' limits
 
 Courses = dict[str, Course]
 
@@ -53,6 +56,28 @@ class Judged:
         """The lower speed of speed changes."""
         return max(self.speed_max_m_per_s - self.speed_step_m_per_s, self.slow_m_per_s)
 
+    @property
+    def at_once(self) -> int:
+        """Spans that may make the largest step at the same time."""
+        return int(self.line.limits.steps_together + 1e-9)
+
+    def together(self) -> tuple[FloatArray, FloatArray]:
+        """The two levels (n,) where all spans step at once, each by as much."""
+        low, high = self.levels()
+        moving = np.count_nonzero(high > low)
+        center, half = 0.5 * (low + high), 0.5 * (high - low)
+        share = min(1.0, self.line.limits.steps_together / max(moving, 1))
+        return center - share * half, center + share * half
+
+    def some(self, spans: Sequence[int]) -> tuple[FloatArray, FloatArray]:
+        """The two levels (n,) where the last of `spans` (from 0) make the whole step, as many as may, and none else."""
+        low, high = self.levels()
+        center = 0.5 * (low + high)
+        moving = [i for i in spans if high[i] > low[i]][-self.at_once :]
+        one, other = center.copy(), center.copy()
+        one[moving], other[moving] = low[moving], high[moving]
+        return one, other
+
     def levels(self) -> tuple[FloatArray, FloatArray]:
         """The two levels (n,) of set-points. A draw-controlled span keeps its own."""
         limits = self.line.limits
@@ -67,7 +92,7 @@ class Judged:
 
 def improvement_courses(judged: Judged, lasting_s: float = 2.5) -> Courses:
     """The named ones but moves, each change standing for `lasting_s`; of steps that the region permits."""
-    low, high = judged.levels()
+    low, high = judged.together()
     period_s, fast = judged.line.control.period_s, judged.fast_m_per_s
     found: Courses = {}
     if judged.tension_step_n > 0.0:
@@ -82,26 +107,35 @@ def improvement_courses(judged: Judged, lasting_s: float = 2.5) -> Courses:
 
 
 def corner_courses(judged: Judged, lasting_s: float = 2.5, tail_s: float = 1.5) -> Courses:
-    """Up and down slow and fast, every second span alone, speed down and up; each with a tail that stands."""
-    low, high = judged.levels()
-    second = np.arange(len(low)) % 2 == 0
-    center = 0.5 * (low + high)
-    one, other = np.where(second, low, center), np.where(second, high, center)
+    """Speed down and up; steps of one span, slow; one after another; of some at once. Each with a tail that stands."""
+    spans = [i for i, span in enumerate(judged.line.spans) if span.control == "tension"]
+    some, one = judged.some(spans), judged.some(spans[len(spans) // 2 :][:1])
     period_s, fast, slow = judged.line.control.period_s, judged.fast_m_per_s, judged.slow_m_per_s
     now, before = judged.tension_n, judged.before_m_per_s
-    step = judged.tension_step_n > 0.0
 
     def of(first: tuple[FloatArray, float], second: tuple[FloatArray, float]) -> Course:
         return course_through(period_s, [(STAND_S, *first), (lasting_s, *second), (lasting_s, *first)], tail_s)
 
     found: Courses = {"speed change": of((now, fast), (now, before))}
-    if step:
+    if judged.tension_step_n > 0.0:
         found |= {
-            "steps, fast": of((low, fast), (high, fast)),
-            "steps, slow": of((low, slow), (high, slow)),
-            "every second span": of((one, fast), (other, fast)),
+            "one span, slow": of((one[0], slow), (one[1], slow)),
+            "one after another": course_through(period_s, _in_turn(judged, lasting_s), tail_s),
+            "neighbours": of((some[0], fast), (some[1], fast)),
         }
     return found
+
+
+def _in_turn(judged: Judged, lasting_s: float) -> list[tuple[float, FloatArray, float]]:
+    """From high to low, against the web, and back to the middle; each step before the last one is over."""
+    low, high = judged.some(range(judged.line.n))
+    parts, now = [(STAND_S, high, judged.fast_m_per_s)], high
+    for goal in (low, 0.5 * (low + high)):
+        for i in np.flatnonzero(high != low)[::-1].tolist():
+            now = np.where(np.arange(len(now)) == i, goal, now)
+            parts.append((TURN_S, now, judged.fast_m_per_s))
+        parts[-1] = (lasting_s, now, judged.fast_m_per_s)
+    return parts
 
 
 def way_of_moves(judged: Judged, rest_s: float = 1.0) -> Way | None:

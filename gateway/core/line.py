@@ -45,6 +45,8 @@ class Limits(Strict):
     tension_margin_n: NonNegative = 1.0  #: set-points keep this far from either: noise at a limit stops the line
     speed_max_m_per_s: Positive
     tension_step_max_n: NonNegative = 0.0  #: largest set-point change that may be made at once; larger ones are ramped
+    #: Times that, the steps of all spans within 2 s: what the last roller's speed has to follow is their sum.
+    steps_together: Annotated[float, Field(ge=1.0, le=60.0)] = 4.0
     speed_step_max_m_per_s: NonNegative = 0.0
     hold_periods: Annotated[int, Field(ge=1, le=3)] = 3  #: periods without a signal until STOP
     watchdog_s: Annotated[float, Field(ge=0.01, le=0.2)] = 0.1  #: the drives take torque off after this silence

@@ -49,6 +49,7 @@ HELP: dict[str, dict[str, str]] = {
         "tension_margin_n": "set-points keep this far from both, so that noise does not stop the line",
         "speed_max_m_per_s": "fastest web speed",
         "tension_step_max_n": "largest set-point change made at once; larger ones are ramped",
+        "steps_together": "times that, the steps of all spans within 2 s: the last roller's speed follows their sum",
         "speed_step_max_m_per_s": "the same for the speed",
         "hold_periods": "periods without a signal until the line is stopped",
         "watchdog_s": "the drives take torque off by themselves after this silence",

@@ -50,6 +50,7 @@ def _process(spans: int) -> str:
         "tension_margin_n": "1.0",
         "speed_max_m_per_s": "0.12",
         "tension_step_max_n": "24.0",
+        "steps_together": "4.0",
         "speed_step_max_m_per_s": "0.09",
         "hold_periods": "3",
         "watchdog_s": "0.1",

@@ -132,6 +132,12 @@ class Scenario(Strict):
                 f"{self.name} steps by {self.tension_step_n:g} N; allowed at once: limits.tension_step_max_n, "
                 f"{limits.tension_step_max_n:g} N"
             )
+        together_n = sum(abs(b - a) for a, b in zip(self.tension_n, self.tension_end_n, strict=True))
+        if self.move_s == 0.0 and together_n > limits.steps_together * limits.tension_step_max_n + 1e-9:
+            found.append(
+                f"{self.name} steps by {together_n:g} N in all spans together; allowed at once: limits.steps_together "
+                f"times limits.tension_step_max_n, {limits.steps_together * limits.tension_step_max_n:g} N"
+            )
         if self.move_s == 0.0 and self.speed_step_m_per_s > limits.speed_step_max_m_per_s + 1e-9:
             found.append(
                 f"{self.name} steps by {self.speed_step_m_per_s:g} m/s; allowed at once: "

@@ -29,6 +29,7 @@ from gateway.loop.deploy import configure
 from gateway.loop.judged import least, on_probation, require_judged, unjudged
 from gateway.loop.machine import STANDSTILL_M_PER_S
 from gateway.loop.refused import Refused
+from gateway.loop.setpoints import STEP_PAUSE_S
 
 SILENT_PATIENCE_S = 0.25  #: without cyclic data (a silent CANopen link reads by SDO) samples are this old at most
 
@@ -238,6 +239,7 @@ def _set_tension(cycle: Cycle, command: SetTension, now_s: float) -> str:
         judged = cycle.configurations.running.region.tension_step_max_n
         largest = least(line.limits.tension_step_max_n, judged)
         _require_step(cycle, size, largest, "N", setpoints.tension_step_pause_s(i, now_s))
+        _require_few(size, line.limits.steps_together * largest, setpoints.stepped_lately_n(now_s))
         setpoints.step_tension(i, command.tension_n, now_s)
     setpoints.tension_target_n[i] = command.tension_n
     how = "at once" if command.step else _pace(cycle, f"at {line.moves.tension_rate_n_per_s:g} N/s")
@@ -278,6 +280,15 @@ def _require_step(cycle: Cycle, size: float, largest: float, unit: str, pause_s:
         raise Refused(f"a step of {size:g} {unit} is too large; allowed: {largest:g} {unit}, or a ramp of any size")
     if pause_s > 0.0:
         raise Refused(f"the last step was just now; the next one may come in {pause_s:.1f} s, a ramp at any time")
+
+
+def _require_few(size_n: float, largest_n: float, lately_n: float) -> None:
+    """Steps of several spans add up in the speed of the rollers behind them."""
+    if lately_n + size_n > largest_n * (1.0 + 1e-9):
+        raise Refused(
+            f"with this step of {size_n:g} N those of the last {STEP_PAUSE_S:g} s come to {lately_n + size_n:g} N; "
+            f"allowed: {largest_n:g} N together (limits.steps_together), or a ramp at any time"
+        )
 
 
 def _select_recipe(cycle: Cycle, command: SelectRecipe) -> str:

@@ -43,6 +43,7 @@ class Setpoints:
         self.speed_m_per_s = 0.0  #: what is asked of the line PLC now
         self.speed_target_m_per_s = recipe.speed_m_per_s  #: what the operator wants while the line runs
         self._tension_stepped_s: FloatArray = np.full(n, -inf)
+        self._tension_stepped_n: FloatArray = np.zeros(n)  #: by how much then
         self._speed_stepped_s = -inf
         self._curve = MinimumJerk(np.zeros(n + 1))
         self._time_s = 0.0  #: on the curve
@@ -71,6 +72,7 @@ class Setpoints:
 
     def step_tension(self, span: int, tension_n: float, now_s: float) -> None:
         """Make a change at once. Span from 0."""
+        self._tension_stepped_n[span] = abs(tension_n - self.tension_n[span])
         self.tension_n[span] = self.tension_target_n[span] = tension_n
         self._curve.put(span, tension_n)
         self._tension_stepped_s[span] = now_s
@@ -115,6 +117,11 @@ class Setpoints:
     def tension_step_pause_s(self, span: int, now_s: float) -> float:
         """Seconds until another step of this tension may be made; not positive when it may be made now."""
         return float(self._tension_stepped_s[span]) + STEP_PAUSE_S - now_s
+
+    def stepped_lately_n(self, now_s: float) -> float:
+        """What the steps of all tensions come to together that are so young that another one would add to them."""
+        lately = self._tension_stepped_s > now_s - STEP_PAUSE_S
+        return float(self._tension_stepped_n[lately].sum())
 
     def speed_step_pause_s(self, now_s: float) -> float:
         return self._speed_stepped_s + STEP_PAUSE_S - now_s

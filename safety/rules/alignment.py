@@ -15,9 +15,8 @@ from gateway.core.signals import FloatArray
 from gateway.core.theta import Theta
 from gateway.core.verdict import RuleFinding
 from safety.case import Case
-from safety.excitation import newest
 from safety.findings import at_most, told
-from safety.predicting import Foretold, foretold
+from safety.predicting import Foretold, foretold_of, with_swings
 
 RULE = "alignment"
 MOST_S = 20.0  #: of data are looked at
@@ -37,7 +36,7 @@ def of_model(case: Case, model: LineModel, name: str = RULE) -> list[RuleFinding
     noise, most_s = noise_of(model), case.line.gate.alignment_max_s
     if noise is None or not case.excited:
         return [told(name, False, "there are no data by which channels could be compared: see model validity")]
-    found = foretold(theta_of(model), noise, newest(case.excited, MOST_S))
+    found = foretold_of(case, model, noise, MOST_S)
     names = channels(found[0].predicted.stretch)
     late_s, spread_s = lateness(theta_of(model), found)
     known = np.flatnonzero(SURE * spread_s <= most_s)
@@ -62,27 +61,31 @@ def lateness(theta: Theta, found: list[Foretold]) -> tuple[FloatArray, FloatArra
     """Of each channel by itself, the others taken for right: seconds, and their standard deviation (c,)."""
     information = gradient = np.zeros(len(channels(found[0].predicted.stretch)))
     for one in found:
-        shown = sensitivities(theta, one.predicted)
+        shown, white = sensitivities(theta, one.predicted)
         information = information + np.square(shown).sum(axis=(1, 2))
-        gradient = gradient + (shown * one.predicted.whitened).sum(axis=(1, 2))
+        gradient = gradient + (shown * white).sum(axis=(1, 2))
     with np.errstate(divide="ignore", invalid="ignore"):
         late, spread = gradient / information, 1.0 / np.sqrt(information)
     return np.where(information > 0.0, late, 0.0), spread
 
 
-def sensitivities(theta: Theta, predicted: Predicted) -> FloatArray:
-    """What a second's lateness of each channel does to the whitened innovations, (c, k, m)."""
-    stretch, period_s = predicted.stretch, predicted.stretch.recording.period_s
+def sensitivities(theta: Theta, predicted: Predicted) -> tuple[FloatArray, FloatArray]:
+    """What a second's lateness of each channel does to the whitened innovations, (c, k, m), and these, (k, m).
+
+    Rollers out of round turn as was learned from the whole stretch, whatever a channel tells.
+    """
+    stretch, period_s = with_swings(predicted), predicted.stretch.recording.period_s
     before = np.zeros_like(stretch.measured)
     states = predicted.state[:, stretch.outputs]
     before[stretch.first + 2 :] = np.diff(states, axis=0) / period_s
-    rows = [_changed(theta, predicted, replace(stretch, measured=_moved(stretch.measured, before, j)))
+    rows = [_whitened(theta, predicted, replace(stretch, measured=_moved(stretch.measured, before, j)))
             for j in range(before.shape[1])]  # fmt: skip
     turned = np.zeros_like(stretch.torque_nm)
     turned[1:] = np.diff(stretch.torque_nm, axis=0) / period_s
-    rows += [_changed(theta, predicted, replace(stretch, torque_nm=_moved(stretch.torque_nm, turned, j)))
+    rows += [_whitened(theta, predicted, replace(stretch, torque_nm=_moved(stretch.torque_nm, turned, j)))
              for j in range(stretch.n)]  # fmt: skip
-    return np.array(rows)
+    white = _whitened(theta, predicted, stretch)
+    return (np.array(rows) - white) / PROBE_S, white
 
 
 def _moved(values: FloatArray, rate: FloatArray, column: int) -> FloatArray:
@@ -91,6 +94,6 @@ def _moved(values: FloatArray, rate: FloatArray, column: int) -> FloatArray:
     return moved
 
 
-def _changed(theta: Theta, predicted: Predicted, stretch: Stretch) -> FloatArray:
+def _whitened(theta: Theta, predicted: Predicted, stretch: Stretch) -> FloatArray:
     innovation, _ = innovations([theta], stretch, predicted.gains)
-    return (whitened(innovation, predicted.gains)[0] - predicted.whitened) / PROBE_S
+    return whitened(innovation, predicted.gains)[0]

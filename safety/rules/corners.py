@@ -27,6 +27,7 @@ RULE = "corners"
 #: A predictive controller, which takes a millisecond a period: whole on the corners where its linear law does worst in
 #: small moves, in shorter courses.
 WHOLE_MPC = 4
+LATE, FINE_STEP_S = 2, 0.001  #: plants that are later than the line is, and the steps in which they are so
 WHOLE_LASTING_S, WHOLE_TAIL_S = 2.0, 0.6  #: of its changes, and their tail
 SMALL_STEP_N, SMALL_STEP_M_PER_S = 1.0, 0.002  #: in which no limit is reached
 
@@ -65,10 +66,24 @@ def check(case: Case) -> list[RuleFinding]:
 def _of_law(case: Case, config: Controller, kept: dict[str, list[Theta]], courses: Courses) -> Worst:
     worst = Worst()
     for name, course in courses.items():
-        worst.take(
-            rollouts(case.line, config, kept[name], course, case.stress_noise, case.seed), name, case.tension_spans
-        )
+        found = rollouts(case.line, config, kept[name], course, case.stress_noise, case.seed)
+        worst.take(found, name, case.tension_spans)
+        for late in _late(case, config, course):
+            worst.take(late, f"{name}, late", case.tension_spans)
     return worst
+
+
+def _late(case: Case, config: Controller, course: Course) -> list[Rollouts]:
+    """On what is believed of the line, stressed, and as late as the delay margin promises to stand.
+
+    A linear loop that is stable then may still swing so far that it leaves the band. Nothing where no torque holds it.
+    """
+    gate = case.line.gate
+    late = stressed(replace(case.believed, latency_s=case.latency_s + gate.delay_margin_min_s), gate)
+    if not holdable([late], course, case.line.limits.torque_nm):
+        return []
+    setup = setup_of(case.line, case.stress_noise, case.seed, gate.stress_late_share, FINE_STEP_S)
+    return [simulate(config, plants_under_stress([late] * LATE, gate, case.seed), course, setup)]
 
 
 def _of_mpc(case: Case, config: MpcConfig, kept: dict[str, list[Theta]]) -> Worst:
@@ -82,6 +97,8 @@ def _of_mpc(case: Case, config: MpcConfig, kept: dict[str, list[Theta]]) -> Wors
     for name, course in corner_courses(small).items():
         found = rollouts(case.line, unconstrained(config), kept[name], course, case.stress_noise, case.seed)
         worst.take(found, f"{name}, small", case.tension_spans)
+        for late in _late(case, unconstrained(config), course):
+            worst.take(late, f"{name}, small, late", case.tension_spans)
         badness[name] = found.tail_swing_n.max(axis=1) + found.chatter_nm.max(axis=1) + found.beyond_n.max(axis=1)
     setup = setup_of(case.line, case.stress_noise, case.seed, case.line.gate.stress_late_share)
     for name, course in corner_courses(judged, WHOLE_LASTING_S, WHOLE_TAIL_S).items():
@@ -132,7 +149,7 @@ def _limits(case: Case, worst: Worst) -> list[RuleFinding]:
 
 def _of_corners(case: Case, kept: dict[str, list[Theta]]) -> RuleFinding:
     left_out = {name: len(case.corners) - len(some) for name, some in kept.items()}
-    what = f"{len(case.corners)} plants that the line may be, {len(left_out)} courses each, up to "
+    what = f"{len(case.corners)} plants that the line may be, and {LATE} late, {len(left_out)} courses each, up to "
     what += f"{case.speed_max_m_per_s:g} m/s and steps of {case.tension_step_n:g} N"
     most = max(left_out.values())
     if most:

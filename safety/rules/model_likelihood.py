@@ -26,9 +26,8 @@ from gateway.core.theta import Noise, Theta, nominal_theta
 from gateway.core.verdict import RuleFinding
 from safety.believed import Unbelievable, stated
 from safety.case import Case
-from safety.excitation import newest
 from safety.findings import at_least, at_most, told
-from safety.predicting import Foretold, foretold, normalised
+from safety.predicting import Foretold, foretold, foretold_of, normalised, with_swings
 
 SHIFT, SURENESS, NOISE, OTHERS = "model: shift", "model: sureness", "model: noise", "model: held-out prediction"
 MOST_S = 20.0  #: of data are looked at
@@ -55,7 +54,7 @@ def look_at(case: Case) -> Look:
     if noise is None or not case.excited:
         raise Unbelievable("without the noise in the model, and data in which tensions move, nothing can be said")
     theta = theta_of(case.model)
-    return Look(theta, noise, foretold(theta, noise, newest(case.excited, MOST_S)))
+    return Look(theta, noise, foretold_of(case, case.model, noise, MOST_S))
 
 
 def check_sureness(case: Case) -> list[RuleFinding]:
@@ -121,7 +120,7 @@ def derivatives(look: Look, names: Sequence[str]) -> tuple[FloatArray, FloatArra
     thetas = [look.theta, *(moved(look.theta, {name: PROBE}) for name in names)]
     for one in look.found:
         predicted: Predicted = one.predicted
-        found, _ = innovations(thetas, predicted.stretch, predicted.gains)
+        found, _ = innovations(thetas, with_swings(predicted), predicted.gains)
         white = whitened(found, predicted.gains).reshape(len(thetas), -1)
         J = (white[1:] - white[0]) / PROBE
         information += J @ J.T

@@ -3,12 +3,12 @@
 The predictor has no disturbance states: with them quiet data pass everything.
 """
 
-from gateway.core.line_model import LineModel, noise_of, theta_of
+from gateway.core.line_model import LineModel, noise_of
 from gateway.core.verdict import RuleFinding
 from safety.case import Case
-from safety.excitation import LEAST_S, MOVING, SAME_M_PER_S, SAME_SPEED, newest
+from safety.excitation import LEAST_S, MOVING, SAME_M_PER_S, SAME_SPEED
 from safety.findings import at_least, at_most, told
-from safety.predicting import Foretold, by_speed, foretold, normalised, normalised_by_output, seconds
+from safety.predicting import Foretold, by_speed, foretold_of, normalised, normalised_by_output, seconds
 
 RULE = "model validity"
 EACH_BEYOND = 0.3  #: by which one load cell or encoder may lie outside the band of all together
@@ -29,7 +29,7 @@ def of_model(case: Case, model: LineModel, name: str = RULE) -> list[RuleFinding
         return [told(name, False, "the model says nothing of the noise, so nobody can tell what it explains")]
     if not case.excited:
         return [told(name, False, _asks_for_data(case))]
-    found = foretold(theta_of(model), noise, newest(case.excited))
+    found = foretold_of(case, model, noise)
     return [_at_speed(case, speed, of, name) for speed, of in by_speed(found)]
 
 

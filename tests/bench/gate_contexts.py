@@ -1,13 +1,20 @@
 """What a proposal is judged against, made as on a real line: an experiment on the true line, a model, a controller."""
 
+import pickle
 import time
-from dataclasses import dataclass
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
+from functools import cache
+from hashlib import sha256
+from pathlib import Path
+from tempfile import NamedTemporaryFile
 
 import numpy as np
 
 from gateway.cli.identify_model import model_of_found
-from gateway.control.design import DesignTask, design_lqi, design_pid, task_of, task_on
+from gateway.control.design import DesignRefused, DesignTask, design_lqi, design_pid, lqi_weights, task_of, task_on
 from gateway.core.controller import Controller, config_hash
 from gateway.core.judge_context import DataReference, JudgeContext, LineState
 from gateway.core.line import Line
@@ -31,6 +38,14 @@ from tests.independent.truth import Truth, truth_of, with_unruly_effects
 NOW = datetime(2026, 8, 3, 14, 6, tzinfo=UTC)
 SPEEDS_M_PER_S = (0.05, 0.1)
 SPEED_M_PER_S = 0.05  #: at which the line runs when it is judged
+CAUTION = 30.0  #: times the torque weight, of a first configuration for a line that nobody knows
+#: By how much a line may have changed since a controller was designed for it: a factor either way.
+DRIFT = {
+    "stiffness_n": 1.3, "length_m": 1.15, "radius_m": 1.1, "inertia_kg_m2": 1.3, "friction_nms_per_rad": 1.6,
+}  # fmt: skip
+DRIFT_TRIES = 40
+KEPT = Path("out/bench/gate-lines")
+MADE_BY = ("gateway", "sim_plant", "tests/bench", "tests/closed_loop", "tests/independent")
 
 
 @dataclass(frozen=True)
@@ -47,6 +62,7 @@ class GateLine:
     plain: Controller  #: a PID, as designed on the line's file
     initial: Controller  #: an LQI, likewise
     adapted: Controller  #: on the model
+    cautious: Controller  #: an LQI on the line's file, with so much torque weight that hardly any line swings under it
 
     @property
     def latency_s(self) -> float:
@@ -54,7 +70,30 @@ class GateLine:
 
 
 def gate_line(number: int) -> GateLine:
-    """Raises NotIdentified where the data of the line give no model."""
+    """Made once for one state of the code, and kept in out/. Raises NotIdentified where its data give no model."""
+    kept = KEPT / f"{code_hash()[:16]}-{number}.pickle"
+    if kept.exists():
+        found: GateLine = pickle.loads(kept.read_bytes())
+        return found
+    found = made_line(number)
+    KEPT.mkdir(parents=True, exist_ok=True)
+    with NamedTemporaryFile(dir=KEPT, delete=False) as file:
+        file.write(pickle.dumps(found))
+    Path(file.name).replace(kept)
+    return found
+
+
+@cache
+def code_hash() -> str:
+    """Of all that a line in service is made by."""
+    found = sha256()
+    for path in sorted(path for folder in MADE_BY for path in Path(folder).rglob("*.py")):
+        found.update(path.read_bytes())
+    return found.hexdigest()
+
+
+def made_line(number: int) -> GateLine:
+    """Anew. Raises NotIdentified."""
     plant, line = plant_number(number), demonstration_line()
     truth = with_unruly_effects(truth_of(plant), np.random.default_rng([number, 7]))
     recording = recorded(plant, number, speeds_m_per_s=SPEEDS_M_PER_S)
@@ -63,8 +102,24 @@ def gate_line(number: int) -> GateLine:
     task = task_on(line, found.estimate.theta, found.estimate.noise)
     file = task_of(line)
     return GateLine(
-        number, plant, truth, line, recording, model, task, design_pid(file), design_lqi(file), design_lqi(task)
+        number, plant, truth, line, recording, model, task, design_pid(file), design_lqi(file), design_lqi(task),
+        heavy_lqi(file),
     )  # fmt: skip
+
+
+def heavy_lqi(task: DesignTask) -> Controller:
+    """An LQI that asks little of the drives."""
+    weights = lqi_weights(task)
+    return design_lqi(task, replace(weights, torque_per_nm2=CAUTION * weights.torque_per_nm2))
+
+
+def outdated(task: DesignTask, generator: np.random.Generator) -> Iterator[Controller]:
+    """Designs for what the line may have been before it drifted to where it is now."""
+    for _ in range(DRIFT_TRIES):
+        moved = {name: getattr(task.model, name) * float(np.exp(generator.uniform(-1.0, 1.0) * np.log(factor)))
+                 for name, factor in DRIFT.items()}  # fmt: skip
+        with suppress(DesignRefused):
+            yield design_lqi(replace(task, model=replace(task.model, **moved)))
 
 
 def instant(seconds: float) -> str:

@@ -43,7 +43,7 @@ class Asked:
     """A proposal to be: in which context, and of which class."""
 
     class_name: str
-    context: str  #: "plain", "initial", "adapted" or "first"
+    context: str  #: "plain", "initial", "adapted", "cautious", "drifted" or "first"
     change: Change
 
 
@@ -247,7 +247,8 @@ CLASSES: dict[str, tuple[float, Maker]] = {
     "model poisoned": (0.02, lambda line, g: _poisoned(line, g)),
     "experiment": (0.02, _experiment),
 }
-CONTEXTS = ("plain", "plain", "initial", "adapted")  #: each as often as it stands here
+#: Each as often as it stands here. In half of them something safe but poor is in service, as before an adaptation.
+CONTEXTS = ("plain", "initial", "adapted", "cautious", "drifted", "drifted")
 
 
 def proposals(line: GateLine, count: int, seed: int) -> list[Asked]:

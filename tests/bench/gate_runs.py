@@ -4,6 +4,8 @@ import time
 from dataclasses import dataclass, field
 from functools import cached_property
 
+import numpy as np
+
 from gateway.core.controller import Controller
 from gateway.core.judge_context import JudgeContext
 from gateway.core.line import Line
@@ -11,13 +13,15 @@ from gateway.core.proposal import ExperimentChange, GainsChange, ModelChange
 from gateway.core.recording import Recording
 from gateway.core.verdict import Verdict
 from safety.judge import judge
-from tests.bench.gate_contexts import GateLine, context_of, payload_of
+from tests.bench.gate_contexts import GateLine, context_of, outdated, payload_of
 from tests.bench.gate_proposals import Asked
 from tests.independent.gate_judge import GateJudge, model_error, unsafe_experiment
 
 MISLEADS = 0.1  #: a model farther from the truth than this
 ROLLOUT_RULE = "corners"  #: in the names of the rule that simulates
 FIRST_TOP_M_PER_S = 0.02
+CHAINED_MARGIN_S = 0.005  #: gate.delay_margin_min_s where one small change after another needs no person
+POORER = 1.05  #: times the mean tracking error of the adapted design: what an outdated one has at least
 
 
 @dataclass(frozen=True)
@@ -55,8 +59,26 @@ class LineBench:
             "plain": context_of(given, given.plain, given.plain),
             "initial": context_of(given, given.initial, given.initial),
             "adapted": context_of(given, given.adapted, given.initial),
+            "cautious": context_of(given, given.cautious, given.cautious),
+            "drifted": context_of(given, self._drifted, self._drifted),
             "first": context_of(given, given.initial, given.initial, first=True),
         }
+
+    @cached_property
+    def _drifted(self) -> Controller:
+        """The first outdated design that is safe on the truth, and clearly poorer there than the adapted one."""
+        given, generator = self.given, np.random.default_rng([self.given.number, 11])
+        judge = GateJudge(given.line, given.truth, given.adapted, given.adapted, self._top_m_per_s, given.number)
+        adapted = judge.references[0]
+        for config in outdated(given.task, generator):
+            poorer = judge.metrics(config).mean_rmse_n > POORER * adapted.mean_rmse_n
+            if poorer and not judge.unsafe(config):
+                return config
+        return given.cautious
+
+    @property
+    def _top_m_per_s(self) -> float:
+        return self.given.model.region.speed_to_m_per_s
 
     def recordings(self, context: str) -> list[Recording]:
         return [] if context == "first" else [self.given.recording]
@@ -67,7 +89,7 @@ class LineBench:
             given, first = self.given, context == "first"
             in_service, baseline = self.contexts[context].in_service, self.contexts[context].baseline
             assert baseline is not None
-            top = FIRST_TOP_M_PER_S if first else given.model.region.speed_to_m_per_s
+            top = FIRST_TOP_M_PER_S if first else self._top_m_per_s
             line = creeping(given.line) if first else given.line
             self._judges[context] = GateJudge(line, given.truth, in_service, baseline, top, given.number)
         return self._judges[context]
@@ -106,9 +128,11 @@ class LineBench:
         return unsafe, False, "an experiment", "experiment"
 
     def judged(self, config: Controller, context: JudgeContext, seed: int) -> Verdict:
-        """A verdict on gains in a context of one's own, on the line's data."""
-        payload = payload_of(GainsChange(controller=config), context, self.given.line)
-        return judge(payload, context, self.given.line, [self.given.recording], seed)
+        """On gains in a context of one's own, on the line's data, where changes go through without a person."""
+        line = self.given.line
+        gate = line.gate.model_copy(update={"delay_margin_min_s": CHAINED_MARGIN_S})
+        payload = payload_of(GainsChange(controller=config), context, line)
+        return judge(payload, context, line.model_copy(update={"gate": gate}), [self.given.recording], seed)
 
 
 def measured(one: Tried) -> bool:

@@ -105,6 +105,16 @@ def test_what_is_outside_the_limits_is_refused_and_changes_nothing(running, comm
     assert before[1] == running.cycle.setpoints.speed_target_m_per_s
 
 
+def test_steps_of_several_spans_add_up_until_they_are_over(running):
+    before = running.cycle.setpoints.tension_n.tolist()
+    goals = [value + (24.0 if value < 34.0 else -24.0) for value in before]
+    said = [SetTension(span=i, tension_n=goal, step=True) for i, goal in enumerate(goals[:5], 1)]
+    assert all(running.command(one).ok for one in said[:4])
+    refused = running.command(said[4])
+    assert not refused.ok and "come to 120 N; allowed: 96 N together" in refused.text
+    assert running.command(SetTension(span=5, tension_n=goals[4])).ok, "a ramp at any time"
+
+
 def test_the_line_plc_takes_its_permissive_back(running):
     running.command(SetSpeed(speed_m_per_s=0.05))
     running.step(200)

@@ -31,6 +31,10 @@ class Metrics:
     overshoot_pct: dict[str, float]  #: `_overshoot_pct`
     settling_s: dict[str, float]
 
+    @property
+    def mean_rmse_n(self) -> float:
+        return float(np.mean(list(self.rmse_n.values())))
+
 
 @dataclass(frozen=True)
 class Judged:

@@ -7,15 +7,20 @@ import numpy as np
 import pytest
 
 from gateway.control.design import MpcWeights, design_lqi, design_mpc, design_scheduled, task_of
-from gateway.control.judged_courses import corner_courses
+from gateway.control.judged_courses import corner_courses, improvement_courses
+from gateway.control.prediction import gains_of, imagined, innovations, predict, stretch_of, whitened
 from gateway.control.rollout import Rollouts
 from gateway.core.line import Span
+from gateway.core.line_model import theta_of
 from gateway.core.proposal import proposal_hash
+from gateway.core.theta import Noise
+from gateway.loop.setpoints import STEP_PAUSE_S
 from safety.believed import Unbelievable, corners_of_model, stated
 from safety.case import Case
 from safety.excitation import excited_parts, newest, recent, same_speed
 from safety.findings import at_least, at_most, told
 from safety.judge import warm_up
+from safety.predicting import Foretold, with_swings
 from safety.rules import (
     alignment,
     authority,
@@ -243,12 +248,13 @@ def test_delay_margin_at_its_limit_for_a_law_and_for_a_schedule(of, context, red
     assert decay.check(case_of(gains(schedule, context), context, of))[0].passed
 
 
-def test_corners_at_each_limit(of, context, redesigned, monkeypatch):
-    def rollouts(low=3.0, high=59.0, swing=0.9, error=2.9, chatter=4.9):
-        one = np.ones((1, 6))
-        return Rollouts(one, low * one, high * one, one, one, one, one, one, tail_swing_n=swing * one,
-                        tail_error_n=error * one, chatter_nm=chatter * one)  # fmt: skip
+def rollouts(low=3.0, high=59.0, swing=0.9, error=2.9, chatter=4.9):
+    one = np.ones((1, 6))
+    return Rollouts(one, low * one, high * one, one, one, one, one, one, tail_swing_n=swing * one,
+                    tail_error_n=error * one, chatter_nm=chatter * one)  # fmt: skip
 
+
+def test_corners_at_each_limit(of, context, redesigned, monkeypatch):
     case = case_of(gains(redesigned, context), context, of)
 
     def found(**figures):
@@ -282,6 +288,62 @@ def test_corners_that_nobody_could_hold_are_left_out_and_told(of, context, redes
     assert (
         "none of 8 plants" in refused(corners.check(replace(case, line=of.line.model_copy(update={"limits": none}))))[0]
     )
+
+
+@pytest.mark.parametrize("together", [1.0, 2.5, 4.0, 60.0])
+def test_no_course_asks_for_more_than_the_loop_permits(case, together):
+    limits = case.line.limits.model_copy(update={"steps_together": together})
+    judged = replace(judged_of(case), line=case.line.model_copy(update={"limits": limits}))
+    pause, most_n = round(STEP_PAUSE_S / case.line.control.period_s), limits.tension_step_max_n
+    for course in [*corner_courses(judged).values(), *improvement_courses(judged).values()]:
+        steps = np.abs(np.diff(course.tension_n, axis=0))
+        lately = np.lib.stride_tricks.sliding_window_view(steps, min(pause, len(steps)), axis=0)
+        assert lately.sum(axis=(1, 2)).max() <= together * most_n + 1e-9
+        assert steps.max() <= most_n + 1e-9
+        assert (lately > 0.0).sum(axis=2).max(initial=0) <= 1, "one span steps again only when the last step is over"
+        low, high = limits.tension_min_n + limits.tension_margin_n, limits.tension_max_n - limits.tension_margin_n
+        assert low <= course.tension_n.min() and course.tension_n.max() <= high
+
+
+def test_a_loop_is_simulated_as_late_as_its_delay_margin_says(case, monkeypatch):
+    seen = []
+
+    def simulate(config, plants, course, setup):
+        seen.append((plants, setup))
+        return rollouts(low=1.0 if setup.step_s == pytest.approx(0.001) else 20.0)
+
+    monkeypatch.setattr(corners, "simulate", simulate)
+    (low,) = [one for one in corners.check(case) if not one.passed]
+    assert low.rule == "corners: lowest tension" and "late" in low.text
+    late = [plants for plants, setup in seen if setup.step_s == pytest.approx(0.001)]
+    assert len(late) == 4 and all(
+        plants.effects.latency_s == pytest.approx(case.latency_s + case.line.gate.delay_margin_min_s) for plants in late
+    )
+    weak = case.line.limits.model_copy(update={"torque_nm": 5.0})
+    course = corner_courses(judged_of(case))["neighbours"]
+    held_by_nobody = replace(case, line=case.line.model_copy(update={"limits": weak}))
+    assert corners._late(held_by_nobody, case.controller, course) == []  # noqa: SLF001
+
+
+def test_rollers_out_of_round_are_known_as_they_were_learned(of, case):
+    round_theta, stretch = theta_of(of.model), stretch_of(case.excited[0].recording)
+    noise, swing = Noise(), np.zeros((6, 2))
+    swing[2] = 2e-3, -1e-3
+    gains_ = gains_of(round_theta, noise, stretch)
+    random = np.random.default_rng(1).standard_normal((stretch.predictions, len(stretch.outputs)))
+    innovation = np.einsum("kij,kj->ki", gains_.factor[gains_.which], random)
+    measured = imagined(round_theta, replace(stretch, swing=swing), gains_, innovation).measured
+    eccentric = replace(round_theta, eccentricity=np.array([0.0, 0.0, 3e-3, 0.0, 0.0, 0.0]))
+    predicted = predict(eccentric, noise, replace(stretch, measured=measured))
+    known = with_swings(predicted)  # from half a turn
+    assert known.swing[2] == pytest.approx(swing[2], abs=6e-4) and not known.swing[[0, 1, 3, 4, 5]].any()
+    white, as_round = (
+        np.square(whitened(innovations([round_theta], one, predicted.gains)[0], predicted.gains)).mean()
+        for one in (known, replace(stretch, measured=measured))
+    )
+    assert white < 1.1 and as_round > 1.1
+    late_s, _ = alignment.lateness(eccentric, [Foretold(case.excited[0], predicted)])
+    assert np.abs(late_s).max() < 1e-3
 
 
 def test_a_predictive_controller_runs_whole_on_some_corners_and_says_what_is_lost(of, context, monkeypatch):

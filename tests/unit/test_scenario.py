@@ -62,6 +62,9 @@ def test_what_a_line_cannot_run_is_named_at_once():
     )
     reasons = "; ".join(wild.reasons_against(2, line.limits))
     assert "59.5 N; allowed: 3 to 59 N" in reasons and "0.2 m/s; allowed: up to 0.12" in reasons
+    all_at_once = TENSION.model_copy(update={"tension_after_n": [48.0, 16.0, 40.0, 20.0, 44.0, 52.0]})
+    (reason,) = all_at_once.reasons_against(6, line.limits)
+    assert "steps by 120 N in all spans together" in reason and "96 N" in reason
     assert "steps by 29.5 N" in reasons and "steps by 0.19 m/s" in reasons
 
 
