@@ -30,7 +30,7 @@ from sim_plant.recording import Recording
 from tests.bench.figures import Bench
 from tests.closed_loop.gate_line import GateLine, largest_step_nm
 
-CHATTER_NM = 8.0  #: from one command to the next: only the law that was forced in moves a torque so far, for long
+CHATTER_NM = 8.0  #: from one command to the next, and back with the one after: so does the law that was forced in
 CHATTERS = 1.5  #: added to what its torques before weigh: they turn round every period
 AROUND_S = 0.3  #: a swap, either side
 TURNS = 3
@@ -145,10 +145,12 @@ def taken_back(line: GateLine, history: History, recording: Recording, found: Fo
                 if one["roller"] == roller and at_s - 0.05 <= one["time_s"] <= at_s + 0.05
             ]
             times_s, torque_nm = np.array(commands).T
-            steps_nm = np.abs(np.diff(torque_nm))
-            after = np.flatnonzero(times_s[1:] >= at_s)
-            first_s = max(first_s, float(times_s[1:][after[0]]) - at_s)
-            late += int((steps_nm[after] > CHATTER_NM).sum())
+            steps_nm = np.diff(torque_nm)
+            far = np.abs(steps_nm) > CHATTER_NM
+            turned = far[1:] & far[:-1] & (steps_nm[1:] * steps_nm[:-1] < 0.0)
+            after = times_s >= at_s
+            first_s = max(first_s, float(times_s[after][0]) - at_s)
+            late += int((turned & after[2:]).sum())
         found.back_s.append(first_s)
         found.late += late
 

@@ -16,7 +16,7 @@ import tempfile
 import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from math import inf
 from pathlib import Path
@@ -108,7 +108,8 @@ class FastLoop(SteppedLoop):
             await asyncio.sleep(0.5 * period_s / self._fast.scale)
 
     def _record(self, frame: Frame) -> None:
-        self._mailbox.publish(LOOP_TELEMETRY, pack(frame))
+        # When the line's time is slower than the gateway's, its frames are new all the same.
+        self._mailbox.publish(LOOP_TELEMETRY, pack(replace(frame, time_s=self._fast.clock())))
 
     def _tell(self, kind: str, text: str, **data: object) -> None:
         event = Event(time_s=self.now_s, kind=kind, text=text, data=data)

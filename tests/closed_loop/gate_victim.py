@@ -16,6 +16,7 @@ import traceback
 from dataclasses import dataclass
 from pathlib import Path
 
+from gateway.cli.lifetime import follow_parent
 from gateway.core.deployment import Region
 from gateway.core.judge_context import JudgeContext, context_hash
 from gateway.core.line_file import load_line
@@ -82,11 +83,13 @@ def live(folder: Path, scale: float, began_s: float) -> None:
 
 def main() -> None:
     folder, scale, began_s = Path(sys.argv[1]), float(sys.argv[2]), float(sys.argv[3])
+    follow_parent()
     output = os.open(folder / "victims.log", os.O_WRONLY | os.O_CREAT | os.O_APPEND)
     for _ in sys.stdin:
         pid = os.fork()
         if pid == 0:
             try:
+                follow_parent()
                 os.dup2(output, 1)
                 os.dup2(output, 2)
                 live(folder, scale, began_s)

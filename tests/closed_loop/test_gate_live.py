@@ -3,14 +3,14 @@
 The recorder inside the simulated line judges what reached the web, the audit what anybody was told.
 """
 
-import json
 import time
 
 import numpy as np
 import pytest
 
 from gateway.control.design import design_lqg, task_of
-from gateway.core.controller import config_hash
+from gateway.core.controller import canonical, config_hash
+from gateway.core.decisions import ProposalShown
 from gateway.supervisor.deployer import LEASE_S
 from tests.closed_loop.gate_line import GateLine, largest_step_nm
 from tests.closed_loop.wire import settled
@@ -34,24 +34,22 @@ def world_s(line) -> float:
 def test_a_proposal_is_judged_approved_runs_is_kept_and_another_is_taken_back(line):
     first, better = config_hash(line.first), design_lqg(task_of(line.line))
     began_s = world_s(line)
-    proposal = line.propose(better)
-    verdict = line.until(proposal, "waiting").verdict
+    file = line.folder / "better.json"
+    file.write_bytes(canonical(better))
+    shown = ProposalShown.model_validate_json(line.command("propose", file, "--reason", "a test", "--json"))
+    proposal, verdict = shown.proposal_hash, shown.verdict
     assert verdict.accepted and verdict.region.speed_max_m_per_s == line.line.gate.first_speed_max_m_per_s
     assert line.in_service() == first  # accepted is not approved
-    reply = line.decide(proposal)
-    assert reply.ok and "no model is accepted" in reply.text, reply
+    said = line.command("approve", proposal[:12], "--yes", "--comment", "a test")
+    assert "on probation" in said and "no model is accepted" in said
     assert line.in_service() == config_hash(better)
     line.until(proposal, "kept")
-    # Another one is taken back by a person, with the commands that people have.
-    first_file = line.folder / "controller.json"
-    shown = json.loads(line.command("propose", first_file, "--reason", "as it was", "--json"))
-    again = shown["proposal_hash"]
-    assert "on probation" in line.command("approve", again[:12], "--yes")
-    assert line.in_service() == first
-    assert "not kept yet" in line.command("proposals", again[:12])
-    assert config_hash(better)[:12] in line.command("rollback", "--comment", "tension 3 hums")
+    assert proposal[:12] in line.command("proposals")
+    again = line.approved(line.first)
+    assert line.shown(again).why.startswith("not kept yet")
+    assert line.roll_back().ok
     assert line.in_service() == config_hash(better)
-    assert line.until(again, "rolled-back").why == "tension 3 hums"
+    assert line.until(again, "rolled-back").why.startswith("asked for by")
     line.wait(settled)
     ended_s = world_s(line)
     recording = line.recording()
