@@ -38,7 +38,7 @@ def a_recording() -> Recording:
 def line() -> GateLine:
     plant = real_plant()
     return GateLine(
-        1, plant, truth_of(plant), LINE, a_recording(), model_of(fields(6)), TASK, design_pid(TASK), LQI, LQI
+        1, plant, truth_of(plant), LINE, a_recording(), model_of(fields(6)), TASK, design_pid(TASK), LQI, LQI, LQI
     )  # fmt: skip
 
 

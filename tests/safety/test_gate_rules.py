@@ -328,15 +328,15 @@ def test_a_loop_is_simulated_as_late_as_its_delay_margin_says(case, monkeypatch)
 def test_rollers_out_of_round_are_known_as_they_were_learned(of, case):
     round_theta, stretch = theta_of(of.model), stretch_of(case.excited[0].recording)
     noise, swing = Noise(), np.zeros((6, 2))
-    swing[2] = 2e-3, -1e-3
+    swing[2] = 1e-2, -5e-3
     gains_ = gains_of(round_theta, noise, stretch)
     random = np.random.default_rng(1).standard_normal((stretch.predictions, len(stretch.outputs)))
     innovation = np.einsum("kij,kj->ki", gains_.factor[gains_.which], random)
     measured = imagined(round_theta, replace(stretch, swing=swing), gains_, innovation).measured
-    eccentric = replace(round_theta, eccentricity=np.array([0.0, 0.0, 3e-3, 0.0, 0.0, 0.0]))
+    eccentric = replace(round_theta, eccentricity=np.array([0.0, 0.0, 1.5e-2, 0.0, 0.0, 0.0]))
     predicted = predict(eccentric, noise, replace(stretch, measured=measured))
     known = with_swings(predicted)  # from half a turn
-    assert known.swing[2] == pytest.approx(swing[2], abs=6e-4) and not known.swing[[0, 1, 3, 4, 5]].any()
+    assert known.swing[2] == pytest.approx(swing[2], abs=1e-3) and not known.swing[[0, 1, 3, 4, 5]].any()
     white, as_round = (
         np.square(whitened(innovations([round_theta], one, predicted.gains)[0], predicted.gains)).mean()
         for one in (known, replace(stretch, measured=measured))
