@@ -9,6 +9,7 @@ from pydantic import ValidationError
 from gateway.cli import (
     audit_commands,
     baselines_commands,
+    commission_commands,
     configurations_commands,
     design_commands,
     doctor_commands,
@@ -49,6 +50,7 @@ app.command(rich_help_panel=ENGINEER)(identify_commands.identify)
 app.command(rich_help_panel=ENGINEER)(design_commands.design)
 app.add_typer(models_commands.app, rich_help_panel=ENGINEER)
 app.command(rich_help_panel=ENGINEER)(rehearse_commands.rehearse)
+app.command(rich_help_panel=ENGINEER)(commission_commands.commission)
 app.add_typer(experiment_commands.app, rich_help_panel=ENGINEER)
 app.command(rich_help_panel=ENGINEER)(judge_commands.judge)
 app.command(rich_help_panel=PROCESSES)(process_commands.run)
