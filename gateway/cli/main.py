@@ -10,6 +10,7 @@ from gateway.cli import (
     audit_commands,
     audit_replay,
     baselines_commands,
+    commission_commands,
     configurations_commands,
     design_commands,
     doctor_commands,
@@ -50,6 +51,7 @@ app.command(rich_help_panel=ENGINEER)(identify_commands.identify)
 app.command(rich_help_panel=ENGINEER)(design_commands.design)
 app.add_typer(models_commands.app, rich_help_panel=ENGINEER)
 app.command(rich_help_panel=ENGINEER)(rehearse_commands.rehearse)
+app.command(rich_help_panel=ENGINEER)(commission_commands.commission)
 app.add_typer(experiment_commands.app, rich_help_panel=ENGINEER)
 app.command(rich_help_panel=ENGINEER)(judge_commands.judge)
 app.command(rich_help_panel=PROCESSES)(process_commands.run)

@@ -20,15 +20,17 @@ from gateway.core.line_model import LineModel, noise_of, theta_of
 from gateway.core.signals import FloatArray
 from gateway.core.theta import Noise
 
+#: None quicker than the design's own weights: those track better on the model, and their rollers overshoot so far in
+#: speed that the line stops itself, which the gate does not simulate.
 LAWS = (
     *(
         Law("lqi", (("torque_per_nm2", torque), ("integral_per_n2s2", integral)))
-        for torque in (0.5, 1.0, 2.0, 4.0)
+        for torque in (1.0, 2.0, 4.0)
         for integral in (1.0, 0.3)
     ),
     *(
         Law("lqg", (("torque_per_nm2", torque), ("disturbance_nm_per_sqrt_s", disturbance)))
-        for torque in (0.5, 1.0, 2.0)
+        for torque in (1.0, 2.0)
         for disturbance in (1.0, 2.0)
     ),
     Law("pid"),
@@ -68,7 +70,7 @@ def redesigns(
         if all(_no_worse(line, figures[name], before[name]) for name in before):
             found.append((sum(figures[name].rmse_n / max(before[name].rmse_n, 1e-9) for name in before), law, config))
     found.sort(key=lambda each: each[0])
-    places = np.unique(np.round(np.linspace(0.0, len(found) - 1.0, RUNGS)).astype(int)).tolist() if found else []
+    places = sorted({round(k * (len(found) - 1) / (RUNGS - 1)) for k in range(RUNGS)}) if found else []
     return [found[place][1:] for place in places]
 
 

@@ -3,6 +3,7 @@
     a  proposals of many classes on S_real and random lines: verdicts beside the truth, of the test half
     b  chains of small steps by an adversary who knows the truth
     c  bytes at the level of the format: mutations of valid proposals
+    d  new lines commissioned through the gate, from the line's file to the highest speed (only where it is asked for)
 
 The truth is told by tests/independent, which shares nothing with the gate. Known good is what is safe there in every
 case, 4 ms later too and under the rules' own stress around the truth, in no metric worse than what is in service and
@@ -26,6 +27,7 @@ from scipy.stats import beta
 from gateway.identification.identify import NotIdentified
 from tests.bench.figures import Bench
 from tests.bench.gate_adversary import Chain, chain
+from tests.bench.gate_commissioning import bench_commissioning
 from tests.bench.gate_contexts import gate_line
 from tests.bench.gate_plants import is_for_tuning
 from tests.bench.gate_proposals import CLASSES, mpc_proposals, proposals
@@ -33,7 +35,7 @@ from tests.bench.gate_runs import LineBench, Tried, measured
 from tests.bench.gate_schema import Tally, mutated
 from tests.bench.identify_runs import Workers
 
-PARTS = "abc"
+PARTS, ASKED_FOR = "abc", "d"  #: of the latter only what is named
 SEED = 6100
 CANDIDATES = 60  #: numbers of lines from which those are taken that the file's own controller holds
 PAPER_RULE = "paper: approve"
@@ -69,7 +71,7 @@ def main() -> None:
     with Workers() as workers:
         for letter in sorted(wanted):
             began = time.monotonic()
-            {"a": _proposals, "b": _chains, "c": _schema}[letter](bench, workers, sizes, half)
+            {"a": _proposals, "b": _chains, "c": _schema, "d": _commissioning}[letter](bench, workers, sizes, half)
             print(f"part {letter}: {time.monotonic() - began:.0f} s", flush=True)
     bench.finish()
 
@@ -251,6 +253,10 @@ def _schema(bench: Bench, workers: Workers, sizes: Sizes, half: str) -> None:
     }
 
 
+def _commissioning(bench: Bench, workers: Workers, sizes: Sizes, half: str) -> None:
+    bench_commissioning(bench, workers, numbers(sizes.plants, half))
+
+
 def _arguments() -> tuple[Sizes, set[str], str, str]:
     most = Sizes()
     parser = argparse.ArgumentParser(prog="make bench-gate", description=__doc__.splitlines()[0])
@@ -260,8 +266,8 @@ def _arguments() -> tuple[Sizes, set[str], str, str]:
     parser.add_argument("--half", choices=("test", "tuning"), default="test", help="tuning: nothing of the test half")
     given = parser.parse_args()
     wanted = set(given.parts.split(","))
-    if not wanted <= set(PARTS):
-        parser.error(f"parts are {', '.join(PARTS)}")
+    if not wanted <= set(PARTS + ASKED_FOR):
+        parser.error(f"parts are {', '.join(PARTS + ASKED_FOR)}")
     sizes = Sizes(**{name: getattr(given, name) for name in vars(most)})
     return sizes, wanted, given.half, " ".join(sys.argv[1:])
 

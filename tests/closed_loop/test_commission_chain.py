@@ -12,7 +12,7 @@ from gateway.cli.commission import commission
 from gateway.cli.commission_stepped import SteppedGate
 from gateway.cli.stepped import SteppedLoop, run_scenario
 from gateway.commissioning.chain import Step
-from gateway.control.design import design_lqg, design_lqi, task_of, task_on
+from gateway.control.design import design_lqi, task_of, task_on
 from gateway.core.controller import config_hash
 from gateway.core.scenario import Scenario
 from gateway.supervisor.gate import book_in
@@ -43,8 +43,8 @@ STARTED_WITH = design_lqi(task_of(LINE))
 STEP = Scenario(
     name="step",
     tension_n=LINE.recipes[0].tension_n,
-    speed_m_per_s=0.05,
-    tension_after_n=[tension + 8.0 for tension in LINE.recipes[0].tension_n],
+    speed_m_per_s=0.03,
+    tension_after_n=[tension + 4.0 for tension in LINE.recipes[0].tension_n],
     change_at_s=0.3,
     duration_s=3.0,
 )
@@ -105,9 +105,10 @@ def test_a_new_line_ends_with_an_adapted_configuration_though_the_chain_was_inte
     loop = producing(plant)
     found, in_service = commissioned(loop, tmp_path, interrupt_at=4)
     assert_adapted(found, in_service, loop, tmp_path)
-    on_truth = {"lqg": design_lqg, "lqi": design_lqi}[in_service.kind](task_on(LINE, truth_of(plant, LINE)))
+    on_truth = design_lqi(task_on(LINE, truth_of(plant, LINE)))
     adapted, best = (run_scenario(LINE, config, plant, STEP, SEED) for config in (in_service, on_truth))
-    assert adapted.unsafe_events == 0 and adapted.rmse_n < 1.02 * best.rmse_n
+    assert adapted.stopped is None and adapted.unsafe_events == 0
+    assert adapted.rmse_n < 1.05 * best.rmse_n
 
 
 def test_friction_and_lag_that_nobody_knows_of_are_found_and_lived_with(tmp_path):

@@ -1,0 +1,163 @@
+"""The commissioning chain on a gateway that runs: asked over its socket, with its stores and its history beside it."""
+
+import asyncio
+import time
+from collections.abc import Awaitable, Callable
+from datetime import UTC, datetime
+from pathlib import Path
+
+from pydantic import ValidationError
+
+from gateway.cli.commission import CannotGoOn
+from gateway.cli.commission_changes import LineNow
+from gateway.commissioning.chain import OPEN_STAGES, Outcome, past_of
+from gateway.core.decisions import ListProposals, ProposalList, ProposalShown, ShowProposal
+from gateway.core.line import Line
+from gateway.core.messages import Reply
+from gateway.core.recording import Recording
+from gateway.core.topics import GATEWAY_PROPOSALS, GATEWAY_PROPOSE, GATEWAY_STATUS, Topic
+from gateway.mailbox.port import Mailbox, Unreachable
+from gateway.supervisor import configurations as configurations_store
+from gateway.supervisor import models as models_store
+from gateway.supervisor.configurations import ConfigurationsError, open_configurations
+from gateway.supervisor.experiments import MOST_EXPERIMENTS, newest_experiments
+from gateway.supervisor.history import HistoryError
+from gateway.supervisor.model_store import ModelsError
+from gateway.supervisor.models import open_repository
+from gateway.supervisor.status import GatewayStatus
+
+TOPICS = (GATEWAY_PROPOSE, GATEWAY_PROPOSALS, GATEWAY_STATUS)  #: that are asked for
+ANSWER_S = 20.0
+POLL_S = 1.0
+STANDS_S = 6.0  #: for which set-points must have stood: the gate looks at the last five seconds
+READY_WITHIN_S = 600.0
+MOST_SHOWN = 200
+
+
+class LiveGate:
+    """Of `line`, whose gateway answers on `mailbox`. See GateSide. `pause` waits for seconds on `clock`."""
+
+    def __init__(
+        self,
+        line: Line,
+        mailbox: Mailbox,
+        tell: Callable[[str], None],
+        pause: Callable[[float], Awaitable[None]] = asyncio.sleep,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._line = line
+        self._mailbox = mailbox
+        self._tell = tell
+        self._pause = pause
+        self._clock = clock
+        self._told = ""  #: for which proposal a person has been asked
+        self._settled: dict[str, ProposalShown] = {}  #: proposals to which nothing happens any more
+
+    async def proposals(self) -> list[ProposalShown]:
+        listed = await self._listed()
+        return [await self._shown(one.proposal) for one in reversed(listed.proposals)]
+
+    async def now(self) -> LineNow:
+        listed, status = await self._listed(), await self._status()
+        tension = [span.setpoint_n for span in status.spans if span.setpoint_n is not None]
+        speed = status.speed_setpoint_m_per_s
+        if listed.in_service is None or speed is None or len(tension) != self._line.n:
+            raise CannotGoOn(f"the loop has not said how the line stands: {status.loop.next}")
+        folder, site, name = Path(status.historian.path).parent, self._line.site, self._line.line
+        try:
+            with open_configurations(folder / configurations_store.FILE_NAME) as configurations:
+                controller = configurations.find(listed.in_service, site, name).controller
+            model = None
+            if listed.model is not None:
+                with open_repository(folder / models_store.FILE_NAME) as models:
+                    model = models.find(listed.model, site, name).model
+        except (ConfigurationsError, ModelsError) as error:
+            raise CannotGoOn(str(error)) from error
+        if controller is None or (listed.model is not None and model is None):
+            raise CannotGoOn("the configuration or the model in service is damaged in the store")
+        return LineNow(controller, model, tension, speed, datetime.fromtimestamp(status.wall_s, UTC))
+
+    async def recordings(self) -> list[Recording]:
+        status = await self._status()
+        begin_s = status.wall_s - self._line.gate.data_max_age_s
+        path, until_s = Path(status.historian.path), status.wall_s + 1.0
+        try:
+            found = await asyncio.to_thread(newest_experiments, path, begin_s, until_s, MOST_EXPERIMENTS)
+        except HistoryError:
+            return []  # there is no history yet
+        return [one for one, _ in found]
+
+    async def ready(self) -> None:
+        """In RUN, with set-points that have stood; after a refusal for the moment, the cool-down later."""
+        shown = await self.proposals()
+        if shown and past_of(shown[-1]).outcome is Outcome.AGAIN:
+            await self._pause(self._line.gate.cool_down_s)
+        began_s = since_s = self._clock()
+        before: object = None
+        told = False
+        while self._clock() - since_s < STANDS_S:
+            status = await self._status()
+            stands = status.loop.state, status.speed_setpoint_m_per_s, [span.setpoint_n for span in status.spans]
+            if status.loop.state != "RUN" and not told:
+                told = True
+                self._tell(f"the line is in {status.loop.state}: {status.loop.next}")
+            if stands != before or status.loop.state != "RUN":
+                before, since_s = stands, self._clock()
+            if self._clock() - began_s > READY_WITHIN_S:
+                raise CannotGoOn(f"the line has not stood in RUN within {READY_WITHIN_S:g} s: start it, then go on")
+            await self._pause(POLL_S)
+
+    async def propose(self, payload: bytes) -> Reply:
+        return Reply.model_validate_json(await self._ask(GATEWAY_PROPOSE, payload))
+
+    async def wait_for(self, proposal: str) -> None:
+        shown = await self._shown(proposal)
+        if shown.stage == "waiting" and self._told != proposal:
+            self._told = proposal
+            self._tell(f"  the gate lets it through; a person decides: r2rgate approve {proposal[:12]}")
+        await self._pause(POLL_S)
+
+    async def _listed(self) -> ProposalList:
+        answer = await self._ask(GATEWAY_PROPOSALS, ListProposals(most=MOST_SHOWN).model_dump_json().encode())
+        try:
+            return ProposalList.model_validate_json(answer)
+        except ValidationError:
+            raise CannotGoOn(_refusal(answer)) from None
+
+    async def _shown(self, proposal: str) -> ProposalShown:
+        if proposal in self._settled:
+            return self._settled[proposal]
+        answer = await self._ask(GATEWAY_PROPOSALS, ShowProposal(proposal=proposal).model_dump_json().encode())
+        try:
+            shown = ProposalShown.model_validate_json(answer)
+        except ValidationError:
+            raise CannotGoOn(_refusal(answer)) from None
+        if shown.stage not in OPEN_STAGES:
+            self._settled[proposal] = shown
+            why = f": {shown.why}" if shown.why else ""
+            self._tell(f"  {proposal[:12]} ({shown.proposal.kind}) is {shown.stage}{why}")
+        return shown
+
+    async def _status(self) -> GatewayStatus:
+        status = GatewayStatus.model_validate_json(await self._ask(GATEWAY_STATUS, b""))
+        if (status.site, status.line) != (self._line.site, self._line.line):
+            raise CannotGoOn(
+                f"there runs {status.site}/{status.line}, the file describes {self._line.site}/{self._line.line}: name "
+                "its --run-dir, or its file"
+            )
+        return status
+
+    async def _ask(self, topic: Topic, payload: bytes) -> bytes:
+        try:
+            return await self._mailbox.request(topic, payload, ANSWER_S)
+        except Unreachable as error:
+            raise CannotGoOn(str(error)) from error
+
+
+def _refusal(answer: bytes) -> str:
+    """What stands in the place of what was asked for."""
+    try:
+        reply = Reply.model_validate_json(answer)
+    except ValidationError:
+        return "what answers there is of another version than this command"
+    return "; ".join([reply.text, *reply.reasons])

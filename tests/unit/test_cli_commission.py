@@ -1,0 +1,126 @@
+"""`r2rgate commission` against a gateway in this process that keeps its promises, and no more."""
+
+import asyncio
+
+from gateway.cli.commission import commission
+from gateway.cli.commission_live import STANDS_S, LiveGate
+from gateway.commissioning.chain import LADDERS, Step
+from gateway.control.design import design_lqi, task_of
+from gateway.core.controller import config_hash
+from gateway.core.decisions import QUERY, ListProposals, ProposalLine, ProposalList, ProposalShown
+from gateway.core.messages import Reply
+from gateway.core.proposal import parse_proposal, proposal_hash
+from gateway.core.topics import GATEWAY_PROPOSALS, GATEWAY_PROPOSE, LOOP_TELEMETRY
+from gateway.core.verdict import RuleFinding, Verdict
+from gateway.mailbox.inprocess import Hub, InProcessMailbox
+from gateway.mailbox.port import Counters
+from gateway.supervisor.configurations import FILE_NAME, Origin, begin_configurations
+from gateway.supervisor.historian import Historian
+from gateway.supervisor.service import Gateway
+from tests.unit.supervisor_support import frame_of, line_of, until
+
+LINE = line_of(2)
+CONFIG = design_lqi(task_of(LINE))
+
+
+class QuietHistorian(Historian):
+    """It is never started, and stores nothing."""
+
+    def frame(self, payload):
+        pass
+
+    def event(self, event):
+        pass
+
+
+class OneProcess:
+    """A gateway over a line that stands at 0.01 m/s; every proposal is refused at once, or waits for a person."""
+
+    def __init__(self, folder, stage="refused", line=LINE):
+        self.now_s, self.frames, self.stage = 100.0, 0, stage
+        self.shown: dict[str, ProposalShown] = {}
+        self.told: list[str] = []
+        hub = Hub()
+        self.mailbox, self.loop = InProcessMailbox(hub), InProcessMailbox(hub)
+        historian = QuietHistorian(folder, line.site, line.line, line.n)
+        clock = lambda: self.now_s  # noqa: E731
+        Gateway(line, InProcessMailbox(hub), historian, Counters(), clock=clock, wall_clock=lambda: 1.8e9 + self.now_s)
+        self.loop.serve(GATEWAY_PROPOSE, self._propose)
+        self.loop.serve(GATEWAY_PROPOSALS, self._proposals)
+        with begin_configurations(folder / FILE_NAME) as store:
+            store.store(LINE.site, LINE.line, CONFIG, Origin(0.0, "test", "the loop starts with it"))
+        self.side = LiveGate(LINE, self.mailbox, self.told.append, self.pause, clock)
+        self._frame()
+
+    async def pause(self, seconds):
+        self.now_s += seconds
+        self._frame()
+
+    def _frame(self):
+        self.frames += 1
+        frame = frame_of(self.frames, self.now_s, 2, unwind_speed_m_per_s=0.01, speed_setpoint_m_per_s=0.01)
+        self.loop.publish(LOOP_TELEMETRY, frame)
+
+    async def _propose(self, payload):
+        proposal = parse_proposal(payload)
+        hash_ = proposal_hash(proposal)
+        refused = self.stage == "refused"
+        verdict = Verdict(
+            format=1, proposal=hash_, payload=hash_, context="0" * 64, line="0" * 64, kind=proposal.kind, seed=1,
+            accepted=not refused, judged=proposal.created, program_version="0",
+            findings=[RuleFinding(rule="corners: error", passed=not refused, text="too far", value=4.0, limit=3.0)],
+        )  # fmt: skip
+        self.shown[hash_] = ProposalShown(
+            format=1, stage=self.stage, why="too far" if refused else "", proposal_hash=hash_, shown=None, epoch=0,
+            difference=[], proposal=proposal, verdict=verdict,
+        )  # fmt: skip
+        return Reply(ok=True, state="", text="is being judged").model_dump_json().encode()
+
+    async def _proposals(self, payload):
+        query = QUERY.validate_json(payload)
+        if not isinstance(query, ListProposals):
+            return self.shown[query.proposal].model_dump_json().encode()
+        lines = [
+            ProposalLine(
+                proposal=one.proposal_hash, kind=one.proposal.kind, author=one.proposal.author, stage=one.stage,
+                why=one.why, created=one.proposal.created, expires=one.proposal.expires, epoch=None,
+            )
+            for one in reversed(self.shown.values())
+        ]  # fmt: skip
+        return ProposalList(
+            format=1, site=LINE.site, line=LINE.line, in_service=config_hash(CONFIG),
+            last_known_good=config_hash(CONFIG), epoch=0, model=None, proposals=lines,
+        ).model_dump_json().encode()  # fmt: skip
+
+
+def test_each_candidate_is_proposed_once_and_the_end_says_why(tmp_path):
+    gateway = OneProcess(tmp_path)
+    found = asyncio.run(commission(LINE, gateway.side, gateway.told.append))
+    assert not found.reached and "too far" in found.text
+    assert [(one.step, one.rung, one.rule, one.value, one.limit) for one in found.tried] == [
+        (Step.FIRST, rung, "corners: error", 4.0, 3.0) for rung in range(LADDERS[Step.FIRST])
+    ]
+    assert gateway.now_s >= 100.0 + LADDERS[Step.FIRST] * STANDS_S  # the line has stood before each
+    again = OneProcess(tmp_path)
+    again.shown = gateway.shown  # the command started anew
+    assert asyncio.run(commission(LINE, again.side)).text == found.text and len(again.shown) == len(found.tried)
+
+
+def test_a_person_is_asked_once_and_waited_for(tmp_path):
+    gateway = OneProcess(tmp_path, stage="waiting")
+
+    async def run():
+        working = asyncio.create_task(commission(LINE, gateway.side, gateway.told.append))
+        await until(lambda: gateway.now_s >= 200.0)
+        working.cancel()
+        await asyncio.gather(working, return_exceptions=True)
+
+    asyncio.run(run())
+    (hash_,) = gateway.shown
+    assert [text for text in gateway.told if f"r2rgate approve {hash_[:12]}" in text] == gateway.told[1:]
+
+
+def test_another_line_than_that_of_the_file_is_left_alone(tmp_path):
+    gateway = OneProcess(tmp_path, line=line_of(2, "another"))
+    found = asyncio.run(commission(LINE, gateway.side))
+    assert not found.reached and "another" in found.text and gateway.shown == {}
