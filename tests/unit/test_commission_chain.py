@@ -1,9 +1,10 @@
 """The policy of the commissioning chain: whatever the gate says, it ends, and goes on after a restart."""
 
 from dataclasses import replace
+from itertools import cycle, islice
 
 import pytest
-from hypothesis import given
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from gateway.commissioning.candidates import (
@@ -126,14 +127,15 @@ def test_what_an_engineer_has_done_meanwhile_counts():
     assert asked(past).reached
 
 
+@settings(deadline=None, max_examples=50, suppress_health_check=[HealthCheck.too_slow])
 @given(
-    st.lists(st.sampled_from([Outcome.DONE, Outcome.DONE, Outcome.FAILED, Outcome.AGAIN]), min_size=600, max_size=600),
+    st.lists(st.sampled_from([Outcome.DONE, Outcome.DONE, Outcome.FAILED, Outcome.AGAIN]), min_size=1, max_size=40),
     st.floats(0.2, 1.0),
 )
 def test_it_ends_whatever_the_gate_says(outcomes, share):
-    """`share` of the speed that an experiment has shown is what a configuration is then let through for."""
+    """It says the same again and again; `share` of what an experiment has shown is what a configuration gets."""
     past: list[Past] = []
-    for outcome in outcomes:
+    for outcome in islice(cycle(outcomes), 600):
         step = asked(past)
         if isinstance(step, Ended):
             return
