@@ -21,10 +21,10 @@ from tests.bench.control_plants import random_plant
 from tests.closed_loop.recorded import demonstration_line
 from tests.closed_loop.truths import truth_of, with_friction_and_lag
 
-pytestmark = pytest.mark.timeout(600)  # stepped time, but on a machine that does other things a long one
+pytestmark = pytest.mark.timeout(600)  # a minute of stepped time; many on a machine that does other things
 
 SPANS, SEED = 3, 71_000
-FASTEST_M_PER_S = 0.06
+FASTEST_M_PER_S = 0.12
 
 
 def new_line():
@@ -92,7 +92,7 @@ def assert_adapted(found, in_service, loop, folder):
     assert book.epoch == len(kept) >= 3 and kept[-1].changes == config_hash(in_service) == book.in_service
     assert loop.cycle.configurations.running.hash == config_hash(in_service)
     assert [one.step for one in found.tried if one.stage in ("kept", "done")] == [
-        Step.FIRST, *2 * [Step.EXPERIMENT, Step.MODEL, Step.REDESIGN],
+        Step.FIRST, *3 * [Step.EXPERIMENT, Step.MODEL, Step.REDESIGN],
     ]  # fmt: skip
     limits, truth = LINE.limits, loop.truth.recorder
     tension = truth.recording().tension_n
@@ -100,8 +100,8 @@ def assert_adapted(found, in_service, loop, folder):
     assert truth.unsafe_total == 0 and not loop.transitions
 
 
-def test_a_new_line_ends_with_an_adapted_configuration_though_the_chain_was_interrupted(tmp_path):
-    plant = random_plant(SEED, SPANS)
+def test_a_new_line_with_friction_that_nobody_knows_of_ends_with_an_adapted_configuration(tmp_path):
+    plant = with_friction_and_lag(random_plant(SEED, SPANS), coulomb_nm=2.0, lag_s=0.005)
     loop = producing(plant)
     found, in_service = commissioned(loop, tmp_path, interrupt_at=4)
     assert_adapted(found, in_service, loop, tmp_path)
@@ -109,9 +109,3 @@ def test_a_new_line_ends_with_an_adapted_configuration_though_the_chain_was_inte
     adapted, best = (run_scenario(LINE, config, plant, STEP, SEED) for config in (in_service, on_truth))
     assert adapted.stopped is None and adapted.unsafe_events == 0
     assert adapted.rmse_n < 1.05 * best.rmse_n
-
-
-def test_friction_and_lag_that_nobody_knows_of_are_found_and_lived_with(tmp_path):
-    loop = producing(with_friction_and_lag(random_plant(SEED, SPANS), coulomb_nm=2.0, lag_s=0.005))
-    found, in_service = commissioned(loop, tmp_path)
-    assert_adapted(found, in_service, loop, tmp_path)
