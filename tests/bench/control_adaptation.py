@@ -24,6 +24,7 @@ ROUNDS = 2  #: on S_real
 SHORT_SEEDS = 2  #: under tiers with a short period
 BEYOND_SEEDS = 3
 PLANTS, WITH_ORACLE = 20, 10  #: of the ensemble
+ROUNDS_OVER = {"A": 1, "B": 2}  #: on plants of the ensemble: what the goals of a tier grant
 KINDS = {"random": "one factor for a whole plant", "uneven": "and each roller and span off by up to 10 % by itself"}
 BEYOND = {
     "stressed": "S_real with white noise of intensity 5e-2 on the rollers",
@@ -165,47 +166,51 @@ def _on_real(given: Given, tier: Tier, runs: Runs, part: Part) -> Table:
 
 
 def _over(given: Given, kind: str, tier: Tier, runs: Runs, part: Part) -> Table:
-    """After one adaptation, over plants that are in no file."""
+    """After each adaptation that the tier is granted, over plants that are in no file."""
     seeds = TEST[: min(given.plants, PLANTS)]
     plants = [f"{kind}-{seed}" for seed in seeds]
-    asked = [Adaptation(tier.name, plant, seed, 1) for plant, seed in zip(plants, seeds, strict=True)]
+    asked = [Adaptation(tier.name, one, seed, ROUNDS_OVER[tier.name]) for one, seed in zip(plants, seeds, strict=True)]
     found = _adapted(asked, runs, part, f"adapted to {kind} plants, tier {tier.name}")
-    heads = ("Case", "RMSE median, N", "p95, N", "to oracle, median", "p95", "to design on the plant, median", "p95")
-    heads += ("worst plant", "Unsafe events", "Without result")
-    rows, words = [], ("adapted", kind, tier.name)
+    heads = ("After", "Case", "RMSE median, N", "p95, N", "to oracle, median", "p95")
+    heads += ("to design on the plant, median", "p95", "worst plant", "Unsafe events", "Without result")
+    rows = []
     for case in CASES:
-        truth = runs.of(
+        own = runs.of(
             [Job(tier.name, case, LAW, plant, plant, seed) for plant, seed in zip(plants, seeds, strict=True)],
             f"designed on {kind} plants, tier {tier.name}",
         )
         asked_best = [Bound(tier.name, case, plant) for plant in plants[:WITH_ORACLE]]
         best = [] if tier.move_s else runs.best(asked_best, f"oracle, {kind} plants")
-        sums = _after(found, 1, case)
-        outcomes = [rounds[0].outcomes.get(case, Outcome(None)) for rounds in found]
-        fine = [_counts(outcome) for outcome in outcomes]
-        to_truth = {
-            plant: ours.rmse_n / own.rmse_n
-            for plant, ours, own, ok in zip(plants, outcomes, truth, fine, strict=True)
-            if ok and own.metrics
-        }
-        to_oracle = [ours.rmse_n / one.rmse_n for ours, one, ok in zip(outcomes, best, fine, strict=False) if ok]
-        worst = max(to_truth, key=lambda plant: to_truth[plant], default="–")
-        cells = [case]
-        for name, unit, values, decimals in (
-            ("n", "N", sums.rmse, 4), ("to_oracle", "x", to_oracle, 3), ("to_truth", "x", list(to_truth.values()), 3)
-        ):  # fmt: skip
-            for quantity, value in _quantiles(values).items():
-                cells.append(told(value, decimals))
-                if values:
-                    part.figures.append((slug(*words, case, f"{name}_{quantity}"), value, unit, len(values)))
-        part.figures.append((slug(*words, case, "without_result"), float(sums.missing), "", len(found)))
-        rows.append((*cells, worst, str(sum(outcome.unsafe for outcome in outcomes)), str(sums.missing)))
+        for number in range(1, ROUNDS_OVER[tier.name] + 1):
+            outcomes = [
+                rounds[number - 1].outcomes.get(case, Outcome(None)) if len(rounds) >= number else Outcome(None)
+                for rounds in found
+            ]
+            sums = _sums(outcomes, len(found))
+            to_truth = {
+                plant: ours.rmse_n / true.rmse_n
+                for plant, ours, true in zip(plants, outcomes, own, strict=True)
+                if _counts(ours) and true.metrics
+            }
+            to_oracle = [ours.rmse_n / one.rmse_n for ours, one in zip(outcomes, best, strict=False) if _counts(ours)]
+            words, cells = ("adapted", kind, tier.name, f"adapt{number}", case), [str(number), case]
+            for name, unit, values, decimals in (
+                ("n", "N", sums.rmse, 4), ("to_oracle", "x", to_oracle, 3),
+                ("to_truth", "x", list(to_truth.values()), 3),
+            ):  # fmt: skip
+                for quantity, value in _quantiles(values).items():
+                    cells.append(told(value, decimals))
+                    if values:
+                        part.figures.append((slug(*words, f"{name}_{quantity}"), value, unit, len(values)))
+            part.figures.append((slug(*words, "without_result"), float(sums.missing), "", len(found)))
+            worst = max(to_truth, key=lambda plant: to_truth[plant], default="–")
+            rows.append((*cells, worst, str(sums.unsafe), str(sums.missing)))
     oracle = "" if tier.move_s else f" Oracle: of the first {len(plants[:WITH_ORACLE])}."
     return Table(
-        f"Adapted to the ensemble ({KINDS[kind]}), one adaptation, tier {tier.name}",
+        f"Adapted to the ensemble ({KINDS[kind]}), tier {tier.name}",
         heads,
         tuple(rows),
-        numeric(heads, 1),
+        numeric(heads, 2),
         note=given.made(
             f"{len(plants)} plants, seeds {seeds[0]} to {seeds[-1]}.{oracle} Unsafe events in experiments: "
             f"{sum(one.unsafe for rounds in found for one in rounds)}. {_told_findings(found)}"

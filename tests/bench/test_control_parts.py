@@ -79,7 +79,7 @@ def test_what_comes_after_adaptation_is_summed_up_and_every_goal_of_it_has_its_f
     assert found["a_adapt1_s_real_tension_to_oracle"] == (pytest.approx(1.6), 1)
     assert found["a_adapt1_s_real_without_result"] == (2.0, 4)
     assert found["b_adapt2_s_real_velocity_to_truth"] == (pytest.approx(1.25), 2)
-    assert found["adapted_uneven_b_velocity_to_truth_p95"] == (pytest.approx(1.25), 3)
+    assert found["adapted_uneven_b_adapt2_velocity_to_truth_p95"] == (pytest.approx(1.25), 3)
     assert found["realistic_a_adapt2_tension_n"] == (pytest.approx(2.0), 2)
     assert found["realistic_a_adapt2_velocity_n"][1] == 0  # a line that was stopped has no RMSE
     assert part.unsafe == 1 + 2 * 2 * 2  # of one experiment, and of two seeds, rounds and cases
