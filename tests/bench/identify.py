@@ -143,7 +143,10 @@ def _spread(bench: Bench, workers: Workers, sizes: Sizes) -> None:
 
 def _shown(bench: Bench, workers: Workers, sizes: Sizes) -> None:
     """No goals: what is reached where the model's structure is not the truth's."""
-    cases = {"stress": runs.stressed, "eccentricity": runs.with_eccentricity, "realistic": runs.realistic}
+    cases = {
+        "stress": runs.stressed, "eccentricity_0.2_pct": runs.with_eccentricity,
+        "eccentricity_0.5_pct": runs.with_much_eccentricity, "realistic": runs.realistic,
+    }  # fmt: skip
     rows = []
     for name, function in cases.items():
         found: list[Chosen] = list(workers.each(function, range(sizes.shown), name))

@@ -63,13 +63,14 @@ class Found:
 
 
 def against_truth(fitted: Fit, plant: Plant) -> Found:
+    """Of the parameters; amplitudes of rollers out of round may be found where there is none, and have no ratio."""
     estimate = fitted.estimate
     truth = true_values(plant, estimate.structure)
-    intervals = estimate.intervals
+    intervals = {name: interval for name, interval in estimate.intervals.items() if name in truth}
     return Found(
-        {name: intervals[name].value / truth[name] - 1.0 for name in intervals},
-        {name: intervals[name].covers(truth[name]) for name in intervals},
-        {name: 0.5 * float(np.log(intervals[name].high / intervals[name].low)) for name in intervals},
+        {name: interval.value / truth[name] - 1.0 for name, interval in intervals.items()},
+        {name: interval.covers(truth[name]) for name, interval in intervals.items()},
+        {name: 0.5 * float(np.log(interval.high / interval.low)) for name, interval in intervals.items()},
         fitted.noise,
         fitted.converged,
     )
@@ -210,13 +211,18 @@ def _gathered(plant: Plant, first: int, seconds: float = 5.0) -> list[Recording]
     return found
 
 
-def with_eccentricity(seed: int) -> Chosen:
-    """Coulomb friction, lag, and rollers that run 0.2 % out of true."""
-    plant = altered(with_friction_and_lag(real_plant()), {"effects": {"eccentricity": {"share": 2e-3}}})
+def with_eccentricity(seed: int, share: float = 2e-3) -> Chosen:
+    """Coulomb friction, lag, and rollers that run out of true by `share` of their radius."""
+    plant = altered(with_friction_and_lag(real_plant()), {"effects": {"eccentricity": {"share": share}}})
     generator = np.random.default_rng(seed)
     phases = generator.uniform(0.0, 2.0 * np.pi, plant.spans).tolist()
     plant = altered(plant, {"effects": {"eccentricity": {"phase_rad": phases}}})
     return at_two_speeds(plant, seed)
+
+
+def with_much_eccentricity(seed: int) -> Chosen:
+    """The same, by the half per cent that the gate's simulations have."""
+    return with_eccentricity(seed, 5e-3)
 
 
 def realistic(seed: int) -> Chosen:
