@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gateway.core.line import Gate
-from safety.probation import WORSE, against, standing
+from safety.probation import WORSE, Standing, against, standing
 
 GATE = Gate()
 PERIODS = 1000
@@ -60,3 +60,30 @@ def test_noise_of_the_load_cell_is_no_swing_and_what_is_not_measured_tells_nothi
     before = stood()
     before.swing_n[:] = np.nan  # not measured before the change: the limit holds
     assert against(stood(swing_n=1.01 * GATE.tail_oscillation_max_n), before, GATE)
+
+
+@pytest.mark.parametrize(
+    ("one", "said"),
+    [
+        (stood(offset_n=3.5), "tension 2 is off by 3.50 N, allowed: 3.00 N"),
+        (stood(swing_n=1.25), "tension 2 swings by 1.25 N, allowed: 1.00 N"),
+        (stood(chatter_nm=5.5), "torque 2 chatters by 5.50 Nm, allowed: 5.00 Nm"),
+    ],
+)
+def test_what_is_said_has_number_and_limit(one: Standing, said: str) -> None:
+    assert against(one, None, GATE) == said
+
+
+def test_what_stands_at_its_limit_is_kept_and_of_several_the_worst_by_its_own_limit_is_named() -> None:
+    none = np.zeros(3)
+    assert against(Standing(np.array([0.0, GATE.tail_error_max_n, 0.0]), none, none), None, GATE) == ""
+    before = Standing(np.array([0.0, 0.0, 10.0]), none, none)
+    assert against(Standing(np.array([0.0, 6.0, 13.0]), none, none), before, GATE).startswith(
+        "tension 2 is off by 6.00"
+    )
+
+
+def test_a_load_cells_noise_counts_as_the_sine_with_its_root_mean_square() -> None:
+    allowed_n = GATE.tail_oscillation_max_n + np.sqrt(2.0) * 0.5
+    assert against(stood(swing_n=0.999 * allowed_n), None, GATE, noise_n=0.5) == ""
+    assert against(stood(swing_n=1.001 * allowed_n), None, GATE, noise_n=0.5)
