@@ -116,6 +116,9 @@ class SteppedGate:
             datetime.fromtimestamp(self._wall_s(), UTC),
         )  # fmt: skip
 
+    async def folder(self) -> Path:
+        return self._folder
+
     async def recordings(self) -> list[Recording]:
         return [one for one, _ in self._kept(self.line.gate.data_max_age_s)]
 

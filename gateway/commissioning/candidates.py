@@ -18,6 +18,7 @@ from gateway.identification.experiment_design import design_experiment
 
 HELD = 0.9  #: of the torque limit: more leaves no room to move
 LEFT_OPEN = 0.05  #: of a value that was found: what data leave open, and what drifts
+NEAR = 0.98  #: of the speed that is wanted, which is as good
 GRID = 20  #: parts of the greatest speed that are looked at
 
 
