@@ -37,7 +37,7 @@ from gateway.core.deployment import Region
 from gateway.core.line import Line
 from gateway.core.line_model import model_hash
 from gateway.core.messages import Reply
-from gateway.core.proposal import Proposal, canonical
+from gateway.core.proposal import Change, Evidence, Proposal, canonical, proposal_hash
 from gateway.core.recording import Recording
 from gateway.supervisor.baselines import BaselinesError
 
@@ -63,6 +63,10 @@ class GateSide(Protocol):
         ...
 
     async def now(self) -> LineNow: ...
+
+    async def state(self) -> str:
+        """Of the loop: RUN, READY ..."""
+        ...
 
     async def folder(self) -> Path:
         """Of the line's data, where its baselines are."""
@@ -116,10 +120,16 @@ class Commissioned:
 
 
 async def commission(
-    line: Line, side: GateSide, tell: Tell = lambda text: None, *, measure_again: bool = False
+    line: Line,
+    side: GateSide,
+    tell: Tell = lambda text: None,
+    *,
+    measure_again: bool = False,
+    most_redesigns: int | None = None,
 ) -> Commissioned:
     """Until the chain has ended, one way or the other. Every rung is tried once, so that it does.
 
+    `most_redesigns`: it is left there once so many have been kept.
     `measure_again`: what was measured until now is of a line that is no longer as it was (another grade, a new part).
     """
     if why := refused_at_once(line):
@@ -129,11 +139,15 @@ async def commission(
     past: list[Past] = []
     shown: list[ProposalShown] = []
     measured: dict[str, Convergence] = {}
-    outdated = frozenset(await _measured(line, side)) if measure_again else frozenset[str]()
+    outdated = None if measure_again else frozenset[str]()
     while True:
         try:
-            shown, measured = await side.proposals(), await _measured(line, side)
+            shown, measured = await side.proposals(), await measured_on(line, side)
+            outdated = frozenset(measured) if outdated is None else outdated
             past = _merged(shown, unmade, measured, outdated)
+            kept_now = sum(one.step is Step.REDESIGN and one.outcome is Outcome.DONE for one in past)
+            if most_redesigns is not None and kept_now >= most_redesigns:
+                return _commissioned(Ended(True, f"{kept_now} redesigns are kept"), past, shown, measured)
             now = await side.now()
             step = next_step(past, first_speed_m_per_s(line), fastest_m_per_s(line, now.model))
             if isinstance(step, Ended):
@@ -163,7 +177,7 @@ async def _look(changes: Changes, side: GateSide, proposal: str, tell: Tell) -> 
     tell(f"measurement: {found.text}")
 
 
-async def _measured(line: Line, side: GateSide) -> dict[str, Convergence]:
+async def measured_on(line: Line, side: GateSide) -> dict[str, Convergence]:
     """By proposal. Raises CannotGoOn."""
     try:
         return kept(await side.folder(), line)
@@ -182,7 +196,13 @@ async def _propose(
         tell(f"{step.step}, candidate {step.rung + 1}: cannot be made: {refused}")
         unmade.append((len(shown), Past(KINDS[step.step], Outcome.FAILED, step.step, step.rung, str(refused))))
         return
-    at = (await side.now()).at
+    tell(f"{step.step}, candidate {step.rung + 1}: {reason}")
+    await put(line, side, change, reason, named(step.step, step.rung))
+
+
+async def put(line: Line, side: GateSide, change: Change, reason: str, evidence: Evidence) -> str:
+    """Before the gate; its hash. Raises CannotGoOn where the gate does not take it."""
+    now = await side.now()
     proposal = Proposal(
         format=1,
         site=line.site,
@@ -191,15 +211,15 @@ async def _propose(
         base=config_hash(now.in_service),
         model=None if now.model is None else model_hash(now.model),
         reason=reason,
-        evidence=[named(step.step, step.rung)],
+        evidence=[evidence],
         author=AUTHOR,
-        created=at.isoformat(timespec="milliseconds"),
-        expires=(at + timedelta(seconds=min(STANDS_S, line.gate.expiry_max_s))).isoformat(timespec="milliseconds"),
+        created=now.at.isoformat(timespec="milliseconds"),
+        expires=(now.at + timedelta(seconds=min(STANDS_S, line.gate.expiry_max_s))).isoformat(timespec="milliseconds"),
     )
-    tell(f"{step.step}, candidate {step.rung + 1}: {reason}")
     reply = await side.propose(canonical(proposal))
     if not reply.ok:
         raise CannotGoOn("; ".join([reply.text, *reply.reasons]))
+    return proposal_hash(proposal)
 
 
 def _require_slow(line: Line, step: Next, now: LineNow) -> None:

@@ -20,10 +20,11 @@ from math import inf, isfinite
 import numpy as np
 
 from gateway.commissioning.candidates import NotOffered
-from gateway.commissioning.redesign import loop_of, predicted
+from gateway.commissioning.redesign import BRIEF_S, LASTING_S, loop_of, predicted
 from gateway.control.judged_courses import Judged
 from gateway.control.rollout import Course, plants_of_thetas, simulate
 from gateway.core.controller import Controller
+from gateway.core.controller_laws import MpcConfig
 from gateway.core.deployment import Region
 from gateway.core.experiment import Abort, Experiment, Leg
 from gateway.core.line import Line, Strict
@@ -36,7 +37,7 @@ from gateway.core.theta import Noise
 RMSE_SHARE, MOST_OVERSHOOT_PCT, MOST_SETTLING_S = 0.05, 20.0, 2.0
 SIGNIFICANT = 0.05  #: of a predicted tracking error: a model that changes it by less leads to no other design
 DWELL_S, STEPS = 3.0, 3  #: of a measurement: from step to step, and at each speed
-OF_SETPOINT = 0.1  #: a step either way, of the set-point, as far as the region permits
+OF_SETPOINT = 0.05  #: a step either way, of the set-point, as far as the region permits
 ABORT_TIMES = 3.0  #: the greatest step either way: farther from its set-point no tension goes
 SMOOTHED_S = 0.05
 STANDS = 0.02  #: of the greatest speed, by which it may differ within a window, noise included
@@ -156,7 +157,8 @@ def _changed(line: Line, recording: Recording, config: Controller, model: LineMo
         line, recording.tension_setpoint_n[0], speed, line.limits.tension_step_max_n,
         min(line.limits.speed_step_max_m_per_s, speed),
     )  # fmt: skip
-    before, after = (predicted(config, line, one, judged) for one in (model, newer))
+    lasting_s = BRIEF_S if isinstance(config, MpcConfig) else LASTING_S
+    before, after = (predicted(config, line, one, judged, lasting_s) for one in (model, newer))
     return max(abs(after[name].rmse_n / max(before[name].rmse_n, 1e-9) - 1.0) for name in before)
 
 
@@ -175,18 +177,21 @@ def _figures(line: Line, recording: Recording, tension_n: FloatArray) -> dict[st
     windows = _windows(line, recording)
     if not windows:
         raise NotOffered("the recording has no step whose course could be looked at: the speed moved throughout")
-    rmse, overshoot, settling = [], [], []
+    found = np.zeros((3, line.n))  # RMSE, overshoot, settling time: the worst of all changes
     for begin, end in windows:
-        rows, asked = slice(begin - 1, end), setpoint[begin - 1 : end]
-        rmse.append(rmse_per_span_n(tension_n[begin:end], setpoint[begin:end]))
-        overshoot.append(overshoot_pct(time_s[rows], smooth[rows], asked, time_s[begin]))
-        settling.append(settling_time_s(time_s[rows], smooth[rows], asked, time_s[begin]))
-    worst = [np.max(values, axis=0) for values in (rmse, overshoot, settling)]
+        rows, asked, changed_s = slice(begin - 1, end), setpoint[begin - 1 : end], float(time_s[begin])
+        one = (
+            rmse_per_span_n(tension_n[begin:end], setpoint[begin:end]),
+            overshoot_pct(time_s[rows], smooth[rows], asked, changed_s),
+            settling_time_s(time_s[rows], smooth[rows], asked, changed_s),
+        )
+        found = np.maximum(found, one)
     lowest = np.min([setpoint[end - 1] for _, end in windows], axis=0)
+    rmse, overshoot, settling = found.tolist()
     return {
         str(i + 1): SpanFigures(
-            rmse_n=float(worst[0][i]), overshoot_pct=float(worst[1][i]),
-            settling_s=float(worst[2][i]) if isfinite(worst[2][i]) else None, setpoint_n=float(lowest[i]),
+            rmse_n=rmse[i], overshoot_pct=overshoot[i], settling_s=settling[i] if isfinite(settling[i]) else None,
+            setpoint_n=float(lowest[i]),
         )
         for i, span in enumerate(line.spans) if span.control == "tension"
     }  # fmt: skip
