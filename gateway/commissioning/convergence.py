@@ -26,7 +26,7 @@ from gateway.control.rollout import Course, plants_of_thetas, simulate
 from gateway.core.controller import Controller
 from gateway.core.controller_laws import MpcConfig
 from gateway.core.deployment import Region
-from gateway.core.experiment import Abort, Experiment, Leg
+from gateway.core.experiment import Abort, Experiment, Leg, signs
 from gateway.core.line import Line, Strict
 from gateway.core.line_model import LineModel, noise_of, theta_of
 from gateway.core.metrics import overshoot_pct, rmse_per_span_n, settling_time_s
@@ -36,7 +36,8 @@ from gateway.core.theta import Noise
 
 RMSE_SHARE, MOST_OVERSHOOT_PCT, MOST_SETTLING_S = 0.05, 20.0, 2.0
 SIGNIFICANT = 0.05  #: of a predicted tracking error: a model that changes it by less leads to no other design
-DWELL_S, STEPS = 3.0, 3  #: of a measurement: from step to step, and at each speed
+DWELL_S, STEPS = 3.0, 4  #: of a measurement: from step to step, and at each speed
+SEEDS = 100  #: are tried, for one with which every span steps at each speed
 OF_SETPOINT = 0.05  #: a step either way, of the set-point, as far as the region permits
 ABORT_TIMES = 3.0  #: the greatest step either way: farther from its set-point no tension goes
 SMOOTHED_S = 0.05
@@ -121,7 +122,7 @@ def measurement(
     nearest_n = float(min(setpoint.min() - limits.tension_min_n, limits.tension_max_n - setpoint.max()))
     if not 0.0 < greatest < nearest_n:
         raise NotOffered("no set-point may step far enough for a look at its course: steps and limits are too narrow")
-    return Experiment(
+    asked = Experiment(
         format=1,
         name="measurement",
         description="steps that stand, to see how the configuration in service does",
@@ -131,6 +132,14 @@ def measurement(
         legs=[Leg(duration_s=STEPS * DWELL_S, speed_m_per_s=speed) for speed in speeds_m_per_s],
         abort=Abort(deviation_n=min(ABORT_TIMES * greatest, nearest_n)),
     )
+    seeds = [asked.model_copy(update={"seed": SEEDS * seed + k}) for k in range(SEEDS)]
+    return max(seeds, key=_stepping)
+
+
+def _stepping(asked: Experiment) -> int:
+    """Spans that step at a speed, over all speeds."""
+    levels = np.array([signs(asked, dwell) for dwell in range(STEPS * len(asked.legs))]).reshape(-1, STEPS, asked.n)
+    return int(np.count_nonzero(np.ptp(levels, axis=1)))
 
 
 def convergence(
