@@ -1,19 +1,24 @@
 """The commissioning chain carried out: the next proposal is made and put before the gate, until the chain has ended.
 
 Whoever runs it, on a simulated line in stepped time or on a gateway that runs, gives a `GateSide`. Nothing is kept
-here: what has been tried stands in the gate's list, and a candidate that cannot be made is found so again.
+here: what has been tried stands in the gate's list, what measurements have shown in the line's baselines, and a
+candidate that cannot be made is found so again.
 """
 
 import asyncio
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Set as AbstractSet
+from dataclasses import dataclass, replace
 from datetime import timedelta
+from pathlib import Path
 from typing import Protocol
 
 from gateway.cli.commission_changes import Changes, LineNow, first_speed_m_per_s
+from gateway.cli.commission_measurements import keep, kept
 from gateway.commissioning.candidates import NotOffered, fastest_m_per_s
 from gateway.commissioning.chain import (
     Ended,
+    Look,
     Next,
     Outcome,
     Past,
@@ -25,18 +30,23 @@ from gateway.commissioning.chain import (
     refused_at_once,
     region_speed,
 )
+from gateway.commissioning.convergence import Convergence
 from gateway.core.controller import config_hash
 from gateway.core.decisions import ProposalShown
 from gateway.core.deployment import Region
 from gateway.core.line import Line
 from gateway.core.line_model import model_hash
 from gateway.core.messages import Reply
-from gateway.core.proposal import Proposal, canonical
+from gateway.core.proposal import Change, Evidence, Proposal, canonical, proposal_hash
 from gateway.core.recording import Recording
+from gateway.supervisor.baselines import BaselinesError
 
 AUTHOR = "rules"
 STANDS_S = 8.0 * 3600.0  #: a proposal, until somebody decides
-KINDS = {Step.FIRST: "gains", Step.EXPERIMENT: "experiment", Step.MODEL: "model", Step.REDESIGN: "gains"}
+KINDS = {
+    Step.FIRST: "gains", Step.EXPERIMENT: "experiment", Step.MODEL: "model", Step.REDESIGN: "gains",
+    Step.MEASUREMENT: "experiment",
+}  # fmt: skip
 
 Tell = Callable[[str], None]
 
@@ -53,6 +63,14 @@ class GateSide(Protocol):
         ...
 
     async def now(self) -> LineNow: ...
+
+    async def state(self) -> str:
+        """Of the loop: RUN, READY ..."""
+        ...
+
+    async def folder(self) -> Path:
+        """Of the line's data, where its baselines are."""
+        ...
 
     async def recordings(self) -> list[Recording]:
         """Of experiments, as the gate judges by them: the newest first."""
@@ -83,6 +101,7 @@ class Tried:
     value: float | None = None
     limit: float | None = None
     speed_m_per_s: float | None = None  #: of the region, where a configuration was let through
+    shown: Convergence | None = None  #: by a measurement
 
     @property
     def text(self) -> str:
@@ -97,30 +116,73 @@ class Commissioned:
     text: str
     tried: list[Tried]
     speed_m_per_s: float | None  #: up to which the configuration in service was judged; None: none was kept
+    converged: bool = False  #: it does what it should, and nothing significant is left to gain
 
 
-async def commission(line: Line, side: GateSide, tell: Tell = lambda text: None) -> Commissioned:
-    """Until the chain has ended, one way or the other. Every rung is tried once, so that it does."""
+async def commission(
+    line: Line,
+    side: GateSide,
+    tell: Tell = lambda text: None,
+    *,
+    measure_again: bool = False,
+    most_redesigns: int | None = None,
+) -> Commissioned:
+    """Until the chain has ended, one way or the other. Every rung is tried once, so that it does.
+
+    `most_redesigns`: it is left there once so many have been kept.
+    `measure_again`: what was measured until now is of a line that is no longer as it was (another grade, a new part).
+    """
     if why := refused_at_once(line):
         return Commissioned(False, why, [], None)
     changes = Changes(line)
     unmade: list[tuple[int, Past]] = []  #: candidates that could not be made, by how many proposals there were
+    past: list[Past] = []
     shown: list[ProposalShown] = []
+    measured: dict[str, Convergence] = {}
+    outdated = None if measure_again else frozenset[str]()
     while True:
         try:
-            shown = await side.proposals()
-            past = _merged(shown, unmade)
+            shown, measured = await side.proposals(), await measured_on(line, side)
+            outdated = frozenset(measured) if outdated is None else outdated
+            past = _merged(shown, unmade, measured, outdated)
+            kept_now = sum(one.step is Step.REDESIGN and one.outcome is Outcome.DONE for one in past)
+            if most_redesigns is not None and kept_now >= most_redesigns:
+                return _commissioned(Ended(True, f"{kept_now} redesigns are kept"), past, shown, measured)
             now = await side.now()
             step = next_step(past, first_speed_m_per_s(line), fastest_m_per_s(line, now.model))
             if isinstance(step, Ended):
-                return _commissioned(step, shown, unmade)
+                return _commissioned(step, past, shown, measured)
             if isinstance(step, Pending):
                 await side.wait_for(step.proposal)
+                continue
+            if isinstance(step, Look):
+                await _look(changes, side, step.proposal, tell)
                 continue
             await side.ready()
             await _propose(changes, side, step, shown, unmade, tell)
         except CannotGoOn as stopped:
-            return _commissioned(Ended(False, str(stopped)), shown, unmade)
+            return _commissioned(Ended(False, str(stopped)), past, shown, measured)
+
+
+async def _look(changes: Changes, side: GateSide, proposal: str, tell: Tell) -> None:
+    """At what the measurement under `proposal`, the newest experiment, has shown."""
+    now, recordings = await side.now(), await side.recordings()
+    if not recordings or now.model is None:
+        raise CannotGoOn("the data of the last measurement are no longer there: measure anew (--again)")
+    try:
+        found = await asyncio.to_thread(changes.looked_at, now, recordings)
+        keep(await side.folder(), changes.line, now, proposal, found, changes.effort_n2m2s(recordings[0]))
+    except (NotOffered, BaselinesError) as error:
+        raise CannotGoOn(f"what was measured cannot be judged: {error}") from error
+    tell(f"measurement: {found.text}")
+
+
+async def measured_on(line: Line, side: GateSide) -> dict[str, Convergence]:
+    """By proposal. Raises CannotGoOn."""
+    try:
+        return kept(await side.folder(), line)
+    except BaselinesError as error:
+        raise CannotGoOn(str(error)) from error
 
 
 async def _propose(
@@ -134,7 +196,13 @@ async def _propose(
         tell(f"{step.step}, candidate {step.rung + 1}: cannot be made: {refused}")
         unmade.append((len(shown), Past(KINDS[step.step], Outcome.FAILED, step.step, step.rung, str(refused))))
         return
-    at = (await side.now()).at
+    tell(f"{step.step}, candidate {step.rung + 1}: {reason}")
+    await put(line, side, change, reason, named(step.step, step.rung))
+
+
+async def put(line: Line, side: GateSide, change: Change, reason: str, evidence: Evidence) -> str:
+    """Before the gate; its hash. Raises CannotGoOn where the gate does not take it."""
+    now = await side.now()
     proposal = Proposal(
         format=1,
         site=line.site,
@@ -143,15 +211,15 @@ async def _propose(
         base=config_hash(now.in_service),
         model=None if now.model is None else model_hash(now.model),
         reason=reason,
-        evidence=[named(step.step, step.rung)],
+        evidence=[evidence],
         author=AUTHOR,
-        created=at.isoformat(timespec="milliseconds"),
-        expires=(at + timedelta(seconds=min(STANDS_S, line.gate.expiry_max_s))).isoformat(timespec="milliseconds"),
+        created=now.at.isoformat(timespec="milliseconds"),
+        expires=(now.at + timedelta(seconds=min(STANDS_S, line.gate.expiry_max_s))).isoformat(timespec="milliseconds"),
     )
-    tell(f"{step.step}, candidate {step.rung + 1}: {reason}")
     reply = await side.propose(canonical(proposal))
     if not reply.ok:
         raise CannotGoOn("; ".join([reply.text, *reply.reasons]))
+    return proposal_hash(proposal)
 
 
 def _require_slow(line: Line, step: Next, now: LineNow) -> None:
@@ -170,26 +238,38 @@ def _region(shown: Sequence[ProposalShown]) -> Region | None:
     return kept[-1].region if kept and kept[-1] is not None else None
 
 
-def _merged(shown: Sequence[ProposalShown], unmade: Sequence[tuple[int, Past]]) -> list[Past]:
+def _merged(
+    shown: Sequence[ProposalShown], unmade: Sequence[tuple[int, Past]], measured: Mapping[str, Convergence],
+    outdated: AbstractSet[str],
+) -> list[Past]:  # fmt: skip
     past = [past_of(one) for one in shown]
+    for at, one in enumerate(past):
+        if found := measured.get(one.proposal):
+            past[at] = replace(one, settled=found.settled, why=found.text)
+        if one.proposal in outdated:
+            past[at] = replace(one, step=None)  # an experiment like any other
     for before, (at, one) in enumerate(unmade):
         past.insert(at + before, one)
     return past
 
 
-def _commissioned(ended: Ended, shown: Sequence[ProposalShown], unmade: Sequence[tuple[int, Past]]) -> Commissioned:
-    past = _merged(shown, unmade)
+def _commissioned(
+    ended: Ended, past: Sequence[Past], shown: Sequence[ProposalShown], measured: Mapping[str, Convergence]
+) -> Commissioned:
     by_hash = {one.proposal_hash: one for one in shown}
-    tried = [_tried(one, by_hash.get(one.proposal)) for one in past]
-    return Commissioned(ended.reached, ended.text, tried, region_speed(past))
+    tried = [_tried(one, by_hash.get(one.proposal), measured.get(one.proposal)) for one in past]
+    return Commissioned(ended.reached, ended.text, tried, region_speed(past), ended.converged)
 
 
-def _tried(one: Past, shown: ProposalShown | None) -> Tried:
+def _tried(one: Past, shown: ProposalShown | None, measured: Convergence | None) -> Tried:
     step = one.step or ""
     if shown is None:
         return Tried(one.kind, step, one.rung, "", "not made", one.why)
     verdict = shown.verdict
     first = next((rule for rule in verdict.findings if not rule.passed), None) if verdict is not None else None
     if first is None:
-        return Tried(one.kind, step, one.rung, one.proposal, shown.stage, one.why, speed_m_per_s=one.speed_m_per_s)
+        return Tried(
+            one.kind, step, one.rung, one.proposal, shown.stage, shown.why, speed_m_per_s=one.speed_m_per_s,
+            shown=measured,
+        )  # fmt: skip
     return Tried(one.kind, step, one.rung, one.proposal, shown.stage, one.why, first.rule, first.value, first.limit)

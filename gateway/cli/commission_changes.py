@@ -5,9 +5,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
 
+import numpy as np
+
 from gateway.cli.identify_model import model_of_found
 from gateway.commissioning.candidates import FIRST_LAWS, Law, NotOffered, configuration, experiment
-from gateway.commissioning.chain import AS_IT_IS, Next, Step
+from gateway.commissioning.chain import AS_IT_IS, Next, Step, first_legs
+from gateway.commissioning.convergence import Convergence, convergence, measurement
 from gateway.commissioning.redesign import redesigns
 from gateway.core.controller import Controller
 from gateway.core.deployment import Region
@@ -43,6 +46,7 @@ class Changes:
     def __init__(self, line: Line) -> None:
         self.line = line
         self._designed: tuple[LineNow, list[tuple[Law, Controller]]] | None = None  #: and what it was designed from
+        self._known: tuple[tuple[str, ...], LineModel, str] | None = None  #: data, and the model that they gave
 
     def made(
         self, step: Next, now: LineNow, recordings: Sequence[Recording], region: Region | None
@@ -50,17 +54,39 @@ class Changes:
         """The change, and the reason for it. `recordings`: the newest first. Raises NotOffered."""
         match step.step:
             case Step.FIRST:
-                return self._first(step)
+                return self._first(step, now)
             case Step.EXPERIMENT:
                 return self._experiment(step, now, region)
             case Step.MODEL:
                 return self._model(step, now, recordings)
             case Step.REDESIGN:
                 return self._redesign(step, now)
+            case Step.MEASUREMENT:
+                return self._measurement(step, now, region)
 
-    def _first(self, step: Next) -> tuple[Change, str]:
-        law = FIRST_LAWS[step.rung]
-        controller = configuration(self.line, None, first_speed_m_per_s(self.line), law)
+    def looked_at(self, now: LineNow, recordings: Sequence[Recording]) -> Convergence:
+        """What the newest of `recordings` shows of the configuration in service. Raises NotOffered."""
+        assert now.model is not None  # a measurement follows a redesign
+        newer: LineModel | str
+        try:
+            newer = self._identified(recordings, now)[0]
+        except NotOffered as refused:
+            newer = str(refused)
+        return convergence(self.line, recordings[0], now.in_service, now.model, newer)
+
+    def effort_n2m2s(self, recording: Recording) -> float:
+        """Of the drives, as far as their torques are known."""
+        return float(recording.period_s * np.nansum(recording.torque_nm**2))
+
+    def _first(self, step: Next, now: LineNow) -> tuple[Change, str]:
+        """One under which an experiment can be designed: without, the chain would end there."""
+        law, speed, gate = FIRST_LAWS[step.rung], first_speed_m_per_s(self.line), self.line.gate
+        controller = configuration(self.line, None, speed, law)
+        region = Region(speed_max_m_per_s=speed, tension_step_max_n=gate.first_step_max_n)
+        try:
+            experiment(self.line, None, controller, region, now.tension_n, now.speed_m_per_s, first_legs(speed))
+        except NotOffered as refused:
+            raise NotOffered(f"{law.text}: under it no experiment can be designed: {refused}") from refused
         return GainsChange(controller=controller), f"{law.text} on the line's file, to begin with"
 
     def _experiment(self, step: Next, now: LineNow, region: Region | None) -> tuple[Change, str]:
@@ -78,15 +104,30 @@ class Changes:
         used = list(recordings if step.rung == 0 else recordings[:1])
         if not used or (step.rung > 0 and len(recordings) == 1):
             raise NotOffered("there is no other recording" if used else "there is no recording of an experiment")
-        try:
-            found = identify(used, self.line, Noise(), time.perf_counter)
-            parent = None if now.model is None else model_hash(now.model)
-            model = model_of_found(self.line, used, found, now.at.isoformat(timespec="milliseconds"), parent=parent)
-        except (NotIdentified, ModelRefused) as refused:
-            raise NotOffered("; ".join(refused.reasons)[:MOST_REASON]) from refused
+        model, structure = self._identified(used, now)
         which = "the last experiment" if len(used) == 1 else f"the last {len(used)} experiments"
-        speed = model.region.speed_to_m_per_s
-        return ModelChange(model=model), f"from {which}: {found.estimate.structure}, up to {speed:.3g} m/s"
+        return ModelChange(model=model), f"from {which}: {structure}, up to {model.region.speed_to_m_per_s:.3g} m/s"
+
+    def _identified(self, used: Sequence[Recording], now: LineNow) -> tuple[LineModel, str]:
+        """A model of these data, and its structure; what they have given already, again. Raises NotOffered."""
+        digests = tuple(one.digest() for one in used)
+        if self._known is None or self._known[0] != digests:
+            try:
+                found = identify(used, self.line, Noise(), time.perf_counter)
+                parent = None if now.model is None else model_hash(now.model)
+                model = model_of_found(self.line, used, found, now.at.isoformat(timespec="milliseconds"), parent=parent)
+            except (NotIdentified, ModelRefused) as refused:
+                raise NotOffered("; ".join(refused.reasons)[:MOST_REASON]) from refused
+            self._known = digests, model, str(found.estimate.structure)
+        return self._known[1:]
+
+    def _measurement(self, step: Next, now: LineNow, region: Region | None) -> tuple[Change, str]:
+        asked = measurement(self.line, region, now.tension_n, step.speeds_m_per_s, step.size, step.number)
+        speeds = " and ".join(f"{speed:.3g}" for speed in step.speeds_m_per_s)
+        steps = f"steps of up to {asked.step_max_n:.3g} N for {asked.duration_s:g} s"
+        return ExperimentChange(
+            experiment=asked
+        ), f"to see how the configuration in service does, {steps} at {speeds} m/s"
 
     def _redesign(self, step: Next, now: LineNow) -> tuple[Change, str]:
         """On the accepted model; in the end the configuration in service, for what data have shown since."""

@@ -1,54 +1,115 @@
 """`r2rgate commission`: a new line brought from its file to an adapted configuration, each step through the gate."""
 
 import asyncio
+from collections.abc import Awaitable, Callable
+from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
 
 from gateway.cli.operate_commands import RunFolder
 from gateway.cli.process_commands import REFUSED, LineFile, read_line
 
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from gateway.cli.commission_history import Tried
+    from gateway.cli.commission_live import LiveGate
+    from gateway.core.line import Line
+
 NOT_REACHED = 1  #: exit code
+T = TypeVar("T")
 
 
 def commission(
     file: LineFile,
     run_dir: RunFolder = None,
+    history: Annotated[
+        bool, typer.Option("--history", help="Show what has been tried on the line until now; propose nothing.")
+    ] = False,
+    again: Annotated[
+        bool, typer.Option("--again", help="Measure anew: the line is no longer as it was (another grade, a new part).")
+    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="With --history: print as JSON.")] = False,
 ) -> None:
     """Bring a new line that runs to an adapted configuration over its range of speeds, each step through the gate.
 
-    Configuration, experiment, model, redesign, and again at higher speeds: each is proposed, judged, and waits for a
-    person's `r2rgate approve`. Ctrl-C ends this command and changes nothing on the line; started again, it goes on.
-    Exit code 0: reached; 1: the candidates have come to an end, with the reason.
+    Configuration, experiment, model, redesign, and again at higher speeds; then what the configuration does is
+    measured, and a newer model and redesign follow, until it converges (tracking error, overshoot, settling time) and
+    nothing significant is left to gain. Each is proposed, judged, and waits for a person's `r2rgate approve`. Ctrl-C
+    ends this command and changes nothing on the line; started again, it goes on.
+
+    Exit code: 0 adapted and converged, 1 not, with the reason, 2 refused.
 
     Example: r2rgate commission line.toml
     """
+    from gateway.cli.commission import CannotGoOn
     from gateway.cli.commission import commission as carried_out
+    from gateway.cli.commission_history import history as tried_on
+    from gateway.cli.waiting import interruptible
+
+    line = read_line(file)
+    if history:
+        try:
+            found = with_gate(line, run_dir, lambda text: None, lambda side: tried_on(line, side))
+        except CannotGoOn as error:
+            typer.echo(str(error), err=True)
+            raise typer.Exit(REFUSED) from None
+        _show(found, as_json)
+        return
+    with interruptible("nothing of what is approved is lost; the same command goes on from here"):
+        ended = with_gate(
+            line, run_dir, typer.echo, lambda side: carried_out(line, side, typer.echo, measure_again=again)
+        )
+    typer.echo(f"{'commissioned' if ended.reached else 'not commissioned'}: {ended.text}")
+    if not ended.converged:
+        raise typer.Exit(NOT_REACHED)
+
+
+def with_gate(
+    line: "Line", run_dir: "Path | None", tell: Callable[[str], None], work: Callable[["LiveGate"], Awaitable[T]]
+) -> T:
+    """What `work` finds with the gateway of `line`."""
     from gateway.cli.commission_live import TOPICS, LiveGate
     from gateway.cli.status_commands import choose_run_folder
-    from gateway.cli.waiting import interruptible
     from gateway.mailbox.listener import PathTooLong
     from gateway.mailbox.paths import GATEWAY_SOCKET, default_run_folder, running_lines
     from gateway.mailbox.unix import UnixMailbox
 
-    line = read_line(file)
     own = default_run_folder(line)
     folder = choose_run_folder(run_dir or (own if own in running_lines() else None))
 
-    async def run() -> bool:
+    async def run() -> T:
         mailbox = UnixMailbox()
         mailbox.connect(TOPICS, folder / GATEWAY_SOCKET)
         try:
-            found = await carried_out(line, LiveGate(line, mailbox, typer.echo), typer.echo)
+            return await work(LiveGate(line, mailbox, tell))
         finally:
             await mailbox.close()
-        typer.echo(f"{'commissioned' if found.reached else 'not commissioned'}: {found.text}")
-        return found.reached
 
     try:
-        with interruptible("nothing of what is approved is lost; the same command goes on from here"):
-            reached = asyncio.run(run())
+        return asyncio.run(run())
     except PathTooLong as error:
         typer.echo(str(error), err=True)
         raise typer.Exit(REFUSED) from None
-    if not reached:
-        raise typer.Exit(NOT_REACHED)
+
+
+def _show(tried: "list[Tried]", as_json: bool) -> None:
+    import json
+
+    from rich.box import SIMPLE_HEAD
+    from rich.console import Console
+    from rich.table import Table
+
+    from gateway.cli.commission_history import approvals
+    from gateway.core.line_problem import printable
+
+    if as_json:
+        typer.echo(json.dumps({"tried": [one.data() for one in tried], "approvals": approvals(tried)}, indent=2))
+        return
+    table = Table(box=SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 1, 0, 0))
+    for name in ("round", "proposed", "what", "why", "became of it", "measured"):
+        table.add_column(name)
+    for one in tried:
+        table.add_row(*map(printable, one.row()))
+    Console(highlight=False, markup=False).print(table)
+    typer.echo(f"{len(tried)} proposals, {approvals(tried)} of them approved")

@@ -77,6 +77,12 @@ class LiveGate:
             raise CannotGoOn("the configuration or the model in service is damaged in the store")
         return LineNow(controller, model, tension, speed, datetime.fromtimestamp(status.wall_s, UTC))
 
+    async def state(self) -> str:
+        return (await self._status()).loop.state
+
+    async def folder(self) -> Path:
+        return Path((await self._status()).historian.path).parent
+
     async def recordings(self) -> list[Recording]:
         status = await self._status()
         begin_s = status.wall_s - self._line.gate.data_max_age_s

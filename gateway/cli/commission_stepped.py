@@ -16,6 +16,7 @@ from gateway.core.audit_record import Who
 from gateway.core.controller import canonical as canonical_controller
 from gateway.core.decisions import Decide, ProposalShown
 from gateway.core.judge_context import JudgeContext
+from gateway.core.line import Line
 from gateway.core.messages import Reply, parse_command
 from gateway.core.recording import Recording, recording_of
 from gateway.core.states import Phase
@@ -35,12 +36,20 @@ from gateway.supervisor.surroundings import LineSurroundings
 from safety.judge import failed, judge
 
 BEGIN = datetime(2026, 1, 5, 6, 0, tzinfo=UTC)  #: of the stepped clock
+STOPPED_S = 1800.0  #: from one loop to the next on the same line
 LOOK_S = 0.5  #: from one look of the gate to the next
 READY_WITHIN_S = 300.0
+LEAST_S = 5.0  #: for which the line must have stood anyway before a change, and before one is kept
 MOST_DECISIONS = 3  #: on one proposal, where carrying it out is refused for the moment
 ENGINEER, RULES = Who(name="engineer"), Who(name="rules")
 
 Approves = Callable[[ProposalShown], bool]
+
+
+def impatient(line: Line) -> Line:
+    """`line` with as short a probation and cool-down as can be: a simulated line has nothing to show later."""
+    shorter = {"probation_s": min(line.gate.probation_s, LEAST_S), "cool_down_s": min(line.gate.cool_down_s, LEAST_S)}
+    return line.model_copy(update={"gate": line.gate.model_copy(update=shorter)})
 
 
 def approve_all(shown: ProposalShown) -> bool:
@@ -64,16 +73,24 @@ class SteppedJudge:
 
 
 class SteppedGate:
-    """A gate over `loop`, which is in production, with its records in `folder`. `async with`; see GateSide."""
+    """A gate over `loop`, which is in production, with its records in `folder`. `async with`; see GateSide.
 
-    def __init__(self, loop: SteppedLoop, folder: Path, seed: int = 0, approves: Approves = approve_all) -> None:
+    `before`: the gate that was there until now, where the line was stopped and started again (another web, a new part).
+    """
+
+    def __init__(
+        self, loop: SteppedLoop, folder: Path, seed: int = 0, approves: Approves = approve_all,
+        before: "SteppedGate | None" = None,
+    ) -> None:  # fmt: skip
         self.loop = loop
+        self.approvals = 0
         self.line = loop.line
         self._folder = folder
         self._approves = approves
         self._recent = Recent(self.line.n, self.line.control.period_s)
         self._seen_frames = self._seen_events = 0
-        self._experiments: list[tuple[Recording, float]] = []
+        self._begin_s = BEGIN.timestamp() if before is None else before.wall_s + STOPPED_S
+        self._experiments: list[tuple[Recording, float]] = [] if before is None else list(before.experiments)
         self._refused: dict[str, int] = {}
         (folder / "controller.json").write_bytes(canonical_controller(loop.config))
         hub = Hub()
@@ -81,7 +98,7 @@ class SteppedGate:
         self._mailboxes[0].serve(LOOP_COMMAND, self._answer)
         self._gate = Gate(
             self.line, self._mailboxes[1], folder, SteppedJudge(loop, seed), self._around, _unnoted,
-            lambda: loop.now_s, self._wall_s,
+            lambda: loop.now_s, lambda: self.wall_s,
         )  # fmt: skip
 
     async def __aenter__(self) -> "SteppedGate":
@@ -113,8 +130,14 @@ class SteppedGate:
         model = None if book.model is None else self._models.find(book.model, site, name).model
         return LineNow(
             controller, model, setpoints.tension_target_n.tolist(), setpoints.speed_target_m_per_s,
-            datetime.fromtimestamp(self._wall_s(), UTC),
+            datetime.fromtimestamp(self.wall_s, UTC),
         )  # fmt: skip
+
+    async def state(self) -> str:
+        return self.loop.cycle.machine.state.name
+
+    async def folder(self) -> Path:
+        return self._folder
 
     async def recordings(self) -> list[Recording]:
         return [one for one, _ in self._kept(self.line.gate.data_max_age_s)]
@@ -124,8 +147,8 @@ class SteppedGate:
         while True:
             book = self.deployer.book
             changed_s = -np.inf if book.changed_s is None else book.changed_s
-            cool = self._wall_s() - changed_s >= self.line.gate.cool_down_s
-            if cool and book.on_the_line is None and self._recent.stands():
+            cool = self.wall_s - changed_s >= self.line.gate.cool_down_s
+            if cool and book.on_the_line is None and (self._recent.stands() or not self._runs):
                 return
             if self.loop.now_s - began_s > READY_WITHIN_S:
                 raise CannotGoOn(f"the line does not come to rest within {READY_WITHIN_S:g} s")
@@ -148,7 +171,8 @@ class SteppedGate:
             await self.pass_time(LOOK_S)
 
     async def pass_time(self, seconds: float) -> None:
-        """The line runs on, with the gate looking at it. Raises CannotGoOn where it stops."""
+        """The line goes on as it is, with the gate looking at it. Raises CannotGoOn where it runs, and stops."""
+        ran = self._runs
         period_s = self.line.control.period_s
         for _ in range(max(1, round(seconds / LOOK_S))):
             self.loop.step(round(LOOK_S / period_s))
@@ -157,8 +181,12 @@ class SteppedGate:
             self._seen_frames = len(self.loop.frames)
             await self._hear()
             await self._gate.look()
-        if self.loop.cycle.machine.phase is not Phase.RUNNING:
+        if ran and not self._runs:
             raise CannotGoOn(f"the line has stopped: {self.loop.cycle.machine.reason}")
+
+    @property
+    def _runs(self) -> bool:
+        return self.loop.cycle.machine.phase is Phase.RUNNING
 
     async def _decide(self, shown: ProposalShown, hash_: str) -> None:
         await self.ready()
@@ -166,6 +194,7 @@ class SteppedGate:
         approve = self._approves(shown) and tries < MOST_DECISIONS
         decision = Decide(proposal=shown.proposal_hash, shown=hash_, approve=approve)
         reply = await self.deployer.decide(decision, ENGINEER)
+        self.approvals += approve
         if not reply.ok:
             self._refused[shown.proposal_hash] = tries + 1
 
@@ -176,7 +205,7 @@ class SteppedGate:
             if event.kind in ENDS:
                 begin_s, end_s = event.data["begin_s"], event.data["end_s"]
                 if begin_s is not None:
-                    self._experiments.append((self._between(begin_s, end_s), BEGIN.timestamp() + end_s))
+                    self._experiments.append((self._between(begin_s, end_s), self._begin_s + end_s))
                 await self.deployer.experiment_ended(str(event.data["hash"]), str(event.data["reason"]))
 
     def _between(self, begin_s: float, end_s: float) -> Recording:
@@ -186,18 +215,27 @@ class SteppedGate:
         return recording_of(frames, period_s, f"experiment on {self.loop.plant.name} at {begin_s:.1f} s")
 
     def _kept(self, most_s: float) -> list[tuple[Recording, float]]:
-        least_s = self._wall_s() - most_s
+        least_s = self.wall_s - most_s
         return [one for one in reversed(self._experiments) if one[1] >= least_s][:MOST_EXPERIMENTS]
 
     def _around(self, configurations: Configurations, models: Models) -> LineSurroundings:
         self._configurations, self._models = configurations, models
-        return LineSurroundings(self.line, self._newest, self._recent, self._kept, configurations, models, self._wall_s)
+        return LineSurroundings(
+            self.line, self._newest, self._recent, self._kept, configurations, models, lambda: self.wall_s
+        )
 
     def _newest(self) -> Frame | None:
         return unpack(self.loop.frames[-1]) if self.loop.frames else None
 
-    def _wall_s(self) -> float:
-        return BEGIN.timestamp() + self.loop.now_s
+    @property
+    def wall_s(self) -> float:
+        """Unix time."""
+        return self._begin_s + self.loop.now_s
+
+    @property
+    def experiments(self) -> list[tuple[Recording, float]]:
+        """All that have been run, the oldest first, each with its end in Unix time."""
+        return self._experiments
 
     async def _answer(self, payload: bytes) -> bytes:
         return self.loop.command(parse_command(payload)).model_dump_json().encode()

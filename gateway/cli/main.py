@@ -24,6 +24,7 @@ from gateway.cli import (
     process_commands,
     proposal_commands,
     recordings_export,
+    refine_commands,
     rehearse_commands,
     scan_commands,
     status_commands,
@@ -52,6 +53,7 @@ app.command(rich_help_panel=ENGINEER)(design_commands.design)
 app.add_typer(models_commands.app, rich_help_panel=ENGINEER)
 app.command(rich_help_panel=ENGINEER)(rehearse_commands.rehearse)
 app.command(rich_help_panel=ENGINEER)(commission_commands.commission)
+app.command(rich_help_panel=ENGINEER)(refine_commands.refine)
 app.add_typer(experiment_commands.app, rich_help_panel=ENGINEER)
 app.command(rich_help_panel=ENGINEER)(judge_commands.judge)
 app.command(rich_help_panel=PROCESSES)(process_commands.run)

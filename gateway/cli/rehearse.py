@@ -8,8 +8,9 @@ from typing import Protocol, TypeVar
 
 import numpy as np
 
-from gateway.cli.rehearse_adaptations import adapt
+from gateway.cli.rehearse_adaptations import Adapted
 from gateway.cli.rehearse_designs import DESIGNS, TRUTH, Design, offered, truth_of
+from gateway.cli.rehearse_gate import adapt_through_gate
 from gateway.cli.rehearse_result import AdaptationResult, CaseResult, ConfigurationResult, Spread
 from gateway.cli.stepped import CommandRefused, SteppedResult, periods_before, run_scenario
 from gateway.cli.tiers import Tier
@@ -106,6 +107,7 @@ def rehearse(
     tell: Callable[[str], None] = lambda text: None,
     designs: Sequence[Design] = DESIGNS,
     adaptations: int = 0,
+    adapt: Callable[[Line, Plant, Scenario, int, int, Callable[[str], None]], list[Adapted]] = adapt_through_gate,
 ) -> tuple[list[ConfigurationResult], list[AdaptationResult]]:
     """Every design in every case, and the rounds of adaptation that have brought some of them.
 

@@ -1,4 +1,6 @@
-"""Adaptation rehearsed: an experiment on the simulated line, a model from its data, designs on that model; and again.
+"""Identification and design by themselves, without a gate: what rounds of experiment, model and design are worth.
+
+`rehearse` goes through the gate (`rehearse_gate`); benchmarks of identification and design take this.
 
 The line runs as it would: under the controller in service, experiment and abort condition in the loop's own hands, data
 as the loop has recorded them. What is estimated knows of the plant what the load cells and drives have told.
@@ -86,19 +88,20 @@ def adapt(
             break
         estimate = identified.estimate
         task = task_on(line, estimate.theta, estimate.noise)
-        model = f"identified-{number}"
-        designs = [
-            Design(f"adapt{number}-lqi", "lqi", model, design_lqi),
-            Design(f"adapt{number}-mpc-observer", "mpc", model, design_mpc),
-        ]
-        found.append(
-            Adapted(
-                _result(number, recordings, identified, [], unsafe, time.perf_counter() - began_s),
-                [(design, task) for design in designs],
-            )
-        )
-        in_service, believed = _next_in_service(designs, task, in_service), believing(line, estimate.theta, LEFT_OPEN)
+        designs = designs_on(number, task)
+        took_s = time.perf_counter() - began_s
+        found.append(Adapted(_result(number, recordings, identified, [], unsafe, took_s), designs))
+        in_service, believed = _next_in_service(designs, in_service), believing(line, estimate.theta, LEFT_OPEN)
     return found
+
+
+def designs_on(number: int, task: DesignTask) -> list[tuple[Design, DesignTask]]:
+    """What a round brings: designs on the model that it has ended with."""
+    model = f"identified-{number}"
+    return [
+        (Design(f"adapt{number}-lqi", "lqi", model, design_lqi), task),
+        (Design(f"adapt{number}-mpc-observer", "mpc", model, design_mpc), task),
+    ]
 
 
 def first_experiment(line: Line, scenario: Scenario) -> Experiment:
@@ -106,8 +109,8 @@ def first_experiment(line: Line, scenario: Scenario) -> Experiment:
     return _experiment(line, design_lqi(task_of(line)), scenario, 1)
 
 
-def _next_in_service(designs: Sequence[Design], task: DesignTask, before: Controller) -> Controller:
-    for design in designs:
+def _next_in_service(designs: Sequence[tuple[Design, DesignTask]], before: Controller) -> Controller:
+    for design, task in designs:
         if design.law == IN_SERVICE:
             try:
                 return offered(design, task)

@@ -31,7 +31,7 @@ def rehearse(
         typer.Option(help="Period, latency, limits and moves of the benchmark. Without it those of the two files."),
     ] = None,
     adaptations: Annotated[
-        int, typer.Option(min=0, max=5, help="Rounds of experiment, model and new designs; 5 s of data at each speed.")
+        int, typer.Option(min=0, max=5, help="Rounds of experiment, model and redesign, each through the gate.")
     ] = 0,
     seed: Annotated[int, typer.Option(min=0, help="Of the simulated line's noise.")] = 0,
     llm: Annotated[str, typer.Option(help="Language model. So far only off.")] = "off",
@@ -42,9 +42,10 @@ def rehearse(
     """Rehearse a line's commissioning against a simulated plant, in stepped time: no hardware, no waiting.
 
     Every law is designed on the line's nominal model and run by the whole cycle of the gateway. LQI and MPC designed
-    on the plant's own parameters show what better knowledge would bring. With --adaptations the line's physics are
-    identified from experiments on it, and LQI and MPC designed on what was found. The files must agree in the number of
-    spans; wires and addresses do not matter. The same seed gives the same figures, but for compute times.
+    on the plant's own parameters show what better knowledge would bring. With --adaptations the line is commissioned
+    as `r2rgate commission` would, every experiment, model and redesign judged by the gate and deployed on probation;
+    LQI and MPC are then designed on each model that was accepted. The files must agree in the number of spans; wires
+    and addresses do not matter. The same seed gives the same figures, but for compute times.
 
     Exit code: 0 done, 1 done and unsafe events were seen at the simulated drives, 2 refused, 130 interrupted.
 

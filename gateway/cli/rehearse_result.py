@@ -76,8 +76,10 @@ class AdaptationResult(Strict):
     valid: bool = False  #: whether the model holds there
     findings: list[str] = []  #: what speaks against it
     refused: list[str]  #: why there is no model
-    unsafe_events: int = 0  #: in the experiment
-    wall_s: float
+    deployments: int = 0  #: of controllers, through the gate
+    tried: list[str] = []  #: what was proposed, and what became of it
+    unsafe_events: int = 0  #: while the line was adapted; of all rounds together in the first
+    wall_s: float  #: the same
 
 
 class RehearseResult(Strict):

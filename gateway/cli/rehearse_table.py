@@ -52,7 +52,8 @@ def remarks(result: RehearseResult) -> list[str]:
 def _round(one: AdaptationResult) -> list[str]:
     """A round of adaptation, what it found, and what speaks against it."""
     if one.refused:
-        return [f"adaptation {one.number} brought no model: {why}" for why in one.refused]
+        told = [f"adaptation {one.number} was not completed: {why}" for why in one.refused]
+        return told + [f"  {text}" for text in one.tried]
     strong = ", ".join(
         f"{symbol} {found.value:.5g} +-{50.0 * (found.high - found.low) / found.value:.2g} %"
         for name, symbol in STRONG.items()
@@ -62,6 +63,9 @@ def _round(one: AdaptationResult) -> list[str]:
         f"adaptation {one.number}: {one.data_s:g} s of data, structure {one.structure}; {strong}",
         f"  innovations on held-out data {one.normalised_innovation:.2f} of what noise makes (1 is right)",
     ]
+    if one.tried:
+        told.append(f"  through the gate: {len(one.tried)} candidates, {one.deployments} deployments")
+    told += [f"  {text}" for text in one.tried if not text.endswith((": kept", ": done"))]
     return told + [f"  {finding}" for finding in one.findings]
 
 

@@ -18,6 +18,7 @@ from gateway.identification.experiment_design import design_experiment
 
 HELD = 0.9  #: of the torque limit: more leaves no room to move
 LEFT_OPEN = 0.05  #: of a value that was found: what data leave open, and what drifts
+NEAR = 0.98  #: of the speed that is wanted, which is as good
 GRID = 20  #: parts of the greatest speed that are looked at
 
 
@@ -50,17 +51,22 @@ FIRST_LAWS = (
 def configuration(line: Line, model: LineModel | None, speed_m_per_s: float, law: Law) -> Controller:
     """On the line's file or on `model`, for speeds up to `speed_m_per_s`. Raises NotOffered."""
     task = _task(_no_faster(line, speed_m_per_s), model)
+    try:
+        config = designed(task, law)
+        require_margin(margins(config, task))
+    except DesignRefused as refused:
+        raise NotOffered(f"{law.text}: {refused}") from refused
+    return config
+
+
+def designed(task: DesignTask, law: Law) -> Controller:
+    """Raises DesignRefused."""
     architecture = ARCHITECTURES[law.name]
     values = architecture.first(task)
     for knob in architecture.knobs:
         factor = dict(law.factors).get(knob.name, 1.0)
         values[knob.name] = min(max(values[knob.name] * factor, knob.least), knob.most)
-    try:
-        config = architecture.design(task, values)
-        require_margin(margins(config, task))
-    except DesignRefused as refused:
-        raise NotOffered(f"{law.text}: {refused}") from refused
-    return config
+    return architecture.design(task, values)
 
 
 def experiment(

@@ -1,10 +1,15 @@
 """The chain by which a new line is commissioned through the gate: what is proposed next, and when it is over. Pure.
 
     configuration on the line's file -> experiment -> model -> redesign on it -> experiment at higher speeds -> ...
+        -> measurement -> model -> redesign -> measurement -> ...
 
 Each link rests on what the gate has let through before: a first configuration needs no model, an experiment only the
 configuration in service, a model only the experiment's data, a redesign the model, and speeds beyond what data have
 shown only an experiment there. So the chain can always begin, and each round ends where the next one does.
+
+Once a configuration is in service over the line's range of speeds, what it does there is measured (algorithm 2):
+where the criteria of convergence are met and no significant gain is predicted any more, the chain has come to its end;
+otherwise a model of these data, a redesign, and a measurement follow, `MOST_ROUNDS` times at most.
 
 Where a proposal is refused, the next, less ambitious candidate of a short ladder is taken (`LADDERS`). What has been
 tried is read from the gate's own list of proposals, in which each says its step and its rung: whoever asks again after
@@ -16,7 +21,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from math import sqrt
 
-from gateway.commissioning.candidates import FIRST_LAWS
+from gateway.commissioning.candidates import FIRST_LAWS, NEAR
 from gateway.commissioning.redesign import RUNGS
 from gateway.core.decisions import ProposalShown
 from gateway.core.line import Line
@@ -29,6 +34,7 @@ class Step(StrEnum):
     EXPERIMENT = "experiment"
     MODEL = "model"
     REDESIGN = "redesign"
+    MEASUREMENT = "measurement"
 
 
 class Outcome(StrEnum):
@@ -44,12 +50,13 @@ LADDERS: dict[Step, int] = {
     Step.EXPERIMENT: 4,
     Step.MODEL: 2,
     Step.REDESIGN: RUNGS + 1,
+    Step.MEASUREMENT: 2,
 }
 AS_IT_IS = RUNGS  #: of a redesign: the configuration in service stays, and is judged for what data have shown since
 MOST_AGAIN = 3  #: times that one rung is proposed again, because the moment was wrong
 MOST_EXPERIMENTS = 3  #: in a row, without a model from their data
+MOST_ROUNDS = 3  #: measurements, before what they show is left as it is
 STRETCH = 3.0  #: of the speed that data have shown: an experiment goes no faster
-NEAR = 0.98  #: of the speed that is wanted, which is as good
 LEAST_RISE = 1.05  #: of the speed, from one adapted configuration to the next; fewer than two in a row rise less
 SLOWER_LEG = 0.5  #: of an experiment's speed: its other one
 #: The same of the first experiment. Moves of tensions that creep turn rollers back, and dry friction with them: at half
@@ -74,6 +81,7 @@ class Past:
     why: str = ""
     speed_m_per_s: float | None = None  #: up to which a verdict lets a configuration run
     proposal: str = ""  #: hash; empty: it could not be made
+    settled: bool | None = None  #: of a measurement: converged, and nothing to gain; None: nobody has looked at it yet
 
 
 @dataclass(frozen=True)
@@ -97,13 +105,24 @@ class Pending:
 
 @dataclass(frozen=True)
 class Ended:
-    """`reached`: an adapted configuration is in service over the line's range of speeds."""
+    """`reached`: an adapted configuration is in service over the line's range of speeds.
+
+    `converged`: and it does there what it should, with nothing significant left to gain.
+    """
 
     reached: bool
     text: str
+    converged: bool = False
 
 
-def next_step(past: Sequence[Past], first_speed_m_per_s: float, wanted_m_per_s: float) -> Next | Pending | Ended:
+@dataclass(frozen=True)
+class Look:
+    """At what a measurement has shown."""
+
+    proposal: str
+
+
+def next_step(past: Sequence[Past], first_speed_m_per_s: float, wanted_m_per_s: float) -> Next | Pending | Look | Ended:
     """`past` oldest first. Speeds: of a first configuration's region, and up to which the line is to be adapted."""
     if open_ := next((one for one in reversed(past) if one.outcome is Outcome.OPEN), None):
         return Pending(open_.proposal, open_.kind)
@@ -111,24 +130,50 @@ def next_step(past: Sequence[Past], first_speed_m_per_s: float, wanted_m_per_s: 
     since = past[max(last.values()) + 1 :]
     if last["gains"] < 0:
         return _on_ladder(Step.FIRST if last["model"] < 0 else Step.REDESIGN, since)
+    measured = past[last["experiment"]] if last["experiment"] > last["gains"] else None
+    if measured is not None and measured.step is Step.MEASUREMENT and last["experiment"] > last["model"]:
+        return _measured(past, measured, since)
     if last["experiment"] > last["model"]:
         found = _on_ladder(Step.MODEL, since)
         number = sum(_is_done(one, "experiment") for one in past[last["model"] + 1 :])
         if isinstance(found, Next) or number >= MOST_EXPERIMENTS:
             return found
         return _experiment(past, since, first_speed_m_per_s, wanted_m_per_s, number)
-    if last["model"] > last["gains"]:
-        return _on_ladder(Step.REDESIGN, since)
     reached = region_speed(past) or 0.0
+    if last["model"] > last["gains"]:
+        found = _on_ladder(Step.REDESIGN, since)
+        measured = any(one.step is Step.MEASUREMENT and _is_done(one, "experiment") for one in past)
+        return Ended(True, found.text) if isinstance(found, Ended) and measured else found
     if last["model"] >= 0 and reached >= NEAR * wanted_m_per_s:
         adapted = any(_is_done(one, "gains") and one.rung != AS_IT_IS for one in past[_first_model(past) :])
         what = (
             "an adapted configuration" if adapted else "the configuration of the begin, judged on the line's own model,"
         )
-        return Ended(True, f"{what} is in service up to {reached:.3g} m/s")
+        text = f"{what} is in service up to {reached:.3g} m/s"
+        found = _on_ladder(Step.MEASUREMENT, since)
+        if isinstance(found, Ended):
+            return Ended(True, f"{text}; what it does there could not be measured: {found.text}")
+        number = sum(one.step is Step.MEASUREMENT for one in past)
+        return Next(Step.MEASUREMENT, found.rung, (SLOWER_LEG * reached, reached), 0.5**found.rung, number)
     if _stands_still(past):
         return Ended(False, f"experiments at {wanted_m_per_s:.3g} m/s lead no further than {reached:.3g} m/s")
     return _experiment(past, since, first_speed_m_per_s, wanted_m_per_s, 0)
+
+
+def _measured(past: Sequence[Past], measured: Past, since: Sequence[Past]) -> Next | Look | Ended:
+    """After a measurement, from whose data nothing has been made yet."""
+    if measured.settled is None:
+        return Look(measured.proposal)
+    what = f"an adapted configuration is in service up to {region_speed(past) or 0.0:.3g} m/s"
+    if measured.settled:
+        return Ended(True, f"{what}; {measured.why}", converged=True)
+    rounds = sum(one.step is Step.MEASUREMENT and _is_done(one, "experiment") for one in past)
+    if rounds >= MOST_ROUNDS:
+        return Ended(True, f"{what}, and after {rounds} measurements that is left as it is; {measured.why}")
+    found = _on_ladder(Step.MODEL, since)
+    if isinstance(found, Ended):
+        return Ended(True, f"{what}; {measured.why}; {found.text}")
+    return found
 
 
 def region_speed(past: Sequence[Past]) -> float | None:
@@ -222,13 +267,18 @@ def _experiment(
     shown = region_speed(past) or first_m_per_s
     if _last_done(past, "model") < 0:
         top = min(first_m_per_s, shown)
-        legs = (SLOWER_FIRST_LEG * top, top) if number == 0 else (top,)
+        legs = first_legs(top) if number == 0 else (top,)
         return Next(Step.EXPERIMENT, found.rung, legs, 2.0 ** max(number - 1, 0) * 0.5**found.rung, number)
     top = min(wanted_m_per_s, STRETCH * shown)
     if found.rung >= 2:
         top = sqrt(shown * top)
     size = 2.0**number * 0.5 ** (found.rung % 2)
     return Next(Step.EXPERIMENT, found.rung, (SLOWER_LEG * top, top), size, number)
+
+
+def first_legs(top_m_per_s: float) -> tuple[float, ...]:
+    """Speeds of the first experiment."""
+    return (SLOWER_FIRST_LEG * top_m_per_s, top_m_per_s)
 
 
 def refused_at_once(line: Line) -> str:

@@ -65,7 +65,7 @@ def per_roller(plant: Plant, spread: float, seed: int) -> Plant:
     generator = np.random.default_rng(seed)
 
     def spread_out(value: float) -> list[float]:
-        return [value * (1.0 + spread * off) for off in generator.uniform(-1.0, 1.0, plant.spans)]
+        return [value * (1.0 + spread * off) for off in generator.uniform(-1.0, 1.0, plant.spans).tolist()]
 
     rollers, web = plant.rollers, plant.web
     return plant.model_copy(

@@ -1,10 +1,17 @@
 """`r2rgate commission` against a gateway in this process that keeps its promises, and no more."""
 
 import asyncio
+from datetime import UTC, datetime
 
-from gateway.cli.commission import commission
+import pytest
+
+from gateway.cli.commission import CannotGoOn, commission
+from gateway.cli.commission_changes import LineNow
+from gateway.cli.commission_history import approvals, history
 from gateway.cli.commission_live import STANDS_S, LiveGate
+from gateway.cli.commission_measurements import SCENARIO, keep, kept
 from gateway.commissioning.chain import LADDERS, Step
+from gateway.commissioning.convergence import Convergence, SpanFigures
 from gateway.control.design import design_lqi, task_of
 from gateway.core.controller import config_hash
 from gateway.core.decisions import QUERY, ListProposals, ProposalLine, ProposalList, ProposalShown
@@ -14,6 +21,7 @@ from gateway.core.topics import GATEWAY_PROPOSALS, GATEWAY_PROPOSE, LOOP_TELEMET
 from gateway.core.verdict import RuleFinding, Verdict
 from gateway.mailbox.inprocess import Hub, InProcessMailbox
 from gateway.mailbox.port import Counters
+from gateway.supervisor import baselines
 from gateway.supervisor.configurations import FILE_NAME, Origin, begin_configurations
 from gateway.supervisor.historian import Historian
 from gateway.supervisor.service import Gateway
@@ -104,6 +112,35 @@ def test_each_candidate_is_proposed_once_and_the_end_says_why(tmp_path):
     again = OneProcess(tmp_path)
     again.shown = gateway.shown  # the command started anew
     assert asyncio.run(commission(LINE, again.side)).text == found.text and len(again.shown) == len(found.tried)
+
+
+def test_the_history_says_what_was_tried_and_by_what_it_was_refused(tmp_path):
+    gateway = OneProcess(tmp_path)
+    with pytest.raises(CannotGoOn, match="r2rgate commission"):
+        asyncio.run(history(LINE, gateway.side))
+    asyncio.run(commission(LINE, gateway.side))
+    found = asyncio.run(history(LINE, gateway.side))
+    assert [(one.step, one.candidate, one.stage, one.against) for one in found] == [
+        (Step.FIRST, 1 + rung, "refused", ["corners: error"]) for rung in range(LADDERS[Step.FIRST])
+    ]
+    assert approvals(found) == 0 and "LQI" in found[0].row()[3] and found[0].data()["measured"] is None
+
+
+def test_what_was_measured_is_kept_beside_the_line_and_is_its_baseline_once_nothing_is_left_to_do(tmp_path):
+    now = LineNow(CONFIG, None, [20.0, 20.0], 0.01, datetime(2026, 1, 5, 6, tzinfo=UTC))
+    span = SpanFigures(rmse_n=0.2, overshoot_pct=5.0, settling_s=None, setpoint_n=20.0)
+    shaky = Convergence(spans={"1": span}, predicted={"1": span}, rmse_n=0.2, gap=0.0, gain=0.01)
+    good = shaky.model_copy(update={"spans": {"1": span.model_copy(update={"settling_s": 0.5})}})
+    assert kept(tmp_path, LINE) == {} and not shaky.settled and good.settled
+    keep(tmp_path, LINE, now, "a" * 64, shaky, 1.0)
+    with baselines.open_baselines(tmp_path / baselines.FILE_NAME) as database:
+        assert database.baseline(LINE.site, LINE.line, SCENARIO) is None
+    keep(tmp_path, LINE, now, "b" * 64, good, 1.0)
+    assert kept(tmp_path, LINE) == {"a" * 64: shaky, "b" * 64: good}
+    with baselines.open_baselines(tmp_path / baselines.FILE_NAME) as database:
+        held_against = database.baseline(LINE.site, LINE.line, SCENARIO)
+    assert held_against is not None and held_against.run.conditions["proposal"] == "b" * 64
+    assert held_against.run.measured.settling_s == 0.5
 
 
 def test_a_person_is_asked_once_and_waited_for(tmp_path):

@@ -18,8 +18,10 @@ from gateway.commissioning.chain import (
     LADDERS,
     MOST_AGAIN,
     MOST_EXPERIMENTS,
+    MOST_ROUNDS,
     STRETCH,
     Ended,
+    Look,
     Next,
     Outcome,
     Past,
@@ -30,7 +32,7 @@ from gateway.commissioning.chain import (
     past_of,
     refused_at_once,
 )
-from gateway.commissioning.redesign import LAWS
+from gateway.commissioning.redesign import LAWS, PREDICTIVE
 from gateway.control.design import design_lqi, is_stable, task_of
 from gateway.core.controller import config_hash
 from gateway.core.decisions import ProposalShown
@@ -40,7 +42,10 @@ from gateway.core.verdict import RuleFinding, Verdict
 from tests.unit.supervisor_support import line_of
 
 FIRST_M_PER_S, WANTED_M_PER_S = 0.02, 0.12
-KINDS = {Step.FIRST: "gains", Step.EXPERIMENT: "experiment", Step.MODEL: "model", Step.REDESIGN: "gains"}
+KINDS = {
+    Step.FIRST: "gains", Step.EXPERIMENT: "experiment", Step.MODEL: "model", Step.REDESIGN: "gains",
+    Step.MEASUREMENT: "experiment",
+}  # fmt: skip
 LINE = line_of(2)
 
 
@@ -48,11 +53,17 @@ def asked(past):
     return next_step(past, FIRST_M_PER_S, WANTED_M_PER_S)
 
 
+def looked_at(past, settled=True):
+    """The last measurement, once somebody has looked at it."""
+    return [*past[:-1], replace(past[-1], settled=settled, why="as it should" if settled else "span 2 overshoots")]
+
+
 def after(step: Next, past, outcome=Outcome.DONE) -> Past:
     """What the gate's list has of a proposal. A configuration is let through for what the last experiment has shown."""
     shown = max((one.speed_m_per_s for one in past if one.kind == "experiment" and one.outcome is Outcome.DONE),
                 default=FIRST_M_PER_S)  # fmt: skip
-    speed = {Step.FIRST: FIRST_M_PER_S, Step.REDESIGN: shown, Step.EXPERIMENT: max(step.speeds_m_per_s, default=None)}
+    fastest = max(step.speeds_m_per_s, default=None)
+    speed = {Step.FIRST: FIRST_M_PER_S, Step.REDESIGN: shown, Step.EXPERIMENT: fastest, Step.MEASUREMENT: fastest}
     done = outcome is Outcome.DONE or step.step is Step.EXPERIMENT
     return Past(KINDS[step.step], outcome, step.step, step.rung, "why", speed.get(step.step) if done else None, "p")
 
@@ -63,8 +74,11 @@ def test_where_everything_gets_through_each_round_goes_faster_until_the_range_is
     while isinstance(step := asked(past), Next):
         steps.append(step)
         past.append(after(step, past))
-    assert isinstance(step, Ended) and step.reached
-    assert [one.step for one in steps] == [Step.FIRST, *3 * [Step.EXPERIMENT, Step.MODEL, Step.REDESIGN]]
+    assert isinstance(step, Look)
+    ended = asked(looked_at(past))
+    assert isinstance(ended, Ended) and ended.reached and ended.converged and "as it should" in ended.text
+    rounds = 3 * [Step.EXPERIMENT, Step.MODEL, Step.REDESIGN]
+    assert [one.step for one in steps] == [Step.FIRST, *rounds, Step.MEASUREMENT]
     tops = [max(one.speeds_m_per_s) for one in steps if one.step is Step.EXPERIMENT]
     assert tops == pytest.approx([0.02, 0.06, 0.12])  # no faster than data have shown, times STRETCH
     assert all(one.rung == 0 and one.size == 1.0 for one in steps)
@@ -124,7 +138,46 @@ def test_what_an_engineer_has_done_meanwhile_counts():
     past += [Past("model", Outcome.DONE)]
     assert asked(past).step is Step.REDESIGN
     past += [Past("gains", Outcome.DONE, speed_m_per_s=0.12)]
-    assert asked(past).reached
+    assert asked(past) == Next(Step.MEASUREMENT, 0, (0.06, 0.12))
+    past += [after(asked(past), past)]
+    assert asked(looked_at(past)).converged
+
+
+ADAPTED = [
+    Past("gains", Outcome.DONE, Step.FIRST, speed_m_per_s=0.02),
+    Past("experiment", Outcome.DONE, Step.EXPERIMENT, speed_m_per_s=0.12),
+    Past("model", Outcome.DONE, Step.MODEL), Past("gains", Outcome.DONE, Step.REDESIGN, speed_m_per_s=0.12),
+]  # fmt: skip
+
+
+def test_what_is_not_settled_leads_to_another_model_and_redesign_a_few_times():
+    past, steps = list(ADAPTED), []
+    while not isinstance(step := asked(past), Ended):
+        if isinstance(step, Look):
+            past = looked_at(past, settled=False)
+            continue
+        steps.append(step.step)
+        past.append(replace(after(step, past), speed_m_per_s=0.12))
+    assert steps == [Step.MEASUREMENT, *(MOST_ROUNDS - 1) * [Step.MODEL, Step.REDESIGN, Step.MEASUREMENT]]
+    assert step.reached and not step.converged and "span 2 overshoots" in step.text
+
+
+@pytest.mark.parametrize("refused", [Step.MEASUREMENT, Step.MODEL, Step.REDESIGN])
+def test_where_nothing_further_gets_through_the_adapted_configuration_stays(refused):
+    past = list(ADAPTED)
+    while not isinstance(step := asked(past), Ended):
+        if isinstance(step, Look):
+            past = looked_at(past, settled=False)
+            continue
+        outcome = Outcome.FAILED if step.step is refused else Outcome.DONE
+        past.append(replace(after(step, past, outcome), speed_m_per_s=0.12))
+    assert step.reached and not step.converged and len(past) == len(ADAPTED) + LADDERS[refused] + {
+        Step.MEASUREMENT: 0, Step.MODEL: 1, Step.REDESIGN: 2}[refused]  # fmt: skip
+
+
+def test_a_measurement_that_failed_is_followed_by_a_smaller_one():
+    failed = after(asked(ADAPTED), ADAPTED, Outcome.FAILED)
+    assert asked([*ADAPTED, failed]).size == 0.5 * asked(ADAPTED).size
 
 
 @settings(deadline=None, max_examples=50, suppress_health_check=[HealthCheck.too_slow])
@@ -139,6 +192,9 @@ def test_it_ends_whatever_the_gate_says(outcomes, share):
         step = asked(past)
         if isinstance(step, Ended):
             return
+        if isinstance(step, Look):
+            past = looked_at(past, settled=len(past) % 2 == 0)
+            continue
         assert isinstance(step, Next) and step.rung < LADDERS[step.step]
         reached = max((one.speed_m_per_s or 0.0 for one in past if one.kind == "gains"), default=FIRST_M_PER_S)
         assert all(speed <= max(STRETCH * reached, FIRST_M_PER_S) * (1.0 + 1e-9) for speed in step.speeds_m_per_s)
@@ -194,7 +250,7 @@ def test_a_closed_line_is_told_at_once():
     assert "closed" in refused_at_once(LINE.model_copy(update={"gate": gate})) and refused_at_once(LINE) == ""
 
 
-@pytest.mark.parametrize("law", [*FIRST_LAWS, *LAWS], ids=lambda law: law.text)
+@pytest.mark.parametrize("law", [*FIRST_LAWS, *LAWS, *PREDICTIVE], ids=lambda law: law.text)
 def test_every_candidate_holds_the_line_that_it_is_made_for(law):
     assert is_stable(configuration(LINE, None, 0.02, law), task_of(LINE))
 

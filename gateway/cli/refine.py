@@ -1,0 +1,131 @@
+"""Phase 4, `r2rgate refine`: in downtime, the model identified anew from what the line has shown since it was accepted.
+
+By the procedure of phase 0, with the accepted model as the prior as far as the data bear it out. What is in service is
+archived as phi_stable before anything changes, so that later runs can go back to it; model and redesign are proposed
+like anything else. A redesign that is approved stands on probation until the line has run with it.
+"""
+
+import asyncio
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from gateway.cli.commission import CannotGoOn, GateSide, Tell, put
+from gateway.cli.commission_changes import MOST_REASON, LineNow
+from gateway.cli.identify_model import model_of_found
+from gateway.commissioning.chain import OPEN_STAGES, refused_at_once
+from gateway.commissioning.redesign import redesigns
+from gateway.core.controller import config_hash
+from gateway.core.decisions import ProposalShown
+from gateway.core.line import Line
+from gateway.core.line_model import LineModel, ModelRefused
+from gateway.core.proposal import Evidence, GainsChange, ModelChange
+from gateway.core.recording import Recording
+from gateway.core.theta import Noise
+from gateway.identification.identify import NotIdentified
+from gateway.identification.inheritance import NotInherited, identify_after
+from gateway.supervisor.configurations import FILE_NAME, STABLE, ConfigurationsError, open_configurations
+
+DOWNTIME = ("SILENT", "READY", "STOP")
+ON_PROBATION = ("probation", "keeping")  #: as far as a change of gains comes while the line stands
+
+
+@dataclass(frozen=True)
+class Refined:
+    """`model`: a refined one is in service. `gains`: so is a redesign on it, or on probation until the line has run."""
+
+    model: bool
+    gains: bool
+    text: str
+    tried: list[ProposalShown]
+
+
+async def refine(line: Line, side: GateSide, who: str, tell: Tell = lambda text: None) -> Refined:
+    """Raises CannotGoOn where the line runs, or there is nothing to refine by; nothing has changed then."""
+    if why := refused_at_once(line):
+        raise CannotGoOn(why)
+    await _require_downtime(side)
+    shown, now = await side.proposals(), await side.now()
+    if now.model is None:
+        raise CannotGoOn("no model has been accepted yet: `r2rgate commission` begins")
+    if pending := next((one for one in shown if one.stage in OPEN_STAGES), None):
+        raise CannotGoOn(f"proposal {pending.proposal_hash[:12]} is {pending.stage}: settle it first")
+    recordings = (await side.recordings())[: _experiments_since_model(shown)]
+    if not recordings:
+        raise CannotGoOn(
+            "since the model in service was accepted no experiment has been run: without data that move there is "
+            "nothing to refine it by; run one in production (`r2rgate experiment design`)"
+        )
+    model, words = await asyncio.to_thread(_identified, line, now, now.model, recordings)
+    tell(words)
+    await _archive(line, side, now, who, tell)
+    tried: list[ProposalShown] = []
+    await _require_downtime(side)
+    change, reason = ModelChange(model=model), f"refined on {len(recordings)} experiments since the last; {words}"
+    tried.append(await _settled(side, await put(line, side, change, reason[:MOST_REASON], _named("model", 0))))
+    if tried[-1].stage != "kept":
+        return Refined(False, False, f"the refined model is {tried[-1].stage}: {tried[-1].why}", tried)
+    tell("the refined model is in service")
+    found = await asyncio.to_thread(redesigns, line, model, now.in_service, now.tension_n)
+    for rung, (law, controller) in enumerate(found):
+        await _require_downtime(side)
+        await side.ready()
+        reason = f"{law.text} on the refined model"
+        tell(reason)
+        hash_ = await put(line, side, GainsChange(controller=controller), reason, _named("redesign", rung))
+        tried.append(await _settled(side, hash_))
+        if tried[-1].stage in ("kept", *ON_PROBATION):
+            return Refined(True, True, f"{reason} is deployed; it is kept once the line has run with it", tried)
+    last = f"; the last one: {tried[-1].why}" if found else ""
+    return Refined(True, False, f"no redesign of {len(found)} gets through: what was in service stays{last}", tried)
+
+
+def _named(what: str, candidate: int) -> Evidence:
+    return Evidence(what=f"refinement: {what}", value=float(candidate))
+
+
+async def _require_downtime(side: GateSide) -> None:
+    if (state := await side.state()) not in DOWNTIME:
+        raise CannotGoOn(
+            f"the line is in {state}: models are refined in downtime; allowed: {', '.join(DOWNTIME)} (`r2rgate stop`)"
+        )
+
+
+def _experiments_since_model(shown: Sequence[ProposalShown]) -> int:
+    """That were run, to their end or not, since a model was accepted."""
+    kinds = [(one.proposal.kind, one.stage) for one in shown]
+    last = max((i for i, one in enumerate(kinds) if one == ("model", "kept")), default=-1)
+    return sum(one == ("experiment", "done") for one in kinds[last + 1 :])
+
+
+def _identified(line: Line, now: LineNow, parent: LineModel, recordings: Sequence[Recording]) -> tuple[LineModel, str]:
+    """And what became of the accepted model as the prior. Raises CannotGoOn."""
+    try:
+        inherited = identify_after(parent, recordings, line, Noise(), time.perf_counter)
+        created = now.at.isoformat(timespec="milliseconds")
+        return (
+            model_of_found(line, recordings, inherited.found, created, parent=inherited.parent),
+            "; ".join(inherited.words),
+        )
+    except (NotIdentified, NotInherited, ModelRefused) as refused:
+        raise CannotGoOn(f"the data give no model: {refused}") from refused
+
+
+async def _archive(line: Line, side: GateSide, now: LineNow, who: str, tell: Tell) -> None:
+    """What is in service, as phi_stable. Raises CannotGoOn."""
+    hash_, at_s = config_hash(now.in_service), now.at.timestamp()
+    try:
+        with open_configurations((await side.folder()) / FILE_NAME) as storage:
+            storage.archive(line.site, line.line, hash_, STABLE, at_s, who, "in service before a refinement")
+    except ConfigurationsError as error:
+        raise CannotGoOn(f"what is in service cannot be archived, so nothing is changed: {error}") from error
+    tell(f"{STABLE}: {hash_[:12]}, which was in service")
+
+
+async def _settled(side: GateSide, proposal: str) -> ProposalShown:
+    """Once it goes no further while the line stands."""
+    while True:
+        shown = next(one for one in await side.proposals() if one.proposal_hash == proposal)
+        if shown.stage not in OPEN_STAGES or shown.stage in ON_PROBATION:
+            return shown
+        await side.wait_for(proposal)

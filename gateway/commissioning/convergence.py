@@ -1,0 +1,230 @@
+"""Whether an adaptation has come to its end: what the line does, beside what the model says of it. Pure.
+
+A measurement is an experiment with steps that stand long enough to be looked at one by one: proposed, judged, decided
+and run like any other, so that it is on record and its data are there for the next model. Of each span the worst of
+its changes counts (BENCHMARK, convergence):
+
+    RMSE_i <= 0.05 T_ref,i    OS_i <= 20 %    t_s,i <= 2 s    (eq. convergence_criteria)
+
+overshoot of the step's size, or of T_ref,i where the span does not step, and the band of settling 2 % of T_ref,i. What
+noise of the load cells adds to overshoot and settling is taken off by a mean over `SMOOTHED_S`.
+
+The prediction is a rollout on the accepted model with the set-points and speeds of the recording, looked at in the
+same way. What is left to gain is told by a model that has seen these data as well: it would lead to another design
+only as far as the figures predicted by it differ from those of the model that the design was made on.
+"""
+
+from collections.abc import Sequence
+from math import inf, isfinite
+
+import numpy as np
+
+from gateway.commissioning.candidates import NotOffered
+from gateway.commissioning.redesign import BRIEF_S, LASTING_S, loop_of, predicted
+from gateway.control.judged_courses import Judged
+from gateway.control.rollout import Course, plants_of_thetas, simulate
+from gateway.core.controller import Controller
+from gateway.core.controller_laws import MpcConfig
+from gateway.core.deployment import Region
+from gateway.core.experiment import Abort, Experiment, Leg, signs
+from gateway.core.line import Line, Strict
+from gateway.core.line_model import LineModel, noise_of, theta_of
+from gateway.core.metrics import overshoot_pct, rmse_per_span_n, settling_time_s
+from gateway.core.recording import Recording
+from gateway.core.signals import FloatArray
+from gateway.core.theta import Noise
+
+RMSE_SHARE, MOST_OVERSHOOT_PCT, MOST_SETTLING_S = 0.05, 20.0, 2.0
+SIGNIFICANT = 0.05  #: of a predicted tracking error: a model that changes it by less leads to no other design
+DWELL_S, STEPS = 3.0, 4  #: of a measurement: from step to step, and at each speed
+SEEDS = 100  #: are tried, for one with which every span steps at each speed
+OF_SETPOINT = 0.05  #: a step either way, of the set-point, as far as the region permits
+ABORT_TIMES = 3.0  #: the greatest step either way: farther from its set-point no tension goes
+SMOOTHED_S = 0.05
+STANDS = 0.02  #: of the greatest speed, by which it may differ within a window, noise included
+
+
+class SpanFigures(Strict):
+    """Of a span in its worst change. null: it never settled."""
+
+    rmse_n: float
+    overshoot_pct: float
+    settling_s: float | None
+    setpoint_n: float  #: the lowest at which it was asked to stand
+
+    @property
+    def converged(self) -> bool:
+        return (
+            self.rmse_n <= RMSE_SHARE * self.setpoint_n
+            and self.overshoot_pct <= MOST_OVERSHOOT_PCT
+            and self.settling_s is not None
+            and self.settling_s <= MOST_SETTLING_S
+        )
+
+
+class Convergence(Strict):
+    """Of a configuration on its line. Spans are those with a load cell; `gap` is measured over predicted less 1."""
+
+    spans: dict[str, SpanFigures]
+    predicted: dict[str, SpanFigures]  #: on the accepted model
+    rmse_n: float  #: over all spans and changes
+    gap: float  #: of that
+    gain: float | None  #: largest change of a predicted tracking error by a model of all data; null: there is none
+    why: str = ""  #: there is none
+
+    @property
+    def converged(self) -> bool:
+        return all(one.converged for one in self.spans.values())
+
+    @property
+    def settled(self) -> bool:
+        """Nothing is left to do: the criteria are met, and no significant gain is predicted any more."""
+        return self.converged and self.gain is not None and self.gain < SIGNIFICANT
+
+    @property
+    def worst(self) -> SpanFigures:
+        """Of each figure the worst span's."""
+        settling = [inf if one.settling_s is None else one.settling_s for one in self.spans.values()]
+        return SpanFigures(
+            rmse_n=max(one.rmse_n for one in self.spans.values()),
+            overshoot_pct=max(one.overshoot_pct for one in self.spans.values()),
+            settling_s=max(settling) if isfinite(max(settling)) else None,
+            setpoint_n=min(one.setpoint_n for one in self.spans.values()),
+        )
+
+    @property
+    def text(self) -> str:
+        beyond = [f"span {name}" for name, one in self.spans.items() if not one.converged]
+        worst = self.worst
+        settling = "never settles" if worst.settling_s is None else f"settles within {worst.settling_s:.2f} s"
+        met = "criteria met" if not beyond else f"criteria not met by {', '.join(beyond)}"
+        gain = f"no newer model: {self.why}" if self.gain is None else f"a newer model changes {self.gain:.1%}"
+        return (
+            f"{met}: error up to {worst.rmse_n:.2f} N, overshoot {worst.overshoot_pct:.0f} %, {settling}; "
+            f"{self.gap:+.0%} beside the prediction; {gain}"
+        )
+
+
+def measurement(
+    line: Line, region: Region | None, tension_n: Sequence[float], speeds_m_per_s: Sequence[float], size: float,
+    seed: int,
+) -> Experiment:  # fmt: skip
+    """Steps from set-points (n,), at each speed. Raises NotOffered."""
+    limits, setpoint = line.limits, np.array(tension_n)
+    step_n = limits.tension_step_max_n
+    if region is not None and region.tension_step_max_n is not None:
+        step_n = min(step_n, region.tension_step_max_n)
+    low, high = limits.tension_min_n + limits.tension_margin_n, limits.tension_max_n - limits.tension_margin_n
+    room = np.minimum.reduce([setpoint - low, high - setpoint, np.full(line.n, 0.5 * step_n)])
+    amplitude = size * np.clip(OF_SETPOINT * setpoint, 0.0, room)
+    amplitude[[i for i, span in enumerate(line.spans) if span.control != "tension"]] = 0.0
+    greatest = float(amplitude.max())
+    nearest_n = float(min(setpoint.min() - limits.tension_min_n, limits.tension_max_n - setpoint.max()))
+    if not 0.0 < greatest < nearest_n:
+        raise NotOffered("no set-point may step far enough for a look at its course: steps and limits are too narrow")
+    asked = Experiment(
+        format=1,
+        name="measurement",
+        description="steps that stand, to see how the configuration in service does",
+        amplitude_n=amplitude.tolist(),
+        dwell_s=DWELL_S,
+        seed=seed,
+        legs=[Leg(duration_s=STEPS * DWELL_S, speed_m_per_s=speed) for speed in speeds_m_per_s],
+        abort=Abort(deviation_n=min(ABORT_TIMES * greatest, nearest_n)),
+    )
+    seeds = [asked.model_copy(update={"seed": SEEDS * seed + k}) for k in range(SEEDS)]
+    return max(seeds, key=_stepping)
+
+
+def _stepping(asked: Experiment) -> int:
+    """Spans that step at a speed, over all speeds."""
+    levels = np.array([signs(asked, dwell) for dwell in range(STEPS * len(asked.legs))]).reshape(-1, STEPS, asked.n)
+    return int(np.count_nonzero(np.ptp(levels, axis=1)))
+
+
+def convergence(
+    line: Line, recording: Recording, in_service: Controller, model: LineModel, newer: LineModel | str
+) -> Convergence:
+    """Of a measurement's recording under `in_service`. `newer`: a model of these data too, or why there is none.
+
+    Raises NotOffered where the recording shows no change to be looked at.
+    """
+    measured = _figures(line, recording, recording.tension_n)
+    foreseen = _figures(line, recording, _rolled_out(line, recording, in_service, model))
+    rmse, foreseen_rmse = (float(np.sqrt(sum(one.rmse_n**2 for one in of.values()))) for of in (measured, foreseen))
+    gain = None if isinstance(newer, str) else _changed(line, recording, in_service, model, newer)
+    return Convergence(
+        spans=measured, predicted=foreseen, rmse_n=rmse, gap=rmse / max(foreseen_rmse, 1e-9) - 1.0, gain=gain,
+        why=newer if isinstance(newer, str) else "",
+    )  # fmt: skip
+
+
+def _changed(line: Line, recording: Recording, config: Controller, model: LineModel, newer: LineModel) -> float:
+    """By how much the tracking errors that the gate compares by differ from one model to the other."""
+    speed = min(model.region.speed_to_m_per_s, line.limits.speed_max_m_per_s)
+    judged = Judged(
+        line, recording.tension_setpoint_n[0], speed, line.limits.tension_step_max_n,
+        min(line.limits.speed_step_max_m_per_s, speed),
+    )  # fmt: skip
+    lasting_s = BRIEF_S if isinstance(config, MpcConfig) else LASTING_S
+    before, after = (predicted(config, line, one, judged, lasting_s) for one in (model, newer))
+    return max(abs(after[name].rmse_n / max(before[name].rmse_n, 1e-9) - 1.0) for name in before)
+
+
+def _rolled_out(line: Line, recording: Recording, config: Controller, model: LineModel) -> FloatArray:
+    """Tensions (k, n) of the model, with the set-points and speeds of the recording."""
+    course = Course(recording.tension_setpoint_n, recording.unwind_speed_m_per_s)
+    setup = loop_of(line, noise_of(model) or Noise())
+    return simulate(config, plants_of_thetas([theta_of(model)]), course, setup, record=True).tension_n[0]
+
+
+def _figures(line: Line, recording: Recording, tension_n: FloatArray) -> dict[str, SpanFigures]:
+    """By the number of the span, of tensions (k, n) under the recording's set-points."""
+    setpoint, period_s = recording.tension_setpoint_n, recording.period_s
+    time_s: FloatArray = np.arange(len(setpoint), dtype=np.float64) * period_s
+    smooth = _smoothed(tension_n, max(1, round(SMOOTHED_S / period_s)))
+    windows = _windows(line, recording)
+    if not windows:
+        raise NotOffered("the recording has no step whose course could be looked at: the speed moved throughout")
+    found = np.zeros((3, line.n))  # RMSE, overshoot, settling time: the worst of all changes
+    for begin, end in windows:
+        rows, asked, changed_s = slice(begin - 1, end), setpoint[begin - 1 : end], float(time_s[begin])
+        one = (
+            rmse_per_span_n(tension_n[begin:end], setpoint[begin:end]),
+            overshoot_pct(time_s[rows], smooth[rows], asked, changed_s),
+            settling_time_s(time_s[rows], smooth[rows], asked, changed_s),
+        )
+        found = np.maximum(found, one)
+    lowest = np.min([setpoint[end - 1] for _, end in windows], axis=0)
+    rmse, overshoot, settling = found.tolist()
+    return {
+        str(i + 1): SpanFigures(
+            rmse_n=rmse[i], overshoot_pct=overshoot[i], settling_s=settling[i] if isfinite(settling[i]) else None,
+            setpoint_n=float(lowest[i]),
+        )
+        for i, span in enumerate(line.spans) if span.control == "tension"
+    }  # fmt: skip
+
+
+def _windows(line: Line, recording: Recording) -> list[tuple[int, int]]:
+    """From each change of set-points to the next, where the speed stands and every load cell tells."""
+    setpoint, speed = recording.tension_setpoint_n, recording.unwind_speed_m_per_s
+    spans = [i for i, span in enumerate(line.spans) if span.control == "tension"]
+    begins = (1 + np.flatnonzero(np.any(np.diff(setpoint, axis=0) != 0.0, axis=1))).tolist()
+    most = STANDS * line.limits.speed_max_m_per_s
+    least = round((MOST_SETTLING_S + SMOOTHED_S) / recording.period_s)
+    return [
+        (begin, end)
+        for begin, end in zip(begins, [*begins[1:], len(setpoint)], strict=True)
+        if end - begin >= least
+        and np.ptp(speed[begin:end]) <= most
+        and np.isfinite(recording.tension_n[begin - 1 : end, spans]).all()
+    ]
+
+
+def _smoothed(values: FloatArray, samples: int) -> FloatArray:
+    """Mean over so many samples until each (k, n); at the begin over those that are there."""
+    sums = np.cumsum(np.vstack((np.zeros((1, values.shape[1])), values)), axis=0)
+    last = np.arange(1, len(values) + 1)
+    first = np.maximum(last - samples, 0)
+    return (sums[last] - sums[first]) / (last - first)[:, None]

@@ -1,0 +1,127 @@
+"""When an adaptation is over: what a measurement asks for, and what is made of what it shows."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from gateway.commissioning.candidates import NotOffered
+from gateway.commissioning.convergence import (
+    DWELL_S,
+    STEPS,
+    Convergence,
+    SpanFigures,
+    convergence,
+    measurement,
+)
+from gateway.control.design import design_lqi, task_on
+from gateway.core.deployment import Region
+from gateway.core.experiment import reasons_against, setpoints
+from gateway.core.line_model import model_of, noise_of, parameters_of, theta_of
+from gateway.core.recording import Recording
+from gateway.core.theta import nominal_theta
+from tests.unit.supervisor_support import line_of
+
+LINE = line_of(2)
+TENSION_N = [28.0, 36.0]
+SPEEDS_M_PER_S = (0.03, 0.06)
+
+
+def model(stiffer=1.0):
+    theta = nominal_theta(LINE)
+    theta = replace(theta, web=replace(theta.web, stiffness_n=stiffer * theta.web.stiffness_n))
+    return model_of(
+        {
+            "format": 1, "site": LINE.site, "line": LINE.line, "created": "2026-01-05T06:00:00+00:00",
+            "program_version": "0", "method": "test",
+            "structure": {"per_roller": False, "coulomb": False, "torque_lag": False},
+            "parameters": parameters_of(theta),
+            "noise": {"tension_n": 0.1, "speed_m_per_s": 1e-4, "acceleration_m_per_s1_5": 1.6e-3},
+            "intervals": {}, "data": {"digest": "0" * 64, "source": "test", "samples": 1000, "period_s": 0.01},
+            "region": {
+                "speed_from_m_per_s": 0.01, "speed_to_m_per_s": 0.12,
+                "tension_from_n": [20.0, 20.0], "tension_to_n": [40.0, 40.0],
+            },
+        }
+    )  # fmt: skip
+
+
+MODEL = model()
+CONFIG = design_lqi(task_on(LINE, theta_of(MODEL), noise_of(MODEL)))
+
+
+def recording(tension_n, setpoint_n, speed_m_per_s):
+    """As if it had been measured."""
+    k = len(setpoint_n)
+    zeros = np.zeros_like(setpoint_n)
+    return Recording(
+        0.01 * np.arange(k), tension_n, setpoint_n, zeros, zeros, zeros, speed_m_per_s, np.ones(k, bool), 0.01, "test"
+    )
+
+
+def stepped(off_n=0.0):
+    """A span 1 that goes from 28 to 30 N with a lag of 50 ms and stands `off_n` from there, and one that stands."""
+    setpoint = np.tile(TENSION_N, (900, 1))
+    setpoint[300:, 0] = 30.0
+    tension = setpoint.copy()
+    tension[300:, 0] += off_n - 2.0 * np.exp(-0.01 * np.arange(600) / 0.05)
+    return recording(tension, setpoint, np.full(900, 0.06))
+
+
+def test_every_span_steps_at_each_speed_within_what_the_line_and_the_region_permit():
+    region = Region(speed_max_m_per_s=0.06, tension_step_max_n=2.0)
+    asked = measurement(LINE, region, TENSION_N, SPEEDS_M_PER_S, 1.0, 3)
+    assert asked.amplitude_n == [1.0, 1.0] and reasons_against(asked, LINE, np.array(TENSION_N), 0.01) == []
+    wide = measurement(LINE, None, TENSION_N, SPEEDS_M_PER_S, 1.0, 3)
+    assert wide.amplitude_n == pytest.approx([1.4, 1.8]) and wide.abort.deviation_n > 2.0 * max(wide.amplitude_n)
+    moved = setpoints(asked, np.array(TENSION_N), 0.01).reshape(2, -1, 2)
+    assert moved.shape[1] == round(STEPS * DWELL_S / 0.01) and (np.ptp(moved, axis=1) > 0.0).all()
+    with pytest.raises(NotOffered, match="narrow"):
+        measurement(LINE, Region(tension_step_max_n=0.0), TENSION_N, SPEEDS_M_PER_S, 1.0, 3)
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "converged"),
+    [((0.2, 5.0, 0.5), (0.1, 5.0, 0.5), True), ((1.4, 20.0, 2.0), (0.1, 5.0, 0.5), True),
+     ((1.41, 5.0, 0.5), (0.1, 5.0, 0.5), False), ((0.2, 20.1, 0.5), (0.1, 5.0, 0.5), False),
+     ((0.2, 5.0, 2.01), (0.1, 5.0, 0.5), False), ((0.2, 5.0, None), (0.1, 5.0, 0.5), False)],
+)  # fmt: skip
+def test_the_criteria_hold_for_every_span(one, other, converged):
+    def figures(rmse, overshoot, settling):
+        return SpanFigures(rmse_n=rmse, overshoot_pct=overshoot, settling_s=settling, setpoint_n=28.0)
+
+    found = Convergence(spans={"1": figures(*one), "2": figures(*other)}, predicted={}, rmse_n=1.0, gap=0.0, gain=0.01)
+    assert found.converged is converged and found.settled is converged
+    assert not found.model_copy(update={"gain": 0.06}).settled
+    assert not found.model_copy(update={"gain": None, "why": "no data"}).settled
+
+
+def test_figures_are_those_of_the_worst_change_and_smooth_noise_away():
+    found = convergence(LINE, stepped(), CONFIG, MODEL, MODEL)
+    assert found.converged and found.gain == 0.0 and found.settled
+    # 2 exp(-t / 50 ms), sampled every 10 ms over 6 s; it is within 0.6 N from 61 ms on, and a mean over 50 ms later.
+    assert found.spans["1"].rmse_n == pytest.approx(2.0 * np.sqrt(1.0 / (1.0 - np.exp(-0.4)) / 600), rel=1e-6)
+    assert found.spans["1"].settling_s == pytest.approx(0.09, abs=0.02)
+    assert found.spans["2"].rmse_n == 0.0 and found.spans["1"].setpoint_n == 30.0
+    slow = convergence(LINE, stepped(off_n=0.7), CONFIG, MODEL, MODEL)
+    assert slow.spans["1"].settling_s is None and not slow.converged and "span 1" in slow.text
+    noisy = stepped()
+    noisy.tension_n[:] += 0.1 * np.random.default_rng(1).standard_normal(noisy.tension_n.shape)
+    assert convergence(LINE, noisy, CONFIG, MODEL, MODEL).spans["2"].overshoot_pct < 1.0  # 0.9 % are 3 sigma
+
+
+def test_a_line_that_is_as_the_model_has_it_has_no_gap_and_another_web_changes_what_is_predicted():
+    asked = measurement(LINE, None, TENSION_N, SPEEDS_M_PER_S, 1.0, 3)
+    moved = setpoints(asked, np.array(TENSION_N), 0.01)
+    course = np.vstack((np.tile(TENSION_N, (100, 1)), moved))
+    speed = np.full(len(course), 0.06)
+    ideal = convergence(LINE, recording(course, course, speed), CONFIG, MODEL, model(0.8))
+    assert ideal.gap < -0.9 and ideal.gain is not None and ideal.gain > 0.0
+    assert 0.0 < ideal.predicted["1"].rmse_n < 1.0 and ideal.predicted["1"].settling_s is not None
+    assert convergence(LINE, recording(course, course, speed), CONFIG, MODEL, "too short").why == "too short"
+
+
+def test_while_the_speed_moves_nothing_is_looked_at():
+    setpoint = stepped().tension_setpoint_n
+    with pytest.raises(NotOffered, match="speed"):
+        convergence(LINE, recording(setpoint, setpoint, np.linspace(0.01, 0.1, 900)), CONFIG, MODEL, MODEL)
