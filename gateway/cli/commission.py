@@ -99,8 +99,18 @@ class Commissioned:
     speed_m_per_s: float | None  #: up to which the configuration in service was judged; None: none was kept
 
 
-async def commission(line: Line, side: GateSide, tell: Tell = lambda text: None) -> Commissioned:
-    """Until the chain has ended, one way or the other. Every rung is tried once, so that it does."""
+async def commission(
+    line: Line,
+    side: GateSide,
+    tell: Tell = lambda text: None,
+    wanted_m_per_s: float | None = None,
+    adaptations: int = 1,
+) -> Commissioned:
+    """Until the chain has ended, one way or the other. Every rung is tried once, so that it does.
+
+    `wanted_m_per_s`: up to which the line is to be adapted; None: as fast as its drives hold. `adaptations`: redesigns
+    at least.
+    """
     if why := refused_at_once(line):
         return Commissioned(False, why, [], None)
     changes = Changes(line)
@@ -111,7 +121,9 @@ async def commission(line: Line, side: GateSide, tell: Tell = lambda text: None)
             shown = await side.proposals()
             past = _merged(shown, unmade)
             now = await side.now()
-            step = next_step(past, first_speed_m_per_s(line), fastest_m_per_s(line, now.model))
+            fastest = fastest_m_per_s(line, now.model)
+            wanted = fastest if wanted_m_per_s is None else min(wanted_m_per_s, fastest)
+            step = next_step(past, first_speed_m_per_s(line), wanted, adaptations)
             if isinstance(step, Ended):
                 return _commissioned(step, shown, unmade)
             if isinstance(step, Pending):
@@ -128,10 +140,12 @@ async def _propose(
 ) -> None:
     line, now, recordings = changes.line, await side.now(), await side.recordings()
     _require_slow(line, step, now)
+    what = f"{step.step}, candidate {step.rung + 1}"
+    tell(f"{what}: being made")
     try:
         change, reason = await asyncio.to_thread(changes.made, step, now, recordings, _region(shown))
     except NotOffered as refused:
-        tell(f"{step.step}, candidate {step.rung + 1}: cannot be made: {refused}")
+        tell(f"{what}: cannot be made: {refused}")
         unmade.append((len(shown), Past(KINDS[step.step], Outcome.FAILED, step.step, step.rung, str(refused))))
         return
     at = (await side.now()).at
@@ -148,7 +162,7 @@ async def _propose(
         created=at.isoformat(timespec="milliseconds"),
         expires=(at + timedelta(seconds=min(STANDS_S, line.gate.expiry_max_s))).isoformat(timespec="milliseconds"),
     )
-    tell(f"{step.step}, candidate {step.rung + 1}: {reason}")
+    tell(f"{what}: {reason}")
     reply = await side.propose(canonical(proposal))
     if not reply.ok:
         raise CannotGoOn("; ".join([reply.text, *reply.reasons]))

@@ -1,6 +1,7 @@
 """`r2rgate commission`: a new line brought from its file to an adapted configuration, each step through the gate."""
 
 import asyncio
+from typing import Annotated
 
 import typer
 
@@ -12,6 +13,11 @@ NOT_REACHED = 1  #: exit code
 
 def commission(
     file: LineFile,
+    speed: Annotated[
+        float | None,
+        typer.Option("--speed", min=0.001, help="m/s, up to which it is adapted; default: as fast as its drives hold."),
+    ] = None,
+    adaptations: Annotated[int, typer.Option("--adaptations", min=1, help="Redesigns, at least.")] = 1,
     run_dir: RunFolder = None,
 ) -> None:
     """Bring a new line that runs to an adapted configuration over its range of speeds, each step through the gate.
@@ -21,6 +27,9 @@ def commission(
     Exit code 0: reached; 1: the candidates have come to an end, with the reason.
 
     Example: r2rgate commission line.toml
+
+    Example, to the speed at which the line produces, and once more on all data: r2rgate commission line.toml
+    --speed 0.08 --adaptations 2
     """
     from gateway.cli.commission import commission as carried_out
     from gateway.cli.commission_live import TOPICS, LiveGate
@@ -38,7 +47,7 @@ def commission(
         mailbox = UnixMailbox()
         mailbox.connect(TOPICS, folder / GATEWAY_SOCKET)
         try:
-            found = await carried_out(line, LiveGate(line, mailbox, typer.echo), typer.echo)
+            found = await carried_out(line, LiveGate(line, mailbox, typer.echo), typer.echo, speed, adaptations)
         finally:
             await mailbox.close()
         typer.echo(f"{'commissioned' if found.reached else 'not commissioned'}: {found.text}")

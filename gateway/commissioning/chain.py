@@ -103,8 +103,22 @@ class Ended:
     text: str
 
 
-def next_step(past: Sequence[Past], first_speed_m_per_s: float, wanted_m_per_s: float) -> Next | Pending | Ended:
-    """`past` oldest first. Speeds: of a first configuration's region, and up to which the line is to be adapted."""
+def next_step(
+    past: Sequence[Past], first_speed_m_per_s: float, wanted_m_per_s: float, adaptations: int = 1
+) -> Next | Pending | Ended:
+    """`past` oldest first. Speeds: of a first configuration's region, and up to which the line is to be adapted.
+
+    `adaptations`: redesigns, at least. Those beyond the first that covers the wanted speed may come to nothing.
+    """
+    found = _next(past, first_speed_m_per_s, wanted_m_per_s, adaptations)
+    if isinstance(found, Ended) and not found.reached and _covered(past, wanted_m_per_s):
+        return Ended(True, f"{_reached(past)}; nothing further gets through: {found.text}")
+    return found
+
+
+def _next(
+    past: Sequence[Past], first_speed_m_per_s: float, wanted_m_per_s: float, adaptations: int
+) -> Next | Pending | Ended:
     if open_ := next((one for one in reversed(past) if one.outcome is Outcome.OPEN), None):
         return Pending(open_.proposal, open_.kind)
     last = {kind: _last_done(past, kind) for kind in ("gains", "experiment", "model")}
@@ -119,26 +133,36 @@ def next_step(past: Sequence[Past], first_speed_m_per_s: float, wanted_m_per_s: 
         return _experiment(past, since, first_speed_m_per_s, wanted_m_per_s, number)
     if last["model"] > last["gains"]:
         return _on_ladder(Step.REDESIGN, since)
-    reached = region_speed(past) or 0.0
-    if last["model"] >= 0 and reached >= NEAR * wanted_m_per_s:
-        adapted = any(_is_done(one, "gains") and one.rung != AS_IT_IS for one in past[_first_model(past) :])
-        what = (
-            "an adapted configuration" if adapted else "the configuration of the begin, judged on the line's own model,"
-        )
-        return Ended(True, f"{what} is in service up to {reached:.3g} m/s")
-    if _stands_still(past):
+    if _covered(past, wanted_m_per_s):
+        if len(_redesigned(past)) >= adaptations:
+            return Ended(True, _reached(past))
+    elif _stands_still(past):
+        reached = region_speed(past) or 0.0
         return Ended(False, f"experiments at {wanted_m_per_s:.3g} m/s lead no further than {reached:.3g} m/s")
     return _experiment(past, since, first_speed_m_per_s, wanted_m_per_s, 0)
+
+
+def _redesigned(past: Sequence[Past]) -> list[Past]:
+    """Configurations that were kept since there is a model, the one of the begin among them."""
+    first = next((i for i, one in enumerate(past) if _is_done(one, "model")), len(past))
+    return [one for one in past[first:] if _is_done(one, "gains")]
+
+
+def _covered(past: Sequence[Past], wanted_m_per_s: float) -> bool:
+    """Whether what is in service was judged on a model, up to the speed that is wanted."""
+    return bool(_redesigned(past)) and (region_speed(past) or 0.0) >= NEAR * wanted_m_per_s
+
+
+def _reached(past: Sequence[Past]) -> str:
+    adapted = any(one.rung != AS_IT_IS for one in _redesigned(past))
+    what = "an adapted configuration" if adapted else "the configuration of the begin, judged on the line's own model,"
+    return f"{what} is in service up to {region_speed(past) or 0.0:.3g} m/s"
 
 
 def region_speed(past: Sequence[Past]) -> float | None:
     """Up to which the configuration that was kept last has been judged; None: there is none, or nobody says."""
     at = _last_done(past, "gains")
     return None if at < 0 else past[at].speed_m_per_s
-
-
-def _first_model(past: Sequence[Past]) -> int:
-    return next(i for i, one in enumerate(past) if _is_done(one, "model"))
 
 
 def _stands_still(past: Sequence[Past]) -> bool:
