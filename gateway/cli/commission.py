@@ -124,12 +124,15 @@ async def commission(
     side: GateSide,
     tell: Tell = lambda text: None,
     *,
-    measure_again: bool = False,
+    wanted_m_per_s: float | None = None,
+    adaptations: int = 1,
     most_redesigns: int | None = None,
+    measure_again: bool = False,
 ) -> Commissioned:
     """Until the chain has ended, one way or the other. Every rung is tried once, so that it does.
 
-    `most_redesigns`: it is left there once so many have been kept.
+    `wanted_m_per_s`: up to which the line is to be adapted; None: as fast as its drives hold.
+    `adaptations`: redesigns at least; `most_redesigns`: it is left there once so many have been kept.
     `measure_again`: what was measured until now is of a line that is no longer as it was (another grade, a new part).
     """
     if why := refused_at_once(line):
@@ -149,7 +152,9 @@ async def commission(
             if most_redesigns is not None and kept_now >= most_redesigns:
                 return _commissioned(Ended(True, f"{kept_now} redesigns are kept"), past, shown, measured)
             now = await side.now()
-            step = next_step(past, first_speed_m_per_s(line), fastest_m_per_s(line, now.model))
+            fastest = fastest_m_per_s(line, now.model)
+            wanted = fastest if wanted_m_per_s is None else min(wanted_m_per_s, fastest)
+            step = next_step(past, first_speed_m_per_s(line), wanted, adaptations)
             if isinstance(step, Ended):
                 return _commissioned(step, past, shown, measured)
             if isinstance(step, Pending):
@@ -190,13 +195,15 @@ async def _propose(
 ) -> None:
     line, now, recordings = changes.line, await side.now(), await side.recordings()
     _require_slow(line, step, now)
+    what = f"{step.step}, candidate {step.rung + 1}"
+    tell(f"{what}: being made")
     try:
         change, reason = await asyncio.to_thread(changes.made, step, now, recordings, _region(shown))
     except NotOffered as refused:
-        tell(f"{step.step}, candidate {step.rung + 1}: cannot be made: {refused}")
+        tell(f"{what}: cannot be made: {refused}")
         unmade.append((len(shown), Past(KINDS[step.step], Outcome.FAILED, step.step, step.rung, str(refused))))
         return
-    tell(f"{step.step}, candidate {step.rung + 1}: {reason}")
+    tell(f"{what}: {reason}")
     await put(line, side, change, reason, named(step.step, step.rung))
 
 

@@ -22,6 +22,11 @@ T = TypeVar("T")
 
 def commission(
     file: LineFile,
+    speed: Annotated[
+        float | None,
+        typer.Option("--speed", min=0.001, help="m/s, up to which it is adapted; default: as fast as its drives hold."),
+    ] = None,
+    adaptations: Annotated[int, typer.Option("--adaptations", min=1, help="Redesigns, at least.")] = 1,
     run_dir: RunFolder = None,
     history: Annotated[
         bool, typer.Option("--history", help="Show what has been tried on the line until now; propose nothing.")
@@ -41,6 +46,9 @@ def commission(
     Exit code: 0 adapted and converged, 1 not, with the reason, 2 refused.
 
     Example: r2rgate commission line.toml
+
+    Example, to the speed at which the line produces, and once more on all data: r2rgate commission line.toml
+    --speed 0.08 --adaptations 2
     """
     from gateway.cli.commission import CannotGoOn
     from gateway.cli.commission import commission as carried_out
@@ -58,7 +66,12 @@ def commission(
         return
     with interruptible("nothing of what is approved is lost; the same command goes on from here"):
         ended = with_gate(
-            line, run_dir, typer.echo, lambda side: carried_out(line, side, typer.echo, measure_again=again)
+            line,
+            run_dir,
+            typer.echo,
+            lambda side: carried_out(
+                line, side, typer.echo, wanted_m_per_s=speed, adaptations=adaptations, measure_again=again
+            ),
         )
     typer.echo(f"{'commissioned' if ended.reached else 'not commissioned'}: {ended.text}")
     if not ended.converged:

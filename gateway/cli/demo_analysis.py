@@ -6,21 +6,28 @@ the case's own set-points. The gateway's history gives timing, and the instant a
 
 import json
 import time
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gateway.cli.demo import DemoFailed, Setup, Window, command_line, machine_lines, now_iso
-from gateway.cli.demo_result import CaseResult, DemoResult, Percentiles, TimingResult
+from gateway.cli.demo_cases import Window
+from gateway.cli.demo_line import Setup
+from gateway.cli.demo_operator import DemoFailed
+from gateway.cli.demo_result import CaseResult, ChainResult, ConfigurationResult, DemoResult, Percentiles, TimingResult
+from gateway.cli.demo_words import command_line, machine_lines, now_iso
+from gateway.cli.rehearse_designs import truth_of
 from gateway.cli.stepped import run_scenario
-from gateway.core.controller import config_hash
+from gateway.control.design import design_lqi, task_of
+from gateway.core.controller import Controller, config_hash
 from gateway.core.metrics import rmse_n, rmse_per_span_n
+from gateway.core.scenario import PAPER, Scenario
 from gateway.supervisor.historian import FILE_NAME
 from gateway.supervisor.history import History
-from sim_plant.plant import load_plant
+from sim_plant.plant import Plant, load_plant
 from sim_plant.recorder import read_recording
 from sim_plant.recording import Recording
 
@@ -51,22 +58,57 @@ class CaseTrace:
     setpoint_n: NDArray[Any]  #: (k, n)
 
 
-def measure(setup: Setup, windows: list[Window], stops: list[str], evidence: Evidence, started_s: float) -> DemoResult:
-    """Every figure of the run, beside the same cases in stepped time."""
+def measure(
+    setup: Setup,
+    windows: list[Window],
+    stops: list[str],
+    evidence: Evidence,
+    started_s: float,
+    names: Callable[[int], str],
+    chain: ChainResult | None,
+) -> DemoResult:
+    """Every figure of the run, beside the same cases in stepped time. `names`: of a configuration, by its place."""
+    plant = load_plant(setup.out / "plant.toml")
+    found: list[ConfigurationResult] = []
+    for config in _configurations(windows):
+        cases = [_case(setup, plant, trace_of(one, evidence), evidence) for one in windows if one.config == config]
+        found.append(
+            ConfigurationResult(name=names(len(found)), law=config.kind, controller=config_hash(config), cases=cases)
+        )
     return DemoResult(
         command=command_line(),
         date=now_iso(),
-        law=setup.config.kind,
         seed=setup.seed,
-        controller=config_hash(setup.config),
         versions={name: version(name) for name in LIBRARIES},
         machine=machine_lines(setup.out / "logs" / "loop.log"),
-        cases=[_case(setup, trace_of(window, evidence), evidence) for window in windows],
+        configurations=found,
+        truth_rmse_n=_on_truth(setup, plant),
+        chain=chain,
         timing=_timing(setup, evidence.history),
         unsafe_events=evidence.summary["unsafe_events"],
         stops=stops,
         wall_s=round(time.monotonic() - started_s, 1),
     )
+
+
+def _configurations(windows: Sequence[Window]) -> list[Controller]:
+    """In the order in which they ran."""
+    found: list[Controller] = []
+    for window in windows:
+        if window.config not in found:
+            found.append(window.config)
+    return found
+
+
+def _on_truth(setup: Setup, plant: Plant) -> dict[str, float]:
+    """By case what an LQI that is designed on the true line has in stepped time: nobody knows that line better."""
+    config = design_lqi(replace(task_of(setup.line), model=truth_of(plant)))
+    return {case.name: _stepped_rmse_n(setup, config, plant, case) for case in PAPER}
+
+
+def _stepped_rmse_n(setup: Setup, config: Controller, plant: Plant, case: Scenario) -> float:
+    seeds = range(setup.seed, setup.seed + STEPPED_SEEDS)
+    return float(np.mean([run_scenario(setup.line, config, plant, case, seed).rmse_n for seed in seeds]))
 
 
 def read_evidence(setup: Setup, windows: list[Window], world_start_s: float) -> Evidence:
@@ -98,15 +140,13 @@ def _change_s(window: Window, history: Arrays) -> float:
     return float(time_s[during[changed[0]]])
 
 
-def _case(setup: Setup, trace: CaseTrace, evidence: Evidence) -> CaseResult:
+def _case(setup: Setup, plant: Plant, trace: CaseTrace, evidence: Evidence) -> CaseResult:
     case, recording = trace.window.case, evidence.recording
     tension = recording.tension_n[trace.rows]
     begin_s, end_s = evidence.truth_s[trace.rows][[0, -1]]
     missed = evidence.history["missed"][(evidence.history["time_s"] >= begin_s) & (evidence.history["time_s"] <= end_s)]
-    plant = load_plant(setup.out / "plant.toml")
-    seeds = range(setup.seed, setup.seed + STEPPED_SEEDS)
-    stepped = [run_scenario(setup.line, setup.config, plant, case, seed).rmse_n for seed in seeds]
-    rmse, stepped_rmse = rmse_n(tension, trace.setpoint_n), float(np.mean(stepped))
+    rmse = rmse_n(tension, trace.setpoint_n)
+    stepped_rmse = _stepped_rmse_n(setup, trace.window.config, plant, case)
     return CaseResult(
         name=case.name,
         rmse_n=rmse,

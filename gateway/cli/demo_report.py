@@ -1,12 +1,13 @@
-"""The demonstration as a page."""
+"""The quick demonstration as a page."""
 
 import os
 from typing import Any
 
 import numpy as np
 
-from gateway.cli.demo import Setup, Window
 from gateway.cli.demo_analysis import STEPPED_SEEDS, CaseTrace, Evidence, trace_of
+from gateway.cli.demo_cases import Window
+from gateway.cli.demo_line import Setup
 from gateway.cli.demo_result import CaseResult, DemoResult
 from gateway.cli.report import Case, Comparison, EventCount, Machine, Report, RunEvent, Timing, render_report
 
@@ -27,7 +28,10 @@ def page(setup: Setup, result: DemoResult, windows: list[Window], evidence: Evid
         command=result.command,
         versions=result.versions,
         machine=Machine(os.cpu_count() or 1, result.machine[0], tuple(result.machine[1:])),
-        cases=tuple(_chart(setup, trace, case, evidence) for trace, case in zip(traces, result.cases, strict=True)),
+        cases=tuple(
+            _chart(setup, trace, case, evidence)
+            for trace, case in zip(traces, result.configurations[0].cases, strict=True)
+        ),
         unsafe_events=tuple(EventCount(kind, count) for kind, count in result.unsafe_events.items()),
         timing=Timing(
             time_s=history["time_s"] - start_s,

@@ -4,6 +4,13 @@ from typing import Literal
 
 from gateway.core.line import Strict
 
+#: The paper's table performance_summary, RMSE in N: tension and velocity case.
+PAPER_RMSE_N: dict[str, dict[str, float]] = {
+    "Initial": {"tension": 2.3615, "velocity": 1.6708},
+    "Adapt1": {"tension": 1.4267, "velocity": 0.7902},
+    "Adapt2": {"tension": 1.0449, "velocity": 0.4490},
+}
+
 
 class CaseResult(Strict):
     name: str
@@ -16,6 +23,59 @@ class CaseResult(Strict):
     tension_max_n: float
     unsafe_events: int  #: seen by the recorder at the drives during the case
     missed_periods: int
+
+
+class ConfigurationResult(Strict):
+    """A configuration, and the cases on it."""
+
+    name: str  #: the paper's: Initial, Adapt1, Adapt2; or "as started"
+    law: str
+    controller: str  #: hash
+    cases: list[CaseResult]
+
+
+class ChangeResult(Strict):
+    """A candidate of the chain."""
+
+    step: str
+    candidate: int  #: from 1
+    proposal: str  #: hash; empty: it could not even be made
+    reason: str  #: of the proposal
+    stage: str  #: that it came to
+    why: str  #: it ended there
+    rules: int  #: that judged it
+    against: list[str]  #: what the rules that failed have found
+    approved_by: str  #: as the audit has it; empty: nobody was asked
+    speed_m_per_s: float | None  #: up to which a configuration was let through
+
+
+class SwapResult(Strict):
+    """A configuration took over while the line ran."""
+
+    configuration: str  #: hash
+    at_s: float  #: since the first control period on record
+    largest_step_nm: float  #: of any drive's torque from one command to the next, in the second around it
+
+
+class AuditResult(Strict):
+    records: int
+    head: str  #: of the last record: whoever knows it knows all of them
+    sound: bool
+    problems: list[str]
+
+
+class ChainResult(Strict):
+    """How the configurations came to the line."""
+
+    reached: bool
+    text: str
+    changes: list[ChangeResult]
+    deployments: int
+    swaps: list[SwapResult]
+    step_allowed_nm: float  #: in one period, by the line's limits
+    step_elsewhere_nm: float  #: the largest of the whole run
+    left_out: list[str]  #: cases that a configuration was not judged for
+    audit: AuditResult
 
 
 class Percentiles(Strict):
@@ -34,16 +94,37 @@ class TimingResult(Strict):
 
 
 class DemoResult(Strict):
-    format: Literal[1] = 1
+    format: Literal[2] = 2
     command: str
     date: str  #: ISO 8601
-    law: str
     seed: int
-    controller: str  #: hash of the configuration
     versions: dict[str, str]
     machine: list[str]
-    cases: list[CaseResult]
+    configurations: list[ConfigurationResult]  #: in the order in which they ran
+    truth_rmse_n: dict[str, float]  #: by case, in stepped time: an LQI designed on the true line
+    chain: ChainResult | None  #: None: one configuration, with which the loop was started
     timing: TimingResult
     unsafe_events: dict[str, int]  #: by kind, over the whole run, with 0 where none was seen
     stops: list[str]  #: why the line stopped by itself and a case was begun anew; empty in a smooth run
     wall_s: float
+
+    def rmse_n(self, configuration: int, case: str) -> float | None:
+        """None: it was not run."""
+        cases = self.configurations[configuration].cases
+        return next((one.rmse_n for one in cases if one.name == case), None)
+
+    def improvement_pct(self, configuration: int, case: str) -> float | None:
+        """Of the RMSE from the configuration before; None: there is none, or one of the two was not run."""
+        if configuration == 0:
+            return None
+        before, now = self.rmse_n(configuration - 1, case), self.rmse_n(configuration, case)
+        return None if before is None or now is None else 100.0 * (1.0 - now / before)
+
+
+def paper_improvement_pct(configuration: str, case: str) -> float | None:
+    """Of the paper's own RMSE, from the configuration before."""
+    names = list(PAPER_RMSE_N)
+    if configuration not in names[1:]:
+        return None
+    before = PAPER_RMSE_N[names[names.index(configuration) - 1]][case]
+    return 100.0 * (1.0 - PAPER_RMSE_N[configuration][case] / before)

@@ -8,7 +8,7 @@ from importlib.metadata import version
 from math import exp, isfinite
 from typing import Literal
 
-from gateway.cli.demo import command_line, now_iso
+from gateway.cli.demo_words import command_line, now_iso
 from gateway.cli.identify_result import (
     CombinationRow,
     ErrorsRow,

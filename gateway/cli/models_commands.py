@@ -182,7 +182,7 @@ def report(
     import platform
     from importlib.metadata import version
 
-    from gateway.cli.demo import command_line, now_iso
+    from gateway.cli.demo_words import command_line, now_iso
     from gateway.cli.models_report import page_of
     from gateway.cli.report.page_render import render_page
 

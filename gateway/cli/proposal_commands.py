@@ -43,6 +43,13 @@ LONG_S = 30.0  #: no verdict takes that long once the judge has begun
 Which = Annotated[str, typer.Argument(help="The proposal's hash, or its first letters (at least 6).")]
 Comment = Annotated[str, typer.Option("--comment", help="Why; it stands in the audit.")]
 Yes = Annotated[bool, typer.Option("--yes", help="Do not ask again.")]
+Script = Annotated[
+    str,
+    typer.Option(
+        "--script",
+        help="Name of a program that decides in a person's place: it stands in the audit, as no person's word.",
+    ),
+]
 
 
 def propose(
@@ -102,23 +109,33 @@ def proposals(
 
 
 def approve(
-    which: Which, comment: Comment = "", yes: Yes = False, run_dir: RunFolder = None, as_json: Json = False
+    which: Which,
+    comment: Comment = "",
+    yes: Yes = False,
+    script: Script = "",
+    run_dir: RunFolder = None,
+    as_json: Json = False,
 ) -> None:
     """Approve a proposal that the gate has accepted: it is carried out at once, and watched before it is kept.
 
     Example: r2rgate approve 3f2a91 --comment "as discussed with the night shift"
     """
-    _decide(which, True, comment, yes, run_dir, as_json)
+    _decide(which, True, comment, yes, script, run_dir, as_json)
 
 
 def reject(
-    which: Which, comment: Comment = "", yes: Yes = False, run_dir: RunFolder = None, as_json: Json = False
+    which: Which,
+    comment: Comment = "",
+    yes: Yes = False,
+    script: Script = "",
+    run_dir: RunFolder = None,
+    as_json: Json = False,
 ) -> None:
     """Reject a proposal.
 
     Example: r2rgate reject 3f2a91 --comment "not during this order"
     """
-    _decide(which, False, comment, yes, run_dir, as_json)
+    _decide(which, False, comment, yes, script, run_dir, as_json)
 
 
 def rollback(comment: Comment = "", run_dir: RunFolder = None, as_json: Json = False) -> None:
@@ -130,7 +147,9 @@ def rollback(comment: Comment = "", run_dir: RunFolder = None, as_json: Json = F
     _end_with(Reply.model_validate_json(_ask(run_dir, GATEWAY_DECISION, command.model_dump_json().encode())), as_json)
 
 
-def _decide(which: str, approve: bool, comment: str, yes: bool, run_dir: Path | None, as_json: bool) -> None:
+def _decide(
+    which: str, approve: bool, comment: str, yes: bool, script: str, run_dir: Path | None, as_json: bool
+) -> None:
     found = _shown(run_dir, which)
     if found.shown is None:
         why = f" ({found.why})" if found.why else ""
@@ -138,7 +157,7 @@ def _decide(which: str, approve: bool, comment: str, yes: bool, run_dir: Path | 
     if not yes:
         print_shown(found, Console(highlight=False, stderr=True))
         typer.confirm("approve it?" if approve else "reject it?", abort=True, err=True)
-    command = Decide(proposal=found.proposal_hash, shown=found.shown, approve=approve, comment=comment)
+    command = Decide(proposal=found.proposal_hash, shown=found.shown, approve=approve, comment=comment, script=script)
     _end_with(Reply.model_validate_json(_ask(run_dir, GATEWAY_DECISION, command.model_dump_json().encode())), as_json)
 
 

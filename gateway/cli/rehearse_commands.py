@@ -152,7 +152,7 @@ def _result(
     import platform
     from importlib.metadata import version
 
-    from gateway.cli.demo import command_line, now_iso
+    from gateway.cli.demo_words import command_line, now_iso
     from gateway.cli.rehearse_designs import without_term
     from gateway.cli.rehearse_result import Conditions, NamedFile, RehearseResult
 

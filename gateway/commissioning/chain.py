@@ -122,8 +122,13 @@ class Look:
     proposal: str
 
 
-def next_step(past: Sequence[Past], first_speed_m_per_s: float, wanted_m_per_s: float) -> Next | Pending | Look | Ended:
-    """`past` oldest first. Speeds: of a first configuration's region, and up to which the line is to be adapted."""
+def next_step(
+    past: Sequence[Past], first_speed_m_per_s: float, wanted_m_per_s: float, adaptations: int = 1
+) -> Next | Pending | Look | Ended:
+    """`past` oldest first. Speeds: of a first configuration's region, and up to which the line is to be adapted.
+
+    `adaptations`: redesigns at least, also where the first has converged already. A further one may come to nothing.
+    """
     if open_ := next((one for one in reversed(past) if one.outcome is Outcome.OPEN), None):
         return Pending(open_.proposal, open_.kind)
     last = {kind: _last_done(past, kind) for kind in ("gains", "experiment", "model")}
@@ -132,7 +137,7 @@ def next_step(past: Sequence[Past], first_speed_m_per_s: float, wanted_m_per_s: 
         return _on_ladder(Step.FIRST if last["model"] < 0 else Step.REDESIGN, since)
     measured = past[last["experiment"]] if last["experiment"] > last["gains"] else None
     if measured is not None and measured.step is Step.MEASUREMENT and last["experiment"] > last["model"]:
-        return _measured(past, measured, since)
+        return _measured(past, measured, since, adaptations)
     if last["experiment"] > last["model"]:
         found = _on_ladder(Step.MODEL, since)
         number = sum(_is_done(one, "experiment") for one in past[last["model"] + 1 :])
@@ -160,19 +165,20 @@ def next_step(past: Sequence[Past], first_speed_m_per_s: float, wanted_m_per_s: 
     return _experiment(past, since, first_speed_m_per_s, wanted_m_per_s, 0)
 
 
-def _measured(past: Sequence[Past], measured: Past, since: Sequence[Past]) -> Next | Look | Ended:
+def _measured(past: Sequence[Past], measured: Past, since: Sequence[Past], adaptations: int) -> Next | Look | Ended:
     """After a measurement, from whose data nothing has been made yet."""
     if measured.settled is None:
         return Look(measured.proposal)
     what = f"an adapted configuration is in service up to {region_speed(past) or 0.0:.3g} m/s"
-    if measured.settled:
+    redesigned = sum(_is_done(one, "gains") for one in past[_first_model(past) :])
+    if measured.settled and redesigned >= adaptations:
         return Ended(True, f"{what}; {measured.why}", converged=True)
     rounds = sum(one.step is Step.MEASUREMENT and _is_done(one, "experiment") for one in past)
     if rounds >= MOST_ROUNDS:
         return Ended(True, f"{what}, and after {rounds} measurements that is left as it is; {measured.why}")
     found = _on_ladder(Step.MODEL, since)
     if isinstance(found, Ended):
-        return Ended(True, f"{what}; {measured.why}; {found.text}")
+        return Ended(True, f"{what}; {measured.why}; {found.text}", converged=measured.settled)
     return found
 
 

@@ -26,6 +26,7 @@ class Decide(Strict):
     shown: Digest  #: `shown_hash` of what the person has seen
     approve: bool
     comment: Comment = ""
+    script: Annotated[str, Field(max_length=80)] = ""  #: program that decides in a person's place; empty: a person
 
 
 class RollBackNow(Strict):

@@ -37,7 +37,7 @@ from gateway.mailbox.port import RemoteError, Unreachable
 from gateway.supervisor.audit_file import AuditUnavailable
 from gateway.supervisor.deployer_sides import AuditSide, JudgeSide, LoopSide, NotKnown, NotTakenUp, Surroundings
 from gateway.supervisor.kept_recording import packed
-from gateway.supervisor.lifecycle import PERSON, PROPOSED, VERDICT, Book, Entry, Impossible, Stage, reconciled
+from gateway.supervisor.lifecycle import PERSON, PROPOSED, SCRIPT, VERDICT, Book, Entry, Impossible, Stage, reconciled
 
 LEASE_S = 5.0  #: of a deployment on probation; renewed every third of it
 UNHEARD_S = 10.0  #: after an experiment should be over
@@ -123,7 +123,8 @@ class Deployer:
             if reasons := self._why_not_decide(entry, decision):
                 return self._refused("nothing was decided", reasons)
             assert entry is not None  # _why_not_decide says so
-            what = {"proposal": entry.proposal, "shown": decision.shown, "comment": decision.comment, "by": PERSON}
+            by = SCRIPT if decision.script else PERSON
+            what = {"proposal": entry.proposal, "shown": decision.shown, "comment": decision.comment, "by": by}
             try:
                 if not decision.approve:
                     await self._step("rejected", {**what, "because": decision.comment or f"by {who.name}"}, who)

@@ -241,6 +241,8 @@ class Gate:
         if self.deployer is None:
             reply = self._shut_reply()
         elif isinstance(decision, Decide):
+            if decision.script:
+                who = who.model_copy(update={"name": f"{decision.script}, run by {who.name}"})
             reply = await self.deployer.decide(decision, who)
         else:
             reply = await self.deployer.roll_back(decision.comment, who)

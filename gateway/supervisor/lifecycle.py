@@ -53,7 +53,7 @@ STEPS: dict[str, tuple[tuple[Stage, ...], Stage]] = {
     "model-in-service": ((Stage.APPROVED,), Stage.KEPT),
 }
 WELL = ("kept", "model-in-service", "experiment-ends")  #: the ends of changes that went well
-PERSON, VERDICT = "person", "verdict"  #: who approved
+PERSON, SCRIPT, VERDICT = "person", "script", "verdict"  #: who approved
 PROPOSED, FOUND = "proposed", "found-in-service"
 OWN_KIND = {"deploying": "gains", "experiment-begins": "experiment", "model-in-service": "model"}
 

@@ -19,7 +19,7 @@ def main() -> None:
     bench = Bench("wire", SEEDS)
     runs = [run(law, seed) for law in LAWS for seed in SEEDS]
     for law in LAWS:
-        of_law = [result for result in runs if result.law == law]
+        of_law = [result.configurations[0] for result in runs if result.configurations[0].law == law]
         for k, name in enumerate(("tension", "velocity")):
             cases = [result.cases[k] for result in of_law]
             suffix = "" if law == "lqi" else f"_{law}"
@@ -40,7 +40,19 @@ def main() -> None:
 
 def run(law: str, seed: int) -> DemoResult:
     with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, "-m", "gateway.cli", "demo", "--out", folder, "--law", law, "--seed", str(seed)]
+        command = [
+            sys.executable,
+            "-m",
+            "gateway.cli",
+            "demo",
+            "--quick",
+            "--out",
+            folder,
+            "--law",
+            law,
+            "--seed",
+            str(seed),
+        ]
         done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False)
         if done.returncode:
             raise SystemExit(f"{law}, seed {seed}: the demonstration has failed\n{done.stdout}")

@@ -19,7 +19,7 @@ pytestmark = [pytest.mark.realtime, pytest.mark.timeout(180)]
 
 def demo(folder: Path) -> subprocess.Popen[str]:
     return subprocess.Popen(
-        [sys.executable, "-m", "gateway.cli", "demo", "--out", str(folder)],
+        [sys.executable, "-m", "gateway.cli", "demo", "--quick", "--out", str(folder)],
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
@@ -62,15 +62,16 @@ def test_the_demonstration_runs_both_cases_and_leaves_nothing_behind(tmp_path):
     output, _ = process.communicate(timeout=150)
     assert process.returncode == 0, output
     result = DemoResult.model_validate(json.loads((folder / "result.json").read_text()))
-    assert [case.name for case in result.cases] == ["tension", "velocity"]
-    for case in result.cases:
+    (configuration,) = result.configurations
+    assert [case.name for case in configuration.cases] == ["tension", "velocity"]
+    for case in configuration.cases:
         goal = GOALS["wire"][f"ratio_{case.name}"]["value"]
         assert case.ratio_to_stepped <= goal == case.limit_ratio, output
         assert case.tension_min_n > 2.0 and case.tension_max_n < 60.0
     assert not any(result.unsafe_events.values()), result.unsafe_events
     assert result.timing.periods > 3000
     page = (folder / "report.html").read_text()
-    assert all(f"{case.rmse_n:.4f}" in page for case in result.cases)
+    assert all(f"{case.rmse_n:.4f}" in page for case in configuration.cases)
     assert "report.html" in output and left_over(folder) == []
 
 

@@ -154,7 +154,7 @@ def test_a_person_is_asked_once_and_waited_for(tmp_path):
 
     asyncio.run(run())
     (hash_,) = gateway.shown
-    assert [text for text in gateway.told if f"r2rgate approve {hash_[:12]}" in text] == gateway.told[1:]
+    assert [text for text in gateway.told if f"r2rgate approve {hash_[:12]}" in text] == gateway.told[2:]
 
 
 def test_another_line_than_that_of_the_file_is_left_alone(tmp_path):

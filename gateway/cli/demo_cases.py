@@ -1,0 +1,63 @@
+"""The paper's cases on the line that runs, in real time; once more where this computer has stalled."""
+
+import time
+from dataclasses import dataclass
+
+from gateway.cli.demo_operator import DemoFailed, Operator
+from gateway.core.controller import Controller
+from gateway.core.messages import SelectRecipe
+from gateway.core.scenario import Scenario
+
+MOST_REPEATS = 2  #: of a case, or of a start, after the line has stopped by itself
+
+
+@dataclass(frozen=True)
+class Window:
+    """When a case ran, on CLOCK_MONOTONIC, and under which configuration."""
+
+    case: Scenario
+    config: Controller
+    begin_s: float
+    end_s: float
+
+
+async def begin_with_repeats(operator: Operator) -> None:
+    """From rest to a line that is being tensioned. Refused, a person reads why and tries again."""
+    for repeats in range(MOST_REPEATS + 1):
+        try:
+            await operator.begin()
+            return
+        except DemoFailed as failed:
+            if repeats == MOST_REPEATS:
+                raise
+            await operator.recover(f"not started; once more ({failed})", str(failed))
+
+
+async def run_with_repeats(operator: Operator, config: Controller, case: Scenario, period_s: float) -> Window:
+    """A computer that stalls, or on which the simulated devices do, stops the line, as it must; then once more."""
+    for repeats in range(MOST_REPEATS + 1):
+        try:
+            return await _run_case(operator, config, case, period_s)
+        except DemoFailed as failed:
+            if repeats == MOST_REPEATS or not await operator.has_stopped():
+                raise
+            await operator.recover(f"the case once more: {failed}", str(failed))
+            await begin_with_repeats(operator)
+    raise AssertionError("the last repeat returns or raises")
+
+
+async def _run_case(operator: Operator, config: Controller, case: Scenario, period_s: float) -> Window:
+    progress = operator.progress
+    await operator.order(SelectRecipe(name=case.name))
+    progress.step(f"{case.heading.lower()}: settling at its set-points")
+    await operator.wait_settled(case.tension_n, case.speed_m_per_s)
+    begin_s = time.monotonic()
+    progress.case(case.heading, case.duration_s)
+    await operator.watch(case.change_at_s)
+    for command in case.commands():
+        await operator.order(command)
+    await operator.watch(begin_s + case.duration_s - time.monotonic())
+    end_s = time.monotonic()
+    # Beyond the window, so that it is whole whenever exactly the change took effect.
+    await operator.watch(4 * period_s)
+    return Window(case, config, begin_s, end_s)

@@ -1,0 +1,186 @@
+"""The chain from the line's file to adapted configurations, on the line that runs, with the cases on each of them."""
+
+import asyncio
+import contextlib
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from gateway.cli.commission import Commissioned, GateSide, commission
+from gateway.cli.commission_changes import LineNow
+from gateway.cli.commission_live import TOPICS, LiveGate
+from gateway.cli.demo_cases import MOST_REPEATS, Window, begin_with_repeats, run_with_repeats
+from gateway.cli.demo_line import Setup
+from gateway.cli.demo_operator import DemoFailed, Operator
+from gateway.core.controller import Controller, config_hash
+from gateway.core.decisions import ProposalShown
+from gateway.core.deployment import Region
+from gateway.core.messages import Reply
+from gateway.core.proposal import GainsChange
+from gateway.core.recording import Recording
+from gateway.core.scenario import PAPER, Scenario
+from gateway.mailbox.paths import GATEWAY_SOCKET
+from gateway.mailbox.unix import UnixMailbox
+
+FASTEST_M_PER_S = max(case.speed_end_m_per_s for case in PAPER)
+ADAPTATIONS = 2  #: as the paper's table has them for both cases
+MOST_DECISIONS = 3  #: on one proposal, where carrying it out is refused for the moment
+
+#: What is going on, by the stage that a proposal has come to.
+DOING = {
+    "received": "the gate judges it",
+    "probation": "it controls the line, on probation",
+    "keeping": "it is being kept",
+    "running": "the experiment runs",
+}
+
+Measure = Callable[[Controller, ProposalShown], Awaitable[None]]
+Decide = Callable[[ProposalShown], Awaitable[None]]
+
+
+class Measured:
+    """A gate behind which each configuration that is kept is measured before the chain goes on. See GateSide."""
+
+    def __init__(self, side: GateSide, decide: Decide, measure: Measure, tell: Callable[[str], None]) -> None:
+        self._side = side
+        self._decide = decide
+        self._measure = measure
+        self._tell = tell
+        self._told: tuple[str, str] | None = None
+        self._measured: set[str] = set()  #: hashes of configurations
+
+    async def proposals(self) -> list[ProposalShown]:
+        return await self._side.proposals()
+
+    async def now(self) -> LineNow:
+        return await self._side.now()
+
+    async def state(self) -> str:
+        return await self._side.state()
+
+    async def folder(self) -> Path:
+        return await self._side.folder()
+
+    async def recordings(self) -> list[Recording]:
+        return await self._side.recordings()
+
+    async def propose(self, payload: bytes) -> Reply:
+        return await self._side.propose(payload)
+
+    async def ready(self) -> None:
+        await self.measure_kept()
+        await self._side.ready()
+
+    async def wait_for(self, proposal: str) -> None:
+        shown = next(one for one in await self._side.proposals() if one.proposal_hash == proposal)
+        if shown.stage == "waiting":
+            await self._decide(shown)
+            return
+        if self._told != (proposal, shown.stage) and shown.stage in DOING:
+            self._told = proposal, shown.stage
+            self._tell(f"  {DOING[shown.stage]}")
+        await self._side.wait_for(proposal)
+
+    async def measure_kept(self) -> None:
+        """What is in service, where it has been kept and not been measured."""
+        kept = [one for one in await self._side.proposals() if one.stage == "kept"]
+        for shown in reversed(kept):
+            if isinstance(shown.proposal.change, GainsChange):
+                controller = shown.proposal.change.controller
+                if config_hash(controller) not in self._measured:
+                    await self._measure(controller, shown)
+                    self._measured.add(config_hash(controller))
+                return
+
+
+@dataclass
+class Chain:
+    """What has been done, as far as the demonstration saw it."""
+
+    windows: list[Window] = field(default_factory=list[Window])
+    left_out: list[str] = field(default_factory=list[str])  #: cases that a configuration was not judged for
+    shown: list[ProposalShown] = field(default_factory=list[ProposalShown])
+    commissioned: Commissioned | None = None
+
+
+async def carry_out(operator: Operator, setup: Setup) -> Chain:
+    """On a line that runs. The operator approves what the gate lets through."""
+    chain, decided = Chain(), dict[str, int]()
+    period_s = setup.line.control.period_s
+
+    async def decide(shown: ProposalShown) -> None:
+        short = shown.proposal_hash[:12]
+        rules = 0 if shown.verdict is None else len(shown.verdict.findings)
+        operator.progress.step(f"  the gate lets it through by {rules} rules; $ r2rgate approve {short} --yes")
+        decided[short] = decided.get(short, 0) + 1
+        try:
+            await operator.approve(short, "the demonstration approves what the gate lets through")
+        except DemoFailed:
+            if decided[short] == MOST_DECISIONS:
+                raise
+
+    async def measure(config: Controller, shown: ProposalShown) -> None:
+        name = name_of(len({config_hash(window.config) for window in chain.windows}))
+        operator.progress.step(f"  kept. {name} is measured: {len(PAPER)} cases of {PAPER[0].duration_s:g} s")
+        region = None if shown.verdict is None else shown.verdict.region
+        found: list[Window] = []
+        for case in PAPER:
+            if against := beyond(case, region):
+                chain.left_out.append(f"{name}, {case.heading.lower()}: {against}")
+            else:
+                found.append(await run_with_repeats(operator, config, case, period_s))
+        chain.windows += found
+
+    mailbox = UnixMailbox()
+    mailbox.connect(TOPICS, operator.run_folder / GATEWAY_SOCKET)
+    side = Measured(
+        LiveGate(setup.line, mailbox, operator.progress.step, operator.watch), decide, measure, operator.progress.step
+    )
+    showing = asyncio.create_task(operator.keep_showing())
+    try:
+        for repeats in range(MOST_REPEATS + 1):
+            try:
+                chain.commissioned = await commission(
+                    setup.line,
+                    side,
+                    operator.progress.step,
+                    wanted_m_per_s=FASTEST_M_PER_S,
+                    adaptations=ADAPTATIONS,
+                    most_redesigns=ADAPTATIONS,
+                )
+                await side.measure_kept()
+                break
+            except DemoFailed as failed:
+                if repeats == MOST_REPEATS or not await operator.has_stopped():
+                    raise
+                await operator.recover(f"the chain goes on after a stop: {failed}", str(failed))
+                await begin_with_repeats(operator)
+        chain.shown = await side.proposals()
+    finally:
+        showing.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await showing
+        await mailbox.close()
+    return chain
+
+
+def name_of(place: int) -> str:
+    """Of a configuration, in the paper's words: `place` from 0 in the order in which they were kept."""
+    return "Initial" if place == 0 else f"Adapt{place}"
+
+
+def beyond(case: Scenario, region: Region | None) -> str:
+    """Why a configuration that was judged for `region` does not run a case; empty: it does."""
+    if region is None:
+        return ""
+    speed = max(case.speed_m_per_s, case.speed_end_m_per_s)
+    wanted = (
+        ("the speed", speed, region.speed_max_m_per_s, "m/s"),
+        ("the step of tension", case.tension_step_n, region.tension_step_max_n, "N"),
+        ("the step of speed", case.speed_step_m_per_s, region.speed_step_max_m_per_s, "m/s"),
+    )
+    return "; ".join(
+        f"{what} is {value:g} {unit}, it was judged up to {most:g} {unit}"
+        for what, value, most, unit in wanted
+        if most is not None and value > most * (1.0 + 1e-9)
+    )

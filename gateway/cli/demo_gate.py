@@ -1,0 +1,97 @@
+"""What the gate has on record of the demonstration: candidates and their verdicts, who approved, swaps, the audit."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from gateway.cli.commission import Tried
+from gateway.cli.demo_analysis import Evidence
+from gateway.cli.demo_chain import Chain
+from gateway.cli.demo_line import Setup
+from gateway.cli.demo_result import AuditResult, ChainResult, ChangeResult, SwapResult
+from gateway.core.decisions import ProposalShown
+from gateway.core.signals import FloatArray
+from gateway.supervisor.audit_file import AuditFile
+from gateway.supervisor.audit_verify import verify
+from gateway.supervisor.historian import FILE_NAME
+from gateway.supervisor.history import History
+from sim_plant.recording import Recording
+
+AROUND_S = 1.0  #: a swap: half before it, half after it
+FAR_S = 4e9  #: beyond any wall clock
+
+
+def chain_result(setup: Setup, chain: Chain, evidence: Evidence) -> ChainResult:
+    """After every process has ended."""
+    found = chain.commissioned
+    assert found is not None  # the chain was carried out
+    approved, deployments = _decided(setup)
+    shown = {one.proposal_hash: one for one in chain.shown}
+    limits, steps = setup.line.limits, _steps(evidence.recording)
+    return ChainResult(
+        reached=found.reached,
+        text=found.text,
+        changes=[_change(one, shown.get(one.proposal), approved.get(one.proposal, "")) for one in found.tried],
+        deployments=deployments,
+        swaps=_swaps(setup, evidence, steps),
+        step_allowed_nm=limits.torque_rate_nm_per_s * setup.line.control.period_s,
+        step_elsewhere_nm=max(float(sizes.max(initial=0.0)) for _, sizes in steps),
+        left_out=chain.left_out,
+        audit=audit_result(setup),
+    )
+
+
+def audit_result(setup: Setup) -> AuditResult:
+    """As `r2rgate audit verify` finds it."""
+    found = verify(setup.out / "data")
+    return AuditResult(records=found.records, head=found.head, sound=found.sound, problems=found.problems)
+
+
+def _change(tried: Tried, shown: ProposalShown | None, approved_by: str) -> ChangeResult:
+    findings = [] if shown is None or shown.verdict is None else shown.verdict.findings
+    return ChangeResult(
+        step=tried.step or tried.kind,
+        candidate=tried.rung + 1,
+        proposal=tried.proposal,
+        reason="" if shown is None else shown.proposal.reason,
+        stage=tried.stage,
+        why=tried.why,
+        rules=len(findings),
+        against=[f"{one.rule}: {one.text}" for one in findings if not one.passed],
+        approved_by=approved_by,
+        speed_m_per_s=tried.speed_m_per_s,
+    )
+
+
+def _decided(setup: Setup) -> tuple[dict[str, str], int]:
+    """By proposal who approved it, and how often anything was deployed."""
+    with AuditFile(setup.out / "data") as file:
+        records = [row.record() for row in file.rows()]
+    approved = {str(one.what["proposal"]): one.who.name for one in records if one.kind == "approved"}
+    return approved, sum(one.kind == "deployed" for one in records)
+
+
+def _steps(recording: Recording) -> list[tuple[FloatArray, FloatArray]]:
+    """By drive: when it was told another torque than before (k,), on CLOCK_MONOTONIC, and by how much (k,)."""
+    commands: dict[int, list[tuple[float, float]]] = {roller: [] for roller in range(1, recording.spans + 1)}
+    for event in recording.of_kind("command"):
+        commands[event["roller"]].append((event["monotonic_s"], event["target_torque_nm"]))
+    told = [np.array(one).reshape(-1, 2) for one in commands.values()]
+    return [(one[1:, 0], np.abs(np.diff(one[:, 1]))) for one in told]
+
+
+def _swaps(setup: Setup, evidence: Evidence, steps: Sequence[tuple[FloatArray, FloatArray]]) -> list[SwapResult]:
+    start_s = float(evidence.history["time_s"][0])
+    with History(setup.out / "data" / FILE_NAME) as file:
+        deployed = [event for event in file.events(0.0, FAR_S) if event.kind == "deployed"]
+    return [
+        SwapResult(
+            configuration=str(event.data["hash"]),
+            at_s=event.time_s - start_s,
+            largest_step_nm=max(
+                float(sizes[np.abs(time_s - event.time_s) <= 0.5 * AROUND_S].max(initial=0.0))
+                for time_s, sizes in steps
+            ),
+        )
+        for event in deployed
+    ]
