@@ -69,7 +69,7 @@ class Changes:
         assert now.model is not None  # a measurement follows a redesign
         newer: LineModel | str
         try:
-            newer = self._identified(recordings, now)[0]
+            newer = self._identified(recordings[:1], now)[0]
         except NotOffered as refused:
             newer = str(refused)
         return convergence(self.line, recordings[0], now.in_service, now.model, newer)
@@ -100,8 +100,11 @@ class Changes:
         return ExperimentChange(experiment=asked), f"to identify the line at {speeds} m/s: {moves}"
 
     def _model(self, step: Next, now: LineNow, recordings: Sequence[Recording]) -> tuple[Change, str]:
-        """Of all experiments, or on the second rung of the newest alone."""
-        used = list(recordings if step.rung == 0 else recordings[:1])
+        """Of the newest experiment, which goes the fastest; on the second rung of all.
+
+        A fit takes as long as its data: of four times as much for what is at most half as wide an interval.
+        """
+        used = list(recordings[:1] if step.rung == 0 else recordings)
         if not used or (step.rung > 0 and len(recordings) == 1):
             raise NotOffered("there is no other recording" if used else "there is no recording of an experiment")
         model, structure = self._identified(used, now)
