@@ -60,7 +60,7 @@ class Changes:
             case Step.MODEL:
                 return self._model(step, now, recordings)
             case Step.REDESIGN:
-                return self._redesign(step, now)
+                return self._redesign(step, now, region)
             case Step.MEASUREMENT:
                 return self._measurement(step, now, region)
 
@@ -132,14 +132,15 @@ class Changes:
             experiment=asked
         ), f"to see how the configuration in service does, {steps} at {speeds} m/s"
 
-    def _redesign(self, step: Next, now: LineNow) -> tuple[Change, str]:
+    def _redesign(self, step: Next, now: LineNow, region: Region | None) -> tuple[Change, str]:
         """On the accepted model; in the end the configuration in service, for what data have shown since."""
         assert now.model is not None  # a redesign follows a model
         on = f"on model {model_hash(now.model)[:12]}, whose data go up to {now.model.region.speed_to_m_per_s:.3g} m/s"
         if step.rung == AS_IT_IS:
             return GainsChange(controller=now.in_service), f"the configuration in service, {on}"
         if self._designed is None or not _same(self._designed[0], now):
-            self._designed = now, redesigns(self.line, now.model, now.in_service, now.tension_n)
+            shown = 0.0 if region is None else region.speed_max_m_per_s or 0.0
+            self._designed = now, redesigns(self.line, now.model, now.in_service, now.tension_n, shown)
         found = self._designed[1]
         if step.rung >= len(found):
             raise NotOffered(f"{len(found)} designs do no worse on the model than the configuration in service")
