@@ -40,17 +40,19 @@ def adapt_through_gate(
         return []
     began_s = time.perf_counter()
     found, shown, unsafe = asyncio.run(_commissioned(impatient(line), plant, scenario, seed, rounds, tell))
+    wall_s = time.perf_counter() - began_s
     models = {
         one.proposal_hash: one.proposal.change.model for one in shown if isinstance(one.proposal.change, ModelChange)
     }
+    cut = _rounds(found)
     adapted: list[Adapted] = []
-    for number, tried in enumerate(_rounds(found), 1):
-        wall_s = time.perf_counter() - began_s if number == 1 else 0.0
+    for number, tried in enumerate(cut, 1):
         model = next((models[one.proposal] for one in tried if one.kind == "model" and one.stage == "kept"), None)
-        ended = number == len(_rounds(found)) and tried[-1].stage != "kept"
-        result = _result(number, model, tried, [found.text] if ended else [], unsafe if number == 1 else 0, wall_s)
-        task = None if model is None else task_on(line, theta_of(model), noise_of(model))
-        adapted.append(Adapted(result, [] if task is None or ended else designs_on(number, task)))
+        failed = number == len(cut) and not found.reached
+        once = (unsafe, wall_s) if number == 1 else (0, 0.0)
+        result = _result(number, model, tried, [found.text] if failed else [], *once)
+        task = None if model is None or failed else task_on(line, theta_of(model), noise_of(model))
+        adapted.append(Adapted(result, [] if task is None else designs_on(number, task)))
     return adapted
 
 
@@ -66,11 +68,10 @@ async def _commissioned(
 
 
 def _rounds(found: Commissioned) -> list[Sequence[Tried]]:
-    """What was tried, cut behind each redesign that was kept. What came after the last is a round only if it failed."""
+    """What was tried, cut behind each redesign that was kept. What came after the last is a round where it failed."""
     cuts = [0, *(i + 1 for i, one in enumerate(found.tried) if one.step == Step.REDESIGN and one.stage == "kept")]
     rounds: list[Sequence[Tried]] = [found.tried[begin:end] for begin, end in zip(cuts[:-1], cuts[1:], strict=True)]
-    rest = found.tried[cuts[-1] :]
-    return rounds if found.reached or not rest else [*rounds, rest]
+    return rounds if found.reached else [*rounds, found.tried[cuts[-1] :]]
 
 
 def _result(

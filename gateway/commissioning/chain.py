@@ -59,6 +59,9 @@ MOST_ROUNDS = 3  #: measurements, before what they show is left as it is
 STRETCH = 3.0  #: of the speed that data have shown: an experiment goes no faster
 LEAST_RISE = 1.05  #: of the speed, from one adapted configuration to the next; fewer than two in a row rise less
 SLOWER_LEG = 0.5  #: of an experiment's speed: its other one
+#: Of the highest speed: a measurement. While spans step together the rollers behind them go faster than the web, and a
+#: line at its highest speed takes that for a broken one.
+MEASURED_AT = 0.75
 #: The same of the first experiment. Moves of tensions that creep turn rollers back, and dry friction with them: at half
 #: the first speed data of one line look like those of two.
 SLOWER_FIRST_LEG = 0.75
@@ -159,7 +162,8 @@ def next_step(
         if isinstance(found, Ended):
             return Ended(True, f"{text}; what it does there could not be measured: {found.text}")
         number = sum(one.step is Step.MEASUREMENT for one in past)
-        return Next(Step.MEASUREMENT, found.rung, (SLOWER_LEG * reached, reached), 0.5**found.rung, number)
+        top = MEASURED_AT * reached
+        return Next(Step.MEASUREMENT, found.rung, (SLOWER_LEG * top, top), 0.5**found.rung, number)
     if _stands_still(past):
         return Ended(False, f"experiments at {wanted_m_per_s:.3g} m/s lead no further than {reached:.3g} m/s")
     return _experiment(past, since, first_speed_m_per_s, wanted_m_per_s, 0)

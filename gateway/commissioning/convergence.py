@@ -10,8 +10,8 @@ overshoot of the step's size, or of T_ref,i where the span does not step, and th
 noise of the load cells adds to overshoot and settling is taken off by a mean over `SMOOTHED_S`.
 
 The prediction is a rollout on the accepted model with the set-points and speeds of the recording, looked at in the
-same way. What is left to gain is told by a model that has seen these data as well: it would lead to another design
-only as far as the figures predicted by it differ from those of the model that the design was made on.
+same way. What is left to gain is told by a model of these data: it would lead to another design only as far as the
+figures predicted by it differ from those of the model that the design was made on.
 """
 
 from collections.abc import Sequence
@@ -36,7 +36,7 @@ from gateway.core.theta import Noise
 
 RMSE_SHARE, MOST_OVERSHOOT_PCT, MOST_SETTLING_S = 0.05, 20.0, 2.0
 SIGNIFICANT = 0.05  #: of a predicted tracking error: a model that changes it by less leads to no other design
-DWELL_S, STEPS = 3.0, 4  #: of a measurement: from step to step, and at each speed
+DWELL_S, STEPS = 2.5, 3  #: of a measurement: from step to step, and at each speed
 SEEDS = 100  #: are tried, for one with which every span steps at each speed
 OF_SETPOINT = 0.05  #: a step either way, of the set-point, as far as the region permits
 ABORT_TIMES = 3.0  #: the greatest step either way: farther from its set-point no tension goes
@@ -69,7 +69,7 @@ class Convergence(Strict):
     predicted: dict[str, SpanFigures]  #: on the accepted model
     rmse_n: float  #: over all spans and changes
     gap: float  #: of that
-    gain: float | None  #: largest change of a predicted tracking error by a model of all data; null: there is none
+    gain: float | None  #: largest change of a predicted tracking error by a model of these data; null: there is none
     why: str = ""  #: there is none
 
     @property
@@ -145,7 +145,7 @@ def _stepping(asked: Experiment) -> int:
 def convergence(
     line: Line, recording: Recording, in_service: Controller, model: LineModel, newer: LineModel | str
 ) -> Convergence:
-    """Of a measurement's recording under `in_service`. `newer`: a model of these data too, or why there is none.
+    """Of a measurement's recording under `in_service`. `newer`: a model of these data, or why there is none.
 
     Raises NotOffered where the recording shows no change to be looked at.
     """

@@ -61,10 +61,13 @@ class Figures:
 
 
 def redesigns(
-    line: Line, model: LineModel, in_service: Controller, tension_n: Sequence[float]
+    line: Line, model: LineModel, in_service: Controller, tension_n: Sequence[float], shown_m_per_s: float = 0.0
 ) -> list[tuple[Law, Controller]]:
-    """At most `RUNGS`, for speeds up to those of the model's data and steps as the line's file permits."""
-    speed = min(model.region.speed_to_m_per_s, line.limits.speed_max_m_per_s)
+    """At most `RUNGS`, for steps as the line's file permits and speeds up to those of the model's data.
+
+    `shown_m_per_s`: or up to a higher one that other data have shown.
+    """
+    speed = min(max(model.region.speed_to_m_per_s, shown_m_per_s), line.limits.speed_max_m_per_s)
     limits = line.limits
     judged = Judged(
         line, np.array(tension_n), speed, limits.tension_step_max_n, min(limits.speed_step_max_m_per_s, speed)

@@ -138,7 +138,7 @@ def test_what_an_engineer_has_done_meanwhile_counts():
     past += [Past("model", Outcome.DONE)]
     assert asked(past).step is Step.REDESIGN
     past += [Past("gains", Outcome.DONE, speed_m_per_s=0.12)]
-    assert asked(past) == Next(Step.MEASUREMENT, 0, (0.06, 0.12))
+    assert asked(past) == Next(Step.MEASUREMENT, 0, (0.045, 0.09))
     past += [after(asked(past), past)]
     assert asked(looked_at(past)).converged
 
