@@ -28,8 +28,7 @@ from gateway.supervisor.status import GatewayStatus
 
 TOPICS = (GATEWAY_PROPOSE, GATEWAY_PROPOSALS, GATEWAY_STATUS)  #: that are asked for
 ANSWER_S = 20.0
-POLL_S = 1.0
-STANDS_S = 6.0  #: for which set-points must have stood: the gate looks at the last five seconds
+POLL_S = 0.5
 READY_WITHIN_S = 600.0
 MOST_SHOWN = 200
 
@@ -94,21 +93,15 @@ class LiveGate:
         return [one for one, _ in found]
 
     async def ready(self) -> None:
-        """In RUN, with set-points that have stood; after a refusal for the moment, the cool-down later."""
+        """In RUN, with set-points that stand as the gate asks; after a refusal for the moment, the cool-down later."""
         shown = await self.proposals()
         if shown and past_of(shown[-1]).outcome is Outcome.AGAIN:
             await self._pause(self._line.gate.cool_down_s)
-        began_s = since_s = self._clock()
-        before: object = None
-        told = False
-        while self._clock() - since_s < STANDS_S:
-            status = await self._status()
-            stands = status.loop.state, status.speed_setpoint_m_per_s, [span.setpoint_n for span in status.spans]
+        began_s, told = self._clock(), False
+        while not (status := await self._status()).stands:
             if status.loop.state != "RUN" and not told:
                 told = True
                 self._tell(f"the line is in {status.loop.state}: {status.loop.next}")
-            if stands != before or status.loop.state != "RUN":
-                before, since_s = stands, self._clock()
             if self._clock() - began_s > READY_WITHIN_S:
                 raise CannotGoOn(f"the line has not stood in RUN within {READY_WITHIN_S:g} s: start it, then go on")
             await self._pause(POLL_S)

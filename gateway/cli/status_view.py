@@ -7,8 +7,9 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from gateway.core.line_problem import printable
 from gateway.core.messages import BusReport
-from gateway.supervisor.status import GatewayStatus, LimitsStatus, SpanStatus, Spread
+from gateway.supervisor.status import ChangeStatus, GatewayStatus, LimitsStatus, SpanStatus, Spread
 
 STATE_STYLE = {
     "SILENT": "bold",
@@ -22,6 +23,7 @@ DRIVE_STYLE = {"ENABLED": "green", "READY": "cyan", "OFF": "", "STOPPING": "yell
 GOOD_ERROR, POOR_ERROR = 0.05, 0.20  # of the set-point: where a tension is shown green, and where red
 FIXED_LINES = 12  # everything but spans and events
 LEAST_EVENTS = 3
+SHORT = 12  #: letters of a hash
 _CLOCK_WIDTH = 8
 
 
@@ -29,6 +31,7 @@ def render(status: GatewayStatus, width: int, height: int | None = None) -> Rend
     """With a `height` (lines), spans that need no attention and old events give way so that it fits."""
     spans, events = status.spans, len(status.events)
     if height is not None:
+        height -= status.change is not None
         room = max(1, height - FIXED_LINES - LEAST_EVENTS)
         if len(spans) > room:
             spans = _urgent(spans, max(1, room - 1), status.limits)
@@ -55,10 +58,20 @@ def _head(status: GatewayStatus) -> RenderableType:
     head.add_row(title, _clock_time(status.wall_s))
     for doubt in loop.doubts:
         head.add_row(Text(f"Proposals are blocked: {doubt}", "bold yellow"), "")
+    if status.change is not None:
+        head.add_row(Text(_change(status.change, status.wall_s), "bold cyan", no_wrap=True, overflow="ellipsis"), "")
     head.add_row(Text(f"Next: {loop.next}", style="italic"), "")
     speed, setpoint = (_number(value, ".4f") for value in (status.unwind_speed_m_per_s, status.speed_setpoint_m_per_s))
     head.add_row(Text(f"Web {speed} m/s, set-point {setpoint} m/s", "" if loop.running else "dim"), "")
     return head
+
+
+def _change(change: ChangeStatus, now_s: float) -> str:
+    """What is being done to the line, since when, and what is missing before it is kept."""
+    since = "" if change.since_wall_s is None else f" since {max(0.0, now_s - change.since_wall_s):.0f} s"
+    what = "on probation" if change.stage == "probation" else change.stage
+    missing = f": {printable(change.text)}" if change.text else ""
+    return f"{change.kind.capitalize()} {change.proposal[:SHORT]} {what}{since}{missing}"
 
 
 def _spans(spans: list[SpanStatus], limits: LimitsStatus, width: int) -> RenderableType:

@@ -24,12 +24,14 @@ from gateway.supervisor.audit import Audit
 from gateway.supervisor.audit_file import AuditFile, AuditUnavailable
 from gateway.supervisor.audit_writer import NOT_DONE
 from gateway.supervisor.configurations import Configurations, ConfigurationsError, Origin, begin_configurations
-from gateway.supervisor.deployer import GATEWAY, Deployer
+from gateway.supervisor.deployer import Deployer
 from gateway.supervisor.deployer_sides import JudgeSide, NotTakenUp
 from gateway.supervisor.experiments import ENDS as EXPERIMENT_ENDS
 from gateway.supervisor.lifecycle import Book, Impossible, book_of
 from gateway.supervisor.model_store import ModelsError
 from gateway.supervisor.models import Models, begin_repository
+from gateway.supervisor.proposal_records import GATEWAY
+from gateway.supervisor.status import ChangeStatus
 from gateway.supervisor.surroundings import LineSurroundings
 
 LOOP_TIME_S = 2.5
@@ -139,6 +141,10 @@ class Gate:
         task = asyncio.get_running_loop().create_task(self.deployer.experiment_ended(hash_, reason))
         self._telling.add(task)
         task.add_done_callback(self._telling.discard)
+
+    def change(self) -> ChangeStatus | None:
+        """What a proposal does to the line now."""
+        return None if self.deployer is None else self.deployer.change()
 
     async def close(self) -> None:
         for task in self._telling:

@@ -79,6 +79,7 @@ class Entry:
     verdict: str | None = None  #: hash
     epoch: int | None = None
     by_person: bool = False  #: approved by one, not by its verdict alone
+    since_s: float | None = None  #: Unix time at which it came to its stage
 
 
 @dataclass
@@ -145,6 +146,7 @@ class Book:
                 **{key: what[key] for key in ("proposal", "author", "base", "changes", "created", "expires")},
                 kind=str(what["change"]),
                 expires_s=float(what["expires_s"]),
+                since_s=_at(what),
             )
             return
         entry = self.entries[proposal]
@@ -152,7 +154,7 @@ class Book:
         if kind == "approved":
             more["by_person"] = what.get("by", PERSON) == PERSON
         self.entries[proposal] = entry = replace(
-            entry, stage=STEPS[kind][1], why=str(what.get("because", entry.why)), **more
+            entry, stage=STEPS[kind][1], why=str(what.get("because", entry.why)), since_s=_at(what), **more
         )
         self._in_service(kind, entry, what)
         self._trust(kind, entry)
@@ -189,6 +191,10 @@ class Book:
         """Whether the records say how the line may have come to this configuration, at this epoch of the loop."""
         deployed = {entry.changes for entry in self.entries.values() if entry.epoch == epoch}
         return configuration in {self.in_service, self.last_known_good, *deployed}
+
+
+def _at(what: Mapping[str, Any]) -> float | None:
+    return float(what["at_s"]) if "at_s" in what else None
 
 
 def reconciled(book: Book, found: InService) -> tuple[str, dict[str, Any]] | None:

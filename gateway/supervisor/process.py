@@ -89,7 +89,7 @@ async def serve(
     historian.start()
     judge.begin()
     gate = Gate(line, mailbox, data_folder, judge, around, gateway.note, clock, wall_clock)
-    gateway.on_event = gate.hear
+    gateway.on_event, gateway.change = gate.hear, gate.change
     looking = asyncio.create_task(_look(gate, stop, watch_s))
     gateway.note("gateway-up", "the gateway has started")
     print(f"gateway of {line.site}/{line.line}: {run_folder / GATEWAY_SOCKET}, history {historian.path}", flush=True)

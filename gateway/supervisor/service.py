@@ -30,6 +30,7 @@ from gateway.mailbox.port import PEER, Counters, Mailbox, Peer, Unreachable
 from gateway.supervisor.historian import Historian
 from gateway.supervisor.recent import Recent
 from gateway.supervisor.status import (
+    ChangeStatus,
     EventStatus,
     GatewayStatus,
     HistorianStatus,
@@ -72,6 +73,7 @@ class Gateway:
         self.recent = Recent(line.n, line.control.period_s)
         self._sink = TelemetrySink(line.n, self._frame)
         self.on_event: Callable[[Event], None] | None = None  #: who else wants to know what the loop tells
+        self.change: Callable[[], ChangeStatus | None] = lambda: None  #: what the gate does to the line now
         self._events: deque[EventStatus] = deque(maxlen=EVENTS_SHOWN)
         self._buses: list[BusReport] = []
         self._malformed_events = 0
@@ -130,6 +132,8 @@ class Gateway:
             loop=loop,
             unwind_speed_m_per_s=known(frame.unwind_speed_m_per_s) if frame is not None else None,
             speed_setpoint_m_per_s=known(frame.speed_setpoint_m_per_s) if frame is not None else None,
+            stands=loop.running and self.recent.stands(),
+            change=self.change(),
             limits=LimitsStatus(
                 tension_min_n=limits.tension_min_n, tension_max_n=limits.tension_max_n, torque_nm=limits.torque_nm
             ),

@@ -106,6 +106,16 @@ class LimitsStatus(Strict):
     torque_nm: float
 
 
+class ChangeStatus(Strict):
+    """What is being done to the line by a proposal: on its way, on probation, or an experiment."""
+
+    proposal: str  #: hash
+    kind: Literal["gains", "experiment", "model"]
+    stage: str  #: as `r2rgate proposals` has it
+    since_wall_s: float | None  #: Unix time at which it came to this stage; None: its record does not say
+    text: str  #: what is still missing; empty: nothing is
+
+
 class GatewayStatus(Strict):
     format: Annotated[int, Field(ge=1, le=1)]
     site: str
@@ -115,6 +125,8 @@ class GatewayStatus(Strict):
     loop: LoopStatus
     unwind_speed_m_per_s: float | None
     speed_setpoint_m_per_s: float | None
+    stands: bool  #: in RUN, and no set-point has moved for as long as a verdict asks for
+    change: ChangeStatus | None  #: None: nothing is being changed
     limits: LimitsStatus
     spans: list[SpanStatus]
     timing: TimingStatus

@@ -15,11 +15,11 @@ from gateway.core.recording import Recording
 from gateway.core.states import LoopState
 from gateway.core.telemetry import Frame
 from gateway.supervisor.configurations import STABLE, Configurations, ConfigurationsError
-from gateway.supervisor.deployer import iso
 from gateway.supervisor.deployer_sides import NotKnown
 from gateway.supervisor.lifecycle import Book, Stage
 from gateway.supervisor.model_store import ModelsError
 from gateway.supervisor.models import Models
+from gateway.supervisor.proposal_records import iso
 from gateway.supervisor.recent import SETTLE_S, WINDOW_S, Recent
 from safety.probation import Standing, against
 

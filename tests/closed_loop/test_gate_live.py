@@ -11,7 +11,7 @@ import pytest
 from gateway.control.design import design_lqg, task_of
 from gateway.core.controller import canonical, config_hash
 from gateway.core.decisions import ProposalShown
-from gateway.supervisor.deployer import LEASE_S
+from gateway.supervisor.on_the_line import LEASE_S
 from tests.closed_loop.gate_line import GateLine, largest_step_nm
 from tests.closed_loop.wire import settled
 

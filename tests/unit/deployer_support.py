@@ -13,8 +13,8 @@ from gateway.core.proposal import GainsChange, Proposal, proposal_hash
 from gateway.core.verdict import RuleFinding, Verdict
 from gateway.mailbox.port import Unreachable
 from gateway.supervisor.audit_file import AuditUnavailable
-from gateway.supervisor.deployer import iso
 from gateway.supervisor.deployer_sides import NotKnown
+from gateway.supervisor.proposal_records import iso
 from tests.unit.supervisor_support import line_of
 
 LINE = line_of(2)

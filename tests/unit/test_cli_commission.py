@@ -8,7 +8,7 @@ import pytest
 from gateway.cli.commission import CannotGoOn, commission
 from gateway.cli.commission_changes import LineNow
 from gateway.cli.commission_history import approvals, history
-from gateway.cli.commission_live import STANDS_S, LiveGate
+from gateway.cli.commission_live import LiveGate
 from gateway.cli.commission_measurements import SCENARIO, keep, kept
 from gateway.commissioning.chain import LADDERS, Step
 from gateway.commissioning.convergence import Convergence, SpanFigures
@@ -24,6 +24,7 @@ from gateway.mailbox.port import Counters
 from gateway.supervisor import baselines
 from gateway.supervisor.configurations import FILE_NAME, Origin, begin_configurations
 from gateway.supervisor.historian import Historian
+from gateway.supervisor.recent import SETTLE_S, WINDOW_S
 from gateway.supervisor.service import Gateway
 from tests.unit.supervisor_support import frame_of, line_of, until
 
@@ -61,8 +62,9 @@ class OneProcess:
         self._frame()
 
     async def pause(self, seconds):
-        self.now_s += seconds
-        self._frame()
+        for _ in range(round(seconds / LINE.control.period_s)):
+            self.now_s += LINE.control.period_s
+            self._frame()
 
     def _frame(self):
         self.frames += 1
@@ -108,7 +110,7 @@ def test_each_candidate_is_proposed_once_and_the_end_says_why(tmp_path):
     assert [(one.step, one.rung, one.rule, one.value, one.limit) for one in found.tried] == [
         (Step.FIRST, rung, "corners: error", 4.0, 3.0) for rung in range(LADDERS[Step.FIRST])
     ]
-    assert gateway.now_s >= 100.0 + LADDERS[Step.FIRST] * STANDS_S  # the line has stood before each
+    assert gateway.now_s >= 100.0 + SETTLE_S + WINDOW_S  # the line has stood before
     again = OneProcess(tmp_path)
     again.shown = gateway.shown  # the command started anew
     assert asyncio.run(commission(LINE, again.side)).text == found.text and len(again.shown) == len(found.tried)
@@ -148,7 +150,7 @@ def test_a_person_is_asked_once_and_waited_for(tmp_path):
 
     async def run():
         working = asyncio.create_task(commission(LINE, gateway.side, gateway.told.append))
-        await until(lambda: gateway.now_s >= 200.0)
+        await until(lambda: gateway.now_s >= 120.0)
         working.cancel()
         await asyncio.gather(working, return_exceptions=True)
 

@@ -12,8 +12,9 @@ from gateway.core.controller import config_hash
 from gateway.core.decisions import Decide
 from gateway.core.deployment import Region
 from gateway.core.proposal import canonical
-from gateway.supervisor.deployer import LEASE_S, Deployer
+from gateway.supervisor.deployer import Deployer
 from gateway.supervisor.lifecycle import Stage, book_of
+from gateway.supervisor.on_the_line import LEASE_S
 from tests.unit.deployer_support import (
     FIRST,
     LIFETIME_S,

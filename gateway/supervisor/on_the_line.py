@@ -1,0 +1,207 @@
+"""What a change does to the line: carried out, on probation under watch, kept or taken back, as the loop has it.
+
+What the loop says of itself settles what a record left open: after a restart, after an answer that did not come.
+"""
+
+from collections.abc import Callable
+
+from gateway.core.audit_record import Who
+from gateway.core.deployment import Deployment, InService
+from gateway.core.line import Line
+from gateway.core.messages import AskConfiguration, Deploy, Keep, Renew, Reply, Rollback, RunExperiment, WatchGood
+from gateway.core.proposal import ExperimentChange, GainsChange, Proposal
+from gateway.mailbox.port import RemoteError, Unreachable
+from gateway.supervisor.audit_file import AuditUnavailable
+from gateway.supervisor.deployer_sides import LoopSide, NotKnown, Surroundings
+from gateway.supervisor.lifecycle import Entry, Impossible, Stage, reconciled
+from gateway.supervisor.proposal_records import GATEWAY, ProposalRecords, done, refused
+
+LEASE_S = 5.0  #: of a deployment on probation; renewed every third of it
+UNHEARD_S = 10.0  #: after an experiment should be over
+LONGEST_REASON = 500  #: characters of one for the loop
+MOST_SETTLING = 1000  #: records in a row from one look at the loop; more is a fault of this program
+
+
+class OnTheLine:
+    """Its steps are taken one at a time: whoever calls holds the records' lock, but for `experiment_ended`."""
+
+    def __init__(
+        self,
+        line: Line,
+        records: ProposalRecords,
+        loop: LoopSide,
+        surroundings: Surroundings,
+        take_up: Callable[[Proposal, str | None], None],
+        clock: Callable[[], float],
+    ) -> None:
+        self.settled = False  #: the loop has been asked since this process began, or since it told of a change
+        self.unwatched = ""  #: why the loop does not watch by the model in service
+        self._line = line
+        self._records = records
+        self._loop = loop
+        self._surroundings = surroundings
+        self._take_up = take_up  #: into the stores, before it is put into service; raises NotTakenUp
+        self._clock = clock
+        self._renewed_s = clock()
+        self._probation_since_s = clock()
+        self._experiment: tuple[str, float] | None = None  #: that runs, and when its end is overdue
+        #: Model and configuration by which, and for which, this process has told the loop what can be recovered.
+        self._looked_after: tuple[str | None, str] | None = None
+
+    async def settle(self) -> InService:
+        """Ask the loop what it runs, and record until the book says so too. Raises Unreachable, AuditUnavailable."""
+        reply = await self._loop.tell(AskConfiguration())
+        if reply.in_service is None:
+            raise RemoteError("the loop does not say what controls the line")
+        found = reply.in_service
+        for _ in range(MOST_SETTLING):
+            if (step := reconciled(self._records.book, found)) is None:
+                self.settled = True
+                return found
+            await self._records.step(*step, GATEWAY)
+        raise Impossible("the book does not come to what the loop says")
+
+    async def look_after(self) -> None:
+        """Renews leases; keeps what is on probation, or takes it back. Raises as `settle`, and Impossible."""
+        if self._records.book.on_the_line is not None or not self.settled or self._to_look_after():
+            await self._look_after(await self.settle())
+
+    async def carry_out(self, entry: Entry, found: InService, who: Who) -> Reply:
+        proposal = self._records.proposal(entry)
+        self._take_up(proposal, entry.verdict)
+        if isinstance(proposal.change, GainsChange):
+            return await self._deploy(entry, proposal.change, found, who)
+        if isinstance(proposal.change, ExperimentChange):
+            await self._records.step("experiment-begins", {"proposal": entry.proposal}, who)
+            reply = await self._loop.tell(RunExperiment(experiment=proposal.change.experiment, proposal=entry.proposal))
+            if not reply.ok:
+                because = "; ".join([reply.text, *reply.reasons])[:1000]
+                await self._records.step("experiment-ends", {"proposal": entry.proposal, "because": because}, GATEWAY)
+                return reply
+            return done(f"{reply.text}; `r2rgate proposals {entry.proposal[:12]}` shows when it is done")
+        await self._records.step("model-in-service", {"proposal": entry.proposal, "model": entry.changes}, who)
+        return done(f"model {entry.changes[:12]} is what proposals are judged by from now on")
+
+    async def roll_back(self, reason: str) -> Reply:
+        """Now. Raises as `settle`, and Impossible."""
+        reply = await self._loop.tell(Rollback(reason=reason))
+        await self.settle()
+        return reply
+
+    async def experiment_ended(self, hash_: str, because: str) -> None:
+        """The loop has told that an experiment is over; `because` empty: complete."""
+        async with self._records.one_step:
+            entry = self._records.book.on_the_line
+            if entry is None or entry.stage is not Stage.RUNNING or entry.changes != hash_:
+                return
+            try:
+                await self._records.step("experiment-ends", {"proposal": entry.proposal, "because": because}, GATEWAY)
+            except AuditUnavailable as error:
+                self._records.trouble = str(error)
+
+    def unseen(self) -> str:
+        """Why what is on probation is not kept yet."""
+        return self._unseen(self._clock())
+
+    async def _deploy(self, entry: Entry, change: GainsChange, found: InService, who: Who) -> Reply:
+        verdict, epoch = self._records.verdict(entry), found.epoch + 1
+        if verdict is None or not verdict.accepted or verdict.region is None:
+            return refused("it is not carried out", ["no verdict lets it through"])
+        watch = await self._surroundings.recovery(found.last_known_good, verdict.region, self._records.book)
+        deployment = Deployment(
+            controller=change.controller, hash=entry.changes, epoch=epoch, lease_s=LEASE_S, region=verdict.region,
+            watch=watch,
+        )  # fmt: skip
+        named = {"proposal": entry.proposal, "epoch": epoch}
+        what = {"configuration": entry.changes, "before": found.hash, "region": verdict.region.model_dump()}
+        await self._records.step("deploying", {**named, **what, "watched": watch is not None}, who)
+        self._surroundings.begin_probation()
+        reply = await self._loop.tell(Deploy(deployment=deployment))
+        if not reply.ok and reply.in_service is not None and reply.in_service.epoch < epoch:
+            because = "; ".join([reply.text, *reply.reasons])[:1000]
+            await self._records.step("not-deployed", {**named, "because": because}, GATEWAY)
+            return reply
+        await self.settle()  # what the loop says it runs, read back
+        self._probation_since_s = self._renewed_s = self._clock()
+        now = self._records.book.entries[entry.proposal]
+        if now.stage is not Stage.PROBATION:
+            return refused(f"it is {now.stage}", [now.why])
+        unwatched = "" if watch else "; no model is accepted yet, by which the loop would see what can be recovered"
+        return done(
+            f"{entry.changes[:12]} controls the line as epoch {epoch}, on probation for {self._line.gate.probation_s:g}"
+            f" s of running; `r2rgate rollback` takes it back at once, `r2rgate proposals` shows how it does{unwatched}"
+        )
+
+    async def _look_after(self, found: InService) -> None:
+        entry, now_s = self._records.book.on_the_line, self._clock()
+        if entry is None:
+            await self._look_after_good(found)
+            return
+        if entry.stage is Stage.RUNNING:
+            await self._end_unheard(entry, now_s)
+            return
+        if against := self._surroundings.against_keeping():
+            await self._loop.tell(Rollback(reason=against))
+            await self.settle()
+        elif entry.stage is Stage.KEEPING or not self._unseen(now_s):
+            await self._keep(entry, found)
+        elif now_s - self._renewed_s >= LEASE_S / 3.0:
+            await self._loop.tell(Renew(epoch=entry.epoch or found.epoch))
+            self._renewed_s = now_s
+
+    def _to_look_after(self) -> bool:
+        book = self._records.book
+        return book.model is not None and (book.model, book.last_known_good) != self._looked_after
+
+    def _unseen(self, now_s: float) -> str:
+        since_s, probation_s = now_s - self._probation_since_s, self._line.gate.probation_s
+        if since_s < probation_s:
+            return f"it has been watched for {since_s:.0f} s of {probation_s:g} s"
+        return self._surroundings.unseen()
+
+    async def _keep(self, entry: Entry, found: InService) -> None:
+        """What cannot be kept is taken back."""
+        if entry.stage is Stage.PROBATION:
+            await self._records.step("keeping", {"proposal": entry.proposal, "epoch": entry.epoch}, GATEWAY)
+        watch = None
+        try:
+            watch = await self._surroundings.recovery(entry.changes, found.region, self._records.book)
+            reply = await self._loop.tell(Keep(epoch=entry.epoch or found.epoch, watch=watch))
+            because = "" if reply.ok else "; ".join([reply.text, *reply.reasons])
+        except NotKnown as error:
+            because = str(error)
+        if because:
+            await self._loop.tell(Rollback(reason=f"it could not be kept: {because}"[:LONGEST_REASON]))
+        elif watch is not None:
+            self._looked_after = self._records.book.model, entry.changes
+        await self.settle()
+
+    async def _look_after_good(self, found: InService) -> None:
+        """A model that is new in service looks after what runs, too."""
+        pair = self._records.book.model, found.last_known_good
+        if self._records.book.model is None or pair == self._looked_after:
+            return
+        self._looked_after, self.unwatched = pair, ""  # a refusal would be the same again
+        try:
+            watch = await self._surroundings.recovery(found.last_known_good, found.region, self._records.book)
+            if watch is None:
+                return
+            reply = await self._loop.tell(WatchGood(watch=watch))
+            because = "" if reply.ok else "; ".join([reply.text, *reply.reasons])
+        except NotKnown as error:
+            because = str(error)
+        except Unreachable:
+            self._looked_after = None
+            raise
+        if because:
+            self.unwatched = f"the loop does not watch by the model in service: {because}"
+
+    async def _end_unheard(self, entry: Entry, now_s: float) -> None:
+        """Of an experiment whose end nobody has told: the loop was started anew, or this process."""
+        if self._experiment is None or self._experiment[0] != entry.proposal:
+            change = self._records.proposal(entry).change
+            takes_s = change.experiment.duration_s if isinstance(change, ExperimentChange) else 0.0
+            self._experiment = (entry.proposal, now_s + takes_s + UNHEARD_S)
+        elif now_s >= self._experiment[1]:
+            what = {"proposal": entry.proposal, "because": "the loop has not told its end"}
+            await self._records.step("experiment-ends", what, GATEWAY)

@@ -1,0 +1,151 @@
+"""Proposals come in, and are judged in the background. The verdict is that of the judge of this process alone."""
+
+import asyncio
+import hashlib
+from datetime import datetime
+from typing import Any
+
+from gateway.core.audit_record import Who
+from gateway.core.controller import config_hash
+from gateway.core.experiment import experiment_hash
+from gateway.core.judge_context import canonical as canonical_context
+from gateway.core.judge_context import context_hash
+from gateway.core.line import Line
+from gateway.core.line_model import model_hash
+from gateway.core.messages import Reply
+from gateway.core.proposal import (
+    ExperimentChange,
+    GainsChange,
+    Proposal,
+    ProposalRefused,
+    canonical,
+    parse_proposal,
+    proposal_hash,
+)
+from gateway.core.verdict import Verdict, canonical_line, verdict_hash
+from gateway.core.verdict import canonical as canonical_verdict
+from gateway.supervisor.audit_file import AuditUnavailable
+from gateway.supervisor.deployer_sides import JudgeSide, Surroundings
+from gateway.supervisor.kept_recording import packed
+from gateway.supervisor.lifecycle import PROPOSED, Impossible, Stage
+from gateway.supervisor.proposal_records import GATEWAY, ProposalRecords, done, refused
+
+
+class Inbox:
+    def __init__(self, line: Line, records: ProposalRecords, judge: JudgeSide, surroundings: Surroundings) -> None:
+        self._line = line
+        self._records = records
+        self._judge = judge
+        self._surroundings = surroundings
+        self._judging: dict[str, asyncio.Task[None]] = {}
+
+    async def propose(self, payload: bytes, who: Who) -> Reply:
+        """Take a proposal in, and judge it in the background."""
+        try:
+            proposal = parse_proposal(payload, self._line.gate.proposal_max_bytes)
+        except ProposalRefused as malformed:
+            return await self._malformed(payload, malformed, who)
+        wrong = [
+            f"it is for {proposal.site}/{proposal.line}; allowed: {self._line.site}/{self._line.line}"
+            for _ in range((proposal.site, proposal.line) != (self._line.site, self._line.line))
+        ]
+        if self._line.gate.autonomy == "closed":
+            wrong.append('the line takes no changes: gate.autonomy is "closed" in its file')
+        if wrong:
+            return refused("it is not judged", wrong)
+        hash_ = proposal_hash(proposal)
+        what = {
+            "proposal": hash_,
+            "change": proposal.kind,
+            "author": proposal.author,
+            "base": proposal.base,
+            "changes": _brings(proposal),
+            "created": proposal.created,
+            "expires": proposal.expires,
+            "expires_s": datetime.fromisoformat(proposal.expires).timestamp(),
+        }
+        try:
+            async with self._records.one_step:
+                await self._records.step(PROPOSED, what, who, {"proposal": canonical(proposal)})
+        except (Impossible, AuditUnavailable) as error:
+            return refused("it is not judged", [str(error)])
+        self._begin(hash_)
+        text = f"proposal {hash_[:12]} ({proposal.kind}) is being judged: `r2rgate proposals {hash_[:12]}` shows how"
+        return done(text)
+
+    def judge_again(self) -> None:
+        """What was being judged when the process before this one ended, or could not be recorded."""
+        for entry in self._records.book.undecided:
+            if entry.stage is Stage.RECEIVED and entry.proposal not in self._judging:
+                self._begin(entry.proposal)
+
+    async def judged(self) -> None:
+        """Until nothing is being judged any more."""
+        while self._judging:
+            await asyncio.gather(*self._judging.values())
+
+    async def close(self) -> None:
+        judging = list(self._judging.values())
+        for task in judging:
+            task.cancel()
+        await asyncio.gather(*judging, return_exceptions=True)
+
+    def _begin(self, proposal: str) -> None:
+        task = asyncio.get_running_loop().create_task(self._judged(proposal))
+        self._judging[proposal] = task
+        task.add_done_callback(lambda _: self._judging.pop(proposal, None))
+
+    async def _judged(self, hash_: str) -> None:
+        try:
+            kind, what, blobs = await self._judgement(hash_)
+        except Exception as error:  # what cannot be judged is refused, whatever the reason
+            kind, blobs = "refused", dict[str, bytes]()
+            what = {"proposal": hash_, "because": f"it could not be judged: {type(error).__name__}: {error}"[:1000]}
+        async with self._records.one_step:
+            if self._records.book.entries[hash_].stage is not Stage.RECEIVED:
+                return  # it has expired meanwhile, or what it would change is gone
+            try:
+                await self._records.step(kind, what, GATEWAY, blobs)
+            except (AuditUnavailable, Impossible) as error:
+                self._records.trouble = str(error)  # it stays as received, and is judged again
+
+    async def _judgement(self, hash_: str) -> tuple[str, dict[str, Any], dict[str, bytes]]:
+        proposal = self._records.proposal(self._records.book.entries[hash_])
+        context, recordings = await self._surroundings.context(self._records.book)
+        verdict = await self._judge.judge(canonical(proposal), context, recordings)
+        what = {
+            "proposal": hash_,
+            "verdict": verdict_hash(verdict),
+            "context": context_hash(context),
+            "seed": verdict.seed,
+            "because": _first_reason(verdict),
+        }
+        blobs = {
+            "verdict": canonical_verdict(verdict),
+            "context": canonical_context(context),
+            "line": canonical_line(self._line),
+        }
+        blobs |= {f"data-{number}": packed(one) for number, one in enumerate(recordings, start=1)}
+        return "accepted" if verdict.accepted else "refused", what, blobs
+
+    async def _malformed(self, payload: bytes, malformed: ProposalRefused, who: Who) -> Reply:
+        what = {"payload": hashlib.sha256(payload).hexdigest(), "reasons": malformed.reasons[:20]}
+        try:
+            await self._records.note("malformed-proposal", who, what)
+        except AuditUnavailable as error:
+            return refused("it is no proposal", [*malformed.reasons, str(error)])
+        return refused("it is no proposal", malformed.reasons)
+
+
+def _brings(proposal: Proposal) -> str:
+    """The hash of what it brings."""
+    change = proposal.change
+    if isinstance(change, GainsChange):
+        return config_hash(change.controller)
+    return experiment_hash(change.experiment) if isinstance(change, ExperimentChange) else model_hash(change.model)
+
+
+def _first_reason(verdict: Verdict) -> str:
+    reasons = verdict.reasons
+    more = f" (and {len(reasons) - 1} more)" if len(reasons) > 1 else ""
+    return (reasons[0] + more)[:1000] if reasons else ""

@@ -1,0 +1,68 @@
+"""The records of what becomes of proposals: each step is stored before it counts, with what lies beside it."""
+
+import asyncio
+from collections.abc import Callable, Mapping
+from datetime import UTC, datetime
+from typing import Any
+
+from gateway.core.audit_record import Who
+from gateway.core.messages import Reply
+from gateway.core.proposal import Proposal
+from gateway.core.verdict import Verdict
+from gateway.supervisor.audit_file import AuditUnavailable
+from gateway.supervisor.deployer_sides import AuditSide
+from gateway.supervisor.lifecycle import Book, Entry, Impossible
+
+GATEWAY = Who(name="gateway")
+
+
+class ProposalRecords:
+    """`book` is what the audit says."""
+
+    def __init__(self, book: Book, audit: AuditSide, wall_clock: Callable[[], float]) -> None:
+        self.book = book
+        self.one_step = asyncio.Lock()  #: for whoever takes steps that rest on one another
+        self.trouble = ""  #: why the last step, or the last look at the line, came to nothing
+        self._audit = audit
+        self._wall_clock = wall_clock
+
+    async def step(
+        self, kind: str, what: Mapping[str, Any], who: Who, blobs: Mapping[str, bytes] | None = None
+    ) -> None:
+        """A record, on the disk before the book knows of it. Raises Impossible, AuditUnavailable."""
+        if reason := self.book.why_not(kind, what):
+            raise Impossible(reason)
+        what = {**what, "at_s": self._wall_clock()}
+        await self._audit.append(kind, who, what, blobs)
+        self.book.apply(kind, what)
+
+    async def note(self, kind: str, who: Who, what: Mapping[str, Any]) -> None:
+        """A record that is no step of a proposal. Raises AuditUnavailable."""
+        await self._audit.append(kind, who, what)
+
+    def proposal(self, entry: Entry) -> Proposal:
+        """Raises AuditUnavailable."""
+        return Proposal.model_validate_json(self._kept(entry.proposal))
+
+    def verdict(self, entry: Entry) -> Verdict | None:
+        """None: there is none yet. Raises AuditUnavailable."""
+        return None if entry.verdict is None else Verdict.model_validate_json(self._kept(entry.verdict))
+
+    def _kept(self, id_: str) -> bytes:
+        """Raises AuditUnavailable where it is no longer what was stored."""
+        if (content := self._audit.blob(id_)) is None:
+            raise AuditUnavailable(f"the audit has lost {id_[:12]}: `r2rgate audit verify` tells more")
+        return content
+
+
+def done(text: str) -> Reply:
+    return Reply(ok=True, state="", text=text)
+
+
+def refused(text: str, reasons: list[str]) -> Reply:
+    return Reply(ok=False, state="", text=text, reasons=reasons)
+
+
+def iso(wall_s: float) -> str:
+    """Unix time as ISO 8601 with zone."""
+    return datetime.fromtimestamp(wall_s, UTC).isoformat(timespec="milliseconds")
