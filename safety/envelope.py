@@ -223,8 +223,9 @@ def _rollers_part(span: int, inputs: Inputs) -> bool:
 
 
 def _roller_limit(limits: EnvelopeLimits, supervision: Supervision) -> float:
-    factor = limits.standstill_overspeed if supervision.standstill else limits.roller_overspeed
-    return factor * limits.speed_max_m_per_s
+    if supervision.standstill:
+        return limits.standstill_overspeed * limits.speed_max_m_per_s
+    return limits.roller_speed_m_per_s
 
 
 def _too_fast(limits: EnvelopeLimits, inputs: Inputs, supervision: Supervision) -> list[bool]:

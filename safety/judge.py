@@ -20,6 +20,7 @@ from gateway.core.theta import Noise, nominal_theta
 from gateway.core.verdict import RuleFinding, ScenarioFigures, Verdict, line_hash
 from safety.case import Case
 from safety.findings import told
+from safety.rules import roller_speed
 from safety.rules.table import FIGURES, REPORTED, RULES, Rule
 from safety.simulated import plants_under_stress, setup_of
 
@@ -91,11 +92,12 @@ def _figures(case: Case) -> list[ScenarioFigures]:
 
 
 def _region(case: Case) -> Region:
-    """For what it was judged."""
+    """For what it was judged. Before a model is accepted nobody foresees how fast a step makes the rollers."""
+    let = roller_speed.steps_let(case) if case.first else None
     return Region(
         speed_max_m_per_s=case.speed_max_m_per_s,
-        tension_step_max_n=case.tension_step_n,
-        speed_step_max_m_per_s=case.speed_step_m_per_s,
+        tension_step_max_n=case.tension_step_n * (1.0 if let is None else let.of_tension()),
+        speed_step_max_m_per_s=case.speed_step_m_per_s * (1.0 if let is None else let.of_speed()),
     )
 
 

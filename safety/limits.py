@@ -7,6 +7,9 @@ import numpy as np
 from gateway.core.line import Line
 from gateway.core.signals import FloatArray
 
+WATCHED = 0.85  #: of the roller speed at which torque goes off: what is foreseen to go beyond it is not let happen
+STEP_ROOM = 0.9  #: of that less the web's speed: what a step may take of it, so that noise does not do the rest
+
 
 @dataclass(frozen=True, slots=True)
 class EnvelopeLimits:
@@ -28,6 +31,21 @@ class EnvelopeLimits:
     unwinder_overspeed: float = 1.1  #: times the greatest speed
     roller_overspeed: float = 1.5  #: a roller runs ahead while it tensions its span
     standstill_overspeed: float = 1.0  #: of a roller while the unwinder stands still
+
+    @property
+    def roller_speed_m_per_s(self) -> float:
+        """Of a roller's surface, either way: beyond it torque goes off."""
+        return self.roller_overspeed * self.speed_max_m_per_s
+
+    @property
+    def roller_speed_watched_m_per_s(self) -> float:
+        """What monitor and judge let a roller come to in what they foresee."""
+        return WATCHED * self.roller_speed_m_per_s
+
+    def roller_speed_in_step_m_per_s(self, web_m_per_s: float) -> float:
+        """What a roller may come to in a step that is foreseen, at the unwinder's speed after it."""
+        watched = self.roller_speed_watched_m_per_s
+        return min(watched, web_m_per_s + STEP_ROOM * (watched - web_m_per_s))
 
 
 def envelope_limits(line: Line) -> EnvelopeLimits:

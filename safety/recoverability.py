@@ -35,7 +35,6 @@ from safety.limits import envelope_limits
 
 TRIED = frozenset((1, 3, 7, 15, 31))  #: periods with cut torques after which the rest is looked at in one
 NEAR_SETPOINT = 0.5  #: of what a set-point keeps from a limit, tensions may keep as well
-FAST = 0.85  #: of the roller speed at which the envelope takes torque off
 EXCUSED = 1e-6  #: of a torque's limit and rate, for rounding
 
 
@@ -50,11 +49,25 @@ class Shortfall:
     ahead_s: float
 
     def __str__(self) -> str:
-        value, unit = (f"{self.value:.1f}", "N") if self.what == "span" else (f"{self.value:.3f}", "m/s")
-        return (
-            f"{self.what} {self.index + 1} would come to {value} {unit} in {self.ahead_s:.2f} s if the fallback took "
-            f"over now, allowed: {self.allowed:g} {unit}"
-        )
+        return f"{self._comes_to} if the fallback took over now, {self._allows}"
+
+    @property
+    def foreseen(self) -> str:
+        """Of what runs already."""
+        return f"{self._comes_to}, {self._allows}"
+
+    @property
+    def _comes_to(self) -> str:
+        value = f"{self.value:.1f}" if self.what == "span" else f"{self.value:.3f}"
+        return f"{self.what} {self.index + 1} would come to {value} {self._unit} in {self.ahead_s:.2f} s"
+
+    @property
+    def _allows(self) -> str:
+        return f"allowed: {self.allowed:g} {self._unit}"
+
+    @property
+    def _unit(self) -> str:
+        return "N" if self.what == "span" else "m/s"
 
 
 @dataclass(frozen=True)
@@ -89,9 +102,10 @@ class Recovery:
         self._n = watch.n
         self._period_s = watch.period_s
         self._margin_n = watch.margin_n
-        limits, envelope = line.limits, envelope_limits(line)
+        limits = line.limits
         self._low_n, self._high_n = limits.tension_min_n, limits.tension_max_n
-        self._fastest = FAST * envelope.roller_overspeed * limits.speed_max_m_per_s
+        self._envelope = envelope_limits(line)
+        self._fastest = self._envelope.roller_speed_watched_m_per_s
         self._torque_nm = limits.torque_nm * (1.0 + EXCUSED)
         self._step_nm = limits.torque_rate_nm_per_s * watch.period_s
         draw = [i for i, span in enumerate(line.spans) if span.control == "draw"]
@@ -125,7 +139,26 @@ class Recovery:
         remembers this at the next sample; None: it would take over then, without a jump.
         """
         found, looks = self.ahead(measured, setpoint_n, in_flight_nm, torque_nm, remembered)
-        least, most = self._bounds(setpoint_n)
+        return self._within(found, looks, *self._bounds(setpoint_n))
+
+    def shortfall_of_step(
+        self,
+        measured: Measured,
+        setpoint_n: FloatArray,
+        in_flight_nm: FloatArray,
+        torque_nm: FloatArray,
+        remembered: FloatArray,
+    ) -> Shortfall | None:
+        """What would go wrong if set-points, or the unwinder's speed, stepped to these: rollers keep some room."""
+        found, looks = self.ahead(measured, setpoint_n, in_flight_nm, torque_nm, remembered)
+        least, most = (bound.copy() for bound in self._bounds(setpoint_n))
+        fastest = self._envelope.roller_speed_in_step_m_per_s(measured.unwind_speed_m_per_s)
+        least[self._n :], most[self._n :] = -fastest, fastest
+        return self._within(found, looks, least, most)
+
+    def _within(
+        self, found: FloatArray, looks: NDArray[np.int64], least: FloatArray, most: FloatArray
+    ) -> Shortfall | None:
         if (found.min(axis=1) >= least).all() and (found.max(axis=1) <= most).all():
             return None
         return self._short(found, looks, least, most)

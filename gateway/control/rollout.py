@@ -74,7 +74,7 @@ def simulate_slowly(
     """As `simulate`, with the law itself, plant by plant; a plant that has run away is left at once."""
     _check(config, plants, course, setup)
     drawn = (*setup.draw(course.periods, plants.n), setup.late(course.periods, plants.n))
-    stepped = np.empty((plants.count, course.periods * setup.substeps, plants.n))
+    stepped = np.empty((plants.count, course.periods * setup.substeps, 2 * plants.n))
     torques = np.empty((plants.count, course.periods, plants.n))
     for b in range(plants.count):
         stepped[b], torques[b] = run_plant(make_law(untimed(config)), plants, b, course, setup, drawn)

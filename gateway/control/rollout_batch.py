@@ -69,6 +69,7 @@ def _figures(rows: FloatArray, course: Course, setup: Setup) -> dict[str, FloatA
         "tension_max_n": rows[kernel.MOST],
         "settled": rows[kernel.LAST],
         "beyond_n": rows[kernel.BEYOND],
+        "roller_speed_max_m_per_s": rows[kernel.SPEED],
         "torque_max_nm": rows[kernel.TORQUE],
         "torque_step_max_nm": rows[kernel.STEP],
         "effort_n2m2s": rows[kernel.EFFORT] * setup.period_s,

@@ -25,8 +25,10 @@ _part: Any = njit(error_model="numpy", fastmath={"contract"})
 _parallel: Any = njit(parallel=True, cache=True, error_model="numpy", fastmath={"contract"})
 
 # Rows of what the kernel accumulates for each roller or span.
-SQUARED, LEAST, MOST, LAST, BEYOND, TORQUE, STEP, EFFORT, TAIL_LEAST, TAIL_MOST, TAIL_ERROR, TAIL_MOVES = range(12)
-ROWS = 12
+(
+    SQUARED, LEAST, MOST, LAST, BEYOND, TORQUE, STEP, EFFORT, TAIL_LEAST, TAIL_MOST, TAIL_ERROR, TAIL_MOVES, SPEED,
+) = range(13)  # fmt: skip
+ROWS = 13
 
 
 @_part
@@ -139,9 +141,17 @@ def _extremes(state, least, most, n):
 
 
 @_part
+def _fastest(state, most, n):
+    for i in range(n):
+        for w in range(LANES):
+            most[i, w] = max(most[i, w], abs(state[n + i, w]))
+
+
+@_part
 def _account_step(state, sums, in_tail, n):
-    """Tensions of a step of the integration."""
+    """Tensions and rollers' speeds of a step of the integration."""
     _extremes(state, sums[LEAST], sums[MOST], n)
+    _fastest(state, sums[SPEED], n)
     if in_tail:
         _extremes(state, sums[TAIL_LEAST], sums[TAIL_MOST], n)
 

@@ -31,7 +31,7 @@ def run_plant(
     setup: Setup,
     drawn: tuple[FloatArray, FloatArray, BoolArray],
 ) -> tuple[FloatArray, FloatArray]:
-    """Tensions (k substeps, n) before each step of the integration and torques (k, n) as sent, of one plant.
+    """[T; w] (k substeps, 2n) before each step of the integration and torques (k, n) as sent, of one plant.
 
     `drawn`: noise and late commands, as `Setup.draw` and `Setup.late` give them. After a plant has run away: nan.
     """
@@ -45,7 +45,7 @@ def run_plant(
     delay = delay_steps(plants, setup)[index]
     acting = [applied] * (delay // setup.substeps + 2)
     quanta = np.array([setup.tension_step_n] * n + [setup.speed_step_m_per_s] * n)
-    stepped, sent = np.full((course.periods * setup.substeps, n), np.nan), np.full((course.periods, n), np.nan)
+    stepped, sent = np.full((course.periods * setup.substeps, 2 * n), np.nan), np.full((course.periods, n), np.nan)
     memory = None
     for k, unwind in enumerate(course.unwind_speed_m_per_s.tolist()):
         seen = quantised(line.state[: 2 * n] + samples[k], quanta)
@@ -60,14 +60,16 @@ def run_plant(
         for j in range(setup.substeps):
             if not (np.abs(line.state[:n]) <= RUNAWAY_N).all():
                 return stepped, sent
-            stepped[k * setup.substeps + j] = line.state[:n]
+            stepped[k * setup.substeps + j] = line.state[: 2 * n]
             age = -(-(delay - j) // setup.substeps)  # periods ago that the acting torque was computed
             line.step(acting[-1 - max(age, 0)], unwind, moved[k * setup.substeps + j])
     return stepped, sent
 
 
 def rollouts_of(stepped: FloatArray, torques: FloatArray, course: Course, setup: Setup, *, record: bool) -> Rollouts:
-    """What is told of recordings: tensions (b, k substeps, n) and torques (b, k, n)."""
+    """What is told of recordings: [T; w] (b, k substeps, 2n) and torques (b, k, n)."""
+    n = torques.shape[2]
+    stepped, speeds = stepped[:, :, :n], stepped[:, :, n:]
     tensions = stepped[:, :: setup.substeps]
     error: FloatArray = tensions - course.tension_n
     settled, beyond = _settled_and_beyond(error, course)
@@ -81,6 +83,7 @@ def rollouts_of(stepped: FloatArray, torques: FloatArray, course: Course, setup:
         "tension_max_n": stepped.max(axis=1),
         "settled": settled,
         "beyond_n": np.maximum(beyond, 0.0),
+        "roller_speed_max_m_per_s": np.abs(speeds).max(axis=1),
         "torque_max_nm": np.abs(torques).max(axis=1),
         "torque_step_max_nm": steps,
         "effort_n2m2s": setup.period_s * np.sum(torques**2, axis=1),

@@ -210,8 +210,8 @@ class Setup:
 class Rollouts:
     """What became of each plant. Errors and tensions are true; (b, n) unless said otherwise.
 
-    Of a plant that has run away all errors, tensions and torques are inf, the lowest tension -inf, and what was
-    recorded ends with nan.
+    Of a plant that has run away all errors, tensions, speeds and torques are inf, the lowest tension -inf, and what
+    was recorded ends with nan.
     """
 
     squared_error_n2: FloatArray  #: mean over all samples of (T - T_ref)^2
@@ -219,6 +219,7 @@ class Rollouts:
     tension_max_n: FloatArray
     settled: FloatArray  #: periods from a change to the last sample outside the band; inf where it never came in
     beyond_n: FloatArray  #: greatest overshoot, in the direction of the set-point's step (either, where there is none)
+    roller_speed_max_m_per_s: FloatArray  #: greatest surface speed, either way, over all steps of the integration
     torque_max_nm: FloatArray
     torque_step_max_nm: FloatArray  #: from period to period
     effort_n2m2s: FloatArray  #: integral of u^2, per drive

@@ -240,6 +240,9 @@ def _set_tension(cycle: Cycle, command: SetTension, now_s: float) -> str:
         largest = least(line.limits.tension_step_max_n, judged)
         _require_step(cycle, size, largest, "N", setpoints.tension_step_pause_s(i, now_s))
         _require_few(size, line.limits.steps_together * largest, setpoints.stepped_lately_n(now_s))
+        stepped_n = setpoints.tension_n.copy()
+        stepped_n[i] = command.tension_n
+        _require_safe(cycle.foreseen(stepped_n))
         setpoints.step_tension(i, command.tension_n, now_s)
     setpoints.tension_target_n[i] = command.tension_n
     how = "at once" if command.step else _pace(cycle, f"at {line.moves.tension_rate_n_per_s:g} N/s")
@@ -257,6 +260,7 @@ def _set_speed(cycle: Cycle, command: SetSpeed, now_s: float) -> str:
         judged = cycle.configurations.running.region.speed_step_max_m_per_s
         largest = least(line.limits.speed_step_max_m_per_s, judged)
         _require_step(cycle, size, largest, "m/s", setpoints.speed_step_pause_s(now_s))
+        _require_safe(cycle.foreseen(setpoints.tension_n, command.speed_m_per_s))
         setpoints.step_speed(command.speed_m_per_s, now_s)
     setpoints.speed_target_m_per_s = command.speed_m_per_s
     how = "at once" if command.step else _pace(cycle, f"at {line.moves.speed_rate_m_per_s2:g} m/s2")
@@ -289,6 +293,12 @@ def _require_few(size_n: float, largest_n: float, lately_n: float) -> None:
             f"with this step of {size_n:g} N those of the last {STEP_PAUSE_S:g} s come to {lately_n + size_n:g} N; "
             f"allowed: {largest_n:g} N together (limits.steps_together), or a ramp at any time"
         )
+
+
+def _require_safe(foreseen: str) -> None:
+    """The monitor would stop the line for it."""
+    if foreseen:
+        raise Refused(f"this step is too large at this speed: {foreseen}; a smaller step, or a ramp at any time")
 
 
 def _select_recipe(cycle: Cycle, command: SelectRecipe) -> str:

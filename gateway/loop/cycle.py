@@ -122,6 +122,16 @@ class Cycle:
         self.experiments.look(self.inputs, torque_nm, self.account.held, tick.due_s)
         self._frame(tick, saturated, cycle_s)
 
+    def foreseen(self, setpoint_n: FloatArray, unwind_speed_m_per_s: float | None = None) -> str:
+        """What would come of these set-points (n,), or this speed, at once, as the accepted model has it; or nothing.
+
+        Between two periods only.
+        """
+        measured = self._estimate()
+        if unwind_speed_m_per_s is not None:
+            measured = replace(measured, unwind_speed_m_per_s=unwind_speed_m_per_s)
+        return self.guard.foresees(self.configurations, self.torque_path, measured, setpoint_n)
+
     def any_enabled(self) -> bool:
         """Whether a drive says that it is enabled."""
         return _ENABLED in self.inputs.drive_state.tolist()

@@ -59,3 +59,18 @@ class Guard:
             remembered = memory(path.state) if recovery.fallback == running.hash else None
             findings += recoverable(recovery, measured, setpoint_n, self._sent_nm, torque_nm, remembered)
         return findings
+
+    def foresees(
+        self, configurations: Configurations, path: TorquePath, measured: Measured, setpoint_n: FloatArray
+    ) -> str:
+        """What would come of set-points (n,), and an unwinder's speed, at once; empty: nothing that is not allowed.
+
+        `against` would stop the line for it. Without a prediction nothing is foreseen.
+        """
+        running = configurations.running
+        recovery = running.recovery
+        if recovery is None or recovery.fallback != running.hash or path.state is None:
+            return ""
+        in_flight, sent = self._sent_nm[1 : 1 + recovery.depth], self._sent_nm[0]
+        short = recovery.shortfall_of_step(measured, setpoint_n, in_flight, sent, memory(path.state))
+        return "" if short is None else short.foreseen

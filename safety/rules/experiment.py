@@ -16,6 +16,7 @@ from gateway.core.verdict import RuleFinding
 from safety.believed import prior_corners
 from safety.case import Case
 from safety.findings import at_least, at_most, told
+from safety.limits import envelope_limits
 from safety.rules.corners import rollouts
 from safety.rules.validity import check as check_validity
 from safety.simulated import holdable, stressed
@@ -61,6 +62,8 @@ def check_corners(case: Case) -> list[RuleFinding]:
         float((case.tension_n - found.tension_min_n).max()), float((found.tension_max_n - case.tension_n).max())
     )
     limits, abort_n = case.line.limits, case.experiment.abort.deviation_n
+    fastest, envelope = float(found.roller_speed_max_m_per_s.max()), envelope_limits(case.line)
+    allowed = envelope.roller_speed_watched_m_per_s
     on = f"on {len(kept)} {where}" + (f", {len(plants) - len(kept)} left out" if len(kept) < len(plants) else "")
     return [
         at_most(
@@ -74,6 +77,11 @@ def check_corners(case: Case) -> list[RuleFinding]:
         at_most(
             f"{RULE}: highest tension", highest, limits.tension_max_n, "N",
             f"tension rises to {highest:.1f} N ({on}); allowed: up to {limits.tension_max_n:g} N",
+        ),
+        at_most(
+            f"{RULE}: roller speed", fastest, allowed, "m/s",
+            f"a roller runs at up to {fastest:.3g} m/s ({on}); allowed: {allowed:.3g} m/s, of "
+            f"{envelope.roller_speed_m_per_s:.3g} m/s at which torque goes off: smaller or slower moves",
         ),
     ]  # fmt: skip
 

@@ -25,6 +25,7 @@ from safety.rules import (
     model_residuals,
     paper,
     promises,
+    roller_speed,
     validity,
 )
 
@@ -50,6 +51,7 @@ RULES: dict[Kind, tuple[Rule, ...]] = {
         Rule(decay.RULE, decay.check),
         Rule(delay_margin.RULE, delay_margin.check),
         Rule(corners.RULE, corners.check),
+        Rule(roller_speed.RULE, roller_speed.check),
         Rule(improvement.RULE, improvement.check, with_model_only=True),
         Rule(promises.RULE, promises.check, with_model_only=True),
     ),

@@ -250,7 +250,7 @@ def test_delay_margin_at_its_limit_for_a_law_and_for_a_schedule(of, context, red
 
 def rollouts(low=3.0, high=59.0, swing=0.9, error=2.9, chatter=4.9):
     one = np.ones((1, 6))
-    return Rollouts(one, low * one, high * one, one, one, one, one, one, tail_swing_n=swing * one,
+    return Rollouts(one, low * one, high * one, one, one, one, one, one, one, tail_swing_n=swing * one,
                     tail_error_n=error * one, chatter_nm=chatter * one)  # fmt: skip
 
 
@@ -506,7 +506,7 @@ def test_the_worst_over_corners_knows_where_it_was():
     worst = Worst()
     one = np.ones((1, 2))
     for name, swing in (("first", 0.5), ("second", 0.7)):
-        worst.take(Rollouts(one, 3 * one, 9 * one, one, one, one, one, one, tail_swing_n=swing * one,
+        worst.take(Rollouts(one, 3 * one, 9 * one, one, one, one, one, one, one, tail_swing_n=swing * one,
                             tail_error_n=one, chatter_nm=one), name, [0, 1])  # fmt: skip
     assert worst.swing_n == (0.7, "second") and worst.lowest_n[0] == 3.0
 

@@ -268,7 +268,9 @@ def test_extremes_between_the_samples_count(effects):
     plants, quick = real(random_plants(1)) if effects else random_plants(1), QUIET
     found = simulate(design_lqi(task()), plants, several_changes(), quick, record=True)
     stepped, _ = run_plant(make_law(design_lqi(task())), plants, 0, several_changes(), quick, drawn(quick))
+    stepped, speeds = stepped[:, :6], stepped[:, 6:]
     assert np.allclose(stepped[::5], found.tension_n[0], atol=1e-9)
+    assert np.allclose(found.roller_speed_max_m_per_s[0], np.abs(speeds).max(axis=0), atol=1e-9)
     assert np.allclose(found.tension_max_n[0], stepped.max(axis=0), atol=1e-9)
     assert np.allclose(found.tail_swing_n[0], 0.5 * np.ptp(stepped[-200:], axis=0), atol=1e-9)
     assert (found.tension_max_n > found.tension_n.max(axis=1) + 1e-3).any()

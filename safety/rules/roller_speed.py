@@ -1,0 +1,145 @@
+"""Whether rollers stay below the speed at which the envelope takes torque off, in steps that the loop lets happen.
+
+A roller runs ahead by L/EA dT/dt while it tensions its span, and by as much again for each span before it: on a slow
+line that is more than its own speed. With an accepted model the loop foresees it and refuses such a step
+(`gateway.loop.guard`), so that a configuration is looked at in steps as large as the model lets them be, on the corners
+under stress. Before that nobody foresees anything: the region of a first configuration has the steps that pass.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gateway.control.judged_courses import Courses, Judged, corner_courses
+from gateway.control.mpc_linear import unconstrained
+from gateway.control.rollout import Course, plants_of_thetas, simulate
+from gateway.core.controller import Controller
+from gateway.core.controller_laws import MpcConfig
+from gateway.core.theta import Noise
+from gateway.core.verdict import RuleFinding
+from safety.case import Case
+from safety.findings import at_most, told
+from safety.limits import envelope_limits
+from safety.rules.corners import rollouts
+from safety.simulated import holdable, judged_of, setup_of, stressed
+
+RULE = "roller speed"
+SPEED_CHANGE = "speed change"  #: the course whose steps are of the speed; those of the others are of tensions
+LEAST_STEP_N = 1.0  #: of one span on a slow line: a law that does not let even that is too quick for the line
+SMALL = 1.0 / 16.0  #: of the largest step: at first nothing is cut
+TRIES = 3
+BELOW = 0.97  #: of the step that the one before lets expect
+LASTING_S = 0.6  #: of a change: by then rollers run as fast as the web again, or never
+QUIET = Noise(0.0, 0.0, 0.0)
+
+Fastest = Callable[[Course], float]  #: the greatest speed of any roller in a course, either way
+
+
+@dataclass(frozen=True)
+class Let:
+    """By course: the share of its largest step that keeps rollers below the speed that is watched; nan: none does."""
+
+    share: dict[str, float]
+    fastest_m_per_s: dict[str, float]  #: with that step, on the corners
+
+    def of_tension(self) -> float:
+        return min((share for name, share in self.share.items() if name != SPEED_CHANGE), default=1.0)
+
+    def of_speed(self) -> float:
+        return self.share[SPEED_CHANGE]
+
+
+def check(case: Case) -> list[RuleFinding]:
+    """The fastest roller on the corners: a first configuration's as the monitor has it, else where torque goes off."""
+    found, limits = steps_let(case), envelope_limits(case.line)
+    if not all(np.isfinite(list(found.share.values()))):
+        return [told(RULE, False, _too_quick(case, "no step at all"))]
+    single = found.share.get("one span, slow", 1.0) * case.tension_step_n
+    if single < min(LEAST_STEP_N, case.tension_step_n):
+        return [told(RULE, False, _too_quick(case, f"a step of {single:.2g} N of one span"))]
+    name, value = max(found.fastest_m_per_s.items(), key=lambda pair: pair[1])
+    allowed = limits.roller_speed_watched_m_per_s if case.first else limits.roller_speed_m_per_s
+    text = (
+        f"a roller runs at up to {value:.3g} m/s ({name}, {found.share[name]:.0%} of the largest step); allowed: "
+        f"{allowed:.3g} m/s, of {limits.roller_speed_m_per_s:.3g} m/s at which torque goes off"
+    )
+    return [at_most(RULE, value, allowed, "m/s", text)]
+
+
+def steps_let(case: Case) -> Let:
+    """Computed once for a case."""
+    return case.once("steps let", _steps_let)
+
+
+def _steps_let(case: Case) -> Let:
+    config = case.controller
+    law = unconstrained(config) if isinstance(config, MpcConfig) else config
+    limits = envelope_limits(case.line)
+    judged, on_corners = judged_of(case), _on_corners(case, law)
+    foreseen = on_corners if case.first else _on_the_mean(case, law)
+    share, fastest = dict[str, float](), dict[str, float]()
+    for name, course in _courses(judged, 1.0).items():
+        web = float(course.unwind_speed_m_per_s.max())
+        allowed = limits.roller_speed_watched_m_per_s if case.first else limits.roller_speed_in_step_m_per_s(web)
+        share[name], fastest[name] = _largest(judged, name, foreseen, allowed)
+        if not case.first and np.isfinite(share[name]):
+            fastest[name] = on_corners(_courses(judged, share[name])[name])
+    return Let(share, fastest)
+
+
+def _largest(judged: Judged, name: str, fastest: Fastest, allowed: float) -> tuple[float, float]:
+    """Share of the step, and the speed that rollers reach with it.
+
+    Cut torques keep a large step from moving rollers as fast as it would: the share follows from a small one.
+    """
+    course = _courses(judged, 1.0)[name]
+    web, value = float(course.unwind_speed_m_per_s.max()), fastest(course)
+    if value <= allowed:
+        return 1.0, value
+    share, value = SMALL, fastest(_courses(judged, SMALL)[name])
+    for _ in range(TRIES):
+        share *= BELOW * (allowed - web) / (value - web)
+        if not 0.0 < share < 1.0:  # nan, too: a line that runs away
+            break
+        value = fastest(_courses(judged, share)[name])
+        if value <= allowed:
+            return share, value
+    return np.nan, np.inf
+
+
+def _courses(judged: Judged, share: float) -> Courses:
+    """With a share of the largest steps; as long as rollers run ahead."""
+    smaller = replace(
+        judged,
+        tension_step_n=share * judged.tension_step_n,
+        speed_step_m_per_s=share * judged.speed_step_m_per_s,
+    )
+    return corner_courses(smaller, LASTING_S, 0.0)
+
+
+def _on_corners(case: Case, law: Controller) -> Fastest:
+    plants = [stressed(theta, case.line.gate) for theta in case.corners]
+
+    def fastest(course: Course) -> float:
+        kept = holdable(plants, course, case.line.limits.torque_nm)
+        if not kept:
+            return np.inf
+        found = rollouts(case.line, law, kept, course, case.stress_noise, case.seed)
+        return float(found.roller_speed_max_m_per_s.max())
+
+    return fastest
+
+
+def _on_the_mean(case: Case, law: Controller) -> Fastest:
+    """As the loop foresees it."""
+    plants, setup = plants_of_thetas([case.believed]), setup_of(case.line, QUIET, case.seed, 0.0)
+    return lambda course: float(simulate(law, plants, course, setup).roller_speed_max_m_per_s.max())
+
+
+def _too_quick(case: Case, what: str) -> str:
+    limits = envelope_limits(case.line)
+    return (
+        f"{what} keeps rollers below {limits.roller_speed_watched_m_per_s:.3g} m/s, of "
+        f"{limits.roller_speed_m_per_s:.3g} m/s at which torque goes off: a calmer law is needed"
+    )

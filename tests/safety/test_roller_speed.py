@@ -1,0 +1,113 @@
+"""The speed of rollers in the judge: which steps are let, and what is refused."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from gateway.control.design import design_lqi, design_mpc, task_of
+from gateway.core.deployment import Region
+from safety.limits import envelope_limits
+from safety.rules import experiment, roller_speed
+from tests.safety.case_support import case_of, gains, proposal, published, refused, verdict_of
+
+
+@pytest.fixture(scope="module")
+def of():
+    return published()
+
+
+@pytest.fixture(scope="module")
+def context(of):
+    return of.context()
+
+
+def slow_line(of, speed_max_m_per_s):
+    limits = of.line.limits.model_copy(update={"speed_max_m_per_s": speed_max_m_per_s})
+    return replace(of, line=of.line.model_copy(update={"limits": limits}))
+
+
+def slow_context(of, speed_m_per_s, **changes):
+    context = of.context(**changes)
+    return context.model_copy(update={"state": context.state.model_copy(update={"speed_m_per_s": speed_m_per_s})})
+
+
+def test_a_first_configuration_of_a_slow_line_has_the_steps_that_keep_its_rollers_slow(of):
+    """Four spans that step by 4 N make a roller run at 0.08 m/s; where 0.03 is the most, torque goes off at 0.045."""
+    slow = slow_line(of, 0.03)
+    context = slow_context(slow, 0.01, model=None, data=[])
+    asked = gains(design_lqi(task_of(slow.line)), context)
+    verdict = verdict_of(asked, context, slow)
+    assert verdict.accepted, verdict.reasons
+    assert 0.2 < verdict.region.tension_step_max_n < 2.0
+    found = roller_speed.steps_let(case_of(asked, context, slow))
+    watched = envelope_limits(slow.line).roller_speed_watched_m_per_s
+    assert watched == pytest.approx(0.85 * 1.5 * 0.03)
+    assert 0.8 * watched < found.fastest_m_per_s["neighbours"] <= watched
+    assert verdict.region.tension_step_max_n == pytest.approx(found.of_tension() * slow.line.gate.first_step_max_n)
+    assert verdict.region.speed_step_max_m_per_s == pytest.approx(found.of_speed() * 0.02)
+    assert verdict.region.within(Region(tension_step_max_n=4.0))
+
+
+def test_with_a_model_steps_are_as_large_as_the_loop_lets_them_and_corners_stay_below_the_envelope(of, context):
+    slow = slow_line(of, 0.08)
+    case = case_of(gains(design_lqi(of.task()), context), context, slow)
+    found, limits = roller_speed.steps_let(case), envelope_limits(slow.line)
+    assert found.share["one span, slow"] == 1.0 > found.share["neighbours"] > 0.05
+    assert max(found.fastest_m_per_s.values()) <= limits.roller_speed_m_per_s
+    assert refused(roller_speed.check(case)) == []
+
+
+def test_a_law_that_lets_no_step_and_one_that_runs_away_are_refused(of, context):
+    of = slow_line(of, 0.052)
+    config = design_lqi(of.task())
+    wild = config.model_copy(update={"gain_state": (20.0 * np.array(config.gain_state)).tolist()})
+    for spoiled in (wild, config.model_copy(update={"gain_state": (-np.array(config.gain_state)).tolist()})):
+        text = refused(roller_speed.check(case_of(gains(spoiled, context), context, of)))
+        assert text and ("calmer law" in text[0] or "torque goes off" in text[0]), text
+
+
+@pytest.mark.parametrize(("value", "passed"), [(0.18, True), (0.1801, False)])
+def test_the_limit_is_where_torque_goes_off(of, context, monkeypatch, value, passed):
+    case = case_of(gains(design_lqi(of.task()), context), context, of)
+    let = roller_speed.Let({"speed change": 1.0, "one span, slow": 1.0}, {"speed change": value, "one span, slow": 0.1})
+    monkeypatch.setattr(roller_speed, "steps_let", lambda _: let)
+    assert roller_speed.check(case)[0].passed is passed
+    first = replace(case, context=context.model_copy(update={"model": None, "data": []}))
+    assert not roller_speed.check(first)[0].passed
+
+
+def test_a_slow_line_without_room_for_a_step_of_one_newton_needs_a_calmer_law(of, context, monkeypatch):
+    case = case_of(gains(design_lqi(of.task()), context), context, of)
+    step = case.tension_step_n
+    for share, passed in ((1.0 / step, True), (0.99 / step, False)):
+        let = roller_speed.Let({"speed change": 1.0, "one span, slow": share}, dict.fromkeys(("one span, slow",), 0.1))
+        monkeypatch.setattr(roller_speed, "steps_let", lambda _, let=let: let)
+        assert roller_speed.check(case)[0].passed is passed
+
+
+def test_corners_that_nobody_holds_say_nothing_good(of, context):
+    weak = of.line.model_copy(update={"limits": of.line.limits.model_copy(update={"torque_nm": 1.0})})
+    case = replace(case_of(gains(design_lqi(of.task()), context), context, of), line=weak)
+    assert refused(roller_speed.check(case))
+
+
+def test_a_predictive_controller_is_looked_at_as_its_linear_law(of, context):
+    case = case_of(gains(design_mpc(of.task()), context), context, of)
+    assert refused(roller_speed.check(case)) == []
+
+
+def test_an_experiment_that_makes_rollers_run_ahead_is_refused(of, context):
+    slow = slow_line(of, 0.08)
+
+    def asked(amplitude_n):
+        moves = {
+            "format": 1, "amplitude_n": [amplitude_n] * 6, "dwell_s": 0.1, "legs": [{"duration_s": 2.0}],
+            "abort": {"deviation_n": 14.0},
+        }  # fmt: skip
+        case = case_of(proposal({"kind": "experiment", "experiment": moves}, context), context, slow)
+        return [one for one in experiment.check_corners(case) if one.rule == "experiment: roller speed"][0]
+
+    small, large = asked(1.0), asked(12.0)
+    assert small.passed and not large.passed and "smaller or slower moves" in large.text
+    assert small.limit == pytest.approx(envelope_limits(slow.line).roller_speed_watched_m_per_s)
