@@ -362,4 +362,4 @@ class Swaps(RuleBasedStateMachine):
 
 
 TestSwaps = Swaps.TestCase
-TestSwaps.settings = settings(max_examples=15, stateful_step_count=15, deadline=None)
+TestSwaps.settings = settings(max_examples=15, stateful_step_count=15)

@@ -258,7 +258,7 @@ ORDERS = [AbortExperiment(), Hold(), Stop(), SetTension(span=3, tension_n=22.0),
 EVENTS = ["nothing", "silent cell", "lost drive", "no permissive"]
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(
     st.sampled_from([*ORDERS, *EVENTS]),
     st.integers(0, 99),

@@ -224,4 +224,4 @@ class Operation(RuleBasedStateMachine):
 
 
 TestOperation = Operation.TestCase
-TestOperation.settings = settings(max_examples=40, stateful_step_count=25, deadline=None)
+TestOperation.settings = settings(max_examples=40, stateful_step_count=25)

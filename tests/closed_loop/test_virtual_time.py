@@ -51,7 +51,7 @@ def test_half_an_hour_passes_at_once_and_many_small_jumps_are_one_large_one():
     assert run(story()) == START_S + 1801.0
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(
     st.lists(
         st.tuples(st.floats(-1.0, 60.0), st.booleans(), st.floats(0.0, 60.0)), min_size=1, max_size=12

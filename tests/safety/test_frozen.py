@@ -46,7 +46,7 @@ def frozen_run(speed_m_per_s: float = LINE_M_PER_S) -> np.ndarray:
 
 # Fixed examples: by chance one seed in about a hundred has learnt too little of its jitter by then.
 @given(seed=st.integers(0, 1000), roller=st.integers(0, 2), before=st.integers(400, 600))
-@settings(max_examples=30, deadline=None, derandomize=True)
+@settings(max_examples=30, derandomize=True)
 def test_a_frozen_drive_is_named_after_its_repeats_and_no_other(seed: int, roller: int, before: int) -> None:
     speeds = turning(before + REPEATS, seed)
     assume((speeds[before - 1] != speeds[before - 2]).all())  # no repeat of its own to begin with

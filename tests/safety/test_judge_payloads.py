@@ -14,7 +14,7 @@ from safety.judge import judge
 from safety.rules.table import Rule
 from tests.safety.case_support import gains, published
 
-MANY = settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+MANY = settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,7 @@ from dataclasses import replace
 from itertools import cycle, islice
 
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gateway.commissioning.candidates import (
@@ -180,7 +180,7 @@ def test_a_measurement_that_failed_is_followed_by_a_smaller_one():
     assert asked([*ADAPTED, failed]).size == 0.5 * asked(ADAPTED).size
 
 
-@settings(deadline=None, max_examples=50, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=50)
 @given(
     st.lists(st.sampled_from([Outcome.DONE, Outcome.DONE, Outcome.FAILED, Outcome.AGAIN]), min_size=1, max_size=40),
     st.floats(0.2, 1.0),

@@ -168,7 +168,7 @@ def test_dead_time_becomes_torques_in_flight(latency_s, depth):
         assert np.abs(tension[-20:] - 30.0).max() < 0.05
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(parameters, st.sampled_from([design_lqi, design_pid]), st.floats(-20, 20), st.data())
 def test_engaging_is_bumpless_and_saturation_does_not_wind_up(values, design, start, data):
     config = design(task(3, **values))

@@ -47,7 +47,7 @@ def any_model(draw: st.DrawFn) -> LineModel:
 
 
 @given(any_model(), st.floats(0.5, 3.0), st.sampled_from([0.0, 0.05]), st.integers(1, 9), st.integers(0, 99))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_every_corner_is_between_the_least_share_and_the_box_of_the_axes(
     given_model: LineModel, sigmas: float, least: float, count: int, seed: int
 ) -> None:
@@ -63,7 +63,7 @@ def test_every_corner_is_between_the_least_share_and_the_box_of_the_axes(
 
 
 @given(any_model(), st.floats(0.5, 3.0), st.integers(0, 99))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_with_no_least_share_corners_are_as_far_as_the_posterior_says_along_every_axis(
     given_model: LineModel, sigmas: float, seed: int
 ) -> None:
@@ -76,7 +76,7 @@ def test_with_no_least_share_corners_are_as_far_as_the_posterior_says_along_ever
 
 
 @given(any_model(), st.integers(0, 99))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_the_same_seed_gives_the_same_plants_and_every_second_is_the_opposite(
     given_model: LineModel, seed: int
 ) -> None:

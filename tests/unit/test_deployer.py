@@ -488,9 +488,7 @@ class LifeCycle(RuleBasedStateMachine):
         assert sum(stage in (Stage.DEPLOYING, Stage.PROBATION, Stage.KEEPING) for stage in stages) <= 1
 
 
-LifeCycle.TestCase.settings = settings(
-    max_examples=30, stateful_step_count=25, deadline=None, suppress_health_check=list(HealthCheck)
-)
+LifeCycle.TestCase.settings = settings(max_examples=30, stateful_step_count=25, suppress_health_check=list(HealthCheck))
 TestLifeCycle = LifeCycle.TestCase
 
 

@@ -407,7 +407,7 @@ def written(value: Any) -> str:
 ALL_PATHS = paths(tomllib.loads(line_template(2)))[1:]
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(st.lists(st.tuples(st.sampled_from(ALL_PATHS), st.sampled_from(JUNK)), min_size=1, max_size=3))
 def test_junk_anywhere_is_refused_or_read_but_never_crashes(edits: list[tuple[tuple[Any, ...], Any]]) -> None:
     document: Any = tomllib.loads(line_template(2))
@@ -428,7 +428,7 @@ def test_junk_anywhere_is_refused_or_read_but_never_crashes(edits: list[tuple[tu
             assert "is not what belongs here" not in problem.wrong
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(st.lists(st.integers(0, TEMPLATE.count("\n")), max_size=40), st.data())
 def test_deleted_lines_and_tables_never_raise_anything_else(deleted: list[int], data: st.DataObject) -> None:
     rows = TEMPLATE.split("\n")

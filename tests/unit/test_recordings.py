@@ -84,7 +84,7 @@ def small(spans: int = 2, samples: int = 3) -> Recording:
     return recording_of(frames, 0.01, "small")
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(recordings())
 def test_csv_gives_back_exactly_what_it_was_given(
     tmp_path_factory: pytest.TempPathFactory, recording: Recording
@@ -95,7 +95,7 @@ def test_csv_gives_back_exactly_what_it_was_given(
     assert same(found, recording) and found.source == "a.csv"
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(recordings())
 def test_mcap_gives_back_exactly_what_it_was_given(
     tmp_path_factory: pytest.TempPathFactory, recording: Recording
@@ -177,7 +177,7 @@ def test_what_is_no_text_is_refused(tmp_path: Path) -> None:
         read_recording(tmp_path / "absent.csv")
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=80)
 @given(st.integers(0, 600), st.sampled_from(list('0;x,\n"#-')))
 def test_a_spoiled_csv_is_read_or_refused(tmp_path_factory: pytest.TempPathFactory, place: int, sign: str) -> None:
     text = csv_text(small())

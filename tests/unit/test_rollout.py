@@ -106,7 +106,7 @@ def test_the_plant_is_that_of_the_simulated_line():
     assert np.allclose(tension[9:-1:10], found.tension_n[0, 1:50], atol=1e-6)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(st.integers(0, 10_000), st.sampled_from([*LINEAR, design_mpc]))
 def test_torque_never_leaves_its_limits_and_designs_hold_on_the_box(seed, design):
     found = simulate(

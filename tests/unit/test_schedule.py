@@ -205,7 +205,7 @@ def test_a_change_of_gains_is_no_jump(design):
     assert most_of_switches <= 0.05 * most_of_periods
 
 
-@settings(deadline=None, max_examples=20)
+@settings(max_examples=20)
 @given(st.integers(0, 1000))
 def test_integral_in_torque_is_the_integral_in_newton_seconds(seed):
     """u = u_ref - K_x x~ - K_u u~ - K_i q with back-calculation through the inverse of K_i, written out once more."""

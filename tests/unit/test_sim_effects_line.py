@@ -78,7 +78,7 @@ def test_compiling_beforehand_changes_nothing() -> None:
     assert difference(world, other) == 0.0
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(calls=st.lists(st.floats(0.0, 3.0), max_size=30), seed=st.integers(0, 2**32))
 def test_the_pattern_of_calls_changes_nothing(calls: list[float], seed: int) -> None:
     whole, pieces = World(REALISTIC, seed), World(REALISTIC, seed)
@@ -106,7 +106,7 @@ def test_the_realistic_plant_holds_its_tensions_with_the_torques_of_its_rest_poi
     assert line.recorder.unsafe_total == 0
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_whatever_is_done_to_a_line_with_slack_no_web_pushes_and_all_stays_finite(seed: int) -> None:
     rng = np.random.default_rng(seed)

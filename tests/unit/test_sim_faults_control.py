@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from typer.testing import CliRunner, Result
 
@@ -85,7 +85,6 @@ def test_what_is_refused_is_said_and_changes_nothing(server, line, request_, sai
     assert len(line.recorder.events) == events and answer(server, do="list")["faults"] == []
 
 
-@settings(deadline=None)
 @given(st.binary(max_size=60))
 def test_every_line_has_an_answer(data):
     got = _QUIET.answer(data)

@@ -3,7 +3,7 @@
 import struct
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from sim_plant.faults import mbap_frames, opcua_frames
@@ -48,7 +48,6 @@ def faults_of(kind, *texts: str, seed: int = 0) -> WireFaults:
 
 
 @each_kind
-@settings(deadline=None)
 @given(data=st.data())
 def test_without_faults_every_frame_passes_as_it_is(kind, frames, data):
     faults = WireFaults(kind)
@@ -57,7 +56,6 @@ def test_without_faults_every_frame_passes_as_it_is(kind, frames, data):
 
 
 @each_kind
-@settings(deadline=None)
 @given(data=st.data())
 def test_after_faults_nothing_is_left_of_them(kind, frames, data):
     """Frames that are held back come once, in order, and then everything passes again."""
@@ -75,7 +73,6 @@ def test_after_faults_nothing_is_left_of_them(kind, frames, data):
 @pytest.mark.parametrize(
     "fault", ["drop", "delay delay_s=1", "duplicate", "corrupt", "wrong-function", "wrong-length by=1", "mute"]
 )
-@settings(deadline=None)
 @given(data=st.data())
 def test_a_fault_of_one_address_touches_no_other(kind, frames, fault, data):
     faults = faults_of(kind, f"canopen 3 {fault}")
@@ -84,7 +81,6 @@ def test_a_fault_of_one_address_touches_no_other(kind, frames, fault, data):
 
 
 @each_kind
-@settings(deadline=None)
 @given(data=st.data(), count=st.integers(1, 10), extra=st.integers(0, 10), probability=st.sampled_from([0.3, 1.0]))
 def test_counts_are_exact(kind, frames, data, count, extra, probability):
     frame = data.draw(frames)
@@ -106,7 +102,6 @@ def test_the_dice_depend_on_seed_and_frames_alone():
 
 
 @each_kind
-@settings(deadline=None)
 @given(data=st.data())
 def test_corruption_inverts_one_bit_and_keeps_the_frame(kind, frames, data):
     frame = data.draw(frames)
@@ -125,7 +120,6 @@ def test_what_has_no_content_is_lost_by_corruption():
     assert faults_of(OpcUaFrames(), "opcua corrupt").pass_(FROM, 0, chunk(b"CLOF", b"")) == []
 
 
-@settings(deadline=None)
 @given(modbus_frames, st.integers(-64, 64), st.booleans())
 def test_the_length_field_of_modbus_fits_or_lies(frame, by, fits):
     faults = faults_of(MbapFrames(), f"modbus-tcp wrong-length by={by} field={'fits' if fits else 'lies'}")
@@ -136,7 +130,6 @@ def test_the_length_field_of_modbus_fits_or_lies(frame, by, fits):
     assert after[:4] == frame[:4] and after[6:8] == frame[6:8]
 
 
-@settings(deadline=None)
 @given(chunks, st.integers(-64, 64), st.booleans())
 def test_the_size_of_a_chunk_fits_or_lies(frame, by, fits):
     ((_, after),) = faults_of(OpcUaFrames(), f"opcua wrong-length by={by} field={'fits' if fits else 'lies'}").pass_(
@@ -146,7 +139,6 @@ def test_the_size_of_a_chunk_fits_or_lies(frame, by, fits):
     assert struct.unpack_from("<I", after, 4)[0] == len(after if fits else frame)
 
 
-@settings(deadline=None)
 @given(can_frames, st.integers(-64, 64))
 def test_a_can_frame_has_0_to_8_bytes(frame, by):
     ((_, (can_id, data)),) = faults_of(CanFrames(), f"canopen wrong-length by={by}").pass_(FROM, 1, frame)
@@ -272,7 +264,6 @@ def test_a_frozen_opcua_server_answers_with_old_values_under_the_new_ids():
 
 
 @each_kind
-@settings(deadline=None)
 @given(data=st.data())
 def test_freezing_takes_any_frames(kind, frames, data):
     faults = faults_of(kind, "canopen freeze")
@@ -336,7 +327,6 @@ FRAMERS = [
 
 
 @pytest.mark.parametrize(("framer", "frames"), FRAMERS, ids=["mbap", "opcua"])
-@settings(deadline=None)
 @given(data=st.data())
 def test_frames_are_found_whatever_segments_they_come_in(framer, frames, data):
     sent = data.draw(st.lists(frames, max_size=6))
@@ -349,7 +339,6 @@ def test_frames_are_found_whatever_segments_they_come_in(framer, frames, data):
 
 
 @pytest.mark.parametrize(("framer", "frames"), FRAMERS, ids=["mbap", "opcua"])
-@settings(deadline=None)
 @given(data=st.data())
 def test_nothing_of_a_stream_is_lost_whatever_it_is(framer, frames, data):
     pieces = data.draw(st.lists(frames | st.binary(max_size=40), max_size=6))
@@ -361,7 +350,6 @@ def test_nothing_of_a_stream_is_lost_whatever_it_is(framer, frames, data):
     assert joined + cutter.rest() == b"".join(pieces)
 
 
-@settings(deadline=None)
 @given(st.lists(st.floats(0, 10)), st.lists(st.floats(0, 10)))
 def test_late_frames_go_at_their_time_and_in_order(times, looks):
     line: DelayLine[int] = DelayLine()

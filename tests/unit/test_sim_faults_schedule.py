@@ -3,7 +3,7 @@
 from math import inf
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from sim_plant.faults.parse import FaultRefused, parse_fault
@@ -92,7 +92,6 @@ def test_there_is_a_bound():
         schedule.add(parse_fault("drive 1 drive-fault at 5000"), 0.0)
 
 
-@settings(deadline=None)
 @given(
     st.lists(st.tuples(st.integers(1, 5), st.integers(0, 50), st.integers(1, 50) | st.none()), max_size=20),
     st.lists(st.integers(0, 120), max_size=20),

@@ -4,7 +4,7 @@ from math import isfinite
 from pathlib import Path
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from sim_plant.faults.effects import EFFECTS
@@ -64,13 +64,11 @@ def injections(draw) -> Injection:
     return Injection(fault, Target(kind, number, wire), values, at_s, for_s)
 
 
-@settings(deadline=None)
 @given(injections())
 def test_what_is_written_reads_back_as_the_same(injection):
     assert parse_fault(str(injection)) == injection
 
 
-@settings(deadline=None)
 @given(
     st.text(max_size=80) | st.lists(st.sampled_from(["plc", "drive", "3", "drop", "at", "for", "=", "count=", "nan"]))
 )

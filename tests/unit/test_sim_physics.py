@@ -69,7 +69,7 @@ def run(p: WebParameters, state: Array, u: Array, v0: float, steps: int, noise: 
     return trace
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(
     n=st.integers(1, 60),
     seed=st.integers(0, 2**32 - 1),

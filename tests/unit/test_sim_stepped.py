@@ -22,7 +22,7 @@ def changed(**tables: dict[str, Any]) -> Plant:
     return Plant.model_validate({**document, **{key: {**document[key], **value} for key, value in tables.items()}})
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(period_ms=st.integers(1, 20), latency_ms=st.integers(0, 45))
 def test_a_torque_acts_exactly_its_latency_after_the_sample(period_ms: int, latency_ms: int) -> None:
     line = SteppedLine(PLANT, seed=1, latency_s=latency_ms / 1000.0)

@@ -1,0 +1,6 @@
+"""For all tests: what is about the wall clock says so by its mark, and no property fails because it took long."""
+
+from hypothesis import HealthCheck, settings
+
+settings.register_profile("any machine", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("any machine")
