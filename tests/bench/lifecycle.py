@@ -56,7 +56,7 @@ def counting(machine: type[LifeCycle]) -> type[LifeCycle]:
 
 def many(examples: int) -> settings:
     return settings(
-        max_examples=examples, stateful_step_count=STEPS, database=None,
+        max_examples=examples, stateful_step_count=STEPS, database=None, deadline=None,
         suppress_health_check=list(HealthCheck), phases=[Phase.generate, Phase.shrink],
     )  # fmt: skip
 
