@@ -1,5 +1,6 @@
 """`r2rgate configurations`: every controller stored for a line, who put it forward and why, and the archived."""
 
+import asyncio
 import json
 import time
 from datetime import UTC, datetime
@@ -13,8 +14,19 @@ from rich.table import Table
 
 from gateway.cli.audit_commands import this_user
 from gateway.cli.data_place import data_folder
+from gateway.cli.operate_commands import RunFolder
 from gateway.cli.process_commands import REFUSED, DataFolder, read_line
+from gateway.cli.status_commands import ask_status
+from gateway.core.decisions import Archive
 from gateway.core.line_problem import printable
+from gateway.core.messages import Reply
+from gateway.core.topics import GATEWAY_DECISION
+from gateway.mailbox.listener import PathTooLong
+from gateway.mailbox.paths import GATEWAY_SOCKET, running_lines
+from gateway.mailbox.port import Unreachable
+from gateway.mailbox.unix import UnixMailbox
+from gateway.supervisor.archiving import archive as archive_configuration
+from gateway.supervisor.audit import Audit
 from gateway.supervisor.configurations import (
     FILE_NAME,
     STABLE,
@@ -32,6 +44,7 @@ app = typer.Typer(
 )
 
 SHORT = 8  #: letters of a hash
+ANSWER_S = 20.0
 Key = tuple[str, str] | tuple[None, None]
 
 Json = Annotated[bool, typer.Option("--json", help="Print as JSON.")]
@@ -145,8 +158,11 @@ def archive(
     name: Annotated[str, typer.Option("--name", help="Name that it shall have from now on.")] = STABLE,
     line: LineOption = None,
     data_dir: DataFolder = None,
+    run_dir: RunFolder = None,
 ) -> None:
-    """Keep a configuration under a name, to be proposed again by it. Puts nothing into service.
+    """Keep a configuration under a name, to be proposed again by it. Puts nothing into service; it is audited.
+
+    Where a gateway runs it does it; --run-dir names its sockets where they do not lie in the usual place.
 
     Exit code: 0 archived, 2 refused.
 
@@ -156,12 +172,50 @@ def archive(
         storage, key = _storage(line, data_dir)
         with storage:
             one = storage.find(which, *key)
-            if one.controller is None:
-                raise ConfigurationsError(f"version {one.version} is damaged and was not archived: {one.damage}")
-            storage.archive(one.site, one.line, one.id, name, time.time(), this_user().name, because)
-    except ConfigurationsError as error:
+            command = Archive(configuration=one.id, name=name, because=because)
+            running = run_dir or _running_on(storage.path.parent)
+            if running is not None:
+                reply = asyncio.run(_asked(running, command))
+            else:
+                reply = asyncio.run(_archived(storage, one, command))
+    except (ConfigurationsError, Unreachable, PathTooLong) as error:
         _refuse(error)
-    typer.echo(f"{name}: version {one.version} of {one.site}/{one.line}, {one.id[:12]}")
+    if not reply.ok:
+        _refuse("\n".join([reply.text, *reply.reasons]))
+    typer.echo(reply.text)
+
+
+def _running_on(folder: Path) -> Path | None:
+    """The run folder of the gateway whose stores lie in `folder`; None: it does not run."""
+    for run_folder in running_lines():
+        try:
+            status = asyncio.run(ask_status(run_folder))
+        except (Unreachable, PathTooLong):
+            continue
+        if Path(status.historian.path).parent.resolve() == folder.resolve():
+            return run_folder
+    return None
+
+
+async def _asked(run_folder: Path, command: Archive) -> Reply:
+    mailbox = UnixMailbox()
+    mailbox.connect((GATEWAY_DECISION,), run_folder / GATEWAY_SOCKET)
+    try:
+        return Reply.model_validate_json(
+            await mailbox.request(GATEWAY_DECISION, command.model_dump_json().encode(), ANSWER_S)
+        )
+    finally:
+        await mailbox.close()
+
+
+async def _archived(storage: Configurations, one: Configuration, command: Archive) -> Reply:
+    """Here: there is no gateway that writes the audit."""
+    audit = Audit(storage.path.parent)
+    audit.start()
+    try:
+        return await archive_configuration(audit, storage, one.site, one.line, command, this_user(), time.time())
+    finally:
+        await asyncio.to_thread(audit.close)
 
 
 def differences(a: Configuration, b: Configuration) -> list[tuple[str, Any, Any]]:

@@ -22,6 +22,7 @@ from gateway.mailbox.port import Unreachable
 
 if TYPE_CHECKING:
     from gateway.cli.demo_chain import Chain
+    from gateway.cli.demo_stepped import SteppedAside
 
 READY_TIME_S = 20.0
 NOT_REACHED = "the chain has ended before its aim: {}. The report says which rule refused what, and by how much"
@@ -38,10 +39,11 @@ def run_demo(out: Path, seed: int, quick: str | None) -> int:
         clear(out)
         with Children(out / "logs") as children:
             setup, world_start_s = begin(children, out, quick or "lqi", seed)
-            windows, chain, stops = asyncio.run(_story(children, setup, console, quick is None))
-            end_in_order(children)
-        console.print("measuring: the same cases in stepped time, then the report")
-        return _conclude(setup, windows, chain, stops, world_start_s, started_s, console)
+            with _stepped_aside(setup) as stepped:
+                windows, chain, stops = asyncio.run(_story(children, setup, stepped, console, quick is None))
+                end_in_order(children)
+                console.print("measuring: the same cases in stepped time, then the report")
+                return _conclude(setup, stepped, windows, chain, stops, world_start_s, started_s, console)
     except (ChildFailed, DemoFailed, Unreachable) as error:
         console.print(f"the demonstration failed: {error}", style="red", markup=False)
         console.print(
@@ -53,8 +55,15 @@ def run_demo(out: Path, seed: int, quick: str | None) -> int:
         return 130
 
 
+def _stepped_aside(setup: Setup) -> "SteppedAside":
+    from gateway.cli.demo_stepped import SteppedAside
+
+    return SteppedAside(setup)
+
+
 def _conclude(
     setup: Setup,
+    stepped: "SteppedAside",
     windows: list[Window],
     chain: "Chain | None",
     stops: list[str],
@@ -73,7 +82,7 @@ def _conclude(
         from gateway.cli.demo_report import page
         from gateway.cli.demo_table import print_cases
 
-        result = measure(setup, windows, stops, evidence, started_s, lambda _: "as started", None)
+        result = measure(setup, windows, stops, evidence, started_s, lambda _: "as started", None, stepped)
         text = page(setup, result, windows, evidence)
         print_cases(result, console)
     else:
@@ -82,7 +91,9 @@ def _conclude(
         from gateway.cli.demo_chain_table import print_chain
         from gateway.cli.demo_gate import chain_result
 
-        result = measure(setup, windows, stops, evidence, started_s, name_of, chain_result(setup, chain, evidence))
+        result = measure(
+            setup, windows, stops, evidence, started_s, name_of, chain_result(setup, chain, evidence), stepped
+        )
         text = page(setup, result, windows, evidence)
         print_chain(result, console)
     (setup.out / "result.json").write_text(result.model_dump_json(indent=2) + "\n", encoding="utf-8")
@@ -96,17 +107,19 @@ def _conclude(
 
 
 async def _story(
-    children: Children, setup: Setup, console: Console, whole: bool
+    children: Children, setup: Setup, stepped: "SteppedAside", console: Console, whole: bool
 ) -> "tuple[list[Window], Chain | None, list[str]]":
     """From SILENT to rest. Returns when each case ran, the chain, and why the line stopped in between, if it did."""
     with Progress(console) as progress:
         operator = Operator(children, progress)
         try:
             progress.step("starting the processes")
+            for config in (setup.config, stepped.on_truth())[whole:]:
+                stepped.ask(config)
             await operator.wait(lambda status: status.loop.running, READY_TIME_S, "the loop")
             await begin_with_repeats(operator)
             if whole:
-                windows, chain = await _whole(operator, setup)
+                windows, chain = await _whole(operator, setup, stepped)
             else:
                 period_s = setup.line.control.period_s
                 windows = [await run_with_repeats(operator, setup.config, case, period_s) for case in PAPER]
@@ -123,7 +136,7 @@ async def _story(
             await operator.close()
 
 
-async def _whole(operator: Operator, setup: Setup) -> "tuple[list[Window], Chain]":
+async def _whole(operator: Operator, setup: Setup, stepped: "SteppedAside") -> "tuple[list[Window], Chain]":
     from gateway.cli.demo_chain import carry_out
 
     recipe = setup.line.recipes[0]
@@ -131,5 +144,5 @@ async def _whole(operator: Operator, setup: Setup) -> "tuple[list[Window], Chain
         "settling: the loop controls the line by what it was started with, an LQI on the line's file"
     )
     await operator.wait_settled(recipe.tension_n, recipe.speed_m_per_s)
-    chain = await carry_out(operator, setup)
+    chain = await carry_out(operator, setup, stepped)
     return chain.windows, chain

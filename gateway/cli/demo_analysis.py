@@ -7,7 +7,7 @@ the case's own set-points. The gateway's history gives timing, and the instant a
 import json
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib.metadata import version
 from typing import Any
 
@@ -18,21 +18,17 @@ from gateway.cli.demo_cases import Window
 from gateway.cli.demo_line import Setup
 from gateway.cli.demo_operator import DemoFailed
 from gateway.cli.demo_result import CaseResult, ChainResult, ConfigurationResult, DemoResult, Percentiles, TimingResult
+from gateway.cli.demo_stepped import SteppedAside
 from gateway.cli.demo_words import command_line, machine_lines, now_iso
-from gateway.cli.rehearse_designs import truth_of
-from gateway.cli.stepped import run_scenario
-from gateway.control.design import design_lqi, task_of
 from gateway.core.controller import Controller, config_hash
 from gateway.core.metrics import rmse_n, rmse_per_span_n
-from gateway.core.scenario import PAPER, Scenario
+from gateway.core.scenario import PAPER
 from gateway.supervisor.historian import FILE_NAME
 from gateway.supervisor.history import History
-from sim_plant.plant import Plant, load_plant
 from sim_plant.recorder import read_recording
 from sim_plant.recording import Recording
 
 LIMIT_RATIO = 1.15  #: on the wire in real time against stepped time
-STEPPED_SEEDS = 5  #: runs in stepped time that a case is held against
 LIBRARIES = ("r2rgate", "numpy", "scipy", "python-can", "canopen", "pymodbus")
 FIELDS = ("tension_setpoint_n", "speed_setpoint_m_per_s", "lateness_s", "cycle_s", "missed")
 
@@ -66,12 +62,12 @@ def measure(
     started_s: float,
     names: Callable[[int], str],
     chain: ChainResult | None,
+    stepped: SteppedAside,
 ) -> DemoResult:
     """Every figure of the run, beside the same cases in stepped time. `names`: of a configuration, by its place."""
-    plant = load_plant(setup.out / "plant.toml")
     found: list[ConfigurationResult] = []
     for config in _configurations(windows):
-        cases = [_case(setup, plant, trace_of(one, evidence), evidence) for one in windows if one.config == config]
+        cases = [_case(stepped, trace_of(one, evidence), evidence) for one in windows if one.config == config]
         found.append(
             ConfigurationResult(name=names(len(found)), law=config.kind, controller=config_hash(config), cases=cases)
         )
@@ -82,7 +78,7 @@ def measure(
         versions={name: version(name) for name in LIBRARIES},
         machine=machine_lines(setup.out / "logs" / "loop.log"),
         configurations=found,
-        truth_rmse_n=_on_truth(setup, plant),
+        truth_rmse_n={case.name: stepped.rmse_n(stepped.on_truth(), case) for case in PAPER},
         chain=chain,
         timing=_timing(setup, evidence.history),
         unsafe_events=evidence.summary["unsafe_events"],
@@ -98,17 +94,6 @@ def _configurations(windows: Sequence[Window]) -> list[Controller]:
         if window.config not in found:
             found.append(window.config)
     return found
-
-
-def _on_truth(setup: Setup, plant: Plant) -> dict[str, float]:
-    """By case what an LQI that is designed on the true line has in stepped time: nobody knows that line better."""
-    config = design_lqi(replace(task_of(setup.line), model=truth_of(plant)))
-    return {case.name: _stepped_rmse_n(setup, config, plant, case) for case in PAPER}
-
-
-def _stepped_rmse_n(setup: Setup, config: Controller, plant: Plant, case: Scenario) -> float:
-    seeds = range(setup.seed, setup.seed + STEPPED_SEEDS)
-    return float(np.mean([run_scenario(setup.line, config, plant, case, seed).rmse_n for seed in seeds]))
 
 
 def read_evidence(setup: Setup, windows: list[Window], world_start_s: float) -> Evidence:
@@ -140,13 +125,13 @@ def _change_s(window: Window, history: Arrays) -> float:
     return float(time_s[during[changed[0]]])
 
 
-def _case(setup: Setup, plant: Plant, trace: CaseTrace, evidence: Evidence) -> CaseResult:
+def _case(stepped: SteppedAside, trace: CaseTrace, evidence: Evidence) -> CaseResult:
     case, recording = trace.window.case, evidence.recording
     tension = recording.tension_n[trace.rows]
     begin_s, end_s = evidence.truth_s[trace.rows][[0, -1]]
     missed = evidence.history["missed"][(evidence.history["time_s"] >= begin_s) & (evidence.history["time_s"] <= end_s)]
     rmse = rmse_n(tension, trace.setpoint_n)
-    stepped_rmse = _stepped_rmse_n(setup, trace.window.config, plant, case)
+    stepped_rmse = stepped.rmse_n(trace.window.config, case)
     return CaseResult(
         name=case.name,
         rmse_n=rmse,

@@ -12,6 +12,7 @@ from gateway.cli.commission_live import TOPICS, LiveGate
 from gateway.cli.demo_cases import MOST_REPEATS, Window, begin_with_repeats, run_with_repeats
 from gateway.cli.demo_line import Setup
 from gateway.cli.demo_operator import DemoFailed, Operator
+from gateway.cli.demo_stepped import SteppedAside
 from gateway.core.controller import Controller, config_hash
 from gateway.core.decisions import ProposalShown
 from gateway.core.deployment import Region
@@ -103,7 +104,7 @@ class Chain:
     commissioned: Commissioned | None = None
 
 
-async def carry_out(operator: Operator, setup: Setup) -> Chain:
+async def carry_out(operator: Operator, setup: Setup, stepped: SteppedAside) -> Chain:
     """On a line that runs. The operator approves what the gate lets through."""
     chain, decided = Chain(), dict[str, int]()
     period_s = setup.line.control.period_s
@@ -122,6 +123,7 @@ async def carry_out(operator: Operator, setup: Setup) -> Chain:
     async def measure(config: Controller, shown: ProposalShown) -> None:
         name = name_of(len({config_hash(window.config) for window in chain.windows}))
         operator.progress.step(f"  kept. {name} is measured: {len(PAPER)} cases of {PAPER[0].duration_s:g} s")
+        stepped.ask(config)
         region = None if shown.verdict is None else shown.verdict.region
         found: list[Window] = []
         for case in PAPER:

@@ -5,10 +5,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from gateway.cli.demo_analysis import STEPPED_SEEDS, CaseTrace, Evidence, trace_of
+from gateway.cli.demo_analysis import CaseTrace, Evidence, trace_of
 from gateway.cli.demo_cases import Window
 from gateway.cli.demo_line import STATED, Setup
 from gateway.cli.demo_result import PAPER_RMSE_N, ChainResult, ChangeResult, DemoResult, paper_improvement_pct
+from gateway.cli.demo_stepped import SEEDS
 from gateway.cli.report import Chart, Page, Section, Series, Table, render_page
 from gateway.core.controller import config_hash
 from gateway.core.scenario import PAPER, Scenario
@@ -128,7 +129,7 @@ def _against_stepped(result: DemoResult) -> Section:
              "unsafe events", "missed periods")  # fmt: skip
     caption = (
         f"RMSE in real time over CANopen and Modbus TCP, and of the same configuration on the same plant in stepped "
-        f"time: the whole cycle without wires and without waiting, mean of {STEPPED_SEEDS} runs."
+        f"time: the whole cycle without wires and without waiting, mean of {SEEDS} runs."
     )
     table = Table(caption, heads, rows, frozenset({2, 3, 4, 7, 8}))
     return Section("In real time against stepped time", tables=(table,))
@@ -197,7 +198,12 @@ def _safety(result: DemoResult, chain: ChainResult) -> Section:
     kinds = tuple((kind.replace("_", " "), str(count)) for kind, count in result.unsafe_events.items())
     names = {one.controller: one.name for one in result.configurations}
     swaps = tuple(
-        (names.get(one.configuration, one.configuration[:12]), f"{one.at_s:.1f}", f"{one.largest_step_nm:.2f}")
+        (
+            names.get(one.configuration, one.configuration[:12]),
+            f"{one.at_s:.1f}",
+            f"{one.largest_step_nm:.2f}",
+            f"{one.before_nm:.2f}",
+        )
         for one in chain.swaps
     )
     audit = chain.audit
@@ -212,7 +218,8 @@ def _safety(result: DemoResult, chain: ChainResult) -> Section:
             Table("Unsafe events at the drives, over the whole run: everything that was watched for.",
                   ("Kind", "Seen"), kinds, frozenset({1})),
             Table("Swaps: the largest change of any drive's torque from one command to the next, in the second around "
-                  "each.", ("Configuration", "at, s", "Torque step, Nm"), swaps, frozenset({1, 2}),
+                  "each, and in the second before that.",
+                  ("Configuration", "at, s", "around it, Nm", "before, Nm"), swaps, frozenset({1, 2, 3}),
                   note=f"Allowed in a period: {chain.step_allowed_nm:g} Nm. The largest of the whole run, in which "
                   f"set-points step: {chain.step_elsewhere_nm:.2f} Nm."),
             Table("The audit, verified after every process had ended (r2rgate audit verify).", ("", ""), facts),

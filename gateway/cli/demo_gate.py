@@ -88,10 +88,13 @@ def _swaps(setup: Setup, evidence: Evidence, steps: Sequence[tuple[FloatArray, F
         SwapResult(
             configuration=str(event.data["hash"]),
             at_s=event.time_s - start_s,
-            largest_step_nm=max(
-                float(sizes[np.abs(time_s - event.time_s) <= 0.5 * AROUND_S].max(initial=0.0))
-                for time_s, sizes in steps
-            ),
+            largest_step_nm=_largest(steps, event.time_s),
+            before_nm=_largest(steps, event.time_s - AROUND_S),
         )
         for event in deployed
     ]
+
+
+def _largest(steps: Sequence[tuple[FloatArray, FloatArray]], at_s: float) -> float:
+    """Within half of `AROUND_S` of `at_s`."""
+    return max(float(sizes[np.abs(time_s - at_s) <= 0.5 * AROUND_S].max(initial=0.0)) for time_s, sizes in steps)

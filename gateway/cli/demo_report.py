@@ -5,10 +5,11 @@ from typing import Any
 
 import numpy as np
 
-from gateway.cli.demo_analysis import STEPPED_SEEDS, CaseTrace, Evidence, trace_of
+from gateway.cli.demo_analysis import CaseTrace, Evidence, trace_of
 from gateway.cli.demo_cases import Window
 from gateway.cli.demo_line import Setup
 from gateway.cli.demo_result import CaseResult, DemoResult
+from gateway.cli.demo_stepped import SEEDS
 from gateway.cli.report import Case, Comparison, EventCount, Machine, Report, RunEvent, Timing, render_report
 
 PLOT_EVERY = 10  #: milliseconds between the samples of a chart
@@ -46,7 +47,7 @@ def page(setup: Setup, result: DemoResult, windows: list[Window], evidence: Evid
             "The controller is designed on the nominal model of the line file, which is wrong on purpose: stiffness, "
             "radius, inertia, friction and span length differ from the simulated line's by 5 to 33 %.",
             *(f"A case was repeated: {stop}" for stop in result.stops),
-            f"In stepped time: the mean of {STEPPED_SEEDS} runs of the whole cycle without wires and without waiting.",
+            f"In stepped time: the mean of {SEEDS} runs of the whole cycle without wires and without waiting.",
         ),
     )
     return render_report(report)

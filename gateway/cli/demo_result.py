@@ -55,6 +55,7 @@ class SwapResult(Strict):
     configuration: str  #: hash
     at_s: float  #: since the first control period on record
     largest_step_nm: float  #: of any drive's torque from one command to the next, in the second around it
+    before_nm: float  #: the same of the second before, in which nothing is swapped
 
 
 class AuditResult(Strict):

@@ -36,8 +36,17 @@ class RollBackNow(Strict):
     comment: Comment = ""
 
 
-Decision = Annotated[Decide | RollBackNow, Field(discriminator="command")]
-DECISION: TypeAdapter[Decide | RollBackNow] = TypeAdapter(Decision)
+class Archive(Strict):
+    """Keep a stored configuration under a name. Puts nothing into service."""
+
+    command: Literal["archive"] = "archive"
+    configuration: Annotated[str, Field(min_length=1, max_length=80)]  #: version, name, or hash or the beginning of it
+    name: Annotated[str, Field(max_length=80)]
+    because: Annotated[str, Field(max_length=1000)]
+
+
+Decision = Annotated[Decide | RollBackNow | Archive, Field(discriminator="command")]
+DECISION: TypeAdapter[Decide | RollBackNow | Archive] = TypeAdapter(Decision)
 
 
 class ListProposals(Strict):

@@ -164,8 +164,7 @@ class Configurations:
     def archive(self, site: str, line: str, id_: str, name: str, time_s: float, who: str, why: str) -> Configuration:
         """Keep a stored configuration under a name. What had the name before has it no longer, but keeps its entry."""
         key, run = (site, line, id_), self._connection.execute
-        if not _NAME.fullmatch(name):
-            raise ConfigurationsError(f"{name!r} is no name; allowed: a letter, then up to 39 letters, digits, _ and -")
+        require_name(name)
         with told(self.path, KIND), transaction(self._connection):
             if not run("SELECT 1 FROM configuration WHERE site = ? AND line = ? AND id = ?", key).get:
                 raise ConfigurationsError(
@@ -219,6 +218,12 @@ class Configurations:
     def _rows(self, columns: str, table: str, where: str, order: str, values: Sequence[str | None]) -> list[Any]:
         query = f"SELECT site, line, id, {columns} FROM {table} WHERE {where} ORDER BY {order}"
         return rows_of(self._connection, query, values)
+
+
+def require_name(name: str) -> None:
+    """Raises ConfigurationsError where nothing can be archived under it."""
+    if not _NAME.fullmatch(name):
+        raise ConfigurationsError(f"{name!r} is no name; allowed: a letter, then up to 39 letters, digits, _ and -")
 
 
 def open_configurations(path: Path) -> Configurations:

@@ -12,7 +12,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from gateway.core.audit_record import Who
 from gateway.core.controller import Controller, ControllerRefused, config_hash, parse_controller
-from gateway.core.decisions import DECISION, QUERY, Decide, ListProposals
+from gateway.core.decisions import DECISION, QUERY, Archive, Decide, ListProposals
 from gateway.core.line import Line
 from gateway.core.messages import Command, Deploy, Event, Keep, Reply, WatchGood, command_bytes
 from gateway.core.proposal import GainsChange, ModelChange, Proposal
@@ -20,6 +20,7 @@ from gateway.core.topics import GATEWAY_DECISION, GATEWAY_PROPOSALS, GATEWAY_PRO
 from gateway.mailbox.port import PEER, Mailbox, Peer, RemoteError
 from gateway.supervisor import configurations as configurations_store
 from gateway.supervisor import models as models_store
+from gateway.supervisor.archiving import archive
 from gateway.supervisor.audit import Audit
 from gateway.supervisor.audit_file import AuditFile, AuditUnavailable
 from gateway.supervisor.audit_writer import NOT_DONE
@@ -250,6 +251,10 @@ class Gate:
             if decision.script:
                 who = who.model_copy(update={"name": f"{decision.script}, run by {who.name}"})
             reply = await self.deployer.decide(decision, who)
+        elif isinstance(decision, Archive):
+            assert self._stores is not None  # they are open before the gate is
+            line, now_s = self._line, self._wall_clock()
+            reply = await archive(self._audit, self._stores[0], line.site, line.line, decision, who, now_s)
         else:
             reply = await self.deployer.roll_back(decision.comment, who)
         self._note("decision", f"{who.name}: {reply.text}", ok=reply.ok, reasons=reply.reasons)

@@ -1,6 +1,7 @@
 """`r2rgate audit`, `configurations` and `baselines` as a user runs them."""
 
 import json
+import os
 import shutil
 from pathlib import Path
 
@@ -133,6 +134,21 @@ def test_configurations_are_listed_shown_compared_and_archived(tmp_path: Path) -
         storage.store(*SITE, controller(0.011), Origin(2.0, "refine", "later", parent=first.id))
     code, said, err = r2rgate("configurations", "archive", "1", "--because", "it held", *data)
     assert code == 0 and "phi_stable: version 1" in said, err
+    _, said, _ = r2rgate("audit", "show", "--kind", "archived", "--json", *data)
+    (one,) = json.loads(said)
+    assert one["record"]["what"] == {
+        "configuration": first.id,
+        "version": 1,
+        "name": "phi_stable",
+        "because": "it held",
+    }
+    assert one["record"]["who"]["uid"] == os.getuid() and r2rgate("audit", "verify", *data)[0] == 0
+    for name, why in (("3", "is no name"), ("other", "another process writes the audit")):
+        writer = AuditWriter(tmp_path)
+        writer.lock()
+        code, _, err = r2rgate("configurations", "archive", "1", "--name", name, "--because", "x", *data)
+        writer.close()
+        assert code == 2 and "nothing was archived" in err and why in err
     code, said, _ = r2rgate("configurations", "list", *data)
     assert code == 0 and "phi_stable" in said and "v2" in said and first.id[:8] in said
     code, said, _ = r2rgate("configurations", "list", "--archived", "--json", *data)

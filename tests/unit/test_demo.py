@@ -1,0 +1,175 @@
+"""The demonstration without its processes: its line, its side of the gate, its tables and its page."""
+
+import asyncio
+import json
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from gateway.cli import demo_line
+from gateway.cli.demo_analysis import Evidence
+from gateway.cli.demo_cases import Window
+from gateway.cli.demo_chain import Measured, beyond, name_of
+from gateway.cli.demo_chain_page import page
+from gateway.cli.demo_chain_table import print_chain
+from gateway.cli.demo_line import Setup, line_text
+from gateway.cli.demo_operator import DemoFailed
+from gateway.cli.demo_result import DemoResult, paper_improvement_pct
+from gateway.control.design import design_lqi, task_of
+from gateway.core.controller import config_hash
+from gateway.core.deployment import Region
+from gateway.core.line_file import load_line
+from gateway.core.proposal import GainsChange
+from gateway.core.scenario import PAPER
+from sim_plant.recording import Recording
+from tests.unit.test_report import Page
+
+LINE = load_line(line_text(41000, 41001), "line.toml")
+CONFIGS = [
+    design_lqi(replace(task_of(LINE), unwind_speed_m_per_s=0.01 * k)).model_copy(update={"antiwindup": 0.1 * k})
+    for k in (1, 2, 3)
+]
+
+
+def test_its_line_says_what_it_states_and_nothing_else_of_the_template_is_lost(monkeypatch):
+    gate = LINE.gate
+    assert (gate.first_speed_max_m_per_s, gate.first_step_max_n, gate.probation_s) == (0.1, 24.0, 10.0)
+    assert {roller.friction_nms_per_rad.tolerance for roller in LINE.rollers} == {0.6}
+    assert (gate.cool_down_s, gate.first_corner_share, gate.autonomy) == (30.0, 0.4, "approve-all")
+    assert "port = 41000" in line_text(41000, 41001) and all(why in line_text(1, 2) for *_, why in demo_line.STATED)
+    monkeypatch.setattr(demo_line, "STATED", (("# no such key = 1", "x = 1", "because"),))
+    with pytest.raises(DemoFailed, match="no such key"):
+        line_text(1, 2)
+
+
+@pytest.mark.parametrize(
+    ("region", "said"),
+    [
+        (Region(), ("", "")),
+        (Region(speed_max_m_per_s=0.1, tension_step_max_n=24.0, speed_step_max_m_per_s=0.09), ("", "")),
+        (Region(speed_max_m_per_s=0.0999), ("", "the speed is 0.1 m/s")),
+        (Region(tension_step_max_n=23.9), ("the step of tension is 24 N", "")),
+        (Region(speed_step_max_m_per_s=0.0899), ("", "the step of speed is 0.09 m/s")),
+    ],
+)
+def test_a_case_runs_only_on_what_was_judged_for_it(region, said):
+    for case, begins in zip(PAPER, said, strict=True):
+        found = beyond(case, region)
+        assert found.startswith(begins) and bool(found) == bool(begins)
+
+
+class Side:
+    """A gate with these proposals; `wait_for` and `ready` are noted."""
+
+    def __init__(self, *shown):
+        self.shown, self.done = list(shown), []
+
+    async def proposals(self):
+        return self.shown
+
+    async def ready(self):
+        self.done.append("ready")
+
+    async def wait_for(self, proposal):
+        self.done.append(f"waited for {proposal}")
+
+
+def shown_as(hash_, stage, config=None):
+    change = SimpleNamespace() if config is None else GainsChange(controller=config)
+    return SimpleNamespace(proposal_hash=hash_, stage=stage, proposal=SimpleNamespace(change=change), verdict=None)
+
+
+def test_each_configuration_that_is_kept_is_measured_once_and_before_the_chain_goes_on():
+    side = Side(shown_as("a", "refused", CONFIGS[0]))
+
+    async def measure(config, shown):
+        side.done.append(f"measured {shown.proposal_hash}")
+
+    async def decide(shown):
+        side.done.append(f"decided {shown.proposal_hash}")
+
+    async def run():
+        measured = Measured(side, decide, measure, side.done.append)
+        await measured.ready()
+        side.shown += [shown_as("b", "kept", CONFIGS[1]), shown_as("c", "done"), shown_as("d", "kept")]
+        await measured.ready()
+        side.shown.append(shown_as("e", "waiting", CONFIGS[2]))
+        await measured.wait_for("e")
+        side.shown[-1].stage = "probation"
+        await measured.wait_for("e")
+        await measured.wait_for("e")
+        side.shown += [shown_as("f", "kept", CONFIGS[1])]  # the same, judged for more
+        await measured.measure_kept()
+
+    asyncio.run(run())
+    assert side.done == [
+        "ready", "measured b", "ready", "decided e", "  it controls the line, on probation", "waited for e",
+        "waited for e",
+    ]  # fmt: skip
+
+
+def example() -> DemoResult:
+    """The published one, of the configurations here."""
+    with open("docs/examples/demo-result.json", encoding="utf-8") as file:
+        document = json.load(file)
+    for one, config in zip(document["configurations"], CONFIGS, strict=True):
+        one["controller"] = config_hash(config)
+    return DemoResult.model_validate_json(json.dumps(document))
+
+
+def test_improvements_are_from_one_configuration_to_the_next_here_and_in_the_paper():
+    result = example()
+    first, second = (result.rmse_n(k, "tension") for k in (0, 1))
+    assert first is not None and second is not None
+    assert result.improvement_pct(0, "tension") is None
+    assert result.improvement_pct(1, "tension") == pytest.approx(100.0 * (first - second) / first)
+    assert paper_improvement_pct("Adapt1", "tension") == pytest.approx(39.59, abs=0.01)
+    assert paper_improvement_pct("Adapt2", "velocity") == pytest.approx(43.18, abs=0.01)
+    assert paper_improvement_pct("Initial", "velocity") is None and paper_improvement_pct("Adapt3", "tension") is None
+    assert [name_of(k) for k in range(3)] == ["Initial", "Adapt1", "Adapt2"]
+
+
+def test_the_table_fits_a_terminal_and_says_who_approved():
+    console = Console(width=80, record=True, file=open("/dev/null", "w", encoding="utf-8"))  # noqa: SIM115
+    result = example()
+    print_chain(result, console)
+    console.file.close()
+    text = console.export_text()
+    assert result.chain is not None and result.chain.audit.head in text and "scripted operator (demo)" in text
+    table = text[: text.index("on truth:")]
+    assert "…" not in table and "paper" in table and max(map(len, table.splitlines())) <= 80
+    assert f"{result.rmse_n(1, 'velocity'):.3f}" in table and "-39.6%" in table
+
+
+def test_the_page_holds_every_figure_and_a_case_that_was_not_run(tmp_path):
+    """On 20 s of a line that stands, but for the set-points of the tension case, three times."""
+    result, n, periods = example(), LINE.n, 6000
+    time_s = np.arange(periods * 10) * 1e-3
+    setpoint = np.tile(PAPER[0].tension_n, (periods, 1))
+    windows = []
+    for k, config in enumerate(CONFIGS):
+        setpoint[2000 * k + 100 : 2000 * k + 1600] = PAPER[0].tension_end_n
+        windows.append(Window(PAPER[0], config, 20.0 * k, 20.0 * k + 15.5))
+    still = np.zeros((periods * 10, n))
+    recording = Recording(n, time_s, np.repeat(setpoint, 10, axis=0), still, still, np.full(periods * 10, 0.01), [])
+    history = {
+        "time_s": np.arange(periods) * 1e-2,
+        "tension_setpoint_n": setpoint,
+        "speed_setpoint_m_per_s": np.full(periods, 0.01),
+    }
+    evidence = Evidence(recording, time_s, history, {"plant": "s-real"})
+    shown = Page(page(Setup(tmp_path, LINE, CONFIGS[0], 1), result, windows, evidence))
+    assert shown.open == []
+    for one in result.configurations:
+        assert all(
+            f"{case.rmse_n:.4f}" in shown.words and f"{case.ratio_to_stepped:.3f}" in shown.words for case in one.cases
+        )
+    assert "It was not run." in shown.words and "scripted operator (demo)" in shown.words
+    chain = result.chain
+    assert chain is not None and chain.audit.head in shown.words
+    refused = [text for one in chain.changes for text in one.against]
+    assert refused and all(text in shown.words for text in refused)
+    assert all(why in shown.words for *_, why in demo_line.STATED)
