@@ -27,7 +27,6 @@ from gateway.commissioning.chain import (
 )
 from gateway.core.controller import config_hash
 from gateway.core.decisions import ProposalShown
-from gateway.core.deployment import Region
 from gateway.core.line import Line
 from gateway.core.line_model import model_hash
 from gateway.core.messages import Reply
@@ -129,7 +128,7 @@ async def _propose(
     line, now, recordings = changes.line, await side.now(), await side.recordings()
     _require_slow(line, step, now)
     try:
-        change, reason = await asyncio.to_thread(changes.made, step, now, recordings, _region(shown))
+        change, reason = await asyncio.to_thread(changes.made, step, now, recordings)
     except NotOffered as refused:
         tell(f"{step.step}, candidate {step.rung + 1}: cannot be made: {refused}")
         unmade.append((len(shown), Past(KINDS[step.step], Outcome.FAILED, step.step, step.rung, str(refused))))
@@ -162,12 +161,6 @@ def _require_slow(line: Line, step: Next, now: LineNow) -> None:
             f"the line shall run at {now.speed_m_per_s:g} m/s, and a first configuration is judged up to {first:g} m/s "
             f"(gate.first_speed_max_m_per_s): `r2rgate speed {first:g}`, then go on"
         )
-
-
-def _region(shown: Sequence[ProposalShown]) -> Region | None:
-    """Of the configuration that was kept last."""
-    kept = [one.verdict for one in shown if one.proposal.kind == "gains" and one.stage == "kept"]
-    return kept[-1].region if kept and kept[-1] is not None else None
 
 
 def _merged(shown: Sequence[ProposalShown], unmade: Sequence[tuple[int, Past]]) -> list[Past]:

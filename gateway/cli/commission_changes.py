@@ -10,7 +10,6 @@ from gateway.commissioning.candidates import FIRST_LAWS, Law, NotOffered, config
 from gateway.commissioning.chain import AS_IT_IS, Next, Step
 from gateway.commissioning.redesign import redesigns
 from gateway.core.controller import Controller
-from gateway.core.deployment import Region
 from gateway.core.line import Line
 from gateway.core.line_model import LineModel, ModelRefused, model_hash
 from gateway.core.proposal import Change, ExperimentChange, GainsChange, ModelChange
@@ -44,15 +43,13 @@ class Changes:
         self.line = line
         self._designed: tuple[LineNow, list[tuple[Law, Controller]]] | None = None  #: and what it was designed from
 
-    def made(
-        self, step: Next, now: LineNow, recordings: Sequence[Recording], region: Region | None
-    ) -> tuple[Change, str]:
+    def made(self, step: Next, now: LineNow, recordings: Sequence[Recording]) -> tuple[Change, str]:
         """The change, and the reason for it. `recordings`: the newest first. Raises NotOffered."""
         match step.step:
             case Step.FIRST:
                 return self._first(step)
             case Step.EXPERIMENT:
-                return self._experiment(step, now, region)
+                return self._experiment(step, now)
             case Step.MODEL:
                 return self._model(step, now, recordings)
             case Step.REDESIGN:
@@ -63,11 +60,10 @@ class Changes:
         controller = configuration(self.line, None, first_speed_m_per_s(self.line), law)
         return GainsChange(controller=controller), f"{law.text} on the line's file, to begin with"
 
-    def _experiment(self, step: Next, now: LineNow, region: Region | None) -> tuple[Change, str]:
-        """Before there is a model within the region of the configuration in service, which is all that is known."""
+    def _experiment(self, step: Next, now: LineNow) -> tuple[Change, str]:
         asked = experiment(
-            self.line, now.model, now.in_service, region if now.model is None else None, now.tension_n,
-            now.speed_m_per_s, step.speeds_m_per_s, step.size, seed=step.number,
+            self.line, now.model, now.in_service, now.tension_n, now.speed_m_per_s, step.speeds_m_per_s, step.size,
+            seed=step.number,
         )  # fmt: skip
         speeds = " and ".join(f"{speed:.3g}" for speed in step.speeds_m_per_s)
         moves = f"set-points move by {max(asked.amplitude_n):g} N for {asked.duration_s:g} s"
