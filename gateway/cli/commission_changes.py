@@ -56,7 +56,7 @@ class Changes:
             case Step.FIRST:
                 return self._first(step, now)
             case Step.EXPERIMENT:
-                return self._experiment(step, now, region)
+                return self._experiment(step, now)
             case Step.MODEL:
                 return self._model(step, now, recordings)
             case Step.REDESIGN:
@@ -80,20 +80,18 @@ class Changes:
 
     def _first(self, step: Next, now: LineNow) -> tuple[Change, str]:
         """One under which an experiment can be designed: without, the chain would end there."""
-        law, speed, gate = FIRST_LAWS[step.rung], first_speed_m_per_s(self.line), self.line.gate
+        law, speed = FIRST_LAWS[step.rung], first_speed_m_per_s(self.line)
         controller = configuration(self.line, None, speed, law)
-        region = Region(speed_max_m_per_s=speed, tension_step_max_n=gate.first_step_max_n)
         try:
-            experiment(self.line, None, controller, region, now.tension_n, now.speed_m_per_s, first_legs(speed))
+            experiment(self.line, None, controller, now.tension_n, now.speed_m_per_s, first_legs(speed))
         except NotOffered as refused:
             raise NotOffered(f"{law.text}: under it no experiment can be designed: {refused}") from refused
         return GainsChange(controller=controller), f"{law.text} on the line's file, to begin with"
 
-    def _experiment(self, step: Next, now: LineNow, region: Region | None) -> tuple[Change, str]:
-        """Before there is a model within the region of the configuration in service, which is all that is known."""
+    def _experiment(self, step: Next, now: LineNow) -> tuple[Change, str]:
         asked = experiment(
-            self.line, now.model, now.in_service, region if now.model is None else None, now.tension_n,
-            now.speed_m_per_s, step.speeds_m_per_s, step.size, seed=step.number,
+            self.line, now.model, now.in_service, now.tension_n, now.speed_m_per_s, step.speeds_m_per_s, step.size,
+            seed=step.number,
         )  # fmt: skip
         speeds = " and ".join(f"{speed:.3g}" for speed in step.speeds_m_per_s)
         moves = f"set-points move by {max(asked.amplitude_n):g} N for {asked.duration_s:g} s"

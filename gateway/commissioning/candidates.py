@@ -8,18 +8,28 @@ import numpy as np
 from gateway.commissioning.architectures import ARCHITECTURES
 from gateway.commissioning.belief import believing
 from gateway.control.design import DesignRefused, DesignTask, margins, require_margin, task_of, task_on
+from gateway.control.mpc_linear import unconstrained
+from gateway.control.rollout import Course, Setup, plants_of_thetas, simulate
 from gateway.core.controller import Controller
-from gateway.core.deployment import Region
-from gateway.core.experiment import Experiment, ExperimentRefused
+from gateway.core.controller_laws import MpcConfig
+from gateway.core.experiment import Experiment, ExperimentRefused, course
 from gateway.core.line import Line
 from gateway.core.line_model import LineModel, noise_of, theta_of
+from gateway.core.signals import FloatArray
+from gateway.core.theta import nominal_theta
 from gateway.core.web_model import equilibrium_torque, reference_speeds
 from gateway.identification.experiment_design import design_experiment
+from safety.limits import envelope_limits
 
 HELD = 0.9  #: of the torque limit: more leaves no room to move
 LEFT_OPEN = 0.05  #: of a value that was found: what data leave open, and what drifts
 NEAR = 0.98  #: of the speed that is wanted, which is as good
 GRID = 20  #: parts of the greatest speed that are looked at
+#: Of what rollers may run ahead of the web in an experiment: the gate looks at more than the mean, under stress.
+AHEAD_BY_MODEL, AHEAD_BY_FILE = 0.7, 0.5
+SLOWER = 5  #: times that an experiment's ramps are made slower, until it keeps that
+LEVEL = 1.25  #: times the way from level to level: a dwell
+LONGEST_STEP_S = 0.005  #: of the integration
 
 
 class NotOffered(Exception):
@@ -73,21 +83,21 @@ def experiment(
     line: Line,
     model: LineModel | None,
     in_service: Controller,
-    region: Region | None,
     tension_n: Sequence[float],
     speed_m_per_s: float,
     speeds_m_per_s: Sequence[float],
     size: float = 1.0,
     seed: int = 0,
 ) -> Experiment:
-    """With legs at `speeds_m_per_s`, from set-points (n,) and a speed, with steps that `region` permits.
+    """With legs at `speeds_m_per_s`, from set-points (n,) and a speed.
 
-    `size`: times the amplitude that it is designed with. Raises NotOffered.
+    Before there is a model with moves as a first configuration is judged for. `size`: times the amplitude that it is
+    designed with. Raises NotOffered.
     """
     believed = line if model is None else believing(line, theta_of(model), LEFT_OPEN)
     step_n = line.limits.tension_step_max_n
-    if region is not None and region.tension_step_max_n is not None:
-        step_n = min(step_n, region.tension_step_max_n)
+    if model is None:
+        step_n = min(step_n, line.gate.first_step_max_n)
     narrowed = believed.model_copy(update={"limits": line.limits.model_copy(update={"tension_step_max_n": step_n})})
     try:
         designed = design_experiment(
@@ -96,7 +106,8 @@ def experiment(
         )  # fmt: skip
     except ExperimentRefused as refused:
         raise NotOffered(str(refused)) from refused
-    return _sized(designed.experiment, size, step_n)
+    asked = _sized(designed.experiment, size, step_n)
+    return _slow_rollers(line, model, in_service, asked, np.array(tension_n), speed_m_per_s)
 
 
 def fastest_m_per_s(line: Line, model: LineModel | None) -> float:
@@ -121,6 +132,62 @@ def fastest_m_per_s(line: Line, model: LineModel | None) -> float:
         if max(float(np.abs(torque).max()) for torque in torques) + coulomb_nm <= HELD * line.limits.torque_nm:
             return speed
     return most / GRID
+
+
+def _slow_rollers(
+    line: Line,
+    model: LineModel | None,
+    in_service: Controller,
+    asked: Experiment,
+    tension_n: FloatArray,
+    speed_m_per_s: float,
+) -> Experiment:
+    """Set-points go to their levels so slowly that rollers run no farther ahead of the web than the gate lets them.
+
+    Ramps, where steps are too quick: smaller steps would tell less. Raises NotOffered.
+    """
+    speeds = [speed_m_per_s if leg.speed_m_per_s is None else leg.speed_m_per_s for leg in asked.legs]
+    web = max(speed_m_per_s, *speeds)
+    ahead = envelope_limits(line).roller_speed_watched_m_per_s - web
+    ahead *= AHEAD_BY_FILE if model is None else AHEAD_BY_MODEL
+    theta = nominal_theta(line) if model is None else theta_of(model)
+    # All spans together, and the last roller has to follow them all: dv = sum of L / EA dT/dt.
+    stretch_s = float(theta.web.length_m[np.array(asked.amplitude_n) > 0.0].sum()) / theta.web.stiffness_n
+    rate = min(ahead / stretch_s, line.moves.tension_rate_n_per_s)
+    for _ in range(SLOWER):
+        found = _fastest_roller(line, model, in_service, asked, tension_n, speed_m_per_s) - web
+        if found <= ahead:
+            return asked
+        if asked.rate_n_per_s is not None:
+            rate *= ahead / found
+        way_s = 2.0 * max(asked.amplitude_n) / rate
+        asked = asked.model_copy(update={"rate_n_per_s": rate, "dwell_s": max(asked.dwell_s, LEVEL * way_s)})
+    raise NotOffered(f"at {web:.3g} m/s rollers would run too far ahead of the web, however slowly tensions move")
+
+
+def _fastest_roller(
+    line: Line,
+    model: LineModel | None,
+    in_service: Controller,
+    asked: Experiment,
+    tension_n: FloatArray,
+    speed_m_per_s: float,
+) -> float:
+    """On the mean of what is believed, without noise."""
+    period_s, limits = line.control.period_s, line.limits
+    rows = list(course(asked, tension_n, speed_m_per_s, period_s))
+    speeds, now, reach = np.empty(len(rows)), speed_m_per_s, line.moves.speed_rate_m_per_s2 * period_s
+    for k, (_, goal) in enumerate(rows):
+        now += min(max(goal - now, -reach), reach)
+        speeds[k] = now
+    theta = nominal_theta(line) if model is None else theta_of(model)
+    setup = Setup(
+        period_s=period_s, latency_s=0.0, substeps=max(1, int(np.ceil(period_s / LONGEST_STEP_S - 1e-9))),
+        torque_nm=limits.torque_nm, torque_rate_nm_per_s=limits.torque_rate_nm_per_s,
+    )  # fmt: skip
+    law = unconstrained(in_service) if isinstance(in_service, MpcConfig) else in_service
+    moves = Course(np.array([tension for tension, _ in rows]), speeds)
+    return float(simulate(law, plants_of_thetas([theta]), moves, setup).roller_speed_max_m_per_s.max())
 
 
 def _task(line: Line, model: LineModel | None) -> DesignTask:

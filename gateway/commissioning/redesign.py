@@ -23,8 +23,8 @@ from gateway.core.line_model import LineModel, noise_of, theta_of
 from gateway.core.signals import FloatArray
 from gateway.core.theta import Noise
 
-#: None quicker than the design's own weights: those track better on the model, and their rollers overshoot so far in
-#: speed that the line stops itself, which the gate does not simulate.
+#: None quicker than the design's own weights: those track better on the model, and their rollers run so far ahead that
+#: the loop lets only small steps happen.
 LAWS = (
     *(
         Law("lqi", (("torque_per_nm2", torque), ("integral_per_n2s2", integral)))

@@ -10,7 +10,7 @@ from gateway.control.design.task import task_on
 from gateway.core.controller import config_hash
 from gateway.core.deployment import Deployment
 from gateway.core.doubts import Doubt
-from gateway.core.messages import Deploy, Keep, SetTension
+from gateway.core.messages import Deploy, Keep, SetSpeed, SetTension
 from gateway.core.states import LoopState, Phase
 from gateway.core.theta import Theta
 from safety.recovery_prediction import recovery_prediction
@@ -122,4 +122,50 @@ def test_the_largest_step_of_a_kept_configuration_is_left_alone():
     step_n = LINE.limits.tension_step_max_n
     assert loop.command(SetTension(span=3, tension_n=TENSION_N[2] + step_n, step=True)).ok
     loop.step(250)
+    assert loop.cycle.machine.phase is Phase.RUNNING and not loop.alarms
+
+
+def kept_at(speed_m_per_s, line=LINE):
+    loop = SteppedLoop(line, GOOD, PLANT, 3)
+    loop.begin_in_production(TENSION_N, speed_m_per_s)
+    loop.step(20)
+    watch = recovery_prediction(THETA, GOOD, line, [0.01, 0.05, 0.1])
+    deploy(loop, GOOD, watch)
+    assert loop.command(Keep(epoch=1, watch=watch)).ok
+    return loop
+
+
+def slow_line():
+    """Whose rollers give way at 0.102 m/s, and are watched from there on."""
+    return LINE.model_copy(update={"limits": LINE.limits.model_copy(update={"speed_max_m_per_s": 0.08})})
+
+
+def test_a_step_that_makes_a_roller_too_fast_is_refused_and_a_smaller_one_done():
+    loop = kept_at(0.08, slow_line())
+    large = SetTension(span=3, tension_n=TENSION_N[2] + LINE.limits.tension_step_max_n, step=True)
+    refused = loop.command(large)
+    assert not refused.ok and "would come to 0.1" in refused.text and "a ramp at any time" in refused.text
+    assert loop.command(large.model_copy(update={"tension_n": TENSION_N[2] + 3.0})).ok
+    loop.step(100)
+    assert loop.cycle.machine.phase is Phase.RUNNING and not loop.alarms
+    assert loop.command(large.model_copy(update={"step": False})).ok
+    forced = kept_at(0.08, slow_line())
+    forced.cycle.setpoints.step_tension(2, large.tension_n, forced.now_s)
+    forced.step(50)
+    assert forced.cycle.machine.state is LoopState.STOP and "roller" in forced.cycle.machine.reason
+
+
+def test_a_step_of_the_speed_is_foreseen_too():
+    loop = kept_at(0.01, slow_line())
+    refused = loop.command(SetSpeed(speed_m_per_s=0.08, step=True))
+    assert not refused.ok and "would come to" in refused.text
+    assert loop.command(SetSpeed(speed_m_per_s=0.04, step=True)).ok
+    loop.step(100)
+    assert loop.cycle.machine.phase is Phase.RUNNING and not loop.alarms
+
+
+def test_the_papers_step_of_the_speed_is_let_happen():
+    loop = kept_at(0.01)
+    assert loop.command(SetSpeed(speed_m_per_s=0.1, step=True)).ok
+    loop.step(200)
     assert loop.cycle.machine.phase is Phase.RUNNING and not loop.alarms

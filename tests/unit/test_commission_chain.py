@@ -264,12 +264,21 @@ def test_the_line_goes_as_fast_as_its_drives_hold():
     assert roller.friction_nms_per_rad.value * omega_per_s < 0.9 * 20.0
 
 
-def test_an_experiment_keeps_to_the_region_and_is_refused_where_it_cannot():
+def test_a_first_experiment_keeps_to_the_steps_of_a_first_configuration_and_is_refused_where_it_cannot():
     config = configuration(LINE, None, 0.02, FIRST_LAWS[0])
-    region = Region(speed_max_m_per_s=0.02, tension_step_max_n=2.0)
-    given = (LINE, None, config, region, LINE.recipes[0].tension_n, 0.01)
+    given = (LINE, None, config, LINE.recipes[0].tension_n, 0.01)
     found = experiment(*given, [0.01, 0.02], size=8.0)
-    assert found.step_max_n == 2.0 and [leg.speed_m_per_s for leg in found.legs] == [0.01, 0.02]
-    assert found.abort.deviation_n > max(found.amplitude_n)
+    assert found.step_max_n == LINE.gate.first_step_max_n and [leg.speed_m_per_s for leg in found.legs] == [0.01, 0.02]
+    assert found.abort.deviation_n > max(found.amplitude_n) and found.rate_n_per_s is None
     with pytest.raises(NotOffered, match="allowed"):
         experiment(*given, [0.01, 2.0 * LINE.limits.speed_max_m_per_s])
+
+
+def test_on_a_slow_line_set_points_of_an_experiment_move_on_ramps():
+    """The rollers of a line for 0.03 m/s may run ahead of the web by no more than 0.018 m/s at 0.02 m/s."""
+    slow = LINE.model_copy(update={"limits": LINE.limits.model_copy(update={"speed_max_m_per_s": 0.03})})
+    config = configuration(slow, None, 0.02, FIRST_LAWS[0])
+    found = experiment(slow, None, config, LINE.recipes[0].tension_n, 0.01, [0.01, 0.02])
+    assert found.rate_n_per_s is not None and 1.0 < found.rate_n_per_s < LINE.moves.tension_rate_n_per_s
+    assert found.dwell_s > 2.0 * max(found.amplitude_n) / found.rate_n_per_s
+    assert max(found.amplitude_n) > 0.5
