@@ -17,7 +17,7 @@ $(VENV)/.ready: requirements.lock pyproject.toml deploy/setup-venv.sh
 
 setup: $(VENV)/.ready ## the virtual environment in .venv, from requirements.lock
 
-run: setup ## set up, then the demonstration: simulated line, loop and gateway in real time (ARGS="--help")
+run: setup ## set up, then the demonstration: a line adapted through the gate, in real time (about 5 min; ARGS="--quick")
 	@exec $(RUN) demo $(ARGS)
 
 test: setup ## set up, then all tests: those about time itself alone, the others on every core

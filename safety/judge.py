@@ -4,12 +4,15 @@ The same bytes, context, line, recordings and seed give the same verdict. A rule
 """
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import replace
 from hashlib import sha256
 from importlib.metadata import version
 
 import numpy as np
 
 from gateway.control.design import design_lqi, task_of
+from gateway.control.prediction import Unpredictable, predict, stretch_of
 from gateway.control.rollout import course_through, simulate
 from gateway.core.deployment import Region
 from gateway.core.judge_context import JudgeContext, context_hash
@@ -67,6 +70,27 @@ def warm_up(line: Line) -> None:
     plants = plants_under_stress([nominal_theta(line)], line.gate, 0)
     course = course_through(line.control.period_s, [(0.1, np.array(line.recipes[0].tension_n), 0.01)], 0.05)
     simulate(config, plants, course, setup_of(line, Noise(), 0, line.gate.stress_late_share))
+    _predict_standing(line)
+
+
+def _predict_standing(line: Line) -> None:
+    """The predictor, on a second of a line at its first recipe, with rollers that are round and with others.
+
+    Whatever judges a model, or is judged by one, needs it. Compiled with the first such verdict, which has its time
+    limit, it would refuse that on a new machine.
+    """
+    recipe, samples, n = line.recipes[0], round(1.0 / line.control.period_s), line.n
+    tension, speed = np.tile(np.array(recipe.tension_n), (samples, 1)), np.full(samples, recipe.speed_m_per_s)
+    nothing = np.zeros((samples, n))
+    standing = Recording(
+        time_s=np.arange(samples) * line.control.period_s, tension_n=tension, tension_setpoint_n=tension,
+        speed_m_per_s=nothing + speed[:, None], torque_nm=nothing, torque_actual_nm=nothing, unwind_speed_m_per_s=speed,
+        controlled=np.ones(samples, dtype=np.bool_), period_s=line.control.period_s, source="warming up",
+    )  # fmt: skip
+    round_ = nominal_theta(line)
+    with suppress(Unpredictable):  # then no verdict predicts either
+        for theta in (round_, replace(round_, eccentricity=np.full(n, 0.001))):
+            predict(theta, Noise(), stretch_of(standing))
 
 
 def _asked(rule: Rule, case: Case) -> list[RuleFinding]:

@@ -25,6 +25,11 @@ if TYPE_CHECKING:
     from gateway.cli.demo_stepped import SteppedAside
 
 READY_TIME_S = 20.0
+OPENING = """From a line's file to adapted configurations, each change through the gate, on a simulated line that runs.
+Some five minutes; the first time on a computer some more, to compile. Ctrl-C brings the line to rest and ends all."""
+OPENING_QUICK = (
+    "Both cases on one configuration, without the gate: some 45 s. Ctrl-C brings the line to rest and ends all."
+)
 NOT_REACHED = "the chain has ended before its aim: {}. The report says which rule refused what, and by how much"
 
 
@@ -35,6 +40,7 @@ def run_demo(out: Path, seed: int, quick: str | None) -> int:
     """
     console = Console(highlight=False)
     started_s = time.monotonic()
+    console.print(OPENING if quick is None else OPENING_QUICK, markup=False)
     try:
         clear(out)
         with Children(out / "logs") as children:

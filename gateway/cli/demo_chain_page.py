@@ -110,8 +110,8 @@ def _beside_the_paper(result: DemoResult) -> Section:
         "RMSE: root of the time mean of the squared 2-norm of the tension error over all spans. Change: against the "
         "configuration in the row before.",
         tuple(heads), tuple(rows), frozenset(range(1, len(heads))), tuple(foot),
-        "The paper does not state noise, limits, period and integration step, and no controller can reach its figures "
-        "with a literal step at the effort it states: compare the changes, not the numbers.",
+        "The paper does not state noise, limits, period and integration step. Within the limits of these drives no "
+        "controller comes near its numbers with a literal step (make bench-control): compare the changes.",
     )  # fmt: skip
     return Section("Initial, Adapt1, Adapt2 beside the paper", tables=(table,))
 

@@ -34,6 +34,11 @@ class GateLine(WireLine):
         super().__init__(folder, seed, spans, f"probation_s = {probation_s}\ncool_down_s = 0.5")
 
     @property
+    def data(self) -> Path:
+        """Audit, stores and history."""
+        return self.folder / "data"
+
+    @property
     def first(self) -> Controller:
         return parse_controller((self.folder / "controller.json").read_bytes())
 

@@ -43,7 +43,12 @@ def test_a_proposal_is_judged_approved_runs_is_kept_and_another_is_taken_back(li
     said = line.command("approve", proposal[:12], "--yes", "--comment", "a test")
     assert "on probation" in said and "no model is accepted" in said
     assert line.in_service() == config_hash(better)
+    assert f"Gains {proposal[:12]} on probation since" in line.command("status")
     line.until(proposal, "kept")
+    said = line.command(
+        "configurations", "archive", config_hash(better), "--because", "a test", "--data-dir", line.data
+    )
+    assert said.startswith("phi_stable")
     assert proposal[:12] in line.command("proposals")
     again = line.approved(line.first)
     assert line.shown(again).why.startswith("not kept yet")
@@ -60,6 +65,7 @@ def test_a_proposal_is_judged_approved_runs_is_kept_and_another_is_taken_back(li
     assert np.abs(recording.tension_n[here] - tension_n).max() < NEAR_N
     assert not any(line.unsafe().values()), line.unsafe()
     assert "sound" in line.audit("verify")
+    assert config_hash(better) in line.audit("show", "--kind", "archived")
     told = line.audit("show", "--id", proposal[:12])
     kinds = ["proposed", "accepted", "approved", "deploying", "deployed", "keeping", "kept"]
     places = [told.index(f"  {kind}  by ") for kind in kinds]

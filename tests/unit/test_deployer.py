@@ -68,10 +68,11 @@ class Gateway:
         await self.deployer.judged()
         return reply
 
-    async def decide(self, one, approve=True, shown=None):
+    async def decide(self, one, approve=True, shown=None, script=""):
         view = self.deployer.shown(hash_of(one))
         hash_ = shown or (view.shown if not isinstance(view, str) else None) or "0" * 64
-        return await self.deployer.decide(Decide(proposal=hash_of(one), shown=hash_, approve=approve), ANNA)
+        decision = Decide(proposal=hash_of(one), shown=hash_, approve=approve, script=script)
+        return await self.deployer.decide(decision, ANNA)
 
     def stage(self, one) -> Stage:
         return self.deployer.book.entries[hash_of(one)].stage
@@ -208,6 +209,20 @@ async def test_small_changes_pass_by_their_verdict_once_a_person_has_approved_on
 
 
 @run
+async def test_what_a_script_approves_is_carried_out_and_trusted_as_no_persons_word():
+    gateway = await started(TRUSTING)
+    one = proposal(1, config_hash(FIRST), 0.0)
+    await gateway.propose(one)
+    assert (await gateway.decide(one, script="a demonstration")).ok
+    await gateway.pass_time(PROBATION_S + 1.0)
+    assert gateway.stage(one) is Stage.KEPT
+    assert [what["by"] for kind, what in gateway.audit.records if kind == "approved"] == ["script"]
+    small = await offered(gateway, 2)
+    assert gateway.stage(small) is Stage.WAITING
+    assert "no person has approved" in gateway.deployer.shown(hash_of(small)).why
+
+
+@run
 async def test_after_a_rollback_a_person_decides_again():
     gateway = await kept_one_by_hand()
     gateway.surroundings.against = "tension 1 swings"
@@ -311,10 +326,13 @@ async def test_what_has_not_shown_enough_stays_on_probation_and_says_so():
     gateway.surroundings.hidden = "the line has not stood for 5 s in a row"
     await gateway.pass_time(3 * PROBATION_S)
     assert gateway.stage(one) is Stage.PROBATION and gateway.loop.lease_end_s is not None
-    assert "has not stood" in gateway.deployer.shown(hash_of(one)).why
+    shown, change = gateway.deployer.shown(hash_of(one)), gateway.deployer.change()
+    assert "has not stood" in shown.why and change is not None
+    assert (change.proposal, change.kind, change.stage, change.text) == (hash_of(one), "gains", "probation", shown.why)
+    assert change.since_wall_s is not None and change.since_wall_s <= gateway.loop.now_s - 3 * PROBATION_S
     gateway.surroundings.hidden = ""
     await gateway.pass_time(1.0)
-    assert gateway.stage(one) is Stage.KEPT
+    assert gateway.stage(one) is Stage.KEPT and gateway.deployer.change() is None
 
 
 @run

@@ -21,7 +21,7 @@ from gateway.cli.status_commands import export_csv, status
 from gateway.cli.status_view import render
 from gateway.core.topics import GATEWAY_STATUS
 from gateway.mailbox.unix import UnixMailbox
-from gateway.supervisor.status import GatewayStatus
+from gateway.supervisor.status import ChangeStatus, GatewayStatus
 from tests.unit.supervisor_support import frame_of, short_folder
 from tests.unit.test_historian import writer_of
 from tests.unit.test_supervisor_status import Bench
@@ -55,6 +55,22 @@ def test_it_fits_the_screen_and_shows_the_newest_events(width: int, height: int,
     assert sum("event 19" in line or "event 18" in line or "event 17" in line for line in lines) == 3
     shown = sum(line.split(maxsplit=2)[1].startswith("span-") for line in lines if len(line.split()) > 5)
     assert (shown == spans) != any(f"and {spans - shown} more spans" in line for line in lines)
+
+
+@pytest.mark.parametrize(
+    ("stage", "text", "said"),
+    [
+        ("probation", "not kept yet: it has been watched for 7 s of 30 s", "on probation since 7 s: not kept yet"),
+        ("running", "", "running since 7 s"),
+    ],
+)
+def test_what_is_being_done_to_the_line_is_shown_and_the_screen_still_fits(stage: str, text: str, said: str) -> None:
+    kind = "gains" if stage == "probation" else "experiment"
+    status = running(20)
+    change = ChangeStatus(proposal="ab" * 32, kind=kind, stage=stage, since_wall_s=status.wall_s - 7.0, text=text)
+    lines = text_of(status.model_copy(update={"change": change}), 80, 24)
+    assert len(lines) <= 24 and max(map(len, lines)) <= 80
+    assert [line for line in lines if f"{kind.capitalize()} abababababab {said}" in line]
 
 
 def test_the_reason_of_the_newest_state_is_told_to_its_end() -> None:
