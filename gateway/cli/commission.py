@@ -7,7 +7,6 @@ candidate that cannot be made is found so again.
 
 import asyncio
 from collections.abc import Callable, Mapping, Sequence
-from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, replace
 from datetime import timedelta
 from pathlib import Path
@@ -127,13 +126,14 @@ async def commission(
     wanted_m_per_s: float | None = None,
     adaptations: int = 1,
     most_redesigns: int | None = None,
-    measure_again: bool = False,
+    again: bool = False,
 ) -> Commissioned:
     """Until the chain has ended, one way or the other. Every rung is tried once, so that it does.
 
     `wanted_m_per_s`: up to which the line is to be adapted; None: as fast as its drives hold.
     `adaptations`: redesigns at least; `most_redesigns`: it is left there once so many have been kept.
-    `measure_again`: what was measured until now is of a line that is no longer as it was (another grade, a new part).
+    `again`: the line is no longer as it was (another grade, a new part). What is in service stays, and counts as a
+    first configuration: for low speed, until experiments have shown more.
     """
     if why := refused_at_once(line):
         return Commissioned(False, why, [], None)
@@ -142,12 +142,14 @@ async def commission(
     past: list[Past] = []
     shown: list[ProposalShown] = []
     measured: dict[str, Convergence] = {}
-    outdated = None if measure_again else frozenset[str]()
+    outdated = None if again else 0  #: so many proposals, the oldest, say nothing of the line as it is now
     while True:
         try:
             shown, measured = await side.proposals(), await measured_on(line, side)
-            outdated = frozenset(measured) if outdated is None else outdated
-            past = _merged(shown, unmade, measured, outdated)
+            outdated = len(shown) if outdated is None else outdated
+            past = _merged(shown, unmade, measured)
+            if outdated:
+                past = [_begin(line, past[:outdated]), *past[outdated:]]
             kept_now = sum(one.step is Step.REDESIGN and one.outcome is Outcome.DONE for one in past)
             if most_redesigns is not None and kept_now >= most_redesigns:
                 return _commissioned(Ended(True, f"{kept_now} redesigns are kept"), past, shown, measured)
@@ -246,18 +248,23 @@ def _region(shown: Sequence[ProposalShown]) -> Region | None:
 
 
 def _merged(
-    shown: Sequence[ProposalShown], unmade: Sequence[tuple[int, Past]], measured: Mapping[str, Convergence],
-    outdated: AbstractSet[str],
-) -> list[Past]:  # fmt: skip
+    shown: Sequence[ProposalShown], unmade: Sequence[tuple[int, Past]], measured: Mapping[str, Convergence]
+) -> list[Past]:
     past = [past_of(one) for one in shown]
     for at, one in enumerate(past):
         if found := measured.get(one.proposal):
-            past[at] = replace(one, settled=found.settled, why=found.text)
-        if one.proposal in outdated:
-            past[at] = replace(one, step=None)  # an experiment like any other
+            past[at] = replace(one, settled=found.settled, gains=found.gains, why=found.text)
     for before, (at, one) in enumerate(unmade):
         past.insert(at + before, one)
     return past
+
+
+def _begin(line: Line, outdated: Sequence[Past]) -> Past:
+    """What was kept last, as a first configuration of the line as it is now."""
+    kept = [one for one in outdated if one.kind == "gains" and one.outcome is Outcome.DONE]
+    if not kept:
+        raise CannotGoOn("nothing has been kept on this line yet: leave out --again")
+    return replace(kept[-1], step=Step.FIRST, rung=0, speed_m_per_s=first_speed_m_per_s(line))
 
 
 def _commissioned(

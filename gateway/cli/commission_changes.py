@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 
 import numpy as np
@@ -12,8 +12,9 @@ from gateway.commissioning.candidates import FIRST_LAWS, Law, NotOffered, config
 from gateway.commissioning.chain import AS_IT_IS, Next, Step, first_legs
 from gateway.commissioning.convergence import Convergence, convergence, measurement
 from gateway.commissioning.redesign import redesigns
-from gateway.core.controller import Controller
+from gateway.core.controller import Controller, config_hash
 from gateway.core.deployment import Region
+from gateway.core.experiment import Experiment
 from gateway.core.line import Line
 from gateway.core.line_model import LineModel, ModelRefused, model_hash
 from gateway.core.proposal import Change, ExperimentChange, GainsChange, ModelChange
@@ -46,6 +47,7 @@ class Changes:
     def __init__(self, line: Line) -> None:
         self.line = line
         self._designed: tuple[LineNow, list[tuple[Law, Controller]]] | None = None  #: and what it was designed from
+        self._experiment_for: tuple[object, Experiment] | None = None  #: and what it was designed from
         self._known: tuple[tuple[str, ...], LineModel, str] | None = None  #: data, and the model that they gave
 
     def made(
@@ -83,19 +85,29 @@ class Changes:
         law, speed = FIRST_LAWS[step.rung], first_speed_m_per_s(self.line)
         controller = configuration(self.line, None, speed, law)
         try:
-            experiment(self.line, None, controller, now.tension_n, now.speed_m_per_s, first_legs(speed))
+            self._asked(replace(now, in_service=controller), first_legs(speed), 1.0, 0)
         except NotOffered as refused:
             raise NotOffered(f"{law.text}: under it no experiment can be designed: {refused}") from refused
         return GainsChange(controller=controller), f"{law.text} on the line's file, to begin with"
 
     def _experiment(self, step: Next, now: LineNow) -> tuple[Change, str]:
-        asked = experiment(
-            self.line, now.model, now.in_service, now.tension_n, now.speed_m_per_s, step.speeds_m_per_s, step.size,
-            seed=step.number,
-        )  # fmt: skip
+        asked = self._asked(now, step.speeds_m_per_s, step.size, step.number)
         speeds = " and ".join(f"{speed:.3g}" for speed in step.speeds_m_per_s)
         moves = f"set-points move by {max(asked.amplitude_n):g} N for {asked.duration_s:g} s"
         return ExperimentChange(experiment=asked), f"to identify the line at {speeds} m/s: {moves}"
+
+    def _asked(self, now: LineNow, speeds_m_per_s: tuple[float, ...], size: float, seed: int) -> Experiment:
+        """Designed; what has been designed last, again. Raises NotOffered."""
+        model = None if now.model is None else model_hash(now.model)
+        key = (config_hash(now.in_service), model, tuple(now.tension_n), now.speed_m_per_s, speeds_m_per_s,
+               size, seed)  # fmt: skip
+        if self._experiment_for is None or self._experiment_for[0] != key:
+            asked = experiment(
+                self.line, now.model, now.in_service, now.tension_n, now.speed_m_per_s, speeds_m_per_s, size,
+                seed,
+            )  # fmt: skip
+            self._experiment_for = key, asked
+        return self._experiment_for[1]
 
     def _model(self, step: Next, now: LineNow, recordings: Sequence[Recording]) -> tuple[Change, str]:
         """Of the newest experiment, which goes the fastest; on the second rung of all.

@@ -32,7 +32,10 @@ def commission(
         bool, typer.Option("--history", help="Show what has been tried on the line until now; propose nothing.")
     ] = False,
     again: Annotated[
-        bool, typer.Option("--again", help="Measure anew: the line is no longer as it was (another grade, a new part).")
+        bool,
+        typer.Option(
+            "--again", help="The line is no longer as it was (another grade, a new part): again from low speed on."
+        ),
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="With --history: print as JSON.")] = False,
 ) -> None:
@@ -70,7 +73,7 @@ def commission(
             run_dir,
             typer.echo,
             lambda side: carried_out(
-                line, side, typer.echo, wanted_m_per_s=speed, adaptations=adaptations, measure_again=again
+                line, side, typer.echo, wanted_m_per_s=speed, adaptations=adaptations, again=again
             ),
         )
     typer.echo(f"{'commissioned' if ended.reached else 'not commissioned'}: {ended.text}")

@@ -9,7 +9,8 @@ shown only an experiment there. So the chain can always begin, and each round en
 
 Once a configuration is in service over the line's range of speeds, what it does there is measured (algorithm 2):
 where the criteria of convergence are met and no significant gain is predicted any more, the chain has come to its end;
-otherwise a model of these data, a redesign, and a measurement follow, `MOST_ROUNDS` times at most.
+otherwise a model of these data, a redesign, and a measurement follow, `MOST_ROUNDS` times at most. Where the model has
+foreseen what is not as it should be, so that a newer one has nothing to add, a calmer candidate follows at once.
 
 Where a proposal is refused, the next, less ambitious candidate of a short ladder is taken (`LADDERS`). What has been
 tried is read from the gate's own list of proposals, in which each says its step and its rung: whoever asks again after
@@ -85,6 +86,7 @@ class Past:
     speed_m_per_s: float | None = None  #: up to which a verdict lets a configuration run
     proposal: str = ""  #: hash; empty: it could not be made
     settled: bool | None = None  #: of a measurement: converged, and nothing to gain; None: nobody has looked at it yet
+    gains: bool = False  #: the same: a newer model would lead to another design
 
 
 @dataclass(frozen=True)
@@ -138,10 +140,11 @@ def next_step(
     since = past[max(last.values()) + 1 :]
     if last["gains"] < 0:
         return _on_ladder(Step.FIRST if last["model"] < 0 else Step.REDESIGN, since)
-    measured = past[last["experiment"]] if last["experiment"] > last["gains"] else None
-    if measured is not None and measured.step is Step.MEASUREMENT and last["experiment"] > last["model"]:
-        return _measured(past, measured, since, adaptations)
-    if last["experiment"] > last["model"]:
+    newest = past[last["experiment"]] if last["experiment"] > last["model"] else None
+    of_measurement = newest is not None and newest.step is Step.MEASUREMENT
+    if newest is not None and of_measurement and last["experiment"] > last["gains"]:
+        return _measured(past, newest, since, adaptations)
+    if newest is not None and not of_measurement:
         found = _on_ladder(Step.MODEL, since)
         number = sum(_is_done(one, "experiment") for one in past[last["model"] + 1 :])
         if isinstance(found, Next) or number >= MOST_EXPERIMENTS:
@@ -149,7 +152,7 @@ def next_step(
         return _experiment(past, since, first_speed_m_per_s, wanted_m_per_s, number)
     reached = region_speed(past) or 0.0
     if last["model"] > last["gains"]:
-        found = _on_ladder(Step.REDESIGN, since)
+        found = _on_ladder(Step.REDESIGN, since, _known_by_measurement(past))
         measured = any(one.step is Step.MEASUREMENT and _is_done(one, "experiment") for one in past)
         return Ended(True, found.text) if isinstance(found, Ended) and measured else found
     if last["model"] >= 0 and reached >= NEAR * wanted_m_per_s:
@@ -180,7 +183,10 @@ def _measured(past: Sequence[Past], measured: Past, since: Sequence[Past], adapt
     rounds = sum(one.step is Step.MEASUREMENT and _is_done(one, "experiment") for one in past)
     if rounds >= MOST_ROUNDS:
         return Ended(True, f"{what}, and after {rounds} measurements that is left as it is; {measured.why}")
-    found = _on_ladder(Step.MODEL, since)
+    if measured.settled or measured.gains:
+        found = _on_ladder(Step.MODEL, since)
+    else:
+        found = _on_ladder(Step.REDESIGN, since, _known_by_measurement(past))
     if isinstance(found, Ended):
         return Ended(True, f"{what}; {measured.why}; {found.text}", converged=measured.settled)
     return found
@@ -252,10 +258,19 @@ def _last_done(past: Sequence[Past], kind: str) -> int:
     return max((i for i, one in enumerate(past) if _is_done(one, kind)), default=-1)
 
 
-def _on_ladder(step: Step, since: Sequence[Past]) -> Next | Ended:
-    """The first rung above those that have failed since something was done last."""
+def _known_by_measurement(past: Sequence[Past]) -> int:
+    """Candidates that need not be tried again: measured, not as they should be, and the model has told so beforehand.
+
+    A newer model would give the same: the next candidate on the same model is a calmer one.
+    """
+    done = [one for one in past if one.step is Step.MEASUREMENT and _is_done(one, "experiment")]
+    return min(sum(one.settled is False and not one.gains for one in done), AS_IT_IS)
+
+
+def _on_ladder(step: Step, since: Sequence[Past], least: int = 0) -> Next | Ended:
+    """The first rung above those that have failed since something was done last; `least` or above."""
     tried = [one for one in since if one.step is step]
-    rung = 1 + max((one.rung for one in tried if one.outcome is Outcome.FAILED), default=-1)
+    rung = max(least, 1 + max((one.rung for one in tried if one.outcome is Outcome.FAILED), default=-1))
     if rung >= LADDERS[step]:
         return Ended(False, f"no {step} of {LADDERS[step]} candidates gets through; the last one: {tried[-1].why}")
     again = [one for one in tried if one.outcome is Outcome.AGAIN and one.rung == rung]

@@ -11,7 +11,8 @@ noise of the load cells adds to overshoot and settling is taken off by a mean ov
 
 The prediction is a rollout on the accepted model with the set-points and speeds of the recording, looked at in the
 same way. What is left to gain is told by a model of these data: it would lead to another design only as far as the
-figures predicted by it differ from those of the model that the design was made on.
+figures predicted by it differ from those of the model that the design was made on. Data of steps that stand for long do
+not always give a model of their own: then the gap itself says whether one is called for.
 """
 
 from collections.abc import Sequence
@@ -37,8 +38,8 @@ from gateway.core.theta import Noise
 RMSE_SHARE, MOST_OVERSHOOT_PCT, MOST_SETTLING_S = 0.05, 20.0, 2.0
 SIGNIFICANT = 0.05  #: of a predicted tracking error: a model that changes it by less leads to no other design
 DWELL_S, STEPS = 2.5, 3  #: of a measurement: from step to step, and at each speed
-SEEDS = 100  #: are tried, for one with which every span steps at each speed
-OF_SETPOINT = 0.05  #: a step either way, of the set-point, as far as the region permits
+SEEDS = 100  #: are tried, for one with which every span steps at each speed, and few neighbours against each other
+OF_SETPOINT = 0.05  #: a step either way, of the mean set-point, as far as the region permits
 ABORT_TIMES = 3.0  #: the greatest step either way: farther from its set-point no tension goes
 SMOOTHED_S = 0.05
 STANDS = 0.02  #: of the greatest speed, by which it may differ within a window, noise included
@@ -69,8 +70,8 @@ class Convergence(Strict):
     predicted: dict[str, SpanFigures]  #: on the accepted model
     rmse_n: float  #: over all spans and changes
     gap: float  #: of that
-    gain: float | None  #: largest change of a predicted tracking error by a model of these data; null: there is none
-    why: str = ""  #: there is none
+    gain: float  #: largest change of a predicted tracking error by a model of these data; without one the gap itself
+    why: str = ""  #: these data give no model of their own
 
     @property
     def converged(self) -> bool:
@@ -79,7 +80,12 @@ class Convergence(Strict):
     @property
     def settled(self) -> bool:
         """Nothing is left to do: the criteria are met, and no significant gain is predicted any more."""
-        return self.converged and self.gain is not None and self.gain < SIGNIFICANT
+        return self.converged and not self.gains
+
+    @property
+    def gains(self) -> bool:
+        """A newer model would lead to another design."""
+        return self.gain >= SIGNIFICANT
 
     @property
     def worst(self) -> SpanFigures:
@@ -98,7 +104,7 @@ class Convergence(Strict):
         worst = self.worst
         settling = "never settles" if worst.settling_s is None else f"settles within {worst.settling_s:.2f} s"
         met = "criteria met" if not beyond else f"criteria not met by {', '.join(beyond)}"
-        gain = f"no newer model: {self.why}" if self.gain is None else f"a newer model changes {self.gain:.1%}"
+        gain = "no newer model from these data alone" if self.why else f"a newer model changes {self.gain:.1%}"
         return (
             f"{met}: error up to {worst.rmse_n:.2f} N, overshoot {worst.overshoot_pct:.0f} %, {settling}; "
             f"{self.gap:+.0%} beside the prediction; {gain}"
@@ -116,8 +122,10 @@ def measurement(
         step_n = min(step_n, region.tension_step_max_n)
     low, high = limits.tension_min_n + limits.tension_margin_n, limits.tension_max_n - limits.tension_margin_n
     room = np.minimum.reduce([setpoint - low, high - setpoint, np.full(line.n, 0.5 * step_n)])
-    amplitude = size * np.clip(OF_SETPOINT * setpoint, 0.0, room)
-    amplitude[[i for i, span in enumerate(line.spans) if span.control != "tension"]] = 0.0
+    measured = np.array([span.control == "tension" for span in line.spans])
+    # All by as much: what a span does while its neighbour steps further says little of its own step.
+    common = np.min(np.clip(OF_SETPOINT * setpoint.mean(), 0.0, room), where=measured, initial=np.inf)
+    amplitude = np.where(measured, size * common, 0.0)
     greatest = float(amplitude.max())
     nearest_n = float(min(setpoint.min() - limits.tension_min_n, limits.tension_max_n - setpoint.max()))
     if not 0.0 < greatest < nearest_n:
@@ -133,13 +141,15 @@ def measurement(
         abort=Abort(deviation_n=min(ABORT_TIMES * greatest, nearest_n)),
     )
     seeds = [asked.model_copy(update={"seed": SEEDS * seed + k}) for k in range(SEEDS)]
-    return max(seeds, key=_stepping)
+    return max(seeds, key=_suited)
 
 
-def _stepping(asked: Experiment) -> int:
-    """Spans that step at a speed, over all speeds."""
-    levels = np.array([signs(asked, dwell) for dwell in range(STEPS * len(asked.legs))]).reshape(-1, STEPS, asked.n)
-    return int(np.count_nonzero(np.ptp(levels, axis=1)))
+def _suited(asked: Experiment) -> tuple[int, int]:
+    """Spans that step at a speed, over all speeds; and as few neighbours as may be that step against each other."""
+    levels = np.array([signs(asked, dwell) for dwell in range(STEPS * len(asked.legs))])
+    steps = np.diff(levels, axis=0, prepend=np.zeros((1, asked.n)))
+    stepping = np.ptp(levels.reshape(-1, STEPS, asked.n), axis=1)
+    return int(np.count_nonzero(stepping)), -int(np.count_nonzero(steps[:, 1:] * steps[:, :-1] < 0.0))
 
 
 def convergence(
@@ -152,9 +162,10 @@ def convergence(
     measured = _figures(line, recording, recording.tension_n)
     foreseen = _figures(line, recording, _rolled_out(line, recording, in_service, model))
     rmse, foreseen_rmse = (float(np.sqrt(sum(one.rmse_n**2 for one in of.values()))) for of in (measured, foreseen))
-    gain = None if isinstance(newer, str) else _changed(line, recording, in_service, model, newer)
+    gap = rmse / max(foreseen_rmse, 1e-9) - 1.0
+    gain = abs(gap) if isinstance(newer, str) else _changed(line, recording, in_service, model, newer)
     return Convergence(
-        spans=measured, predicted=foreseen, rmse_n=rmse, gap=rmse / max(foreseen_rmse, 1e-9) - 1.0, gain=gain,
+        spans=measured, predicted=foreseen, rmse_n=rmse, gap=gap, gain=gain,
         why=newer if isinstance(newer, str) else "",
     )  # fmt: skip
 

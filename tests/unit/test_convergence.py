@@ -73,7 +73,7 @@ def test_every_span_steps_at_each_speed_within_what_the_line_and_the_region_perm
     asked = measurement(LINE, region, TENSION_N, SPEEDS_M_PER_S, 1.0, 3)
     assert asked.amplitude_n == [1.0, 1.0] and reasons_against(asked, LINE, np.array(TENSION_N), 0.01) == []
     wide = measurement(LINE, None, TENSION_N, SPEEDS_M_PER_S, 1.0, 3)
-    assert wide.amplitude_n == pytest.approx([1.4, 1.8]) and wide.abort.deviation_n > 2.0 * max(wide.amplitude_n)
+    assert wide.amplitude_n == pytest.approx([1.6, 1.6]) and wide.abort.deviation_n > 2.0 * max(wide.amplitude_n)
     moved = setpoints(asked, np.array(TENSION_N), 0.01).reshape(2, -1, 2)
     assert moved.shape[1] == round(STEPS * DWELL_S / 0.01) and (np.ptp(moved, axis=1) > 0.0).all()
     with pytest.raises(NotOffered, match="narrow"):
@@ -93,7 +93,6 @@ def test_the_criteria_hold_for_every_span(one, other, converged):
     found = Convergence(spans={"1": figures(*one), "2": figures(*other)}, predicted={}, rmse_n=1.0, gap=0.0, gain=0.01)
     assert found.converged is converged and found.settled is converged
     assert not found.model_copy(update={"gain": 0.06}).settled
-    assert not found.model_copy(update={"gain": None, "why": "no data"}).settled
 
 
 def test_figures_are_those_of_the_worst_change_and_smooth_noise_away():
@@ -116,9 +115,10 @@ def test_a_line_that_is_as_the_model_has_it_has_no_gap_and_another_web_changes_w
     course = np.vstack((np.tile(TENSION_N, (100, 1)), moved))
     speed = np.full(len(course), 0.06)
     ideal = convergence(LINE, recording(course, course, speed), CONFIG, MODEL, model(0.8))
-    assert ideal.gap < -0.9 and ideal.gain is not None and ideal.gain > 0.0
+    assert ideal.gap < -0.9 and 0.0 < ideal.gain < 0.5
     assert 0.0 < ideal.predicted["1"].rmse_n < 1.0 and ideal.predicted["1"].settling_s is not None
-    assert convergence(LINE, recording(course, course, speed), CONFIG, MODEL, "too short").why == "too short"
+    alone = convergence(LINE, recording(course, course, speed), CONFIG, MODEL, "too short")
+    assert alone.why == "too short" and alone.gain == -alone.gap and alone.gains
 
 
 def test_while_the_speed_moves_nothing_is_looked_at():
