@@ -4,6 +4,7 @@
     b  chains of small steps by an adversary who knows the truth
     c  bytes at the level of the format: mutations of valid proposals
     d  new lines commissioned through the gate, from the line's file to the highest speed (only where it is asked for)
+    e  models held against new data of their own line, with friction, lag and eccentric rollers (likewise)
 
 The truth is told by tests/independent, which shares nothing with the gate. Known good is what is safe there in every
 case, 4 ms later too and under the rules' own stress around the truth, in no metric worse than what is in service and
@@ -33,9 +34,10 @@ from tests.bench.gate_plants import is_for_tuning
 from tests.bench.gate_proposals import CLASSES, mpc_proposals, proposals
 from tests.bench.gate_runs import LineBench, Tried, measured
 from tests.bench.gate_schema import Tally, mutated
+from tests.bench.gate_validity import bench_validity
 from tests.bench.identify_runs import Workers
 
-PARTS, ASKED_FOR = "abc", "d"  #: of the latter only what is named
+PARTS, ASKED_FOR = "abc", "de"  #: of the latter only what is named
 SEED = 6100
 CANDIDATES = 60  #: numbers of lines from which those are taken that the file's own controller holds
 PAPER_RULE = "paper: approve"
@@ -49,6 +51,7 @@ class Sizes:
     predictive: int = 42
     chains: int = 60
     schema: int = 1_000_000
+    models: int = 100
 
 
 @dataclass(frozen=True)
@@ -71,7 +74,9 @@ def main() -> None:
     with Workers() as workers:
         for letter in sorted(wanted):
             began = time.monotonic()
-            {"a": _proposals, "b": _chains, "c": _schema, "d": _commissioning}[letter](bench, workers, sizes, half)
+            {"a": _proposals, "b": _chains, "c": _schema, "d": _commissioning, "e": _validity}[letter](
+                bench, workers, sizes, half
+            )
             print(f"part {letter}: {time.monotonic() - began:.0f} s", flush=True)
     bench.finish()
 
@@ -255,6 +260,10 @@ def _schema(bench: Bench, workers: Workers, sizes: Sizes, half: str) -> None:
 
 def _commissioning(bench: Bench, workers: Workers, sizes: Sizes, half: str) -> None:
     bench_commissioning(bench, workers, numbers(sizes.plants, half))
+
+
+def _validity(bench: Bench, workers: Workers, sizes: Sizes, half: str) -> None:
+    bench_validity(bench, workers, sizes.models, half)
 
 
 def _arguments() -> tuple[Sizes, set[str], str, str]:

@@ -91,7 +91,9 @@ class LineBench:
             assert baseline is not None
             top = FIRST_TOP_M_PER_S if first else self._top_m_per_s
             line = creeping(given.line) if first else given.line
-            self._judges[context] = GateJudge(line, given.truth, in_service, baseline, top, given.number)
+            self._judges[context] = GateJudge(
+                line, given.truth, in_service, baseline, top, given.number, given.line.limits.speed_max_m_per_s
+            )
         return self._judges[context]
 
     def in_service(self) -> dict[str, str]:

@@ -19,6 +19,9 @@ AROUND = 0.05  #: the rules' stress is tried on corners of so much around the tr
 CORNERS = 6  #: drawn of the 32
 BETTER = 0.03  #: in one metric at least
 TOLERATED = 0.5  #: of the gate's own tolerance: what no metric may be worse by
+ROLLERS = 1.5  #: times the line's greatest speed: there torque goes off
+FORESEEN = 0.85  #: of that: the loop refuses a step that its model says would make a roller faster
+LITTLE = 1.0 / 16.0  #: of a case: so little that no torque is cut
 MARGIN_CASES = (0, 3, 7, 8)  #: of those that are tried: where the margin is looked at
 FAMILIES = ("stiffness_n", "length_m", "radius_m", "inertia_kg_m2", "friction_nms_per_rad")
 
@@ -48,9 +51,18 @@ class GateJudge:
     """Of one line, whose truth it knows, against a configuration in service and a baseline."""
 
     def __init__(
-        self, line: Line, truth: Truth, in_service: Controller, baseline: Controller, top_m_per_s: float, seed: int
+        self,
+        line: Line,
+        truth: Truth,
+        in_service: Controller,
+        baseline: Controller,
+        top_m_per_s: float,
+        seed: int,
+        speed_max_m_per_s: float | None = None,
     ) -> None:
+        """`speed_max_m_per_s`: of the line, where `line` has been narrowed to what is judged."""
         self.line, self.truth, self.seed = line, truth, seed
+        self.roller_most_m_per_s = ROLLERS * (speed_max_m_per_s or line.limits.speed_max_m_per_s)
         self.top_m_per_s = fastest(line, truth, top_m_per_s)
         self.cases = trying_cases(line, self.top_m_per_s, np.random.default_rng(seed))
         self.measuring = measuring_cases(line, self.top_m_per_s)
@@ -122,11 +134,30 @@ class GateJudge:
     def _wrong(self, config: Controller, truths: list[Truth], cases: list[Case], latency_s: float) -> str:
         """One case at a time: the first that is unsafe ends it."""
         for b, (truth, case) in enumerate(zip(truths, cases, strict=True)):
-            found = simulated(config, [truth], [case], self.line.limits, self.seed + b, latency_s=latency_s,
-                              stop_outside=True)  # fmt: skip
-            if reason := self._reason(found):
+            found = self._alone(config, truth, case, latency_s, b)
+            if reason := self._reason(found) or self.too_fast(config, truth, case, latency_s, b, found):
                 return f"{case.name}: {reason}"
         return ""
+
+    def _alone(self, config: Controller, truth: Truth, case: Case, latency_s: float, b: int) -> Found:
+        return simulated(config, [truth], [case], self.line.limits, self.seed + b, latency_s=latency_s,
+                         stop_outside=True)  # fmt: skip
+
+    def too_fast(self, config: Controller, truth: Truth, case: Case, latency_s: float, b: int, found: Found) -> str:
+        """Whether a roller runs so fast that torque goes off, in moves so small that the loop would not refuse them.
+
+        Cut torques keep a large move from making rollers as fast as it would: how small to make it follows from little.
+        """
+        most = self.roller_most_m_per_s
+        if found.roller_m_per_s.max() <= most:
+            return ""
+        little = case.smaller(LITTLE)
+        web = float(np.abs(little.unwind_m_per_s).max())
+        ahead = float(self._alone(config, truth, little, latency_s, b).roller_m_per_s.max()) - web
+        share = LITTLE * (FORESEEN * most - web) / ahead if ahead > 0.0 else LITTLE
+        less = case.smaller(float(np.clip(share, LITTLE * LITTLE, 1.0)))
+        fastest = float(self._alone(config, truth, less, latency_s, b).roller_m_per_s.max())
+        return "" if fastest <= most else f"a roller runs at {fastest:.3f} m/s"
 
     def _reason(self, found: Found) -> str:
         gate, limits = self.line.gate, self.line.limits
@@ -180,7 +211,8 @@ def unsafe_experiment(
         return "it runs away"
     if least < line.limits.tension_min_n or most > line.limits.tension_max_n:
         return f"tension from {least:.1f} to {most:.1f} N"
-    return ""
+    fastest = float(found.roller_m_per_s.max())
+    return "" if fastest <= ROLLERS * line.limits.speed_max_m_per_s else f"a roller runs at {fastest:.3f} m/s"
 
 
 def model_error(model: LineModel, truth: Truth) -> float:

@@ -1,6 +1,6 @@
 """Closed loops on true lines: cases of set-points, speeds and pushes through, and what became of the tensions."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,7 +18,7 @@ from tests.independent.truth_kernel import STEP_S, compiled
 
 RUNAWAY_N = 300.0
 # Columns of what is found of a span.
-LEAST, MOST, SWING, ERROR, CHATTER, SQUARED, BEYOND, SETTLED, COLUMNS = range(9)
+LEAST, MOST, SWING, ERROR, CHATTER, SQUARED, BEYOND, SETTLED, ROLLER, COLUMNS = range(10)
 
 
 @dataclass(frozen=True)
@@ -37,6 +37,16 @@ class Case:
     def periods(self) -> int:
         return len(self.unwind_m_per_s)
 
+    def smaller(self, share: float) -> "Case":
+        """The same with a share of what set-points, speed and pushes do."""
+        first, slow = self.tension_n[0], self.unwind_m_per_s[0]
+        return replace(
+            self,
+            tension_n=first + share * (self.tension_n - first),
+            unwind_m_per_s=slow + share * (self.unwind_m_per_s - slow),
+            push_nm=share * self.push_nm,
+        )
+
 
 class Found(NamedTuple):
     """(b, n) each, N and Nm, true values. Of a line that has run away, or left its band, as far as it went."""
@@ -49,6 +59,7 @@ class Found(NamedTuple):
     squared_n2: FloatArray  #: mean squared error
     beyond_n: FloatArray  #: overshoot in the direction of the change
     settled_s: FloatArray  #: after the change
+    roller_m_per_s: FloatArray  #: greatest surface speed of the span's roller, either way
     ended: NDArray[np.int64]  #: (b,), the period in which it ran away; -1: it did not
 
 
@@ -117,6 +128,7 @@ def _steps(whole, b, line, k, unwind, push, noise, bounds, per_period, stop_outs
                 found[i, LEAST], found[i, MOST] = -np.inf, np.inf
                 return True
             found[i, LEAST], found[i, MOST] = min(found[i, LEAST], tension), max(found[i, MOST], tension)
+            found[i, ROLLER] = max(found[i, ROLLER], abs(line.speed_m_per_s[i]))
             if tailing:
                 in_tail[0, i], in_tail[1, i] = min(in_tail[0, i], tension), max(in_tail[1, i], tension)
             if stop_outside and not (bounds[2] <= tension <= bounds[3]):

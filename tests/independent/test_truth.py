@@ -207,3 +207,20 @@ def test_a_good_design_is_safe_and_fragile_ones_are_not() -> None:
     weights = replace(lqg_weights(task), disturbance_nm_per_sqrt_s=60.0, torque_per_nm2=0.002, roller_noise=20.0)
     assert judge.unsafe(design_lqg(task, weights))
     assert "runs away" in judge.unsafe(scaled_all(lqi, -1.0)) or "tension" in judge.unsafe(scaled_all(lqi, -1.0))
+
+
+def test_a_roller_that_runs_too_fast_in_small_moves_is_unsafe_and_one_in_moves_that_the_loop_refuses_is_not() -> None:
+    """The largest steps take rollers of a line for 0.06 m/s beyond 0.09 m/s under any law, small ones do not."""
+    limits = LINE.limits.model_copy(update={"speed_max_m_per_s": 0.06})
+    line = LINE.model_copy(update={"limits": limits})
+    config = design_lqi(task_of(LINE))
+    judge = GateJudge(line, quiet(), config, config, 0.05, 3)
+    case = next(one for one in judge.cases if one.name == "most-up-and-down")
+    found = simulated(config, [judge.truth], [case], limits, 3, latency_s=0.01)
+    assert found.roller_m_per_s.max() > judge.roller_most_m_per_s == 0.09
+    assert judge.too_fast(config, judge.truth, case, 0.01, 0, found) == ""
+    judge.roller_most_m_per_s = 0.9 * float(case.unwind_m_per_s.max())  # the web itself is too fast
+    assert "a roller runs at" in judge.too_fast(config, judge.truth, case, 0.01, 0, found)
+    assert np.allclose(
+        case.smaller(0.5).tension_n[-1] + case.smaller(0.5).tension_n[0], case.tension_n[-1] + case.tension_n[0]
+    )
