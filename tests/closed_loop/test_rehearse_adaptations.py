@@ -1,10 +1,14 @@
 """Adaptation rehearsed: what rounds through the gate, and without one, tell of the line, and what they are worth."""
 
+import numpy as np
 import pytest
 
 from gateway.cli.rehearse import cases_of, rehearse
 from gateway.cli.rehearse_adaptations import adapt, first_experiment
+from gateway.cli.stepped import SteppedLoop
+from gateway.cli.stepped_experiment import run_experiment
 from gateway.cli.tiers import A_FAST
+from gateway.control.design import design_lqi, task_of
 from gateway.core.scenario import Scenario
 from tests.closed_loop.recorded import demonstration_line, real_plant
 
@@ -72,10 +76,21 @@ def test_a_line_that_tells_nothing_brings_no_model_and_the_gate_says_why():
     assert only.tried and not any(text.startswith("redesign") for text in only.tried)
 
 
+def test_without_a_gate_a_round_tells_the_truth_as_well():
+    case = cases_of(demonstration_line(2), plant_of_two(), [STEP], None)[0]
+    (only,) = adapt(case.line, case.plant, case.scenario, 3, 1)
+    assert only.result.refused == [] and only.result.unsafe_events == 0 and only.result.valid
+    assert only.result.data_s == pytest.approx(10.0, rel=0.01) and only.result.tried == []
+    assert_true(only.result.intervals, 0.03)
+    assert [design.name for design, _ in only.designs] == ["adapt1-lqi", "adapt1-mpc-observer"]
+
+
 def test_at_a_short_period_noise_ends_no_experiment():
     case = cases_of(demonstration_line(2), plant_of_two(), [STEP], A_FAST)[0]
     first = first_experiment(case.line, case.scenario)
     assert first.abort.saturated_share < 0.7 and first.abort.reversal_share < 0.7  # noise is not what it ends by
-    (only,) = adapt(case.line, case.plant, case.scenario, 3, 1, first=first)
-    assert only.result.refused == [] and only.result.unsafe_events == 0 and only.result.valid
-    assert_true(only.result.intervals, 0.06)
+    loop = SteppedLoop(case.line, design_lqi(task_of(case.line)), case.plant, 3)
+    loop.begin_in_production(np.array(STEP.tension_n), STEP.speed_m_per_s)
+    loop.step(round(0.5 / case.line.control.period_s))
+    assert run_experiment(loop, first).samples * case.line.control.period_s > 9.9  # or it raises
+    assert loop.truth.recorder.unsafe_total == 0
