@@ -6,8 +6,8 @@ from typing import Literal
 
 import numpy as np
 
-from gateway.control.judged_courses import improvement_courses, ramp_of_moves, way_of_moves
-from gateway.control.rollout import Course, Plants, Rollouts, Setup, plants_of_thetas, simulate
+from gateway.control.judged_courses import improvement_courses, way_of_moves
+from gateway.control.rollout import Course, Rollouts, Setup, plants_of_thetas, simulate
 from gateway.control.shaped_run import Way, follow
 from gateway.core.controller import Controller
 from gateway.core.signals import FloatArray
@@ -44,26 +44,15 @@ def performance(config: Controller, case: Case) -> Performance:
         )
         for name, course in improvement_courses(judged).items()
     }
-    moves = _moves(config, case, plants, quiet)
-    return found if moves is None else found | {"moves": moves}
+    way = way_of_moves(judged)
+    return found if way is None else found | {"moves": _moved(follow(config, plants, way, quiet), way, quiet, case)}
 
 
-def _moves(config: Controller, case: Case, plants: Plants, quiet: Setup) -> Figures | None:
-    """The tracking error of a move: what else there is to know, steps tell."""
-    judged, spans = judged_of(case), case.tension_spans
-    if case.line.moves.shape == "ramp":
-        ramp = ramp_of_moves(judged)
-        squared = None if ramp is None else simulate(config, plants, ramp, quiet).squared_error_n2[0, spans]
-    else:
-        way = way_of_moves(judged)
-        squared = None if way is None else _squared(follow(config, plants, way, quiet), way, quiet)[spans]
-    return None if squared is None else Figures(_sound(float(np.sqrt(squared.sum()))), 0.0, 0.0, 0.0)
-
-
-def _squared(tensions: FloatArray, way: Way, setup: Setup) -> FloatArray:
-    """Mean squared error (n,) of a shaped move."""
-    error: FloatArray = tensions - way.course(setup.period_s).tension_n
-    return np.mean(error**2, axis=0)
+def _moved(tensions: FloatArray, way: Way, setup: Setup, case: Case) -> Figures:
+    """The tracking error of a shaped move: what else there is to know, steps tell."""
+    spans = case.tension_spans
+    error: FloatArray = (tensions - way.course(setup.period_s).tension_n)[:, spans]
+    return Figures(_sound(float(np.sqrt(np.sum(error**2) / len(error)))), 0.0, 0.0, 0.0)
 
 
 def figures_of(case: Case) -> list[ScenarioFigures]:

@@ -26,9 +26,11 @@ LEFT_OPEN = 0.05  #: of a value that was found: what data leave open, and what d
 NEAR = 0.98  #: of the speed that is wanted, which is as good
 GRID = 20  #: parts of the greatest speed that are looked at
 #: Of what rollers may run ahead of the web in an experiment: the gate looks at more than the mean, under stress.
-AHEAD_BY_MODEL, AHEAD_BY_FILE = 0.7, 0.5
-SLOWER = 5  #: times that an experiment's ramps are made slower, until it keeps that
+AHEAD_BY_MODEL, AHEAD_BY_FILE = 0.6, 0.5
+SLOWER = 8  #: times that an experiment's ramps are made slower, until it keeps that
+BELOW = 0.9  #: times the rate that the one before lets expect
 LEVEL = 1.25  #: times the way from level to level: a dwell
+LONGEST_DWELL_S = 60.0
 LONGEST_STEP_S = 0.005  #: of the integration
 
 
@@ -146,23 +148,28 @@ def _slow_rollers(
 
     Ramps, where steps are too quick: smaller steps would tell less. Raises NotOffered.
     """
-    speeds = [speed_m_per_s if leg.speed_m_per_s is None else leg.speed_m_per_s for leg in asked.legs]
-    web = max(speed_m_per_s, *speeds)
-    ahead = envelope_limits(line).roller_speed_watched_m_per_s - web
+
+    def fastest(one: Experiment) -> float:
+        return _fastest_roller(line, model, in_service, one, tension_n, speed_m_per_s)
+
+    still = fastest(asked.model_copy(update={"amplitude_n": [0.0] * asked.n}))
+    ahead = envelope_limits(line).roller_speed_watched_m_per_s - still
     ahead *= AHEAD_BY_FILE if model is None else AHEAD_BY_MODEL
     theta = nominal_theta(line) if model is None else theta_of(model)
     # All spans together, and the last roller has to follow them all: dv = sum of L / EA dT/dt.
     stretch_s = float(theta.web.length_m[np.array(asked.amplitude_n) > 0.0].sum()) / theta.web.stiffness_n
     rate = min(ahead / stretch_s, line.moves.tension_rate_n_per_s)
     for _ in range(SLOWER):
-        found = _fastest_roller(line, model, in_service, asked, tension_n, speed_m_per_s) - web
+        found = fastest(asked) - still
         if found <= ahead:
             return asked
         if asked.rate_n_per_s is not None:
-            rate *= ahead / found
-        way_s = 2.0 * max(asked.amplitude_n) / rate
-        asked = asked.model_copy(update={"rate_n_per_s": rate, "dwell_s": max(asked.dwell_s, LEVEL * way_s)})
-    raise NotOffered(f"at {web:.3g} m/s rollers would run too far ahead of the web, however slowly tensions move")
+            rate *= BELOW * ahead / found
+        if rate <= 0.0:
+            break
+        dwell_s = max(asked.dwell_s, LEVEL * 2.0 * max(asked.amplitude_n) / rate)
+        asked = asked.model_copy(update={"rate_n_per_s": rate, "dwell_s": min(dwell_s, LONGEST_DWELL_S)})
+    raise NotOffered(f"rollers run at {still:.3g} m/s by themselves: too fast for tensions to move, however slowly")
 
 
 def _fastest_roller(

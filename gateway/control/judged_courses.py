@@ -7,8 +7,7 @@ asked of the spans before it. Three courses have a name that a promise may use:
 
     tension     all set-points at once: up, and down again
     velocity    the unwinder's speed, down by the largest step and up again, in one period each
-    moves       a quarter of that, as set-points move on the line: on a ramp (`ramp_of_moves`), which no law is told of
-                ahead, or along a minimum-jerk curve with its feed-forward (`way_of_moves`); without noise
+    moves       a quarter of that, along a minimum-jerk move (`way_of_moves`), without noise
 """
 
 from collections.abc import Sequence
@@ -139,28 +138,10 @@ def _in_turn(judged: Judged, lasting_s: float) -> list[tuple[float, FloatArray, 
     return parts
 
 
-def ramp_of_moves(judged: Judged, rest_s: float = 1.0) -> Course | None:
-    """The move on a line whose set-points go on ramps; None where no set-point may move at once."""
-    low, high = _moved(judged)
-    period_s = judged.line.control.period_s
-    reach = judged.line.moves.tension_rate_n_per_s * period_s
-    stand = round(STAND_S / period_s)
-    lasting = stand + int(np.ceil((high - low).max() / reach)) + round(rest_s / period_s)
-    gone = np.maximum(np.arange(lasting) - stand + 1, 0)[:, None] * reach
-    course = Course(np.minimum(low + gone, high), np.full(lasting, judged.fast_m_per_s), stand)
-    return course if judged.tension_step_n > 0.0 else None
-
-
 def way_of_moves(judged: Judged, rest_s: float = 1.0) -> Way | None:
     """The shaped move; None where no set-point may move at once."""
-    low, high = _moved(judged)
-    time_s = max(MOVE_S, MinimumJerk.PEAK * MOVED * judged.tension_step_n / judged.line.moves.tension_rate_n_per_s)
-    way = Way(low, high, judged.fast_m_per_s, STAND_S, time_s, rest_s)
-    return way if judged.tension_step_n > 0.0 else None
-
-
-def _moved(judged: Judged) -> tuple[FloatArray, FloatArray]:
-    """The two levels (n,) of a move."""
     low, high = judged.levels()
     middle, half = 0.5 * (low + high), 0.5 * MOVED * (high - low)
-    return middle - half, middle + half
+    time_s = max(MOVE_S, MinimumJerk.PEAK * MOVED * judged.tension_step_n / judged.line.moves.tension_rate_n_per_s)
+    way = Way(middle - half, middle + half, judged.fast_m_per_s, STAND_S, time_s, rest_s)
+    return way if judged.tension_step_n > 0.0 else None

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from gateway.control.design import MpcWeights, design_lqi, design_mpc, design_scheduled, task_of
-from gateway.control.judged_courses import Judged, corner_courses, improvement_courses, ramp_of_moves
+from gateway.control.judged_courses import corner_courses, improvement_courses
 from gateway.control.prediction import gains_of, imagined, innovations, predict, stretch_of, whitened
 from gateway.control.rollout import Rollouts
 from gateway.core.line import Span
@@ -20,7 +20,6 @@ from safety.case import Case
 from safety.excitation import excited_parts, newest, recent, same_speed
 from safety.findings import at_least, at_most, told
 from safety.judge import warm_up
-from safety.performance import performance
 from safety.predicting import Foretold, with_swings
 from safety.rules import (
     alignment,
@@ -43,7 +42,6 @@ from safety.rules import (
 )
 from safety.rules.corners import Worst
 from safety.simulated import holdable, judged_of, stressed
-from tests.closed_loop.recorded import TENSION_N
 from tests.safety.case_support import EXPIRES, NOW, case_of, gains, proposal, published, refused, verdict_of
 
 
@@ -580,23 +578,3 @@ def test_a_line_with_a_draw_span_takes_its_first_configuration(of):
     context = drawn.context(model=None, data=[])
     verdict = verdict_of(gains(context.in_service, context), context, drawn)
     assert verdict.accepted, verdict.reasons
-
-
-@pytest.mark.parametrize("shape", ["ramp", "minimum-jerk"])
-def test_a_move_is_judged_as_set_points_move_on_the_line(of, context, redesigned, shape):
-    moves = of.line.moves.model_copy(update={"shape": shape})
-    line = of.line.model_copy(update={"moves": moves})
-    case = replace(case_of(gains(redesigned, context), context, of), line=line)
-    error_n = performance(redesigned, case)["moves"].rmse_n
-    assert (0.5 < error_n < 3.0) if shape == "ramp" else (0.0 < error_n < 0.5)
-    still = line.model_copy(update={"limits": line.limits.model_copy(update={"tension_step_max_n": 0.0})})
-    assert "moves" not in performance(redesigned, replace(case, line=still))
-
-
-def test_a_ramp_begins_with_the_first_period_after_standing_and_ends_at_its_target(of):
-    judged = Judged(of.line, np.array(TENSION_N), 0.05, 24.0, 0.05)
-    course = ramp_of_moves(judged)
-    assert np.ptp(course.tension_n, axis=0) == pytest.approx(np.full(6, 6.0))
-    steps = np.diff(course.tension_n, axis=0)
-    assert steps.max() == pytest.approx(0.2) and np.flatnonzero(steps[:, 0])[0] + 1 == course.changed
-    assert course.unwind_speed_m_per_s.tolist() == [0.05] * course.periods
