@@ -83,7 +83,7 @@ def _predict_standing(line: Line) -> None:
     tension, speed = np.tile(np.array(recipe.tension_n), (samples, 1)), np.full(samples, recipe.speed_m_per_s)
     nothing = np.zeros((samples, n))
     standing = Recording(
-        time_s=np.arange(samples, dtype=np.float64) * line.control.period_s, tension_n=tension, tension_setpoint_n=tension,
+        time_s=np.linspace(0.0, 1.0, samples, endpoint=False), tension_n=tension, tension_setpoint_n=tension,
         speed_m_per_s=nothing + speed[:, None], torque_nm=nothing, torque_actual_nm=nothing, unwind_speed_m_per_s=speed,
         controlled=np.ones(samples, dtype=np.bool_), period_s=line.control.period_s, source="warming up",
     )  # fmt: skip

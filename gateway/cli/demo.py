@@ -40,7 +40,7 @@ def run_demo(out: Path, seed: int, quick: str | None) -> int:
     """
     console = Console(highlight=False)
     started_s = time.monotonic()
-    console.print(OPENING if quick is None else OPENING_QUICK, markup=False)
+    console.print(OPENING if quick is None else OPENING_QUICK, markup=False, soft_wrap=True)
     try:
         clear(out)
         with Children(out / "logs") as children:

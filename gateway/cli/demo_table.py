@@ -30,7 +30,8 @@ def print_cases(result: DemoResult, console: Console) -> None:
         )
     console.print(table)
     law = configuration.law.upper()
-    console.print(f"{law}, designed on a model that is wrong on purpose; judged by the recorder at the devices.")
+    text = f"{law}, designed on a model that is wrong on purpose; judged by the recorder at the devices."
+    console.print(text, markup=False, soft_wrap=True)
     print_common(result, console)
 
 
