@@ -112,3 +112,20 @@ def test_an_experiment_that_makes_rollers_run_ahead_is_refused(of, context):
     assert small.passed and not large.passed and "smaller or slower moves" in large.text
     watched = envelope_limits(slow.line).roller_speed_watched_m_per_s
     assert small.limit == pytest.approx(0.05 + 0.9 * (watched - 0.05))
+
+
+@pytest.mark.parametrize("fastest", [lambda course: 1.0, lambda course: np.nan, lambda course: 0.2])
+def test_what_no_share_of_a_step_makes_slow_is_refused(of, context, monkeypatch, fastest):
+    monkeypatch.setattr(roller_speed, "_on_the_mean", lambda *_: fastest)
+    found = refused(roller_speed.check(case_of(gains(design_lqi(of.task()), context), context, of)))
+    assert len(found) == 1 and "no step at all keeps rollers below 0.153 m/s" in found[0]
+
+
+def test_a_line_whose_set_points_only_ramp_is_looked_at_in_its_speed_changes(of, context):
+    limits = of.line.limits.model_copy(update={"tension_step_max_n": 0.0})
+    case = replace(
+        case_of(gains(design_lqi(of.task()), context), context, of), line=of.line.model_copy(update={"limits": limits})
+    )
+    found = roller_speed.steps_let(case)
+    assert set(found.share) == {"speed change"} and found.of_tension() == 1.0
+    assert refused(roller_speed.check(case)) == []

@@ -16,6 +16,7 @@ from gateway.core.line_template import line_template
 from gateway.core.theta import nominal_theta
 from gateway.core.web_model import equilibrium_torque, linearise, reference_speeds
 from safety.actions import Action
+from safety.limits import envelope_limits
 from safety.monitor import recoverable
 from safety.recoverability import Recovery
 from safety.recovery_prediction import recovery_prediction
@@ -182,3 +183,34 @@ def test_the_monitor_says_what_is_short_and_nothing_without_a_model():
     away = replace_speed(measured, 2, 0.4)
     (finding,) = recoverable(recovery_of(), away, setpoint_n, in_flight_nm, torque_nm, None)
     assert finding.rule == "recoverability" and finding.action is Action.STOP and "span" in finding.text
+
+
+def test_a_step_leaves_rollers_a_tenth_of_the_room_that_the_monitor_watches():
+    """The least step of all set-points that is too large for the monitor, and for a step that is foreseen."""
+    config, reference = LAWS["lqi"], Steady(TENSION_N)
+    web = THETA.web
+    v_eq = reference_speeds(web, TENSION_N, SPEED)
+    u_eq = equilibrium_torque(web, TENSION_N, v_eq)
+    measured = Measured(TENSION_N.copy(), v_eq.copy(), SPEED)
+    law = make_law(config)
+    state = law.engage(measured, reference, u_eq)
+    state = law.commit(state, law.ask(state, measured, reference), u_eq)
+    recovery = Recovery(recovery_prediction(THETA, config, LINE, [SPEED]), config, LINE)
+    given = (u_eq[None], u_eq, memory(state))
+    watched = envelope_limits(LINE).roller_speed_watched_m_per_s
+    assert recovery.shortfall_of_step(measured, TENSION_N, *given) is None
+
+    def fastest(step_n):
+        return float(np.abs(recovery.ahead(measured, TENSION_N + step_n, *given)[0][6:]).max())
+
+    for step_n in np.linspace(0.5, 12.0, 24):
+        short, stopped = (look(measured, TENSION_N + step_n, *given) for look in looks_of(recovery))
+        assert (stopped is None) or stopped.what == "roller"
+        assert (short is not None) == (fastest(step_n) > SPEED + 0.9 * (watched - SPEED))
+        assert (stopped is not None) == (fastest(step_n) > watched)
+    assert short is not None and "would come to" in short.foreseen and "fallback" not in short.foreseen
+    assert "if the fallback took over now" in str(short) and short.allowed == pytest.approx(0.1427, abs=1e-4)
+
+
+def looks_of(recovery):
+    return recovery.shortfall_of_step, recovery.shortfall
