@@ -48,7 +48,6 @@ class Changes:
         self.line = line
         self._designed: tuple[LineNow, list[tuple[Law, Controller]]] | None = None  #: and what it was designed from
         self._experiment_for: tuple[object, Experiment] | None = None  #: and what it was designed from
-        self._known: tuple[tuple[str, ...], LineModel, str] | None = None  #: data, and the model that they gave
 
     def made(
         self, step: Next, now: LineNow, recordings: Sequence[Recording], region: Region | None
@@ -69,12 +68,7 @@ class Changes:
     def looked_at(self, now: LineNow, recordings: Sequence[Recording]) -> Convergence:
         """What the newest of `recordings` shows of the configuration in service. Raises NotOffered."""
         assert now.model is not None  # a measurement follows a redesign
-        newer: LineModel | str
-        try:
-            newer = self._identified(recordings[:1], now)[0]
-        except NotOffered as refused:
-            newer = str(refused)
-        return convergence(self.line, recordings[0], now.in_service, now.model, newer)
+        return convergence(self.line, recordings[0], now.in_service, now.model)
 
     def effort_n2m2s(self, recording: Recording) -> float:
         """Of the drives, as far as their torques are known."""
@@ -117,22 +111,15 @@ class Changes:
         used = list(recordings[:1] if step.rung == 0 else recordings)
         if not used or (step.rung > 0 and len(recordings) == 1):
             raise NotOffered("there is no other recording" if used else "there is no recording of an experiment")
-        model, structure = self._identified(used, now)
+        try:
+            found = identify(used, self.line, Noise(), time.perf_counter)
+            parent = None if now.model is None else model_hash(now.model)
+            model = model_of_found(self.line, used, found, now.at.isoformat(timespec="milliseconds"), parent=parent)
+        except (NotIdentified, ModelRefused) as refused:
+            raise NotOffered("; ".join(refused.reasons)[:MOST_REASON]) from refused
         which = "the last experiment" if len(used) == 1 else f"the last {len(used)} experiments"
-        return ModelChange(model=model), f"from {which}: {structure}, up to {model.region.speed_to_m_per_s:.3g} m/s"
-
-    def _identified(self, used: Sequence[Recording], now: LineNow) -> tuple[LineModel, str]:
-        """A model of these data, and its structure; what they have given already, again. Raises NotOffered."""
-        digests = tuple(one.digest() for one in used)
-        if self._known is None or self._known[0] != digests:
-            try:
-                found = identify(used, self.line, Noise(), time.perf_counter)
-                parent = None if now.model is None else model_hash(now.model)
-                model = model_of_found(self.line, used, found, now.at.isoformat(timespec="milliseconds"), parent=parent)
-            except (NotIdentified, ModelRefused) as refused:
-                raise NotOffered("; ".join(refused.reasons)[:MOST_REASON]) from refused
-            self._known = digests, model, str(found.estimate.structure)
-        return self._known[1:]
+        speed = model.region.speed_to_m_per_s
+        return ModelChange(model=model), f"from {which}: {found.estimate.structure}, up to {speed:.3g} m/s"
 
     def _measurement(self, step: Next, now: LineNow, region: Region | None) -> tuple[Change, str]:
         asked = measurement(self.line, region, now.tension_n, step.speeds_m_per_s, step.size, step.number)

@@ -22,6 +22,7 @@ from gateway.core.line_model import LineModel, ModelRefused
 from gateway.core.proposal import Evidence, GainsChange, ModelChange
 from gateway.core.recording import Recording
 from gateway.core.theta import Noise
+from gateway.identification.assessment import assess
 from gateway.identification.identify import NotIdentified
 from gateway.identification.inheritance import NotInherited, identify_after
 from gateway.supervisor.configurations import FILE_NAME, STABLE, ConfigurationsError, open_configurations
@@ -50,18 +51,19 @@ async def refine(line: Line, side: GateSide, who: str, tell: Tell = lambda text:
         raise CannotGoOn("no model has been accepted yet: `r2rgate commission` begins")
     if pending := next((one for one in shown if one.stage in OPEN_STAGES), None):
         raise CannotGoOn(f"proposal {pending.proposal_hash[:12]} is {pending.stage}: settle it first")
-    recordings = (await side.recordings())[: _experiments_since_model(shown)]
+    since = (await side.recordings())[: _experiments_since_model(shown)]
+    recordings = [one for one in since if not assess(one, line).refusals][:1]
     if not recordings:
         raise CannotGoOn(
-            "since the model in service was accepted no experiment has been run: without data that move there is "
-            "nothing to refine it by; run one in production (`r2rgate experiment design`)"
+            f"of {len(since)} experiments since the model in service was accepted none has data that tell of the line: "
+            "run one in production (`r2rgate experiment design`)"
         )
     model, words = await asyncio.to_thread(_identified, line, now, now.model, recordings)
     tell(words)
     await _archive(line, side, now, who, tell)
     tried: list[ProposalShown] = []
     await _require_downtime(side)
-    change, reason = ModelChange(model=model), f"refined on {len(recordings)} experiments since the last; {words}"
+    change, reason = ModelChange(model=model), f"refined on the newest experiment; {words}"
     tried.append(await _settled(side, await put(line, side, change, reason[:MOST_REASON], _named("model", 0))))
     if tried[-1].stage != "kept":
         return Refined(False, False, f"the refined model is {tried[-1].stage}: {tried[-1].why}", tried)

@@ -1,7 +1,7 @@
 """The chain by which a new line is commissioned through the gate: what is proposed next, and when it is over. Pure.
 
     configuration on the line's file -> experiment -> model -> redesign on it -> experiment at higher speeds -> ...
-        -> measurement -> model -> redesign -> measurement -> ...
+        -> measurement -> experiment -> model -> redesign -> measurement -> ...
 
 Each link rests on what the gate has let through before: a first configuration needs no model, an experiment only the
 configuration in service, a model only the experiment's data, a redesign the model, and speeds beyond what data have
@@ -9,7 +9,7 @@ shown only an experiment there. So the chain can always begin, and each round en
 
 Once a configuration is in service over the line's range of speeds, what it does there is measured (algorithm 2):
 where the criteria of convergence are met and no significant gain is predicted any more, the chain has come to its end;
-otherwise a model of these data, a redesign, and a measurement follow, `MOST_ROUNDS` times at most. Where the model has
+otherwise another experiment, model, redesign and measurement follow, `MOST_ROUNDS` times at most. Where the model has
 foreseen what is not as it should be, so that a newer one has nothing to add, a calmer candidate follows at once.
 
 Where a proposal is refused, the next, less ambitious candidate of a short ladder is taken (`LADDERS`). What has been
@@ -86,7 +86,9 @@ class Past:
     speed_m_per_s: float | None = None  #: up to which a verdict lets a configuration run
     proposal: str = ""  #: hash; empty: it could not be made
     settled: bool | None = None  #: of a measurement: converged, and nothing to gain; None: nobody has looked at it yet
-    gains: bool = False  #: the same: a newer model would lead to another design
+    gains: bool = (
+        False  #: the same: the line does otherwise than the model foresees, so that a newer one would tell more
+    )
 
 
 @dataclass(frozen=True)
@@ -143,7 +145,8 @@ def next_step(
     newest = past[last["experiment"]] if last["experiment"] > last["model"] else None
     of_measurement = newest is not None and newest.step is Step.MEASUREMENT
     if newest is not None and of_measurement and last["experiment"] > last["gains"]:
-        return _measured(past, newest, since, adaptations)
+        more = _experiment(past, since, first_speed_m_per_s, wanted_m_per_s, 0)
+        return _measured(past, newest, since, adaptations, more)
     if newest is not None and not of_measurement:
         found = _on_ladder(Step.MODEL, since)
         number = sum(_is_done(one, "experiment") for one in past[last["model"] + 1 :])
@@ -172,8 +175,10 @@ def next_step(
     return _experiment(past, since, first_speed_m_per_s, wanted_m_per_s, 0)
 
 
-def _measured(past: Sequence[Past], measured: Past, since: Sequence[Past], adaptations: int) -> Next | Look | Ended:
-    """After a measurement, from whose data nothing has been made yet."""
+def _measured(
+    past: Sequence[Past], measured: Past, since: Sequence[Past], adaptations: int, more: Next | Ended
+) -> Next | Look | Ended:
+    """After a measurement. `more`: the experiment with which another round begins."""
     if measured.settled is None:
         return Look(measured.proposal)
     what = f"an adapted configuration is in service up to {region_speed(past) or 0.0:.3g} m/s"
@@ -183,12 +188,10 @@ def _measured(past: Sequence[Past], measured: Past, since: Sequence[Past], adapt
     rounds = sum(one.step is Step.MEASUREMENT and _is_done(one, "experiment") for one in past)
     if rounds >= MOST_ROUNDS:
         return Ended(True, f"{what}, and after {rounds} measurements that is left as it is; {measured.why}")
-    if measured.settled or measured.gains:
-        found = _on_ladder(Step.MODEL, since)
-    else:
-        found = _on_ladder(Step.REDESIGN, since, _known_by_measurement(past))
+    calmer = not (measured.settled or measured.gains)
+    found = _on_ladder(Step.REDESIGN, since, _known_by_measurement(past)) if calmer else more
     if isinstance(found, Ended):
-        return Ended(True, f"{what}; {measured.why}; {found.text}", converged=measured.settled)
+        return Ended(True, f"{what}; {measured.why}; {found.text}", measured.settled)
     return found
 
 

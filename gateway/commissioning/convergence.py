@@ -1,8 +1,8 @@
 """Whether an adaptation has come to its end: what the line does, beside what the model says of it. Pure.
 
-A measurement is an experiment with steps that stand long enough to be looked at one by one: proposed, judged, decided
-and run like any other, so that it is on record and its data are there for the next model. Of each span the worst of
-its changes counts (BENCHMARK, convergence):
+A measurement is an experiment in which set-points move at the line's own rate, as in production, and stand long enough
+for each move to be looked at by itself: proposed, judged, decided and run like any other, so that it is on record and
+its data are there for the next model. Of each span the worst of its changes counts, from the begin of the move:
 
     RMSE_i <= 0.05 T_ref,i    OS_i <= 20 %    t_s,i <= 2 s    (eq. convergence_criteria)
 
@@ -10,9 +10,9 @@ overshoot of the step's size, or of T_ref,i where the span does not step, and th
 noise of the load cells adds to overshoot and settling is taken off by a mean over `SMOOTHED_S`.
 
 The prediction is a rollout on the accepted model with the set-points and speeds of the recording, looked at in the
-same way. What is left to gain is told by a model of these data: it would lead to another design only as far as the
-figures predicted by it differ from those of the model that the design was made on. Data of steps that stand for long do
-not always give a model of their own: then the gap itself says whether one is called for.
+same way. Where what was measured is what was foreseen, a newer model would foresee the same, and lead to no other
+design: so the gap between the two says whether there is anything to gain. (Data of moves that stand for long give no
+model by themselves.)
 """
 
 from collections.abc import Sequence
@@ -21,11 +21,9 @@ from math import inf, isfinite
 import numpy as np
 
 from gateway.commissioning.candidates import NotOffered
-from gateway.commissioning.redesign import BRIEF_S, LASTING_S, loop_of, predicted
-from gateway.control.judged_courses import Judged
+from gateway.commissioning.redesign import loop_of
 from gateway.control.rollout import Course, plants_of_thetas, simulate
 from gateway.core.controller import Controller
-from gateway.core.controller_laws import MpcConfig
 from gateway.core.deployment import Region
 from gateway.core.experiment import Abort, Experiment, Leg, signs
 from gateway.core.line import Line, Strict
@@ -36,7 +34,7 @@ from gateway.core.signals import FloatArray
 from gateway.core.theta import Noise
 
 RMSE_SHARE, MOST_OVERSHOOT_PCT, MOST_SETTLING_S = 0.05, 20.0, 2.0
-SIGNIFICANT = 0.05  #: of a predicted tracking error: a model that changes it by less leads to no other design
+SIGNIFICANT = 0.1  #: of the predicted tracking error: a gap below it, noise included, leads to no other design
 DWELL_S, STEPS = 2.5, 3  #: of a measurement: from step to step, and at each speed
 SEEDS = 100  #: are tried, for one with which every span steps at each speed, and few neighbours against each other
 OF_SETPOINT = 0.05  #: a step either way, of the mean set-point, as far as the region permits
@@ -70,8 +68,6 @@ class Convergence(Strict):
     predicted: dict[str, SpanFigures]  #: on the accepted model
     rmse_n: float  #: over all spans and changes
     gap: float  #: of that
-    gain: float  #: largest change of a predicted tracking error by a model of these data; without one the gap itself
-    why: str = ""  #: these data give no model of their own
 
     @property
     def converged(self) -> bool:
@@ -85,7 +81,7 @@ class Convergence(Strict):
     @property
     def gains(self) -> bool:
         """A newer model would lead to another design."""
-        return self.gain >= SIGNIFICANT
+        return abs(self.gap) >= SIGNIFICANT
 
     @property
     def worst(self) -> SpanFigures:
@@ -104,10 +100,9 @@ class Convergence(Strict):
         worst = self.worst
         settling = "never settles" if worst.settling_s is None else f"settles within {worst.settling_s:.2f} s"
         met = "criteria met" if not beyond else f"criteria not met by {', '.join(beyond)}"
-        gain = "no newer model from these data alone" if self.why else f"a newer model changes {self.gain:.1%}"
         return (
             f"{met}: error up to {worst.rmse_n:.2f} N, overshoot {worst.overshoot_pct:.0f} %, {settling}; "
-            f"{self.gap:+.0%} beside the prediction; {gain}"
+            f"{self.gap:+.0%} beside the prediction"
         )
 
 
@@ -136,6 +131,7 @@ def measurement(
         description="steps that stand, to see how the configuration in service does",
         amplitude_n=amplitude.tolist(),
         dwell_s=DWELL_S,
+        rate_n_per_s=line.moves.tension_rate_n_per_s,
         seed=seed,
         legs=[Leg(duration_s=STEPS * DWELL_S, speed_m_per_s=speed) for speed in speeds_m_per_s],
         abort=Abort(deviation_n=min(ABORT_TIMES * greatest, nearest_n)),
@@ -152,34 +148,15 @@ def _suited(asked: Experiment) -> tuple[int, int]:
     return int(np.count_nonzero(stepping)), -int(np.count_nonzero(steps[:, 1:] * steps[:, :-1] < 0.0))
 
 
-def convergence(
-    line: Line, recording: Recording, in_service: Controller, model: LineModel, newer: LineModel | str
-) -> Convergence:
-    """Of a measurement's recording under `in_service`. `newer`: a model of these data, or why there is none.
+def convergence(line: Line, recording: Recording, in_service: Controller, model: LineModel) -> Convergence:
+    """Of a measurement's recording under `in_service`, which is judged by `model`.
 
     Raises NotOffered where the recording shows no change to be looked at.
     """
     measured = _figures(line, recording, recording.tension_n)
     foreseen = _figures(line, recording, _rolled_out(line, recording, in_service, model))
     rmse, foreseen_rmse = (float(np.sqrt(sum(one.rmse_n**2 for one in of.values()))) for of in (measured, foreseen))
-    gap = rmse / max(foreseen_rmse, 1e-9) - 1.0
-    gain = abs(gap) if isinstance(newer, str) else _changed(line, recording, in_service, model, newer)
-    return Convergence(
-        spans=measured, predicted=foreseen, rmse_n=rmse, gap=gap, gain=gain,
-        why=newer if isinstance(newer, str) else "",
-    )  # fmt: skip
-
-
-def _changed(line: Line, recording: Recording, config: Controller, model: LineModel, newer: LineModel) -> float:
-    """By how much the tracking errors that the gate compares by differ from one model to the other."""
-    speed = min(model.region.speed_to_m_per_s, line.limits.speed_max_m_per_s)
-    judged = Judged(
-        line, recording.tension_setpoint_n[0], speed, line.limits.tension_step_max_n,
-        min(line.limits.speed_step_max_m_per_s, speed),
-    )  # fmt: skip
-    lasting_s = BRIEF_S if isinstance(config, MpcConfig) else LASTING_S
-    before, after = (predicted(config, line, one, judged, lasting_s) for one in (model, newer))
-    return max(abs(after[name].rmse_n / max(before[name].rmse_n, 1e-9) - 1.0) for name in before)
+    return Convergence(spans=measured, predicted=foreseen, rmse_n=rmse, gap=rmse / max(foreseen_rmse, 1e-9) - 1.0)
 
 
 def _rolled_out(line: Line, recording: Recording, config: Controller, model: LineModel) -> FloatArray:
@@ -221,7 +198,8 @@ def _windows(line: Line, recording: Recording) -> list[tuple[int, int]]:
     """From each change of set-points to the next, where the speed stands and every load cell tells."""
     setpoint, speed = recording.tension_setpoint_n, recording.unwind_speed_m_per_s
     spans = [i for i, span in enumerate(line.spans) if span.control == "tension"]
-    begins = (1 + np.flatnonzero(np.any(np.diff(setpoint, axis=0) != 0.0, axis=1))).tolist()
+    moved = np.any(np.diff(setpoint, axis=0) != 0.0, axis=1)
+    begins = (1 + np.flatnonzero(moved & ~np.concatenate(([False], moved[:-1])))).tolist()  # of moves, however long
     most = STANDS * line.limits.speed_max_m_per_s
     least = round((MOST_SETTLING_S + SMOOTHED_S) / recording.period_s)
     return [

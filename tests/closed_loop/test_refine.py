@@ -56,12 +56,13 @@ async def settled(side, hash_):
     return side.deployer.shown(hash_)
 
 
-async def measured(side):
-    """Steps in production, as phase 3 has them."""
-    steps = measurement(LINE, None, RECIPE.tension_n, (0.01, 0.02), 2.0, 1)
+async def moved(side):
+    """Steps in production, large enough to tell of the line."""
+    moves = measurement(LINE, None, RECIPE.tension_n, (0.01, 0.02), 2.0, 1)
+    asked = moves.model_copy(update={"rate_n_per_s": None})
     await side.ready()
     what = Evidence(what="how does it do")
-    return await settled(side, await put(LINE, side, ExperimentChange(experiment=steps), "a look", what))
+    return await settled(side, await put(LINE, side, ExperimentChange(experiment=asked), "a look", what))
 
 
 def test_a_line_that_has_drifted_is_refined_in_downtime_and_can_go_back(tmp_path):
@@ -76,7 +77,7 @@ def test_a_line_that_has_drifted_is_refined_in_downtime_and_can_go_back(tmp_path
         async with SteppedGate(producing(drifted, before, SEED + 1), tmp_path, SEED, before=side) as then:
             with pytest.raises(CannotGoOn, match="downtime"):
                 await refine(LINE, then, "anna")
-            assert (await measured(then)).stage == "done"
+            assert (await moved(then)).stage == "done"
             then.loop.command(Stop())
             assert then.loop.step_until(Phase.OFF, 30.0)
             assert then.loop.arm().ok and then.loop.step_until(Phase.READY, 10.0)

@@ -131,7 +131,7 @@ def test_the_history_says_what_was_tried_and_by_what_it_was_refused(tmp_path):
 def test_what_was_measured_is_kept_beside_the_line_and_is_its_baseline_once_nothing_is_left_to_do(tmp_path):
     now = LineNow(CONFIG, None, [20.0, 20.0], 0.01, datetime(2026, 1, 5, 6, tzinfo=UTC))
     span = SpanFigures(rmse_n=0.2, overshoot_pct=5.0, settling_s=None, setpoint_n=20.0)
-    shaky = Convergence(spans={"1": span}, predicted={"1": span}, rmse_n=0.2, gap=0.0, gain=0.01)
+    shaky = Convergence(spans={"1": span}, predicted={"1": span}, rmse_n=0.2, gap=0.0)
     good = shaky.model_copy(update={"spans": {"1": span.model_copy(update={"settling_s": 0.5})}})
     assert kept(tmp_path, LINE) == {} and not shaky.settled and good.settled
     keep(tmp_path, LINE, now, "a" * 64, shaky, 1.0)

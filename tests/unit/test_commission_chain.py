@@ -161,7 +161,9 @@ def test_what_is_not_settled_leads_to_another_model_and_redesign_a_few_times(gai
         steps.append(step.step)
         rungs += [step.rung] if step.step is Step.REDESIGN else []
         past.append(replace(after(step, past), speed_m_per_s=0.12))
-    again = [Step.MODEL, Step.REDESIGN, Step.MEASUREMENT] if gains else [Step.REDESIGN, Step.MEASUREMENT]
+    again = (
+        [Step.EXPERIMENT, Step.MODEL, Step.REDESIGN, Step.MEASUREMENT] if gains else [Step.REDESIGN, Step.MEASUREMENT]
+    )
     assert steps == [Step.MEASUREMENT, *(MOST_ROUNDS - 1) * again]
     assert step.reached and not step.converged and "span 2 overshoots" in step.text
     assert rungs == ([0, 0] if gains else [1, 2])  # what the model has foreseen, a newer one would give again
@@ -169,9 +171,13 @@ def test_what_is_not_settled_leads_to_another_model_and_redesign_a_few_times(gai
 
 @pytest.mark.parametrize(
     ("refused", "gains", "tried"),
-    [(Step.MEASUREMENT, True, LADDERS[Step.MEASUREMENT]), (Step.MODEL, True, 1 + LADDERS[Step.MODEL]),
-     (Step.REDESIGN, True, 2 + LADDERS[Step.REDESIGN]), (Step.REDESIGN, False, LADDERS[Step.REDESIGN])],
-)  # fmt: skip
+    [
+        (Step.MEASUREMENT, True, LADDERS[Step.MEASUREMENT]),
+        (Step.EXPERIMENT, True, 1 + LADDERS[Step.EXPERIMENT]),
+        (Step.REDESIGN, True, 3 + LADDERS[Step.REDESIGN]),
+        (Step.REDESIGN, False, LADDERS[Step.REDESIGN]),
+    ],
+)
 def test_where_nothing_further_gets_through_the_adapted_configuration_stays(refused, gains, tried):
     past = list(ADAPTED)
     while not isinstance(step := asked(past), Ended):
