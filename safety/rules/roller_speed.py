@@ -99,8 +99,8 @@ def _largest(judged: Judged, name: str, fastest: Fastest, allowed: float) -> tup
         return 1.0, value
     share, value = SMALL, fastest(_courses(judged, SMALL)[name])
     for _ in range(TRIES):
-        share *= BELOW * (allowed - web) / (value - web)
-        if not 0.0 < share < 1.0:  # nan, too: a line that runs away
+        share = min(share * BELOW * (allowed - web) / (value - web), BELOW)  # the whole step has been found too large
+        if not share > 0.0:  # nan, too: a line that runs away
             break
         value = fastest(_courses(judged, share)[name])
         if value <= allowed:
