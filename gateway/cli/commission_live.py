@@ -11,11 +11,11 @@ from pydantic import ValidationError
 from gateway.cli.commission import CannotGoOn
 from gateway.cli.commission_changes import LineNow
 from gateway.commissioning.chain import OPEN_STAGES, Outcome, past_of
-from gateway.core.decisions import ListProposals, ProposalList, ProposalShown, ShowProposal
+from gateway.core.decisions import Archive, ListProposals, ProposalList, ProposalShown, ShowProposal
 from gateway.core.line import Line
 from gateway.core.messages import Reply
 from gateway.core.recording import Recording
-from gateway.core.topics import GATEWAY_PROPOSALS, GATEWAY_PROPOSE, GATEWAY_STATUS, Topic
+from gateway.core.topics import GATEWAY_DECISION, GATEWAY_PROPOSALS, GATEWAY_PROPOSE, GATEWAY_STATUS, Topic
 from gateway.mailbox.port import Mailbox, Unreachable
 from gateway.supervisor import configurations as configurations_store
 from gateway.supervisor import models as models_store
@@ -26,7 +26,7 @@ from gateway.supervisor.model_store import ModelsError
 from gateway.supervisor.models import open_repository
 from gateway.supervisor.status import GatewayStatus
 
-TOPICS = (GATEWAY_PROPOSE, GATEWAY_PROPOSALS, GATEWAY_STATUS)  #: that are asked for
+TOPICS = (GATEWAY_PROPOSE, GATEWAY_PROPOSALS, GATEWAY_STATUS, GATEWAY_DECISION)  #: that are asked for
 ANSWER_S = 20.0
 POLL_S = 0.5
 READY_WITHIN_S = 600.0
@@ -108,6 +108,9 @@ class LiveGate:
 
     async def propose(self, payload: bytes) -> Reply:
         return Reply.model_validate_json(await self._ask(GATEWAY_PROPOSE, payload))
+
+    async def archive(self, command: Archive) -> Reply:
+        return Reply.model_validate_json(await self._ask(GATEWAY_DECISION, command.model_dump_json().encode()))
 
     async def wait_for(self, proposal: str) -> None:
         shown = await self._shown(proposal)

@@ -14,14 +14,14 @@ from gateway.cli.commission_changes import LineNow
 from gateway.cli.stepped import SteppedLoop
 from gateway.core.audit_record import Who
 from gateway.core.controller import canonical as canonical_controller
-from gateway.core.decisions import Decide, ProposalShown
+from gateway.core.decisions import Archive, Decide, ProposalShown
 from gateway.core.judge_context import JudgeContext
 from gateway.core.line import Line
 from gateway.core.messages import Reply, parse_command
 from gateway.core.recording import Recording, recording_of
 from gateway.core.states import Phase
 from gateway.core.telemetry import Frame, frame_dtype, unpack
-from gateway.core.topics import LOOP_COMMAND
+from gateway.core.topics import GATEWAY_DECISION, LOOP_COMMAND
 from gateway.core.verdict import Verdict
 from gateway.mailbox.inprocess import Hub, InProcessMailbox
 from gateway.supervisor.configurations import Configurations
@@ -38,6 +38,7 @@ from safety.judge import failed, judge
 BEGIN = datetime(2026, 1, 5, 6, 0, tzinfo=UTC)  #: of the stepped clock
 STOPPED_S = 1800.0  #: from one loop to the next on the same line
 LOOK_S = 0.5  #: from one look of the gate to the next
+ANSWER_S = 5.0  #: within this process
 READY_WITHIN_S = 300.0
 LEAST_S = 5.0  #: for which the line must have stood anyway before a change, and before one is kept
 MOST_DECISIONS = 3  #: on one proposal, where carrying it out is refused for the moment
@@ -158,6 +159,10 @@ class SteppedGate:
         reply = await self.deployer.propose(payload, RULES)
         await self.deployer.judged()
         return reply
+
+    async def archive(self, command: Archive) -> Reply:
+        payload = command.model_dump_json().encode()
+        return Reply.model_validate_json(await self._mailboxes[0].request(GATEWAY_DECISION, payload, ANSWER_S))
 
     async def wait_for(self, proposal: str) -> None:
         shown = self.deployer.shown(proposal)

@@ -11,7 +11,7 @@ from typing import IO, Any
 
 import numpy as np
 
-from gateway.cli.recordings_table import MOST_SPANS, PER_SPAN, RecordingRefused
+from gateway.cli.recordings_table import MOST_SPANS, PER_SPAN, RecordingRefused, usual_step_s
 from gateway.core.recording import Recording
 from gateway.core.signals import FloatArray
 
@@ -123,8 +123,7 @@ def _recording(samples: list[dict[str, Any]], period_s: float | None, name: str)
                 f"{name}, message {k}, controlled: is {sample['controlled']!r}, should be true or false"
             )
     controlled = np.array([sample["controlled"] for sample in samples])
-    median_s = float(np.median(np.diff(arrays["time_s"])))
-    return Recording(**arrays, controlled=controlled, period_s=period_s or median_s, source=name)
+    return Recording(**arrays, controlled=controlled, period_s=period_s or usual_step_s(arrays["time_s"]), source=name)
 
 
 def _array(samples: list[dict[str, Any]], key: str, n: int, name: str) -> FloatArray:

@@ -78,10 +78,16 @@ def recording_from(columns: dict[str, FloatArray], n: int, period_s: float | Non
         time_s=time_s,
         unwind_speed_m_per_s=columns["unwind_speed_m_per_s"],
         controlled=columns.get("controlled", np.ones(len(time_s))) == 1.0,
-        period_s=float(np.median(np.diff(time_s))) if period_s is None else period_s,
+        period_s=usual_step_s(time_s) if period_s is None else period_s,
         source=source,
         **{array: together(name) for array, name in PER_SPAN.items()},
     )
+
+
+def usual_step_s(time_s: FloatArray) -> float:
+    """Of times (k,) that may be anything: what is wrong with them is for the assessment to say."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        return float(np.median(np.diff(time_s)))
 
 
 def _nearest(name: str, known: Sequence[str]) -> str:

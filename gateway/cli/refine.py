@@ -9,6 +9,7 @@ import asyncio
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 from gateway.cli.commission import CannotGoOn, GateSide, Tell, put
 from gateway.cli.commission_changes import MOST_REASON, LineNow
@@ -16,19 +17,26 @@ from gateway.cli.identify_model import model_of_found
 from gateway.commissioning.chain import OPEN_STAGES, refused_at_once
 from gateway.commissioning.redesign import redesigns
 from gateway.core.controller import config_hash
-from gateway.core.decisions import ProposalShown
+from gateway.core.decisions import Archive, ProposalShown
 from gateway.core.line import Line
 from gateway.core.line_model import LineModel, ModelRefused
+from gateway.core.messages import Reply
 from gateway.core.proposal import Evidence, GainsChange, ModelChange
 from gateway.core.recording import Recording
 from gateway.core.theta import Noise
 from gateway.identification.assessment import assess
 from gateway.identification.identify import NotIdentified
 from gateway.identification.inheritance import NotInherited, identify_after
-from gateway.supervisor.configurations import FILE_NAME, STABLE, ConfigurationsError, open_configurations
+from gateway.supervisor.configurations import STABLE
 
 DOWNTIME = ("SILENT", "READY", "STOP")
 ON_PROBATION = ("probation", "keeping")  #: as far as a change of gains comes while the line stands
+
+
+class RefinedSide(GateSide, Protocol):
+    async def archive(self, command: Archive) -> Reply:
+        """Recorded in the audit before it is done. Raises CannotGoOn."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -41,7 +49,7 @@ class Refined:
     tried: list[ProposalShown]
 
 
-async def refine(line: Line, side: GateSide, who: str, tell: Tell = lambda text: None) -> Refined:
+async def refine(line: Line, side: RefinedSide, tell: Tell = lambda text: None) -> Refined:
     """Raises CannotGoOn where the line runs, or there is nothing to refine by; nothing has changed then."""
     if why := refused_at_once(line):
         raise CannotGoOn(why)
@@ -60,7 +68,7 @@ async def refine(line: Line, side: GateSide, who: str, tell: Tell = lambda text:
         )
     model, words = await asyncio.to_thread(_identified, line, now, now.model, recordings)
     tell(words)
-    await _archive(line, side, now, who, tell)
+    await _archive(side, now, tell)
     tried: list[ProposalShown] = []
     await _require_downtime(side)
     change, reason = ModelChange(model=model), f"refined on the newest experiment; {words}"
@@ -71,7 +79,6 @@ async def refine(line: Line, side: GateSide, who: str, tell: Tell = lambda text:
     found = await asyncio.to_thread(redesigns, line, model, now.in_service, now.tension_n)
     for rung, (law, controller) in enumerate(found):
         await _require_downtime(side)
-        await side.ready()
         reason = f"{law.text} on the refined model"
         tell(reason)
         hash_ = await put(line, side, GainsChange(controller=controller), reason, _named("redesign", rung))
@@ -113,14 +120,13 @@ def _identified(line: Line, now: LineNow, parent: LineModel, recordings: Sequenc
         raise CannotGoOn(f"the data give no model: {refused}") from refused
 
 
-async def _archive(line: Line, side: GateSide, now: LineNow, who: str, tell: Tell) -> None:
+async def _archive(side: RefinedSide, now: LineNow, tell: Tell) -> None:
     """What is in service, as phi_stable. Raises CannotGoOn."""
-    hash_, at_s = config_hash(now.in_service), now.at.timestamp()
-    try:
-        with open_configurations((await side.folder()) / FILE_NAME) as storage:
-            storage.archive(line.site, line.line, hash_, STABLE, at_s, who, "in service before a refinement")
-    except ConfigurationsError as error:
-        raise CannotGoOn(f"what is in service cannot be archived, so nothing is changed: {error}") from error
+    hash_ = config_hash(now.in_service)
+    reply = await side.archive(Archive(configuration=hash_, name=STABLE, because="in service before a refinement"))
+    if not reply.ok:
+        why = "; ".join(reply.reasons) or reply.text
+        raise CannotGoOn(f"what is in service cannot be archived, so nothing is changed: {why}")
     tell(f"{STABLE}: {hash_[:12]}, which was in service")
 
 

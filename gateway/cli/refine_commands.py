@@ -19,7 +19,6 @@ def refine(file: LineFile, run_dir: RunFolder = None) -> None:
 
     Example: r2rgate refine line.toml
     """
-    from gateway.cli.audit_commands import this_user
     from gateway.cli.commission import CannotGoOn
     from gateway.cli.commission_commands import with_gate
     from gateway.cli.refine import refine as carried_out
@@ -28,9 +27,7 @@ def refine(file: LineFile, run_dir: RunFolder = None) -> None:
     line = read_line(file)
     try:
         with interruptible("what is approved stays; nothing else is changed"):
-            found = with_gate(
-                line, run_dir, typer.echo, lambda side: carried_out(line, side, this_user().name, typer.echo)
-            )
+            found = with_gate(line, run_dir, typer.echo, lambda side: carried_out(line, side, typer.echo))
     except CannotGoOn as error:
         typer.echo(f"not refined: {error}", err=True)
         raise typer.Exit(REFUSED) from None

@@ -16,6 +16,7 @@ from gateway.core.messages import Start, Stop
 from gateway.core.proposal import Evidence, ExperimentChange, GainsChange
 from gateway.core.scenario import Scenario
 from gateway.core.states import Phase
+from gateway.supervisor.audit_file import AuditFile
 from gateway.supervisor.configurations import FILE_NAME, STABLE, open_configurations
 from tests.bench.control_plants import random_plant, scaled
 from tests.closed_loop.recorded import demonstration_line
@@ -76,12 +77,12 @@ def test_a_line_that_has_drifted_is_refined_in_downtime_and_can_go_back(tmp_path
             before = (await side.now()).in_service
         async with SteppedGate(producing(drifted, before, SEED + 1), tmp_path, SEED, before=side) as then:
             with pytest.raises(CannotGoOn, match="downtime"):
-                await refine(LINE, then, "anna")
+                await refine(LINE, then)
             assert (await moved(then)).stage == "done"
             then.loop.command(Stop())
             assert then.loop.step_until(Phase.OFF, 30.0)
             assert then.loop.arm().ok and then.loop.step_until(Phase.READY, 10.0)
-            found = await refine(LINE, then, "anna")
+            found = await refine(LINE, then)
             assert found.model and found.gains, found
             assert then.deployer.book.in_service != config_hash(before)
             then.loop.command(Start())
@@ -104,6 +105,9 @@ def test_a_line_that_has_drifted_is_refined_in_downtime_and_can_go_back(tmp_path
 async def back_to_stable(side, folder):
     with open_configurations(folder / FILE_NAME) as storage:
         stable = storage.find(STABLE)
-    assert stable.controller is not None and stable.archived[-1].who == "anna"
+    assert stable.controller is not None and stable.archived[-1].why == "in service before a refinement"
+    with AuditFile(folder) as audit:
+        kinds = [row.record().kind for row in audit.rows()]
+    assert "archived" in kinds
     await side.ready()
     return await put(LINE, side, GainsChange(controller=stable.controller), "back", Evidence(what="as it was"))
