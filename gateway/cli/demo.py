@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 
 from gateway.cli.children import ChildFailed, Children
-from gateway.cli.demo_cases import Window, begin_with_repeats, run_with_repeats
+from gateway.cli.demo_cases import Window, begin_with_repeats, run_with_repeats, settle_with_repeats
 from gateway.cli.demo_line import Setup, begin, clear, end_in_order
 from gateway.cli.demo_operator import DemoFailed, Operator
 from gateway.cli.demo_progress import Progress
@@ -149,6 +149,6 @@ async def _whole(operator: Operator, setup: Setup, stepped: "SteppedAside") -> "
     operator.progress.step(
         "settling: the loop controls the line by what it was started with, an LQI on the line's file"
     )
-    await operator.wait_settled(recipe.tension_n, recipe.speed_m_per_s)
+    await settle_with_repeats(operator, recipe.tension_n, recipe.speed_m_per_s)
     chain = await carry_out(operator, setup, stepped)
     return chain.windows, chain

@@ -1,6 +1,7 @@
 """The paper's cases on the line that runs, in real time; once more where this computer has stalled."""
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from gateway.cli.demo_operator import DemoFailed, Operator
@@ -31,6 +32,19 @@ async def begin_with_repeats(operator: Operator) -> None:
             if repeats == MOST_REPEATS:
                 raise
             await operator.recover(f"not started; once more ({failed})", str(failed))
+
+
+async def settle_with_repeats(operator: Operator, tension_n: Sequence[float], speed_m_per_s: float) -> None:
+    """At set-points; started again where the line has stopped meanwhile."""
+    for repeats in range(MOST_REPEATS + 1):
+        try:
+            await operator.wait_settled(tension_n, speed_m_per_s)
+            return
+        except DemoFailed as failed:
+            if repeats == MOST_REPEATS or not await operator.has_stopped():
+                raise
+            await operator.recover(f"started once more: {failed}", str(failed))
+            await begin_with_repeats(operator)
 
 
 async def run_with_repeats(operator: Operator, config: Controller, case: Scenario, period_s: float) -> Window:

@@ -13,10 +13,11 @@ from gateway.cli.demo_cases import MOST_REPEATS, Window, begin_with_repeats, run
 from gateway.cli.demo_line import Setup
 from gateway.cli.demo_operator import DemoFailed, Operator
 from gateway.cli.demo_stepped import SteppedAside
+from gateway.commissioning.chain import Step, past_of
 from gateway.core.controller import Controller, config_hash
 from gateway.core.decisions import ProposalShown
 from gateway.core.deployment import Region
-from gateway.core.messages import Reply
+from gateway.core.messages import Reply, SelectRecipe
 from gateway.core.proposal import GainsChange
 from gateway.core.recording import Recording
 from gateway.core.scenario import PAPER, Scenario
@@ -83,8 +84,13 @@ class Measured:
         await self._side.wait_for(proposal)
 
     async def measure_kept(self) -> None:
-        """What is in service, where it has been kept and not been measured."""
-        kept = [one for one in await self._side.proposals() if one.stage == "kept"]
+        """What is in service, where it is a redesign that has been kept and not been measured.
+
+        A first configuration is judged for smaller steps than those of the cases.
+        """
+        kept = [
+            one for one in await self._side.proposals() if one.stage == "kept" and past_of(one).step is Step.REDESIGN
+        ]
         for shown in reversed(kept):
             if isinstance(shown.proposal.change, GainsChange):
                 controller = shown.proposal.change.controller
@@ -111,8 +117,7 @@ async def carry_out(operator: Operator, setup: Setup, stepped: SteppedAside) -> 
 
     async def decide(shown: ProposalShown) -> None:
         short = shown.proposal_hash[:12]
-        rules = 0 if shown.verdict is None else len(shown.verdict.findings)
-        operator.progress.step(f"  the gate lets it through by {rules} rules; $ r2rgate approve {short} --yes")
+        operator.progress.step(f"  the gate lets it through by {_rules(shown)} rules; $ r2rgate approve {short} --yes")
         decided[short] = decided.get(short, 0) + 1
         try:
             await operator.approve(short, "the demonstration approves what the gate lets through")
@@ -124,15 +129,15 @@ async def carry_out(operator: Operator, setup: Setup, stepped: SteppedAside) -> 
         name = name_of(len({config_hash(window.config) for window in chain.windows}))
         operator.progress.step(f"  kept. {name} is measured: {len(PAPER)} cases of {PAPER[0].duration_s:g} s")
         stepped.ask(config)
-        region = None if shown.verdict is None else shown.verdict.region
         found: list[Window] = []
         for case in PAPER:
-            if against := beyond(case, region):
+            if against := beyond(case, _region(shown)):
                 chain.left_out.append(f"{name}, {case.heading.lower()}: {against}")
             else:
                 found.append(await run_with_repeats(operator, config, case, period_s))
         chain.windows += found
 
+    chain.windows = await _initial(operator, setup, stepped)
     mailbox = UnixMailbox()
     mailbox.connect(TOPICS, operator.run_folder / GATEWAY_SOCKET)
     side = Measured(
@@ -164,6 +169,25 @@ async def carry_out(operator: Operator, setup: Setup, stepped: SteppedAside) -> 
             await showing
         await mailbox.close()
     return chain
+
+
+def _rules(shown: ProposalShown) -> int:
+    return 0 if shown.verdict is None else len(shown.verdict.findings)
+
+
+def _region(shown: ProposalShown) -> Region | None:
+    return None if shown.verdict is None else shown.verdict.region
+
+
+async def _initial(operator: Operator, setup: Setup, stepped: SteppedAside) -> list[Window]:
+    """Both cases under what the loop was started with, and back to where the line stood."""
+    operator.progress.step(f"Initial, what the loop was started with, is measured: {len(PAPER)} cases")
+    stepped.ask(setup.config)
+    period_s, recipe = setup.line.control.period_s, setup.line.recipes[0]
+    windows = [await run_with_repeats(operator, setup.config, case, period_s) for case in PAPER]
+    await operator.order(SelectRecipe(name=recipe.name))
+    await operator.wait_settled(recipe.tension_n, recipe.speed_m_per_s)
+    return windows
 
 
 def name_of(place: int) -> str:

@@ -18,6 +18,7 @@ from gateway.cli.demo_chain_table import print_chain
 from gateway.cli.demo_line import Setup, line_text
 from gateway.cli.demo_operator import DemoFailed
 from gateway.cli.demo_result import DemoResult, paper_improvement_pct
+from gateway.commissioning.chain import Step, named
 from gateway.control.design import design_lqi, task_of
 from gateway.core.controller import config_hash
 from gateway.core.deployment import Region
@@ -77,13 +78,14 @@ class Side:
         self.done.append(f"waited for {proposal}")
 
 
-def shown_as(hash_, stage, config=None):
-    change = SimpleNamespace() if config is None else GainsChange(controller=config)
-    return SimpleNamespace(proposal_hash=hash_, stage=stage, proposal=SimpleNamespace(change=change), verdict=None)
+def shown_as(hash_, stage, config=None, step=Step.REDESIGN):
+    change = SimpleNamespace(kind="model") if config is None else GainsChange(controller=config)
+    proposal = SimpleNamespace(change=change, kind=change.kind, evidence=[named(step, 0)])
+    return SimpleNamespace(proposal_hash=hash_, stage=stage, why="", proposal=proposal, verdict=None)
 
 
-def test_each_configuration_that_is_kept_is_measured_once_and_before_the_chain_goes_on():
-    side = Side(shown_as("a", "refused", CONFIGS[0]))
+def test_each_redesign_that_is_kept_is_measured_once_and_before_the_chain_goes_on():
+    side = Side(shown_as("a", "refused", CONFIGS[0]), shown_as("0", "kept", CONFIGS[0], Step.FIRST))
 
     async def measure(config, shown):
         side.done.append(f"measured {shown.proposal_hash}")
