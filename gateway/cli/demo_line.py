@@ -27,7 +27,7 @@ STATED: tuple[tuple[str, str, str], ...] = (
     (
         "# first_speed_max_m_per_s = 0.02",
         "first_speed_max_m_per_s = 0.1",
-        "the cases of the paper run at 0.01 and 0.1 m/s, so the first configuration is asked, and judged, for that speed",
+        "the cases of the paper run at up to 0.1 m/s: the first configuration is asked, and judged, for that speed",
     ),
     ("# first_step_max_n = 4.0", "first_step_max_n = 24.0", "and for their step; on a line of yours leave both"),
     ("# probation_s = 30.0", "probation_s = 10.0", "shorter than on a line that produces: three changes in minutes"),

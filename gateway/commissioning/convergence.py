@@ -38,6 +38,7 @@ SIGNIFICANT = 0.1  #: of the predicted tracking error: a gap below it, noise inc
 DWELL_S, STEPS = 2.5, 3  #: of a measurement: from step to step, and at each speed
 SEEDS = 100  #: are tried, for one with which every span steps at each speed, and few neighbours against each other
 OF_SETPOINT = 0.05  #: a step either way, of the mean set-point, as far as the region permits
+REVERSAL_TIMES = 3.0  #: of the rms that the gate lets a torque chatter by: a noise that large is hardly ever there
 ABORT_TIMES = 3.0  #: the greatest step either way: farther from its set-point no tension goes
 SMOOTHED_S = 0.05
 STANDS = 0.02  #: of the greatest speed, by which it may differ within a window, noise included
@@ -134,7 +135,10 @@ def measurement(
         rate_n_per_s=line.moves.tension_rate_n_per_s,
         seed=seed,
         legs=[Leg(duration_s=STEPS * DWELL_S, speed_m_per_s=speed) for speed in speeds_m_per_s],
-        abort=Abort(deviation_n=min(ABORT_TIMES * greatest, nearest_n)),
+        # What the gate lets a torque chatter is no reason to end it.
+        abort=Abort(
+            deviation_n=min(ABORT_TIMES * greatest, nearest_n), reversal_nm=REVERSAL_TIMES * line.gate.chatter_max_nm
+        ),
     )
     seeds = [asked.model_copy(update={"seed": SEEDS * seed + k}) for k in range(SEEDS)]
     return max(seeds, key=_suited)
