@@ -163,7 +163,12 @@ async def commission(
                 await side.wait_for(step.proposal)
                 continue
             if isinstance(step, Look):
-                await _look(changes, side, step.proposal, tell)
+                try:
+                    await _look(changes, side, step.proposal, tell)
+                except NotOffered as error:
+                    text = f"an adapted configuration is in service up to {region_speed(past) or 0.0:.3g} m/s"
+                    ended = Ended(True, f"{text}; what was measured cannot be judged: {error}")
+                    return _commissioned(ended, past, shown, measured)
                 continue
             await side.ready()
             await _propose(changes, side, step, shown, unmade, tell)
@@ -172,15 +177,15 @@ async def commission(
 
 
 async def _look(changes: Changes, side: GateSide, proposal: str, tell: Tell) -> None:
-    """At what the measurement under `proposal`, the newest experiment, has shown."""
+    """At what the measurement under `proposal`, the newest experiment, has shown. Raises CannotGoOn, NotOffered."""
     now, recordings = await side.now(), await side.recordings()
     if not recordings or now.model is None:
         raise CannotGoOn("the data of the last measurement are no longer there: measure anew (--again)")
     try:
         found = await asyncio.to_thread(changes.looked_at, now, recordings)
         keep(await side.folder(), changes.line, now, proposal, found, changes.effort_n2m2s(recordings[0]))
-    except (NotOffered, BaselinesError) as error:
-        raise CannotGoOn(f"what was measured cannot be judged: {error}") from error
+    except BaselinesError as error:
+        raise CannotGoOn(f"what was measured cannot be kept: {error}") from error
     tell(f"measurement: {found.text}")
 
 
