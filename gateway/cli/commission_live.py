@@ -30,6 +30,7 @@ TOPICS = (GATEWAY_PROPOSE, GATEWAY_PROPOSALS, GATEWAY_STATUS, GATEWAY_DECISION) 
 ANSWER_S = 20.0
 POLL_S = 0.5
 READY_WITHIN_S = 600.0
+STORED_WITHIN_S = 5.0
 MOST_SHOWN = 200
 
 
@@ -83,7 +84,9 @@ class LiveGate:
         return Path((await self._status()).historian.path).parent
 
     async def recordings(self) -> list[Recording]:
-        status = await self._status()
+        status = await self._stored()
+        if status is None:
+            return []
         begin_s = status.wall_s - self._line.gate.data_max_age_s
         path, until_s = Path(status.historian.path), status.wall_s + 1.0
         try:
@@ -91,6 +94,20 @@ class LiveGate:
         except HistoryError:
             return []  # there is no history yet
         return [one for one, _ in found]
+
+    async def _stored(self) -> GatewayStatus | None:
+        """Once the historian has stored what there was when this was asked; None: it does not.
+
+        Without this the newest experiment in the history may not be the newest one.
+        """
+        asked = status = await self._status()
+        began_s = self._clock()
+        while (age_s := status.historian.last_stored_age_s) is None or status.wall_s - age_s < asked.wall_s:
+            if self._clock() - began_s > STORED_WITHIN_S:
+                return None
+            await self._pause(POLL_S)
+            status = await self._status()
+        return status
 
     async def ready(self) -> None:
         """In RUN, with set-points that stand as the gate asks; after a refusal for the moment, the cool-down later."""

@@ -40,7 +40,7 @@ class Health:
     frames_stored: int = 0
     frames_lost: int = 0  #: came while nothing could be stored and memory was full
     events_lost: int = 0
-    last_stored_s: float | None = None  #: monotonic
+    last_stored_s: float | None = None  #: monotonic: what had come until then is stored
     moved_aside: str = ""  #: where the last damaged file is kept
 
 
@@ -127,27 +127,28 @@ class Historian:
             self._writer.disconnect()
 
     def _turn(self, finish: bool) -> None:
+        until_s = self._clock()
         _move(self._frames, self._new_frames)
         _move(self._events, self._new_events)
         idle = not self._new_frames
         try:
             wall_ahead_s = self._wall_clock() - self._clock()
             self._writer.store(self._new_frames, self._new_events, wall_ahead_s)
-            self._stored()
+            self._stored(until_s)
             if finish or idle or self._writer.gathered_s() >= BLOB_S:
                 self._writer.pack(wall_ahead_s)
                 self._writer.expire(self._retention, self._wall_clock())
         except Exception as error:  # the thread must outlive whatever happens to the disk
             self._recover(error)
 
-    def _stored(self) -> None:
+    def _stored(self, until_s: float) -> None:
         something = self._new_frames or self._new_events
         self._health = replace(
             self._health,
             storing=True,
             text="storing",
             frames_stored=self._health.frames_stored + len(self._new_frames),
-            last_stored_s=self._clock() if something else self._health.last_stored_s,
+            last_stored_s=until_s if something else self._health.last_stored_s,
         )
         self._new_frames.clear()
         self._new_events.clear()

@@ -15,9 +15,9 @@ from gateway.commissioning.convergence import Convergence, SpanFigures
 from gateway.control.design import design_lqi, task_of
 from gateway.core.controller import config_hash
 from gateway.core.decisions import QUERY, ListProposals, ProposalLine, ProposalList, ProposalShown
-from gateway.core.messages import Reply
+from gateway.core.messages import Event, Reply
 from gateway.core.proposal import parse_proposal, proposal_hash
-from gateway.core.topics import GATEWAY_PROPOSALS, GATEWAY_PROPOSE, LOOP_TELEMETRY
+from gateway.core.topics import GATEWAY_PROPOSALS, GATEWAY_PROPOSE, LOOP_EVENT, LOOP_TELEMETRY
 from gateway.core.verdict import RuleFinding, Verdict
 from gateway.mailbox.inprocess import Hub, InProcessMailbox
 from gateway.mailbox.port import Counters
@@ -42,18 +42,30 @@ class QuietHistorian(Historian):
         pass
 
 
+class LateHistorian(Historian):
+    """It stores by its own clock, at every fourth look at its health."""
+
+    looks = 0
+
+    def health(self):
+        self.looks += 1
+        if self.looks % 4 == 0:
+            self._turn(False)
+        return super().health()
+
+
 class OneProcess:
     """A gateway over a line that stands at 0.01 m/s; every proposal is refused at once, or waits for a person."""
 
-    def __init__(self, folder, stage="refused", line=LINE):
+    def __init__(self, folder, stage="refused", line=LINE, historian=QuietHistorian):
         self.now_s, self.frames, self.stage = 100.0, 0, stage
         self.shown: dict[str, ProposalShown] = {}
         self.told: list[str] = []
         hub = Hub()
         self.mailbox, self.loop = InProcessMailbox(hub), InProcessMailbox(hub)
-        historian = QuietHistorian(folder, line.site, line.line, line.n)
-        clock = lambda: self.now_s  # noqa: E731
-        Gateway(line, InProcessMailbox(hub), historian, Counters(), clock=clock, wall_clock=lambda: 1.8e9 + self.now_s)
+        clock, wall_clock = lambda: self.now_s, lambda: 1.8e9 + self.now_s
+        kept = historian(folder, line.site, line.line, line.n, clock=clock, wall_clock=wall_clock)
+        Gateway(line, InProcessMailbox(hub), kept, Counters(), clock=clock, wall_clock=wall_clock)
         self.loop.serve(GATEWAY_PROPOSE, self._propose)
         self.loop.serve(GATEWAY_PROPOSALS, self._proposals)
         with begin_configurations(folder / FILE_NAME) as store:
@@ -157,6 +169,28 @@ def test_a_person_is_asked_once_and_waited_for(tmp_path):
     asyncio.run(run())
     (hash_,) = gateway.shown
     assert [text for text in gateway.told if f"r2rgate approve {hash_[:12]}" in text] == gateway.told[2:]
+
+
+def test_an_experiment_that_has_just_ended_is_the_newest(tmp_path):
+    gateway = OneProcess(tmp_path, historian=LateHistorian)
+
+    async def ended():
+        begin_s = gateway.now_s
+        await gateway.pause(1.0)
+        data = {"begin_s": begin_s, "end_s": gateway.now_s}
+        event = Event(time_s=gateway.now_s, kind="experiment-end", text="", data=data)
+        gateway.loop.publish(LOOP_EVENT, event.model_dump_json().encode())
+        return len(await gateway.side.recordings())
+
+    async def run():
+        return [await ended() for _ in range(3)]
+
+    assert asyncio.run(run()) == [1, 2, 3]
+
+
+def test_without_a_history_that_stores_there_are_no_recordings(tmp_path):
+    gateway = OneProcess(tmp_path)
+    assert asyncio.run(gateway.side.recordings()) == [] and gateway.now_s > 100.0
 
 
 def test_another_line_than_that_of_the_file_is_left_alone(tmp_path):
