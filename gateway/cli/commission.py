@@ -9,13 +9,15 @@ import asyncio
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import timedelta
+from math import inf
 from pathlib import Path
 from typing import Protocol
 
 from gateway.cli.commission_changes import Changes, LineNow, first_speed_m_per_s
 from gateway.cli.commission_measurements import keep, kept
-from gateway.commissioning.candidates import NotOffered, fastest_m_per_s
+from gateway.commissioning.candidates import Exhausted, NotOffered, fastest_m_per_s
 from gateway.commissioning.chain import (
+    AS_IT_IS,
     Ended,
     Look,
     Next,
@@ -137,7 +139,7 @@ async def commission(
     """
     if why := refused_at_once(line):
         return Commissioned(False, why, [], None)
-    changes = Changes(line)
+    changes = Changes(line, inf if wanted_m_per_s is None else wanted_m_per_s)
     unmade: list[tuple[int, Past]] = []  #: candidates that could not be made, by how many proposals there were
     past: list[Past] = []
     shown: list[ProposalShown] = []
@@ -208,7 +210,8 @@ async def _propose(
         change, reason = await asyncio.to_thread(changes.made, step, now, recordings, _region(shown))
     except NotOffered as refused:
         tell(f"{what}: cannot be made: {refused}")
-        unmade.append((len(shown), Past(KINDS[step.step], Outcome.FAILED, step.step, step.rung, str(refused))))
+        rung = AS_IT_IS - 1 if isinstance(refused, Exhausted) else step.rung
+        unmade.append((len(shown), Past(KINDS[step.step], Outcome.FAILED, step.step, rung, str(refused))))
         return
     tell(f"{what}: {reason}")
     await put(line, side, change, reason, named(step.step, step.rung))

@@ -4,11 +4,12 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
+from math import inf
 
 import numpy as np
 
 from gateway.cli.identify_model import model_of_found
-from gateway.commissioning.candidates import FIRST_LAWS, Law, NotOffered, configuration, experiment
+from gateway.commissioning.candidates import FIRST_LAWS, Exhausted, Law, NotOffered, configuration, experiment
 from gateway.commissioning.chain import AS_IT_IS, Next, Step, first_legs
 from gateway.commissioning.convergence import Convergence, convergence, measurement
 from gateway.commissioning.redesign import redesigns
@@ -42,10 +43,11 @@ def first_speed_m_per_s(line: Line) -> float:
 
 
 class Changes:
-    """Of a line."""
+    """Of a line that is to go as fast as `wanted_m_per_s`, or as its drives hold."""
 
-    def __init__(self, line: Line) -> None:
+    def __init__(self, line: Line, wanted_m_per_s: float = inf) -> None:
         self.line = line
+        self._wanted_m_per_s = wanted_m_per_s
         self._designed: tuple[LineNow, list[tuple[Law, Controller]]] | None = None  #: and what it was designed from
         self._experiment_for: tuple[object, Experiment] | None = None  #: and what it was designed from
 
@@ -137,10 +139,12 @@ class Changes:
             return GainsChange(controller=now.in_service), f"the configuration in service, {on}"
         if self._designed is None or not _same(self._designed[0], now):
             shown = 0.0 if region is None else region.speed_max_m_per_s or 0.0
-            self._designed = now, redesigns(self.line, now.model, now.in_service, now.tension_n, shown)
+            found = redesigns(self.line, now.model, now.in_service, now.tension_n, shown, self._wanted_m_per_s)
+            self._designed = now, found
         found = self._designed[1]
         if step.rung >= len(found):
-            raise NotOffered(f"{len(found)} designs do no worse on the model than the configuration in service")
+            what = f"{len(found) or 'no'} design{'' if len(found) == 1 else 's'}"
+            raise Exhausted(f"{what} on the model promise no worse than the configuration in service")
         law, controller = found[step.rung]
         return GainsChange(controller=controller), f"{law.text} {on}"
 

@@ -38,6 +38,10 @@ class NotOffered(Exception):
     """There is no such candidate; the text says why."""
 
 
+class Exhausted(NotOffered):
+    """Nor is there any after it."""
+
+
 @dataclass(frozen=True)
 class Law:
     """An architecture, and factors on the values with which its design begins."""

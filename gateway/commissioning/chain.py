@@ -188,8 +188,9 @@ def _measured(
     rounds = sum(one.step is Step.MEASUREMENT and _is_done(one, "experiment") for one in past)
     if rounds >= MOST_ROUNDS:
         return Ended(True, f"{what}, and after {rounds} measurements that is left as it is; {measured.why}")
-    calmer = not (measured.settled or measured.gains)
-    found = _on_ladder(Step.REDESIGN, since, _known_by_measurement(past)) if calmer else more
+    calmer = redesigned >= adaptations and not (measured.settled or measured.gains)
+    # What is in service has been judged for all that data have shown: as it is, it is no candidate here.
+    found = _on_ladder(Step.REDESIGN, since, _known_by_measurement(past), AS_IT_IS) if calmer else more
     if isinstance(found, Ended):
         return Ended(True, f"{what}; {measured.why}; {found.text}", measured.settled)
     return found
@@ -262,20 +263,23 @@ def _last_done(past: Sequence[Past], kind: str) -> int:
 
 
 def _known_by_measurement(past: Sequence[Past]) -> int:
-    """Candidates that need not be tried again: measured, not as they should be, and the model has told so beforehand.
+    """Candidates on the model that need not be tried again: measured, not as they should be, and foreseen by it.
 
     A newer model would give the same: the next candidate on the same model is a calmer one.
     """
-    done = [one for one in past if one.step is Step.MEASUREMENT and _is_done(one, "experiment")]
+    on_it = past[_last_done(past, "model") + 1 :]
+    done = [one for one in on_it if one.step is Step.MEASUREMENT and _is_done(one, "experiment")]
     return min(sum(one.settled is False and not one.gains for one in done), AS_IT_IS)
 
 
-def _on_ladder(step: Step, since: Sequence[Past], least: int = 0) -> Next | Ended:
-    """The first rung above those that have failed since something was done last; `least` or above."""
+def _on_ladder(step: Step, since: Sequence[Past], least: int = 0, end: int | None = None) -> Next | Ended:
+    """The first rung above those that have failed since something was done last; from `least` up to before `end`."""
+    end = LADDERS[step] if end is None else end
     tried = [one for one in since if one.step is step]
     rung = max(least, 1 + max((one.rung for one in tried if one.outcome is Outcome.FAILED), default=-1))
-    if rung >= LADDERS[step]:
-        return Ended(False, f"no {step} of {LADDERS[step]} candidates gets through; the last one: {tried[-1].why}")
+    if rung >= end:
+        last = f"; the last one: {tried[-1].why}" if tried else ""
+        return Ended(False, f"no {step} of {end} candidates gets through{last}")
     again = [one for one in tried if one.outcome is Outcome.AGAIN and one.rung == rung]
     if len(again) > MOST_AGAIN:
         return Ended(False, f"the {step} has come at a wrong moment {len(again)} times; the last time: {again[-1].why}")

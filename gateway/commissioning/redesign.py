@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import takewhile
+from math import inf
 
 import numpy as np
 
@@ -61,11 +62,13 @@ class Figures:
 
 
 def redesigns(
-    line: Line, model: LineModel, in_service: Controller, tension_n: Sequence[float], shown_m_per_s: float = 0.0
-) -> list[tuple[Law, Controller]]:
+    line: Line, model: LineModel, in_service: Controller, tension_n: Sequence[float], shown_m_per_s: float = 0.0,
+    wanted_m_per_s: float = inf,
+) -> list[tuple[Law, Controller]]:  # fmt: skip
     """At most `RUNGS`, for steps as the line's file permits and speeds up to those of the model's data.
 
-    `shown_m_per_s`: or up to a higher one that other data have shown.
+    `shown_m_per_s`: or up to a higher one that other data have shown. Predictive control is offered once it is the
+    highest that the drives hold, or `wanted_m_per_s`: on the way there it would only take the gate's time.
     """
     speed = min(max(model.region.speed_to_m_per_s, shown_m_per_s), line.limits.speed_max_m_per_s)
     limits = line.limits
@@ -76,7 +79,7 @@ def redesigns(
     found = _worth(designed, in_service, line, model, judged, BRIEF_S if _slow(in_service) else LASTING_S)
     places = sorted({round(k * (len(found) - 1) / (LINEAR_RUNGS - 1)) for k in range(LINEAR_RUNGS)}) if found else []
     linear = [found[place] for place in places]
-    if speed < NEAR * fastest_m_per_s(line, model):
+    if speed < NEAR * min(wanted_m_per_s, fastest_m_per_s(line, model)):
         return linear
     predictive = _designed(line, model, speed, PREDICTIVE)
     found = _worth([*predictive, *linear[:1]], in_service, line, model, judged, BRIEF_S)

@@ -15,6 +15,7 @@ from gateway.commissioning.candidates import (
     fastest_m_per_s,
 )
 from gateway.commissioning.chain import (
+    AS_IT_IS,
     LADDERS,
     MOST_AGAIN,
     MOST_EXPERIMENTS,
@@ -49,8 +50,8 @@ KINDS = {
 LINE = line_of(2)
 
 
-def asked(past):
-    return next_step(past, FIRST_M_PER_S, WANTED_M_PER_S)
+def asked(past, adaptations=1):
+    return next_step(past, FIRST_M_PER_S, WANTED_M_PER_S, adaptations)
 
 
 def looked_at(past, settled=True, gains=False):
@@ -169,13 +170,26 @@ def test_what_is_not_settled_leads_to_another_model_and_redesign_a_few_times(gai
     assert rungs == ([0, 0] if gains else [1, 2])  # what the model has foreseen, a newer one would give again
 
 
+def test_so_many_adaptations_as_are_asked_for_each_rest_on_an_experiment_of_their_own():
+    past, steps, rungs = list(ADAPTED), [], []
+    while not isinstance(step := asked(past, adaptations=3), Ended):
+        if isinstance(step, Look):
+            past = looked_at(past, settled=False)
+            continue
+        steps.append(step.step)
+        rungs += [step.rung] if step.step is Step.REDESIGN else []
+        past.append(replace(after(step, past), speed_m_per_s=0.12))
+    again = [Step.EXPERIMENT, Step.MODEL, Step.REDESIGN, Step.MEASUREMENT]
+    assert steps == [Step.MEASUREMENT, *again, *again] and rungs == [0, 0]
+
+
 @pytest.mark.parametrize(
     ("refused", "gains", "tried"),
     [
         (Step.MEASUREMENT, True, LADDERS[Step.MEASUREMENT]),
         (Step.EXPERIMENT, True, 1 + LADDERS[Step.EXPERIMENT]),
         (Step.REDESIGN, True, 3 + LADDERS[Step.REDESIGN]),
-        (Step.REDESIGN, False, LADDERS[Step.REDESIGN]),
+        (Step.REDESIGN, False, AS_IT_IS),  # what is in service is no candidate against itself
     ],
 )
 def test_where_nothing_further_gets_through_the_adapted_configuration_stays(refused, gains, tried):
