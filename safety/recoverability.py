@@ -147,7 +147,7 @@ class Recovery:
         setpoint_n: FloatArray,
         in_flight_nm: FloatArray,
         torque_nm: FloatArray,
-        remembered: FloatArray,
+        remembered: FloatArray | None,
     ) -> Shortfall | None:
         """What would go wrong if set-points, or the unwinder's speed, stepped to these: rollers keep some room."""
         found, looks = self.ahead(measured, setpoint_n, in_flight_nm, torque_nm, remembered)

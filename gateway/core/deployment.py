@@ -48,7 +48,7 @@ class RecoveryNode(Strict):
 class RecoveryPrediction(Strict):
     """Whether a fallback configuration would still recover the line, from any state: what the loop computes it from."""
 
-    fallback: Hash  #: the configuration that is switched to; the one in service itself: then the line stops
+    fallback: Hash  #: the configuration that is switched to; where that is the one that runs, the line stops
     period_s: Positive
     horizon_s: Positive  #: that is looked ahead
     margin_n: (
@@ -106,6 +106,7 @@ class InService(Strict):
     on_probation: bool
     lease_left_s: float | None = None  #: None: not on probation
     last_known_good: Hash
+    good_if_kept: Hash  #: what would be that if the one that runs were kept: under a predictive one, a linear one
     region: Region
     watched: bool  #: a recovery prediction looks after it
     why: str  #: "start", "deployed", "kept", or "rolled back: .."

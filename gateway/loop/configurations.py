@@ -2,6 +2,10 @@
 
 Whoever deploys may die: a lease that is not renewed ends, and the loop goes back by itself. All changes are made
 between two periods, or at the beginning of a period's control, and each is told.
+
+What is kept becomes the last known good one, unless it is predictive and that is linear: whether a linear law would
+still recover the line can be told in every period, of a predictive one under its limits it cannot
+(`safety.recoverability`). So the predictive one controls the line on top of the linear one, which stays the way back.
 """
 
 from collections.abc import Callable
@@ -15,10 +19,11 @@ from gateway.control.law import Law, Measured
 from gateway.control.reference import Steady
 from gateway.core.controller import Controller, ControllerRefused, config_hash
 from gateway.core.controller_fit import misfits
+from gateway.core.controller_laws import MpcConfig
 from gateway.core.deployment import Deployment, InService, RecoveryPrediction, Region
 from gateway.core.line import Line
 from gateway.loop.experiment import Tell
-from gateway.loop.kept import Kept
+from gateway.loop.kept import Kept, OnTop
 from gateway.loop.setpoints import Setpoints
 from gateway.loop.torque import TorquePath
 from safety.recoverability import Recovery
@@ -66,6 +71,7 @@ class Configurations:
         self.why = "start"
         self.prepared: tuple[Deployment, Configuration] | None = None  #: built ahead of its command
         self.prepared_watch: tuple[RecoveryPrediction, Recovery] | None = None
+        self.to_keep = False  #: what outlives this loop is no longer what it should be
         self._line = line
         self._law_of = law_of
         self._setpoints = setpoints
@@ -78,6 +84,9 @@ class Configurations:
         recovery = None if watch is None else Recovery(watch, kept.controller, self._line)
         config = Configuration(kept.controller, config_hash(kept.controller), law, kept.region, watch, recovery)
         self.running = self.good = config
+        if (top := kept.on_top) is not None:
+            law = self._law_of(top.controller)
+            self.running = Configuration(top.controller, config_hash(top.controller), law, top.region, watch, recovery)
         self.epoch = kept.epoch
         self.path.take_over(law)
 
@@ -121,23 +130,44 @@ class Configurations:
         if self.probation is not None:
             self.probation.until_s = now_s + self.probation.lease_s
 
+    @property
+    def good_if_kept(self) -> Configuration:
+        """What the line goes back to once nothing is on probation, where what runs is kept."""
+        on_top = isinstance(self.running.config, MpcConfig) and not isinstance(self.good.config, MpcConfig)
+        return self.good if on_top else self.running
+
+    @property
+    def on_top(self) -> OnTop | None:
+        """What runs without being what the line goes back to, and not on probation."""
+        running = self.running
+        if running is self.good or self.probation is not None:
+            return None
+        return OnTop(controller=running.config, region=running.region)
+
     def keep(self, watch: RecoveryPrediction | None, recovery: Recovery | None) -> None:
-        """What is on probation becomes the last known good."""
-        old = self.running
-        self.running = self.good = Configuration(old.config, old.hash, old.law, old.region, watch, recovery)
+        """What is on probation is kept; `watch` is for what the line goes back to from now on."""
+        self.good = self.good_if_kept
+        self._watch(watch, recovery)
         self.probation = None
         self.why = "kept"
-        self._say("kept", "is the last known good from now on")
+        good = "is the last known good from now on"
+        self._say("kept", good if self.running is self.good else f"is kept, with {self.good.hash[:12]} to go back to")
 
     def watch_good(self, watch: RecoveryPrediction, recovery: Recovery) -> None:
-        """What runs and is good is watched by another model. Only where nothing is on probation."""
-        self.running = self.good = replace(self.good, watch=watch, recovery=recovery)
+        """The line is watched by another model. Only where nothing is on probation."""
+        self._watch(watch, recovery)
         self._say("watched", "is watched by the model that was accepted last")
+
+    def _watch(self, watch: RecoveryPrediction | None, recovery: Recovery | None) -> None:
+        good = replace(self.good, watch=watch, recovery=recovery)
+        self.running = good if self.running is self.good else replace(self.running, watch=watch, recovery=recovery)
+        self.good = good
 
     def roll_back(self, reason: str) -> bool:
         """Back to the last known good; False where that runs already."""
         if self.running is self.good:
             return False
+        self.to_keep |= self.on_top is not None
         given_up, self.running = self.running, self.good
         self.probation = None
         self.why = f"rolled back: {reason}"
@@ -171,6 +201,7 @@ class Configurations:
             on_probation=probation is not None,
             lease_left_s=None if probation is None else max(probation.until_s - now_s, 0.0),
             last_known_good=self.good.hash,
+            good_if_kept=self.good_if_kept.hash,
             region=running.region,
             watched=running.recovery is not None,
             why=self.why,

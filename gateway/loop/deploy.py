@@ -81,9 +81,11 @@ def _keep(cycle: Cycle, command: Keep) -> str:
     configurations, watch = cycle.configurations, command.watch
     recovery = None
     if watch is not None:
-        recovery = _recovery(configurations, watch, configurations.running.config, "not kept")
+        recovery = _recovery(configurations, watch, configurations.good_if_kept.config, "not kept")
     configurations.keep(watch, recovery)
-    return f"epoch {command.epoch} is the last known good"
+    good = configurations.good
+    under = "" if configurations.running is good else f", with {good.hash[:12]} to go back to"
+    return f"epoch {command.epoch} is kept{under}"
 
 
 def _watch_good(cycle: Cycle, command: WatchGood) -> str:
@@ -94,7 +96,7 @@ def _watch_good(cycle: Cycle, command: WatchGood) -> str:
     configurations.watch_good(
         command.watch, _recovery(configurations, command.watch, good.config, "not watched by another model")
     )
-    return f"{good.hash[:12]} is watched by the model that was accepted last"
+    return f"{configurations.running.hash[:12]} is watched by the model that was accepted last"
 
 
 def _recovery(configurations: Configurations, watch: RecoveryPrediction, fallback: Controller, not_: str) -> Recovery:

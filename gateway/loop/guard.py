@@ -65,12 +65,13 @@ class Guard:
     ) -> str:
         """What would come of set-points (n,), and an unwinder's speed, at once; empty: nothing that is not allowed.
 
-        `against` would stop the line for it. Without a prediction nothing is foreseen.
+        `against` would stop the line for it, or give up the law that runs. Without a prediction nothing is foreseen.
         """
         running = configurations.running
         recovery = running.recovery
-        if recovery is None or recovery.fallback != running.hash or path.state is None:
+        if recovery is None or configurations.probation is not None or path.state is None:
             return ""
+        remembered = memory(path.state) if recovery.fallback == running.hash else None
         in_flight, sent = self._sent_nm[1 : 1 + recovery.depth], self._sent_nm[0]
-        short = recovery.shortfall_of_step(measured, setpoint_n, in_flight, sent, memory(path.state))
+        short = recovery.shortfall_of_step(measured, setpoint_n, in_flight, sent, remembered)
         return "" if short is None else short.foreseen

@@ -1,7 +1,8 @@
 """What outlives the loop: the last known good configuration, in one file, all of it or the one before.
 
-Never the one on probation: a loop that starts anew starts with what is known to be good. The file belongs to the
-configuration that the loop is started with: an engineer who gives it another one gets that.
+Beside it the predictive one that was kept on top of it, if one was (see `configurations`). Never the one on probation:
+a loop that starts anew starts with what was kept. The file belongs to the configuration that the loop is started with:
+an engineer who gives it another one gets that.
 """
 
 import os
@@ -20,6 +21,13 @@ FILE = "configuration.json"
 GIVEN = "started-with.json"  #: what the loop was given, for the gateway: its messages name configurations by hash
 
 
+class OnTop(Strict):
+    """A predictive configuration that was kept: it controls the line, and is not what the line goes back to."""
+
+    controller: ControllerConfig
+    region: Region
+
+
 class Kept(Strict):
     format: Annotated[int, Field(ge=1, le=1)] = 1
     started_with: Hash  #: the configuration that the loop was given
@@ -27,6 +35,7 @@ class Kept(Strict):
     controller: ControllerConfig
     region: Region
     watch: RecoveryPrediction | None
+    on_top: OnTop | None = None
 
 
 class Store:
@@ -49,7 +58,8 @@ class Store:
         if kept.started_with != self._started_with:
             say(f"{self.path} belongs to another configuration than the one given, which is used")
             return None
-        if reasons := misfits(kept.controller, line):
+        on_top = [] if kept.on_top is None else misfits(kept.on_top.controller, line)
+        if reasons := [*misfits(kept.controller, line), *on_top]:
             say(f"{self.path} is not used, the configuration given is: {'; '.join(reasons)}")
             return None
         return kept
@@ -58,9 +68,14 @@ class Store:
         """Before the first period. Raises OSError."""
         self._write(self.path.with_name(GIVEN), canonical(config))
 
-    def write(self, epoch: int, config: Controller, region: Region, watch: RecoveryPrediction | None) -> None:
+    def write(
+        self, epoch: int, config: Controller, region: Region, watch: RecoveryPrediction | None,
+        on_top: OnTop | None = None,
+    ) -> None:  # fmt: skip
         """On the disk when it returns. Raises OSError; the file before is then as it was."""
-        kept = Kept(started_with=self._started_with, epoch=epoch, controller=config, region=region, watch=watch)
+        kept = Kept(
+            started_with=self._started_with, epoch=epoch, controller=config, region=region, watch=watch, on_top=on_top
+        )
         self._write(self.path, kept.model_dump_json().encode())
 
     def _write(self, path: Path, content: bytes) -> None:

@@ -21,9 +21,10 @@ from gateway.loop.aside import Aside
 from gateway.loop.commands import carry_out, forbidden, prepare_to_arm, release, unheard
 from gateway.loop.cycle import Cycle
 from gateway.loop.deploy import against
-from gateway.loop.kept import Store
+from gateway.loop.kept import OnTop, Store
 from gateway.loop.pacer import Tick
 
+KEPT_AGAIN_S = 1.0
 HEARD_AGAIN_S = 1.0  #: for devices that were lost to tell what speaks against arming, or that nothing does
 MAX_WAITING = 32  #: commands between two periods; more are refused, but for a stop
 
@@ -41,6 +42,7 @@ class Runner:
         self._waiting: deque[tuple[Command, Answer]] = deque()
         self._passed = asyncio.Event()
         self._arming: asyncio.Task[Reply | None] | None = None
+        self._keeping: asyncio.Task[None] | None = None
         self._ending = False
 
     async def period(self, tick: Tick) -> None:
@@ -53,6 +55,8 @@ class Runner:
             if not answer.done():
                 answer.set_result(reply)
         await self.cycle.period(tick)
+        if self.cycle.configurations.to_keep:
+            self._keep_anew()
         self._passed.set()
         self._passed.clear()  # whoever waited goes on all the same
 
@@ -148,17 +152,22 @@ class Runner:
             except OSError as error:
                 return self._refused("not deployed", [f"nothing could be kept at {store.path}: {error.strerror}"])
         configurations.prepared = deployment, candidate
-        return await self._at_boundary(command)
+        reply = await self._at_boundary(command)
+        if not reply.ok and self._store is not None and configurations.on_top is not None:
+            configurations.to_keep = True  # the disk is to have again what runs on
+        return reply
 
     async def _keep(self, command: Keep) -> Reply:
         """The disk first: after a restart the line runs what somebody was told is kept."""
         configurations, watch = self.cycle.configurations, command.watch
-        running, good = configurations.running, configurations.good
+        good, then = configurations.good, configurations.good_if_kept
+        running = configurations.running
+        on_top = None if then is running else OnTop(controller=running.config, region=running.region)
         if configurations.probation is None or configurations.epoch != command.epoch:
             return await self._at_boundary(command)  # which refuses it
         if watch is not None:
             try:
-                recovery = await self._aside.do(lambda: configurations.recovery(watch, running.config))
+                recovery = await self._aside.do(lambda: configurations.recovery(watch, then.config))
             except ControllerRefused as refused:
                 return self._refused("not kept", [str(refused)])
             configurations.prepared_watch = watch, recovery
@@ -166,7 +175,7 @@ class Runner:
             return await self._at_boundary(command)
         store, epoch = self._store, command.epoch
         try:
-            await self._aside.do(lambda: store.write(epoch, running.config, running.region, watch))
+            await self._aside.do(lambda: store.write(epoch, then.config, then.region, watch, on_top))
             reply = await self._at_boundary(command)
             if not reply.ok:  # rolled back meanwhile
                 await self._aside.do(lambda: store.write(epoch, good.config, good.region, good.watch))
@@ -177,19 +186,37 @@ class Runner:
     async def _watch_good(self, command: WatchGood) -> Reply:
         """Made, and on the disk, while periods go on."""
         configurations, watch = self.cycle.configurations, command.watch
-        good, epoch = configurations.good, configurations.epoch
+        good, epoch, on_top = configurations.good, configurations.epoch, configurations.on_top
         if configurations.probation is not None:
             return await self._at_boundary(command)  # which refuses it
         try:
             recovery = await self._aside.do(lambda: configurations.recovery(watch, good.config))
             if (store := self._store) is not None:
-                await self._aside.do(lambda: store.write(epoch, good.config, good.region, watch))
+                await self._aside.do(lambda: store.write(epoch, good.config, good.region, watch, on_top))
         except ControllerRefused as refused:
             return self._refused("not watched by another model", [str(refused)])
         except OSError as error:
             return self._refused("not watched by another model", [f"nothing could be kept: {error.strerror}"])
         configurations.prepared_watch = watch, recovery
         return await self._at_boundary(command)
+
+    def _keep_anew(self) -> None:
+        """A loop that starts anew must not run what was given up. Aside, and again where the disk refuses."""
+        configurations, store = self.cycle.configurations, self._store
+        configurations.to_keep = False
+        if store is None:
+            return
+
+        async def keep() -> None:
+            async with self._configuring:
+                good, epoch, on_top = configurations.good, configurations.epoch, configurations.on_top
+                try:
+                    await self._aside.do(lambda: store.write(epoch, good.config, good.region, good.watch, on_top))
+                except OSError:
+                    await asyncio.sleep(KEPT_AGAIN_S)
+                    configurations.to_keep = True
+
+        self._keeping = asyncio.create_task(keep())
 
     async def _prove(self) -> Reply | None:
         """As `prepare_to_arm`, for devices that have come back, too.

@@ -175,7 +175,7 @@ class Book:
         elif kind == "deployed":
             self.in_service = entry.changes
         elif kind == "kept":
-            self.last_known_good = entry.changes
+            self.last_known_good = str(what.get("last_known_good", entry.changes))
         elif kind == "rolled-back":
             self.in_service = str(what["to"])
         elif kind == "model-in-service":
@@ -183,6 +183,8 @@ class Book:
 
     def _found(self, what: Mapping[str, Any]) -> None:
         """The loop's own word on what controls the line."""
+        if self.in_service not in (None, what["configuration"]):  # what was kept has been taken back
+            self.trusted.clear()
         self.in_service = str(what["configuration"])
         self.last_known_good = str(what["last_known_good"])
         self.epoch = int(what["epoch"])
@@ -226,9 +228,10 @@ def _settled(change: Entry, found: InService) -> tuple[str, dict[str, Any]] | No
     named: dict[str, Any] = {"proposal": change.proposal, "epoch": change.epoch}
     if runs and found.on_probation:
         return ("deployed", named) if change.stage is Stage.DEPLOYING else None
-    if runs and found.last_known_good == found.hash:
+    if runs:
         after = {Stage.DEPLOYING: "deployed", Stage.PROBATION: "keeping"}
-        return after.get(change.stage, "kept"), named
+        kind = after.get(change.stage, "kept")
+        return kind, {**named, "last_known_good": found.last_known_good} if kind == "kept" else named
     if change.stage is Stage.DEPLOYING and found.epoch != change.epoch:
         return "not-deployed", {**named, "because": f"the loop is at epoch {found.epoch}: {found.why}"}
     return "rolled-back", {**named, "to": found.hash, "because": found.why.removeprefix("rolled back: ")}

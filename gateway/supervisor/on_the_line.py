@@ -165,7 +165,7 @@ class OnTheLine:
             await self._records.step("keeping", {"proposal": entry.proposal, "epoch": entry.epoch}, GATEWAY)
         watch = None
         try:
-            watch = await self._surroundings.recovery(entry.changes, found.region, self._records.book)
+            watch = await self._surroundings.recovery(found.good_if_kept, found.region, self._records.book)
             reply = await self._loop.tell(Keep(epoch=entry.epoch or found.epoch, watch=watch))
             because = "" if reply.ok else "; ".join([reply.text, *reply.reasons])
         except NotKnown as error:
@@ -173,7 +173,7 @@ class OnTheLine:
         if because:
             await self._loop.tell(Rollback(reason=f"it could not be kept: {because}"[:LONGEST_REASON]))
         elif watch is not None:
-            self._looked_after = self._records.book.model, entry.changes
+            self._looked_after = self._records.book.model, found.good_if_kept
         await self.settle()
 
     async def _look_after_good(self, found: InService) -> None:

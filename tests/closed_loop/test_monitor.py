@@ -5,12 +5,12 @@ import pytest
 
 from gateway.cli.rehearse_designs import truth_of
 from gateway.cli.stepped import SteppedLoop
-from gateway.control.design import design_lqg, design_lqi, design_lqr
+from gateway.control.design import design_lqg, design_lqi, design_lqr, design_mpc
 from gateway.control.design.task import task_on
 from gateway.core.controller import config_hash
 from gateway.core.deployment import Deployment
 from gateway.core.doubts import Doubt
-from gateway.core.messages import Deploy, Keep, SetSpeed, SetTension
+from gateway.core.messages import Deploy, Keep, SetSpeed, SetTension, WatchGood
 from gateway.core.states import LoopState, Phase
 from gateway.core.theta import Theta
 from safety.recovery_prediction import recovery_prediction
@@ -20,7 +20,7 @@ TENSION_N = np.array([28.0, 36.0, 20.0, 40.0, 24.0, 32.0])
 LINE, PLANT = demo_line(), real_plant()
 THETA = Theta(truth_of(PLANT), np.zeros(6), 0.0, LINE.control.latency_s)
 TASK = task_on(LINE, THETA)
-GOOD = design_lqi(TASK)
+GOOD, PREDICTIVE = design_lqi(TASK), design_mpc(TASK)
 
 
 def scaled(config, factor):
@@ -123,6 +123,46 @@ def test_the_largest_step_of_a_kept_configuration_is_left_alone():
     assert loop.command(SetTension(span=3, tension_n=TENSION_N[2] + step_n, step=True)).ok
     loop.step(250)
     assert loop.cycle.machine.phase is Phase.RUNNING and not loop.alarms
+
+
+def predictive_kept():
+    loop = producing()
+    deploy(loop, PREDICTIVE, watch_for())
+    other = loop.command(Keep(epoch=1, watch=watch_for(PREDICTIVE)))
+    assert not other.ok and "go back to" in other.reasons[0]
+    reply = loop.command(Keep(epoch=1, watch=watch_for()))
+    assert reply.ok and not reply.in_service.on_probation and reply.in_service.watched
+    assert (reply.in_service.hash, reply.in_service.last_known_good) == (config_hash(PREDICTIVE), config_hash(GOOD))
+    return loop
+
+
+def test_predictive_control_is_kept_with_a_linear_law_to_go_back_to_and_makes_the_largest_step():
+    loop = predictive_kept()
+    step_n = LINE.limits.tension_step_max_n
+    assert loop.command(SetTension(span=3, tension_n=TENSION_N[2] + step_n, step=True)).ok
+    loop.step(250)
+    found = loop.cycle.configurations.in_service(loop.now_s)
+    assert loop.cycle.machine.phase is Phase.RUNNING and not loop.alarms and found.hash == config_hash(PREDICTIVE)
+    assert loop.command(WatchGood(watch=watch_for())).in_service.hash == config_hash(PREDICTIVE)
+
+
+def test_where_kept_predictive_control_goes_wrong_the_linear_law_takes_over_and_the_line_goes_on():
+    loop = predictive_kept()
+    law = loop.cycle.torque_path.law
+    ask, rest_nm = law.ask, loop.cycle.outputs.torque_nm.copy()
+
+    def wrong(*given):
+        decision = ask(*given)
+        decision.torque_nm = 2.0 * rest_nm - decision.torque_nm
+        return decision
+
+    law.ask = wrong
+    loop.step(300)
+    found = loop.cycle.configurations.in_service(loop.now_s)
+    assert loop.cycle.machine.phase is Phase.RUNNING and found.hash == found.last_known_good == config_hash(GOOD)
+    assert "would come to" in found.why
+    lowest, highest = band(loop)
+    assert LINE.limits.tension_min_n < lowest and highest < LINE.limits.tension_max_n
 
 
 def kept_at(speed_m_per_s, line=LINE):

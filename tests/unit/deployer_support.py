@@ -90,6 +90,7 @@ class FakeLoop:
         self.now_s = 0.0
         self.runs = self.good = config_hash(FIRST)
         self.epoch = 0
+        self.predictive: set[str] = set()  #: hashes
         self.lease_end_s: float | None = None
         self.why = "start"
         self.reachable = True
@@ -123,7 +124,7 @@ class FakeLoop:
         return InService(
             hash=self.runs, kind="lqi", epoch=self.epoch, on_probation=probation,
             lease_left_s=self.lease_end_s - self.now_s if probation else None, last_known_good=self.good,
-            region=Region(), watched=False, why=self.why,
+            good_if_kept=self.good if self.runs in self.predictive else self.runs, region=Region(), watched=False, why=self.why,
         )  # fmt: skip
 
     def _back(self, why: str) -> None:
@@ -147,7 +148,8 @@ class FakeLoop:
         elif isinstance(command, Renew):
             self.lease_end_s = self.now_s + self.lease_s
         elif isinstance(command, Keep):
-            self.good, self.lease_end_s, self.why = self.runs, None, "kept"
+            self.good = self.in_service().good_if_kept
+            self.lease_end_s, self.why = None, "kept"
         elif isinstance(command, Rollback):
             self._back(f"rolled back: {command.reason}")
         elif isinstance(command, RunExperiment):

@@ -234,6 +234,26 @@ async def test_after_a_rollback_a_person_decides_again():
 
 
 @run
+async def test_what_is_kept_on_top_of_a_linear_law_goes_back_to_that_and_is_trusted_no_more():
+    gateway = await started(TRUSTING)
+    one = proposal(1, config_hash(FIRST), 0.0)
+    gateway.loop.predictive.add(config_hash(controller(1)))
+    await gateway.propose(one)
+    await gateway.pass_time(1.0)
+    assert (await gateway.decide(one)).ok
+    await gateway.pass_time(PROBATION_S + 1.0)
+    book = gateway.deployer.book
+    assert gateway.stage(one) is Stage.KEPT and book.in_service == gateway.loop.runs == config_hash(controller(1))
+    assert book.last_known_good == gateway.loop.good == config_hash(FIRST) and book.trusted
+    gateway.loop._back("rolled back: span 3 would come to 60 N")
+    gateway.deployer.look_again()
+    await gateway.pass_time(1.0)
+    kind, what = gateway.audit.records[-1]
+    assert kind == "found-in-service" and what["explained"] and "span 3" in what["because"]
+    assert book.in_service == book.last_known_good == config_hash(FIRST) and not book.trusted
+
+
+@run
 async def test_a_wider_region_than_the_approved_is_a_persons():
     gateway = await kept_one_by_hand()
     gateway.judge.region = Region(speed_max_m_per_s=0.2)

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from gateway.cli.stepped import SteppedLoop
-from gateway.control.design import design_lqi, design_pid, task_of
+from gateway.control.design import design_lqi, design_mpc, design_pid, task_of
 from gateway.core.controller import config_hash
 from gateway.core.deployment import Deployment, Region
-from gateway.core.messages import Deploy, Keep, Reply, Rollback, command_bytes
+from gateway.core.messages import Deploy, Keep, Reply, Rollback, WatchGood, command_bytes
 from gateway.core.theta import nominal_theta
 from gateway.loop.kept import FILE, Store
 from gateway.loop.pacer import Tick
@@ -18,7 +18,8 @@ from safety.recovery_prediction import recovery_prediction
 from tests.closed_loop.conftest import demo_line, real_plant
 
 LINE = demo_line()
-GIVEN, OTHER = design_lqi(task_of(LINE)), design_pid(task_of(LINE))
+GIVEN, OTHER, PREDICTIVE = (design(task_of(LINE)) for design in (design_lqi, design_pid, design_mpc))
+WATCH = recovery_prediction(nominal_theta(LINE), GIVEN, LINE, [0.05])
 TENSION_N = np.array([28.0, 36.0, 20.0, 40.0, 24.0, 32.0])
 
 
@@ -59,8 +60,8 @@ def test_a_file_for_another_given_configuration_or_another_line_is_not_used(tmp_
     assert Store(tmp_path, GIVEN).read(demo_line(2), said.append) is None and "for 6 spans" in said[1]
 
 
-def told(runner, loop, *commands):
-    """Replies of the runner to commands, while periods go on."""
+def told(runner, loop, *commands, until=lambda: True):
+    """Replies of the runner to commands, while periods go on; and then `until` something is so."""
 
     async def story():
         replies = []
@@ -72,7 +73,12 @@ def told(runner, loop, *commands):
                 loop.periods += 1
                 await asyncio.sleep(0)
             replies.append(Reply.model_validate_json(answer.result()))
-        return replies
+        for _ in range(1000):
+            if until():
+                return replies
+            await runner.period(Tick(loop.now_s, loop.now_s, 0))
+            await asyncio.sleep(0.001)
+        raise AssertionError("it does not come to that")
 
     try:
         return asyncio.run(story())
@@ -87,8 +93,9 @@ def producing(store):
     return loop, Runner(loop.cycle, store)
 
 
-def deploy(epoch=1):
-    return Deploy(deployment=Deployment(controller=OTHER, hash=config_hash(OTHER), epoch=epoch, lease_s=60.0))
+def deploy(epoch=1, controller=OTHER):
+    hash_ = config_hash(controller)
+    return Deploy(deployment=Deployment(controller=controller, hash=hash_, epoch=epoch, lease_s=60.0))
 
 
 def test_on_probation_the_disk_has_what_is_good_and_after_keeping_what_was_kept(tmp_path):
@@ -109,6 +116,48 @@ def test_on_probation_the_disk_has_what_is_good_and_after_keeping_what_was_kept(
     found = again.cycle.configurations.in_service(0.0)
     assert (found.hash, found.last_known_good, found.epoch) == (config_hash(OTHER), config_hash(OTHER), 1)
     assert found.watched and not found.on_probation
+
+
+def predictive_kept(store):
+    loop, runner = producing(store)
+    replies = told(runner, loop, deploy(controller=PREDICTIVE), Keep(epoch=1, watch=WATCH))
+    assert all(reply.ok for reply in replies), replies
+    return loop, Runner(loop.cycle, store)
+
+
+def test_predictive_control_that_was_kept_runs_again_after_a_restart_with_what_it_goes_back_to(tmp_path):
+    store, said = Store(tmp_path, GIVEN), []
+    loop, runner = predictive_kept(store)
+    (reply,) = told(runner, loop, WatchGood(watch=WATCH))
+    kept = store.read(LINE, said.append)
+    assert reply.ok and (kept.controller, kept.on_top.controller, kept.epoch) == (GIVEN, PREDICTIVE, 1)
+    again = SteppedLoop(LINE, GIVEN, real_plant(), 1)
+    again.cycle.configurations.resume(kept)
+    found = again.cycle.configurations.in_service(0.0)
+    assert (found.hash, found.last_known_good) == (config_hash(PREDICTIVE), config_hash(GIVEN))
+    assert found.watched and not found.on_probation and not said
+
+
+def test_predictive_control_that_was_given_up_does_not_come_back(tmp_path):
+    store = Store(tmp_path, GIVEN)
+    loop, runner = predictive_kept(store)
+    told(runner, loop, Rollback(reason="it hums"), until=lambda: store.read(LINE, print).on_top is None)
+    assert store.read(LINE, print).controller == GIVEN
+
+
+def test_predictive_control_stays_kept_where_its_successor_is_refused_at_the_last_moment(tmp_path):
+    store = Store(tmp_path, GIVEN)
+    loop, runner = predictive_kept(store)
+    checked = loop.cycle.configurations.candidate
+
+    def late(deployment):
+        candidate = checked(deployment)
+        loop.cycle.configurations.epoch = 2  # somebody else's has come first
+        return candidate
+
+    loop.cycle.configurations.candidate = late
+    (reply,) = told(runner, loop, deploy(2), until=lambda: store.read(LINE, print).on_top is not None)
+    assert not reply.ok and store.read(LINE, print).on_top.controller == PREDICTIVE
 
 
 def test_where_nothing_can_be_kept_nothing_is_deployed(tmp_path):
