@@ -8,7 +8,7 @@ information of any amplitude.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from math import ceil, inf
+from math import ceil, floor, inf
 
 import numpy as np
 
@@ -292,12 +292,12 @@ class _Drawing:
         return experiment, foreseen
 
     def with_abort(self, experiment: Experiment, foreseen: Foreseen) -> Experiment:
-        """Halfway from what is foreseen at worst to the tension limits, but not beyond twice what is foreseen."""
+        """Halfway from what is foreseen at worst to the tension limits, not beyond these, or twice what is foreseen."""
         limits, base, spans = self.line.limits, self.foresight.base_n, self.foresight.task.tension_spans
         room = float(np.minimum(base - limits.tension_min_n, limits.tension_max_n - base)[spans].min())
         worst = max(foreseen.deviation_n, max(experiment.amplitude_n))
         abort = Abort(
-            deviation_n=round(min(2.0 * worst, max(0.5 * (worst + room), 1.1 * worst)), 2),
+            deviation_n=floor(100.0 * min(2.0 * worst, room, max(0.5 * (worst + room), 1.1 * worst))) / 100.0,
             window_s=WINDOW_S,
             saturated_share=_allowed(foreseen.saturated_share),
             reversal_share=_allowed(foreseen.reversal_share),

@@ -1,5 +1,7 @@
 """What a designed experiment promises, held against the simulated line: intervals, tensions, refusals."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -14,7 +16,8 @@ from gateway.core.theta import Noise
 from gateway.core.web_model import WebModel
 from gateway.identification import experiment_information as information
 from gateway.identification.assessment import assess
-from gateway.identification.experiment_design import PREFERRED_S, Wanted, design_experiment
+from gateway.identification.experiment_design import PREFERRED_S, Wanted, _Drawing, design_experiment
+from gateway.identification.experiment_foresight import Foresight
 from tests.closed_loop.conftest import demo_line
 from tests.closed_loop.recorded import per_roller, real_plant
 from tests.closed_loop.test_experiment import BASE, SPEED, asked, producing, swinging
@@ -122,6 +125,16 @@ def test_the_design_tells_what_is_wanted_and_keeps_tensions_where_it_says(design
     assert len({leg.speed_m_per_s for leg in experiment.legs}) == 2
     assert 3.0 <= designed.foreseen.tension_min_n < designed.foreseen.tension_max_n <= 59.0
     assert designed.foreseen.deviation_n < experiment.abort.deviation_n < 18.0
+
+
+@pytest.mark.parametrize("deviation_n", [1.0, 12.0, 17.9])
+def test_an_experiment_is_aborted_beyond_what_is_foreseen_and_before_a_limit(designed, deviation_n):
+    line = demo_line()
+    base = np.array(line.recipes[0].tension_n)
+    drawing = _Drawing(Foresight(line, design_lqi(task_of(line)), base, SPEED), Wanted(), 2.0, 0)
+    abort = drawing.with_abort(designed.experiment, replace(designed.foreseen, deviation_n=deviation_n)).abort
+    room = min(base.min() - line.limits.tension_min_n, line.limits.tension_max_n - base.max())
+    assert deviation_n < abort.deviation_n <= room
 
 
 def test_on_plants_of_the_tolerances_tensions_go_no_further_than_was_foreseen(designed):
