@@ -114,7 +114,7 @@ class FakeLoop:
     def pass_time(self, seconds: float) -> None:
         self.now_s += seconds
         if self.lease_end_s is not None and self.now_s >= self.lease_end_s:
-            self._back("rolled back: the lease is over")
+            self.go_back("rolled back: the lease is over")
 
     def restart(self) -> None:
         self.runs, self.lease_end_s, self.why = self.good, None, "start"
@@ -124,10 +124,11 @@ class FakeLoop:
         return InService(
             hash=self.runs, kind="lqi", epoch=self.epoch, on_probation=probation,
             lease_left_s=self.lease_end_s - self.now_s if probation else None, last_known_good=self.good,
-            good_if_kept=self.good if self.runs in self.predictive else self.runs, region=Region(), watched=False, why=self.why,
+            good_if_kept=self.good if self.runs in self.predictive else self.runs,
+            region=Region(), watched=False, why=self.why,
         )  # fmt: skip
 
-    def _back(self, why: str) -> None:
+    def go_back(self, why: str) -> None:
         self.runs, self.lease_end_s, self.why = self.good, None, why
 
     def _done(self, command: Command) -> Reply:
@@ -151,7 +152,7 @@ class FakeLoop:
             self.good = self.in_service().good_if_kept
             self.lease_end_s, self.why = None, "kept"
         elif isinstance(command, Rollback):
-            self._back(f"rolled back: {command.reason}")
+            self.go_back(f"rolled back: {command.reason}")
         elif isinstance(command, RunExperiment):
             ok, text = False, "no experiment in these tests"
         return Reply(ok=ok, state="RUN", text=text, in_service=self.in_service())

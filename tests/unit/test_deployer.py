@@ -245,7 +245,7 @@ async def test_what_is_kept_on_top_of_a_linear_law_goes_back_to_that_and_is_trus
     book = gateway.deployer.book
     assert gateway.stage(one) is Stage.KEPT and book.in_service == gateway.loop.runs == config_hash(controller(1))
     assert book.last_known_good == gateway.loop.good == config_hash(FIRST) and book.trusted
-    gateway.loop._back("rolled back: span 3 would come to 60 N")
+    gateway.loop.go_back("rolled back: span 3 would come to 60 N")
     gateway.deployer.look_again()
     await gateway.pass_time(1.0)
     kind, what = gateway.audit.records[-1]
