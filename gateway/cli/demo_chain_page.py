@@ -101,7 +101,7 @@ def _beside_the_paper(result: DemoResult) -> Section:
             ]
         rows.append(tuple(row))
     heads = ["Configuration"]
-    foot = ["LQI designed on the true line, stepped time"]
+    foot = ["MPC designed on the true line, stepped time"]
     for case in PAPER:
         name = case.name.capitalize()
         heads += [f"{name}, RMSE, N", "change", "paper's RMSE, N", "paper's change"]

@@ -47,7 +47,7 @@ def _of_the_cases(result: DemoResult) -> list[str]:
     ratios = [(case.ratio_to_stepped, case.limit_ratio) for one in result.configurations for case in one.cases]
     worst, limit = max(ratios)
     return [
-        "on truth: an LQI designed on the true line, in stepped time. Compare the changes, not the numbers: the report "
+        "on truth: an MPC designed on the true line, in stepped time. Compare the changes, not the numbers: the report "
         "says why.",
         f"over the wires in real time against stepped time: {min(ratios)[0]:.3f} to {worst:.3f}; at most {limit:g}: "
         f"{'met' if worst <= limit else 'MISSED'}",

@@ -102,7 +102,7 @@ class DemoResult(Strict):
     versions: dict[str, str]
     machine: list[str]
     configurations: list[ConfigurationResult]  #: in the order in which they ran
-    truth_rmse_n: dict[str, float]  #: by case, in stepped time: an LQI designed on the true line
+    truth_rmse_n: dict[str, float]  #: by case, in stepped time: an MPC designed on the true line
     chain: ChainResult | None  #: None: one configuration, with which the loop was started
     timing: TimingResult
     unsafe_events: dict[str, int]  #: by kind, over the whole run, with 0 where none was seen

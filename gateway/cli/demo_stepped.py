@@ -15,7 +15,7 @@ from gateway.cli.demo_line import Setup
 from gateway.cli.rehearse_designs import truth_of
 from gateway.cli.stepped import run_scenario
 from gateway.cli.workers import Workers
-from gateway.control.design import design_lqi, task_of
+from gateway.control.design import design_mpc, task_of
 from gateway.core.controller import Controller, config_hash
 from gateway.core.line import Line
 from gateway.core.scenario import PAPER, Scenario
@@ -58,8 +58,8 @@ class SteppedAside:
         return self._asked[config_hash(config), case.name].result()
 
     def on_truth(self) -> Controller:
-        """An LQI that is designed on the true line: nobody knows that line better."""
-        return design_lqi(replace(task_of(self._setup.line), model=truth_of(load_plant(self._plant))))
+        """Predictive control that is designed on the true line: nobody knows that line better."""
+        return design_mpc(replace(task_of(self._setup.line), model=truth_of(load_plant(self._plant))))
 
 
 def _rmse_n(line: Line, config: Controller, plant: Path, case: Scenario, seed: int) -> float:
