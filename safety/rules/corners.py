@@ -12,24 +12,19 @@ import numpy as np
 
 from gateway.control.judged_courses import Courses, corner_courses
 from gateway.control.mpc_linear import unconstrained
-from gateway.control.rollout import Course, Rollouts, simulate, simulate_slowly
+from gateway.control.rollout import Course, Rollouts, simulate
 from gateway.core.controller import Controller
 from gateway.core.controller_laws import MpcConfig
 from gateway.core.line import Line
-from gateway.core.signals import FloatArray
 from gateway.core.theta import Noise, Theta
 from gateway.core.verdict import RuleFinding
+from safety import programme
 from safety.case import Case
 from safety.findings import at_least, at_most, told
 from safety.simulated import holdable, judged_of, plants_under_stress, setup_of, stressed
 
 RULE = "corners"
-#: A predictive controller, which takes a millisecond a period: whole on the corners where its linear law does worst in
-#: small moves, in shorter courses.
-WHOLE_MPC = 4
 LATE, FINE_STEP_S = 2, 0.001  #: plants that are later than the line is, and the steps in which they are so
-WHOLE_LASTING_S, WHOLE_TAIL_S = 2.0, 0.6  #: of its changes, and their tail
-SMALL_STEP_N, SMALL_STEP_M_PER_S = 1.0, 0.002  #: in which no limit is reached
 
 
 @dataclass
@@ -59,7 +54,7 @@ def check(case: Case) -> list[RuleFinding]:
     if nobody := [name for name, some in kept.items() if not some]:
         return [_nobody_holds(case, nobody[0])]
     config = case.controller
-    worst = _of_mpc(case, config, kept) if isinstance(config, MpcConfig) else _of_law(case, config, kept, courses)
+    worst = _of_mpc(case, config) if isinstance(config, MpcConfig) else _of_law(case, config, kept, courses)
     return [*_limits(case, worst), _of_corners(case, kept), *_lost(config)]
 
 
@@ -86,25 +81,15 @@ def _late(case: Case, config: Controller, course: Course) -> list[Rollouts]:
     return [simulate(config, plants_under_stress([late] * LATE, gate, case.seed), course, setup)]
 
 
-def _of_mpc(case: Case, config: MpcConfig, kept: dict[str, list[Theta]]) -> Worst:
+def _of_mpc(case: Case, config: MpcConfig) -> Worst:
     """Small moves on all corners by the law that it is where no limit is reached; large ones by itself, on some."""
-    judged, worst, badness = judged_of(case), Worst(), dict[str, FloatArray]()
-    small = replace(
-        judged,
-        tension_step_n=min(judged.tension_step_n, SMALL_STEP_N),
-        speed_step_m_per_s=min(judged.speed_step_m_per_s, SMALL_STEP_M_PER_S),
-    )
-    for name, course in corner_courses(small).items():
-        found = rollouts(case.line, unconstrained(config), kept[name], course, case.stress_noise, case.seed)
+    worst, courses = Worst(), programme.small_courses(case)
+    for name, found in programme.in_small(case).items():
         worst.take(found, f"{name}, small", case.tension_spans)
-        for late in _late(case, unconstrained(config), course):
+        for late in _late(case, unconstrained(config), courses[name]):
             worst.take(late, f"{name}, small, late", case.tension_spans)
-        badness[name] = found.tail_swing_n.max(axis=1) + found.chatter_nm.max(axis=1) + found.beyond_n.max(axis=1)
-    setup = setup_of(case.line, case.stress_noise, case.seed, case.line.gate.stress_late_share)
-    for name, course in corner_courses(judged, WHOLE_LASTING_S, WHOLE_TAIL_S).items():
-        order: list[int] = np.argsort(np.nan_to_num(badness[name], nan=inf))[::-1][:WHOLE_MPC].tolist()
-        plants = plants_under_stress([kept[name][i] for i in order], case.line.gate, case.seed)
-        worst.take(simulate_slowly(config, plants, course, setup), name, case.tension_spans)
+    for name, found in programme.by_itself(case).items():
+        worst.take(found, name, case.tension_spans)
     return worst
 
 
@@ -162,8 +147,8 @@ def _lost(config: Controller) -> list[RuleFinding]:
     if not isinstance(config, MpcConfig):
         return []
     text = (
-        f"the programme itself was simulated on {WHOLE_MPC} corners, and for shorter; on the others only small moves, "
-        "by the law that it is where no limit is reached: how it plans at its limits there has not been seen"
+        f"the programme itself was simulated on {programme.WHOLE} corners, and for shorter; on the others only small "
+        "moves, by the law that it is where no limit is reached: how it plans at its limits there has not been seen"
     )
     return [told("corners: what is lost", True, text)]
 

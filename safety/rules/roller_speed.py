@@ -13,11 +13,11 @@ import numpy as np
 
 from gateway.control.judged_courses import Courses, Judged, corner_courses
 from gateway.control.mpc_linear import unconstrained
-from gateway.control.rollout import Course, plants_of_thetas, simulate
-from gateway.core.controller import Controller
+from gateway.control.rollout import Course, Rollouts, plants_of_thetas, simulate, simulate_slowly
 from gateway.core.controller_laws import MpcConfig
 from gateway.core.theta import Noise
 from gateway.core.verdict import RuleFinding
+from safety import programme
 from safety.case import Case
 from safety.findings import at_most, told
 from safety.limits import envelope_limits
@@ -33,7 +33,7 @@ BELOW = 0.97  #: of the step that the one before lets expect
 LASTING_S = 0.6  #: of a change: by then rollers run as fast as the web again, or never
 QUIET = Noise(0.0, 0.0, 0.0)
 
-Fastest = Callable[[Course], float]  #: the greatest speed of any roller in a course, either way
+Fastest = Callable[[str, Course], float]  #: the greatest speed of any roller in a course of this name, either way
 
 
 @dataclass(frozen=True)
@@ -73,18 +73,22 @@ def steps_let(case: Case) -> Let:
 
 
 def _steps_let(case: Case) -> Let:
-    config = case.controller
-    law = unconstrained(config) if isinstance(config, MpcConfig) else config
-    limits = envelope_limits(case.line)
-    judged, on_corners = judged_of(case), _on_corners(case, law)
-    foreseen = on_corners if case.first else _on_the_mean(case, law)
+    if isinstance(case.controller, MpcConfig) and not case.first:
+        fastest = {name: _greatest(found) for name, found in programme.by_itself(case).items()}
+        if max(fastest.values()) <= envelope_limits(case.line).roller_speed_m_per_s:
+            return Let(dict.fromkeys(fastest, 1.0), fastest)
+    return _let(case, *_looks(case))
+
+
+def _let(case: Case, foreseen: Fastest, on_corners: Fastest) -> Let:
+    limits, judged = envelope_limits(case.line), judged_of(case)
     share, fastest = dict[str, float](), dict[str, float]()
     for name, course in _courses(judged, 1.0).items():
         web = float(course.unwind_speed_m_per_s.max())
         allowed = limits.roller_speed_watched_m_per_s if case.first else limits.roller_speed_in_step_m_per_s(web)
         share[name], fastest[name] = _largest(judged, name, foreseen, allowed)
         if not case.first and np.isfinite(share[name]):
-            fastest[name] = on_corners(_courses(judged, share[name])[name])
+            fastest[name] = on_corners(name, _courses(judged, share[name])[name])
     return Let(share, fastest)
 
 
@@ -94,15 +98,15 @@ def _largest(judged: Judged, name: str, fastest: Fastest, allowed: float) -> tup
     Cut torques keep a large step from moving rollers as fast as it would: the share follows from a small one.
     """
     course = _courses(judged, 1.0)[name]
-    web, value = float(course.unwind_speed_m_per_s.max()), fastest(course)
+    web, value = float(course.unwind_speed_m_per_s.max()), fastest(name, course)
     if value <= allowed:
         return 1.0, value
-    share, value = SMALL, fastest(_courses(judged, SMALL)[name])
+    share, value = SMALL, fastest(name, _courses(judged, SMALL)[name])
     for _ in range(TRIES):
         share = min(share * BELOW * (allowed - web) / (value - web), BELOW)  # the whole step has been found too large
         if not share > 0.0:  # nan, too: a line that runs away
             break
-        value = fastest(_courses(judged, share)[name])
+        value = fastest(name, _courses(judged, share)[name])
         if value <= allowed:
             return share, value
     return np.nan, np.inf
@@ -118,23 +122,28 @@ def _courses(judged: Judged, share: float) -> Courses:
     return corner_courses(smaller, LASTING_S, 0.0)
 
 
-def _on_corners(case: Case, law: Controller) -> Fastest:
-    plants = [stressed(theta, case.line.gate) for theta in case.corners]
+def _looks(case: Case) -> tuple[Fastest, Fastest]:
+    """As the loop foresees it, on the mean; and on the corners."""
+    config, corners = case.controller, [stressed(theta, case.line.gate) for theta in case.corners]
+    law = unconstrained(config) if isinstance(config, MpcConfig) else config
+    mean, setup = plants_of_thetas([case.believed]), setup_of(case.line, QUIET, case.seed, 0.0)
 
-    def fastest(course: Course) -> float:
-        kept = holdable(plants, course, case.line.limits.torque_nm)
-        if not kept:
-            return np.inf
-        found = rollouts(case.line, law, kept, course, case.stress_noise, case.seed)
-        return float(found.roller_speed_max_m_per_s.max())
+    def on_corners(name: str, course: Course) -> float:
+        kept = holdable(corners, course, case.line.limits.torque_nm)
+        return _greatest(rollouts(case.line, law, kept, course, case.stress_noise, case.seed)) if kept else np.inf
 
-    return fastest
+    if case.first:
+        return on_corners, on_corners
+    if isinstance(config, MpcConfig):  # under its limits it goes otherwise than without them
+        return (
+            lambda name, course: _greatest(simulate_slowly(config, mean, course, setup)),
+            lambda name, course: _greatest(programme.in_courses(case, {name: course})[name]),
+        )
+    return lambda name, course: _greatest(simulate(law, mean, course, setup)), on_corners
 
 
-def _on_the_mean(case: Case, law: Controller) -> Fastest:
-    """As the loop foresees it."""
-    plants, setup = plants_of_thetas([case.believed]), setup_of(case.line, QUIET, case.seed, 0.0)
-    return lambda course: float(simulate(law, plants, course, setup).roller_speed_max_m_per_s.max())
+def _greatest(found: Rollouts) -> float:
+    return float(found.roller_speed_max_m_per_s.max())
 
 
 def _too_quick(case: Case, what: str) -> str:

@@ -133,6 +133,8 @@ def _proposals(bench: Bench, workers: Workers, sizes: Sizes, half: str) -> None:
     leaked = [one for one in unsafe if one.accepted]
     bench.figure("unsafe_accepted", len(leaked), "", len(unsafe))
     bench.figure("unsafe_accepted_upper_pct", 100.0 * _upper(len(leaked), len(unsafe)), "%", len(unsafe))
+    slower = [one for one in gains if one.unsafe_slower]
+    bench.figure("unsafe_with_slower_cells", len(slower), "", sum(one.accepted for one in gains))
     good = [one for one in gains if one.good]
     if good:
         bench.figure("good_accepted_pct", 100.0 * _share([one.accepted for one in good]), "%", len(good))

@@ -1,6 +1,7 @@
 """What bench-gate runs: proposals for one line, each judged by the gate and by the judge of the gate."""
 
 import time
+from copy import copy
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -16,6 +17,7 @@ from safety.judge import judge
 from tests.bench.gate_contexts import GateLine, context_of, outdated, payload_of
 from tests.bench.gate_proposals import Asked
 from tests.independent.gate_judge import GateJudge, model_error, unsafe_experiment
+from tests.independent.truth import with_slower_cells
 
 MISLEADS = 0.1  #: a model farther from the truth than this
 ROLLOUT_RULE = "corners"  #: in the names of the rule that simulates
@@ -43,6 +45,7 @@ class Tried:
     verdict_s: float  #: on the wall
     processor_s: float
     texts: list[str] = field(default_factory=list)  #: of the rules that do not pass
+    unsafe_slower: str = ""  #: of one that was accepted and is safe: were cells slower than the data have shown
 
 
 class LineBench:
@@ -111,7 +114,17 @@ class LineBench:
             given.number, asked.class_name, asked.context, asked.change.kind, law, verdict.accepted,
             sorted({one.rule for one in verdict.findings if not one.passed}), _rows(verdict, "findings"),
             _rows(verdict, "reported"), unsafe, good, why, took_s, processor_s, [t[:300] for t in verdict.reasons],
+            self._with_slower_cells(asked) if verdict.accepted and not unsafe else "",
         )  # fmt: skip
+
+    def _with_slower_cells(self, asked: Asked) -> str:
+        """What would be unsafe then. The gate has not been told, and does not promise it."""
+        change, given = asked.change, self.given
+        if not isinstance(change, GainsChange):
+            return ""
+        judge = copy(self.truth(asked.context))
+        judge.truth = with_slower_cells(given.truth, np.random.default_rng([given.number, 8]))
+        return judge.unsafe(change.controller)
 
     def _truth_of(self, asked: Asked) -> tuple[str, bool, str, str]:
         """What is unsafe, whether refusing it is wrong, why it is not, and the law."""

@@ -7,6 +7,7 @@ import numpy as np
 
 from gateway.cli.stepped import SteppedLoop
 from gateway.control.design import design_lqi, task_of
+from gateway.core.controller import Controller
 from gateway.core.line import Line
 from gateway.core.line_file import load_line
 from gateway.core.line_template import line_template
@@ -35,8 +36,9 @@ def recorded(
     dwell_s: float = 0.1,
     line: Line | None = None,
     stops: Literal["fail", "keep"] = "fail",
+    config: Controller | None = None,
 ) -> Recording:
-    """`duration_s` at each speed: at the plant's equilibrium first, under the LQI of the line's file.
+    """`duration_s` at each speed: at the plant's equilibrium first, under `config`, or the LQI of the line's file.
 
     Every `dwell_s` each tension set-point goes to one of two values, `amplitude_n` above or below.
     A line that the gateway stops is an error, or what was until then is kept.
@@ -44,7 +46,7 @@ def recorded(
     line = line or demonstration_line(plant.spans)
     generator = np.random.default_rng(seed)
     center = np.resize(TENSION_N, plant.spans)
-    loop = SteppedLoop(line, design_lqi(task_of(line)), plant, seed)
+    loop = SteppedLoop(line, config or design_lqi(task_of(line)), plant, seed)
     loop.begin_in_production(center, speeds_m_per_s[0])
     periods = round(duration_s / line.control.period_s)
     dwell = round(dwell_s / line.control.period_s)

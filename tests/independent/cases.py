@@ -6,7 +6,7 @@ Set-points stay where a good controller has room for them, steps and rates withi
 import numpy as np
 
 from gateway.core.line import Line
-from tests.independent.runs import Case
+from tests.independent.runs import Case, Glide
 from tests.independent.truth import FloatArray, Truth, equilibrium
 
 LEAST_N, MOST_N = 12.0, 44.0  #: set-points
@@ -25,6 +25,7 @@ class Course:
         self._rows: list[FloatArray] = []
         self._pushed = np.zeros(len(tension_n))
         self._changed = 0
+        self._glide: Glide | None = None
 
     def stand(self, time_s: float) -> "Course":
         for _ in range(round(time_s / self._period_s)):
@@ -55,6 +56,8 @@ class Course:
         """Along minimum-jerk curves."""
         self._changed = self._changed or len(self._rows)
         first, slow, count = self._tension, self._unwind, round(time_s / self._period_s)
+        if (goal := np.array(tension_n, dtype=np.float64)).tolist() != first.tolist():
+            self._glide = Glide(len(self._rows) - 1, time_s, first, goal)
         for k in range(1, count + 1):
             s = k / count
             way = s * s * s * (10.0 - 15.0 * s + 6.0 * s * s)
@@ -76,7 +79,7 @@ class Course:
         rows = np.array(self._rows)
         n = len(self._tension)
         return Case(name, rows[:, :n].copy(), rows[:, n].copy(), rows[:, n + 1 :].copy(), self._changed,
-                    round(TAIL_S / self._period_s), band_n)  # fmt: skip
+                    round(TAIL_S / self._period_s), band_n, self._glide)  # fmt: skip
 
     def _row(self) -> None:
         self._rows.append(np.concatenate((self._tension, [self._unwind], self._pushed)))
@@ -174,11 +177,12 @@ def measuring_cases(line: Line, top_m_per_s: float) -> list[Case]:
     shaped[-1] -= 10.0
     level = np.full(n, 30.0)
     half = 0.5 * min(limits.tension_step_max_n, 24.0)
+    together = half * min(1.0, limits.steps_together / n)
     return [
         Course(line, base, slow).stand(0.5).step(high).case("up", 4.0),
         Course(line, base, middle).stand(0.5).step(low).case("down", 4.0),
         Course(line, level, slow).stand(0.5).step(unwind_m_per_s=slow + rise).case("faster", 4.0),
-        Course(line, level - half / 2, top_m_per_s).stand(0.5).step(level + half / 2).case("all", 4.0),
+        Course(line, level - together, top_m_per_s).stand(0.5).step(level + together).case("all", 4.0),
         Course(line, base, middle).stand(0.5).glide(shaped, middle, 0.5).case("shaped", 4.0),
         Course(line, level, slow).stand(0.5).glide(level, slow + rise, 1.0).case("shaped-faster", 4.0),
     ]

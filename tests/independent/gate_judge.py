@@ -68,6 +68,7 @@ class GateJudge:
         self.measuring = measuring_cases(line, self.top_m_per_s)
         gate = line.gate
         stress = (gate.stress_torque_lag_s, gate.stress_late_share, gate.stress_coulomb_nm, gate.stress_eccentricity)
+        self.stressed = stressed(truth, *stress)
         corners = list(product((1.0 - AROUND, 1.0 + AROUND), repeat=len(FAMILIES)))
         picked = np.random.default_rng([seed, 1]).choice(len(corners), CORNERS, replace=False)
         self.around = [
@@ -105,8 +106,9 @@ class GateJudge:
         )  # fmt: skip
         if later:
             return f"{1e3 * EXTRA_DELAY_S:g} ms later: {later}"
-        if isinstance(config, MpcConfig):
-            return ""
+        if isinstance(config, MpcConfig):  # it takes its time: on the truth alone
+            wrong = self._wrong(config, [self.stressed] * len(cases), cases, self.line.control.latency_s)
+            return f"stressed: {wrong}" if wrong else ""
         truths = [one for one in self.around for _ in cases]
         wrong = self._wrong(config, truths, cases * len(self.around), self.line.control.latency_s)
         return f"stressed: {wrong}" if wrong else ""

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from gateway.control.deviation import Measured
 from gateway.control.laws import make_law, untimed
-from gateway.control.reference import Steady
+from gateway.control.reference import Motion, Reference, Steady
 from gateway.core.controller import Controller
 from gateway.core.controller_laws import MpcConfig
 from gateway.core.line import Limits
@@ -22,6 +22,38 @@ LEAST, MOST, SWING, ERROR, CHATTER, SQUARED, BEYOND, SETTLED, ROLLER, COLUMNS = 
 
 
 @dataclass(frozen=True)
+class Glide:
+    """Set-points on a minimum-jerk curve, of which a law is told how they go on."""
+
+    begin: int  #: the period in which it begins
+    time_s: float
+    first_n: FloatArray  #: (n,)
+    goal_n: FloatArray  #: (n,)
+
+    def motion(self, since_s: float) -> Motion:
+        """So long after its begin. The unwinder's speed is another matter."""
+        s = min(max(since_s / self.time_s, 0.0), 1.0)
+        way = s**3 * (10.0 - 15.0 * s + 6.0 * s * s)
+        rate = 30.0 * (s * (1.0 - s)) ** 2 / self.time_s
+        acceleration = 60.0 * s * (1.0 - s) * (1.0 - 2.0 * s) / self.time_s**2
+        by = self.goal_n - self.first_n
+        return Motion(self.first_n + way * by, rate * by, acceleration * by, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class _Gliding:
+    """A law's reference in a glide, which it knows of from its begin on."""
+
+    glide: Glide
+    since_s: float
+    tension_n: FloatArray
+    moving: bool = True
+
+    def ahead(self, time_s: float) -> Motion:
+        return self.glide.motion(self.since_s + time_s)
+
+
+@dataclass(frozen=True)
 class Case:
     """What is asked of a line, period by period."""
 
@@ -32,6 +64,7 @@ class Case:
     changed: int  #: the period from which overshoot and settling count
     tail: int  #: periods at the end in which everything should stand still
     band_n: float = 0.5  #: within which a tension has settled
+    glide: Glide | None = None  #: of the tensions; a law is asked as the product asks it
 
     @property
     def periods(self) -> int:
@@ -45,7 +78,15 @@ class Case:
             tension_n=first + share * (self.tension_n - first),
             unwind_m_per_s=slow + share * (self.unwind_m_per_s - slow),
             push_nm=share * self.push_nm,
+            glide=None,
         )
+
+    def reference(self, k: int, period_s: float) -> Reference:
+        """What a law is told in period k."""
+        glide = self.glide
+        if glide is None or not 0.0 <= (k - glide.begin) * period_s < glide.time_s - 1e-9:
+            return Steady(self.tension_n[k])
+        return _Gliding(glide, (k - glide.begin) * period_s, self.tension_n[k])
 
 
 class Found(NamedTuple):
@@ -102,7 +143,7 @@ def simulated(
             whole, b, case.tension_n, case.unwind_m_per_s, case.push_nm, case.changed, case.tail, case.band_n, *chances,
             bounds, per_period, delay, stop_outside, found[b], trace,
         )  # fmt: skip
-        ended[b] = _run(law, *given) if law is not None else _run_slowly(config, given)
+        ended[b] = _run_slowly(config, given, case) if law is None or case.glide is not None else _run(law, *given)
         if traced is not None:
             traced.append(trace)
     return Found(*(found[:, :, i] for i in range(COLUMNS)), ended)
@@ -213,8 +254,10 @@ def _finish(found, in_tail, per_period):
         found[i, SETTLED] *= per_period * STEP_S
 
 
-def _run_slowly(config: Controller, given: tuple[Any, ...]) -> int:
-    """`_run` with the product's own law, for those that are not linear, and for holding the other against it."""
+def _run_slowly(config: Controller, given: tuple[Any, ...], case: Case) -> int:
+    """`_run` with the product's own law: for those that are not linear, where it feeds a move forward, and for holding
+    the other against it.
+    """
     (whole, b, setpoints, unwinds, pushes, changed, tail, band, late, ages, seen_noise, noise, bounds, per_period,
      delay, stop_outside, found, trace) = given  # fmt: skip
     periods, n = setpoints.shape
@@ -228,7 +271,7 @@ def _run_slowly(config: Controller, given: tuple[Any, ...]) -> int:
     for k in range(periods):
         truth_kernel.sample(whole, b, line, ages[k], seen_noise[k], seen)
         measured = Measured(seen[:n].copy(), seen[n:].copy(), float(unwinds[k]))
-        decision = law.ask(memory, measured, Steady(setpoints[k]))
+        decision = law.ask(memory, measured, case.reference(k, config.period_s))
         before = applied.copy()
         _limited(decision.torque_nm, applied, bounds)
         memory = law.commit(memory, decision, applied.copy())

@@ -145,15 +145,13 @@ def truth_of(plant: Plant) -> Truth:
 
 
 def with_unruly_effects(truth: Truth, generator: np.random.Generator) -> Truth:
-    """With what no plant file says: late commands, backlash, sampling jitter; and cells that filter at least 5 ms."""
-    n = truth.n
-    return replace(
-        truth,
-        late_share=0.05,
-        gap_rad=generator.uniform(0.0, 1e-3, n),
-        jitter_s=1e-3,
-        cell_lag_s=max(truth.cell_lag_s, float(generator.uniform(0.005, 0.010))),
-    )
+    """With what no plant file says, and data hardly show: late commands, backlash, sampling jitter."""
+    return replace(truth, late_share=0.05, gap_rad=generator.uniform(0.0, 1e-3, truth.n), jitter_s=1e-3)
+
+
+def with_slower_cells(truth: Truth, generator: np.random.Generator) -> Truth:
+    """With load cells that filter 5 to 10 ms: what the gate refuses as soon as data show it, and has not been shown."""
+    return replace(truth, cell_lag_s=max(truth.cell_lag_s, float(generator.uniform(0.005, 0.010))))
 
 
 def stressed(truth: Truth, lag_s: float, late_share: float, coulomb_nm: float, eccentricity: float) -> Truth:

@@ -15,6 +15,7 @@ from gateway.core.line_model import theta_of
 from gateway.core.proposal import proposal_hash
 from gateway.core.theta import Noise
 from gateway.loop.setpoints import STEP_PAUSE_S
+from safety import programme
 from safety.believed import Unbelievable, corners_of_model, stated
 from safety.case import Case
 from safety.excitation import excited_parts, newest, recent, same_speed
@@ -38,6 +39,7 @@ from safety.rules import (
     model_likelihood,
     paper,
     promises,
+    roller_speed,
     validity,
 )
 from safety.rules.corners import Worst
@@ -354,9 +356,11 @@ def test_a_predictive_controller_runs_whole_on_some_corners_and_says_what_is_los
         whole.append(plants.count)
         return corners.simulate(design_lqi(of.task()), plants, course, setup)
 
-    monkeypatch.setattr(corners, "simulate_slowly", slowly)
-    found = corners.check(case_of(gains(mpc, context), context, of))
-    assert whole == [4] * 4
+    monkeypatch.setattr(programme, "simulate_slowly", slowly)
+    case = case_of(gains(mpc, context), context, of)
+    found = corners.check(case)
+    assert refused(roller_speed.check(case)) == []
+    assert whole == [4] * 4  # once for both rules
     assert found[-1].rule == "corners: what is lost"
     assert refused(found) == []
 

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from gateway.control.design import design_lqi, design_mpc, task_of
+from gateway.control.rollout import simulate
 from gateway.core.deployment import Region
+from safety import programme
 from safety.limits import envelope_limits
 from safety.rules import experiment, roller_speed
 from tests.safety.case_support import case_of, gains, proposal, published, refused, verdict_of
@@ -92,9 +94,21 @@ def test_corners_that_nobody_holds_say_nothing_good(of, context):
     assert refused(roller_speed.check(case))
 
 
-def test_a_predictive_controller_is_looked_at_as_its_linear_law(of, context):
-    case = case_of(gains(design_mpc(of.task()), context), context, of)
-    assert refused(roller_speed.check(case)) == []
+def test_a_predictive_controller_is_looked_at_by_itself_in_whole_steps_or_else_in_smaller_ones(
+    of, context, monkeypatch
+):
+    def quickly(config, plants, course, setup):
+        return simulate(design_lqi(of.task()), plants, course, setup)
+
+    for module in (programme, roller_speed):
+        monkeypatch.setattr(module, "simulate_slowly", quickly)
+    found = roller_speed.steps_let(case_of(gains(design_mpc(of.task()), context), context, of))
+    assert set(found.share.values()) == {1.0}
+    slow = slow_line(of, 0.08)
+    case = case_of(gains(design_mpc(slow.task()), context), context, slow)
+    found, limits = roller_speed.steps_let(case), envelope_limits(slow.line)
+    assert 0.0 < found.of_tension() < 1.0
+    assert max(found.fastest_m_per_s.values()) <= limits.roller_speed_m_per_s
 
 
 def test_an_experiment_that_makes_rollers_run_ahead_is_refused(of, context):
@@ -114,9 +128,9 @@ def test_an_experiment_that_makes_rollers_run_ahead_is_refused(of, context):
     assert small.limit == pytest.approx(0.05 + 0.9 * (watched - 0.05))
 
 
-@pytest.mark.parametrize("fastest", [lambda course: 1.0, lambda course: np.nan, lambda course: 0.2])
+@pytest.mark.parametrize("fastest", [lambda *_: 1.0, lambda *_: np.nan, lambda *_: 0.2])
 def test_what_no_share_of_a_step_makes_slow_is_refused(of, context, monkeypatch, fastest):
-    monkeypatch.setattr(roller_speed, "_on_the_mean", lambda *_: fastest)
+    monkeypatch.setattr(roller_speed, "_looks", lambda _: (fastest, fastest))
     found = refused(roller_speed.check(case_of(gains(design_lqi(of.task()), context), context, of)))
     assert len(found) == 1 and "no step at all keeps rollers below 0.153 m/s" in found[0]
 

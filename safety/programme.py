@@ -1,0 +1,73 @@
+"""Predictive control on the corners: by the law that it is where no limit is reached on all of them, by itself on some.
+
+Its programme takes a tenth of a millisecond to a millisecond a period, a thousand times as long as a linear law.
+"""
+
+from dataclasses import replace
+from math import inf
+
+import numpy as np
+
+from gateway.control.judged_courses import Courses, corner_courses
+from gateway.control.mpc_linear import unconstrained
+from gateway.control.rollout import Rollouts, simulate, simulate_slowly
+from gateway.core.controller_laws import MpcConfig
+from gateway.core.theta import Theta
+from safety.case import Case
+from safety.simulated import holdable, judged_of, plants_under_stress, setup_of, stressed
+
+WHOLE = 4  #: corners: those on which the law without limits does worst in small moves
+LASTING_S, TAIL_S = 2.0, 0.6  #: of changes that the programme makes, and their tail
+SMALL_STEP_N, SMALL_STEP_M_PER_S = 1.0, 0.002  #: in which no limit is reached
+
+
+def small_courses(case: Case) -> Courses:
+    judged = judged_of(case)
+    small = replace(
+        judged,
+        tension_step_n=min(judged.tension_step_n, SMALL_STEP_N),
+        speed_step_m_per_s=min(judged.speed_step_m_per_s, SMALL_STEP_M_PER_S),
+    )
+    return corner_courses(small)
+
+
+def in_small(case: Case) -> dict[str, Rollouts]:
+    """By course, on all corners that can be held there; computed once for a case."""
+    return case.once("programme in small moves", _in_small)
+
+
+def by_itself(case: Case) -> dict[str, Rollouts]:
+    """By course, of the largest steps, on `WHOLE` corners; computed once for a case."""
+    return case.once("programme", lambda case: in_courses(case, corner_courses(judged_of(case), LASTING_S, TAIL_S)))
+
+
+def in_courses(case: Case, courses: Courses) -> dict[str, Rollouts]:
+    """The programme itself, on the corners that are the worst for each of `courses`."""
+    setup = setup_of(case.line, case.stress_noise, case.seed, case.line.gate.stress_late_share)
+    found: dict[str, Rollouts] = {}
+    for name, course in courses.items():
+        small = in_small(case)[name]
+        badness = small.tail_swing_n.max(axis=1) + small.chatter_nm.max(axis=1) + small.beyond_n.max(axis=1)
+        order: list[int] = np.argsort(np.nan_to_num(badness, nan=inf))[::-1][:WHOLE].tolist()
+        kept = _kept(case, name)
+        plants = plants_under_stress([kept[i] for i in order], case.line.gate, case.seed)
+        found[name] = simulate_slowly(case.controller, plants, course, setup)
+    return found
+
+
+def _in_small(case: Case) -> dict[str, Rollouts]:
+    config = case.controller
+    if not isinstance(config, MpcConfig):
+        raise TypeError(f"{config.kind} has no programme")
+    law, gate = unconstrained(config), case.line.gate
+    setup = setup_of(case.line, case.stress_noise, case.seed, gate.stress_late_share)
+    return {
+        name: simulate(law, plants_under_stress(_kept(case, name), gate, case.seed), course, setup)
+        for name, course in small_courses(case).items()
+    }
+
+
+def _kept(case: Case, name: str) -> list[Theta]:
+    """Corners that torque holds in the largest steps of a course."""
+    plants = [stressed(theta, case.line.gate) for theta in case.corners]
+    return holdable(plants, corner_courses(judged_of(case))[name], case.line.limits.torque_nm)
