@@ -12,7 +12,7 @@ done
 [ -n "$python" ] || { echo "r2rgate needs Python 3.11 or newer; set PYTHON=/path/to/python3" >&2; exit 1; }
 [ ! -L "$venv" ] || { echo "$venv is a link: it is not touched; remove it, and it is made anew" >&2; exit 1; }
 mkdir -p out
-echo "setting up $venv with $($python --version) (once, about a minute)"
+echo "setting up $venv with $($python --version) (once, a minute or two)"
 "$python" -m venv --clear "$venv" >out/setup.log 2>&1 || {
     cat out/setup.log >&2
     echo "$python cannot make a virtual environment: install its venv module (Debian: apt-get install python3-venv)" >&2
@@ -27,4 +27,10 @@ pip() {
 }
 pip install --require-hashes -r requirements.lock
 pip install --no-deps --no-build-isolation --editable .
+echo "compiling the simulations (once, half a minute)"
+"$venv/bin/python" -m gateway.cli.compiled >>out/setup.log 2>&1 || {
+    tail -n 20 out/setup.log >&2
+    echo "the simulations could not be compiled; the whole story is in out/setup.log" >&2
+    exit 1
+}
 touch "$venv/.ready"

@@ -10,7 +10,7 @@ import numpy as np
 
 from gateway.control.judged_courses import Courses, corner_courses
 from gateway.control.mpc_linear import unconstrained
-from gateway.control.rollout import Rollouts, simulate, simulate_slowly
+from gateway.control.rollout import Rollouts, simulate
 from gateway.core.controller_laws import MpcConfig
 from gateway.core.theta import Theta
 from safety.case import Case
@@ -51,7 +51,7 @@ def in_courses(case: Case, courses: Courses) -> dict[str, Rollouts]:
         order: list[int] = np.argsort(np.nan_to_num(badness, nan=inf))[::-1][:WHOLE].tolist()
         kept = _kept(case, name)
         plants = plants_under_stress([kept[i] for i in order], case.line.gate, case.seed)
-        found[name] = simulate_slowly(case.controller, plants, course, setup)
+        found[name] = simulate(case.controller, plants, course, setup)
     return found
 
 

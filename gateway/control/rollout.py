@@ -13,7 +13,7 @@ import numpy as np
 
 from gateway.control.laws import make_law, untimed
 from gateway.control.rollout_line import rate, rk4
-from gateway.control.rollout_slow import limited, rollouts_of, run_law, run_plant
+from gateway.control.rollout_slow import LineOf, limited, plain_line, rollouts_of, run_law, run_plant
 from gateway.control.rollout_start import references, start
 from gateway.control.rollout_terms import (
     RUNAWAY_N,
@@ -57,27 +57,35 @@ __all__ = [
 def simulate(config: Controller, plants: Plants, course: Course, setup: Setup, *, record: bool = False) -> Rollouts:
     """The loop of `config` on each plant, from the plant's own equilibrium with the law engaged there.
 
-    MPC runs as `simulate_slowly`: a second of a line takes about as long. (`mpc_linear` has what runs fast of it.)
+    MPC runs plant by plant: a second of a line takes some tenths of one. (`mpc_linear` has what runs fast of it.)
     Raises ValueError for a period that is not the law's, or a course or plants of another size.
     """
     _check(config, plants, course, setup)
-    if isinstance(config, MpcConfig):
-        return simulate_slowly(config, plants, course, setup, record=record)
     from gateway.control.rollout_batch import run  # compiled code, for those who use it
+    from gateway.control.rollout_compiled_line import CompiledLine
 
+    if isinstance(config, MpcConfig):
+        return _plant_by_plant(config, plants, course, setup, CompiledLine, record=record)
     return run(config, plants, course, setup, record=record)
 
 
 def simulate_slowly(
     config: Controller, plants: Plants, course: Course, setup: Setup, *, record: bool = False
 ) -> Rollouts:
-    """As `simulate`, with the law itself, plant by plant; a plant that has run away is left at once."""
+    """As `simulate`, with the law itself and nothing compiled, plant by plant: what `simulate` is held against."""
     _check(config, plants, course, setup)
+    return _plant_by_plant(config, plants, course, setup, plain_line, record=record)
+
+
+def _plant_by_plant(
+    config: Controller, plants: Plants, course: Course, setup: Setup, line_of: LineOf, *, record: bool
+) -> Rollouts:
+    """A plant that has run away is left at once."""
     drawn = (*setup.draw(course.periods, plants.n), setup.late(course.periods, plants.n))
     stepped = np.empty((plants.count, course.periods * setup.substeps, 2 * plants.n))
     torques = np.empty((plants.count, course.periods, plants.n))
     for b in range(plants.count):
-        stepped[b], torques[b] = run_plant(make_law(untimed(config)), plants, b, course, setup, drawn)
+        stepped[b], torques[b] = run_plant(make_law(untimed(config)), plants, b, course, setup, drawn, line_of)
     return rollouts_of(stepped, torques, course, setup, record=record)
 
 

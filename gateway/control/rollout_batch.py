@@ -32,22 +32,15 @@ def run(
     samples, moved = setup.draw(course.periods, n)
     unwinds = np.ascontiguousarray(course.unwind_speed_m_per_s, dtype=np.float64)  # of another kind: compiled anew
     memory = _engaged(laws[int(which[0])], course, setup, states, torques, samples[0])
-    gain = plants.radius_m / plants.inertia_kg_m2
-    coefficients = np.hstack(
-        (
-            plants.stiffness_n, 1.0 / plants.length_m, plants.radius_m * gain,
-            plants.friction_nms_per_rad / plants.inertia_kg_m2, gain,
-        )
-    )  # fmt: skip
     effects = plants.effects
     shape = (blocks * kernel.LANES, course.periods, n) if record else (0, 0, 0)
     tension_n, torque_nm = np.full(shape, np.nan), np.full(shape, np.nan)
     sums = kernel.simulate(
-        _lanes(coefficients, fill), _lanes(plants.boundary_n, fill),
-        None if effects is None else _lanes(_own(plants, effects, setup), fill),
+        lanes(coefficients_of(plants), fill), lanes(plants.boundary_n, fill),
+        None if effects is None else lanes(effects_of(plants, effects, setup), fill),
         effects is not None and bool(effects.eccentricity.any()),
         np.array(delay_steps(plants, setup))[fill].reshape(blocks, kernel.LANES),
-        _lanes(states, fill), _lanes(torques, fill), _lanes(memory, fill),
+        lanes(states, fill), lanes(torques, fill), lanes(memory, fill),
         *_entries([form.torque for form in forms]), *_entries([np.hstack((f.state, f.applied)) for f in forms]), which,
         references(config, course), unwinds, samples, moved, setup.late(course.periods, n),
         np.array([setup.tension_step_n] * n + [setup.speed_step_m_per_s] * n),
@@ -81,7 +74,18 @@ def _figures(rows: FloatArray, course: Course, setup: Setup) -> dict[str, FloatA
     return figures
 
 
-def _own(plants: Plants, effects: Effects, setup: Setup) -> FloatArray:
+def coefficients_of(plants: Plants) -> FloatArray:
+    """What the kernel has of each plant (b, 5n), in the order of its `_rate`."""
+    gain = plants.radius_m / plants.inertia_kg_m2
+    return np.hstack(
+        (
+            plants.stiffness_n, 1.0 / plants.length_m, plants.radius_m * gain,
+            plants.friction_nms_per_rad / plants.inertia_kg_m2, gain,
+        )
+    )  # fmt: skip
+
+
+def effects_of(plants: Plants, effects: Effects, setup: Setup) -> FloatArray:
     """What the kernel has of each plant's effects, (b, 4n + 3), in the order that `kernel.simulate` tells."""
     lag_s = effects.torque_lag_s[:, None]
     with np.errstate(divide="ignore"):
@@ -92,7 +96,7 @@ def _own(plants: Plants, effects: Effects, setup: Setup) -> FloatArray:
     )
 
 
-def _lanes(values: FloatArray, fill: Any) -> FloatArray:
+def lanes(values: FloatArray, fill: Any) -> FloatArray:
     """(plants, rows) as (blocks, rows, LANES)."""
     picked = values[fill]
     return np.ascontiguousarray(picked.reshape(-1, kernel.LANES, values.shape[1]).transpose(0, 2, 1))

@@ -22,6 +22,7 @@ LOOKED_AT = 8  #: periods, after which blocks that have run away are left
 # numba's decorator has no types; what it returns is called as the function it decorates. Whether to inline is left to
 # LLVM: one large function has too many arrays for it to see that they do not overlap, and becomes scalar code.
 _part: Any = njit(error_model="numpy", fastmath={"contract"})
+_alone: Any = njit(cache=True, error_model="numpy", fastmath={"contract"})
 _parallel: Any = njit(parallel=True, cache=True, error_model="numpy", fastmath={"contract"})
 
 # Rows of what the kernel accumulates for each roller or span.
@@ -358,6 +359,18 @@ def _advance(
             coefficients, boundary, own[block], state, acting, work[7], unwind, moved, step_s, slopes, probe, work,
             eccentric, n,
         )  # fmt: skip
+
+
+@_alone
+def advance(coefficients, boundary, own, eccentric, state, acting, torque, unwind, moved, step_s, slopes, probe, work):
+    """A step of one block, whose torques (n, LANES) arrive now. `state` and `acting` are what changes."""
+    n = torque.shape[0]
+    if own is None:
+        _step(coefficients, boundary, state, torque, unwind, moved, step_s, slopes, probe, n)
+    else:
+        _real_step(
+            coefficients, boundary, own, state, acting, torque, unwind, moved, step_s, slopes, probe, work, eccentric, n
+        )
 
 
 @_parallel

@@ -1,7 +1,8 @@
 """Closed loops plant by plant, with the law as it runs on the line: what the compiled kernel is held against."""
 
+from collections.abc import Callable
 from math import inf
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -23,6 +24,27 @@ def run_law(
     return run_plant(law, plants_of([model]), 0, course, setup, (samples, moved, setup.late(course.periods, model.n)))
 
 
+class Line(Protocol):
+    """A plant: `rollout_line`, or compiled."""
+
+    @property
+    def state(self) -> FloatArray:
+        """[T; w] (2n,), and more behind it."""
+        ...
+
+    def step(self, sent_nm: FloatArray, unwind_speed_m_per_s: float, moved_m_per_s: FloatArray) -> None: ...
+
+
+LineOf = Callable[[Plants, int, Setup, FloatArray, FloatArray], Line]  #: from its state (2n,) and torques (n,)
+
+
+def plain_line(plants: Plants, index: int, setup: Setup, state: FloatArray, torque_nm: FloatArray) -> Line:
+    """In numpy, written apart from the kernel."""
+    if plants.effects is None:
+        return PlainLine(plants.model(index), setup.step_s, state)
+    return RealLine(plants, plants.effects, index, setup.step_s, state, torque_nm)
+
+
 def run_plant(
     law: Law[Any],
     plants: Plants,
@@ -30,6 +52,7 @@ def run_plant(
     course: Course,
     setup: Setup,
     drawn: tuple[FloatArray, FloatArray, BoolArray],
+    line_of: LineOf = plain_line,
 ) -> tuple[FloatArray, FloatArray]:
     """[T; w] (k substeps, 2n) before each step of the integration and torques (k, n) as sent, of one plant.
 
@@ -37,11 +60,8 @@ def run_plant(
     """
     n, (samples, moved, late) = plants.n, drawn
     states, torques = start(plants, course)
-    applied, effects = torques[index], plants.effects
-    if effects is None:
-        line = PlainLine(plants.model(index), setup.step_s, states[index])
-    else:
-        line = RealLine(plants, effects, index, setup.step_s, states[index], applied)
+    applied = torques[index]
+    line = line_of(plants, index, setup, states[index], applied)
     delay = delay_steps(plants, setup)[index]
     acting = [applied] * (delay // setup.substeps + 2)
     quanta = np.array([setup.tension_step_n] * n + [setup.speed_step_m_per_s] * n)
@@ -58,9 +78,10 @@ def run_plant(
         sent[k] = applied
         acting.append(np.where(late[k], before, applied))
         for j in range(setup.substeps):
-            if not (np.abs(line.state[:n]) <= RUNAWAY_N).all():
+            state = line.state
+            if not (np.abs(state[:n]) <= RUNAWAY_N).all():
                 return stepped, sent
-            stepped[k * setup.substeps + j] = line.state[: 2 * n]
+            stepped[k * setup.substeps + j] = state[: 2 * n]
             age = -(-(delay - j) // setup.substeps)  # periods ago that the acting torque was computed
             line.step(acting[-1 - max(age, 0)], unwind, moved[k * setup.substeps + j])
     return stepped, sent

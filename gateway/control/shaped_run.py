@@ -3,14 +3,13 @@ noise. (The compiled rollouts know references that stand between their steps.)
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from gateway.control.deviation import Measured
 from gateway.control.laws import make_law, untimed
 from gateway.control.reference import MinimumJerk, Motion, Reference, Steady
-from gateway.control.rollout_line import PlainLine, RealLine, delay_steps
+from gateway.control.rollout_line import delay_steps
 from gateway.control.rollout_slow import limited
 from gateway.control.rollout_start import start
 from gateway.control.rollout_terms import Course, Plants, Setup
@@ -60,21 +59,22 @@ class _On:
 
 def follow(config: Controller, plants: Plants, way: Way, setup: Setup) -> FloatArray:
     """Tensions (k, n) at the samples, of the first of `plants`. nan from where they are no numbers any more."""
+    from gateway.control.rollout_compiled_line import CompiledLine  # for those who use it
+
     course, curve, n = way.course(setup.period_s), way.curve(), plants.n
     states, torques = start(plants, course)
     applied: FloatArray = torques[0]
-    line: Any = PlainLine(plants.model(0), setup.step_s, states[0])
-    if plants.effects is not None:
-        line = RealLine(plants, plants.effects, 0, setup.step_s, states[0], applied)
+    line = CompiledLine(plants, 0, setup, states[0], applied)
     delay = delay_steps(plants, setup)[0]
     acting = [applied] * (delay // setup.substeps + 2)
     law, memory = make_law(untimed(config)), None
     tensions, still = np.full((course.periods, n), np.nan), np.zeros(n)
     for k in range(course.periods):
-        tensions[k] = line.state[:n]
-        if not np.isfinite(line.state).all():
+        state = line.state
+        tensions[k] = state[:n]
+        if not np.isfinite(state).all():
             break
-        measured = Measured(line.state[:n].copy(), line.state[n : 2 * n].copy(), way.speed_m_per_s)
+        measured = Measured(state[:n], state[n : 2 * n], way.speed_m_per_s)
         reference = _reference(curve, way, course.tension_n[k], k * setup.period_s)
         if memory is None:
             memory = law.engage(measured, reference, applied)

@@ -13,7 +13,7 @@ import numpy as np
 
 from gateway.control.judged_courses import Courses, Judged, corner_courses
 from gateway.control.mpc_linear import unconstrained
-from gateway.control.rollout import Course, Rollouts, plants_of_thetas, simulate, simulate_slowly
+from gateway.control.rollout import Course, Rollouts, plants_of_thetas, simulate
 from gateway.core.controller_laws import MpcConfig
 from gateway.core.theta import Noise
 from gateway.core.verdict import RuleFinding
@@ -136,7 +136,7 @@ def _looks(case: Case) -> tuple[Fastest, Fastest]:
         return on_corners, on_corners
     if isinstance(config, MpcConfig):  # under its limits it goes otherwise than without them
         return (
-            lambda name, course: _greatest(simulate_slowly(config, mean, course, setup)),
+            lambda name, course: _greatest(simulate(config, mean, course, setup)),
             lambda name, course: _greatest(programme.in_courses(case, {name: course})[name]),
         )
     return lambda name, course: _greatest(simulate(law, mean, course, setup)), on_corners

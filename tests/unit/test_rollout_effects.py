@@ -22,8 +22,9 @@ from gateway.control.rollout import (
     start,
     with_effects,
 )
+from gateway.control.rollout_compiled_line import CompiledLine
 from gateway.control.rollout_line import RealLine
-from gateway.control.rollout_slow import run_plant
+from gateway.control.rollout_slow import plain_line, run_plant
 from gateway.core.controller_schedule import ScheduledConfig
 from gateway.core.metrics import overshoot_pct, settling_time_s
 from gateway.core.theta import Theta
@@ -94,6 +95,21 @@ def test_the_kernel_does_what_the_laws_do_with_all_effects(design):
     assert not fast.diverged.any()
     assert (fast.torque_max_nm == 40.0).any() and (fast.torque_step_max_nm > 9.99).any()  # limits do act
     assert_alike(fast, slow, rows)
+
+
+@pytest.mark.parametrize("effects", [True, False])
+def test_a_law_that_is_not_compiled_meets_the_same_line(effects):
+    line, generator = random_plants(3), np.random.default_rng(5)
+    plants = real(line) if effects else line
+    states, torques = start(plants, several_changes())
+    lines = [line_of(plants, 1, NOISY, states[1], torques[1]) for line_of in (CompiledLine, plain_line)]
+    for _ in range(300):
+        torque, moved = torques[1] + generator.normal(0.0, 5.0, 6), generator.normal(0.0, 1e-4, 6)
+        for one in lines:
+            one.step(torque, 0.05, moved)
+    fast, slow = (one.state for one in lines)
+    assert np.abs(slow[:6] - states[1][:6]).max() > 1.0  # it moves
+    assert np.allclose(fast, slow, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("design", [design_lqi, design_lqg])
