@@ -3,6 +3,7 @@
 import asyncio
 import json
 from dataclasses import replace
+from io import StringIO
 from types import SimpleNamespace
 
 import numpy as np
@@ -135,10 +136,9 @@ def test_improvements_are_from_one_configuration_to_the_next_here_and_in_the_pap
 
 
 def test_the_table_fits_a_terminal_and_says_who_approved():
-    console = Console(width=80, record=True, file=open("/dev/null", "w", encoding="utf-8"))  # noqa: SIM115
+    console = Console(width=80, record=True, file=StringIO())
     result = example()
     print_chain(result, console)
-    console.file.close()
     text = console.export_text()
     assert result.chain is not None and result.chain.audit.head in text and "scripted operator (demo)" in text
     table = text[: text.index("on truth:")]
