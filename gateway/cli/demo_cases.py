@@ -1,13 +1,16 @@
 """The paper's cases on the line that runs, in real time; once more where this computer has stalled."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 from gateway.cli.demo_operator import DemoFailed, Operator
 from gateway.core.controller import Controller
 from gateway.core.messages import SelectRecipe
 from gateway.core.scenario import Scenario
+
+T = TypeVar("T")
 
 MOST_REPEATS = 2  #: of a case, or of a start, after the line has stopped by itself
 
@@ -24,40 +27,37 @@ class Window:
 
 async def begin_with_repeats(operator: Operator) -> None:
     """From rest to a line that is being tensioned. Refused, a person reads why and tries again."""
-    for repeats in range(MOST_REPEATS + 1):
+    for _ in range(MOST_REPEATS):
         try:
-            await operator.begin()
-            return
+            return await operator.begin()
         except DemoFailed as failed:
-            if repeats == MOST_REPEATS:
-                raise
             await operator.recover(f"not started; once more ({failed})", str(failed))
+    await operator.begin()
+
+
+async def again_after_stops(operator: Operator, do: Callable[[], Awaitable[T]], story: str) -> T:
+    """A computer that stalls, or on which the simulated devices do, stops the line, as it must; then once more.
+
+    `story`: what is said of that. Raises DemoFailed where anything else is wrong, or the line has stopped too often.
+    """
+    for _ in range(MOST_REPEATS):
+        try:
+            return await do()
+        except DemoFailed as failed:
+            if not await operator.has_stopped():
+                raise
+            await operator.recover(f"{story}: {failed}", str(failed))
+            await begin_with_repeats(operator)
+    return await do()
 
 
 async def settle_with_repeats(operator: Operator, tension_n: Sequence[float], speed_m_per_s: float) -> None:
-    """At set-points; started again where the line has stopped meanwhile."""
-    for repeats in range(MOST_REPEATS + 1):
-        try:
-            await operator.wait_settled(tension_n, speed_m_per_s)
-            return
-        except DemoFailed as failed:
-            if repeats == MOST_REPEATS or not await operator.has_stopped():
-                raise
-            await operator.recover(f"started once more: {failed}", str(failed))
-            await begin_with_repeats(operator)
+    """At set-points."""
+    await again_after_stops(operator, lambda: operator.wait_settled(tension_n, speed_m_per_s), "started once more")
 
 
 async def run_with_repeats(operator: Operator, config: Controller, case: Scenario, period_s: float) -> Window:
-    """A computer that stalls, or on which the simulated devices do, stops the line, as it must; then once more."""
-    for repeats in range(MOST_REPEATS + 1):
-        try:
-            return await _run_case(operator, config, case, period_s)
-        except DemoFailed as failed:
-            if repeats == MOST_REPEATS or not await operator.has_stopped():
-                raise
-            await operator.recover(f"the case once more: {failed}", str(failed))
-            await begin_with_repeats(operator)
-    raise AssertionError("the last repeat returns or raises")
+    return await again_after_stops(operator, lambda: _run_case(operator, config, case, period_s), "the case once more")
 
 
 async def _run_case(operator: Operator, config: Controller, case: Scenario, period_s: float) -> Window:

@@ -9,7 +9,7 @@ from pathlib import Path
 from gateway.cli.commission import Commissioned, GateSide, commission
 from gateway.cli.commission_changes import LineNow
 from gateway.cli.commission_live import TOPICS, LiveGate
-from gateway.cli.demo_cases import MOST_REPEATS, Window, begin_with_repeats, run_with_repeats
+from gateway.cli.demo_cases import Window, again_after_stops, run_with_repeats
 from gateway.cli.demo_line import Setup
 from gateway.cli.demo_operator import DemoFailed, Operator
 from gateway.cli.demo_stepped import SteppedAside
@@ -143,25 +143,22 @@ async def carry_out(operator: Operator, setup: Setup, stepped: SteppedAside) -> 
     side = Measured(
         LiveGate(setup.line, mailbox, operator.progress.step, operator.watch), decide, measure, operator.progress.step
     )
+
+    async def adapt() -> Commissioned:
+        found = await commission(
+            setup.line,
+            side,
+            operator.progress.step,
+            wanted_m_per_s=FASTEST_M_PER_S,
+            adaptations=ADAPTATIONS,
+            most_redesigns=ADAPTATIONS,
+        )
+        await side.measure_kept()
+        return found
+
     showing = asyncio.create_task(operator.keep_showing())
     try:
-        for repeats in range(MOST_REPEATS + 1):
-            try:
-                chain.commissioned = await commission(
-                    setup.line,
-                    side,
-                    operator.progress.step,
-                    wanted_m_per_s=FASTEST_M_PER_S,
-                    adaptations=ADAPTATIONS,
-                    most_redesigns=ADAPTATIONS,
-                )
-                await side.measure_kept()
-                break
-            except DemoFailed as failed:
-                if repeats == MOST_REPEATS or not await operator.has_stopped():
-                    raise
-                await operator.recover(f"the chain goes on after a stop: {failed}", str(failed))
-                await begin_with_repeats(operator)
+        chain.commissioned = await again_after_stops(operator, adapt, "the chain goes on after a stop")
         chain.shown = await side.proposals()
     finally:
         showing.cancel()

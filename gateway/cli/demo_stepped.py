@@ -1,8 +1,6 @@
 """The same cases in stepped time, worked out beside the line that runs: in one process of low priority."""
 
-import ctypes
 import os
-import signal
 from concurrent.futures import Future
 from dataclasses import replace
 from pathlib import Path
@@ -23,7 +21,6 @@ from sim_plant.plant import load_plant
 
 SEEDS = 5  #: runs that a case is held against
 NICER = 10
-_PR_SET_PDEATHSIG = 1
 
 
 class SteppedAside:
@@ -68,6 +65,5 @@ def _rmse_n(line: Line, config: Controller, plant: Path, case: Scenario, seed: i
 
 
 def _begin() -> None:
-    """Behind everything that runs, and gone with whoever started it, however that ends."""
+    """Behind everything that runs."""
     os.nice(NICER)
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)

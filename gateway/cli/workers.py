@@ -1,13 +1,13 @@
 """Processes that work for a command, and are gone with it: at its end, and at once where it is interrupted."""
 
 import os
-import signal
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
-from contextlib import contextmanager
 from multiprocessing import get_context
 from types import TracebackType
 from typing import Any, ParamSpec, TypeVar
+
+from gateway.supervisor.spawned import end_with_parent, interrupt_later
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -17,14 +17,15 @@ class Workers(ProcessPoolExecutor):
     """Fresh processes, not forked: numba and the linear algebra library have threads of their own by now.
 
     Ctrl-C in a terminal reaches all processes. It is the command's: workers never see it, whatever they are at. An
-    exception that leaves the `with` block, KeyboardInterrupt among them, ends them without waiting for their work.
+    exception that leaves the `with` block, KeyboardInterrupt among them, ends them without waiting for their work. And
+    where the command ends without leaving it, killed or terminated, they end all the same.
     """
 
     def __init__(self, count: int, begin: Callable[..., None] | None = None, given: tuple[Any, ...] = ()) -> None:
-        super().__init__(count, get_context("spawn"), begin, given)
+        super().__init__(count, get_context("spawn"), _begin, (begin, given))
 
     def submit(self, fn: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> Future[T]:
-        with _interrupt_later():  # a process that is started here has the mask for good
+        with interrupt_later():  # a process that is started here has the mask for good
             return super().submit(fn, *args, **kwargs)
 
     def map(
@@ -51,13 +52,10 @@ class Workers(ProcessPoolExecutor):
         return super().__exit__(kind, error, trace)
 
 
-@contextmanager
-def _interrupt_later() -> Iterator[None]:
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+def _begin(begin: Callable[..., None] | None, given: tuple[Any, ...]) -> None:
+    end_with_parent()
+    if begin is not None:
+        begin(*given)
 
 
 def processors() -> int:

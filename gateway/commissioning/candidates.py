@@ -1,15 +1,17 @@
 """What the commissioning chain proposes: configurations and experiments, and how fast a line can go. Pure."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from gateway.commissioning.architectures import ARCHITECTURES
 from gateway.commissioning.belief import believing
+from gateway.commissioning.simulated_loop import QUIET, loop_of
 from gateway.control.design import DesignRefused, DesignTask, margins, require_margin, task_of, task_on
 from gateway.control.mpc_linear import unconstrained
-from gateway.control.rollout import Course, Setup, plants_of_thetas, simulate
+from gateway.control.rollout import Course, plants_of_thetas, simulate
 from gateway.core.controller import Controller
 from gateway.core.controller_laws import MpcConfig
 from gateway.core.experiment import Experiment, ExperimentRefused, course
@@ -31,7 +33,6 @@ SLOWER = 8  #: times that an experiment's ramps are made slower, until it keeps 
 BELOW = 0.9  #: times the rate that the one before lets expect
 LEVEL = 1.25  #: times the way from level to level: a dwell
 LONGEST_DWELL_S = 60.0
-LONGEST_STEP_S = 0.005  #: of the integration
 
 
 class NotOffered(Exception):
@@ -113,7 +114,8 @@ def experiment(
     except ExperimentRefused as refused:
         raise NotOffered(str(refused)) from refused
     asked = _sized(designed.experiment, size, step_n)
-    return _slow_rollers(line, model, in_service, asked, np.array(tension_n), speed_m_per_s)
+    fastest = partial(_fastest_roller, line, model, in_service, np.array(tension_n), speed_m_per_s)
+    return _slow_rollers(line, model, asked, fastest)
 
 
 def fastest_m_per_s(line: Line, model: LineModel | None) -> float:
@@ -141,21 +143,13 @@ def fastest_m_per_s(line: Line, model: LineModel | None) -> float:
 
 
 def _slow_rollers(
-    line: Line,
-    model: LineModel | None,
-    in_service: Controller,
-    asked: Experiment,
-    tension_n: FloatArray,
-    speed_m_per_s: float,
+    line: Line, model: LineModel | None, asked: Experiment, fastest: Callable[[Experiment], float]
 ) -> Experiment:
     """Set-points go to their levels so slowly that rollers run no farther ahead of the web than the gate lets them.
 
-    Ramps, where steps are too quick: smaller steps would tell less. Raises NotOffered.
+    Ramps, where steps are too quick: smaller steps would tell less. `fastest`: the speed that a roller comes to, m/s.
+    Raises NotOffered.
     """
-
-    def fastest(one: Experiment) -> float:
-        return _fastest_roller(line, model, in_service, one, tension_n, speed_m_per_s)
-
     still = fastest(asked.model_copy(update={"amplitude_n": [0.0] * asked.n}))
     ahead = envelope_limits(line).roller_speed_watched_m_per_s - still
     ahead *= AHEAD_BY_FILE if model is None else AHEAD_BY_MODEL
@@ -180,25 +174,21 @@ def _fastest_roller(
     line: Line,
     model: LineModel | None,
     in_service: Controller,
-    asked: Experiment,
     tension_n: FloatArray,
     speed_m_per_s: float,
+    asked: Experiment,
 ) -> float:
     """On the mean of what is believed, without noise."""
-    period_s, limits = line.control.period_s, line.limits
+    period_s = line.control.period_s
     rows = list(course(asked, tension_n, speed_m_per_s, period_s))
     speeds, now, reach = np.empty(len(rows)), speed_m_per_s, line.moves.speed_rate_m_per_s2 * period_s
     for k, (_, goal) in enumerate(rows):
         now += min(max(goal - now, -reach), reach)
         speeds[k] = now
     theta = nominal_theta(line) if model is None else theta_of(model)
-    setup = Setup(
-        period_s=period_s, latency_s=0.0, substeps=max(1, int(np.ceil(period_s / LONGEST_STEP_S - 1e-9))),
-        torque_nm=limits.torque_nm, torque_rate_nm_per_s=limits.torque_rate_nm_per_s,
-    )  # fmt: skip
     law = unconstrained(in_service) if isinstance(in_service, MpcConfig) else in_service
     moves = Course(np.array([tension for tension, _ in rows]), speeds)
-    return float(simulate(law, plants_of_thetas([theta]), moves, setup).roller_speed_max_m_per_s.max())
+    return float(simulate(law, plants_of_thetas([theta]), moves, loop_of(line, QUIET)).roller_speed_max_m_per_s.max())
 
 
 def _task(line: Line, model: LineModel | None) -> DesignTask:

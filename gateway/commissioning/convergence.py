@@ -21,7 +21,7 @@ from math import inf, isfinite
 import numpy as np
 
 from gateway.commissioning.candidates import NotOffered
-from gateway.commissioning.redesign import loop_of
+from gateway.commissioning.simulated_loop import loop_of
 from gateway.control.rollout import Course, plants_of_thetas, simulate
 from gateway.core.controller import Controller
 from gateway.core.deployment import Region

@@ -15,8 +15,9 @@ from math import inf
 import numpy as np
 
 from gateway.commissioning.candidates import NEAR, Law, NotOffered, configuration, fastest_m_per_s
+from gateway.commissioning.simulated_loop import QUIET, loop_of
 from gateway.control.judged_courses import Judged, improvement_courses
-from gateway.control.rollout import Course, Setup, plants_of_thetas, simulate
+from gateway.control.rollout import Course, plants_of_thetas, simulate
 from gateway.core.controller import Controller
 from gateway.core.controller_laws import MpcConfig
 from gateway.core.line import Line
@@ -48,8 +49,6 @@ LINEAR_RUNGS = 4  #: of all others that are worth it: the best, and more at even
 RUNGS = len(PREDICTIVE) + LINEAR_RUNGS
 LASTING_S, BRIEF_S = 2.5, 1.0  #: of each change; with predictive control
 OF_TOLERANCE = 0.9  #: that is used of what the gate lets a figure be worse: it meets another noise
-LONGEST_STEP_S = 0.005  #: of the integration
-QUIET = Noise(0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -156,18 +155,3 @@ def _scale(course: Course) -> FloatArray:
     settled: FloatArray = course.settled_at_n
     step: FloatArray = np.abs(settled[0] - course.tension_n[0])
     return np.where(step > 0.0, step, settled[0])
-
-
-def loop_of(line: Line, noise: Noise) -> Setup:
-    """The line's loop; the latency is that of the plants."""
-    period_s, limits = line.control.period_s, line.limits
-    return Setup(
-        period_s=period_s,
-        latency_s=0.0,
-        substeps=max(1, int(np.ceil(period_s / LONGEST_STEP_S - 1e-9))),
-        torque_nm=limits.torque_nm,
-        torque_rate_nm_per_s=limits.torque_rate_nm_per_s,
-        tension_noise_n=noise.tension_n,
-        speed_noise_m_per_s=noise.speed_m_per_s,
-        acceleration_m_per_s1_5=noise.acceleration_m_per_s1_5,
-    )

@@ -112,7 +112,11 @@ def _between(low: Any, high: Any, share: float) -> Any:
                 update={name: _between(getattr(low, name), getattr(high, name), share) for name in names}
             )
         case float() | list():
-            mixed: Any = (1.0 - share) * np.array(low) + share * np.array(high)  # pyright: ignore[reportUnknownArgumentType]
-            return mixed.tolist()
+            return _mixed(low, high, share)
         case _:
             return low
+
+
+def _mixed(low: Any, high: Any, share: float) -> Any:
+    """Of numbers, or of lists of one shape."""
+    return ((1.0 - share) * np.array(low) + share * np.array(high)).tolist()

@@ -12,7 +12,7 @@ from pydantic import Field, TypeAdapter
 
 from gateway.core.line import Strict
 from gateway.core.line_model import Digest
-from gateway.core.proposal import Proposal
+from gateway.core.proposal import Kind, Proposal
 from gateway.core.verdict import Verdict
 
 Comment = Annotated[str, Field(max_length=1000)]
@@ -69,7 +69,7 @@ class ProposalLine(Strict):
     """A proposal in a list."""
 
     proposal: Digest
-    kind: Literal["gains", "experiment", "model"]
+    kind: Kind
     author: str
     stage: str
     why: str  #: of the stage: the first reason against it, what ended it

@@ -2,7 +2,7 @@
 
 import json
 from functools import cache
-from typing import Any
+from typing import Any, cast
 
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
@@ -51,15 +51,15 @@ def document_of(payload: bytes) -> dict[str, Any]:
         raise NotJson(f"it is {_kind(document)}; allowed: a JSON object {{ ... }}")
     if _is_too_deep(document):  # whatever walks through it, such as what tells its mistakes, calls itself
         raise NotJson(f"objects and lists stand in one another more than {MOST_DEEP} deep")
-    return document  # pyright: ignore[reportUnknownVariableType]
+    return cast(dict[str, Any], document)
 
 
 def _is_too_deep(document: Any) -> bool:
-    level: list[Any] = [document]
+    level: list[dict[str, Any] | list[Any]] = [document]
     for _ in range(MOST_DEEP):
         inner: list[Any] = []
         for one in level:
-            inner += one.values() if isinstance(one, dict) else one  # pyright: ignore[reportUnknownVariableType]
+            inner += one.values() if isinstance(one, dict) else one
         level = [child for child in inner if isinstance(child, dict | list)]
         if not level:
             return False

@@ -19,6 +19,7 @@ from gateway.core.json_problems import NotJson, document_of, problems
 from gateway.core.line import Name, NonNegative, Strict
 from gateway.core.line_model import Digest, Instant, LineModel
 
+Kind = Literal["gains", "experiment", "model"]
 MOST_BYTES = 65_536  #: unless the line's file has another limit
 
 Reason = Annotated[str, Field(min_length=1, max_length=4000)]
@@ -98,7 +99,7 @@ class Proposal(Strict):
     expires: Instant
 
     @property
-    def kind(self) -> Literal["gains", "experiment", "model"]:
+    def kind(self) -> Kind:
         return self.change.kind
 
     @property

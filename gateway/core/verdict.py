@@ -9,6 +9,7 @@ from pydantic import Field, model_validator
 from gateway.core.deployment import Region
 from gateway.core.line import Line, NonNegative, Strict
 from gateway.core.line_model import Digest, Instant
+from gateway.core.proposal import Kind
 
 Text = Annotated[str, Field(max_length=2000)]
 
@@ -42,7 +43,7 @@ class Verdict(Strict):
     payload: Digest  #: SHA-256 of the bytes as they came
     context: Digest
     line: Digest  #: SHA-256 of the line's file in its canonical form
-    kind: Literal["gains", "experiment", "model"] | None
+    kind: Kind | None
     seed: Annotated[int, Field(ge=0)]  #: drawn anew for each proposal
     accepted: bool
     findings: list[RuleFinding]  #: of the rules that decide, each

@@ -163,7 +163,7 @@ class Deployer:
         if (entry := self.book.on_the_line) is None:
             return None
         return ChangeStatus(
-            proposal=entry.proposal, kind=entry.kind, stage=entry.stage, since_wall_s=entry.since_s,  # type: ignore[arg-type]
+            proposal=entry.proposal, kind=entry.kind, stage=entry.stage, since_wall_s=entry.since_s,
             text=self._why(entry),
         )  # fmt: skip
 
@@ -237,6 +237,6 @@ class Deployer:
 
 def _line_of(entry: Entry, why: str) -> ProposalLine:
     return ProposalLine(
-        proposal=entry.proposal, kind=entry.kind, author=entry.author, stage=entry.stage, why=why,  # type: ignore[arg-type]
+        proposal=entry.proposal, kind=entry.kind, author=entry.author, stage=entry.stage, why=why,
         created=entry.created, expires=entry.expires, epoch=entry.epoch,
     )  # fmt: skip

@@ -19,6 +19,7 @@ from gateway.core.judge_context import JudgeContext
 from gateway.core.line import Line
 from gateway.core.recording import Recording
 from gateway.core.verdict import Verdict
+from gateway.supervisor.spawned import end_with_parent, interrupt_later
 
 NICER = 10  #: than the process that starts them
 BEGIN_S = 600.0  #: until one is ready: on a new machine it compiles first
@@ -43,7 +44,7 @@ class _Worker:
         context = get_context("spawn")
         self._ours, theirs = context.Pipe()
         self._process: BaseProcess = context.Process(target=_work, args=(theirs, line), daemon=True)
-        with _one_thread_each(), _interrupt_later():
+        with _one_thread_each(), interrupt_later():
             self._process.start()
         theirs.close()
         self._ready = False
@@ -173,6 +174,7 @@ def _forgotten(asked: "asyncio.Future[Verdict]") -> None:
 def _work(pipe: Connection, line: Line) -> None:
     """A worker's life: ready, then a verdict for each job, until the other end is gone."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the process that has started this one
+    end_with_parent()
     os.nice(NICER)
     from safety.judge import failed, judge, warm_up
 
@@ -203,12 +205,3 @@ def _one_thread_each() -> Iterator[None]:
                 del os.environ[name]
             else:
                 os.environ[name] = value
-
-
-@contextmanager
-def _interrupt_later() -> Iterator[None]:
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)

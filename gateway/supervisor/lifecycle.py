@@ -10,6 +10,7 @@ from enum import StrEnum
 from typing import Any
 
 from gateway.core.deployment import InService
+from gateway.core.proposal import Kind
 
 
 class Stage(StrEnum):
@@ -55,7 +56,7 @@ STEPS: dict[str, tuple[tuple[Stage, ...], Stage]] = {
 WELL = ("kept", "model-in-service", "experiment-ends")  #: the ends of changes that went well
 PERSON, SCRIPT, VERDICT = "person", "script", "verdict"  #: who approved
 PROPOSED, FOUND = "proposed", "found-in-service"
-OWN_KIND = {"deploying": "gains", "experiment-begins": "experiment", "model-in-service": "model"}
+OWN_KIND: dict[str, Kind] = {"deploying": "gains", "experiment-begins": "experiment", "model-in-service": "model"}
 
 
 class Impossible(Exception):
@@ -67,7 +68,7 @@ class Entry:
     """A proposal and where it stands."""
 
     proposal: str  #: hash
-    kind: str  #: of its change
+    kind: Kind  #: of its change
     author: str
     base: str  #: hash of the configuration that it would change
     changes: str  #: hash of the configuration, experiment or model that it brings
@@ -144,7 +145,7 @@ class Book:
         if kind == PROPOSED:
             self.entries[proposal] = Entry(
                 **{key: what[key] for key in ("proposal", "author", "base", "changes", "created", "expires")},
-                kind=str(what["change"]),
+                kind=what["change"],
                 expires_s=float(what["expires_s"]),
                 since_s=_at(what),
             )

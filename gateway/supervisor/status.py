@@ -11,6 +11,7 @@ from pydantic import Field
 from gateway.core.doubts import in_words
 from gateway.core.line import Line, Strict
 from gateway.core.messages import BusReport
+from gateway.core.proposal import Kind
 from gateway.core.signals import DriveState, Quality
 from gateway.core.states import LoopState
 from gateway.core.telemetry import Frame
@@ -110,7 +111,7 @@ class ChangeStatus(Strict):
     """What is being done to the line by a proposal: on its way, on probation, or an experiment."""
 
     proposal: str  #: hash
-    kind: Literal["gains", "experiment", "model"]
+    kind: Kind
     stage: str  #: as `r2rgate proposals` has it
     since_wall_s: float | None  #: Unix time at which it came to this stage; None: its record does not say
     text: str  #: what is still missing; empty: nothing is

@@ -2,8 +2,8 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
 
+from gateway.core.proposal import Kind
 from gateway.core.verdict import RuleFinding, ScenarioFigures
 from safety.case import Case
 from safety.performance import figures_of
@@ -28,8 +28,6 @@ from safety.rules import (
     roller_speed,
     validity,
 )
-
-Kind = Literal["gains", "experiment", "model"]
 
 
 @dataclass(frozen=True)

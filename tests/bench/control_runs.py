@@ -6,14 +6,11 @@ the recorder there. A design knows the model that it was made on and nothing els
 
 import os
 from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cache
-from multiprocessing import get_context
-from typing import Any, Literal, Self
+from typing import Any, Literal
 
 import numpy as np
-from rich.progress import Progress
 
 from gateway.cli.rehearse_designs import mpc_without_observer, truth_of
 from gateway.cli.stepped import CommandRefused, SteppedResult, run_scenario
@@ -40,6 +37,7 @@ from sim_plant.physics import STEP_S, equilibrium
 from sim_plant.plant import Plant, load_plant
 from tests.bench.control_plants import FASTEST_M_PER_S, random_plant, stressed_plant, uneven_plant
 from tests.bench.oracle import Terms, by_clarabel, by_piqp, oracle
+from tests.bench.workers import Workers
 
 Boundary = Literal["free", "continued"]  #: T_0 = T_{n+1} = 0; or those of the first and the last span
 DRAWN = {"random": random_plant, "uneven": uneven_plant}
@@ -178,23 +176,16 @@ def _trace(found: SteppedResult) -> Trace:
     return Trace(found.tension_n[rows], found.torque_nm[rows])
 
 
-class Runs:
+class Runs(Workers):
     """Runs in other processes. What was run before is not run again. Use as a context."""
 
     def __init__(self, workers: int | None = None) -> None:
         # What they compute is small: threads of linear algebra would only stand in each other's way.
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-        # Fresh processes: threads of compiled code do not survive a fork.
-        self._pool = ProcessPoolExecutor(workers or os.cpu_count(), mp_context=get_context("spawn"))
+        super().__init__(workers)
         self._outcomes: dict[Job, Outcome] = {}
         self._bests: dict[Bound, Best] = {}
         self._others: dict[Callable[[Any], Any], dict[Any, Any]] = {}
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._pool.shutdown(cancel_futures=True)
 
     def of(self, jobs: Sequence[Job], title: str) -> list[Outcome]:
         """Outcomes of `jobs`, in their order."""
@@ -207,14 +198,6 @@ class Runs:
     def every(self, function: Callable[[Any], Any], asked: Sequence[Any], title: str) -> list[Any]:
         """`function` of each of `asked`, in their order."""
         return _all(self._others.setdefault(function, {}), asked, self.each, function, title)
-
-    def each(self, function: Callable[[Any], Any], given: Sequence[Any], title: str) -> Iterable[Any]:
-        """`function` of each, in its order."""
-        with Progress() as progress:
-            bar = progress.add_task(title, total=len(given))
-            for found in self._pool.map(function, given):
-                progress.advance(bar)
-                yield found
 
     @property
     def made(self) -> dict[Job, Outcome]:

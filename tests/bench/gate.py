@@ -21,6 +21,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from scipy.stats import beta
@@ -35,7 +36,7 @@ from tests.bench.gate_proposals import CLASSES, mpc_proposals, proposals
 from tests.bench.gate_runs import LineBench, Tried, measured
 from tests.bench.gate_schema import Tally, mutated
 from tests.bench.gate_validity import bench_validity
-from tests.bench.identify_runs import Workers
+from tests.bench.workers import Workers
 
 PARTS, ASKED_FOR = "abc", "de"  #: of the latter only what is named
 SEED = 6100
@@ -165,7 +166,7 @@ def _paper(bench: Bench, gains: Sequence[Tried]) -> None:
         bench.figure("paper_good_accepted_pct", 100.0 * _share([passed[id(one)] for one in good]), "%", len(good))
 
 
-def by_class(tried: Sequence[Tried]) -> dict[str, object]:
+def by_class(tried: Sequence[Tried]) -> dict[str, Any]:
     rows = []
     for name in [*CLASSES, "predictive"]:
         own = [one for one in tried if one.class_name == name]
@@ -180,7 +181,7 @@ def by_class(tried: Sequence[Tried]) -> dict[str, object]:
     }
 
 
-def by_rule(tried: Sequence[Tried]) -> dict[str, object]:
+def by_rule(tried: Sequence[Tried]) -> dict[str, Any]:
     """Rules in the rows: how many unsafe ones it stopped, alone, and how many known good."""
     rules = sorted({rule for one in tried for rule in one.against})
     rows = []
@@ -201,7 +202,7 @@ def by_rule(tried: Sequence[Tried]) -> dict[str, object]:
     }
 
 
-def _listed(tried: Sequence[Tried]) -> dict[str, object]:
+def _listed(tried: Sequence[Tried]) -> dict[str, Any]:
     return {
         "heads": ("line", "class", "context", "law", "truth", "against", "tightest margins"),
         "rows": [

@@ -27,7 +27,7 @@ from tests.bench.control_plants import random_plant, scaled
 from tests.bench.figures import Bench
 from tests.bench.gate_plants import FIRST_SEED, plant_number
 from tests.bench.gate_tiers import Worth, law_of, worth
-from tests.bench.identify_runs import Workers
+from tests.bench.workers import Workers
 from tests.closed_loop.recorded import demonstration_line, real_plant
 
 GOALS = "gate-commissioning"  #: part of goals.toml

@@ -10,6 +10,7 @@ from functools import cache
 from hashlib import sha256
 from pathlib import Path
 from tempfile import NamedTemporaryFile
+from typing import Any
 
 import numpy as np
 
@@ -158,14 +159,14 @@ def data_reference(recording: Recording) -> DataReference:
     return DataReference(path="data.csv", digest=recording.digest(), recorded=instant(-90.0))
 
 
-def proposed(change: Change, context: JudgeContext, line: Line, **more: object) -> Proposal:
+def proposed(change: Change, context: JudgeContext, line: Line, **more: Any) -> Proposal:
     """A proposal of the agents, made in this context."""
-    fields: dict[str, object] = {
+    fields: dict[str, Any] = {
         "format": 1, "site": line.site, "line": line.line, "change": change, "base": config_hash(context.in_service),
         "model": None if context.model is None else model_hash(context.model), "reason": "it tracks better",
         "author": "agents", "created": instant(-30.0), "expires": instant(3600.0),
     }  # fmt: skip
-    return Proposal(**(fields | more))  # type: ignore[arg-type]
+    return Proposal(**(fields | more))
 
 
 def payload_of(change: GainsChange | ExperimentChange | ModelChange, context: JudgeContext, line: Line) -> bytes:

@@ -20,7 +20,7 @@ from sim_plant.plant import Plant
 from tests.bench.control_plants import random_plant
 from tests.bench.figures import Bench
 from tests.bench.gate_contexts import SPEED_M_PER_S, SPEEDS_M_PER_S, data_reference, instant, proposed
-from tests.bench.identify_runs import Workers
+from tests.bench.workers import Workers
 from tests.closed_loop.recorded import TENSION_N, demonstration_line, per_roller, real_plant, recorded
 from tests.closed_loop.truths import altered
 

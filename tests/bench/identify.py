@@ -24,8 +24,9 @@ from gateway.identification.parameters import COMBINATIONS
 from tests.bench import identify_runs as runs
 from tests.bench.figures import Bench
 from tests.bench.identify_passive import DURATION_S, MOVES, Passive, counted, passive
-from tests.bench.identify_runs import STRONG, Chosen, Found, Workers
+from tests.bench.identify_runs import STRONG, Chosen, Found
 from tests.bench.identify_wire import over_the_wire
+from tests.bench.workers import Workers
 
 PARTS = "abcdefg"
 NORMALISED = (0.8, 1.2)  #: the gate's validity test

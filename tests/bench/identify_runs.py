@@ -1,14 +1,10 @@
 """What bench-identify runs: a simulated line is recorded, and what is identified is held against its truth."""
 
 import time
-from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Sequence
 from dataclasses import dataclass
-from multiprocessing import get_context
-from typing import Any, Self
 
 import numpy as np
-from rich.progress import Progress
 
 from gateway.control.prediction import predict
 from gateway.core.recording import Recording
@@ -24,31 +20,10 @@ from tests.bench.control_plants import MOST_FRICTION_NM, scaled
 from tests.closed_loop.recorded import demonstration_line, per_roller, real_plant, recorded
 from tests.closed_loop.truths import altered, true_values, with_friction_and_lag
 
-WORKERS = 2
 SPEED_M_PER_S, FAST_M_PER_S = 0.05, 0.1
 HELD_OUT = 1000  #: added to a seed for data that no fit has seen, once more for each speed
 STRONG = ("stiffness_per_length", "radius_per_inertia", "friction_per_inertia")
 STRESS_M_PER_S2 = 5e-2 / np.sqrt(1e-3)  #: white noise of intensity 5e-2, held for 1 ms
-
-
-class Workers:
-    """Processes that run one thing after another. Use as a context."""
-
-    def __enter__(self) -> Self:
-        # Fresh processes: threads of compiled code do not survive a fork.
-        self._pool = ProcessPoolExecutor(WORKERS, mp_context=get_context("spawn"))
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._pool.shutdown(cancel_futures=True)
-
-    def each(self, function: Callable[[Any], Any], given: Sequence[Any], title: str) -> Iterable[Any]:
-        """`function` of each, in its order."""
-        with Progress() as progress:
-            bar = progress.add_task(title, total=len(given))
-            for found in self._pool.map(function, given):
-                progress.advance(bar)
-                yield found
 
 
 @dataclass(frozen=True)

@@ -6,11 +6,12 @@ from gateway.control.design import design_lqi, task_on
 from tests.bench.figures import Bench
 from tests.bench.gate_commissioning import Chain, OfLine, bench_commissioning, plant_of
 from tests.bench.gate_tiers import Worth, worth
+from tests.bench.workers import Workers
 from tests.closed_loop.recorded import demonstration_line
 from tests.closed_loop.truths import truth_of
 
 
-class Told:
+class Told(Workers):
     """Workers that have done already what they are asked for."""
 
     def __init__(self, found):
@@ -41,7 +42,7 @@ def test_refusals_are_counted_by_rule_and_lines_by_what_they_are():
         (2, True, False): of_line(2, True, False, [kept, refused, aborted], 1.03),
     }
     bench = Bench("gate-part", [1], goals_of="gate")
-    bench_commissioning(bench, Told(found), [0, 2])  # type: ignore[arg-type]
+    bench_commissioning(bench, Told(found), [0, 2])
     figures = {one.name: one.value for one in bench.figures}
     assert figures["commissioned"] == 3 and figures["commissioned_pct"] == 75.0
     assert figures["s_real_a_to_oracle_tension"] == 1.02 and figures["s_real_b_n_tension"] == 1.02

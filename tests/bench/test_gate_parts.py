@@ -135,9 +135,9 @@ def test_tables_count_what_was_accepted_by_class_and_stopped_by_rule() -> None:
         a_verdict(accepted=False, good=True, against=("corners",)),
         a_verdict(accepted=True, good=True),
     ]
-    rows = {row[0]: row for row in gate.by_class(tried)["rows"]}  # type: ignore[attr-defined]
+    rows = {row[0]: row for row in gate.by_class(tried)["rows"]}
     assert rows["wrong model"] == ("wrong model", 4, "0/2", "1/2", "0/0")
-    by_rule = {row[0]: row[1:5] for row in gate.by_rule(tried)["rows"]}  # type: ignore[attr-defined]
+    by_rule = {row[0]: row[1:5] for row in gate.by_rule(tried)["rows"]}
     assert by_rule == {"decay": (2, 1, 0, 0), "corners": (1, 0, 1, 1)}
 
 

@@ -1,6 +1,7 @@
 """The judge of the gate's judge, against closed forms, scipy and the simulated line."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -31,8 +32,8 @@ TENSION_N = np.array([28.0, 36.0, 20.0, 40.0, 24.0, 32.0])
 STEP_S = truth_kernel.STEP_S
 
 
-def quiet(**effects: object) -> Truth:
-    return replace(plain_truth(real_plant(), quiet=True), **effects)  # type: ignore[arg-type]
+def quiet(**effects: Any) -> Truth:
+    return replace(plain_truth(real_plant(), quiet=True), **effects)
 
 
 def driven(truth: Truth, torque_nm: FloatArray, steps: int, unwind: float = 0.05):  # noqa: ANN201

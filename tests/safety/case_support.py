@@ -97,3 +97,8 @@ def case_of(given: Proposal, context: JudgeContext, of: Setting, seed: int = 1, 
 def refused(found: list[RuleFinding]) -> list[str]:
     """What is against it."""
     return [one.text for one in found if not one.passed]
+
+
+def with_state(context: JudgeContext, **changes: Any) -> JudgeContext:
+    """The same, but for `changes` of the line's state."""
+    return context.model_copy(update={"state": context.state.model_copy(update=changes)})

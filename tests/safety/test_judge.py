@@ -10,24 +10,9 @@ from gateway.core.experiment import Abort, Experiment, Leg
 from gateway.core.proposal import canonical as proposal_bytes
 from gateway.core.verdict import canonical
 from safety import judge as judging
-from safety.judge import failed, judge, refusal
+from safety.judge import failed, judge, refusal, warm_up
 from safety.rules.table import RULES, Rule
-from tests.safety.case_support import gains, proposal, published, verdict_of
-
-
-@pytest.fixture(scope="module")
-def of():
-    return published()
-
-
-@pytest.fixture(scope="module")
-def context(of):
-    return of.context()
-
-
-@pytest.fixture(scope="module")
-def redesigned(of):
-    return design_lqi(of.task())
+from tests.safety.case_support import gains, proposal, verdict_of
 
 
 def against(verdict):
@@ -283,3 +268,15 @@ def test_a_law_without_integral_action_that_leaves_the_web_off_is_refused(of, co
     off = weak.feedforward.model_copy(update={"friction_nms_per_rad": [1.0] * 6})
     verdict = verdict_of(gains(weak.model_copy(update={"feedforward": off}), context), context, of)
     assert "corners: error" in against(verdict)
+
+
+def test_a_line_with_a_draw_span_takes_its_first_configuration(of):
+    spans = [span.model_copy(update={"control": "draw"}) if i == 2 else span for i, span in enumerate(of.line.spans)]
+    drawn = replace(of, line=of.line.model_copy(update={"spans": spans}))
+    context = drawn.context(model=None, data=[])
+    verdict = verdict_of(gains(context.in_service, context), context, drawn)
+    assert verdict.accepted, verdict.reasons
+
+
+def test_a_judge_that_is_warm_has_compiled_what_it_needs(of):
+    warm_up(of.line)

@@ -12,14 +12,9 @@ from gateway.core.proposal import canonical
 from safety import judge as judging
 from safety.judge import judge
 from safety.rules.table import Rule
-from tests.safety.case_support import gains, published
+from tests.safety.case_support import gains
 
 MANY = settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
-
-
-@pytest.fixture(scope="module")
-def of():
-    return published()
 
 
 @pytest.fixture(scope="module")

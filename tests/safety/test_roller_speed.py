@@ -11,17 +11,7 @@ from gateway.core.deployment import Region
 from safety import programme
 from safety.limits import envelope_limits
 from safety.rules import experiment, roller_speed
-from tests.safety.case_support import case_of, gains, proposal, published, refused, verdict_of
-
-
-@pytest.fixture(scope="module")
-def of():
-    return published()
-
-
-@pytest.fixture(scope="module")
-def context(of):
-    return of.context()
+from tests.safety.case_support import case_of, gains, proposal, refused, verdict_of, with_state
 
 
 def slow_line(of, speed_max_m_per_s):
@@ -30,8 +20,7 @@ def slow_line(of, speed_max_m_per_s):
 
 
 def slow_context(of, speed_m_per_s, **changes):
-    context = of.context(**changes)
-    return context.model_copy(update={"state": context.state.model_copy(update={"speed_m_per_s": speed_m_per_s})})
+    return with_state(of.context(**changes), speed_m_per_s=speed_m_per_s)
 
 
 def test_a_first_configuration_of_a_slow_line_has_the_steps_that_keep_its_rollers_slow(of):

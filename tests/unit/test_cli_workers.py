@@ -1,4 +1,4 @@
-"""Ctrl-C while processes work: one line of the command's own, and nothing is left of them, whatever they were at."""
+"""However a command ends while processes work for it, nothing is left of them; after Ctrl-C it says so in one line."""
 
 import os
 import re
@@ -68,6 +68,16 @@ def test_workers_end_with_what_they_work_for(stage: str, send: Callable[[int, in
         assert process.stdout is not None and process.stdout.readline() == "begun\n"
         assert interrupt(process, send) == ("", "")
         assert process.returncode == 130
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.parametrize("stage", ["starting", "at work"])
+def test_workers_end_with_a_command_that_cannot_end_them(stage: str, number: signal.Signals) -> None:
+    with begun("-c", STORY, stage) as process:
+        assert process.stdout is not None and process.stdout.readline() == "begun\n"
+        process.send_signal(number)
+        process.communicate(timeout=PATIENCE_S)  # they all have its standard output, as has what tracks their resources
+        assert process.returncode == -number
 
 
 @pytest.mark.parametrize("send", [TO_ALL, TO_ONE])

@@ -3,6 +3,7 @@
 import asyncio
 import json
 from dataclasses import replace
+from io import StringIO
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,7 +12,7 @@ from rich.console import Console
 
 from gateway.cli import demo_line
 from gateway.cli.demo_analysis import Evidence
-from gateway.cli.demo_cases import Window
+from gateway.cli.demo_cases import MOST_REPEATS, Window, again_after_stops
 from gateway.cli.demo_chain import Measured, beyond, name_of
 from gateway.cli.demo_chain_page import page
 from gateway.cli.demo_chain_table import print_chain
@@ -122,6 +123,44 @@ def example() -> DemoResult:
     return DemoResult.model_validate_json(json.dumps(document))
 
 
+class Stopping:
+    """An operator of a line that stops by itself, or does not stop where something else is wrong."""
+
+    def __init__(self, stops):
+        self.stops, self.told, self.begun = stops, [], 0
+
+    async def has_stopped(self):
+        return self.stops
+
+    async def recover(self, story, why):
+        self.told.append((story, why))
+
+    async def begin(self):
+        self.begun += 1
+
+
+@pytest.mark.parametrize(
+    ("fails", "stops", "runs", "told"),
+    [(0, True, 1, 0), (1, True, 2, 1), (MOST_REPEATS, True, 3, 2), (MOST_REPEATS + 1, True, 3, 2), (1, False, 1, 0)],
+)
+def test_what_a_stop_has_ended_is_done_again_so_often_and_what_is_wrong_otherwise_is_not(fails, stops, runs, told):
+    operator, made = Stopping(stops), []
+
+    async def do():
+        made.append(len(made))
+        if len(made) <= fails:
+            raise DemoFailed("late")
+        return "done"
+
+    if fails <= MOST_REPEATS and (stops or not fails):
+        assert asyncio.run(again_after_stops(operator, do, "the case once more")) == "done"
+    else:
+        with pytest.raises(DemoFailed, match="late"):
+            asyncio.run(again_after_stops(operator, do, "the case once more"))
+    assert (len(made), operator.begun) == (runs, told)
+    assert operator.told == told * [("the case once more: late", "late")]
+
+
 def test_improvements_are_from_one_configuration_to_the_next_here_and_in_the_paper():
     result = example()
     first, second = (result.rmse_n(k, "tension") for k in (0, 1))
@@ -135,10 +174,9 @@ def test_improvements_are_from_one_configuration_to_the_next_here_and_in_the_pap
 
 
 def test_the_table_fits_a_terminal_and_says_who_approved():
-    console = Console(width=80, record=True, file=open("/dev/null", "w", encoding="utf-8"))  # noqa: SIM115
+    console = Console(width=80, record=True, file=StringIO())
     result = example()
     print_chain(result, console)
-    console.file.close()
     text = console.export_text()
     assert result.chain is not None and result.chain.audit.head in text and "scripted operator (demo)" in text
     table = text[: text.index("on truth:")]

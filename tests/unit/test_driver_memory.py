@@ -1,7 +1,9 @@
 """The link of stepped time."""
 
+from collections.abc import Coroutine
 from dataclasses import dataclass, field
 from math import inf, nan
+from typing import Any
 
 import numpy as np
 import pytest
@@ -35,10 +37,10 @@ class FakePlant:
         self.applied.append((torque_nm.copy(), enable, speed, run, now_s))
 
 
-def finish(coroutine: object) -> None:
+def finish(coroutine: Coroutine[Any, Any, None]) -> None:
     """Drive a coroutine that must not suspend."""
     with pytest.raises(StopIteration):
-        coroutine.send(None)  # type: ignore[attr-defined]
+        coroutine.send(None)
 
 
 def prepared() -> tuple[FakePlant, MemoryLink]:

@@ -251,9 +251,9 @@ def test_a_disk_that_does_not_answer_is_told_and_close_does_not_wait_for_it(
     eventually(lambda: historian.health().storing)
     store = module.Writer.store
 
-    def hang(*arguments: object) -> None:
+    def hang(*arguments: Any) -> None:
         answers.wait()
-        store(*arguments)  # type: ignore[arg-type]
+        store(*arguments)
 
     monkeypatch.setattr(module.Writer, "store", hang)
 

@@ -1,0 +1,115 @@
+"""Rules on who proposes what and when, on the state of the line, and on what a controller is made for."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from gateway.control.design import MpcWeights, design_lqi, design_mpc, task_of
+from gateway.core.proposal import proposal_hash
+from safety.case import Case
+from safety.rules import authority, cool_down, fits_line, freshness, line_state
+from tests.safety.case_support import EXPIRES, NOW, case_of, gains, proposal, refused, with_state
+
+
+def test_authority(of, context, redesigned):
+    def of_author(author, **gate):
+        return refused(authority.check(case_of(gains(redesigned, context, author=author), context, of, **gate)))
+
+    assert of_author("agents") == []
+    assert "did you mean agents?" in of_author("agent")[0]
+    assert "is closed" in of_author("agents", autonomy="closed")[0]
+    assert len(of_author("nobody", autonomy="closed")) == 2
+
+
+STALE = {
+    "site": ({"site": "elsewhere"}, {}, "it is for elsewhere/line-1"),
+    "base": ({"base": "0" * 64}, {}, "in service is"),
+    "model": ({"model": "0" * 64}, {}, "it was made by the model 0000"),
+    "the file": ({"model": None}, {}, "it was made by the line's file"),
+    "no model": ({"model": "0" * 64}, {"model": None}, "no model is accepted"),
+    "expired": ({}, {"now": EXPIRES}, "it has expired"),
+    "future": ({}, {"now": "2026-08-03T14:04:59+00:00"}, "it comes from the future"),
+    "for ever": ({"expires": "2026-08-04T14:05:01+00:00"}, {}, "allowed: gate.expiry_max_s, 86400 s"),
+}
+
+
+@pytest.mark.parametrize("name", STALE)
+def test_freshness(of, context, redesigned, name):
+    given, surroundings, words = STALE[name]
+    now = context.model_copy(update=surroundings)
+    assert words in refused(freshness.check(case_of(gains(redesigned, context, **given), now, of)))[0]
+
+
+def test_what_is_just_fresh_passes_and_what_was_decided_does_not(of, context, redesigned):
+    given = gains(redesigned, context, created=NOW, expires="2026-08-04T14:06:00+00:00")
+    assert refused(freshness.check(case_of(given, context, of))) == []
+    decided = context.model_copy(update={"decided": [proposal_hash(given)]})
+    again = Case(of.line, decided, given, proposal_hash(given), [of.recording], 1)
+    assert "decided already" in refused(freshness.check(again))[0]
+    moved = {"kind": "model", "model": of.model.model_dump()}
+    assert refused(freshness.check(case_of(proposal(moved, context, model=None), context, of))) == []
+
+
+@pytest.mark.parametrize(("since_s", "passes"), [(None, True), (30.0, True), (29.9, False)])
+def test_cool_down(of, context, redesigned, since_s, passes):
+    now = with_state(context, since_change_s=since_s)
+    assert (refused(cool_down.check(case_of(gains(redesigned, context), now, of))) == []) is passes
+
+
+def test_state_of_the_line(of, context, redesigned):
+    def found(check, **state):
+        return refused(check(case_of(gains(redesigned, context), with_state(context, **state), of)))
+
+    for state in ("RUN", "READY", "SILENT", "HOLD"):
+        assert found(line_state.check_gains, state=state) == []
+    assert "the line is in STOP" in found(line_state.check_gains, state="STOP")[0]
+    assert "the line is in HOLD; allowed: RUN" in found(line_state.check_experiment, state="HOLD")[0]
+    assert found(line_state.check_experiment) == [] == found(line_state.check_model, state="STOP", moving=True)
+    everything = {"moving": True, "experiment": True, "on_probation": True, "doubts": ["cell 3"], "tension_n": [30.0]}
+    assert len(found(line_state.check_gains, **everything)) == 5
+    assert len(found(line_state.check_model, on_probation=True)) == 1
+
+
+def test_set_points_of_another_number_than_spans_are_no_place_to_judge_from(of, context, redesigned):
+    case = case_of(gains(redesigned, context), with_state(context, tension_n=[30.0]), of)
+    with pytest.raises(ValueError, match="state.tension_n has 1 entries"):
+        _ = case.tension_n
+
+
+def test_a_proposal_is_of_one_kind(case, of, context):
+    with pytest.raises(TypeError, match="has no experiment"):
+        _ = case.experiment
+    with pytest.raises(TypeError, match="has no model"):
+        _ = case.model
+    moved = case_of(proposal({"kind": "model", "model": of.model.model_dump()}, context), context, of)
+    with pytest.raises(TypeError, match="has no controller"):
+        _ = moved.controller
+
+
+def test_a_controller_of_another_line(of, context, redesigned):
+    def found(config, surroundings=context):
+        return refused(fits_line.check(case_of(gains(config, context), surroundings, of)))
+
+    assert found(redesigned) == []
+    assert found(redesigned.model_copy(update={"latency_s": 0.02})) == []
+    assert "latency of 0.0201 s" in found(redesigned.model_copy(update={"latency_s": 0.0201}))[0]
+    assert found(redesigned, context.model_copy(update={"latency_s": 0.0201}))
+    assert "period is 0.02 s" in found(redesigned.model_copy(update={"period_s": 0.02}))[0]
+    assert "takes spans [1]" in found(redesigned.model_copy(update={"draw_spans": [1]}))[0]
+    small = replace(task_of(of.line), model=replace(task_of(of.line).model, **first_spans(of.line, 2)),
+                    tension_n=np.array([30.0, 30.0]))  # fmt: skip
+    assert "is for 2 spans" in found(design_lqi(small))[0]
+
+
+def first_spans(line, n):
+    model = task_of(line).model
+    return {name: getattr(model, name)[:n] for name in
+            ("length_m", "radius_m", "inertia_kg_m2", "friction_nms_per_rad")}  # fmt: skip
+
+
+def test_a_predictive_controller_plans_with_the_limits_of_the_line(of, context):
+    mpc = design_mpc(of.task(), MpcWeights())
+    assert refused(fits_line.check(case_of(gains(mpc, context), context, of))) == []
+    strong = mpc.model_copy(update={"torque_nm": 61.0, "torque_rate_nm_per_s": 1e5, "tension_max_n": 61.0})
+    assert len(refused(fits_line.check(case_of(gains(strong, context), context, of)))) == 3

@@ -1,0 +1,155 @@
+"""Rules on the corners of what is believed: decay, delay margin, simulated courses, the paper's criterion."""
+
+from dataclasses import replace
+from math import inf, nan
+
+import numpy as np
+import pytest
+
+from gateway.control.design import MpcWeights, design_lqi, design_mpc, design_scheduled
+from gateway.control.judged_courses import corner_courses, improvement_courses
+from gateway.control.rollout import Rollouts
+from gateway.loop.setpoints import STEP_PAUSE_S
+from safety import programme
+from safety.rules import corners, decay, delay_margin, paper, roller_speed
+from safety.rules.corners import Worst
+from safety.simulated import holdable, judged_of, stressed
+from tests.safety.case_support import case_of, gains, refused
+
+
+def test_decay_at_its_limit(of, context, redesigned):
+    def found(**gate):
+        return decay.check(case_of(gains(redesigned, context), context, of, **gate))[0]
+
+    rate = found().value
+    assert found(decay_min_per_s=rate - 1e-9).passed and not found(decay_min_per_s=rate + 1e-9).passed
+
+
+def test_gains_without_end_have_no_decay(of, context, redesigned, monkeypatch):
+    monkeypatch.setattr(decay, "closed_loop", lambda form, plant: np.full((3, 3), inf))
+    found = decay.check(case_of(gains(redesigned, context), context, of))[0]
+    assert not found.passed and found.value is None
+
+
+def test_delay_margin_at_its_limit_for_a_law_and_for_a_schedule(of, context, redesigned):
+    def stood(config, **gate):
+        return delay_margin.check(case_of(gains(config, context), context, of, **gate))[0]
+
+    found = stood(redesigned, delay_margin_min_s=0.05)
+    assert not found.passed and 0.004 < found.value < 0.05
+    assert stood(redesigned, delay_margin_min_s=found.value).passed
+    assert not stood(redesigned, delay_margin_min_s=found.value + 5e-4).passed
+    assert stood(redesigned).passed and "or more" in stood(redesigned).text
+    schedule = design_scheduled(of.task(), design_lqi, [0.02, 0.05])
+    assert stood(schedule).passed
+    assert decay.check(case_of(gains(schedule, context), context, of))[0].passed
+
+
+def rollouts(low=3.0, high=59.0, swing=0.9, error=2.9, chatter=4.9):
+    one = np.ones((1, 6))
+    return Rollouts(one, low * one, high * one, one, one, one, one, one, one, tail_swing_n=swing * one,
+                    tail_error_n=error * one, chatter_nm=chatter * one)  # fmt: skip
+
+
+def test_corners_at_each_limit(of, context, redesigned, monkeypatch):
+    case = case_of(gains(redesigned, context), context, of)
+
+    def found(**figures):
+        monkeypatch.setattr(corners, "rollouts", lambda *_: rollouts(**figures))
+        return [one.rule for one in corners.check(case) if not one.passed]
+
+    assert found() == []
+    assert found(low=2.0, high=60.0, swing=1.0, error=3.0, chatter=5.0) == []
+    assert found(low=1.99) == ["corners: lowest tension"]
+    assert found(high=60.01) == ["corners: highest tension"]
+    assert found(swing=1.01) == ["corners: oscillation"]
+    assert found(error=3.01) == ["corners: error"]
+    assert found(chatter=5.01) == ["corners: chatter"]
+    assert len(found(low=-inf, high=inf, swing=inf, error=inf, chatter=inf)) == 5
+    assert len(found(low=nan, high=nan, swing=nan, error=nan, chatter=nan)) == 5
+
+
+def test_corners_that_nobody_could_hold_are_left_out_and_told(of, context, redesigned):
+    case = case_of(gains(redesigned, context), context, of)
+    plants, courses = [stressed(theta, of.line.gate) for theta in case.corners], corner_courses(judged_of(case))
+
+    def kept(torque_nm):
+        return [len(holdable(plants, course, torque_nm)) for course in courses.values()]
+
+    some_nm = next(torque for torque in np.arange(20.0, 40.0, 0.02).tolist() if min(kept(torque)) > 0)
+    assert min(kept(some_nm)) < 8
+    weak = of.line.limits.model_copy(update={"torque_nm": some_nm})
+    text = corners.check(replace(case, line=of.line.model_copy(update={"limits": weak})))[-1].text
+    assert "left out, because no controller holds them with 2" in text
+    none = of.line.limits.model_copy(update={"torque_nm": 5.0})
+    assert (
+        "none of 8 plants" in refused(corners.check(replace(case, line=of.line.model_copy(update={"limits": none}))))[0]
+    )
+
+
+@pytest.mark.parametrize("together", [1.0, 2.5, 4.0, 60.0])
+def test_no_course_asks_for_more_than_the_loop_permits(case, together):
+    limits = case.line.limits.model_copy(update={"steps_together": together})
+    judged = replace(judged_of(case), line=case.line.model_copy(update={"limits": limits}))
+    pause, most_n = round(STEP_PAUSE_S / case.line.control.period_s), limits.tension_step_max_n
+    for course in [*corner_courses(judged).values(), *improvement_courses(judged).values()]:
+        steps = np.abs(np.diff(course.tension_n, axis=0))
+        lately = np.lib.stride_tricks.sliding_window_view(steps, min(pause, len(steps)), axis=0)
+        assert lately.sum(axis=(1, 2)).max() <= together * most_n + 1e-9
+        assert steps.max() <= most_n + 1e-9
+        assert (lately > 0.0).sum(axis=2).max(initial=0) <= 1, "one span steps again only when the last step is over"
+        low, high = limits.tension_min_n + limits.tension_margin_n, limits.tension_max_n - limits.tension_margin_n
+        assert low <= course.tension_n.min() and course.tension_n.max() <= high
+
+
+def test_a_loop_is_simulated_as_late_as_its_delay_margin_says(case, monkeypatch):
+    seen = []
+
+    def simulate(config, plants, course, setup):
+        seen.append((plants, setup))
+        return rollouts(low=1.0 if setup.step_s == pytest.approx(0.001) else 20.0)
+
+    monkeypatch.setattr(corners, "simulate", simulate)
+    (low,) = [one for one in corners.check(case) if not one.passed]
+    assert low.rule == "corners: lowest tension" and "late" in low.text
+    late = [plants for plants, setup in seen if setup.step_s == pytest.approx(0.001)]
+    assert len(late) == 4 and all(
+        plants.effects.latency_s == pytest.approx(case.latency_s + case.line.gate.delay_margin_min_s) for plants in late
+    )
+    weak = case.line.limits.model_copy(update={"torque_nm": 5.0})
+    course = corner_courses(judged_of(case))["neighbours"]
+    held_by_nobody = replace(case, line=case.line.model_copy(update={"limits": weak}))
+    assert corners._late(held_by_nobody, case.controller, course) == []  # noqa: SLF001
+
+
+def test_a_predictive_controller_runs_whole_on_some_corners_and_says_what_is_lost(of, context, monkeypatch):
+    mpc = design_mpc(of.task(), MpcWeights())
+    whole: list[int] = []
+
+    def counted(config, plants, course, setup):
+        if config == mpc:
+            whole.append(plants.count)
+            config = design_lqi(of.task())
+        return corners.simulate(config, plants, course, setup)
+
+    monkeypatch.setattr(programme, "simulate", counted)
+    case = case_of(gains(mpc, context), context, of)
+    found = corners.check(case)
+    assert refused(roller_speed.check(case)) == []
+    assert whole == [4] * 4  # once for both rules
+    assert found[-1].rule == "corners: what is lost"
+    assert refused(found) == []
+
+
+def test_the_worst_over_corners_knows_where_it_was():
+    worst = Worst()
+    one = np.ones((1, 2))
+    for name, swing in (("first", 0.5), ("second", 0.7)):
+        worst.take(Rollouts(one, 3 * one, 9 * one, one, one, one, one, one, one, tail_swing_n=swing * one,
+                            tail_error_n=one, chatter_nm=one), name, [0, 1])  # fmt: skip
+    assert worst.swing_n == (0.7, "second") and worst.lowest_n[0] == 3.0
+
+
+def test_corners_that_torque_does_not_hold_leave_the_papers_criterion_open(of, context, case):
+    weak = of.line.model_copy(update={"limits": of.line.limits.model_copy(update={"torque_nm": 5.0})})
+    assert any("no corner is held" in text for text in refused(paper.check(replace(case, line=weak))))

@@ -1,0 +1,55 @@
+"""Rules on what a configuration gains: no worse than what is in service and the baseline, and promises kept."""
+
+from dataclasses import replace
+from math import inf
+
+import pytest
+
+from gateway.control.design import design_lqi, task_of
+from gateway.core.line import Span
+from safety.rules import corners, improvement, promises
+from safety.simulated import judged_of
+from tests.safety.case_support import case_of, gains, refused
+
+
+def test_improvement_at_each_tolerance(of):
+    gate = of.line.gate
+    assert improvement.allowed(gate, "rmse_n", 2.0) == pytest.approx(2.1)
+    assert improvement.allowed(gate, "rmse_n", 20.0) == pytest.approx(20.4)
+    assert improvement.allowed(gate, "settling_s", 1.0) == pytest.approx(1.1)
+    assert improvement.allowed(gate, "overshoot_pct", 10.0) == pytest.approx(12.0)
+    assert improvement.in_words(inf, "settling_s") == "never"
+    assert improvement.in_words(inf, "rmse_n") == "without end"
+
+
+def test_what_is_worse_than_in_service_or_than_the_baseline_is_refused(of, context, redesigned):
+    first = design_lqi(task_of(of.line))
+    walked = context.model_copy(update={"in_service": first, "baseline": redesigned})
+    found = improvement.check(case_of(gains(first, walked), walked, of))
+    assert {one.rule.rsplit(", ", 1)[1] for one in found} == {"in service", "baseline"}
+    assert all(one.passed for one in found if one.rule.endswith("in service"))
+    assert [one.rule for one in found if not one.passed and one.rule.endswith("baseline")]
+
+
+def test_a_promise_that_nobody_can_break(of, context, redesigned):
+    def found(**promise):
+        given = gains(redesigned, context, predicted=[{"scenario": "tension", **promise}])
+        return promises.check(case_of(given, context, of))
+
+    assert refused(found()) == [] == refused(found(rmse_n=1e6, overshoot_pct=1e6, settling_s=1e6))
+    assert len(refused(found(rmse_n=0.0, settling_s=0.0))) == 2
+
+
+def test_a_line_that_permits_no_steps_is_judged_standing(of, context, redesigned):
+    limits = of.line.limits.model_copy(update={"tension_step_max_n": 0.0, "speed_step_max_m_per_s": 0.0})
+    still = replace(
+        case_of(gains(redesigned, context), context, of), line=of.line.model_copy(update={"limits": limits})
+    )
+    assert refused(corners.check(still)) == [] == refused(improvement.check(still))
+
+
+def test_spans_without_a_load_cell_keep_their_set_point(of, context, case):
+    spans = [span if i else Span(name=span.name, length_m=span.length_m, control="draw")
+             for i, span in enumerate(of.line.spans)]  # fmt: skip
+    low, high = judged_of(replace(case, line=of.line.model_copy(update={"spans": spans}))).levels()
+    assert low[0] == high[0] == context.state.tension_n[0] and (high[1:] - low[1:] == 24.0).all()

@@ -1,0 +1,133 @@
+"""Rules that hold a model against recent data: is it still valid, and is nothing late?"""
+
+from dataclasses import replace
+from math import inf, nan
+
+import numpy as np
+import pytest
+
+from gateway.control.prediction import gains_of, imagined, innovations, predict, stretch_of, whitened
+from gateway.core.line_model import theta_of
+from gateway.core.theta import Noise
+from safety.excitation import excited_parts, newest, recent, same_speed
+from safety.predicting import Foretold, with_swings
+from safety.rules import alignment, validity
+from tests.safety.case_support import case_of, gains, refused
+
+
+def test_validity_at_its_limits(of, context, case, redesigned):
+    value = validity.check(case)[0].value
+    assert value == pytest.approx(1.0, abs=0.1)
+
+    def found(**gate):
+        return validity.check(case_of(gains(redesigned, context), context, of, **gate))[0]
+
+    assert found(innovation_low=0.5, innovation_high=value + 1e-9).passed
+    assert not found(innovation_low=0.5, innovation_high=value - 1e-9).passed
+    assert found(innovation_low=value - 1e-9, innovation_high=1.9).passed
+    assert not found(innovation_low=value + 1e-9, innovation_high=1.9).passed
+
+
+def test_one_load_cell_that_the_model_does_not_explain_is_enough(of, context, redesigned):
+    def found(**noise):
+        model = of.model.model_copy(update={"noise": of.model.noise.model_copy(update=noise)})
+        return refused(
+            validity.check(case_of(gains(redesigned, context), context.model_copy(update={"model": model}), of))
+        )
+
+    assert "up to 1.5" in found(tension_n=0.06)[0]
+    assert "takes the noise for greater" in found(tension_n=0.25)[0]
+
+
+def test_models_that_cannot_be_looked_at_are_not_valid(of, context, redesigned):
+    silent = of.model.model_copy(update={"noise": None})
+    case = case_of(gains(redesigned, context), context.model_copy(update={"model": silent}), of)
+    assert "says nothing of the noise" in refused(validity.check(case))[0]
+    assert "no data by which" in refused(alignment.check(case))[0]
+    none = case_of(gains(redesigned, context), context.model_copy(update={"model": None}), of)
+    assert refused(validity.check(none)) and refused(alignment.check(none))
+    old = case_of(gains(redesigned, context), context.model_copy(update={"now": "2026-08-20T00:00:00+00:00"}), of)
+    assert "1 of them older" in refused(validity.check(old))[0]
+
+
+def test_parts_at_one_speed_are_judged_together(of, context, redesigned):
+    twice = of.context(data=[*context.data, *context.data])
+    found = validity.check(case_of(gains(redesigned, context), twice, of))
+    assert len(found) == 2 and "over 5.2 s" in found[0].text
+
+
+@pytest.mark.parametrize("channel", ["tension_n", "speed_m_per_s"])
+def test_a_channel_that_is_late_is_found(of, context, redesigned, channel):
+    values = getattr(of.recording, channel).copy()
+    values[1:, 2] = values[:-1, 2]
+    late = replace(of, recording=replace(of.recording, **{channel: values}))
+    given = gains(redesigned, late.context())
+    found = alignment.check(case_of(given, late.context(), late))[0]
+    assert not found.passed and found.value > 0.004
+    # A speed that is late and a torque that is early are one and the same to its roller.
+    assert found.text.startswith("tension 3" if channel == "tension_n" else ("speed 3", "torque 3"))
+
+
+def test_alignment_at_its_limit_and_data_that_do_not_tell(of, context, case, redesigned):
+    def found(**gate):
+        return alignment.check(case_of(gains(redesigned, context), context, of, **gate))[0]
+
+    assert found().passed and found().value < 0.001
+    assert "do not tell" in found(alignment_max_s=1e-6).text and not found(alignment_max_s=1e-6).passed
+
+
+def test_rollers_out_of_round_are_known_as_they_were_learned(of, case):
+    round_theta, stretch = theta_of(of.model), stretch_of(case.excited[0].recording)
+    noise, swing = Noise(), np.zeros((6, 2))
+    swing[2] = 1e-2, -5e-3
+    gains_ = gains_of(round_theta, noise, stretch)
+    random = np.random.default_rng(1).standard_normal((stretch.predictions, len(stretch.outputs)))
+    innovation = np.einsum("kij,kj->ki", gains_.factor[gains_.which], random)
+    measured = imagined(round_theta, replace(stretch, swing=swing), gains_, innovation).measured
+    eccentric = replace(round_theta, eccentricity=np.array([0.0, 0.0, 1.5e-2, 0.0, 0.0, 0.0]))
+    predicted = predict(eccentric, noise, replace(stretch, measured=measured))
+    known = with_swings(predicted)  # from half a turn
+    assert known.swing[2] == pytest.approx(swing[2], abs=1e-3) and not known.swing[[0, 1, 3, 4, 5]].any()
+    white, as_round = (
+        np.square(whitened(innovations([round_theta], one, predicted.gains)[0], predicted.gains)).mean()
+        for one in (known, replace(stretch, measured=measured))
+    )
+    assert white < 1.1 and as_round > 1.1
+    late_s, _ = alignment.lateness(eccentric, [Foretold(case.excited[0], predicted)])
+    assert np.abs(late_s).max() < 1e-3
+
+
+def test_a_measured_latency_is_what_is_judged_by(of, context, redesigned):
+    slow = context.model_copy(update={"latency_s": 0.017})
+    case = case_of(gains(redesigned, context), slow, of)
+    assert case.latency_s == case.believed.latency_s == 0.017
+    assert {theta.latency_s for theta in case.corners} == {0.017}
+
+
+def test_excited_parts_are_at_one_speed_and_move(of):
+    recording = of.recording
+    (part,) = excited_parts(recording)
+    assert part.speed_m_per_s == pytest.approx(0.05, abs=1e-4) and part.movement_n > 1.0
+    standing = replace(recording, tension_n=np.where(np.arange(6) == 3, 30.0, recording.tension_n))
+    assert excited_parts(standing) == []
+    half = recording.samples // 2
+    speed = np.where(np.arange(recording.samples) < half, 0.05, 0.1)
+    assert excited_parts(replace(recording, unwind_speed_m_per_s=speed)) == []
+    draws = replace(recording, tension_n=np.full_like(recording.tension_n, nan))
+    assert excited_parts(draws)[0].movement_n == inf
+
+
+def test_old_and_future_data_do_not_count(of, context):
+    def kept(now):
+        return len(recent(context.model_copy(update={"now": now}), [of.recording], 604_800.0))
+
+    assert kept("2026-08-10T14:00:00+00:00") == 1
+    assert kept("2026-08-10T14:00:01+00:00") == 0
+    assert kept("2026-08-03T13:59:59+00:00") == 0
+
+
+def test_of_much_data_the_newest_are_looked_at_and_every_speed(of):
+    (part,) = excited_parts(of.recording)
+    slow = replace(part, speed_m_per_s=0.01)
+    assert newest([part] * 5 + [slow] * 5, 5.0) == [part, part, slow]
+    assert same_speed(0.05, 0.0524) and same_speed(0.002, 0.0039) and not same_speed(0.1, 0.106)
