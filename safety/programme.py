@@ -8,20 +8,20 @@ from math import inf
 
 import numpy as np
 
-from gateway.control.judged_courses import Courses, corner_courses
+from gateway.control.judged_courses import CornerCourses, corner_courses
 from gateway.control.mpc_linear import unconstrained
 from gateway.control.rollout import Rollouts, simulate
 from gateway.core.controller_laws import MpcConfig
 from gateway.core.theta import Theta
 from safety.case import Case
-from safety.simulated import holdable, judged_of, plants_under_stress, setup_of, stressed
+from safety.simulated import held, judged_of, plants_under_stress, setup_of, stressed
 
 WHOLE = 4  #: corners: those on which the law without limits does worst in small moves
 LASTING_S, TAIL_S = 2.0, 0.6  #: of changes that the programme makes, and their tail
 SMALL_STEP_N, SMALL_STEP_M_PER_S = 1.0, 0.002  #: in which no limit is reached
 
 
-def small_courses(case: Case) -> Courses:
+def small_courses(case: Case) -> CornerCourses:
     judged = judged_of(case)
     small = replace(
         judged,
@@ -41,17 +41,17 @@ def by_itself(case: Case) -> dict[str, Rollouts]:
     return case.once("programme", lambda case: in_courses(case, corner_courses(judged_of(case), LASTING_S, TAIL_S)))
 
 
-def in_courses(case: Case, courses: Courses) -> dict[str, Rollouts]:
-    """The programme itself, on the corners that are the worst for each of `courses`."""
+def in_courses(case: Case, courses: CornerCourses) -> dict[str, Rollouts]:
+    """The programme itself, on the corners that are the worst for each of `courses`; on one where they are shared."""
     setup = setup_of(case.line, case.stress_noise, case.seed, case.line.gate.stress_late_share)
     found: dict[str, Rollouts] = {}
-    for name, course in courses.items():
+    for name, one in courses.items():
         small = in_small(case)[name]
         badness = small.tail_swing_n.max(axis=1) + small.chatter_nm.max(axis=1) + small.beyond_n.max(axis=1)
-        order: list[int] = np.argsort(np.nan_to_num(badness, nan=inf))[::-1][:WHOLE].tolist()
+        order: list[int] = np.argsort(np.nan_to_num(badness, nan=inf))[::-1][: 1 if one.shared else WHOLE].tolist()
         kept = _kept(case, name)
         plants = plants_under_stress([kept[i] for i in order], case.line.gate, case.seed)
-        found[name] = simulate(case.controller, plants, course, setup)
+        found[name] = simulate(case.controller, plants, one.course, setup)
     return found
 
 
@@ -62,12 +62,12 @@ def _in_small(case: Case) -> dict[str, Rollouts]:
     law, gate = unconstrained(config), case.line.gate
     setup = setup_of(case.line, case.stress_noise, case.seed, gate.stress_late_share)
     return {
-        name: simulate(law, plants_under_stress(_kept(case, name), gate, case.seed), course, setup)
-        for name, course in small_courses(case).items()
+        name: simulate(law, plants_under_stress(_kept(case, name), gate, case.seed), one.course, setup)
+        for name, one in small_courses(case).items()
     }
 
 
 def _kept(case: Case, name: str) -> list[Theta]:
     """Corners that torque holds in the largest steps of a course."""
     plants = [stressed(theta, case.line.gate) for theta in case.corners]
-    return holdable(plants, corner_courses(judged_of(case))[name], case.line.limits.torque_nm)
+    return held(plants, corner_courses(judged_of(case))[name], case.line.limits.torque_nm)

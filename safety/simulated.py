@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from gateway.control.judged_courses import Judged
+from gateway.control.judged_courses import CornerCourse, Judged
 from gateway.control.rollout import Course, Plants, Setup, plants_of_thetas
 from gateway.core.line import Gate, Line
 from gateway.core.theta import Noise, Theta
@@ -31,10 +31,14 @@ def stressed(theta: Theta, gate: Gate) -> Theta:
 
 
 def plants_under_stress(thetas: Sequence[Theta], gate: Gate, seed: int) -> Plants:
-    """Stressed, and with rollers out of round, each from another angle on."""
-    n = thetas[0].n
-    phases = np.random.default_rng([seed, 2]).uniform(0.0, 2.0 * np.pi, (len(thetas), n))
-    return plants_of_thetas([stressed(theta, gate) for theta in thetas], gate.stress_eccentricity, phases)
+    """Stressed, and with rollers out of round."""
+    return plants_out_of_round([stressed(theta, gate) for theta in thetas], gate, seed)
+
+
+def plants_out_of_round(thetas: Sequence[Theta], gate: Gate, seed: int) -> Plants:
+    """Each roller from another angle on."""
+    phases = np.random.default_rng([seed, 2]).uniform(0.0, 2.0 * np.pi, (len(thetas), thetas[0].n))
+    return plants_of_thetas(thetas, gate.stress_eccentricity, phases)
 
 
 def setup_of(line: Line, noise: Noise, seed: int, late_share: float, longest_step_s: float = LONGEST_STEP_S) -> Setup:
@@ -57,6 +61,11 @@ def setup_of(line: Line, noise: Noise, seed: int, late_share: float, longest_ste
 def holdable(thetas: Sequence[Theta], course: Course, torque_nm: float) -> list[Theta]:
     """Those that the torque holds wherever the course stands: beyond that no controller can, and none is to blame."""
     return [theta for theta in thetas if _needed_nm(theta, course) <= HOLDABLE * torque_nm]
+
+
+def held(thetas: Sequence[Theta], one: CornerCourse, torque_nm: float) -> list[Theta]:
+    """Those that a course is for and that the torque holds; where there are none of both, one that it holds."""
+    return holdable(one.of(thetas), one.course, torque_nm) or holdable(thetas, one.course, torque_nm)[:1]
 
 
 def _needed_nm(theta: Theta, course: Course) -> float:

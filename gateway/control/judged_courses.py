@@ -12,6 +12,7 @@ asked of the spans before it. Three courses have a name that a promise may use:
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
@@ -28,6 +29,8 @@ LEAST_SPEED_M_PER_S = 0.005  #: the slowest that is looked at, where the line is
 SLOW = 0.1  #: the slow speed, of the fast one
 TURN_S = 0.25  #: from one step to that of the next span
 ROOM = 1.0 / 3.0  #: of a step, to the set-points' limits
+MOST_ALONE = 3  #: spans that step alone, at a speed
+T = TypeVar("T")
 
 Courses = dict[str, Course]
 
@@ -106,24 +109,58 @@ def improvement_courses(judged: Judged, lasting_s: float = 2.5) -> Courses:
     return found or {"standing": course_through(period_s, [(lasting_s, judged.tension_n, fast)])}
 
 
-def corner_courses(judged: Judged, lasting_s: float = 2.5, tail_s: float = 1.5) -> Courses:
-    """Speed down and up; steps of one span, slow; one after another; of some at once. Each with a tail that stands."""
+@dataclass(frozen=True)
+class CornerCourse:
+    """A course and the corners that it is for: all of them, or every so many from one on."""
+
+    course: Course
+    first: int = 0
+    every: int = 1
+    late: bool = True  #: it is looked at late, too
+
+    @property
+    def shared(self) -> bool:
+        """With others of its kind it is shared out over the corners."""
+        return self.every > 1
+
+    def of(self, corners: Sequence[T]) -> Sequence[T]:
+        """Its part of them."""
+        return corners[self.first % len(corners) :: self.every]
+
+
+CornerCourses = dict[str, CornerCourse]
+
+
+def corner_courses(judged: Judged, lasting_s: float = 2.5, tail_s: float = 1.5) -> CornerCourses:
+    """Speed down and up; steps of single spans, slow or fast; one after another; of some at once; each with a tail.
+
+    Every other span steps slow, the others fast, and they share the corners among them.
+    """
     spans = [i for i, span in enumerate(judged.line.spans) if span.control == "tension"]
-    some, one = judged.some(spans), judged.some(spans[len(spans) // 2 :][:1])
+    some = judged.some(spans)
     period_s, fast, slow = judged.line.control.period_s, judged.fast_m_per_s, judged.slow_m_per_s
     now, before = judged.tension_n, judged.before_m_per_s
 
     def of(first: tuple[FloatArray, float], second: tuple[FloatArray, float]) -> Course:
         return course_through(period_s, [(STAND_S, *first), (lasting_s, *second), (lasting_s, *first)], tail_s)
 
-    found: Courses = {"speed change": of((now, fast), (now, before))}
+    found: CornerCourses = {"speed change": CornerCourse(of((now, fast), (now, before)))}
     if judged.tension_step_n > 0.0:
-        found |= {
-            "one span, slow": of((one[0], slow), (one[1], slow)),
-            "one after another": course_through(period_s, _in_turn(judged, lasting_s), tail_s),
-            "neighbours": of((some[0], fast), (some[1], fast)),
-        }
+        for name, speed, alone in (("slow", slow, _apart(spans[::2])), ("fast", fast, _apart(spans[1::2] or spans))):
+            for at, span in enumerate(alone):
+                low, high = judged.some([span])
+                found[f"span {span + 1} alone, {name}"] = CornerCourse(
+                    of((low, speed), (high, speed)), at, len(alone), late=speed == slow and at == len(alone) // 2
+                )
+        found["one after another"] = CornerCourse(course_through(period_s, _in_turn(judged, lasting_s), tail_s))
+        found["neighbours"] = CornerCourse(of((some[0], fast), (some[1], fast)))
     return found
+
+
+def _apart(spans: Sequence[int]) -> list[int]:
+    """At most `MOST_ALONE` of them, at even distances."""
+    count = min(len(spans), MOST_ALONE)
+    return [spans[at * (len(spans) - 1) // max(count - 1, 1)] for at in range(count)]
 
 
 def _in_turn(judged: Judged, lasting_s: float) -> list[tuple[float, FloatArray, float]]:

@@ -10,7 +10,7 @@ from math import inf
 
 import numpy as np
 
-from gateway.control.judged_courses import Courses, corner_courses
+from gateway.control.judged_courses import CornerCourse, CornerCourses, corner_courses
 from gateway.control.mpc_linear import unconstrained
 from gateway.control.rollout import Course, Rollouts, simulate
 from gateway.core.controller import Controller
@@ -21,7 +21,7 @@ from gateway.core.verdict import RuleFinding
 from safety import programme
 from safety.case import Case
 from safety.findings import at_least, at_most, told
-from safety.simulated import holdable, judged_of, plants_under_stress, setup_of, stressed
+from safety.simulated import held, holdable, judged_of, plants_out_of_round, plants_under_stress, setup_of, stressed
 
 RULE = "corners"
 LATE, FINE_STEP_S = 2, 0.001  #: plants that are later than the line is, and the steps in which they are so
@@ -50,7 +50,7 @@ def check(case: Case) -> list[RuleFinding]:
     """Tension's band, its oscillation and error once it should stand, and the torque's chatter: the worst of all."""
     plants = [stressed(theta, case.line.gate) for theta in case.corners]
     courses = corner_courses(judged_of(case))
-    kept = {name: holdable(plants, course, case.line.limits.torque_nm) for name, course in courses.items()}
+    kept = {name: held(plants, one, case.line.limits.torque_nm) for name, one in courses.items()}
     if nobody := [name for name, some in kept.items() if not some]:
         return [_nobody_holds(case, nobody[0])]
     config = case.controller
@@ -58,27 +58,33 @@ def check(case: Case) -> list[RuleFinding]:
     return [*_limits(case, worst), _of_corners(case, kept), *_lost(config)]
 
 
-def _of_law(case: Case, config: Controller, kept: dict[str, list[Theta]], courses: Courses) -> Worst:
+def _of_law(case: Case, config: Controller, kept: dict[str, list[Theta]], courses: CornerCourses) -> Worst:
     worst = Worst()
-    for name, course in courses.items():
-        found = rollouts(case.line, config, kept[name], course, case.stress_noise, case.seed)
+    for name, one in courses.items():
+        found = rollouts(case.line, config, kept[name], one.course, case.stress_noise, case.seed)
         worst.take(found, name, case.tension_spans)
-        for late in _late(case, config, course):
+        for late in _late(case, config, one):
             worst.take(late, f"{name}, late", case.tension_spans)
     return worst
 
 
-def _late(case: Case, config: Controller, course: Course) -> list[Rollouts]:
+def _late(case: Case, config: Controller, one: CornerCourse) -> list[Rollouts]:
     """On what is believed of the line, stressed, and as late as the delay margin promises to stand.
 
-    A linear loop that is stable then may still swing so far that it leaves the band. Nothing where no torque holds it.
+    A linear loop that is stable then may still swing so far that it leaves the band. The delay is in place of the lag
+    that corners are stressed by: both are the reserve for what is not known of the delay. Nothing where no torque
+    holds it.
     """
-    gate = case.line.gate
-    late = stressed(replace(case.believed, latency_s=case.latency_s + gate.delay_margin_min_s), gate)
-    if not holdable([late], course, case.line.limits.torque_nm):
+    gate, believed = case.line.gate, case.believed
+    late = replace(
+        stressed(believed, gate),
+        latency_s=case.latency_s + gate.delay_margin_min_s,
+        torque_lag_s=believed.torque_lag_s,
+    )
+    if not one.late or not holdable([late], one.course, case.line.limits.torque_nm):
         return []
     setup = setup_of(case.line, case.stress_noise, case.seed, gate.stress_late_share, FINE_STEP_S)
-    return [simulate(config, plants_under_stress([late] * LATE, gate, case.seed), course, setup)]
+    return [simulate(config, plants_out_of_round([late] * LATE, gate, case.seed), one.course, setup)]
 
 
 def _of_mpc(case: Case, config: MpcConfig) -> Worst:
@@ -133,9 +139,11 @@ def _limits(case: Case, worst: Worst) -> list[RuleFinding]:
 
 
 def _of_corners(case: Case, kept: dict[str, list[Theta]]) -> RuleFinding:
-    left_out = {name: len(case.corners) - len(some) for name, some in kept.items()}
-    what = f"{len(case.corners)} plants that the line may be, and {LATE} late, {len(left_out)} courses each, up to "
-    what += f"{case.speed_max_m_per_s:g} m/s and steps of {case.tension_step_n:g} N"
+    courses = corner_courses(judged_of(case))
+    left_out = {name: max(len(courses[name].of(case.corners)) - len(some), 0) for name, some in kept.items()}
+    shared = sum(one.shared for one in courses.values())
+    what = f"{len(case.corners)} plants that the line may be, and {LATE} late, {len(courses) - shared} courses each, "
+    what += f"{shared} shared out, up to {case.speed_max_m_per_s:g} m/s and steps of {case.tension_step_n:g} N"
     most = max(left_out.values())
     if most:
         names = ", ".join(f"{count} of {name}" for name, count in left_out.items() if count)

@@ -67,7 +67,8 @@ def _norm(figures: Figures) -> float:
 
 
 def _robust(case: Case) -> RuleFinding:
-    name, course = next(reversed(corner_courses(judged_of(case)).items()))
+    name, one = next(reversed(corner_courses(judged_of(case)).items()))
+    course = one.course
     most = CORNERS_MPC if isinstance(case.controller, MpcConfig) else CORNERS
     thetas = holdable(case.corners[:most], course, case.line.limits.torque_nm)
     if not thetas:

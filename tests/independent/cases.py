@@ -183,6 +183,7 @@ def measuring_cases(line: Line, top_m_per_s: float) -> list[Case]:
         Course(line, base, middle).stand(0.5).step(low).case("down", 4.0),
         Course(line, level, slow).stand(0.5).step(unwind_m_per_s=slow + rise).case("faster", 4.0),
         Course(line, level - together, top_m_per_s).stand(0.5).step(level + together).case("all", 4.0),
+        Course(line, level + together, top_m_per_s).stand(0.5).step(level - together).case("all-down", 4.0),
         Course(line, base, middle).stand(0.5).glide(shaped, middle, 0.5).case("shaped", 4.0),
         Course(line, level, slow).stand(0.5).glide(level, slow + rise, 1.0).case("shaped-faster", 4.0),
     ]

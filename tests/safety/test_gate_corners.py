@@ -74,7 +74,7 @@ def test_corners_that_nobody_could_hold_are_left_out_and_told(of, context, redes
     plants, courses = [stressed(theta, of.line.gate) for theta in case.corners], corner_courses(judged_of(case))
 
     def kept(torque_nm):
-        return [len(holdable(plants, course, torque_nm)) for course in courses.values()]
+        return [len(holdable(plants, one.course, torque_nm)) for one in courses.values()]
 
     some_nm = next(torque for torque in np.arange(20.0, 40.0, 0.02).tolist() if min(kept(torque)) > 0)
     assert min(kept(some_nm)) < 8
@@ -92,7 +92,7 @@ def test_no_course_asks_for_more_than_the_loop_permits(case, together):
     limits = case.line.limits.model_copy(update={"steps_together": together})
     judged = replace(judged_of(case), line=case.line.model_copy(update={"limits": limits}))
     pause, most_n = round(STEP_PAUSE_S / case.line.control.period_s), limits.tension_step_max_n
-    for course in [*corner_courses(judged).values(), *improvement_courses(judged).values()]:
+    for course in [*(one.course for one in corner_courses(judged).values()), *improvement_courses(judged).values()]:
         steps = np.abs(np.diff(course.tension_n, axis=0))
         lately = np.lib.stride_tricks.sliding_window_view(steps, min(pause, len(steps)), axis=0)
         assert lately.sum(axis=(1, 2)).max() <= together * most_n + 1e-9
@@ -136,7 +136,7 @@ def test_a_predictive_controller_runs_whole_on_some_corners_and_says_what_is_los
     case = case_of(gains(mpc, context), context, of)
     found = corners.check(case)
     assert refused(roller_speed.check(case)) == []
-    assert whole == [4] * 4  # once for both rules
+    assert sorted(whole) == [1] * 6 + [4] * 3  # once for both rules
     assert found[-1].rule == "corners: what is lost"
     assert refused(found) == []
 
