@@ -3,10 +3,11 @@ SHELL := /bin/sh
 VENV  := .venv
 PY    := $(VENV)/bin/python
 RUN   := $(PY) -m gateway.cli
+PARALLEL := --numprocesses auto --maxprocesses 4 --dist loadfile
 export PYTHONDONTWRITEBYTECODE :=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup run test coverage system-test check format bench bench-stepped bench-wire bench-processes bench-cycle bench-monitor bench-control bench-identify bench-faults bench-fuzz bench-soak bench-gate bench-lifecycle bench-audit bench-kill bench-gate-live lock clean
+.PHONY: help setup run test test-long coverage system-test check format bench bench-stepped bench-wire bench-processes bench-cycle bench-monitor bench-control bench-identify bench-faults bench-fuzz bench-soak bench-gate bench-lifecycle bench-audit bench-kill bench-gate-live lock clean
 
 help: ## this list
 	@echo "r2rgate: make TARGET"
@@ -20,9 +21,12 @@ setup: $(VENV)/.ready ## the virtual environment in .venv, from requirements.loc
 run: setup ## set up, then the demonstration: a line adapted through the gate, in real time (about 5 min; ARGS="--quick")
 	@exec $(RUN) demo $(ARGS)
 
-test: setup ## set up, then all tests: those about time itself alone, the others on every core
+test: setup ## set up, then all tests but the long ones: those about time itself alone, the others on every core
 	@$(PY) -m pytest -m realtime $(ARGS) || [ $$? -eq 5 ]  # 5: none of them was asked for
-	@$(PY) -m pytest -m "not realtime" --numprocesses auto --maxprocesses 4 --dist loadfile $(ARGS) || [ $$? -eq 5 ]
+	@$(PY) -m pytest -m "not realtime and not long" $(PARALLEL) $(ARGS) || [ $$? -eq 5 ]
+
+test-long: setup ## tests of a minute or more: whole chains through the gate, comparisons with other libraries (about 4 min)
+	@$(PY) -m pytest -m long $(PARALLEL) $(ARGS)
 
 system-test: setup ## a real CAN kernel and foreign protocol stacks; as root, installs Debian and npm packages (about 6 min)
 	@$(PY) -m tests.system.needs

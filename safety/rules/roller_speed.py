@@ -74,32 +74,34 @@ def steps_let(case: Case) -> Let:
 
 
 def _steps_let(case: Case) -> Let:
-    if isinstance(case.controller, MpcConfig) and not case.first:
-        fastest = {name: _greatest(found) for name, found in programme.by_itself(case).items()}
-        if max(fastest.values()) <= JUDGED * envelope_limits(case.line).roller_speed_m_per_s:
-            return Let(dict.fromkeys(fastest, 1.0), fastest)
-    return _let(case, *_looks(case))
-
-
-def _let(case: Case, foreseen: Fastest, on_corners: Fastest) -> Let:
     limits, judged = envelope_limits(case.line), judged_of(case)
-    share, fastest = dict[str, float](), dict[str, float]()
+    foreseen, on_corners = _looks(case)
+    share, fastest = dict[str, float](), _in_whole_steps(case)
     for name, one in _courses(judged, 1.0).items():
+        if fastest.get(name, np.inf) <= JUDGED * limits.roller_speed_m_per_s:
+            share[name] = 1.0
+            continue
         web = float(one.course.unwind_speed_m_per_s.max())
         allowed = limits.roller_speed_watched_m_per_s if case.first else limits.roller_speed_in_step_m_per_s(web)
-        share[name], fastest[name] = _largest(judged, name, foreseen, allowed)
+        share[name], fastest[name] = _largest(judged, name, one, foreseen, allowed)
         if not case.first and np.isfinite(share[name]):
-            fastest[name] = on_corners(name, _courses(judged, share[name])[name])
+            fastest[name] = on_corners(name, one if share[name] == 1.0 else _courses(judged, share[name])[name])
     return Let(share, fastest)
 
 
-def _largest(judged: Judged, name: str, fastest: Fastest, allowed: float) -> tuple[float, float]:
+def _in_whole_steps(case: Case) -> dict[str, float]:
+    """By course, where that is known already: of a programme, which takes its time."""
+    if case.first or not isinstance(case.controller, MpcConfig):
+        return {}
+    return {name: _greatest(found) for name, found in programme.by_itself(case).items()}
+
+
+def _largest(judged: Judged, name: str, whole: CornerCourse, fastest: Fastest, allowed: float) -> tuple[float, float]:
     """Share of the step, and the speed that rollers reach with it.
 
     Cut torques keep a large step from moving rollers as fast as it would: the share follows from a small one.
     """
-    one = _courses(judged, 1.0)[name]
-    web, value = float(one.course.unwind_speed_m_per_s.max()), fastest(name, one)
+    web, value = float(whole.course.unwind_speed_m_per_s.max()), fastest(name, whole)
     if value <= allowed:
         return 1.0, value
     share, value = SMALL, fastest(name, _courses(judged, SMALL)[name])

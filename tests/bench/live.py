@@ -140,10 +140,10 @@ class LiveLine:
     def run(self) -> None:
         """From rest to RUN, settled at the first recipe. Raises LineStalls."""
         for _ in range(STARTS):
-            self.stops += self._run_once()
-            status = self.status()
-            if status is not None and self.settled(status):
+            stops = self._run_once()
+            if not stops:
                 return
+            self.stops += stops
             self.wait(at_rest)
             time.sleep(RECOVERY_S)
         raise LineStalls(f"not started in {STARTS} tries: {'; '.join(self.stops)}")

@@ -21,7 +21,10 @@ from tests.bench.control_plants import random_plant
 from tests.closed_loop.recorded import demonstration_line
 from tests.closed_loop.truths import truth_of, with_friction_and_lag
 
-pytestmark = pytest.mark.timeout(600)  # a minute of stepped time; many on a machine that does other things
+pytestmark = [
+    pytest.mark.long,
+    pytest.mark.timeout(600),
+]  # a minute of stepped time; many on a machine that does other things
 
 SPANS, SEED = 3, 71_000
 FASTEST_M_PER_S = 0.12

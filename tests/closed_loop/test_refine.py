@@ -22,7 +22,7 @@ from tests.bench.control_plants import random_plant, scaled
 from tests.closed_loop.recorded import demonstration_line
 from tests.closed_loop.truths import truth_of
 
-pytestmark = pytest.mark.timeout(600)
+pytestmark = [pytest.mark.long, pytest.mark.timeout(600)]
 
 SPANS, SEED, DRIFT = 2, 72_000, 0.85
 

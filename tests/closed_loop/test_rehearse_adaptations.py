@@ -12,6 +12,8 @@ from gateway.control.design import design_lqi, task_of
 from gateway.core.scenario import Scenario
 from tests.closed_loop.recorded import demonstration_line, real_plant
 
+pytestmark = pytest.mark.long
+
 STEP = Scenario(
     name="step",
     tension_n=[30.0, 24.0],

@@ -181,6 +181,7 @@ def test_laws_ask_for_what_the_products_laws_ask_for(name: str) -> None:
     assert most < (0.1 if name == "scheduled" else 1e-7)
 
 
+@pytest.mark.long
 def test_a_closed_loop_is_that_of_the_simulated_line() -> None:
     nothing = {"tension_noise_n": 0.0, "speed_noise_m_per_s": 0.0}
     plant = altered(real_plant(), {"sensors": nothing, "rollers": {"disturbance_m_per_s2": 0.0}})

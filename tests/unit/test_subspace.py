@@ -73,6 +73,7 @@ def test_a_gap_leaves_out_its_instants_alone():
     np.testing.assert_allclose(markov(of(moesp(data, 4, 3))), markov(system), atol=1e-9)
 
 
+@pytest.mark.long
 def test_without_a_loop_it_is_the_po_moesp_of_nfoursid():
     """The same singular values and, from them by another way (a least squares fit of states), nearly the same model."""
     system, inputs, outputs = simulated(0.1)
@@ -92,6 +93,7 @@ def test_without_a_loop_it_is_the_po_moesp_of_nfoursid():
     np.testing.assert_allclose(poles(ours.A), poles(system[0]), atol=0.01)
 
 
+@pytest.mark.long
 def test_in_a_loop_references_as_instruments_take_the_bias_away():
     """y_{k+1} = 0.9 y_k + u_k + w_k under u = r - 0.5 y: least squares on inputs as their own instruments is off."""
     generator = np.random.default_rng(0)
