@@ -25,7 +25,7 @@ test: setup ## set up, then all tests but the long ones: those about time itself
 	@$(PY) -m pytest -m realtime $(ARGS) || [ $$? -eq 5 ]  # 5: none of them was asked for
 	@$(PY) -m pytest -m "not realtime and not long" $(PARALLEL) $(ARGS) || [ $$? -eq 5 ]
 
-test-long: setup ## tests of a minute or more: whole chains through the gate, comparisons with other libraries (about 4 min)
+test-long: setup ## tests of a minute or more: whole chains through the gate, comparisons with other libraries (about 2 min)
 	@$(PY) -m pytest -m long $(PARALLEL) $(ARGS)
 
 system-test: setup ## a real CAN kernel and foreign protocol stacks; as root, installs Debian and npm packages (about 6 min)
