@@ -7,7 +7,7 @@ PARALLEL := --numprocesses auto --maxprocesses 4 --dist loadfile
 export PYTHONDONTWRITEBYTECODE :=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup run test test-long coverage system-test check format bench bench-stepped bench-wire bench-processes bench-cycle bench-monitor bench-control bench-identify bench-faults bench-fuzz bench-soak bench-gate bench-lifecycle bench-audit bench-kill bench-gate-live lock clean
+.PHONY: help setup run test test-long coverage system-test check types lint format bench bench-stepped bench-wire bench-processes bench-cycle bench-monitor bench-control bench-identify bench-faults bench-fuzz bench-soak bench-gate bench-lifecycle bench-audit bench-kill bench-gate-live lock clean
 
 help: ## this list
 	@echo "r2rgate: make TARGET"
@@ -18,7 +18,13 @@ $(VENV)/.ready: requirements.lock pyproject.toml deploy/setup-venv.sh
 
 setup: $(VENV)/.ready ## the virtual environment in .venv, from requirements.lock
 
-run: setup ## set up, then the demonstration: a line adapted through the gate, in real time (about 5 min; ARGS="--quick")
+$(VENV)/.compiled: $(VENV)/.ready $(wildcard gateway/control/*.py safety/*.py sim_plant/*.py)
+	@echo "compiling the simulations (once, half a minute)"
+	@mkdir -p out
+	@$(PY) -m gateway.cli.compiled > out/compiled.txt 2>&1 || { cat out/compiled.txt; exit 1; }
+	@touch $@
+
+run: $(VENV)/.compiled ## set up, then the demonstration: a line adapted through the gate, in real time (about 5 min; ARGS="--quick")
 	@exec $(RUN) demo $(ARGS)
 
 test: setup ## set up, then all tests but the long ones: those about time itself alone, the others on every core
@@ -37,11 +43,16 @@ coverage: setup ## every line and branch of safety/, run by its own tests (about
 	@$(PY) -m coverage report
 
 check: setup ## lint, types, import contracts
+	@$(MAKE) --no-print-directory --jobs=2 --output-sync types lint
+
+types: setup
+	@$(PY) -m basedpyright
+
+lint: setup
 	@$(PY) -m ruff check .
 	@$(PY) -m ruff format --check .
 	@mkdir -p out
 	@$(VENV)/bin/lint-imports --no-cache > out/lint-imports.txt 2>&1 || { cat out/lint-imports.txt; exit 1; }
-	@$(PY) -m basedpyright
 
 format: setup ## format the code
 	@$(PY) -m ruff format .

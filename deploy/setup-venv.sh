@@ -25,12 +25,6 @@ pip() {
         exit 1
     }
 }
-pip install --require-hashes -r requirements.lock
-pip install --no-deps --no-build-isolation --editable .
-echo "compiling the simulations (once, half a minute)"
-"$venv/bin/python" -m gateway.cli.compiled >>out/setup.log 2>&1 || {
-    tail -n 20 out/setup.log >&2
-    echo "the simulations could not be compiled; the whole story is in out/setup.log" >&2
-    exit 1
-}
+pip install --no-compile --require-hashes -r requirements.lock
+pip install --no-compile --no-deps --no-build-isolation --editable .
 touch "$venv/.ready"

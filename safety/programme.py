@@ -12,9 +12,9 @@ from gateway.control.judged_courses import CornerCourses, corner_courses
 from gateway.control.mpc_linear import unconstrained
 from gateway.control.rollout import Rollouts, simulate
 from gateway.core.controller_laws import MpcConfig
-from gateway.core.theta import Theta
 from safety.case import Case
-from safety.simulated import held, judged_of, plants_under_stress, setup_of, stressed
+from safety.corner_runs import corners_held
+from safety.simulated import judged_of, plants_under_stress, setup_of
 
 WHOLE = 4  #: corners: those on which the law without limits does worst in small moves
 LASTING_S, TAIL_S = 2.0, 0.6  #: of changes that the programme makes, and their tail
@@ -49,7 +49,7 @@ def in_courses(case: Case, courses: CornerCourses) -> dict[str, Rollouts]:
         small = in_small(case)[name]
         badness = small.tail_swing_n.max(axis=1) + small.chatter_nm.max(axis=1) + small.beyond_n.max(axis=1)
         order: list[int] = np.argsort(np.nan_to_num(badness, nan=inf))[::-1][: 1 if one.shared else WHOLE].tolist()
-        kept = _kept(case, name)
+        kept = corners_held(case)[name]
         plants = plants_under_stress([kept[i] for i in order], case.line.gate, case.seed)
         found[name] = simulate(case.controller, plants, one.course, setup)
     return found
@@ -61,13 +61,8 @@ def _in_small(case: Case) -> dict[str, Rollouts]:
         raise TypeError(f"{config.kind} has no programme")
     law, gate = unconstrained(config), case.line.gate
     setup = setup_of(case.line, case.stress_noise, case.seed, gate.stress_late_share)
+    held = corners_held(case)
     return {
-        name: simulate(law, plants_under_stress(_kept(case, name), gate, case.seed), one.course, setup)
+        name: simulate(law, plants_under_stress(held[name], gate, case.seed), one.course, setup)
         for name, one in small_courses(case).items()
     }
-
-
-def _kept(case: Case, name: str) -> list[Theta]:
-    """Corners that torque holds in the largest steps of a course."""
-    plants = [stressed(theta, case.line.gate) for theta in case.corners]
-    return held(plants, corner_courses(judged_of(case))[name], case.line.limits.torque_nm)

@@ -70,10 +70,11 @@ def held(thetas: Sequence[Theta], one: CornerCourse, torque_nm: float) -> list[T
 
 def _needed_nm(theta: Theta, course: Course) -> float:
     """The greatest torque at the equilibria between the changes of a course."""
-    needed = 0.0
-    for k in (0, *(course.changes[1:] - 1).tolist()):
-        tension = course.tension_n[k]
-        speed = reference_speeds(theta.web, tension, float(course.unwind_speed_m_per_s[k]))
+    needed, ends = 0.0, [0, *(course.changes[1:] - 1).tolist()]
+    stands = np.unique(np.column_stack([course.tension_n[ends], course.unwind_speed_m_per_s[ends]]), axis=0)
+    for *tensions, unwind in stands.tolist():
+        tension = np.array(tensions)
+        speed = reference_speeds(theta.web, tension, unwind)
         torque = equilibrium_torque(theta.web, tension, speed) + theta.coulomb_nm * np.sign(speed)
         needed = max(needed, float(np.abs(torque).max()))
     return needed

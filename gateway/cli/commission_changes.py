@@ -143,10 +143,16 @@ class Changes:
             self._designed = now, found
         found = self._designed[1]
         if step.rung >= len(found):
-            what = f"{len(found) or 'no'} design{'' if len(found) == 1 else 's'}"
-            raise Exhausted(f"{what} on the model promise no worse than the configuration in service")
+            raise Exhausted(_nothing_left(len(found)))
         law, controller = found[step.rung]
         return GainsChange(controller=controller), f"{law.text} {on}"
+
+
+def _nothing_left(offered: int) -> str:
+    better = "on the model promises no worse than the configuration in service"
+    if offered == 0:
+        return f"no design {better}"
+    return f"no other design {better}; {offered} {'has' if offered == 1 else 'have'} been offered"
 
 
 def _same(one: LineNow, other: LineNow) -> bool:

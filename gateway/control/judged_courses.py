@@ -30,6 +30,7 @@ SLOW = 0.1  #: the slow speed, of the fast one
 TURN_S = 0.25  #: from one step to that of the next span
 ROOM = 1.0 / 3.0  #: of a step, to the set-points' limits
 MOST_ALONE = 3  #: spans that step alone, at a speed
+SLOW_ALONE, FAST_ALONE = "alone, slow", "alone, fast"  #: in the names of the courses in which they do
 T = TypeVar("T")
 
 Courses = dict[str, Course]
@@ -146,11 +147,13 @@ def corner_courses(judged: Judged, lasting_s: float = 2.5, tail_s: float = 1.5) 
 
     found: CornerCourses = {"speed change": CornerCourse(of((now, fast), (now, before)))}
     if judged.tension_step_n > 0.0:
-        for name, speed, alone in (("slow", slow, _apart(spans[::2])), ("fast", fast, _apart(spans[1::2] or spans))):
+        every_other = (SLOW_ALONE, slow, spans[::2]), (FAST_ALONE, fast, spans[1::2] or spans)
+        for name, speed, some_of in every_other:
+            alone = _apart(some_of)
             for at, span in enumerate(alone):
                 low, high = judged.some([span])
-                found[f"span {span + 1} alone, {name}"] = CornerCourse(
-                    of((low, speed), (high, speed)), at, len(alone), late=speed == slow and at == len(alone) // 2
+                found[f"span {span + 1} {name}"] = CornerCourse(
+                    of((low, speed), (high, speed)), at, len(alone), late=name == SLOW_ALONE and at == len(alone) // 2
                 )
         found["one after another"] = CornerCourse(course_through(period_s, _in_turn(judged, lasting_s), tail_s))
         found["neighbours"] = CornerCourse(of((some[0], fast), (some[1], fast)))

@@ -4,24 +4,22 @@ Nonlinear, with saturation, rate limit, noise and latency, and with torque lag, 
 rollers out of round, which the plain equations do not have.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import inf
 
 import numpy as np
 
-from gateway.control.judged_courses import CornerCourse, CornerCourses, corner_courses
+from gateway.control.judged_courses import CornerCourse, corner_courses
 from gateway.control.mpc_linear import unconstrained
-from gateway.control.rollout import Course, Rollouts, simulate
+from gateway.control.rollout import Rollouts, simulate
 from gateway.core.controller import Controller
 from gateway.core.controller_laws import MpcConfig
-from gateway.core.line import Line
-from gateway.core.theta import Noise, Theta
 from gateway.core.verdict import RuleFinding
 from safety import programme
 from safety.case import Case
+from safety.corner_runs import corners_held, in_largest_steps
 from safety.findings import at_least, at_most, told
-from safety.simulated import held, holdable, judged_of, plants_out_of_round, plants_under_stress, setup_of, stressed
+from safety.simulated import holdable, judged_of, plants_out_of_round, setup_of, stressed
 
 RULE = "corners"
 LATE, FINE_STEP_S = 2, 0.001  #: plants that are later than the line is, and the steps in which they are so
@@ -48,22 +46,18 @@ class Worst:
 
 def check(case: Case) -> list[RuleFinding]:
     """Tension's band, its oscillation and error once it should stand, and the torque's chatter: the worst of all."""
-    plants = [stressed(theta, case.line.gate) for theta in case.corners]
-    courses = corner_courses(judged_of(case))
-    kept = {name: held(plants, one, case.line.limits.torque_nm) for name, one in courses.items()}
-    if nobody := [name for name, some in kept.items() if not some]:
+    if nobody := [name for name, some in corners_held(case).items() if not some]:
         return [_nobody_holds(case, nobody[0])]
     config = case.controller
-    worst = _of_mpc(case, config) if isinstance(config, MpcConfig) else _of_law(case, config, kept, courses)
-    return [*_limits(case, worst), _of_corners(case, kept), *_lost(config)]
+    worst = _of_mpc(case, config) if isinstance(config, MpcConfig) else _of_law(case, config)
+    return [*_limits(case, worst), _of_corners(case), *_lost(config)]
 
 
-def _of_law(case: Case, config: Controller, kept: dict[str, list[Theta]], courses: CornerCourses) -> Worst:
-    worst = Worst()
-    for name, one in courses.items():
-        found = rollouts(case.line, config, kept[name], one.course, case.stress_noise, case.seed)
+def _of_law(case: Case, config: Controller) -> Worst:
+    worst, courses = Worst(), corner_courses(judged_of(case))
+    for name, found in in_largest_steps(case).items():
         worst.take(found, name, case.tension_spans)
-        for late in _late(case, config, one):
+        for late in _late(case, config, courses[name]):
             worst.take(late, f"{name}, late", case.tension_spans)
     return worst
 
@@ -99,14 +93,6 @@ def _of_mpc(case: Case, config: MpcConfig) -> Worst:
     return worst
 
 
-def rollouts(
-    line: Line, config: Controller, thetas: Sequence[Theta], course: Course, noise: Noise, seed: int
-) -> Rollouts:
-    """On stressed plants."""
-    setup = setup_of(line, noise, seed, line.gate.stress_late_share)
-    return simulate(config, plants_under_stress(thetas, line.gate, seed), course, setup)
-
-
 def _limits(case: Case, worst: Worst) -> list[RuleFinding]:
     limits, gate = case.line.limits, case.line.gate
     (low, low_at), (high, high_at) = worst.lowest_n, worst.highest_n
@@ -138,8 +124,8 @@ def _limits(case: Case, worst: Worst) -> list[RuleFinding]:
     ]  # fmt: skip
 
 
-def _of_corners(case: Case, kept: dict[str, list[Theta]]) -> RuleFinding:
-    courses = corner_courses(judged_of(case))
+def _of_corners(case: Case) -> RuleFinding:
+    courses, kept = corner_courses(judged_of(case)), corners_held(case)
     left_out = {name: max(len(courses[name].of(case.corners)) - len(some), 0) for name, some in kept.items()}
     shared = sum(one.shared for one in courses.values())
     what = f"{len(case.corners)} plants that the line may be, and {LATE} late, {len(courses) - shared} courses each, "

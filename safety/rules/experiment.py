@@ -15,9 +15,9 @@ from gateway.core.theta import Theta
 from gateway.core.verdict import RuleFinding
 from safety.believed import prior_corners
 from safety.case import Case
+from safety.corner_runs import rollouts
 from safety.findings import at_least, at_most, told
 from safety.limits import envelope_limits
-from safety.rules.corners import rollouts
 from safety.rules.validity import check as check_validity
 from safety.simulated import holdable, stressed
 

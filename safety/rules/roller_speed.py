@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gateway.control.judged_courses import CornerCourse, CornerCourses, Judged, corner_courses
+from gateway.control.judged_courses import SLOW_ALONE, CornerCourse, CornerCourses, Judged, corner_courses
 from gateway.control.mpc_linear import unconstrained
 from gateway.control.rollout import Rollouts, plants_of_thetas, simulate
 from gateway.core.controller_laws import MpcConfig
@@ -19,9 +19,9 @@ from gateway.core.theta import Noise
 from gateway.core.verdict import RuleFinding
 from safety import programme
 from safety.case import Case
+from safety.corner_runs import in_largest_steps, rollouts
 from safety.findings import at_most, told
 from safety.limits import envelope_limits
-from safety.rules.corners import rollouts
 from safety.simulated import held, judged_of, setup_of, stressed
 
 RULE = "roller speed"
@@ -56,7 +56,9 @@ def check(case: Case) -> list[RuleFinding]:
     found, limits = steps_let(case), envelope_limits(case.line)
     if not all(np.isfinite(list(found.share.values()))):
         return [told(RULE, False, _too_quick(case, "no step at all"))]
-    single = min((share for name, share in found.share.items() if "slow" in name), default=1.0) * case.tension_step_n
+    single = (
+        min((share for name, share in found.share.items() if SLOW_ALONE in name), default=1.0) * case.tension_step_n
+    )
     if single < min(LEAST_STEP_N, case.tension_step_n):
         return [told(RULE, False, _too_quick(case, f"a step of {single:.2g} N of one span"))]
     name, value = max(found.fastest_m_per_s.items(), key=lambda pair: pair[1])
@@ -76,24 +78,26 @@ def steps_let(case: Case) -> Let:
 def _steps_let(case: Case) -> Let:
     limits, judged = envelope_limits(case.line), judged_of(case)
     foreseen, on_corners = _looks(case)
-    share, fastest = dict[str, float](), _in_whole_steps(case)
+    share, fastest, whole_steps = dict[str, float](), dict[str, float](), _in_whole_steps(case)
+    passes = limits.roller_speed_watched_m_per_s if case.first else JUDGED * limits.roller_speed_m_per_s
     for name, one in _courses(judged, 1.0).items():
-        if fastest.get(name, np.inf) <= JUDGED * limits.roller_speed_m_per_s:
-            share[name] = 1.0
+        share[name], fastest[name] = 1.0, whole_steps.get(name, np.inf)
+        if fastest[name] <= passes:
             continue
         web = float(one.course.unwind_speed_m_per_s.max())
         allowed = limits.roller_speed_watched_m_per_s if case.first else limits.roller_speed_in_step_m_per_s(web)
-        share[name], fastest[name] = _largest(judged, name, one, foreseen, allowed)
-        if not case.first and np.isfinite(share[name]):
-            fastest[name] = on_corners(name, one if share[name] == 1.0 else _courses(judged, share[name])[name])
+        share[name], looked_at = _largest(judged, name, one, foreseen, allowed)
+        if share[name] < 1.0 and not case.first:
+            fastest[name] = on_corners(name, _courses(judged, share[name])[name])
+        elif share[name] != 1.0:
+            fastest[name] = looked_at
     return Let(share, fastest)
 
 
 def _in_whole_steps(case: Case) -> dict[str, float]:
-    """By course, where that is known already: of a programme, which takes its time."""
-    if case.first or not isinstance(case.controller, MpcConfig):
-        return {}
-    return {name: _greatest(found) for name, found in programme.by_itself(case).items()}
+    """By course, on the corners: rule `corners` has simulated them already."""
+    of = programme.by_itself if isinstance(case.controller, MpcConfig) else in_largest_steps
+    return {name: _greatest(found) for name, found in of(case).items()}
 
 
 def _largest(judged: Judged, name: str, whole: CornerCourse, fastest: Fastest, allowed: float) -> tuple[float, float]:

@@ -1,8 +1,8 @@
 """`make bench-lifecycle`: what becomes of proposals, in any order of everything, with processes that die in between.
 
-The state machines of tests/unit/test_deployer.py over many sequences: propose, judge, approve, reject, expire,
-supersede, deploy, renew, keep, roll back, gateway and loop started anew, wire and disk lost, death between any two
-effects. Every invariant is asked after every step. A sequence that breaks one is shrunk and printed, and counted.
+The state machines of tests/unit/test_deployer_life_cycle.py over many sequences: propose, judge, approve, reject,
+expire, supersede, deploy, renew, keep, roll back, gateway and loop started anew, wire and disk lost, death between any
+two effects. Every invariant is asked after every step. A sequence that breaks one is shrunk and printed, and counted.
 """
 
 import argparse
@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, Phase, settings
 from hypothesis.stateful import run_state_machine_as_test
 
 from tests.bench.figures import Bench
-from tests.unit.test_deployer import LifeCycle, TrustingLifeCycle
+from tests.unit.test_deployer_life_cycle import LifeCycle, TrustingLifeCycle
 
 STEPS = 30  #: at most, of a sequence
 

@@ -90,13 +90,8 @@ def test_without_an_accepted_model_nothing_is_predicted():
     assert not loop.cycle.configurations.in_service(loop.now_s).watched and not loop.alarms
 
 
-def test_where_the_last_known_good_itself_would_not_recover_the_line_stops_under_control():
-    loop = producing()
-    deploy(loop, GOOD, watch_for())
-    assert loop.command(Keep(epoch=1, watch=watch_for())).ok
-    loop.step(50)
-    assert loop.cycle.machine.phase is Phase.RUNNING
-    # Something is wrong with the law that no judge saw: all of a sudden it pushes where it should pull.
+def push_where_it_should_pull(loop):
+    """All of a sudden: something is wrong with the law that no judge saw."""
     law = loop.cycle.torque_path.law
     ask, rest_nm = law.ask, loop.cycle.outputs.torque_nm.copy()
 
@@ -106,6 +101,15 @@ def test_where_the_last_known_good_itself_would_not_recover_the_line_stops_under
         return decision
 
     law.ask = wrong
+
+
+def test_where_the_last_known_good_itself_would_not_recover_the_line_stops_under_control():
+    loop = producing()
+    deploy(loop, GOOD, watch_for())
+    assert loop.command(Keep(epoch=1, watch=watch_for())).ok
+    loop.step(50)
+    assert loop.cycle.machine.phase is Phase.RUNNING
+    push_where_it_should_pull(loop)
     for _ in range(200):
         loop.step()
         if loop.cycle.machine.state is LoopState.STOP:
@@ -148,15 +152,7 @@ def test_predictive_control_is_kept_with_a_linear_law_to_go_back_to_and_makes_th
 
 def test_where_kept_predictive_control_goes_wrong_the_linear_law_takes_over_and_the_line_goes_on():
     loop = predictive_kept()
-    law = loop.cycle.torque_path.law
-    ask, rest_nm = law.ask, loop.cycle.outputs.torque_nm.copy()
-
-    def wrong(*given):
-        decision = ask(*given)
-        decision.torque_nm = 2.0 * rest_nm - decision.torque_nm
-        return decision
-
-    law.ask = wrong
+    push_where_it_should_pull(loop)
     loop.step(300)
     found = loop.cycle.configurations.in_service(loop.now_s)
     assert loop.cycle.machine.phase is Phase.RUNNING and found.hash == found.last_known_good == config_hash(GOOD)

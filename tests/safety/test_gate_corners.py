@@ -10,7 +10,7 @@ from gateway.control.design import MpcWeights, design_lqi, design_mpc, design_sc
 from gateway.control.judged_courses import corner_courses, improvement_courses
 from gateway.control.rollout import Rollouts
 from gateway.loop.setpoints import STEP_PAUSE_S
-from safety import programme
+from safety import corner_runs, programme
 from safety.rules import corners, decay, delay_margin, paper, roller_speed
 from safety.rules.corners import Worst
 from safety.simulated import holdable, judged_of, stressed
@@ -55,8 +55,8 @@ def test_corners_at_each_limit(of, context, redesigned, monkeypatch):
     case = case_of(gains(redesigned, context), context, of)
 
     def found(**figures):
-        monkeypatch.setattr(corners, "rollouts", lambda *_: rollouts(**figures))
-        return [one.rule for one in corners.check(case) if not one.passed]
+        monkeypatch.setattr(corner_runs, "rollouts", lambda *_: rollouts(**figures))
+        return [one.rule for one in corners.check(replace(case)) if not one.passed]
 
     assert found() == []
     assert found(low=2.0, high=60.0, swing=1.0, error=3.0, chatter=5.0) == []
@@ -109,17 +109,36 @@ def test_a_loop_is_simulated_as_late_as_its_delay_margin_says(case, monkeypatch)
         seen.append((plants, setup))
         return rollouts(low=1.0 if setup.step_s == pytest.approx(0.001) else 20.0)
 
-    monkeypatch.setattr(corners, "simulate", simulate)
+    for module in (corners, corner_runs):
+        monkeypatch.setattr(module, "simulate", simulate)
     (low,) = [one for one in corners.check(case) if not one.passed]
     assert low.rule == "corners: lowest tension" and "late" in low.text
     late = [plants for plants, setup in seen if setup.step_s == pytest.approx(0.001)]
     assert len(late) == 4 and all(
         plants.effects.latency_s == pytest.approx(case.latency_s + case.line.gate.delay_margin_min_s) for plants in late
     )
-    weak = case.line.limits.model_copy(update={"torque_nm": 5.0})
-    course = corner_courses(judged_of(case))["neighbours"]
-    held_by_nobody = replace(case, line=case.line.model_copy(update={"limits": weak}))
-    assert corners._late(held_by_nobody, case.controller, course) == []  # noqa: SLF001
+
+
+def test_a_late_loop_is_not_looked_at_where_no_torque_holds_it(case, monkeypatch):
+    steps_s: list[float] = []
+
+    def simulate(config, plants, course, setup):
+        steps_s.append(setup.step_s)
+        return rollouts()
+
+    for module in (corners, corner_runs):
+        monkeypatch.setattr(module, "simulate", simulate)
+
+    def looked_at(torque_nm):
+        steps_s.clear()
+        limits = case.line.limits.model_copy(update={"torque_nm": torque_nm})
+        found = corners.check(replace(case, line=case.line.model_copy(update={"limits": limits})))
+        late = sum(step_s == pytest.approx(0.001) for step_s in steps_s)
+        return late if "none of" not in found[0].text else None
+
+    seen = [looked_at(torque_nm) for torque_nm in np.arange(20.0, 40.0, 0.1).tolist()]
+    assert seen[0] is None and seen[-1] == 4
+    assert {1, 2, 3} & set(seen), "some corner is held in every course, and what is believed is not"
 
 
 def test_a_predictive_controller_runs_whole_on_some_corners_and_says_what_is_lost(of, context, monkeypatch):

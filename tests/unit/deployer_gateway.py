@@ -1,0 +1,99 @@
+"""A deployer and everything around it, in one process that can die and begin anew."""
+
+import asyncio
+
+from gateway.core.audit_record import Who
+from gateway.core.controller import config_hash
+from gateway.core.decisions import Decide
+from gateway.core.proposal import canonical
+from gateway.supervisor.deployer import Deployer
+from gateway.supervisor.lifecycle import Stage, book_of
+from tests.unit.deployer_support import (
+    FIRST,
+    LINE,
+    Death,
+    FakeAudit,
+    FakeJudge,
+    FakeLoop,
+    FakeSurroundings,
+    hash_of,
+    proposal,
+)
+
+ANNA = Who(name="anna", uid=1000, pid=1)
+PROBATION_S = LINE.gate.probation_s
+#: From controller 1 to 2 is a quarter of a number, from 1 to 3 two fifths.
+TRUSTING = LINE.model_copy(
+    update={"gate": LINE.gate.model_copy(update={"autonomy": "approve-first", "small_share": 0.3})}
+)
+
+
+class Gateway:
+    """A deployer and everything around it, in one process that can die and begin anew."""
+
+    def __init__(self, line=LINE) -> None:
+        self.line = line
+        self.death = Death()
+        self.audit = FakeAudit(self.death, self._checked)
+        self.loop = FakeLoop(self.death)
+        self.judge = FakeJudge()
+        self.surroundings = FakeSurroundings(self.loop)
+        self.proposals = {}
+        self.begin()
+
+    def _checked(self, kind, what) -> None:
+        if kind == "deploying":
+            base = self.proposals[what["proposal"]].base
+            assert self.loop.runs == what["before"] == base, "it was made for another configuration"
+
+    def begin(self) -> None:
+        clock = lambda: self.loop.now_s  # noqa: E731
+        book = book_of(self.audit.records)
+        args = (self.audit, self.loop, self.judge, self.surroundings, lambda proposal, verdict: None, clock, clock)
+        self.deployer = Deployer(self.line, book, *args)
+
+    async def propose(self, one):
+        self.proposals[hash_of(one)] = one
+        reply = await self.deployer.propose(canonical(one), ANNA)
+        await self.deployer.judged()
+        return reply
+
+    async def decide(self, one, approve=True, shown=None, script=""):
+        view = self.deployer.shown(hash_of(one))
+        hash_ = shown or (view.shown if not isinstance(view, str) else None) or "0" * 64
+        decision = Decide(proposal=hash_of(one), shown=hash_, approve=approve, script=script)
+        return await self.deployer.decide(decision, ANNA)
+
+    def stage(self, one) -> Stage:
+        return self.deployer.book.entries[hash_of(one)].stage
+
+    async def pass_time(self, seconds: float) -> None:
+        """With the deployer looking twice a second."""
+        for _ in range(round(2 * seconds)):
+            self.loop.pass_time(0.5)
+            await self.deployer.watch()
+
+
+def run(test):
+    """An async test."""
+
+    def synchronous():
+        asyncio.run(test())
+
+    synchronous.__name__ = test.__name__
+    return synchronous
+
+
+async def started(line=LINE) -> Gateway:
+    gateway = Gateway(line)
+    await gateway.deployer.watch()
+    return gateway
+
+
+async def deployed(number=1) -> tuple[Gateway, object]:
+    gateway = await started()
+    one = proposal(number, config_hash(FIRST), gateway.loop.now_s)
+    assert (await gateway.propose(one)).ok
+    reply = await gateway.decide(one)
+    assert reply.ok, reply
+    return gateway, one

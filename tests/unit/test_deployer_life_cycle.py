@@ -1,0 +1,168 @@
+"""The life of a proposal: proposed, judged, decided, deployed, kept, rolled back, expired, in any order, with processes
+that die between any two of their effects."""
+
+import asyncio
+
+from hypothesis import HealthCheck, settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
+
+from gateway.core.controller import config_hash
+from gateway.supervisor.lifecycle import Stage, book_of
+from gateway.supervisor.on_the_line import LEASE_S
+from tests.unit.deployer_gateway import ANNA, PROBATION_S, TRUSTING, Gateway
+from tests.unit.deployer_support import FIRST, LIFETIME_S, LINE, Killed, controller, hash_of, proposal
+
+
+class LifeCycle(RuleBasedStateMachine):
+    """Any order of everything, and death between any two effects."""
+
+    line = LINE
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.gateway = Gateway(self.line)
+        self.count = 0
+        self._run(self._begin())
+
+    def _run(self, coroutine) -> None:
+        try:
+            asyncio.run(coroutine)
+        except (Killed, BaseExceptionGroup):
+            self.gateway.death.effects = 0
+            self.gateway.begin()
+            self._run(self._begin())
+
+    async def _begin(self) -> None:
+        await self.gateway.deployer.watch()
+        await self.gateway.deployer.judged()
+
+    def _any(self, data):
+        return data.draw(st.sampled_from(sorted(self.gateway.proposals.items())))[1] if self.gateway.proposals else None
+
+    @rule(number=st.integers(1, 4), good=st.booleans(), on_what_runs=st.integers(0, 4))
+    def propose(self, number, good, on_what_runs):
+        self.count += 1
+        base = self.gateway.loop.runs if on_what_runs else config_hash(controller(9))
+        one = proposal(number, base, self.gateway.loop.now_s, self.count)
+        if not good:
+            self.gateway.judge.refuses.add(hash_of(one))
+        self._run(self.gateway.propose(one))
+
+    @rule(data=st.data(), approve=st.booleans())
+    def decide(self, data, approve):
+        if (one := self._any(data)) is not None:
+            self._run(self.gateway.decide(one, approve))
+
+    @rule(data=st.data())
+    def approve_the_newest(self, data):
+        waiting = [e for e in self.gateway.deployer.book.entries.values() if e.stage is Stage.WAITING]
+        if waiting:
+            self._run(self.gateway.decide(self.gateway.proposals[waiting[-1].proposal]))
+
+    @rule(seconds=st.sampled_from([0.5, 2.0, LEASE_S, PROBATION_S, PROBATION_S + 1.0, LIFETIME_S]))
+    def time_passes(self, seconds):
+        self._run(self.gateway.pass_time(min(seconds, PROBATION_S + 1.0)))
+        if seconds == LIFETIME_S:
+            self.gateway.loop.pass_time(seconds)
+
+    @rule(seconds=st.sampled_from([1.0, LEASE_S, 2 * LEASE_S]))
+    def the_gateway_is_away(self, seconds):
+        self.gateway.begin()
+        self.gateway.loop.pass_time(seconds)
+        self._run(self._begin())
+
+    @rule()
+    def the_loop_is_started_anew(self):
+        self.gateway.loop.restart()
+
+    @rule(reachable=st.booleans(), answers=st.booleans())
+    def the_wire(self, reachable, answers):
+        self.gateway.loop.reachable, self.gateway.loop.answers = reachable, answers
+
+    @rule(available=st.booleans())
+    def the_disk(self, available):
+        self.gateway.audit.available = available
+
+    @rule(against=st.booleans())
+    def something_shows(self, against):
+        self.gateway.surroundings.against = "tension 1 swings" if against else ""
+
+    @rule()
+    def taken_back(self):
+        self._run(self.gateway.deployer.roll_back("", ANNA))
+
+    @rule(effects=st.integers(1, 6), after=st.booleans())
+    def death_is_near(self, effects, after):
+        self.gateway.death.effects, self.gateway.death.after = effects, after
+
+    @invariant()
+    def the_audit_explains_what_runs(self):
+        loop, book = self.gateway.loop, book_of(self.gateway.audit.records)
+        if book.in_service is not None:  # the loop has been asked once
+            assert book.explains(loop.runs, loop.epoch), (loop.runs[:8], loop.epoch, book)
+
+    @invariant()
+    def nothing_runs_that_was_not_accepted_and_approved(self):
+        seen: dict[str, list[str]] = {}
+        brings = {config_hash(FIRST)}
+        for kind, what in self.gateway.audit.records:
+            if "proposal" not in what:
+                continue
+            before = seen.setdefault(what["proposal"], [])
+            if kind == "deploying":
+                assert "accepted" in before and before[-1] == "approved" and "deploying" not in before
+                brings.add(what["configuration"])
+            before.append(kind)
+        assert {self.gateway.loop.runs, self.gateway.loop.good} <= brings
+
+    @invariant()
+    def what_is_good_was_kept_on_record(self):
+        kept = {config_hash(FIRST)}
+        for kind, what in self.gateway.audit.records:
+            if kind == "keeping":
+                entry = book_of(self.gateway.audit.records).entries[what["proposal"]]
+                kept.add(entry.changes)
+        assert self.gateway.loop.good in kept
+
+    @invariant()
+    def no_approval_is_left_lying(self):
+        gateway = self.gateway
+        if gateway.audit.available:
+            self._run(gateway.deployer.watch())
+            if gateway.audit.available:
+                assert Stage.APPROVED not in {entry.stage for entry in gateway.deployer.book.entries.values()}
+
+    @invariant()
+    def one_change_at_a_time(self):
+        stages = [entry.stage for entry in self.gateway.deployer.book.entries.values()]
+        assert sum(stage in (Stage.DEPLOYING, Stage.PROBATION, Stage.KEEPING) for stage in stages) <= 1
+
+
+LifeCycle.TestCase.settings = settings(max_examples=30, stateful_step_count=25, suppress_health_check=list(HealthCheck))
+TestLifeCycle = LifeCycle.TestCase
+
+
+class TrustingLifeCycle(LifeCycle):
+    """The same where small changes pass by their verdict."""
+
+    line = TRUSTING
+
+    @invariant()
+    def what_passes_by_its_verdict_is_like_what_a_person_approved(self):
+        proposals, well, by = self.gateway.proposals, set(), {}
+        for kind, what in self.gateway.audit.records:
+            if kind == "rolled-back":
+                well.clear()
+            elif kind == "kept" and by[what["proposal"]] == "person":
+                well.add(what["proposal"])
+            elif kind == "approved":
+                by[what["proposal"]] = what["by"]
+                if what["by"] == "verdict":
+                    assert what["like"] in well
+                    like, new = (proposals[what[name]].change.controller for name in ("like", "proposal"))
+                    assert abs(new.antiwindup / like.antiwindup - 1.0) <= 0.3
+
+
+TestTrustingLifeCycle = TrustingLifeCycle.TestCase
+TestTrustingLifeCycle.settings = LifeCycle.TestCase.settings

@@ -1,0 +1,90 @@
+"""A change on probation: it is kept, stays, or goes back to what was good."""
+
+from gateway.core.controller import config_hash
+from gateway.supervisor.lifecycle import Stage
+from gateway.supervisor.on_the_line import LEASE_S
+from tests.unit.deployer_gateway import ANNA, PROBATION_S, deployed, run, started
+from tests.unit.deployer_support import FIRST, controller, hash_of, proposal
+
+
+@run
+async def test_an_audit_that_fails_on_probation_leaves_the_line_on_what_was_good():
+    gateway, one = await deployed()
+    gateway.audit.available = False
+    await gateway.pass_time(PROBATION_S + 2 * LEASE_S)
+    assert gateway.loop.good == config_hash(FIRST)
+    gateway.loop.pass_time(LEASE_S)
+    gateway.audit.available = True
+    await gateway.deployer.watch()
+    assert gateway.stage(one) is Stage.ROLLED_BACK
+    assert gateway.deployer.book.in_service == gateway.loop.runs == config_hash(FIRST)
+
+
+@run
+async def test_a_person_takes_it_back():
+    gateway, one = await deployed()
+    assert (await gateway.deployer.roll_back("it hums", ANNA)).ok
+    assert gateway.loop.runs == config_hash(FIRST)
+    assert gateway.stage(one) is Stage.ROLLED_BACK
+    assert "it hums" in gateway.deployer.book.entries[hash_of(one)].why
+
+
+@run
+async def test_what_speaks_against_it_on_probation_takes_it_back():
+    gateway, one = await deployed()
+    gateway.surroundings.against = "tension 3 swings"
+    await gateway.pass_time(1.0)
+    assert gateway.stage(one) is Stage.ROLLED_BACK
+    assert "swings" in gateway.deployer.book.entries[hash_of(one)].why
+
+
+@run
+async def test_what_has_not_shown_enough_stays_on_probation_and_says_so():
+    gateway, one = await deployed()
+    gateway.surroundings.hidden = "the line has not stood for 5 s in a row"
+    await gateway.pass_time(3 * PROBATION_S)
+    assert gateway.stage(one) is Stage.PROBATION and gateway.loop.lease_end_s is not None
+    shown, change = gateway.deployer.shown(hash_of(one)), gateway.deployer.change()
+    assert "has not stood" in shown.why and change is not None
+    assert (change.proposal, change.kind, change.stage, change.text) == (hash_of(one), "gains", "probation", shown.why)
+    assert change.since_wall_s is not None and change.since_wall_s <= gateway.loop.now_s - 3 * PROBATION_S
+    gateway.surroundings.hidden = ""
+    await gateway.pass_time(1.0)
+    assert gateway.stage(one) is Stage.KEPT and gateway.deployer.change() is None
+
+
+@run
+async def test_without_a_model_nothing_is_watched_with_one_the_fallback_is():
+    gateway, _ = await deployed()
+    await gateway.pass_time(PROBATION_S + 1.0)
+    assert gateway.loop.watches == [("deploy", None), ("keep", None)]
+    # A model is accepted: what runs is looked after, once; then a change by its fallback, and by itself when kept.
+    gateway.loop.watches.clear()
+    gateway.deployer.book.model = "7" * 64
+    await gateway.pass_time(2.0)
+    assert [(what, watch.fallback) for what, watch in gateway.loop.watches] == [("watch-good", gateway.loop.good)]
+    before = gateway.loop.good
+    gateway.loop.watches.clear()
+    two = proposal(2, before, gateway.loop.now_s)
+    await gateway.propose(two)
+    assert (await gateway.decide(two)).ok
+    await gateway.pass_time(PROBATION_S + 1.0)
+    fallbacks = [(what, watch.fallback) for what, watch in gateway.loop.watches]
+    assert fallbacks == [("deploy", before), ("keep", config_hash(controller(2)))]
+
+
+@run
+async def test_what_cannot_be_watched_is_not_deployed_and_not_kept():
+    gateway = await started()
+    one = proposal(1, config_hash(FIRST), 0.0)
+    await gateway.propose(one)
+    gateway.surroundings.unknown = "the model in service is damaged"
+    reply = await gateway.decide(one)
+    assert not reply.ok and "damaged" in reply.reasons[0] and gateway.loop.epoch == 0
+    gateway.surroundings.unknown = ""
+    await gateway.deployer.watch()
+    assert (await gateway.decide(one)).ok
+    gateway.surroundings.unknown = "the model in service is damaged"
+    await gateway.pass_time(PROBATION_S + 1.0)
+    assert gateway.stage(one) is Stage.ROLLED_BACK and gateway.loop.runs == config_hash(FIRST)
+    assert "could not be kept: the model in service is damaged" in gateway.deployer.book.entries[hash_of(one)].why
