@@ -2,13 +2,19 @@
 
 from collections.abc import Sequence
 
-from gateway.control.judged_courses import corner_courses
+from gateway.control.judged_courses import CornerCourses, corner_courses
 from gateway.control.rollout import Course, Rollouts, simulate
 from gateway.core.controller import Controller
+from gateway.core.controller_laws import MpcConfig
 from gateway.core.line import Line
 from gateway.core.theta import Noise, Theta
 from safety.case import Case
 from safety.simulated import held, judged_of, plants_under_stress, setup_of, stressed
+
+
+def courses_of(case: Case) -> CornerCourses:
+    """What the proposed law is put through on the corners."""
+    return corner_courses(judged_of(case), programme=isinstance(case.controller, MpcConfig))
 
 
 def corners_held(case: Case) -> dict[str, list[Theta]]:
@@ -31,12 +37,12 @@ def rollouts(
 
 def _corners_held(case: Case) -> dict[str, list[Theta]]:
     plants = [stressed(theta, case.line.gate) for theta in case.corners]
-    courses = corner_courses(judged_of(case))
+    courses = courses_of(case)
     return {name: held(plants, one, case.line.limits.torque_nm) for name, one in courses.items()}
 
 
 def _in_largest_steps(case: Case) -> dict[str, Rollouts]:
-    courses = corner_courses(judged_of(case))
+    courses = courses_of(case)
     return {
         name: rollouts(case.line, case.controller, kept, courses[name].course, case.stress_noise, case.seed)
         for name, kept in corners_held(case).items()

@@ -28,7 +28,7 @@ def small_courses(case: Case) -> CornerCourses:
         tension_step_n=min(judged.tension_step_n, SMALL_STEP_N),
         speed_step_m_per_s=min(judged.speed_step_m_per_s, SMALL_STEP_M_PER_S),
     )
-    return corner_courses(small)
+    return corner_courses(small, programme=True)
 
 
 def in_small(case: Case) -> dict[str, Rollouts]:
@@ -36,9 +36,18 @@ def in_small(case: Case) -> dict[str, Rollouts]:
     return case.once("programme in small moves", _in_small)
 
 
+def falls_in_small(case: Case) -> bool:
+    """Whether it leaves the band in small moves already: then large ones, which take many seconds, decide nothing."""
+    limits = case.line.limits
+    return not all(
+        found.tension_min_n.min() >= limits.tension_min_n and found.tension_max_n.max() <= limits.tension_max_n
+        for found in in_small(case).values()
+    )
+
+
 def by_itself(case: Case) -> dict[str, Rollouts]:
     """By course, of the largest steps, on `WHOLE` corners; computed once for a case."""
-    return case.once("programme", lambda case: in_courses(case, corner_courses(judged_of(case), LASTING_S, TAIL_S)))
+    return case.once("programme", _by_itself)
 
 
 def in_courses(case: Case, courses: CornerCourses) -> dict[str, Rollouts]:
@@ -53,6 +62,10 @@ def in_courses(case: Case, courses: CornerCourses) -> dict[str, Rollouts]:
         plants = plants_under_stress([kept[i] for i in order], case.line.gate, case.seed)
         found[name] = simulate(case.controller, plants, one.course, setup)
     return found
+
+
+def _by_itself(case: Case) -> dict[str, Rollouts]:
+    return in_courses(case, corner_courses(judged_of(case), LASTING_S, TAIL_S, programme=True))
 
 
 def _in_small(case: Case) -> dict[str, Rollouts]:

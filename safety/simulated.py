@@ -8,6 +8,7 @@ import numpy as np
 from gateway.control.judged_courses import CornerCourse, Judged
 from gateway.control.rollout import Course, Plants, Setup, plants_of_thetas
 from gateway.core.line import Gate, Line
+from gateway.core.signals import FloatArray
 from gateway.core.theta import Noise, Theta
 from gateway.core.web_model import equilibrium_torque, reference_speeds
 from safety.case import Case
@@ -60,7 +61,9 @@ def setup_of(line: Line, noise: Noise, seed: int, late_share: float, longest_ste
 
 def holdable(thetas: Sequence[Theta], course: Course, torque_nm: float) -> list[Theta]:
     """Those that the torque holds wherever the course stands: beyond that no controller can, and none is to blame."""
-    return [theta for theta in thetas if _needed_nm(theta, course) <= HOLDABLE * torque_nm]
+    ends = [0, *(course.changes[1:] - 1).tolist()]
+    asked = np.unique(np.column_stack([course.unwind_speed_m_per_s[ends], course.tension_n[ends]]), axis=0)
+    return [theta for theta in thetas if _needed_nm(theta, asked) <= HOLDABLE * torque_nm]
 
 
 def held(thetas: Sequence[Theta], one: CornerCourse, torque_nm: float) -> list[Theta]:
@@ -68,13 +71,12 @@ def held(thetas: Sequence[Theta], one: CornerCourse, torque_nm: float) -> list[T
     return holdable(one.of(thetas), one.course, torque_nm) or holdable(thetas, one.course, torque_nm)[:1]
 
 
-def _needed_nm(theta: Theta, course: Course) -> float:
-    """The greatest torque at the equilibria between the changes of a course."""
-    needed, ends = 0.0, [0, *(course.changes[1:] - 1).tolist()]
-    stands = np.unique(np.column_stack([course.tension_n[ends], course.unwind_speed_m_per_s[ends]]), axis=0)
-    for *tensions, unwind in stands.tolist():
-        tension = np.array(tensions)
-        speed = reference_speeds(theta.web, tension, unwind)
+def _needed_nm(theta: Theta, asked: FloatArray) -> float:
+    """The greatest torque at equilibria, each a row (1 + n,): the unwinder's speed, and set-points."""
+    needed = 0.0
+    for row in asked:
+        tension = row[1:]
+        speed = reference_speeds(theta.web, tension, float(row[0]))
         torque = equilibrium_torque(theta.web, tension, speed) + theta.coulomb_nm * np.sign(speed)
         needed = max(needed, float(np.abs(torque).max()))
     return needed

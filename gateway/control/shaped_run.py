@@ -31,8 +31,10 @@ class Way:
     def course(self, period_s: float) -> Course:
         """What is asked, period by period."""
         times = np.arange(round((self.stand_s + self.move_s + self.rest_s) / period_s)) * period_s
-        curve = self.curve()
-        tension = np.array([curve.at(t)[0] for t in times.tolist()])
+        curve, end_s = self.curve(), self.stand_s + self.move_s
+        tension = np.where(times[:, None] < end_s, self.low_n, self.high_n)
+        for k in np.flatnonzero((times > self.stand_s) & (times < end_s)).tolist():
+            tension[k] = curve.at(times[k])[0]
         return Course(tension, np.full(len(times), self.speed_m_per_s), round(self.stand_s / period_s))
 
     def curve(self) -> MinimumJerk:

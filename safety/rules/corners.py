@@ -9,7 +9,7 @@ from math import inf
 
 import numpy as np
 
-from gateway.control.judged_courses import CornerCourse, corner_courses
+from gateway.control.judged_courses import CornerCourse
 from gateway.control.mpc_linear import unconstrained
 from gateway.control.rollout import Rollouts, simulate
 from gateway.core.controller import Controller
@@ -17,9 +17,9 @@ from gateway.core.controller_laws import MpcConfig
 from gateway.core.verdict import RuleFinding
 from safety import programme
 from safety.case import Case
-from safety.corner_runs import corners_held, in_largest_steps
+from safety.corner_runs import corners_held, courses_of, in_largest_steps
 from safety.findings import at_least, at_most, told
-from safety.simulated import holdable, judged_of, plants_out_of_round, setup_of, stressed
+from safety.simulated import holdable, plants_out_of_round, setup_of, stressed
 
 RULE = "corners"
 LATE, FINE_STEP_S = 2, 0.001  #: plants that are later than the line is, and the steps in which they are so
@@ -50,11 +50,11 @@ def check(case: Case) -> list[RuleFinding]:
         return [_nobody_holds(case, nobody[0])]
     config = case.controller
     worst = _of_mpc(case, config) if isinstance(config, MpcConfig) else _of_law(case, config)
-    return [*_limits(case, worst), _of_corners(case), *_lost(config)]
+    return [*_limits(case, worst), _of_corners(case), *_lost(case)]
 
 
 def _of_law(case: Case, config: Controller) -> Worst:
-    worst, courses = Worst(), corner_courses(judged_of(case))
+    worst, courses = Worst(), courses_of(case)
     for name, found in in_largest_steps(case).items():
         worst.take(found, name, case.tension_spans)
         for late in _late(case, config, courses[name]):
@@ -88,8 +88,9 @@ def _of_mpc(case: Case, config: MpcConfig) -> Worst:
         worst.take(found, f"{name}, small", case.tension_spans)
         for late in _late(case, unconstrained(config), courses[name]):
             worst.take(late, f"{name}, small, late", case.tension_spans)
-    for name, found in programme.by_itself(case).items():
-        worst.take(found, name, case.tension_spans)
+    if not programme.falls_in_small(case):
+        for name, found in programme.by_itself(case).items():
+            worst.take(found, name, case.tension_spans)
     return worst
 
 
@@ -125,7 +126,7 @@ def _limits(case: Case, worst: Worst) -> list[RuleFinding]:
 
 
 def _of_corners(case: Case) -> RuleFinding:
-    courses, kept = corner_courses(judged_of(case)), corners_held(case)
+    courses, kept = courses_of(case), corners_held(case)
     left_out = {name: max(len(courses[name].of(case.corners)) - len(some), 0) for name, some in kept.items()}
     shared = sum(one.shared for one in courses.values())
     what = f"{len(case.corners)} plants that the line may be, and {LATE} late, {len(courses) - shared} courses each, "
@@ -137,9 +138,11 @@ def _of_corners(case: Case) -> RuleFinding:
     return told(RULE, True, what)
 
 
-def _lost(config: Controller) -> list[RuleFinding]:
-    if not isinstance(config, MpcConfig):
+def _lost(case: Case) -> list[RuleFinding]:
+    if not isinstance(case.controller, MpcConfig):
         return []
+    if programme.falls_in_small(case):
+        return [told("corners: what is lost", True, "small moves leave the band already: no large ones were looked at")]
     text = (
         f"the programme itself was simulated on {programme.WHOLE} corners, and for shorter; on the others only small "
         "moves, by the law that it is where no limit is reached: how it plans at its limits there has not been seen"

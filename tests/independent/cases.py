@@ -164,6 +164,17 @@ def trying_cases(line: Line, top_m_per_s: float, generator: np.random.Generator)
     return found
 
 
+def largest_case(line: Line, top_m_per_s: float, generator: np.random.Generator) -> Case:
+    """As many spans as may, any of them, by as much as may be, at the highest speed: up, and down again."""
+    n, limits = line.n, line.limits
+    half = 0.5 * min(limits.tension_step_max_n, MOST_N - LEAST_N)
+    middle = np.resize([28.0, 34.0, 26.0, 36.0, 27.0, 32.0], n)
+    high, low = middle.copy(), middle.copy()
+    moving = generator.permutation(n)[: max(1, min(n, int(limits.steps_together)))]
+    high[moving], low[moving] = 30.0 + half, 30.0 - half
+    return Course(line, low, top_m_per_s).stand(0.5).step(high).stand(2.5).step(low).case("largest")
+
+
 def measuring_cases(line: Line, top_m_per_s: float) -> list[Case]:
     """The cases by which configurations are compared: steps of one, of all, of the speed, and shaped moves."""
     n, limits = line.n, line.limits
@@ -173,8 +184,7 @@ def measuring_cases(line: Line, top_m_per_s: float) -> list[Case]:
     high, low, shaped = base.copy(), base.copy(), base.copy()
     high[n // 2 - 1 if n > 1 else 0] += min(limits.tension_step_max_n, 22.0)
     low[1 % n] -= min(limits.tension_step_max_n, 20.0)
-    shaped[0] += 8.0
-    shaped[-1] -= 10.0
+    shaped += np.resize([8.0, -10.0], n)  # every span: a feed-forward may be wrong for any of them
     level = np.full(n, 30.0)
     half = 0.5 * min(limits.tension_step_max_n, 24.0)
     together = half * min(1.0, limits.steps_together / n)

@@ -155,7 +155,7 @@ def test_a_predictive_controller_runs_whole_on_some_corners_and_says_what_is_los
     case = case_of(gains(mpc, context), context, of)
     found = corners.check(case)
     assert refused(roller_speed.check(case)) == []
-    assert sorted(whole) == [1] * 6 + [4] * 3  # once for both rules
+    assert sorted(whole) == [1] * 7 + [4] * 3  # once for both rules
     assert found[-1].rule == "corners: what is lost"
     assert refused(found) == []
 

@@ -13,6 +13,9 @@ NO_LIMIT = 1e6  #: Nm and N: for a limit that is not given
 
 HORIZON_S = 0.15  #: that the blocks cover, as far as there are periods in it
 BLOCKS = 7
+#: Of the band between the limits of tension, at either end, which the plan keeps clear of: noise, and a plant that is
+#: not quite the model, take it beyond what it planned.
+ROOM = 0.12
 TIME_SHARE = 0.3  #: of a period that a solution may take; half of it may go before the samples are in
 
 
@@ -27,6 +30,8 @@ def design_mpc(task: DesignTask, weights: MpcWeights | None = None, blocks: tupl
     if not blocks or min(blocks) < 1:
         raise DesignRefused(f"the horizon's blocks are {list(blocks)}; allowed: one or more, each of 1 period or more")
     n, limits = task.n, task.limits
+    bounded = isfinite(limits.tension_max_n)
+    room_n = ROOM * (limits.tension_max_n - limits.tension_min_n) if bounded else 0.0
     _, remaining = feedback(task, weights)
     cautious = lqi_weights(task).torque_per_nm2
     # The feedback of the problem itself is too eager for limits that it does not know of.
@@ -43,9 +48,9 @@ def design_mpc(task: DesignTask, weights: MpcWeights | None = None, blocks: tupl
         blocks=list(blocks),
         torque_nm=min(limits.torque_nm, NO_LIMIT),
         torque_rate_nm_per_s=min(limits.torque_rate_nm_per_s, NO_LIMIT),
-        tension_min_n=limits.tension_min_n,
-        tension_max_n=min(limits.tension_max_n, NO_LIMIT),
-        weight_tension_limit=weights.tension_limit_per_n2 if isfinite(limits.tension_max_n) else 0.0,
+        tension_min_n=limits.tension_min_n + room_n,
+        tension_max_n=min(limits.tension_max_n - room_n, NO_LIMIT),
+        weight_tension_limit=weights.tension_limit_per_n2 if bounded else 0.0,
         fallback_state=fallback[:, : 2 * n].tolist(),
         fallback_input=fallback[:, 2 * n :].tolist(),
         time_limit_s=TIME_SHARE * task.period_s,

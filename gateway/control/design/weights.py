@@ -79,7 +79,7 @@ class MpcWeights(LqgWeights):
 
     torque_per_nm2: float = 1.0e-3
     disturbance_nm_per_sqrt_s: float = 1.0
-    tension_limit_per_n2: float = 10.0
+    tension_limit_per_n2: float = 100.0
 
 
 def stood_s(task: DesignTask) -> float:
