@@ -18,8 +18,8 @@ $(VENV)/.ready: requirements.lock pyproject.toml deploy/setup-venv.sh
 
 setup: $(VENV)/.ready ## the virtual environment in .venv, from requirements.lock
 
-$(VENV)/.compiled: $(VENV)/.ready $(wildcard gateway/control/*.py safety/*.py sim_plant/*.py)
-	@echo "compiling the simulations (once, half a minute)"
+$(VENV)/.compiled: $(VENV)/.ready gateway/cli/compiled.py $(wildcard gateway/control/*_kernel.py sim_plant/*.py)
+	@echo "compiling the simulations (half a minute, once and after changes of them)"
 	@mkdir -p out
 	@$(PY) -m gateway.cli.compiled > out/compiled.txt 2>&1 || { cat out/compiled.txt; exit 1; }
 	@touch $@
@@ -27,12 +27,13 @@ $(VENV)/.compiled: $(VENV)/.ready $(wildcard gateway/control/*.py safety/*.py si
 run: $(VENV)/.compiled ## set up, then the demonstration: a line adapted through the gate, in real time (about 5 min; ARGS="--quick")
 	@exec $(RUN) demo $(ARGS)
 
-test: setup ## set up, then all tests but the long ones: those about time itself alone, the others on every core
-	@$(PY) -m pytest -m realtime $(ARGS) || [ $$? -eq 5 ]  # 5: none of them was asked for
+test: $(VENV)/.compiled ## set up, then all tests but the long ones: those about time itself alone, the others on every core
+	@$(PY) -m pytest -m "realtime and not long" $(ARGS) || [ $$? -eq 5 ]  # 5: none of them was asked for
 	@$(PY) -m pytest -m "not realtime and not long" $(PARALLEL) $(ARGS) || [ $$? -eq 5 ]
 
-test-long: setup ## tests of a minute or more: whole chains through the gate, comparisons with other libraries (about 2 min)
-	@$(PY) -m pytest -m long $(PARALLEL) $(ARGS)
+test-long: $(VENV)/.compiled ## the demonstration, whole chains through the gate, comparisons with other libraries (about 4 min)
+	@$(PY) -m pytest -m "long and realtime" $(ARGS) || [ $$? -eq 5 ]
+	@$(PY) -m pytest -m "long and not realtime" $(PARALLEL) $(ARGS) || [ $$? -eq 5 ]
 
 system-test: setup ## a real CAN kernel and foreign protocol stacks; as root, installs Debian and npm packages (about 6 min)
 	@$(PY) -m tests.system.needs
@@ -63,10 +64,10 @@ bench: bench-stepped bench-wire bench-processes ## the figures of the README (ab
 bench-stepped: setup ## both cases in stepped time: RMSE against the goals, speed against real time
 	@$(PY) -m tests.bench.stepped $(ARGS)
 
-bench-wire: setup ## the demonstration in real time, both laws, three seeds
+bench-wire: $(VENV)/.compiled ## the demonstration in real time, both laws, three seeds
 	@$(PY) -m tests.bench.wire $(ARGS)
 
-bench-processes: setup ## processes killed in mid-run, judged by the recorder
+bench-processes: $(VENV)/.compiled ## processes killed in mid-run, judged by the recorder
 	@$(PY) -m tests.bench.processes $(ARGS)
 
 bench-control: setup ## every law under every tier beside the oracle (about an hour and a half; ARGS="--parts a,c --seeds 3 --tiers A,B")
@@ -78,13 +79,13 @@ bench-monitor: setup ## unsafe configurations forced in, healthy ones left alone
 bench-identify: setup ## what a line learns of itself from 5 s, against truths never seen (ARGS="--parts a,c --friction 10")
 	@$(PY) -m tests.bench.identify $(ARGS)
 
-bench-faults: setup ## every fault 200 times in virtual time, 5 times over the wires (ARGS="--injections 20 --wire 0")
+bench-faults: $(VENV)/.compiled ## every fault 200 times in virtual time, 5 times over the wires (ARGS="--injections 20 --wire 0")
 	@$(PY) -m tests.bench.faults $(ARGS)
 
 bench-fuzz: setup ## a million hostile frames through each decoder (ARGS="--frames 100000")
 	@$(PY) -m tests.bench.fuzz $(ARGS)
 
-bench-soak: setup ## an hour of a line on three wires, with something going wrong each minute (ARGS="--minutes 10")
+bench-soak: $(VENV)/.compiled ## an hour of a line on three wires, with something going wrong each minute (ARGS="--minutes 10")
 	@$(PY) -m tests.bench.soak $(ARGS)
 
 bench-audit: setup ## the audit: a thousand kills of its writer, ten thousand damages (about 15 min)
@@ -94,7 +95,7 @@ bench-audit: setup ## the audit: a thousand kills of its writer, ten thousand da
 bench-kill: setup ## the gateway process killed a thousand times while proposals are made and decided (about 20 min; ARGS="--kills 100")
 	@$(PY) -m tests.bench.gate_kill $(ARGS)
 
-bench-gate-live: setup ## the gate on a running line: rollback, swaps, and the loop while verdicts are computed (about 5 min)
+bench-gate-live: $(VENV)/.compiled ## the gate on a running line: rollback, swaps, and the loop while verdicts are computed (about 5 min)
 	@$(PY) -m tests.bench.gate_live $(ARGS)
 
 bench-gate: setup ## proposals of every way of going wrong, judged by the gate and by the truth (ARGS="--parts a --plants 5 --proposals 200")
@@ -103,7 +104,7 @@ bench-gate: setup ## proposals of every way of going wrong, judged by the gate a
 bench-lifecycle: setup ## the life of a proposal in any order of everything, 10,000 sequences (about 15 min; ARGS="--sequences 1000")
 	@$(PY) -m tests.bench.lifecycle $(ARGS)
 
-bench-cycle: setup ## how late the loop wakes beside cyclictest, what a cycle takes and costs; as root (about 40 min)
+bench-cycle: $(VENV)/.compiled ## how late the loop wakes beside cyclictest, what a cycle takes and costs; as root (about 40 min)
 	@$(PY) -m tests.bench.cycle $(ARGS)
 
 lock: setup ## requirements.lock anew from pyproject.toml (needs uv), hashes without any index address

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from gateway.control.judged_courses import CornerCourses, corner_courses
+from gateway.control.judged_courses import CornerCourses, Judged, corner_courses, programme_courses
 from gateway.control.rollout import Course, Rollouts, simulate
 from gateway.core.controller import Controller
 from gateway.core.controller_laws import MpcConfig
@@ -13,8 +13,14 @@ from safety.simulated import held, judged_of, plants_under_stress, setup_of, str
 
 
 def courses_of(case: Case) -> CornerCourses:
-    """What the proposed law is put through on the corners."""
-    return corner_courses(judged_of(case), programme=isinstance(case.controller, MpcConfig))
+    """What the proposed law is put through on the corners. Computed once for a case."""
+    return case.once("courses on corners", lambda case: courses_through(case, judged_of(case)))
+
+
+def courses_through(case: Case, judged: Judged, lasting_s: float = 2.5, tail_s: float = 1.5) -> CornerCourses:
+    """Those of the proposed law's kind, for other steps and lasting otherwise."""
+    courses = programme_courses if isinstance(case.controller, MpcConfig) else corner_courses
+    return courses(judged, lasting_s, tail_s)
 
 
 def corners_held(case: Case) -> dict[str, list[Theta]]:

@@ -8,7 +8,7 @@ from math import inf
 
 import numpy as np
 
-from gateway.control.judged_courses import CornerCourses, corner_courses
+from gateway.control.judged_courses import CornerCourses, programme_courses
 from gateway.control.mpc_linear import unconstrained
 from gateway.control.rollout import Rollouts, simulate
 from gateway.core.controller_laws import MpcConfig
@@ -28,7 +28,7 @@ def small_courses(case: Case) -> CornerCourses:
         tension_step_n=min(judged.tension_step_n, SMALL_STEP_N),
         speed_step_m_per_s=min(judged.speed_step_m_per_s, SMALL_STEP_M_PER_S),
     )
-    return corner_courses(small, programme=True)
+    return programme_courses(small)
 
 
 def in_small(case: Case) -> dict[str, Rollouts]:
@@ -51,10 +51,15 @@ def by_itself(case: Case) -> dict[str, Rollouts]:
 
 
 def in_courses(case: Case, courses: CornerCourses) -> dict[str, Rollouts]:
-    """The programme itself, on the corners that are the worst for each of `courses`; on one where they are shared."""
+    """The programme itself, on the corners that are the worst for each of `courses`; on one where they are shared.
+
+    No course that torque holds on no corner.
+    """
     setup = setup_of(case.line, case.stress_noise, case.seed, case.line.gate.stress_late_share)
     found: dict[str, Rollouts] = {}
     for name, one in courses.items():
+        if not corners_held(case)[name]:
+            continue
         small = in_small(case)[name]
         badness = small.tail_swing_n.max(axis=1) + small.chatter_nm.max(axis=1) + small.beyond_n.max(axis=1)
         order: list[int] = np.argsort(np.nan_to_num(badness, nan=inf))[::-1][: 1 if one.shared else WHOLE].tolist()
@@ -65,7 +70,7 @@ def in_courses(case: Case, courses: CornerCourses) -> dict[str, Rollouts]:
 
 
 def _by_itself(case: Case) -> dict[str, Rollouts]:
-    return in_courses(case, corner_courses(judged_of(case), LASTING_S, TAIL_S, programme=True))
+    return in_courses(case, programme_courses(judged_of(case), LASTING_S, TAIL_S))
 
 
 def _in_small(case: Case) -> dict[str, Rollouts]:
@@ -78,4 +83,5 @@ def _in_small(case: Case) -> dict[str, Rollouts]:
     return {
         name: simulate(law, plants_under_stress(held[name], gate, case.seed), one.course, setup)
         for name, one in small_courses(case).items()
+        if held[name]
     }

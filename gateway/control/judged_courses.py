@@ -27,7 +27,7 @@ MOVE_S = 0.5  #: a shaped move, or longer where the line's rate asks for it
 MOVED = 0.25  #: of the largest step: more in so short a time is a matter of the torque limit
 LEAST_SPEED_M_PER_S = 0.005  #: the slowest that is looked at, where the line is to run faster
 SLOW = 0.1  #: the slow speed, of the fast one
-LONGER_S = 1.0  #: that what moves many spans stands at its end: what still settles there is no oscillation
+LONGER_S = 1.0  #: that what moves many spans stands before its tail: what still settles there is no oscillation
 TURN_S = 0.25  #: from one step to that of the next span
 ROOM = 1.0 / 3.0  #: of a step, to the set-points' limits
 OTHERS_LOW = "some step, the others low"
@@ -134,19 +134,17 @@ class CornerCourse:
 CornerCourses = dict[str, CornerCourse]
 
 
-def corner_courses(
-    judged: Judged, lasting_s: float = 2.5, tail_s: float = 1.5, *, programme: bool = False
-) -> CornerCourses:
+def corner_courses(judged: Judged, lasting_s: float = 2.5, tail_s: float = 1.5) -> CornerCourses:
     """Speed down and up; steps of single spans, slow or fast; one after another; of some at once; each with a tail.
 
-    Every other span steps slow, the others fast, and they share the corners among them. For a programme there is one
-    more: some spans after the first step up while the others stand low. Those that step draw web out of those before
-    them; linear laws that pass the other courses hold these, and a programme that rides its limits lets them go.
+    Every other span steps slow, the others fast, and they share the corners among them. Without a tail nothing stands
+    longer for it.
     """
     spans = [i for i, span in enumerate(judged.line.spans) if span.control == "tension"]
     some = judged.some(spans)
     period_s, fast, slow = judged.line.control.period_s, judged.fast_m_per_s, judged.slow_m_per_s
     now, before = judged.tension_n, judged.before_m_per_s
+    longer_s = LONGER_S if tail_s > 0.0 else 0.0
 
     def of(first: tuple[FloatArray, float], second: tuple[FloatArray, float], longer_s: float = 0.0) -> Course:
         parts = [(STAND_S, *first), (lasting_s, *second), (lasting_s + longer_s, *first)]
@@ -162,24 +160,28 @@ def corner_courses(
                 found[f"span {span + 1} {name}"] = CornerCourse(
                     of((low, speed), (high, speed)), at, len(alone), late=name == SLOW_ALONE and at == len(alone) // 2
                 )
-        found["one after another"] = CornerCourse(course_through(period_s, _in_turn(judged, lasting_s), tail_s))
-        found["neighbours"] = CornerCourse(of((some[0], fast), (some[1], fast), LONGER_S))
-        if programme:
-            found |= _others_low(judged, lasting_s, tail_s)
+        found["one after another"] = CornerCourse(
+            course_through(period_s, _in_turn(judged, lasting_s, longer_s), tail_s)
+        )
+        found["neighbours"] = CornerCourse(of((some[0], fast), (some[1], fast), longer_s))
     return found
 
 
-def _others_low(judged: Judged, lasting_s: float, tail_s: float) -> CornerCourses:
-    """None where nothing may step, or where every span may at once."""
-    low, high = judged.levels()
+def programme_courses(judged: Judged, lasting_s: float = 2.5, tail_s: float = 1.5) -> CornerCourses:
+    """Those, and one more: spans from the second on step up together while the others stand at their low level.
+
+    Those that step draw web out of those that stand before them. Predictive control lets these fall by some newtons
+    more than linear laws do, down to the limit that it plans by. Where fewer than two spans step there is none.
+    """
+    found, (low, high) = corner_courses(judged, lasting_s, tail_s), judged.levels()
     spans = np.flatnonzero(high > low)[1 : 1 + judged.at_once]
     if len(spans) == 0:
-        return {}
+        return found
     up, fast = low.copy(), judged.fast_m_per_s
     up[spans] = high[spans]
     parts = [(STAND_S, low, fast), (lasting_s, up, fast), (lasting_s, low, fast)]
     course = course_through(judged.line.control.period_s, parts, tail_s)
-    return {OTHERS_LOW: CornerCourse(course, every=MOST_ALONE, late=False)}
+    return found | {OTHERS_LOW: CornerCourse(course, late=False)}
 
 
 def _apart(spans: Sequence[int]) -> list[int]:
@@ -188,7 +190,7 @@ def _apart(spans: Sequence[int]) -> list[int]:
     return [spans[at * (len(spans) - 1) // max(count - 1, 1)] for at in range(count)]
 
 
-def _in_turn(judged: Judged, lasting_s: float) -> list[tuple[float, FloatArray, float]]:
+def _in_turn(judged: Judged, lasting_s: float, longer_s: float) -> list[tuple[float, FloatArray, float]]:
     """From high to low, against the web, and back to the middle; each step before the last one is over."""
     low, high = judged.some(range(judged.line.n))
     parts, now = [(STAND_S, high, judged.fast_m_per_s)], high
@@ -197,7 +199,7 @@ def _in_turn(judged: Judged, lasting_s: float) -> list[tuple[float, FloatArray, 
             now = np.where(np.arange(len(now)) == i, goal, now)
             parts.append((TURN_S, now, judged.fast_m_per_s))
         parts[-1] = (lasting_s, now, judged.fast_m_per_s)
-    parts[-1] = (lasting_s + LONGER_S, now, judged.fast_m_per_s)
+    parts[-1] = (lasting_s + longer_s, now, judged.fast_m_per_s)
     return parts
 
 

@@ -18,6 +18,9 @@ from gateway.control.sampled import Sampled
 from gateway.core.controller_laws import MpcConfig
 from gateway.core.signals import FloatArray
 
+#: Of the band that is planned for: how far from any set-point no row begins, so that none is active at rest for noise.
+CLEAR = 0.025
+
 
 class MpcProblem:
     """P, A and the products that give the rest. All in Nm and N."""
@@ -92,9 +95,12 @@ class MpcProblem:
             bound[m : m + n] -= found.bump_nm
         if self._limited:
             tension = np.tile(tension_setpoint_n, blocks) + self._tension_free.dot(x)
-            least = np.tile(np.minimum(config.tension_min_n, tension_setpoint_n), blocks)  # a slack web is tensioned
-            lower[2 * m :] = least - tension
-            upper[2 * m :] = config.tension_max_n - tension
+            # A set-point beyond what is planned for is held all the same, and a slack web is tensioned.
+            clear_n = CLEAR * (config.tension_max_n - config.tension_min_n)
+            least = np.minimum(config.tension_min_n, tension_setpoint_n - clear_n)
+            most = np.maximum(config.tension_max_n, tension_setpoint_n + clear_n)
+            lower[2 * m :] = np.tile(least, blocks) - tension
+            upper[2 * m :] = np.tile(most, blocks) - tension
         return q, lower, upper
 
     def torques(self, solution: FloatArray, found: Estimate) -> FloatArray:

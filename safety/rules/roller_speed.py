@@ -2,8 +2,9 @@
 
 A roller runs ahead by L/EA dT/dt while it tensions its span, and by as much again for each span before it: on a slow
 line that is more than its own speed. With an accepted model the loop foresees it and refuses such a step
-(`gateway.loop.guard`), so that a configuration is looked at in steps as large as the model lets them be, on the corners
-under stress. Before that nobody foresees anything: the region of a first configuration has the steps that pass.
+(`gateway.loop.guard`). A configuration is looked at on the corners under stress, in whole steps; where these are too
+fast, in steps as large as the model lets them be. Before that nobody foresees anything: the region of a first
+configuration has the steps that pass.
 """
 
 from collections.abc import Callable
@@ -11,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gateway.control.judged_courses import SLOW_ALONE, CornerCourse, CornerCourses, Judged, corner_courses
+from gateway.control.judged_courses import SLOW_ALONE, CornerCourse, CornerCourses
 from gateway.control.mpc_linear import unconstrained
 from gateway.control.rollout import Rollouts, plants_of_thetas, simulate
 from gateway.core.controller_laws import MpcConfig
@@ -19,7 +20,7 @@ from gateway.core.theta import Noise
 from gateway.core.verdict import RuleFinding
 from safety import programme
 from safety.case import Case
-from safety.corner_runs import in_largest_steps, rollouts
+from safety.corner_runs import courses_through, in_largest_steps, rollouts
 from safety.findings import at_most, told
 from safety.limits import envelope_limits
 from safety.simulated import held, judged_of, setup_of, stressed
@@ -39,7 +40,7 @@ Fastest = Callable[[str, CornerCourse], float]  #: the greatest speed of any rol
 
 @dataclass(frozen=True)
 class Let:
-    """By course: the share of its largest step that keeps rollers below the speed that is watched; nan: none does."""
+    """By course: the share of its largest step that passes on the corners, or that the loop lets; nan: none does."""
 
     share: dict[str, float]
     fastest_m_per_s: dict[str, float]  #: with that step, on the corners
@@ -64,6 +65,8 @@ def check(case: Case) -> list[RuleFinding]:
     if single < min(LEAST_STEP_N, case.tension_step_n):
         return [told(RULE, False, _too_quick(case, f"a step of {single:.2g} N of one span"))]
     name, value = max(found.fastest_m_per_s.items(), key=lambda pair: pair[1])
+    if value == np.inf:
+        return [told(RULE, False, f"on a plant that the line may be rollers run away, or none is held ({name})")]
     allowed = limits.roller_speed_watched_m_per_s if case.first else JUDGED * limits.roller_speed_m_per_s
     text = (
         f"a roller runs at up to {value:.3g} m/s ({name}, {found.share[name]:.0%} of the largest step); allowed: "
@@ -78,57 +81,61 @@ def steps_let(case: Case) -> Let:
 
 
 def _steps_let(case: Case) -> Let:
-    limits, judged = envelope_limits(case.line), judged_of(case)
+    """Whole steps first, on the corners. What is too fast there is looked at as the loop would let it."""
+    limits, courses = envelope_limits(case.line), _courses(case, 1.0)
     foreseen, on_corners = _looks(case)
-    share, fastest, whole_steps = dict[str, float](), dict[str, float](), _in_whole_steps(case)
+    whole_steps = _in_whole_steps(case, courses, on_corners)
     passes = limits.roller_speed_watched_m_per_s if case.first else JUDGED * limits.roller_speed_m_per_s
-    for name, one in _courses(judged, 1.0).items():
-        share[name], fastest[name] = 1.0, whole_steps.get(name, np.inf)
+    share, fastest = dict.fromkeys(courses, 1.0), {name: whole_steps.get(name, np.inf) for name in courses}
+    for name, one in courses.items():
         if fastest[name] <= passes:
             continue
-        web = float(one.course.unwind_speed_m_per_s.max())
-        allowed = limits.roller_speed_watched_m_per_s if case.first else limits.roller_speed_in_step_m_per_s(web)
-        share[name], looked_at = _largest(judged, name, one, foreseen, allowed)
-        if share[name] < 1.0 and not case.first:
-            fastest[name] = on_corners(name, _courses(judged, share[name])[name])
-        elif share[name] != 1.0:
-            fastest[name] = looked_at
+        if case.first:  # nobody foresees anything: corners are all there is to go by
+            share[name], fastest[name] = _smaller(case, name, one, on_corners, passes)
+            continue
+        allowed = limits.roller_speed_in_step_m_per_s(float(one.course.unwind_speed_m_per_s.max()))
+        if not foreseen(name, one) <= allowed:
+            share[name], _ = _smaller(case, name, one, foreseen, allowed)
+        if share[name] < 1.0:
+            fastest[name] = on_corners(name, _courses(case, share[name])[name])
     return Let(share, fastest)
 
 
-def _in_whole_steps(case: Case) -> dict[str, float]:
-    """By course, on the corners: rule `corners` has simulated them already."""
-    of = programme.by_itself if isinstance(case.controller, MpcConfig) else in_largest_steps
-    return {name: _greatest(found) for name, found in of(case).items()}
+def _in_whole_steps(case: Case, courses: CornerCourses, on_corners: Fastest) -> dict[str, float]:
+    """By course, on the corners; in most cases rule `corners` has simulated them already."""
+    if not isinstance(case.controller, MpcConfig):
+        return {name: _greatest(found) for name, found in in_largest_steps(case).items()}
+    if case.first:  # a programme is looked at on some corners only, which is too few where nobody foresees anything
+        return {name: on_corners(name, one) for name, one in courses.items()}
+    return {name: _greatest(found) for name, found in programme.by_itself(case).items()}
 
 
-def _largest(judged: Judged, name: str, whole: CornerCourse, fastest: Fastest, allowed: float) -> tuple[float, float]:
-    """Share of the step, and the speed that rollers reach with it.
+def _smaller(case: Case, name: str, whole: CornerCourse, fastest: Fastest, allowed: float) -> tuple[float, float]:
+    """Share of a step that is too large, and the speed that rollers reach with it; nan and infinite: there is none.
 
     Cut torques keep a large step from moving rollers as fast as it would: the share follows from a small one.
     """
-    web, value = float(whole.course.unwind_speed_m_per_s.max()), fastest(name, whole)
-    if value <= allowed:
-        return 1.0, value
-    share, value = SMALL, fastest(name, _courses(judged, SMALL)[name])
+    web = float(whole.course.unwind_speed_m_per_s.max())
+    share, value = SMALL, fastest(name, _courses(case, SMALL)[name])
     for _ in range(TRIES):
         share = min(share * BELOW * (allowed - web) / (value - web), BELOW)  # the whole step has been found too large
         if not share > 0.0:  # nan, too: a line that runs away
             break
-        value = fastest(name, _courses(judged, share)[name])
+        value = fastest(name, _courses(case, share)[name])
         if value <= allowed:
             return share, value
     return np.nan, np.inf
 
 
-def _courses(judged: Judged, share: float) -> CornerCourses:
+def _courses(case: Case, share: float) -> CornerCourses:
     """With a share of the largest steps; as long as rollers run ahead."""
+    judged = judged_of(case)
     smaller = replace(
         judged,
         tension_step_n=share * judged.tension_step_n,
         speed_step_m_per_s=share * judged.speed_step_m_per_s,
     )
-    return corner_courses(smaller, LASTING_S, 0.0)
+    return courses_through(case, smaller, LASTING_S, 0.0)
 
 
 def _looks(case: Case) -> tuple[Fastest, Fastest]:
@@ -141,12 +148,10 @@ def _looks(case: Case) -> tuple[Fastest, Fastest]:
         kept = held(corners, one, case.line.limits.torque_nm)
         return _greatest(rollouts(case.line, law, kept, one.course, case.stress_noise, case.seed)) if kept else np.inf
 
-    if case.first:
-        return on_corners, on_corners
-    if isinstance(config, MpcConfig):  # under its limits it goes otherwise than without them
+    if isinstance(config, MpcConfig) and not case.first:  # under its limits it goes otherwise than without them
         return (
             lambda name, one: _greatest(simulate(config, mean, one.course, setup)),
-            lambda name, one: _greatest(programme.in_courses(case, {name: one})[name]),
+            lambda name, one: max(map(_greatest, programme.in_courses(case, {name: one}).values()), default=np.inf),
         )
     return lambda name, one: _greatest(simulate(law, mean, one.course, setup)), on_corners
 

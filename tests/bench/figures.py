@@ -4,6 +4,7 @@ import os
 import platform
 import sys
 import tomllib
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from importlib.metadata import version
@@ -81,23 +82,33 @@ class Bench:
             tables=self.tables,
         )
 
+    def so_far(self, since: int = 0) -> int:
+        """Write everything, print the figures from number `since` on; the number of the next one."""
+        self._write()
+        self._print_rows(self.figures[since:])
+        return len(self.figures)
+
     def finish(self) -> None:
         """Write and print. Raises SystemExit when a figure that has a goal was not measured."""
-        result = self.result()
-        path = Path("out/bench") / f"{self.name}.json"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(result.model_dump_json(indent=2) + "\n")
+        path = self._write()
         missing = set(GOALS.get(self.name, {})) - {figure.name for figure in self.figures}
         if missing:
             raise SystemExit(f"bench {self.name} did not measure {sorted(missing)}")
-        self._print(path)
-
-    def _print(self, path: Path) -> None:
         print(f"\nbench {self.name}")
         print(f"  {'figure':<26}{'value':>13}  {'goal':>13}  {'':<7}{'n':>5}")
-        for figure in self.figures:
+        self._print_rows(self.figures)
+        print(f"  -> {path}")
+
+    def _write(self) -> Path:
+        path = Path("out/bench") / f"{self.name}.json"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(self.result().model_dump_json(indent=2) + "\n")
+        return path
+
+    @staticmethod
+    def _print_rows(figures: Sequence[Figure]) -> None:
+        for figure in figures:
             goal = "" if figure.goal is None else f"{figure.op} {figure.goal:g}"
             verdict = {None: "", True: "met", False: "MISSED"}[figure.met]
             value = f"{figure.value:.4g} {figure.unit}"
-            print(f"  {figure.name:<26}{value:>13}  {goal:>13}  {verdict:<7}{figure.n:>5}")
-        print(f"  -> {path}")
+            print(f"  {figure.name:<26}{value:>13}  {goal:>13}  {verdict:<7}{figure.n:>5}", flush=True)

@@ -72,6 +72,7 @@ def main() -> None:
         "gate" if whole else "gate-part", [SEED], goals_of="gate",
         command=f'make bench-gate ARGS="{more}"' if more else "make bench-gate",
     )  # fmt: skip
+    told = 0
     with Workers() as workers:
         for letter in sorted(wanted):
             began = time.monotonic()
@@ -79,6 +80,7 @@ def main() -> None:
                 bench, workers, sizes, half
             )
             print(f"part {letter}: {time.monotonic() - began:.0f} s", flush=True)
+            told = bench.so_far(told)
     bench.finish()
 
 

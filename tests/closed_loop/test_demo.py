@@ -56,6 +56,7 @@ def left_over(folder: Path) -> list[str]:
     return found
 
 
+@pytest.mark.long
 def test_the_demonstration_runs_both_cases_and_leaves_nothing_behind(tmp_path):
     folder = tmp_path / "a folder with spaces"
     process = demo(folder)

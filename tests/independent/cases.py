@@ -13,6 +13,7 @@ LEAST_N, MOST_N = 12.0, 44.0  #: set-points
 TAIL_S, STANDS_S = 2.0, 4.0
 MOST_TORQUE_SHARE = 0.85  #: of the limit, at the equilibria of the fastest case
 PUSH_NM = 3.0
+GLIDE_PEAK = 1.875  #: the greatest rate of a minimum-jerk move, times its time, of its way
 BAND_N = 0.6  #: 2 % of a middling set-point: what has settled stays within
 
 
@@ -184,7 +185,9 @@ def measuring_cases(line: Line, top_m_per_s: float) -> list[Case]:
     high, low, shaped = base.copy(), base.copy(), base.copy()
     high[n // 2 - 1 if n > 1 else 0] += min(limits.tension_step_max_n, 22.0)
     low[1 % n] -= min(limits.tension_step_max_n, 20.0)
-    shaped += np.resize([8.0, -10.0], n)  # every span: a feed-forward may be wrong for any of them
+    moved = np.resize([8.0, -10.0], n)  # every span: a feed-forward may be wrong for any of them
+    gliding_s = max(0.5, GLIDE_PEAK * float(np.abs(moved).max()) / line.moves.tension_rate_n_per_s)
+    shaped += moved
     level = np.full(n, 30.0)
     half = 0.5 * min(limits.tension_step_max_n, 24.0)
     together = half * min(1.0, limits.steps_together / n)
@@ -194,6 +197,6 @@ def measuring_cases(line: Line, top_m_per_s: float) -> list[Case]:
         Course(line, level, slow).stand(0.5).step(unwind_m_per_s=slow + rise).case("faster", 4.0),
         Course(line, level - together, top_m_per_s).stand(0.5).step(level + together).case("all", 4.0),
         Course(line, level + together, top_m_per_s).stand(0.5).step(level - together).case("all-down", 4.0),
-        Course(line, base, middle).stand(0.5).glide(shaped, middle, 0.5).case("shaped", 4.0),
+        Course(line, base, middle).stand(0.5).glide(shaped, middle, gliding_s).case("shaped", 4.0),
         Course(line, level, slow).stand(0.5).glide(level, slow + rise, 1.0).case("shaped-faster", 4.0),
     ]

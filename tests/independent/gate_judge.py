@@ -22,7 +22,7 @@ TOLERATED = 0.5  #: of the gate's own tolerance: what no metric may be worse by
 ROLLERS = 1.5  #: times the line's greatest speed: there torque goes off
 FORESEEN = 0.85  #: of that: the loop refuses a step that its model says would make a roller faster
 LITTLE = 1.0 / 16.0  #: of a case: so little that no torque is cut
-MARGIN_CASES = (0, 3, 7, 8)  #: of those that are tried: where the margin is looked at, and in the largest steps
+MARGIN_CASES = (0, 3, 7, 8, -1)  #: of those that are tried: where the margin is looked at
 FAMILIES = ("stiffness_n", "length_m", "radius_m", "inertia_kg_m2", "friction_nms_per_rad")
 
 
@@ -64,10 +64,9 @@ class GateJudge:
         self.line, self.truth, self.seed = line, truth, seed
         self.roller_most_m_per_s = ROLLERS * (speed_max_m_per_s or line.limits.speed_max_m_per_s)
         self.top_m_per_s = fastest(line, truth, top_m_per_s)
-        self.cases = trying_cases(line, self.top_m_per_s, np.random.default_rng(seed))
-        self.measuring = measuring_cases(line, self.top_m_per_s)
         largest = largest_case(line, self.top_m_per_s, np.random.default_rng([seed, 2]))
-        self.margin_cases = [*(self.cases[i] for i in MARGIN_CASES), largest]
+        self.cases = [*trying_cases(line, self.top_m_per_s, np.random.default_rng(seed)), largest]
+        self.measuring = measuring_cases(line, self.top_m_per_s)
         gate = line.gate
         stress = (gate.stress_torque_lag_s, gate.stress_late_share, gate.stress_coulomb_nm, gate.stress_eccentricity)
         self.stressed = stressed(truth, *stress)
@@ -102,7 +101,7 @@ class GateJudge:
         )
 
     def _without_margin(self, config: Controller) -> str:
-        cases = self.margin_cases
+        cases = [self.cases[i] for i in MARGIN_CASES]
         later = self._wrong(
             config, [self.truth] * len(cases), cases, self.line.control.latency_s + EXTRA_DELAY_S
         )  # fmt: skip
@@ -157,7 +156,10 @@ class GateJudge:
             return ""
         little = case.smaller(LITTLE)
         ahead = float(self._alone(config, truth, little, latency_s, b).roller_m_per_s.max()) - _web_m_per_s(little)
-        less = _foreseen_at(case, max(ahead, 0.0) / LITTLE, FORESEEN * most)
+        none = _web_m_per_s(case.smaller(0.0))
+        whole = _web_m_per_s(case) + max(ahead, 0.0) / LITTLE
+        share = (FORESEEN * most - none) / (whole - none) if whole > none else 1.0
+        less = case.smaller(float(np.clip(share, LITTLE * LITTLE, 1.0)))
         fastest = float(self._alone(config, truth, less, latency_s, b).roller_m_per_s.max())
         return "" if fastest <= most else f"a roller runs at {fastest:.3f} m/s"
 
@@ -180,18 +182,6 @@ class GateJudge:
 
 def _web_m_per_s(case: Case) -> float:
     return float(np.abs(case.unwind_m_per_s).max())
-
-
-def _foreseen_at(case: Case, ahead_m_per_s: float, allowed_m_per_s: float) -> Case:
-    """As much of it as keeps the web, with rollers so far ahead of it as the whole case makes them, at that speed."""
-    none, whole = LITTLE * LITTLE, 1.0
-    for _ in range(20):
-        share = 0.5 * (none + whole)
-        if _web_m_per_s(case.smaller(share)) + share * ahead_m_per_s <= allowed_m_per_s:
-            none = share
-        else:
-            whole = share
-    return case.smaller(none)
 
 
 def _overshoot_pct(beyond_n: FloatArray, case: Case) -> float:

@@ -221,6 +221,9 @@ def test_a_roller_that_runs_too_fast_in_small_moves_is_unsafe_and_one_in_moves_t
     found = simulated(config, [judge.truth], [case], limits, 3, latency_s=0.01)
     assert found.roller_m_per_s.max() > judge.roller_most_m_per_s == 0.09
     assert judge.too_fast(config, judge.truth, case, 0.01, 0, found) == ""
+    change = next(one for one in judge.cases if one.name == "step-and-speed")  # half of its speed comes with the move
+    found = simulated(config, [judge.truth], [change], limits, 3, latency_s=0.01)
+    assert judge.too_fast(config, judge.truth, change, 0.01, 0, found) == ""
     judge.roller_most_m_per_s = 0.9 * float(case.unwind_m_per_s.max())  # the web itself is too fast
     assert "a roller runs at" in judge.too_fast(config, judge.truth, case, 0.01, 0, found)
     assert np.allclose(

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from gateway.control.design import MpcWeights, design_lqi, design_mpc, design_scheduled
-from gateway.control.judged_courses import corner_courses, improvement_courses
+from gateway.control.judged_courses import corner_courses, improvement_courses, programme_courses
 from gateway.control.rollout import Rollouts
 from gateway.loop.setpoints import STEP_PAUSE_S
 from safety import corner_runs, programme
@@ -92,7 +92,7 @@ def test_no_course_asks_for_more_than_the_loop_permits(case, together):
     limits = case.line.limits.model_copy(update={"steps_together": together})
     judged = replace(judged_of(case), line=case.line.model_copy(update={"limits": limits}))
     pause, most_n = round(STEP_PAUSE_S / case.line.control.period_s), limits.tension_step_max_n
-    for course in [*(one.course for one in corner_courses(judged).values()), *improvement_courses(judged).values()]:
+    for course in [*(one.course for one in programme_courses(judged).values()), *improvement_courses(judged).values()]:
         steps = np.abs(np.diff(course.tension_n, axis=0))
         lately = np.lib.stride_tricks.sliding_window_view(steps, min(pause, len(steps)), axis=0)
         assert lately.sum(axis=(1, 2)).max() <= together * most_n + 1e-9
@@ -155,7 +155,7 @@ def test_a_predictive_controller_runs_whole_on_some_corners_and_says_what_is_los
     case = case_of(gains(mpc, context), context, of)
     found = corners.check(case)
     assert refused(roller_speed.check(case)) == []
-    assert sorted(whole) == [1] * 7 + [4] * 3  # once for both rules
+    assert sorted(whole) == [1] * 6 + [4] * 4  # once for both rules
     assert found[-1].rule == "corners: what is lost"
     assert refused(found) == []
 

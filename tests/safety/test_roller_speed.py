@@ -121,7 +121,7 @@ def test_an_experiment_that_makes_rollers_run_ahead_is_refused(of, context):
 
 @pytest.mark.parametrize("fastest", [lambda *_: 1.0, lambda *_: np.nan, lambda *_: 0.2])
 def test_what_no_share_of_a_step_makes_slow_is_refused(of, context, monkeypatch, fastest):
-    monkeypatch.setattr(roller_speed, "_in_whole_steps", lambda _: {})
+    monkeypatch.setattr(roller_speed, "_in_whole_steps", lambda *_: {})
     monkeypatch.setattr(roller_speed, "_looks", lambda _: (fastest, fastest))
     found = refused(roller_speed.check(case_of(gains(design_lqi(of.task()), context), context, of)))
     assert len(found) == 1 and "no step at all keeps rollers below 0.153 m/s" in found[0]
