@@ -27,7 +27,8 @@ MOVE_S = 0.5  #: a shaped move, or longer where the line's rate asks for it
 MOVED = 0.25  #: of the largest step: more in so short a time is a matter of the torque limit
 LEAST_SPEED_M_PER_S = 0.005  #: the slowest that is looked at, where the line is to run faster
 SLOW = 0.1  #: the slow speed, of the fast one
-LONGER_S = 1.0  #: that what moves many spans stands before its tail: what still settles there is no oscillation
+BETWEEN_S = 2.0  #: that a course stands between its changes, at most
+LONGER_S = 1.0  #: that steps stand before their tail: what still settles there is no oscillation
 TURN_S = 0.25  #: from one step to that of the next span
 ROOM = 1.0 / 3.0  #: of a step, to the set-points' limits
 OTHERS_LOW = "some step, the others low"
@@ -144,13 +145,13 @@ def corner_courses(judged: Judged, lasting_s: float = 2.5, tail_s: float = 1.5) 
     some = judged.some(spans)
     period_s, fast, slow = judged.line.control.period_s, judged.fast_m_per_s, judged.slow_m_per_s
     now, before = judged.tension_n, judged.before_m_per_s
-    longer_s = LONGER_S if tail_s > 0.0 else 0.0
 
-    def of(first: tuple[FloatArray, float], second: tuple[FloatArray, float], longer_s: float = 0.0) -> Course:
-        parts = [(STAND_S, *first), (lasting_s, *second), (lasting_s + longer_s, *first)]
+    def of(first: tuple[FloatArray, float], second: tuple[FloatArray, float], longer_s: float) -> Course:
+        parts = [(STAND_S, *first), (min(lasting_s, BETWEEN_S), *second), (lasting_s + longer_s, *first)]
         return course_through(period_s, parts, tail_s)
 
-    found: CornerCourses = {"speed change": CornerCourse(of((now, fast), (now, before)))}
+    longer_s = LONGER_S if tail_s > 0.0 else 0.0
+    found: CornerCourses = {"speed change": CornerCourse(of((now, fast), (now, before), 0.0))}
     if judged.tension_step_n > 0.0:
         every_other = (SLOW_ALONE, slow, spans[::2]), (FAST_ALONE, fast, spans[1::2] or spans)
         for name, speed, some_of in every_other:
@@ -158,8 +159,9 @@ def corner_courses(judged: Judged, lasting_s: float = 2.5, tail_s: float = 1.5) 
             for at, span in enumerate(alone):
                 low, high = judged.some([span])
                 found[f"span {span + 1} {name}"] = CornerCourse(
-                    of((low, speed), (high, speed)), at, len(alone), late=name == SLOW_ALONE and at == len(alone) // 2
-                )
+                    of((low, speed), (high, speed), longer_s), at, len(alone),
+                    late=name == SLOW_ALONE and at == len(alone) // 2,
+                )  # fmt: skip
         found["one after another"] = CornerCourse(
             course_through(period_s, _in_turn(judged, lasting_s, longer_s), tail_s)
         )
@@ -179,7 +181,7 @@ def programme_courses(judged: Judged, lasting_s: float = 2.5, tail_s: float = 1.
         return found
     up, fast = low.copy(), judged.fast_m_per_s
     up[spans] = high[spans]
-    parts = [(STAND_S, low, fast), (lasting_s, up, fast), (lasting_s, low, fast)]
+    parts = [(STAND_S, low, fast), (min(lasting_s, BETWEEN_S), up, fast), (lasting_s, low, fast)]
     course = course_through(judged.line.control.period_s, parts, tail_s)
     return found | {OTHERS_LOW: CornerCourse(course, late=False)}
 
@@ -198,7 +200,7 @@ def _in_turn(judged: Judged, lasting_s: float, longer_s: float) -> list[tuple[fl
         for i in np.flatnonzero(high != low)[::-1].tolist():
             now = np.where(np.arange(len(now)) == i, goal, now)
             parts.append((TURN_S, now, judged.fast_m_per_s))
-        parts[-1] = (lasting_s, now, judged.fast_m_per_s)
+        parts[-1] = (min(lasting_s, BETWEEN_S), now, judged.fast_m_per_s)
     parts[-1] = (lasting_s + longer_s, now, judged.fast_m_per_s)
     return parts
 

@@ -10,6 +10,7 @@ from tests.independent.runs import Case, Glide
 from tests.independent.truth import FloatArray, Truth, equilibrium
 
 LEAST_N, MOST_N = 12.0, 44.0  #: set-points
+SETPOINTS_N = (28.0, 36.0, 20.0, 40.0, 24.0, 32.0)
 TAIL_S, STANDS_S = 2.0, 4.0
 MOST_TORQUE_SHARE = 0.85  #: of the limit, at the equilibria of the fastest case
 PUSH_NM = 3.0
@@ -169,10 +170,11 @@ def largest_case(line: Line, top_m_per_s: float, generator: np.random.Generator)
     """As many spans as may, any of them, by as much as may be, at the highest speed: up, and down again."""
     n, limits = line.n, line.limits
     half = 0.5 * min(limits.tension_step_max_n, MOST_N - LEAST_N)
-    middle = np.resize([28.0, 34.0, 26.0, 36.0, 27.0, 32.0], n)
+    middle = np.clip(np.resize(SETPOINTS_N, n), LEAST_N + half, MOST_N - half)
     high, low = middle.copy(), middle.copy()
     moving = generator.permutation(n)[: max(1, min(n, int(limits.steps_together)))]
-    high[moving], low[moving] = 30.0 + half, 30.0 - half
+    high[moving] += half
+    low[moving] -= half
     return Course(line, low, top_m_per_s).stand(0.5).step(high).stand(2.5).step(low).case("largest")
 
 
@@ -181,7 +183,7 @@ def measuring_cases(line: Line, top_m_per_s: float) -> list[Case]:
     n, limits = line.n, line.limits
     slow, middle = min(0.01, 0.3 * top_m_per_s), 0.5 * top_m_per_s
     rise = min(limits.speed_step_max_m_per_s, top_m_per_s - slow)
-    base = np.resize([28.0, 36.0, 20.0, 40.0, 24.0, 32.0], n)
+    base = np.resize(SETPOINTS_N, n)
     high, low, shaped = base.copy(), base.copy(), base.copy()
     high[n // 2 - 1 if n > 1 else 0] += min(limits.tension_step_max_n, 22.0)
     low[1 % n] -= min(limits.tension_step_max_n, 20.0)
