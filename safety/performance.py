@@ -13,6 +13,7 @@ from gateway.core.controller import Controller
 from gateway.core.signals import FloatArray
 from gateway.core.theta import Noise
 from gateway.core.verdict import ScenarioFigures
+from safety import programme
 from safety.case import Case
 from safety.simulated import judged_of, setup_of
 
@@ -30,6 +31,7 @@ class Figures:
     effort_n2m2s: float
 
 
+LOST = Figures(inf, inf, inf, inf)
 Performance = dict[str, Figures]  #: by the name of the course
 
 
@@ -82,7 +84,8 @@ def _performances(case: Case) -> dict[Whose, Performance]:
     if context.baseline is not None:
         same = context.baseline == context.in_service
         found["baseline"] = found["in service"] if same else performance(context.baseline, case)
-    found["proposed"] = performance(case.controller, case)
+    lost = programme.fails_in_small(case)
+    found["proposed"] = dict.fromkeys(found["in service"], LOST) if lost else performance(case.controller, case)
     return found
 
 

@@ -36,13 +36,11 @@ def in_small(case: Case) -> dict[str, Rollouts]:
     return case.once("programme in small moves", _in_small)
 
 
-def falls_in_small(case: Case) -> bool:
-    """Whether it leaves the band in small moves already: then large ones, which take many seconds, decide nothing."""
-    limits = case.line.limits
-    return not all(
-        found.tension_min_n.min() >= limits.tension_min_n and found.tension_max_n.max() <= limits.tension_max_n
-        for found in in_small(case).values()
-    )
+def fails_in_small(case: Case) -> bool:
+    """Whether a programme is refused for its small moves: then what takes it many seconds decides nothing."""
+    if not isinstance(case.controller, MpcConfig):
+        return False
+    return case.once("programme fails in small moves", _fails_in_small)
 
 
 def by_itself(case: Case) -> dict[str, Rollouts]:
@@ -67,6 +65,18 @@ def in_courses(case: Case, courses: CornerCourses) -> dict[str, Rollouts]:
         plants = plants_under_stress([kept[i] for i in order], case.line.gate, case.seed)
         found[name] = simulate(case.controller, plants, one.course, setup)
     return found
+
+
+def _fails_in_small(case: Case) -> bool:
+    limits, gate, spans = case.line.limits, case.line.gate, case.tension_spans
+    return not all(
+        found.tension_min_n.min() >= limits.tension_min_n
+        and found.tension_max_n.max() <= limits.tension_max_n
+        and found.tail_swing_n[:, spans].max() <= gate.tail_oscillation_max_n
+        and found.tail_error_n[:, spans].max() <= gate.tail_error_max_n
+        and found.chatter_nm.max() <= gate.chatter_max_nm
+        for found in in_small(case).values()
+    )
 
 
 def _by_itself(case: Case) -> dict[str, Rollouts]:

@@ -88,7 +88,7 @@ def _of_mpc(case: Case, config: MpcConfig) -> Worst:
         worst.take(found, f"{name}, small", case.tension_spans)
         for late in _late(case, unconstrained(config), courses[name]):
             worst.take(late, f"{name}, small, late", case.tension_spans)
-    if not programme.falls_in_small(case):
+    if not programme.fails_in_small(case):
         for name, found in programme.by_itself(case).items():
             worst.take(found, name, case.tension_spans)
     return worst
@@ -141,8 +141,8 @@ def _of_corners(case: Case) -> RuleFinding:
 def _lost(case: Case) -> list[RuleFinding]:
     if not isinstance(case.controller, MpcConfig):
         return []
-    if programme.falls_in_small(case):
-        return [told("corners: what is lost", True, "small moves leave the band already: no large ones were looked at")]
+    if programme.fails_in_small(case):
+        return [told("corners: what is lost", True, "it is refused for its small moves: no large ones were looked at")]
     text = (
         f"the programme itself was simulated on {programme.WHOLE} corners, and for shorter; on the others only small "
         "moves, by the law that it is where no limit is reached: how it plans at its limits there has not been seen"

@@ -17,6 +17,7 @@ from gateway.control.judged_courses import corner_courses, improvement_courses
 from gateway.control.rollout import Course, plants_of_thetas, simulate
 from gateway.core.controller_laws import MpcConfig
 from gateway.core.verdict import RuleFinding
+from safety import programme
 from safety.case import Case
 from safety.findings import at_most, told
 from safety.performance import Figures, performances
@@ -29,6 +30,11 @@ CORNERS, CORNERS_MPC = 8, 2  #: a predictive controller takes its time
 
 def check(case: Case) -> list[RuleFinding]:
     """C_safe, P_improved, S_robust, and their conjunction."""
+    if programme.fails_in_small(case):
+        names = ("C_safe", "P_improved", "S_robust", "approve")
+        return [
+            told(f"paper: {name}", False, "not looked at: it is refused for its small moves already") for name in names
+        ]
     found = [_safe(case), _improved(case), _robust(case)]
     passed = all(one.passed for one in found)
     return [*found, told("paper: approve", passed, f"the paper's filter would {'approve' if passed else 'reject'} it")]

@@ -54,8 +54,8 @@ class Let:
 
 def check(case: Case) -> list[RuleFinding]:
     """The fastest roller on the corners: a first configuration's as the monitor has it, else where torque goes off."""
-    if isinstance(case.controller, MpcConfig) and programme.falls_in_small(case):
-        return [told(RULE, False, "not looked at: in small moves already tensions leave their band")]
+    if programme.fails_in_small(case):
+        return [told(RULE, False, "not looked at: it is refused for its small moves already")]
     found, limits = steps_let(case), envelope_limits(case.line)
     if not all(np.isfinite(list(found.share.values()))):
         return [told(RULE, False, _too_quick(case, "no step at all"))]

@@ -9,7 +9,7 @@ from gateway.control.design import MpcWeights, design_mpc
 from gateway.control.judged_courses import OTHERS_LOW, corner_courses, programme_courses
 from gateway.control.rollout import course_through, plants_of_thetas, simulate
 from safety import corner_runs, programme
-from safety.rules import corners, roller_speed
+from safety.rules import corners, improvement, paper, roller_speed
 from safety.simulated import judged_of, setup_of
 from tests.safety.case_support import case_of, gains, refused
 from tests.safety.test_gate_corners import rollouts
@@ -52,7 +52,9 @@ def test_where_small_moves_leave_the_band_large_ones_are_not_looked_at(of, conte
     monkeypatch.setattr(programme, "by_itself", lambda _: pytest.fail("large moves"))
     found = corners.check(case)
     assert "no large ones" in found[-1].text and refused(found)
-    assert "not looked at" in refused(roller_speed.check(case))[0]
+    for rule in (roller_speed, paper):
+        assert all("not looked at" in text for text in refused(rule.check(case)))
+    assert {text.split(":")[1].split(",")[0] for text in refused(improvement.check(case))} == {" without end", " never"}
 
 
 def test_a_first_predictive_configuration_is_looked_at_on_all_corners(of, clear, monkeypatch):
