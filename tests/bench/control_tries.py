@@ -17,7 +17,7 @@ from gateway.control.design import DesignTask
 from gateway.control.law import Measured
 from gateway.control.laws import ENDLESS_S
 from gateway.control.mpc import Mpc
-from gateway.control.mpc_problem import MpcProblem
+from gateway.control.mpc_problem import CLEAR, MpcProblem
 from gateway.control.mpc_solver import MpcSolver
 from gateway.control.reference import Steady
 from gateway.control.rollout import Setup, limited, rk4
@@ -228,14 +228,17 @@ class SparseForm:
         lower, upper = [start, met.lower[: 2 * m]], [start, met.upper[: 2 * m]]
         if config.weight_tension_limit > 0.0:
             blocks = len(config.blocks)
-            least = np.tile(np.minimum(config.tension_min_n, met.setpoint_n) - met.setpoint_n, blocks)
-            most = np.tile(config.tension_max_n - met.setpoint_n, blocks)
-            lower += [least]
-            upper += [most]
+            clear = CLEAR * (config.tension_max_n - config.tension_min_n)
+            lower += [np.tile(np.minimum(config.tension_min_n - met.setpoint_n, -clear), blocks)]
+            upper += [np.tile(np.maximum(config.tension_max_n - met.setpoint_n, clear), blocks)]
         return np.concatenate(lower), np.concatenate(upper)
 
     def first(self, solution: FloatArray) -> FloatArray:
         return solution[self._states : self._states + self._n]
+
+    def slack_n(self, solution: FloatArray) -> FloatArray:
+        """By which tensions leave their band; none where nothing is made of it."""
+        return solution[self._states + self._m :]
 
 
 def _height(row: list[Any]) -> int:
