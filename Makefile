@@ -31,7 +31,7 @@ test: $(VENV)/.compiled ## set up, then all tests but the long ones: those about
 	@$(PY) -m pytest -m "realtime and not long" $(ARGS) || [ $$? -eq 5 ]  # 5: none of them was asked for
 	@$(PY) -m pytest -m "not realtime and not long" $(PARALLEL) $(ARGS) || [ $$? -eq 5 ]
 
-test-long: $(VENV)/.compiled ## the demonstration, whole chains through the gate, comparisons with other libraries (about 4 min)
+test-long: $(VENV)/.compiled ## the demonstration, whole chains through the gate, comparisons with other libraries (about 3 min)
 	@$(PY) -m pytest -m "long and realtime" $(ARGS) || [ $$? -eq 5 ]
 	@$(PY) -m pytest -m "long and not realtime" $(PARALLEL) $(ARGS) || [ $$? -eq 5 ]
 
