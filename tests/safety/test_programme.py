@@ -81,3 +81,9 @@ def test_rollers_of_a_programme_that_torque_holds_on_no_corner_are_refused_with_
 def test_weights_may_let_the_plan_leave_its_band_more_readily(of, clear):
     assert clear.weight_tension_limit == 100.0
     assert design_mpc(of.task(), MpcWeights(tension_limit_per_n2=1.0)).weight_tension_limit == 1.0
+
+
+def test_a_linear_law_has_no_programme(case):
+    assert not programme.fails_in_small(case)
+    with pytest.raises(TypeError, match="lqi has no programme"):
+        programme.in_small(case)
