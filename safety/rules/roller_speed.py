@@ -59,9 +59,8 @@ def check(case: Case) -> list[RuleFinding]:
     found, limits = steps_let(case), envelope_limits(case.line)
     if not all(np.isfinite(list(found.share.values()))):
         return [told(RULE, False, _too_quick(case, "no step at all"))]
-    single = (
-        min((share for name, share in found.share.items() if SLOW_ALONE in name), default=1.0) * case.tension_step_n
-    )
+    alone = [share for name, share in found.share.items() if SLOW_ALONE in name]
+    single = case.tension_step_n * min(alone, default=1.0)
     if single < min(LEAST_STEP_N, case.tension_step_n):
         return [told(RULE, False, _too_quick(case, f"a step of {single:.2g} N of one span"))]
     name, value = max(found.fastest_m_per_s.items(), key=lambda pair: pair[1])

@@ -47,10 +47,12 @@ class Gateway:
             assert self.loop.runs == what["before"] == base, "it was made for another configuration"
 
     def begin(self) -> None:
-        clock = lambda: self.loop.now_s  # noqa: E731
-        book = book_of(self.audit.records)
+        book, clock = book_of(self.audit.records), self._now_s
         args = (self.audit, self.loop, self.judge, self.surroundings, lambda proposal, verdict: None, clock, clock)
         self.deployer = Deployer(self.line, book, *args)
+
+    def _now_s(self) -> float:
+        return self.loop.now_s
 
     async def propose(self, one):
         self.proposals[hash_of(one)] = one
