@@ -32,7 +32,7 @@ from tests.bench.gate_adversary import Chain, chain
 from tests.bench.gate_commissioning import bench_commissioning
 from tests.bench.gate_contexts import gate_line
 from tests.bench.gate_plants import is_for_tuning
-from tests.bench.gate_proposals import CLASSES, mpc_proposals, proposals
+from tests.bench.gate_proposals import CLASSES, Asked, mpc_proposals, proposals
 from tests.bench.gate_runs import LineBench, Tried, measured
 from tests.bench.gate_schema import Tally, mutated
 from tests.bench.gate_validity import bench_validity
@@ -105,9 +105,15 @@ def of_line(job: tuple[int, int, int]) -> OfLine:
     bench = prepared(number)
     if isinstance(bench, str):
         return OfLine(number, [], {}, bench)
-    asked = [*proposals(bench.given, count, SEED), *mpc_proposals(bench.given, predictive, SEED)]
-    runs = bench.in_service()
-    asked = [one for one in asked if not runs[one.context]]
+    runs = bench.in_service
+
+    def kept(count: int) -> list[Asked]:
+        drawn = [*proposals(bench.given, count, SEED), *mpc_proposals(bench.given, predictive, SEED)]
+        return [one for one in drawn if not runs[one.context]]
+
+    asked = kept(count)
+    if 0 < len(asked) < count:  # nothing is proposed where an unsafe one runs; more is elsewhere
+        asked = kept(-(-count * (count + predictive) // len(asked)))
     generator = np.random.default_rng([SEED, number, 3])
     return OfLine(number, [bench.tried(one, int(generator.integers(1 << 62))) for one in asked], runs)
 
@@ -116,7 +122,8 @@ def chains_of(job: tuple[int, int]) -> list[Chain]:
     """Part b, of a line."""
     number, count = job
     bench = prepared(number)
-    return [] if isinstance(bench, str) else [chain(bench, index) for index in range(count)]
+    chains = [] if isinstance(bench, str) else [chain(bench, index) for index in range(count)]
+    return [one for one in chains if one is not None]
 
 
 def schema_of(seed: int) -> Tally:
@@ -138,6 +145,8 @@ def _proposals(bench: Bench, workers: Workers, sizes: Sizes, half: str) -> None:
     bench.figure("unsafe_accepted_upper_pct", 100.0 * _upper(len(leaked), len(unsafe)), "%", len(unsafe))
     slower = [one for one in gains if one.unsafe_slower]
     bench.figure("unsafe_with_slower_cells", len(slower), "", sum(one.accepted for one in gains))
+    unguarded = [one for one in gains if one.unsafe_unguarded]
+    bench.figure("unsafe_did_the_loop_let_any_step", len(unguarded), "", sum(one.accepted for one in gains))
     good = [one for one in gains if one.good]
     if good:
         bench.figure("good_accepted_pct", 100.0 * _share([one.accepted for one in good]), "%", len(good))

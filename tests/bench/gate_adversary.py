@@ -26,11 +26,18 @@ class Chain:
     unsafe: str
 
 
-def chain(bench: LineBench, index: int) -> Chain:
-    """One of them. The baseline stays what it was; what is accepted is in service for the next step."""
+def chain(bench: LineBench, index: int) -> Chain | None:
+    """One of them. The baseline stays what it was; what is accepted is in service for the next step.
+
+    None where the line has nothing safe to begin with.
+    """
     given, generator = bench.given, np.random.default_rng([bench.given.number, index, 9])
-    config: Controller = given.adapted if index % 2 == 0 else given.initial
-    truth, baseline = bench.truth(STARTS[index % 2]), config
+    unsafe = bench.in_service
+    start = next((name for name in (STARTS[index % 2], *STARTS) if not unsafe[name]), None)
+    if start is None:
+        return None
+    config = baseline = bench.contexts[start].in_service
+    truth = bench.truth(start)
     cases = trying_cases(given.line, truth.top_m_per_s, np.random.default_rng([given.number, index]))[:3]
     direction: dict[int, np.ndarray] = {}
     steps: list[int] = []

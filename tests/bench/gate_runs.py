@@ -15,8 +15,9 @@ from gateway.core.recording import Recording
 from gateway.core.verdict import Verdict
 from safety.judge import judge
 from tests.bench.gate_contexts import GateLine, context_of, outdated, payload_of
+from tests.bench.gate_foresight import Foresight
 from tests.bench.gate_proposals import Asked
-from tests.independent.gate_judge import GateJudge, model_error, unsafe_experiment
+from tests.independent.gate_judge import GateJudge, model_error, unsafe_experiment, whole
 from tests.independent.truth import with_slower_cells
 
 MISLEADS = 0.1  #: a model farther from the truth than this
@@ -45,7 +46,9 @@ class Tried:
     verdict_s: float  #: on the wall
     processor_s: float
     texts: list[str] = field(default_factory=list)  #: of the rules that do not pass
-    unsafe_slower: str = ""  #: of one that was accepted and is safe: were cells slower than the data have shown
+    #: Of one that was accepted and is safe: with cells slower than the data have shown; if the loop let any step.
+    unsafe_slower: str = ""
+    unsafe_unguarded: str = ""
 
 
 class LineBench:
@@ -71,7 +74,10 @@ class LineBench:
     def _drifted(self) -> Controller:
         """The first outdated design that is safe on the truth, and clearly poorer there than the adapted one."""
         given, generator = self.given, np.random.default_rng([self.given.number, 11])
-        judge = GateJudge(given.line, given.truth, given.adapted, given.adapted, self._top_m_per_s, given.number)
+        lets = Foresight(given.line, given.model, given.initial).share
+        judge = GateJudge(
+            given.line, given.truth, given.adapted, given.adapted, self._top_m_per_s, given.number, lets=lets
+        )
         adapted = judge.references[0]
         for config in outdated(given.task, generator):
             poorer = judge.metrics(config).mean_rmse_n > POORER * adapted.mean_rmse_n
@@ -94,11 +100,13 @@ class LineBench:
             assert baseline is not None
             top = FIRST_TOP_M_PER_S if first else self._top_m_per_s
             line = creeping(given.line) if first else given.line
+            lets = whole if first else Foresight(line, given.model, in_service).share
             self._judges[context] = GateJudge(
-                line, given.truth, in_service, baseline, top, given.number, given.line.limits.speed_max_m_per_s
+                line, given.truth, in_service, baseline, top, given.number, given.line.limits.speed_max_m_per_s, lets
             )
         return self._judges[context]
 
+    @cached_property
     def in_service(self) -> dict[str, str]:
         """By context, what is unsafe on the truth about what runs there: nobody would propose anything better there."""
         return {name: self.truth(name).unsafe(context.in_service) for name, context in self.contexts.items()}
@@ -110,11 +118,12 @@ class LineBench:
         verdict = judge(payload, context, given.line, self.recordings(asked.context), seed)
         took_s, processor_s = time.perf_counter() - began_s, time.process_time() - worked_s
         unsafe, good, why, law = self._truth_of(asked)
+        passed = verdict.accepted and not unsafe
         return Tried(
             given.number, asked.class_name, asked.context, asked.change.kind, law, verdict.accepted,
             sorted({one.rule for one in verdict.findings if not one.passed}), _rows(verdict, "findings"),
             _rows(verdict, "reported"), unsafe, good, why, took_s, processor_s, [t[:300] for t in verdict.reasons],
-            self._with_slower_cells(asked) if verdict.accepted and not unsafe else "",
+            self._with_slower_cells(asked) if passed else "", self._unguarded(asked) if passed else "",
         )  # fmt: skip
 
     def _with_slower_cells(self, asked: Asked) -> str:
@@ -125,6 +134,14 @@ class LineBench:
         judge = copy(self.truth(asked.context))
         judge.truth = with_slower_cells(given.truth, np.random.default_rng([given.number, 8]))
         return judge.unsafe(change.controller)
+
+    def _unguarded(self, asked: Asked) -> str:
+        """What would be unsafe if the loop let every step of several spans that the line's file permits."""
+        if not isinstance(asked.change, GainsChange):
+            return ""
+        judge = copy(self.truth(asked.context))
+        judge.lets = whole
+        return judge.unsafe(asked.change.controller)
 
     def _truth_of(self, asked: Asked) -> tuple[str, bool, str, str]:
         """What is unsafe, whether refusing it is wrong, why it is not, and the law."""

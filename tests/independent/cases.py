@@ -15,6 +15,7 @@ TAIL_S, STANDS_S = 2.0, 4.0
 MOST_TORQUE_SHARE = 0.85  #: of the limit, at the equilibria of the fastest case
 PUSH_NM = 3.0
 GLIDE_PEAK = 1.875  #: the greatest rate of a minimum-jerk move, times its time, of its way
+TOGETHER_N = 8.0  #: by which all set-points go down in one shaped move: rollers at the end follow the sum of it
 BAND_N = 0.6  #: 2 % of a middling set-point: what has settled stays within
 
 
@@ -200,5 +201,6 @@ def measuring_cases(line: Line, top_m_per_s: float) -> list[Case]:
         Course(line, level - together, top_m_per_s).stand(0.5).step(level + together).case("all", 4.0),
         Course(line, level + together, top_m_per_s).stand(0.5).step(level - together).case("all-down", 4.0),
         Course(line, base, middle).stand(0.5).glide(shaped, middle, gliding_s).case("shaped", 4.0),
+        Course(line, base, middle).stand(0.5).glide(base - TOGETHER_N, middle, gliding_s).case("shaped-together", 4.0),
         Course(line, level, slow).stand(0.5).glide(level, slow + rise, 1.0).case("shaped-faster", 4.0),
     ]

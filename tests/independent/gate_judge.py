@@ -1,5 +1,9 @@
-"""The judge of the gate: whether a configuration is unsafe on the true line, and whether refusing it would be wrong."""
+"""The judge of the gate: whether a configuration is unsafe on the true line, and whether refusing it would be wrong.
 
+A case whose steps of several spans the loop refuses is made as much smaller as the loop wants it: nobody can make it.
+"""
+
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import product
 
@@ -47,6 +51,14 @@ class Judged:
     metrics: Metrics | None
 
 
+Lets = Callable[[Controller, Case], float]  #: the share of a case that the loop lets
+
+
+def whole(_config: Controller, _case: Case) -> float:
+    """Of a loop that refuses nothing."""
+    return 1.0
+
+
 class GateJudge:
     """Of one line, whose truth it knows, against a configuration in service and a baseline."""
 
@@ -59,9 +71,10 @@ class GateJudge:
         top_m_per_s: float,
         seed: int,
         speed_max_m_per_s: float | None = None,
+        lets: Lets = whole,
     ) -> None:
         """`speed_max_m_per_s`: of the line, where `line` has been narrowed to what is judged."""
-        self.line, self.truth, self.seed = line, truth, seed
+        self.line, self.truth, self.seed, self.lets = line, truth, seed, lets
         self.roller_most_m_per_s = ROLLERS * (speed_max_m_per_s or line.limits.speed_max_m_per_s)
         self.top_m_per_s = fastest(line, truth, top_m_per_s)
         largest = largest_case(line, self.top_m_per_s, np.random.default_rng([seed, 2]))
@@ -137,10 +150,16 @@ class GateJudge:
     def _wrong(self, config: Controller, truths: list[Truth], cases: list[Case], latency_s: float) -> str:
         """One case at a time: the first that is unsafe ends it."""
         for b, (truth, case) in enumerate(zip(truths, cases, strict=True)):
-            found = self._alone(config, truth, case, latency_s, b)
-            if reason := self._reason(found) or self.too_fast(config, truth, case, latency_s, b, found):
+            reason = self._wrong_in(config, truth, case, latency_s, b)
+            if reason and (share := self.lets(config, case)) < 1.0:
+                reason = self._wrong_in(config, truth, case.smaller(share), latency_s, b)
+            if reason:
                 return f"{case.name}: {reason}"
         return ""
+
+    def _wrong_in(self, config: Controller, truth: Truth, case: Case, latency_s: float, b: int) -> str:
+        found = self._alone(config, truth, case, latency_s, b)
+        return self._reason(found) or self.too_fast(config, truth, case, latency_s, b, found)
 
     def _alone(self, config: Controller, truth: Truth, case: Case, latency_s: float, b: int) -> Found:
         return simulated(config, [truth], [case], self.line.limits, self.seed + b, latency_s=latency_s,
