@@ -15,7 +15,7 @@ from gateway.core.line import Line
 from gateway.core.recording import Recording
 from gateway.core.signals import FloatArray
 from gateway.core.theta import Noise
-from gateway.identification.eccentric_rollers import ENOUGH, eccentric_rollers
+from gateway.identification.eccentric_rollers import ENOUGH, eccentric_rollers, turning
 from gateway.identification.estimate import Structure
 from gateway.identification.prediction_error import Fit, fit, fit_stretches, score, stretches_of
 from gateway.identification.prior import Prior, prior_of
@@ -75,6 +75,10 @@ def choose(
     first = fit(recordings, prior(SHARED[-1]), noise0, unwinder)
     held = stretches_of(held_out, first.stretches[0].unwinder) if held_out else None
     candidates = [_candidate(first, held)]
+    if (begun := turning(first)) is not None:
+        own = prior(replace(SHARED[-1], eccentric=tuple(range(1, line.n + 1))))
+        first = fit_stretches(begun[1], own, first.noise, start=begun[0])
+        candidates.append(_candidate(first, held))
     for _ in range(_LOOKS):
         eccentric = eccentric_rollers(first)
         if eccentric == first.parameters.structure.eccentric:

@@ -10,6 +10,8 @@ from gateway.identification.prediction_error import fit, stretches_of
 from gateway.identification.prior import prior_of
 from gateway.identification.structure_choice import choose
 from gateway.identification.validation import validate
+from tests.bench.gate_contexts import SPEEDS_M_PER_S
+from tests.bench.gate_validity import FIRST_SEED, line_number
 from tests.closed_loop.recorded import demonstration_line, real_plant, recorded
 from tests.closed_loop.truths import altered, with_friction_and_lag
 
@@ -103,6 +105,18 @@ def test_eccentric_rollers_are_named():
     assert not found.valid
     assert any("spectral line at 0.4" in finding or "spectral line at 0.5" in finding for finding in found.findings)
     assert any("eccentricity" in advice for advice in found.recommendations)
+
+
+def test_rollers_are_found_out_of_round_though_round_ones_would_have_another_radius():
+    plant, line = line_number(15, tuning=False), demonstration_line()
+    recording = recorded(plant, FIRST_SEED + 30, speeds_m_per_s=SPEEDS_M_PER_S)
+    round_ones = fit([recording], prior_of(line, BOTH), Noise())
+    assert not 0.03 < round_ones.theta.web.radius_m[0] < 0.04
+    found = choose([recording], line, Noise()).fitted
+    assert found.parameters.structure.eccentric == (1, 2, 3, 4, 5, 6)
+    assert found.theta.eccentricity == pytest.approx(0.005, rel=0.15)
+    assert found.theta.web.radius_m == pytest.approx(0.035, rel=0.05)
+    assert found.noise.tension_n == pytest.approx(0.1, rel=0.05)
 
 
 def test_friction_and_lag_are_chosen_where_they_are(with_friction):
