@@ -14,13 +14,13 @@ from gateway.core.signals import BoolArray, CountArray, FloatArray
 from gateway.identification.prediction_error import SWING_SD, Fit, NormalEquations, normal_equations
 
 ENOUGH = 3.0  #: log evidence, 20 to 1, for each roller
-IN_STEP_RAD = 0.6  #: between neighbouring radii, of the longest turn in the data
+IN_STEP_RAD = 0.6  #: between neighbouring radii, of the longest turn in the data; more where that were too many
 FAR = 3.0  #: standard deviations of the prior to which radii are looked at
 LEAST_RADII, MOST_RADII = 3, 61
 AT_ONE_RADIUS = ("radius_m", "inertia_kg_m2", "friction_nms_per_rad")  #: what else goes with it, so that R/J, f/J stay
 
 
-def turning(fitted: Fit) -> tuple[FloatArray, list[Stretch]] | None:
+def with_swings(fitted: Fit) -> tuple[FloatArray, list[Stretch]] | None:
     """Where a fit with eccentric rollers may begin: log-parameters (p,), and the stretches with their swings.
 
     At the radius, one factor for all, at which swings have most evidence. None where they have not enough at any.

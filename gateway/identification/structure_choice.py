@@ -15,7 +15,7 @@ from gateway.core.line import Line
 from gateway.core.recording import Recording
 from gateway.core.signals import FloatArray
 from gateway.core.theta import Noise
-from gateway.identification.eccentric_rollers import ENOUGH, eccentric_rollers, turning
+from gateway.identification.eccentric_rollers import ENOUGH, eccentric_rollers, with_swings
 from gateway.identification.estimate import Structure
 from gateway.identification.prediction_error import Fit, fit, fit_stretches, score, stretches_of
 from gateway.identification.prior import Prior, prior_of
@@ -75,10 +75,13 @@ def choose(
     first = fit(recordings, prior(SHARED[-1]), noise0, unwinder)
     held = stretches_of(held_out, first.stretches[0].unwinder) if held_out else None
     candidates = [_candidate(first, held)]
-    if (begun := turning(first)) is not None:
+    if (begin := with_swings(first)) is not None:
+        logs, swung = begin
         own = prior(replace(SHARED[-1], eccentric=tuple(range(1, line.n + 1))))
-        first = fit_stretches(begun[1], own, first.noise, start=begun[0])
-        candidates.append(_candidate(first, held))
+        every = fit_stretches(swung, own, first.noise, start=logs)
+        if every.evidence > first.evidence:
+            first = every
+            candidates.append(_candidate(first, held))
     for _ in range(_LOOKS):
         eccentric = eccentric_rollers(first)
         if eccentric == first.parameters.structure.eccentric:
@@ -89,7 +92,9 @@ def choose(
     eccentric, stretches = first.parameters.structure.eccentric, first.stretches
     for structure in SHARED[:-1]:
         own = prior(replace(structure, eccentric=eccentric))
-        candidates.append(_candidate(fit_stretches(stretches, own, first.noise), held))
+        # Swings belong to a radius: from the prior's a fit would not come back to them.
+        start = own.parameters.logs(first.parameters.theta(first.logs)) if eccentric else None
+        candidates.append(_candidate(fit_stretches(stretches, own, first.noise, start=start), held))
     best = _chosen(candidates)
     own = prior(replace(best.structure, per_roller=True))
     start = own.parameters.logs(best.fitted.parameters.theta(best.fitted.logs))

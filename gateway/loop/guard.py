@@ -66,11 +66,10 @@ class Guard:
         """What would come of set-points (n,), and an unwinder's speed, at once; empty: nothing that is not allowed.
 
         `against` would stop the line for it, or give up the law that runs. Without a prediction nothing is foreseen.
-        On probation it is the fallback of which it is foreseen, as if it took over with the step.
         """
         running = configurations.running
         recovery = running.recovery
-        if recovery is None or path.state is None:
+        if recovery is None or configurations.probation is not None or path.state is None:
             return ""
         remembered = memory(path.state) if recovery.fallback == running.hash else None
         in_flight, sent = self._sent_nm[1 : 1 + recovery.depth], self._sent_nm[0]

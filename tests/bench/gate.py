@@ -6,7 +6,8 @@
     d  new lines commissioned through the gate, from the line's file to the highest speed (only where it is asked for)
     e  models held against new data of their own line, with friction, lag and eccentric rollers
 
-The truth is told by tests/independent, which shares nothing with the gate. Known good is what is safe there in every
+The truth is told by tests/independent, which shares nothing with the gate; only what the loop refuses to do at once is
+told by the product. Known good is what is safe there in every
 case, 4 ms later too and under the rules' own stress around the truth, in no metric worse than what is in service and
 than the baseline, and by 3 % better in one (docs/gate.md). In half of the contexts what is in service is tuned, in the
 others poor but safe. Lines are made once for a state of the code, and kept in out/bench/gate-lines.
@@ -40,6 +41,7 @@ from tests.bench.workers import Workers
 
 PARTS, ASKED_FOR = "abce", "d"  #: of the latter only what is named
 SEED = 6100
+DRAWS = 8  #: of proposals for a line, at most
 CANDIDATES = 60  #: numbers of lines from which those are taken that the file's own controller holds
 PAPER_RULE = "paper: approve"
 PIECE = 20_000  #: mutations that a worker makes at a time
@@ -105,17 +107,16 @@ def of_line(job: tuple[int, int, int]) -> OfLine:
     bench = prepared(number)
     if isinstance(bench, str):
         return OfLine(number, [], {}, bench)
-    runs = bench.in_service
-
-    def kept(count: int) -> list[Asked]:
-        drawn = [*proposals(bench.given, count, SEED), *mpc_proposals(bench.given, predictive, SEED)]
-        return [one for one in drawn if not runs[one.context]]
-
-    asked = kept(count)
-    if 0 < len(asked) < count:  # nothing is proposed where an unsafe one runs; more is elsewhere
-        asked = kept(-(-count * (count + predictive) // len(asked)))
+    unsafe = {context: bench.unsafe_in_service(context) for context in bench.contexts}
+    asked: list[Asked] = []
+    for draw in range(DRAWS):  # nothing is proposed where an unsafe one runs; the next draw makes up for it
+        drawn = proposals(bench.given, count - len(asked), SEED + draw)
+        drawn += mpc_proposals(bench.given, predictive, SEED) if draw == 0 else []
+        asked += [one for one in drawn if not unsafe[one.context]]
+        if len(asked) >= count:
+            break
     generator = np.random.default_rng([SEED, number, 3])
-    return OfLine(number, [bench.tried(one, int(generator.integers(1 << 62))) for one in asked], runs)
+    return OfLine(number, [bench.tried(one, int(generator.integers(1 << 62))) for one in asked], unsafe)
 
 
 def chains_of(job: tuple[int, int]) -> list[Chain]:
@@ -145,8 +146,8 @@ def _proposals(bench: Bench, workers: Workers, sizes: Sizes, half: str) -> None:
     bench.figure("unsafe_accepted_upper_pct", 100.0 * _upper(len(leaked), len(unsafe)), "%", len(unsafe))
     slower = [one for one in gains if one.unsafe_slower]
     bench.figure("unsafe_with_slower_cells", len(slower), "", sum(one.accepted for one in gains))
-    unguarded = [one for one in gains if one.unsafe_unguarded]
-    bench.figure("unsafe_did_the_loop_let_any_step", len(unguarded), "", sum(one.accepted for one in gains))
+    unguarded = [one for one in gains if one.accepted and one.unsafe_unguarded]
+    bench.figure("unsafe_if_any_step_were_let", len(unguarded), "", sum(one.accepted for one in gains))
     good = [one for one in gains if one.good]
     if good:
         bench.figure("good_accepted_pct", 100.0 * _share([one.accepted for one in good]), "%", len(good))
@@ -246,6 +247,7 @@ def _chains(bench: Bench, workers: Workers, sizes: Sizes, half: str) -> None:
     every: list[list[Chain]] = list(workers.each(chains_of, [(k, count) for k in lines], "chains"))
     found = [one for some in every for one in some]
     reached = [one for one in found if one.unsafe or max(one.badness) >= 1.0]
+    bench.figure("chains", len(found), "", len(lines))
     bench.figure("chains_unsafe", len(reached), "", len(found))
     bench.figure("chains_steps_accepted", sum(step > 0 for one in found for step in one.steps), "", len(found))
     bench.tables["chains"] = {

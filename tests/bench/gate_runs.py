@@ -17,7 +17,7 @@ from safety.judge import judge
 from tests.bench.gate_contexts import GateLine, context_of, outdated, payload_of
 from tests.bench.gate_foresight import Foresight
 from tests.bench.gate_proposals import Asked
-from tests.independent.gate_judge import GateJudge, model_error, unsafe_experiment, whole
+from tests.independent.gate_judge import GateJudge, Judged, Lets, everything, model_error, unsafe_experiment
 from tests.independent.truth import with_slower_cells
 
 MISLEADS = 0.1  #: a model farther from the truth than this
@@ -46,9 +46,8 @@ class Tried:
     verdict_s: float  #: on the wall
     processor_s: float
     texts: list[str] = field(default_factory=list)  #: of the rules that do not pass
-    #: Of one that was accepted and is safe: with cells slower than the data have shown; if the loop let any step.
-    unsafe_slower: str = ""
-    unsafe_unguarded: str = ""
+    unsafe_slower: str = ""  #: of one that was accepted and is safe: with cells slower than the data have shown
+    unsafe_unguarded: str = ""  #: if the loop let every step
 
 
 class LineBench:
@@ -57,6 +56,7 @@ class LineBench:
     def __init__(self, given: GateLine) -> None:
         self.given = given
         self._judges: dict[str, GateJudge] = {}
+        self._unsafe: dict[str, str] = {}
 
     @cached_property
     def contexts(self) -> dict[str, JudgeContext]:
@@ -74,7 +74,7 @@ class LineBench:
     def _drifted(self) -> Controller:
         """The first outdated design that is safe on the truth, and clearly poorer there than the adapted one."""
         given, generator = self.given, np.random.default_rng([self.given.number, 11])
-        lets = Foresight(given.line, given.model, given.initial).share
+        lets = self._lets(given.initial)
         judge = GateJudge(
             given.line, given.truth, given.adapted, given.adapted, self._top_m_per_s, given.number, lets=lets
         )
@@ -100,16 +100,21 @@ class LineBench:
             assert baseline is not None
             top = FIRST_TOP_M_PER_S if first else self._top_m_per_s
             line = creeping(given.line) if first else given.line
-            lets = whole if first else Foresight(line, given.model, in_service).share
+            lets = everything if first else self._lets(in_service)
             self._judges[context] = GateJudge(
                 line, given.truth, in_service, baseline, top, given.number, given.line.limits.speed_max_m_per_s, lets
             )
         return self._judges[context]
 
-    @cached_property
-    def in_service(self) -> dict[str, str]:
-        """By context, what is unsafe on the truth about what runs there: nobody would propose anything better there."""
-        return {name: self.truth(name).unsafe(context.in_service) for name, context in self.contexts.items()}
+    def _lets(self, in_service: Controller) -> Lets:
+        line, model = self.given.line, self.given.model
+        return lambda config, case: Foresight(line, model, config, in_service).let(case)
+
+    def unsafe_in_service(self, context: str) -> str:
+        """What is unsafe on the truth about what runs there: nobody would propose anything better there."""
+        if context not in self._unsafe:
+            self._unsafe[context] = self.truth(context).unsafe(self.contexts[context].in_service)
+        return self._unsafe[context]
 
     def tried(self, asked: Asked, seed: int) -> Tried:
         given, context = self.given, self.contexts[asked.context]
@@ -117,13 +122,13 @@ class LineBench:
         began_s, worked_s = time.perf_counter(), time.process_time()
         verdict = judge(payload, context, given.line, self.recordings(asked.context), seed)
         took_s, processor_s = time.perf_counter() - began_s, time.process_time() - worked_s
-        unsafe, good, why, law = self._truth_of(asked)
-        passed = verdict.accepted and not unsafe
+        found, law = self._truth_of(asked)
+        passed = verdict.accepted and not found.unsafe
         return Tried(
             given.number, asked.class_name, asked.context, asked.change.kind, law, verdict.accepted,
             sorted({one.rule for one in verdict.findings if not one.passed}), _rows(verdict, "findings"),
-            _rows(verdict, "reported"), unsafe, good, why, took_s, processor_s, [t[:300] for t in verdict.reasons],
-            self._with_slower_cells(asked) if passed else "", self._unguarded(asked) if passed else "",
+            _rows(verdict, "reported"), found.unsafe, found.good, found.why_not_good, took_s, processor_s,
+            [t[:300] for t in verdict.reasons], self._with_slower_cells(asked) if passed else "", found.unguarded,
         )  # fmt: skip
 
     def _with_slower_cells(self, asked: Asked) -> str:
@@ -135,29 +140,20 @@ class LineBench:
         judge.truth = with_slower_cells(given.truth, np.random.default_rng([given.number, 8]))
         return judge.unsafe(change.controller)
 
-    def _unguarded(self, asked: Asked) -> str:
-        """What would be unsafe if the loop let every step of several spans that the line's file permits."""
-        if not isinstance(asked.change, GainsChange):
-            return ""
-        judge = copy(self.truth(asked.context))
-        judge.lets = whole
-        return judge.unsafe(asked.change.controller)
-
-    def _truth_of(self, asked: Asked) -> tuple[str, bool, str, str]:
-        """What is unsafe, whether refusing it is wrong, why it is not, and the law."""
+    def _truth_of(self, asked: Asked) -> tuple[Judged, str]:
+        """And the law."""
         given, change = self.given, asked.change
         if isinstance(change, GainsChange):
-            found = self.truth(asked.context).of(change.controller)
-            return found.unsafe, found.good, found.why_not_good, change.controller.kind
+            return self.truth(asked.context).of(change.controller), change.controller.kind
         if isinstance(change, ModelChange):
             error = model_error(change.model, given.truth)
-            return (f"off by {100.0 * error:.0f} %" if error > MISLEADS else ""), False, "a model", "model"
+            return Judged(f"off by {100.0 * error:.0f} %" if error > MISLEADS else "", False, "a model", None), "model"
         assert isinstance(change, ExperimentChange)
         state, config = self.contexts[asked.context].state, self.contexts[asked.context].in_service
         unsafe = unsafe_experiment(
             change.experiment, given.line, given.truth, config, list(state.tension_n), state.speed_m_per_s, given.number
         )
-        return unsafe, False, "an experiment", "experiment"
+        return Judged(unsafe, False, "an experiment", None), "experiment"
 
     def judged(self, config: Controller, context: JudgeContext, seed: int) -> Verdict:
         """On gains in a context of one's own, on the line's data, where changes go through without a person."""

@@ -1,6 +1,6 @@
 """The judge of the gate: whether a configuration is unsafe on the true line, and whether refusing it would be wrong.
 
-A case whose steps of several spans the loop refuses is made as much smaller as the loop wants it: nobody can make it.
+A case that is unsafe as a whole is looked at again without those steps that the loop refuses: nobody can make them.
 """
 
 from collections.abc import Callable
@@ -49,14 +49,15 @@ class Judged:
     good: bool  #: safe with a margin, and better than what is in service: refusing it is wrong
     why_not_good: str
     metrics: Metrics | None
+    unguarded: str = ""  #: what is unsafe if the loop lets every step; then it is not good
 
 
-Lets = Callable[[Controller, Case], float]  #: the share of a case that the loop lets
+Lets = Callable[[Controller, Case], Case]  #: a case without the steps that the loop refuses
 
 
-def whole(_config: Controller, _case: Case) -> float:
+def everything(_config: Controller, case: Case) -> Case:
     """Of a loop that refuses nothing."""
-    return 1.0
+    return case
 
 
 class GateJudge:
@@ -71,7 +72,7 @@ class GateJudge:
         top_m_per_s: float,
         seed: int,
         speed_max_m_per_s: float | None = None,
-        lets: Lets = whole,
+        lets: Lets = everything,
     ) -> None:
         """`speed_max_m_per_s`: of the line, where `line` has been narrowed to what is judged."""
         self.line, self.truth, self.seed, self.lets = line, truth, seed, lets
@@ -92,16 +93,23 @@ class GateJudge:
 
     def of(self, config: Controller) -> Judged:
         """Everything that is wrong is not looked for: the first thing that is unsafe is enough."""
-        unsafe = self.unsafe(config)
-        if unsafe:
-            return Judged(unsafe, False, unsafe, None)
+        unguarded = self._wrong(config, [self.truth] * len(self.cases), self.cases, self.line.control.latency_s)
+        if unguarded:
+            unsafe = self.unsafe(config)
+            return Judged(unsafe, False, unguarded, None, unguarded)
         metrics = self.metrics(config)
         why = self._worse(metrics) or self._without_margin(config)
         return Judged("", not why, why, metrics)
 
     def unsafe(self, config: Controller) -> str:
-        """On the truth as it is."""
-        return self._wrong(config, [self.truth] * len(self.cases), self.cases, self.line.control.latency_s)
+        """On the truth as it is, in what the loop lets."""
+        latency_s = self.line.control.latency_s
+        for b, case in enumerate(self.cases):
+            if self._wrong_in(config, self.truth, case, latency_s, b):
+                reason = self._wrong_in(config, self.truth, self.lets(config, case), latency_s, b)
+                if reason:
+                    return f"{case.name}: {reason}"
+        return ""
 
     def metrics(self, config: Controller) -> Metrics:
         cases = self.measuring
@@ -150,10 +158,7 @@ class GateJudge:
     def _wrong(self, config: Controller, truths: list[Truth], cases: list[Case], latency_s: float) -> str:
         """One case at a time: the first that is unsafe ends it."""
         for b, (truth, case) in enumerate(zip(truths, cases, strict=True)):
-            reason = self._wrong_in(config, truth, case, latency_s, b)
-            if reason and (share := self.lets(config, case)) < 1.0:
-                reason = self._wrong_in(config, truth, case.smaller(share), latency_s, b)
-            if reason:
+            if reason := self._wrong_in(config, truth, case, latency_s, b):
                 return f"{case.name}: {reason}"
         return ""
 
