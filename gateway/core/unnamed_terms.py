@@ -1,4 +1,5 @@
-"""What is believed, before any data, of what a line's file does not name: Coulomb friction, lag, error of the latency.
+"""What is believed, before any data, of what a line's file does not name: Coulomb friction, lag, error of the latency,
+and how much rollers and spans of one line differ.
 
 Normal in the logarithm where a standard deviation has no unit.
 """
@@ -6,3 +7,5 @@ Normal in the logarithm where a standard deviation has no unit.
 COULOMB_SHARE, COULOMB_SD = 0.02, 1.0  #: median over the torque limit; standard deviation of the logarithm
 LAG_S, LAG_SD = 0.003, 0.7  #: median of the drives' torque lag; standard deviation of the logarithm
 LATENCY_SD_S = 0.002  #: the truth against the file's
+ROLLERS_DIFFER = 0.1  #: from what all have in common, as a fraction either way; lengths of spans likewise
+COULOMB_DIFFERS = 3.0  #: times as much

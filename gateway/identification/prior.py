@@ -8,11 +8,17 @@ import numpy as np
 from gateway.core.line import Line, Parameter
 from gateway.core.signals import FloatArray
 from gateway.core.theta import nominal_theta
-from gateway.core.unnamed_terms import COULOMB_SD, COULOMB_SHARE, LAG_S, LAG_SD, LATENCY_SD_S
+from gateway.core.unnamed_terms import (
+    COULOMB_DIFFERS,
+    COULOMB_SD,
+    COULOMB_SHARE,
+    LAG_S,
+    LAG_SD,
+    LATENCY_SD_S,
+    ROLLERS_DIFFER,
+)
 from gateway.identification.estimate import Structure
 from gateway.identification.parameters import EACH, Parameters
-
-SPREAD = 0.1  #: between rollers, as a fraction either way
 
 
 @dataclass(frozen=True)
@@ -46,7 +52,7 @@ def deviation(tolerance: float) -> float:
     return log(1.0 + tolerance) / sqrt(3.0)
 
 
-def prior_of(line: Line, structure: Structure, *, spread: float = SPREAD, with_latency: bool = False) -> Prior:
+def prior_of(line: Line, structure: Structure, *, spread: float = ROLLERS_DIFFER, with_latency: bool = False) -> Prior:
     """From the line's file: nominal values and tolerances.
 
     Where rollers differ, the tolerance is that of a factor which all have in common, and each differs from it by
@@ -64,7 +70,7 @@ def prior_of(line: Line, structure: Structure, *, spread: float = SPREAD, with_l
     if structure.coulomb:
         for row in np.flatnonzero(parameters.weights("coulomb_nm").any(axis=0)).tolist():
             logs[parameters.names[row]] = log(COULOMB_SHARE * line.limits.torque_nm)
-        _believe(parameters, covariance, "coulomb_nm", COULOMB_SD, 3.0 * deviation(spread))
+        _believe(parameters, covariance, "coulomb_nm", COULOMB_SD, COULOMB_DIFFERS * deviation(spread))
     if structure.torque_lag:
         logs["torque_lag_s"] = log(LAG_S)
         _believe(parameters, covariance, "torque_lag_s", LAG_SD, 0.0)

@@ -23,6 +23,7 @@ from gateway.core.line_model import LineModel, noise_of, theta_of
 from gateway.core.line_model_names import split_name
 from gateway.core.signals import FloatArray
 from gateway.core.theta import Noise, Theta, nominal_theta
+from gateway.core.unnamed_terms import COULOMB_DIFFERS, ROLLERS_DIFFER
 from gateway.core.verdict import RuleFinding
 from safety.believed import Unbelievable, stated
 from safety.case import Case
@@ -129,7 +130,10 @@ def derivatives(look: Look, names: Sequence[str]) -> tuple[FloatArray, FloatArra
 
 
 def prior_precision(line: Line, names: Sequence[str]) -> FloatArray:
-    """P (p, p), diagonal: uniform within the tolerance, as a variance; hardly any of what the file does not name."""
+    """P (p, p): uniform within the tolerance, as a variance; hardly any of what the file does not name.
+
+    Rollers and spans of one line have the tolerance in common, and differ by less.
+    """
     roller, span = line.rollers[0], line.spans[0]
     tolerances = {
         "stiffness_n": line.web.stiffness_n.tolerance,
@@ -138,8 +142,20 @@ def prior_precision(line: Line, names: Sequence[str]) -> FloatArray:
         "inertia_kg_m2": roller.inertia_kg_m2.tolerance,
         "friction_nms_per_rad": roller.friction_nms_per_rad.tolerance,
     }
-    deviations = [log(1.0 + tolerances.get(split_name(name)[0], UNNAMED)) / sqrt(3.0) for name in names]
-    return np.diag(1.0 / np.square(deviations))
+    families = [split_name(name)[0] for name in names]
+    covariance = np.zeros((len(names), len(names)))
+    for family in set(families):
+        rows = np.flatnonzero([family == one for one in families])
+        covariance[np.ix_(rows, rows)] = _variance(tolerances.get(family, UNNAMED))
+        if len(rows) > 1:
+            differ = COULOMB_DIFFERS if family == "coulomb_nm" else 1.0
+            covariance[rows, rows] += differ**2 * _variance(ROLLERS_DIFFER)
+    return np.asarray(np.linalg.inv(covariance), dtype=np.float64)
+
+
+def _variance(tolerance: float) -> float:
+    """Of the logarithm of what lies within this fraction either way, anywhere alike."""
+    return log(1.0 + tolerance) ** 2 / 3.0
 
 
 def _narrow_intervals(model: LineModel, names: Sequence[str], covariance: FloatArray) -> list[RuleFinding]:

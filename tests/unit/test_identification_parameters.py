@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 from gateway.core.line_file import load_line
 from gateway.core.line_template import line_template
 from gateway.core.theta import nominal_theta
-from gateway.core.unnamed_terms import COULOMB_SHARE
+from gateway.core.unnamed_terms import COULOMB_SHARE, ROLLERS_DIFFER
 from gateway.identification.estimate import Structure
 from gateway.identification.parameters import COMBINATIONS, EACH, Parameters
-from gateway.identification.prior import SPREAD, deviation, prior_after, prior_of
+from gateway.identification.prior import deviation, prior_after, prior_of
 
 LINE = load_line(line_template(4, "line.toml"), "line.toml")
 structures = st.builds(Structure, per_roller=st.booleans(), coulomb=st.booleans(), torque_lag=st.booleans())
@@ -80,7 +80,7 @@ def test_rollers_differ_from_what_they_have_in_common():
         rows = prior.parameters.weights(name)
         own = rows @ prior.covariance @ rows.T
         differ = rows[0] - rows[1]
-        assert np.sqrt(differ @ prior.covariance @ differ) == pytest.approx(np.sqrt(2.0) * deviation(SPREAD))
+        assert np.sqrt(differ @ prior.covariance @ differ) == pytest.approx(np.sqrt(2.0) * deviation(ROLLERS_DIFFER))
         assert own[0, 1] > 0.0
     assert np.linalg.eigvalsh(prior.covariance).min() > 0.0
 
