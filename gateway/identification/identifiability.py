@@ -12,9 +12,9 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from gateway.core.signals import FloatArray
+from gateway.core.unnamed_terms import deviation
 from gateway.identification.parameters import COMBINATIONS, SYMBOLS, Parameters
 from gateway.identification.prediction_error import Z95, Fit
-from gateway.identification.prior import deviation
 
 STRONG, NOTHING = 0.03, 0.7  #: standard deviation over that of the prior: up to the first, from the second on
 TAPE = 0.002  #: tolerance of a length or radius that is measured

@@ -1,7 +1,7 @@
 """What is known of the log-parameters before data: from the line's file, by measuring, or by an earlier estimate."""
 
 from dataclasses import dataclass, replace
-from math import log, sqrt
+from math import log
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from gateway.core.unnamed_terms import (
     LAG_SD,
     LATENCY_SD_S,
     ROLLERS_DIFFER,
+    deviation,
 )
 from gateway.identification.estimate import Structure
 from gateway.identification.parameters import EACH, Parameters
@@ -45,11 +46,6 @@ class Prior:
                 covariance = covariance - np.outer(gain, row @ covariance)
                 covariance = 0.5 * (covariance + covariance.T)
         return replace(self, mean=mean, covariance=covariance)
-
-
-def deviation(tolerance: float) -> float:
-    """Standard deviation of the logarithm of what lies within this fraction either way, anywhere alike."""
-    return log(1.0 + tolerance) / sqrt(3.0)
 
 
 def prior_of(line: Line, structure: Structure, *, spread: float = ROLLERS_DIFFER, with_latency: bool = False) -> Prior:

@@ -23,7 +23,7 @@ from gateway.core.line_model import LineModel, noise_of, theta_of
 from gateway.core.line_model_names import split_name
 from gateway.core.signals import FloatArray
 from gateway.core.theta import Noise, Theta, nominal_theta
-from gateway.core.unnamed_terms import COULOMB_DIFFERS, ROLLERS_DIFFER
+from gateway.core.unnamed_terms import COULOMB_DIFFERS, ROLLERS_DIFFER, deviation
 from gateway.core.verdict import RuleFinding
 from safety.believed import Unbelievable, stated
 from safety.case import Case
@@ -146,16 +146,11 @@ def prior_precision(line: Line, names: Sequence[str]) -> FloatArray:
     covariance = np.zeros((len(names), len(names)))
     for family in set(families):
         rows = np.flatnonzero([family == one for one in families])
-        covariance[np.ix_(rows, rows)] = _variance(tolerances.get(family, UNNAMED))
+        covariance[np.ix_(rows, rows)] = deviation(tolerances.get(family, UNNAMED)) ** 2
         if len(rows) > 1:
             differ = COULOMB_DIFFERS if family == "coulomb_nm" else 1.0
-            covariance[rows, rows] += differ**2 * _variance(ROLLERS_DIFFER)
+            covariance[rows, rows] += (differ * deviation(ROLLERS_DIFFER)) ** 2
     return np.asarray(np.linalg.inv(covariance), dtype=np.float64)
-
-
-def _variance(tolerance: float) -> float:
-    """Of the logarithm of what lies within this fraction either way, anywhere alike."""
-    return log(1.0 + tolerance) ** 2 / 3.0
 
 
 def _narrow_intervals(model: LineModel, names: Sequence[str], covariance: FloatArray) -> list[RuleFinding]:

@@ -47,7 +47,7 @@ class Tried:
     processor_s: float
     texts: list[str] = field(default_factory=list)  #: of the rules that do not pass
     unsafe_slower: str = ""  #: of one that was accepted and is safe: with cells slower than the data have shown
-    unsafe_unguarded: str = ""  #: if the loop let every step
+    unsafe_unguarded: str = ""  #: what is unsafe if the loop lets every step
 
 
 class LineBench:
@@ -141,7 +141,7 @@ class LineBench:
         return judge.unsafe(change.controller)
 
     def _truth_of(self, asked: Asked) -> tuple[Judged, str]:
-        """And the law."""
+        """What is true of it, and the law."""
         given, change = self.given, asked.change
         if isinstance(change, GainsChange):
             return self.truth(asked.context).of(change.controller), change.controller.kind

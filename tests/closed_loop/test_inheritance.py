@@ -10,6 +10,7 @@ from gateway.core.line_model import LineModel, model_hash
 from gateway.core.recording import Recording
 from gateway.core.signals import FloatArray
 from gateway.core.theta import Noise
+from gateway.core.unnamed_terms import deviation
 from gateway.identification.estimate import Structure
 from gateway.identification.inheritance import (
     DRIFT,
@@ -20,7 +21,7 @@ from gateway.identification.inheritance import (
 )
 from gateway.identification.model_record import Origin, model_from
 from gateway.identification.prediction_error import Fit, fit
-from gateway.identification.prior import Prior, deviation, prior_of
+from gateway.identification.prior import Prior, prior_of
 from tests.closed_loop.recorded import demonstration_line, real_plant, recorded
 from tests.closed_loop.truths import altered, true_values
 from tests.unit.model_support import CREATED

@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 from gateway.core.line_file import load_line
 from gateway.core.line_template import line_template
 from gateway.core.theta import nominal_theta
-from gateway.core.unnamed_terms import COULOMB_SHARE, ROLLERS_DIFFER
+from gateway.core.unnamed_terms import COULOMB_SHARE, ROLLERS_DIFFER, deviation
 from gateway.identification.estimate import Structure
 from gateway.identification.parameters import COMBINATIONS, EACH, Parameters
-from gateway.identification.prior import deviation, prior_after, prior_of
+from gateway.identification.prior import prior_after, prior_of
 
 LINE = load_line(line_template(4, "line.toml"), "line.toml")
 structures = st.builds(Structure, per_roller=st.booleans(), coulomb=st.booleans(), torque_lag=st.booleans())
