@@ -7,7 +7,7 @@ PARALLEL := --numprocesses auto --maxprocesses 4 --dist loadfile
 export PYTHONDONTWRITEBYTECODE :=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup run test test-long coverage system-test check types lint format bench bench-stepped bench-wire bench-processes bench-cycle bench-monitor bench-control bench-identify bench-faults bench-fuzz bench-soak bench-gate bench-lifecycle bench-audit bench-kill bench-gate-live lock clean
+.PHONY: help setup run test test-long coverage system-test check types lint format bench bench-stepped bench-wire bench-processes bench-cycle bench-monitor bench-control bench-identify bench-faults bench-fuzz bench-soak bench-gate bench-lifecycle bench-audit bench-kill bench-gate-live mutate lock clean
 
 help: ## this list
 	@echo "r2rgate: make TARGET"
@@ -42,6 +42,9 @@ system-test: setup ## a real CAN kernel and foreign protocol stacks; as root, in
 coverage: setup ## every line and branch of safety/, run by its own tests (about 3 min)
 	@$(PY) -m coverage run -m pytest tests/safety tests/unit/test_monitor.py tests/unit/test_recoverability.py
 	@$(PY) -m coverage report
+
+mutate: setup ## changes of safety/ that no test of it notices (hours; goes on where it was interrupted; ARGS="safety.envelope.*")
+	@$(PY) -m tests.mutation.mutate $(ARGS)
 
 check: setup ## lint, types, import contracts
 	@$(MAKE) --no-print-directory --jobs=2 --output-sync types lint

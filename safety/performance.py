@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 
-from gateway.control.judged_courses import improvement_courses, way_of_moves
+from gateway.control.judged_courses import Judged, improvement_courses, way_of_moves
 from gateway.control.rollout import Course, Rollouts, Setup, plants_of_thetas, simulate
 from gateway.control.shaped_run import Way, follow
 from gateway.core.controller import Controller
@@ -35,11 +35,11 @@ LOST = Figures(inf, inf, inf, inf)
 Performance = dict[str, Figures]  #: by the name of the course
 
 
-def performance(config: Controller, case: Case) -> Performance:
+def performance(config: Controller, case: Case, judged: Judged) -> Performance:
     """RMSE and effort under the model's noise; overshoot and settling without, where they are no matter of luck."""
     noisy = setup_of(case.line, case.noise, case.seed, 0.0)
     quiet = setup_of(case.line, QUIET, case.seed, 0.0)
-    plants, judged = plants_of_thetas([case.believed]), judged_of(case)
+    plants = plants_of_thetas([case.believed])
     found = {
         name: _figures(
             simulate(config, plants, course, noisy), simulate(config, plants, course, quiet), course, noisy, case
@@ -79,14 +79,31 @@ def performances(case: Case) -> dict[Whose, Performance]:
 
 
 def _performances(case: Case) -> dict[Whose, Performance]:
-    context = case.context
-    found: dict[Whose, Performance] = {"in service": performance(context.in_service, case)}
+    context, judged = case.context, judged_of(case)
+    found: dict[Whose, Performance] = {"in service": performance(context.in_service, case, judged)}
     if context.baseline is not None:
         same = context.baseline == context.in_service
-        found["baseline"] = found["in service"] if same else performance(context.baseline, case)
-    lost = programme.fails_in_small(case)
-    found["proposed"] = dict.fromkeys(found["in service"], LOST) if lost else performance(case.controller, case)
+        found["baseline"] = found["in service"] if same else performance(context.baseline, case, judged)
+    found["proposed"] = _of_proposed(case, judged, found["in service"])
     return found
+
+
+def _of_proposed(case: Case, judged: Judged, in_service: Performance) -> Performance:
+    """In the same courses."""
+    if programme.fails_in_small(case):
+        return dict.fromkeys(in_service, LOST)
+    return performance(case.controller, case, judged)
+
+
+def beside_in_service(case: Case) -> tuple[Performance, Performance]:
+    """What is in service and what is proposed, no further than the former was judged for: beyond it never runs."""
+    judged = judged_of(case)
+    known = judged.within(case.context.region)
+    if known is judged:
+        found = performances(case)
+        return found["in service"], found["proposed"]
+    in_service = performance(case.context.in_service, case, known)
+    return in_service, _of_proposed(case, known, in_service)
 
 
 def _figures(noisy: Rollouts, quiet: Rollouts, course: Course, setup: Setup, case: Case) -> Figures:

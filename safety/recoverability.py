@@ -33,8 +33,9 @@ from gateway.core.line import Line
 from gateway.core.signals import FloatArray
 from safety.limits import envelope_limits
 
-TRIED = frozenset((1, 3, 7, 15, 31))  #: periods with cut torques after which the rest is looked at in one
+MOST_TRIED = 4  #: times that the rest is looked at in one, from a period on that cut no torque
 NEAR_SETPOINT = 0.5  #: of what a set-point keeps from a limit, tensions may keep as well
+STEP_MARGINS = 1.1  #: times these margins is what tensions must keep in a step that is still to be made: noise follows
 EXCUSED = 1e-6  #: of a torque's limit and rate, for rounding
 
 
@@ -75,18 +76,18 @@ class _Way:
     """From q (with z behind it where the fallback runs already): where everything goes."""
 
     begin: FloatArray  #: (2 s + n, q), [s; d; c]
-    looks: FloatArray  #: (3n k, q), tensions, speeds and torques asked for, of each at every look
+    states: FloatArray  #: (2n k, q), tensions, then speeds, of each at every look
+    torques: FloatArray  #: (n k, q), asked for, likewise
 
 
 @dataclass(frozen=True)
 class _Loop:
     """The fallback in closed loop with the model near one speed."""
 
-    A: FloatArray  #: (s, s), without control
     B: FloatArray  #: (s, n)
     K: FloatArray  #: (n, s)
-    both: FloatArray  #: (s + n, s), [A; K]
-    onward: FloatArray  #: (3n k, 2 s), from [s; B c + d]: tensions and speeds away from equilibrium, torques less c
+    period: FloatArray  #: (s + n, s + n), [A B; K A, K B]: from [s; u] to the next s and what it asks for, less c and d
+    onward: _Way  #: from [s; B c + d]: tensions and speeds away from equilibrium, torques less c
     taking_over: _Way
     running: _Way
 
@@ -110,8 +111,6 @@ class Recovery:
         self._step_nm = limits.torque_rate_nm_per_s * watch.period_s
         draw = [i for i, span in enumerate(line.spans) if span.control == "draw"]
         self._draw = np.array(draw, dtype=np.intp)
-        self._free = np.zeros(watch.n)  #: added to a span's bounds: nobody sees the tension of a draw span
-        self._free[draw] = np.inf
         self._each: NDArray[np.int64] = np.arange(self.periods + 1, dtype=np.int64)
         self._looks = _looks(self._each, watch.n)
         # The first torque follows the one that is sent now.
@@ -149,12 +148,14 @@ class Recovery:
         torque_nm: FloatArray,
         remembered: FloatArray | None,
     ) -> Shortfall | None:
-        """What would go wrong if set-points, or the unwinder's speed, stepped to these: rollers keep some room."""
+        """What would go wrong if set-points, or the unwinder's speed, stepped to these.
+
+        A little more must be kept than `shortfall` asks for, which would stop the line for a step of its own that
+        noise has taken a tenth of a newton further.
+        """
         found, looks = self.ahead(measured, setpoint_n, in_flight_nm, torque_nm, remembered)
-        least, most = (bound.copy() for bound in self._bounds(setpoint_n))
         fastest = self._envelope.roller_speed_in_step_m_per_s(measured.unwind_speed_m_per_s)
-        least[self._n :], most[self._n :] = -fastest, fastest
-        return self._within(found, looks, least, most)
+        return self._within(found, looks, *self._kept(setpoint_n, STEP_MARGINS, fastest))
 
     def _within(
         self, found: FloatArray, looks: NDArray[np.int64], least: FloatArray, most: FloatArray
@@ -188,9 +189,8 @@ class Recovery:
             way, q = loop.taking_over, np.concatenate(known)
         else:
             way, q = loop.running, np.concatenate((*known, remembered))
-        found = way.looks.dot(q).reshape(3 * n, -1)
-        if self._never_cut(found[2 * n :], torque_nm):
-            return found[: 2 * n], self._looks
+        if self._never_cut(way.torques.dot(q).reshape(n, -1), torque_nm):
+            return way.states.dot(q).reshape(2 * n, -1), self._looks
         return self._step_by_step(loop, way.begin.dot(q), x_eq, torque_nm)
 
     def _never_cut(self, asked_nm: FloatArray, before_nm: FloatArray) -> bool:
@@ -202,34 +202,55 @@ class Recovery:
         self, loop: _Loop, begin: FloatArray, x_eq: FloatArray, before_nm: FloatArray
     ) -> tuple[FloatArray, NDArray[np.int64]]:
         """As `ahead`, with torques cut as the envelope cuts them, for as long as any is."""
-        B, n, states = loop.B, self._n, len(loop.A)
-        step_nm, most_nm = self._step_nm, self._torque_nm
-        s, constant, c = begin[:states], begin[states:], begin[2 * states :]
-        driven = B.dot(c) + begin[states : 2 * states]
-        stepped: list[FloatArray] = []
-        for k in range(self.periods + 1):
-            if k in TRIED:
-                onward = loop.onward.dot(np.concatenate((s, driven))).reshape(3 * n, -1)
-                if self._never_cut(onward[2 * n :] + c[:, None], before_nm):
-                    found = np.hstack((np.array(stepped).T, onward[: 2 * n]))
+        n, states = self._n, len(loop.B)
+        s, d, c = begin[:states], begin[states : 2 * states], begin[2 * states :]
+        constant, driven = np.concatenate((d, loop.K.dot(d) + c)), loop.B.dot(c) + d
+        now = np.concatenate((s, loop.K.dot(s) + c))  # [s; u], u as it is asked for until it is cut
+        gone: list[FloatArray] = []
+        tried = 0
+        for k in range(1, self.periods + 2):
+            cut = self._cut(now[states:], before_nm)
+            before_nm = now[states:]
+            gone.append(now)
+            now = loop.period.dot(now)
+            now += constant
+            if not cut and tried < MOST_TRIED:
+                tried += 1
+                begin = np.concatenate((now[:states], driven))
+                if self._never_cut(loop.onward.torques.dot(begin).reshape(n, -1) + c[:, None], before_nm):
+                    found = np.hstack((np.array(gone).T[: 2 * n], loop.onward.states.dot(begin).reshape(2 * n, -1)))
                     return found + x_eq[:, None], np.concatenate((self._each[:k], self._looks + k))
-            stepped.append(s[: 2 * n])
-            following = loop.both.dot(s) + constant
-            torque = np.minimum(np.maximum(following[states:], before_nm - step_nm), before_nm + step_nm)
-            before_nm = np.minimum(np.maximum(torque, -most_nm), most_nm)
-            s = following[:states] + B.dot(before_nm)
-        return np.array(stepped).T + x_eq[:, None], self._each
+        return np.array(gone).T[: 2 * n] + x_eq[:, None], self._each
+
+    def _cut(self, torque_nm: FloatArray, before_nm: FloatArray) -> bool:
+        """Cut what is asked for (n,), in place, to rate and limit; whether anything was cut."""
+        asked, step_nm, most_nm = torque_nm.tobytes(), self._step_nm, self._torque_nm
+        np.maximum(torque_nm, before_nm - step_nm, out=torque_nm)
+        np.minimum(torque_nm, before_nm + step_nm, out=torque_nm)
+        np.maximum(torque_nm, -most_nm, out=torque_nm)
+        np.minimum(torque_nm, most_nm, out=torque_nm)
+        return torque_nm.tobytes() != asked
 
     def _bounds(self, setpoint_n: FloatArray) -> tuple[FloatArray, FloatArray]:
         """What tensions and speeds (2n,) must keep."""
         setpoints = setpoint_n.tobytes()
         if setpoints != self._setpoints:
-            low = self._low_n + np.minimum(self._margin_n, NEAR_SETPOINT * (setpoint_n - self._low_n)) - self._free
-            high = self._high_n - np.minimum(self._margin_n, NEAR_SETPOINT * (self._high_n - setpoint_n)) + self._free
-            fastest = np.full(self._n, self._fastest)
-            self._least, self._most = np.concatenate((low, -fastest)), np.concatenate((high, fastest))
+            self._least, self._most = self._kept(setpoint_n, 1.0, self._fastest)
             self._setpoints = setpoints
         return self._least, self._most
+
+    def _kept(self, setpoint_n: FloatArray, margins: float, fastest_m_per_s: float) -> tuple[FloatArray, FloatArray]:
+        """Least and most of tensions, so many margins from the limits, and of speeds (2n,)."""
+        n, low_n, high_n = self._n, self._low_n, self._high_n
+        least, most = np.empty(2 * n), np.empty(2 * n)
+        np.minimum(self._margin_n, NEAR_SETPOINT * (setpoint_n - low_n), out=least[:n])
+        np.minimum(self._margin_n, NEAR_SETPOINT * (high_n - setpoint_n), out=most[:n])
+        least[:n] = low_n + margins * least[:n]
+        most[:n] = high_n - margins * most[:n]
+        if self._draw.size:  # nobody sees the tension of a draw span
+            least[self._draw], most[self._draw] = -np.inf, np.inf
+        least[n:], most[n:] = -fastest_m_per_s, fastest_m_per_s
+        return least, most
 
     def _short(self, found: FloatArray, looks: NDArray[np.int64], least: FloatArray, most: FloatArray) -> Shortfall:
         """The tension that is furthest beyond its bounds, or the speed where no tension is."""
@@ -243,8 +264,8 @@ class Recovery:
 
 
 def _looks(each: NDArray[np.int64], n: int) -> NDArray[np.int64]:
-    """Every period at the beginning, then every other one; on a longer line fewer, for each takes more."""
-    closely, stride = (10, 2) if n <= 8 else (4, n // 4)
+    """Every period at the beginning, then every third; on a longer line fewer, for each takes more."""
+    closely, stride = (8, 3) if n <= 8 else (4, n // 4)
     return np.concatenate((each[:closely], each[closely::stride]))
 
 
@@ -265,8 +286,13 @@ def _loop(node: RecoveryNode, law: LinearConfig | MpcConfig, looks: NDArray[np.i
     K[:, physical:] = form.part(form.torque, "z")
     taking_over, running = (_beginning(law, form, F, G, remembers) for remembers in (False, True))
     eye, none = np.eye(size, 2 * size), np.zeros((n, 2 * size))
-    onward = _rows(A + B @ K, eye, np.eye(size, 2 * size, size), K, none, none[:1], looks)
-    return _Loop(A, B, K, np.vstack((A, K)), onward, _way(A, B, K, taking_over, looks), _way(A, B, K, running, looks))
+    closed = A + B @ K
+    onward = _way(closed, K, (eye, np.eye(size, 2 * size, size), none, none[:1]), eye[:0], looks)
+    return _Loop(
+        B, K, np.block([[A, B], [K @ A, K @ B]]), onward,
+        *(_way(closed, K, (s, B @ c + d, c, x_eq), np.vstack((s, d, c)), looks)
+          for s, d, c, x_eq in (taking_over, running)),
+    )  # fmt: skip
 
 
 def _beginning(
@@ -287,30 +313,21 @@ def _beginning(
 
 
 def _way(
-    A: FloatArray,
-    B: FloatArray,
+    closed: FloatArray,
     K: FloatArray,
     beginning: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
+    begin: FloatArray,
     looks: NDArray[np.int64],
 ) -> _Way:
-    s, d, c, x_eq = beginning
-    return _Way(np.vstack((s, d, c)), _rows(A + B @ K, s, B @ c + d, K, c, x_eq, looks))
-
-
-def _rows(
-    closed: FloatArray,
-    s: FloatArray,
-    driven: FloatArray,
-    K: FloatArray,
-    c: FloatArray,
-    x_eq: FloatArray,
-    looks: NDArray[np.int64],
-) -> FloatArray:
-    """Tensions and speeds, then torques, at each look: s_next = closed s + driven, u = K s + c."""
+    """What s_next = closed s + driven, u = K s + c come to at each look. `beginning`: s, driven, c and x_eq."""
+    s, driven, c, x_eq = beginning
     physical, wanted = 2 * len(K), set(looks.tolist())
-    rows: list[FloatArray] = []
+    states: list[FloatArray] = []
+    torques: list[FloatArray] = []
     for k in range(int(looks[-1]) + 1):
         if k in wanted:
-            rows.append(np.vstack((s[:physical] + x_eq, K @ s + c)))
+            states.append(s[:physical] + x_eq)
+            torques.append(K @ s + c)
         s = closed @ s + driven
-    return np.stack(rows, axis=1).reshape(-1, s.shape[1])
+    width = s.shape[1]
+    return _Way(begin, np.stack(states, axis=1).reshape(-1, width), np.stack(torques, axis=1).reshape(-1, width))

@@ -207,7 +207,7 @@ async def _propose(
     what = f"{step.step}, candidate {step.rung + 1}"
     tell(f"{what}: being made")
     try:
-        change, reason = await asyncio.to_thread(changes.made, step, now, recordings, _region(shown))
+        change, reason = await asyncio.to_thread(changes.made, step, now, recordings, region_kept(shown))
     except NotOffered as refused:
         tell(f"{what}: cannot be made: {refused}")
         rung = AS_IT_IS - 1 if isinstance(refused, Exhausted) else step.rung
@@ -249,7 +249,7 @@ def _require_slow(line: Line, step: Next, now: LineNow) -> None:
         )
 
 
-def _region(shown: Sequence[ProposalShown]) -> Region | None:
+def region_kept(shown: Sequence[ProposalShown]) -> Region | None:
     """Of the configuration that was kept last."""
     kept = [one.verdict for one in shown if one.proposal.kind == "gains" and one.stage == "kept"]
     return kept[-1].region if kept and kept[-1] is not None else None

@@ -138,8 +138,8 @@ class Changes:
         if step.rung == AS_IT_IS:
             return GainsChange(controller=now.in_service), f"the configuration in service, {on}"
         if self._designed is None or not _same(self._designed[0], now):
-            shown = 0.0 if region is None else region.speed_max_m_per_s or 0.0
-            found = redesigns(self.line, now.model, now.in_service, now.tension_n, shown, self._wanted_m_per_s)
+            judged = Region() if region is None else region
+            found = redesigns(self.line, now.model, now.in_service, now.tension_n, judged, self._wanted_m_per_s)
             self._designed = now, found
         found = self._designed[1]
         if step.rung >= len(found):

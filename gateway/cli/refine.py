@@ -11,13 +11,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-from gateway.cli.commission import CannotGoOn, GateSide, Tell, put
+from gateway.cli.commission import CannotGoOn, GateSide, Tell, put, region_kept
 from gateway.cli.commission_changes import MOST_REASON, LineNow
 from gateway.cli.identify_model import model_of_found
 from gateway.commissioning.chain import OPEN_STAGES, refused_at_once
 from gateway.commissioning.redesign import redesigns
 from gateway.core.controller import config_hash
 from gateway.core.decisions import Archive, ProposalShown
+from gateway.core.deployment import Region
 from gateway.core.line import Line
 from gateway.core.line_model import LineModel, ModelRefused
 from gateway.core.messages import Reply
@@ -76,7 +77,8 @@ async def refine(line: Line, side: RefinedSide, tell: Tell = lambda text: None) 
     if tried[-1].stage != "kept":
         return Refined(False, False, f"the refined model is {tried[-1].stage}: {tried[-1].why}", tried)
     tell("the refined model is in service")
-    found = await asyncio.to_thread(redesigns, line, model, now.in_service, now.tension_n)
+    region = region_kept(shown) or Region()
+    found = await asyncio.to_thread(redesigns, line, model, now.in_service, now.tension_n, region)
     for rung, (law, controller) in enumerate(found):
         await _require_downtime(side)
         reason = f"{law.text} on the refined model"

@@ -1,9 +1,9 @@
 """Configurations on an accepted model, the one that promises most first, then calmer ones. Pure.
 
-A design is worth proposing where it does no worse on the model than the configuration in service, in any figure by
-which the gate compares the two (docs/gate.md, improvement): tracking error, overshoot and settling time in the gate's
-courses. Of those the tracking error decides. What holds on the model's corners is the gate's own to find: where it
-refuses one, the next of the ladder is a calmer one.
+A design is worth proposing where it does no worse on the model than the configuration in service, as far as that was
+judged for, in any figure by which the gate compares the two (docs/gate.md, improvement): tracking error, overshoot and
+settling time in the gate's courses. The tracking error in all that it is proposed for decides. What holds on the
+model's corners is the gate's own to find: where it refuses one, the next of the ladder is a calmer one.
 """
 
 from collections.abc import Sequence
@@ -20,6 +20,7 @@ from gateway.control.judged_courses import Judged, improvement_courses
 from gateway.control.rollout import Course, plants_of_thetas, simulate
 from gateway.core.controller import Controller
 from gateway.core.controller_laws import MpcConfig
+from gateway.core.deployment import Region
 from gateway.core.line import Line
 from gateway.core.line_model import LineModel, noise_of, theta_of
 from gateway.core.signals import FloatArray
@@ -60,28 +61,39 @@ class Figures:
     settling_s: float
 
 
+@dataclass(frozen=True)
+class Beside:
+    """What is in service, and for what it was judged."""
+
+    controller: Controller
+    region: Region
+
+
 def redesigns(
-    line: Line, model: LineModel, in_service: Controller, tension_n: Sequence[float], shown_m_per_s: float = 0.0,
+    line: Line, model: LineModel, in_service: Controller, tension_n: Sequence[float], region: Region,
     wanted_m_per_s: float = inf,
 ) -> list[tuple[Law, Controller]]:  # fmt: skip
     """At most `RUNGS`, for steps as the line's file permits and speeds up to those of the model's data.
 
-    `shown_m_per_s`: or up to a higher one that other data have shown. Predictive control is offered once it is the
-    highest that the drives hold, or `wanted_m_per_s`: on the way there it would only take the gate's time.
+    Or up to a higher one of `region`, for which the configuration in service was judged. Predictive control is offered
+    once it is the highest that the drives hold, or `wanted_m_per_s`: on the way there it would only take the gate's
+    time.
     """
+    shown_m_per_s = region.speed_max_m_per_s or 0.0
     speed = min(max(model.region.speed_to_m_per_s, shown_m_per_s), line.limits.speed_max_m_per_s)
     limits = line.limits
     judged = Judged(
         line, np.array(tension_n), speed, limits.tension_step_max_n, min(limits.speed_step_max_m_per_s, speed)
     )
     designed = _designed(line, model, speed, LAWS)
-    found = _worth(designed, in_service, line, model, judged, BRIEF_S if _slow(in_service) else LASTING_S)
+    beside = Beside(in_service, region)
+    found = _worth(designed, beside, line, model, judged, BRIEF_S if _slow(in_service) else LASTING_S)
     places = sorted({round(k * (len(found) - 1) / (LINEAR_RUNGS - 1)) for k in range(LINEAR_RUNGS)}) if found else []
     linear = [found[place] for place in places]
     if speed < NEAR * min(wanted_m_per_s, fastest_m_per_s(line, model)):
         return linear
     predictive = _designed(line, model, speed, PREDICTIVE)
-    found = _worth([*predictive, *linear[:1]], in_service, line, model, judged, BRIEF_S)
+    found = _worth([*predictive, *linear[:1]], beside, line, model, judged, BRIEF_S)
     return [*takewhile(lambda each: each not in linear, found), *linear]
 
 
@@ -95,15 +107,17 @@ def _designed(line: Line, model: LineModel, speed_m_per_s: float, laws: Sequence
 
 
 def _worth(
-    designed: Sequence[tuple[Law, Controller]], beside: Controller, line: Line, model: LineModel, judged: Judged,
+    designed: Sequence[tuple[Law, Controller]], beside: Beside, line: Line, model: LineModel, judged: Judged,
     lasting_s: float,
 ) -> list[tuple[Law, Controller]]:  # fmt: skip
-    """Those that do no worse than `beside`, the one with the least tracking error first."""
-    before = predicted(beside, line, model, judged, lasting_s)
+    """Those that do no worse than what is in service, the one with the least tracking error first."""
+    known = judged.within(beside.region)
+    before, before_known = (predicted(beside.controller, line, model, of, lasting_s) for of in (judged, known))
     found: list[tuple[float, Law, Controller]] = []
     for law, config in designed:
         figures = predicted(config, line, model, judged, lasting_s)
-        if all(_no_worse(line, figures[name], before[name]) for name in before):
+        figures_known = figures if known is judged else predicted(config, line, model, known, lasting_s)
+        if all(_no_worse(line, figures_known[name], before_known[name]) for name in before_known):
             found.append((sum(figures[name].rmse_n / max(before[name].rmse_n, 1e-9) for name in before), law, config))
     return [each[1:] for each in sorted(found, key=lambda each: each[0])]
 
@@ -139,14 +153,15 @@ def predicted(
 def _no_worse(line: Line, one: Figures, before: Figures) -> bool:
     """As the gate compares them, but with a part of its tolerances. What is no number is worse."""
     gate = line.gate
-    pairs = (
-        (one.rmse_n, before.rmse_n, gate.tolerance_n),
-        (one.overshoot_pct, before.overshoot_pct, gate.tolerance_overshoot_pct),
-        (one.settling_s, before.settling_s, gate.tolerance_settling_s),
+    rows = (
+        (one.rmse_n, before.rmse_n, gate.tolerance_n, 0.0),
+        (one.overshoot_pct, before.overshoot_pct, gate.tolerance_overshoot_pct, gate.fine_overshoot_pct),
+        (one.settling_s, before.settling_s, gate.tolerance_settling_s, 0.0),
     )
     return all(
-        value == reference or value <= reference + OF_TOLERANCE * max(gate.tolerance_share * reference, floor)
-        for value, reference, floor in pairs
+        value == reference
+        or value <= max(reference + OF_TOLERANCE * max(gate.tolerance_share * reference, floor), OF_TOLERANCE * fine)
+        for value, reference, floor, fine in rows
     )
 
 

@@ -11,7 +11,7 @@ asked of the spans before it. Three courses have a name that a promise may use:
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
@@ -19,6 +19,7 @@ import numpy as np
 from gateway.control.reference import MinimumJerk
 from gateway.control.rollout_terms import Course, course_through
 from gateway.control.shaped_run import Way
+from gateway.core.deployment import Region
 from gateway.core.line import Line
 from gateway.core.signals import FloatArray
 
@@ -48,6 +49,22 @@ class Judged:
     speed_max_m_per_s: float
     tension_step_n: float
     speed_step_m_per_s: float
+
+    def within(self, region: Region) -> "Judged":
+        """No further than `region`; itself where that is no narrower."""
+        mine = Region(
+            speed_max_m_per_s=self.speed_max_m_per_s,
+            tension_step_max_n=self.tension_step_n,
+            speed_step_max_m_per_s=self.speed_step_m_per_s,
+        )
+        if mine.within(region):
+            return self
+        return replace(
+            self,
+            speed_max_m_per_s=_least(self.speed_max_m_per_s, region.speed_max_m_per_s),
+            tension_step_n=_least(self.tension_step_n, region.tension_step_max_n),
+            speed_step_m_per_s=_least(self.speed_step_m_per_s, region.speed_step_max_m_per_s),
+        )
 
     @property
     def fast_m_per_s(self) -> float:
@@ -184,6 +201,10 @@ def programme_courses(judged: Judged, lasting_s: float = 2.5, tail_s: float = 1.
     parts = [(STAND_S, low, fast), (min(lasting_s, BETWEEN_S), up, fast), (lasting_s, low, fast)]
     course = course_through(judged.line.control.period_s, parts, tail_s)
     return found | {OTHERS_LOW: CornerCourse(course, late=False)}
+
+
+def _least(value: float, most: float | None) -> float:
+    return value if most is None else min(value, most)
 
 
 def _apart(spans: Sequence[int]) -> list[int]:

@@ -11,6 +11,7 @@ from typing import Annotated
 from pydantic import Field, ValidationError
 
 from gateway.core.controller import ControllerConfig
+from gateway.core.deployment import Region
 from gateway.core.json_problems import NotJson, document_of, problems
 from gateway.core.line import NonNegative, Positive, Strict
 from gateway.core.line_model import Digest, Instant, LineModel
@@ -50,6 +51,7 @@ class JudgeContext(Strict):
     now: Instant
     state: LineState
     in_service: ControllerConfig
+    region: Region = Region()  #: for which that was judged; what it would do beyond is no measure for others
     baseline: ControllerConfig | None = None  #: that small steps are held against; null: as in service
     model: LineModel | None = None  #: accepted, by which is judged; null: the tolerances of the line's file
     data: Annotated[list[DataReference], Field(max_length=64)] = []  #: recent, on which the model must hold

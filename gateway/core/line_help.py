@@ -168,6 +168,7 @@ HELP: dict[str, dict[str, str]] = {
         "tolerance_n": "the same of tracking errors, where that is more",
         "tolerance_settling_s": "the same of settling times",
         "tolerance_overshoot_pct": "the same of overshoot",
+        "fine_overshoot_pct": "overshoot up to which none is worse than another",
         "first_speed_max_m_per_s": "fastest speed before a model is accepted",
         "first_step_max_n": "largest set-point step before a model is accepted",
         "first_corner_share": "of the tolerances: at its corners a first configuration and an experiment are simulated",

@@ -52,10 +52,9 @@ def reference_speeds(model: WebModel, tension_n: FloatArray, unwind_speed_m_per_
 
 
 def speed_ratios(model: WebModel, tension_n: FloatArray) -> FloatArray:
-    """The same per unwinder speed: v_i / v_0, (n,)."""
-    upstream = np.concatenate(([model.tension_before_n], tension_n[:-1]))
-    ratios: FloatArray = (model.stiffness_n - upstream) / (model.stiffness_n - tension_n)
-    return np.cumprod(ratios, dtype=np.float64)
+    """The same per unwinder speed: v_i / v_0 (n,), the product of (EA - T_{k-1}) / (EA - T_k) up to k = i."""
+    ratios: FloatArray = (model.stiffness_n - model.tension_before_n) / (model.stiffness_n - tension_n)
+    return ratios
 
 
 def equilibrium_torque(model: WebModel, tension_n: FloatArray, speed_m_per_s: FloatArray) -> FloatArray:

@@ -30,6 +30,8 @@ from safety.recoverability import Recovery
 
 WARM_PERIODS = 3  #: that a law is asked before it is let near the line: first solutions take longest
 
+ROUNDING_S = 1e-9  #: a lease of twenty periods ends with the twentieth, whatever their sum is rounded to
+
 LawOf = Callable[[Controller], Law[Any]]
 
 
@@ -182,7 +184,7 @@ class Configurations:
     def look(self, now_s: float) -> None:
         """Once a period, before control."""
         probation = self.probation
-        if probation is not None and now_s >= probation.until_s:
+        if probation is not None and now_s > probation.until_s - ROUNDING_S:
             self.roll_back(f"the lease of {probation.lease_s:g} s was not renewed")
         if self._shaped and self.probation is None and self._setpoints.at_rest():
             self._shaped = False

@@ -74,4 +74,7 @@ class Guard:
         remembered = memory(path.state) if recovery.fallback == running.hash else None
         in_flight, sent = self._sent_nm[1 : 1 + recovery.depth], self._sent_nm[0]
         short = recovery.shortfall_of_step(measured, setpoint_n, in_flight, sent, remembered)
-        return "" if short is None else short.foreseen
+        if short is None:
+            return ""
+        # Under predictive control it is the linear law behind it that is looked at.
+        return str(short) if remembered is None else short.foreseen

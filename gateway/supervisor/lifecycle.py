@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import Any
 
-from gateway.core.deployment import InService
+from gateway.core.deployment import InService, Region
 from gateway.core.proposal import Kind
 
 
@@ -81,6 +81,7 @@ class Entry:
     epoch: int | None = None
     by_person: bool = False  #: approved by one, not by its verdict alone
     since_s: float | None = None  #: Unix time at which it came to its stage
+    region: Region = Region()  #: of a configuration that has been deployed: for what it was judged
 
 
 @dataclass
@@ -104,6 +105,12 @@ class Book:
     @property
     def undecided(self) -> list[Entry]:
         return [entry for entry in self.entries.values() if entry.stage in UNDECIDED]
+
+    @property
+    def region(self) -> Region:
+        """For what the configuration in service was judged when it was kept last."""
+        kept = (entry for entry in reversed(self.entries.values()) if entry.stage is Stage.KEPT)
+        return next((entry.region for entry in kept if entry.changes == self.in_service), Region())
 
     def why_not(self, kind: str, what: Mapping[str, Any]) -> str:
         """Why a record of `kind` cannot come now; empty: it can."""
@@ -152,6 +159,8 @@ class Book:
             return
         entry = self.entries[proposal]
         more = {key: what[key] for key in ("verdict", "epoch") if key in what}
+        if "region" in what:
+            more["region"] = Region.model_validate(what["region"])
         if kind == "approved":
             more["by_person"] = what.get("by", PERSON) == PERSON
         self.entries[proposal] = entry = replace(

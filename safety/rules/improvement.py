@@ -6,7 +6,7 @@ from gateway.core.line import Gate
 from gateway.core.verdict import RuleFinding
 from safety.case import Case
 from safety.findings import at_most
-from safety.performance import Figures, Performance, performances
+from safety.performance import Figures, Performance, beside_in_service, performances
 
 RULE = "improvement"
 UNITS = {"rmse_n": "N", "overshoot_pct": "%", "settling_s": "s"}
@@ -14,25 +14,32 @@ NAMES = {"rmse_n": "tracking error", "overshoot_pct": "overshoot", "settling_s":
 
 
 def check(case: Case) -> list[RuleFinding]:
-    """Of each metric the course in which it does worst, against each reference, with gate.tolerance_*."""
-    found = performances(case)
-    proposed = found["proposed"]
-    return [
-        _worst(case.line.gate, metric, whose, found[whose], proposed)
-        for whose in ("in service", "baseline")
-        if whose in found
-        for metric in UNITS
-    ]
+    """Of each metric the course in which it does worst, against each reference, with gate.tolerance_*.
+
+    Against what is in service only as far as that was judged for: where it never runs, it is no measure.
+    """
+    found, gate = performances(case), case.line.gate
+    both = beside_in_service(case)
+    findings = [_worst(gate, metric, "in service", *both) for metric in UNITS]
+    if "baseline" in found:
+        findings += [_worst(gate, metric, "baseline", found["baseline"], found["proposed"]) for metric in UNITS]
+    return findings
 
 
 def allowed(gate: Gate, metric: str, reference: float) -> float:
-    """How large a metric may be beside that of a reference."""
+    """How large a metric may be beside that of a reference, with its tolerance."""
     floor = {
         "rmse_n": gate.tolerance_n,
         "overshoot_pct": gate.tolerance_overshoot_pct,
         "settling_s": gate.tolerance_settling_s,
     }
     return reference + max(gate.tolerance_share * reference, floor[metric])
+
+
+def no_worse(gate: Gate, metric: str, reference: float) -> float:
+    """How large a metric may be for a change to be no worse than a reference."""
+    most = allowed(gate, metric, reference)
+    return max(most, gate.fine_overshoot_pct) if metric == "overshoot_pct" else most
 
 
 def value_of(figures: Figures, metric: str) -> float:
@@ -51,8 +58,8 @@ def in_words(value: float, metric: str) -> str:
 
 def _worst(gate: Gate, metric: str, whose: str, reference: Performance, proposed: Performance) -> RuleFinding:
     pairs = [(name, value_of(proposed[name], metric), value_of(reference[name], metric)) for name in proposed]
-    name, value, before = max(pairs, key=lambda pair: _excess(pair[1], allowed(gate, metric, pair[2])))
-    limit = allowed(gate, metric, before)
+    name, value, before = max(pairs, key=lambda pair: _excess(pair[1], no_worse(gate, metric, pair[2])))
+    limit = no_worse(gate, metric, before)
     text = (
         f"{NAMES[metric]} in {name}: {in_words(value, metric)}, {whose} {in_words(before, metric)}; allowed: up to "
         f"{in_words(limit, metric)}"

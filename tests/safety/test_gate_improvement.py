@@ -6,6 +6,7 @@ from math import inf
 import pytest
 
 from gateway.control.design import design_lqi, task_of
+from gateway.core.deployment import Region
 from gateway.core.line import Span
 from safety.rules import corners, improvement, promises
 from safety.simulated import judged_of
@@ -29,6 +30,31 @@ def test_what_is_worse_than_in_service_or_than_the_baseline_is_refused(of, conte
     assert {one.rule.rsplit(", ", 1)[1] for one in found} == {"in service", "baseline"}
     assert all(one.passed for one in found if one.rule.endswith("in service"))
     assert [one.rule for one in found if not one.passed and one.rule.endswith("baseline")]
+
+
+def test_nothing_is_worse_than_what_in_service_would_do_beyond_what_it_was_judged_for(of, context, redesigned):
+    first = design_lqi(task_of(of.line))
+    better = context.model_copy(update={"in_service": redesigned})
+
+    def against(region):
+        within = better.model_copy(update={"region": region})
+        found = improvement.check(case_of(gains(first, within), within, of))
+        return {one.rule for one in found if not one.passed}
+
+    everywhere = against(Region())
+    assert "improvement: tracking error, in service" in everywhere
+    assert against(Region(speed_max_m_per_s=1.0, tension_step_max_n=1e3, speed_step_max_m_per_s=1.0)) == everywhere
+    small = Region(speed_max_m_per_s=0.01, tension_step_max_n=0.1, speed_step_max_m_per_s=0.0)
+    # What they differ by there is within the tolerances; overshoot is a share of the step.
+    assert against(small) == {"improvement: overshoot, in service"} <= everywhere
+
+
+def test_a_small_overshoot_is_no_worse_than_none_but_breaks_a_promise(of):
+    gate = of.line.gate
+    assert improvement.no_worse(gate, "overshoot_pct", 0.0) == gate.fine_overshoot_pct == 10.0
+    assert improvement.no_worse(gate, "overshoot_pct", 9.0) == pytest.approx(11.0)
+    assert improvement.no_worse(gate, "rmse_n", 2.0) == improvement.allowed(gate, "rmse_n", 2.0)
+    assert improvement.allowed(gate, "overshoot_pct", 0.0) == 2.0
 
 
 def test_a_promise_that_nobody_can_break(of, context, redesigned):

@@ -77,7 +77,7 @@ def test_the_prediction_is_what_the_law_does_with_the_model(name, size):
     x, before_nm, torque_nm = disturbed(size)
     recovery = Recovery(recovery_prediction(THETA, config, LINE, [SPEED]), config, LINE)
     found, looks = recovery.ahead(Measured(x[:6], x[6:], SPEED), TENSION_N, before_nm[None], torque_nm)
-    truth = rolled_out(config, x, before_nm, torque_nm, 100)
+    truth = rolled_out(config, x, before_nm, torque_nm, 2 * recovery.periods)
     # The model is linear near the recipe's tensions in both; a schedule's law is that of the node's speed.
     scheduled = 0.2 if name == "scheduled" else 0.0
     np.testing.assert_allclose(found[:6].T, truth[looks], atol=1e-3 * max(1.0, size / 10.0) + scheduled * size)
@@ -210,6 +210,28 @@ def test_a_step_leaves_rollers_a_tenth_of_the_room_that_the_monitor_watches():
         assert (stopped is not None) == (fastest(step_n) > watched)
     assert short is not None and "would come to" in short.foreseen and "fallback" not in short.foreseen
     assert "if the fallback took over now" in str(short) and short.allowed == pytest.approx(0.1427, abs=1e-4)
+
+
+def test_a_step_leaves_more_room_than_it_would_be_stopped_for():
+    config = LAWS["lqi"]
+    recovery = Recovery(recovery_prediction(THETA, config, LINE, [SPEED]), config, LINE)
+    v_eq = reference_speeds(THETA.web, TENSION_N, SPEED)
+    u_eq = equilibrium_torque(THETA.web, TENSION_N, v_eq)
+    measured = Measured(TENSION_N.copy(), v_eq, SPEED)
+    law = make_law(config)
+    state = law.engage(measured, Steady(TENSION_N), u_eq)
+    given = (u_eq[None], u_eq, memory(law.commit(state, law.ask(state, measured, Steady(TENSION_N)), u_eq)))
+    low_n, told = LINE.limits.tension_min_n, set()
+    for down_n in np.linspace(2.0, TENSION_N[5] - low_n - 1.0, 200):
+        asked = TENSION_N - down_n * np.eye(6)[5]
+        lowest_n = recovery.ahead(measured, asked, *given)[0][:6].min(axis=1)
+        margin_n = np.minimum(6.0, 0.5 * (asked - low_n))
+        short, stopped = (look(measured, asked, *given) for look in looks_of(recovery))
+        if (stopped or short) is None or (stopped or short).what == "span":
+            assert (stopped is not None) == bool((lowest_n < low_n + margin_n).any())
+            assert (short is not None) == bool((lowest_n < low_n + 1.1 * margin_n).any())
+        told.add((short is not None, stopped is not None))
+    assert (True, False) in told and (False, True) not in told
 
 
 def looks_of(recovery):

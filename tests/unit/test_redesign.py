@@ -6,6 +6,7 @@ import pytest
 from gateway.commissioning.candidates import Law, configuration
 from gateway.commissioning.redesign import LINEAR_RUNGS, PREDICTIVE, RUNGS, predicted, redesigns
 from gateway.control.judged_courses import Judged
+from gateway.core.deployment import Region
 from gateway.core.line_model import model_of
 from tests.unit.model_support import fields
 from tests.unit.supervisor_support import line_of
@@ -30,7 +31,7 @@ CALM = configuration(LINE, MODEL, 0.06, Law("lqi", (("torque_per_nm2", 16.0), ("
 
 @pytest.fixture(scope="module")
 def offered():
-    return redesigns(LINE, MODEL, CALM, TENSION_N)
+    return redesigns(LINE, MODEL, CALM, TENSION_N, Region())
 
 
 def test_where_data_reach_the_highest_speed_predictive_control_comes_before_the_others(offered):
@@ -38,9 +39,9 @@ def test_where_data_reach_the_highest_speed_predictive_control_comes_before_the_
     assert len(laws) <= RUNGS and laws[0] in PREDICTIVE
     predictive = [law in PREDICTIVE for law in laws]
     assert predictive == sorted(predictive, reverse=True) and 1 <= predictive.count(False) <= LINEAR_RUNGS
-    slower = redesigns(LINE, believing(0.03), CALM, TENSION_N)
+    slower = redesigns(LINE, believing(0.03), CALM, TENSION_N, Region())
     assert slower and not any(law in PREDICTIVE for law, _ in slower)
-    shown = redesigns(LINE, believing(0.03), CALM, TENSION_N, shown_m_per_s=0.06)
+    shown = redesigns(LINE, believing(0.03), CALM, TENSION_N, Region(speed_max_m_per_s=0.06))
     assert shown[0][0] in PREDICTIVE
 
 
