@@ -5,7 +5,7 @@ from pathlib import Path
 
 import grimp
 
-ROOTS = ("gateway", "drivers", "sim_plant", "safety")
+ROOTS = ("gateway", "drivers", "sim_plant", "safety", "agents")
 
 
 def room(module: str) -> str:
