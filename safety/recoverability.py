@@ -196,30 +196,36 @@ class Recovery:
     def _never_cut(self, asked_nm: FloatArray, before_nm: FloatArray) -> bool:
         """Whether torques (n, k) at the looks, after `before_nm` (n,), keep limit and rate. Most periods they do."""
         change_nm = np.abs(asked_nm - np.concatenate((before_nm[:, None], asked_nm[:, :-1]), axis=1))
-        return bool(np.abs(asked_nm).max() <= self._torque_nm and (change_nm <= self._steps_nm).all())
+        return bool(
+            np.abs(asked_nm).max() <= self._torque_nm and (change_nm <= self._steps_nm[: len(change_nm[0])]).all()
+        )
 
     def _step_by_step(
         self, loop: _Loop, begin: FloatArray, x_eq: FloatArray, before_nm: FloatArray
     ) -> tuple[FloatArray, NDArray[np.int64]]:
-        """As `ahead`, with torques cut as the envelope cuts them, for as long as any is."""
+        """As `ahead`, with torques cut as the envelope cuts them, until after some cut none is cut any more."""
         n, states = self._n, len(loop.B)
         s, d, c = begin[:states], begin[states : 2 * states], begin[2 * states :]
         constant, driven = np.concatenate((d, loop.K.dot(d) + c)), loop.B.dot(c) + d
         now = np.concatenate((s, loop.K.dot(s) + c))  # [s; u], u as it is asked for until it is cut
         gone: list[FloatArray] = []
-        tried = 0
+        tried, cut_before = 0, False
         for k in range(1, self.periods + 2):
             cut = self._cut(now[states:], before_nm)
+            cut_before |= cut
             before_nm = now[states:]
             gone.append(now)
             now = loop.period.dot(now)
             now += constant
-            if not cut and tried < MOST_TRIED:
+            if cut_before and not cut and tried < MOST_TRIED and k <= self.periods:
                 tried += 1
                 begin = np.concatenate((now[:states], driven))
-                if self._never_cut(loop.onward.torques.dot(begin).reshape(n, -1) + c[:, None], before_nm):
-                    found = np.hstack((np.array(gone).T[: 2 * n], loop.onward.states.dot(begin).reshape(2 * n, -1)))
-                    return found + x_eq[:, None], np.concatenate((self._each[:k], self._looks + k))
+                rest = int(np.searchsorted(self._looks, self.periods - k, side="right"))  # of the looks, in the horizon
+                asked = loop.onward.torques.dot(begin).reshape(n, -1)[:, :rest]
+                if self._never_cut(asked + c[:, None], before_nm):
+                    onward = loop.onward.states.dot(begin).reshape(2 * n, -1)[:, :rest]
+                    found = np.hstack((np.array(gone).T[: 2 * n], onward))
+                    return found + x_eq[:, None], np.concatenate((self._each[:k], self._looks[:rest] + k))
         return np.array(gone).T[: 2 * n] + x_eq[:, None], self._each
 
     def _cut(self, torque_nm: FloatArray, before_nm: FloatArray) -> bool:
@@ -265,7 +271,7 @@ class Recovery:
 
 def _looks(each: NDArray[np.int64], n: int) -> NDArray[np.int64]:
     """Every period at the beginning, then every third; on a longer line fewer, for each takes more."""
-    closely, stride = (8, 3) if n <= 8 else (4, n // 4)
+    closely, stride = (8, 3) if n <= 8 else (4, max(3, n // 4))
     return np.concatenate((each[:closely], each[closely::stride]))
 
 

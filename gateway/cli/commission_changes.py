@@ -48,7 +48,8 @@ class Changes:
     def __init__(self, line: Line, wanted_m_per_s: float = inf) -> None:
         self.line = line
         self._wanted_m_per_s = wanted_m_per_s
-        self._designed: tuple[LineNow, list[tuple[Law, Controller]]] | None = None  #: and what it was designed from
+        #: And what it was designed from
+        self._designed: tuple[LineNow, Region | None, list[tuple[Law, Controller]]] | None = None
         self._experiment_for: tuple[object, Experiment] | None = None  #: and what it was designed from
 
     def made(
@@ -137,11 +138,11 @@ class Changes:
         on = f"on model {model_hash(now.model)[:12]}, whose data go up to {now.model.region.speed_to_m_per_s:.3g} m/s"
         if step.rung == AS_IT_IS:
             return GainsChange(controller=now.in_service), f"the configuration in service, {on}"
-        if self._designed is None or not _same(self._designed[0], now):
+        if self._designed is None or self._designed[1] != region or not _same(self._designed[0], now):
             judged = Region() if region is None else region
             found = redesigns(self.line, now.model, now.in_service, now.tension_n, judged, self._wanted_m_per_s)
-            self._designed = now, found
-        found = self._designed[1]
+            self._designed = now, region, found
+        found = self._designed[2]
         if step.rung >= len(found):
             raise Exhausted(_nothing_left(len(found)))
         law, controller = found[step.rung]

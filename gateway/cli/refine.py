@@ -77,7 +77,8 @@ async def refine(line: Line, side: RefinedSide, tell: Tell = lambda text: None) 
     if tried[-1].stage != "kept":
         return Refined(False, False, f"the refined model is {tried[-1].stage}: {tried[-1].why}", tried)
     tell("the refined model is in service")
-    region = region_kept(shown) or Region()
+    # As fast as the newest data go: the others may be too old for the gate.
+    region = (region_kept(shown) or Region()).model_copy(update={"speed_max_m_per_s": None})
     found = await asyncio.to_thread(redesigns, line, model, now.in_service, now.tension_n, region)
     for rung, (law, controller) in enumerate(found):
         await _require_downtime(side)

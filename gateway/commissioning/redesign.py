@@ -118,7 +118,7 @@ def _worth(
         figures = predicted(config, line, model, judged, lasting_s)
         figures_known = figures if known is judged else predicted(config, line, model, known, lasting_s)
         if all(_no_worse(line, figures_known[name], before_known[name]) for name in before_known):
-            found.append((sum(figures[name].rmse_n / max(before[name].rmse_n, 1e-9) for name in before), law, config))
+            found.append((sum(_beside(figures[name].rmse_n, before[name].rmse_n) for name in before), law, config))
     return [each[1:] for each in sorted(found, key=lambda each: each[0])]
 
 
@@ -148,6 +148,11 @@ def predicted(
             settling_s=float(quiet.period_s * still.settled[0, spans].max()),
         )
     return found
+
+
+def _beside(rmse_n: float, before_n: float) -> float:
+    """How large a tracking error is; by itself where what it is held against is none, or has no end."""
+    return rmse_n / before_n if 0.0 < before_n < inf else rmse_n
 
 
 def _no_worse(line: Line, one: Figures, before: Figures) -> bool:

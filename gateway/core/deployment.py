@@ -25,6 +25,11 @@ class Region(Strict):
     tension_step_max_n: NonNegative | None = None
     speed_step_max_m_per_s: NonNegative | None = None
 
+    def and_also(self, other: "Region") -> "Region":
+        """As far as either goes."""
+        both = ((name, value, getattr(other, name)) for name, value in self.model_dump().items())
+        return Region(**{name: None if None in (a, b) else max(a, b) for name, a, b in both})
+
     def within(self, other: "Region") -> bool:
         """Whether it goes nowhere beyond `other`."""
         mine, its = self.model_dump(), other.model_dump()

@@ -204,7 +204,9 @@ class Gate(Strict):
     tolerance_n: NonNegative = 0.1  #: a floor of the same, for tracking errors
     tolerance_settling_s: NonNegative = 0.1
     tolerance_overshoot_pct: NonNegative = 2.0
-    fine_overshoot_pct: NonNegative = 10.0  #: up to it no overshoot is worse than another; half of what converges
+    fine_overshoot_pct: Annotated[float, Field(ge=0.0, le=20.0)] = (
+        10.0  #: up to it no overshoot is worse than another; half of what converges
+    )
     # A line without an accepted model
     first_speed_max_m_per_s: Positive = 0.02
     first_step_max_n: Positive = 4.0

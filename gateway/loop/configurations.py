@@ -30,7 +30,7 @@ from safety.recoverability import Recovery
 
 WARM_PERIODS = 3  #: that a law is asked before it is let near the line: first solutions take longest
 
-ROUNDING_S = 1e-9  #: a lease of twenty periods ends with the twentieth, whatever their sum is rounded to
+ROUNDING_S = 1e-6  #: a lease of twenty periods ends with the twentieth, whatever their sum is rounded to
 
 LawOf = Callable[[Controller], Law[Any]]
 

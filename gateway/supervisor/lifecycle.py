@@ -81,7 +81,7 @@ class Entry:
     epoch: int | None = None
     by_person: bool = False  #: approved by one, not by its verdict alone
     since_s: float | None = None  #: Unix time at which it came to its stage
-    region: Region = Region()  #: of a configuration that has been deployed: for what it was judged
+    region: Region | None = None  #: of a configuration that has been deployed: for what it was judged
 
 
 @dataclass
@@ -92,6 +92,7 @@ class Book:
     in_service: str | None = None
     last_known_good: str | None = None
     epoch: int = 0  #: of the last deployment that the loop has taken, or is being told of
+    region: Region = Region()  #: in which the loop lets it run
     model: str | None = None
     changed_s: float | None = None  #: Unix time at which how the line is controlled has changed last
     #: By kind the proposal that a person approved last, and that went well; empty after anything was rolled back.
@@ -107,10 +108,13 @@ class Book:
         return [entry for entry in self.entries.values() if entry.stage in UNDECIDED]
 
     @property
-    def region(self) -> Region:
-        """For what the configuration in service was judged when it was kept last."""
-        kept = (entry for entry in reversed(self.entries.values()) if entry.stage is Stage.KEPT)
-        return next((entry.region for entry in kept if entry.changes == self.in_service), Region())
+    def judged_for(self) -> Region:
+        """As far as the configuration in service has been judged and kept, now or before: data become too old again."""
+        found = self.region
+        for entry in self.entries.values():
+            if entry.changes == self.in_service and entry.stage is Stage.KEPT and entry.region is not None:
+                found = found.and_also(entry.region)
+        return found
 
     def why_not(self, kind: str, what: Mapping[str, Any]) -> str:
         """Why a record of `kind` cannot come now; empty: it can."""
@@ -159,8 +163,8 @@ class Book:
             return
         entry = self.entries[proposal]
         more = {key: what[key] for key in ("verdict", "epoch") if key in what}
-        if "region" in what:
-            more["region"] = Region.model_validate(what["region"])
+        if kind == "deploying":
+            more["region"] = _region(what)
         if kind == "approved":
             more["by_person"] = what.get("by", PERSON) == PERSON
         self.entries[proposal] = entry = replace(
@@ -183,11 +187,11 @@ class Book:
         elif kind == "not-deployed":
             self.epoch = int(what["epoch"]) - 1
         elif kind == "deployed":
-            self.in_service = entry.changes
+            self.in_service, self.region = entry.changes, entry.region or Region()
         elif kind == "kept":
             self.last_known_good = str(what.get("last_known_good", entry.changes))
         elif kind == "rolled-back":
-            self.in_service = str(what["to"])
+            self.in_service, self.region = str(what["to"]), _region(what)
         elif kind == "model-in-service":
             self.model = entry.changes
 
@@ -198,6 +202,7 @@ class Book:
         self.in_service = str(what["configuration"])
         self.last_known_good = str(what["last_known_good"])
         self.epoch = int(what["epoch"])
+        self.region = _region(what)
 
     def explains(self, configuration: str, epoch: int) -> bool:
         """Whether the records say how the line may have come to this configuration, at this epoch of the loop."""
@@ -209,6 +214,10 @@ def _at(what: Mapping[str, Any]) -> float | None:
     return float(what["at_s"]) if "at_s" in what else None
 
 
+def _region(what: Mapping[str, Any]) -> Region:
+    return Region.model_validate(what.get("region", {}))
+
+
 def reconciled(book: Book, found: InService) -> tuple[str, dict[str, Any]] | None:
     """The next record that brings the book to what the loop says of itself; None: they agree.
 
@@ -217,11 +226,13 @@ def reconciled(book: Book, found: InService) -> tuple[str, dict[str, Any]] | Non
     change = book.on_the_line
     if change is not None and change.stage is not Stage.RUNNING:
         return _settled(change, found)
-    if (found.hash, found.last_known_good) != (book.in_service, book.last_known_good) or found.epoch != book.epoch:
+    said = (found.hash, found.last_known_good, found.epoch, found.region)
+    if said != (book.in_service, book.last_known_good, book.epoch, book.region):
         return FOUND, {
             "configuration": found.hash,
             "last_known_good": found.last_known_good,
             "epoch": found.epoch,
+            "region": found.region.model_dump(),
             "because": found.why,
             "explained": book.explains(found.hash, found.epoch),
         }
@@ -234,7 +245,8 @@ def reconciled(book: Book, found: InService) -> tuple[str, dict[str, Any]] | Non
 
 def _settled(change: Entry, found: InService) -> tuple[str, dict[str, Any]] | None:
     """What has become of a change that was on its way to the line."""
-    runs = found.hash == change.changes and found.epoch == change.epoch
+    # The same configuration may be deployed again for another region: what was before it is back, then.
+    runs = (found.hash, found.epoch) == (change.changes, change.epoch) and change.region in (None, found.region)
     named: dict[str, Any] = {"proposal": change.proposal, "epoch": change.epoch}
     if runs and found.on_probation:
         return ("deployed", named) if change.stage is Stage.DEPLOYING else None
@@ -244,7 +256,8 @@ def _settled(change: Entry, found: InService) -> tuple[str, dict[str, Any]] | No
         return kind, {**named, "last_known_good": found.last_known_good} if kind == "kept" else named
     if change.stage is Stage.DEPLOYING and found.epoch != change.epoch:
         return "not-deployed", {**named, "because": f"the loop is at epoch {found.epoch}: {found.why}"}
-    return "rolled-back", {**named, "to": found.hash, "because": found.why.removeprefix("rolled back: ")}
+    because = found.why.removeprefix("rolled back: ")
+    return "rolled-back", {**named, "to": found.hash, "region": found.region.model_dump(), "because": because}
 
 
 def book_of(records: Iterable[tuple[str, Mapping[str, Any]]]) -> Book:

@@ -61,7 +61,7 @@ class LineSurroundings:
             now=iso(now_s),
             state=self._state(book, now_s),
             in_service=self._controller(book.in_service),
-            region=book.region,
+            region=book.judged_for,
             baseline=self._baseline(),
             model=self._model(book),
             data=[

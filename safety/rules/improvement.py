@@ -7,6 +7,7 @@ from gateway.core.verdict import RuleFinding
 from safety.case import Case
 from safety.findings import at_most
 from safety.performance import Figures, Performance, beside_in_service, performances
+from safety.simulated import judged_of
 
 RULE = "improvement"
 UNITS = {"rmse_n": "N", "overshoot_pct": "%", "settling_s": "s"}
@@ -20,7 +21,7 @@ def check(case: Case) -> list[RuleFinding]:
     """
     found, gate = performances(case), case.line.gate
     both = beside_in_service(case)
-    findings = [_worst(gate, metric, "in service", *both) for metric in UNITS]
+    findings = [_worst(gate, metric, "in service", *both, _as_far_as(case)) for metric in UNITS]
     if "baseline" in found:
         findings += [_worst(gate, metric, "baseline", found["baseline"], found["proposed"]) for metric in UNITS]
     return findings
@@ -56,13 +57,24 @@ def in_words(value: float, metric: str) -> str:
     return f"{value:.3g} {UNITS[metric]}"
 
 
-def _worst(gate: Gate, metric: str, whose: str, reference: Performance, proposed: Performance) -> RuleFinding:
+def _as_far_as(case: Case) -> str:
+    """How far what is in service is a measure; empty: in everything that the change is proposed for."""
+    judged = judged_of(case)
+    known = judged.within(case.context.region)
+    if known is judged:
+        return ""
+    return f", compared up to {known.speed_max_m_per_s:.3g} m/s and steps of {known.tension_step_n:.3g} N"
+
+
+def _worst(
+    gate: Gate, metric: str, whose: str, reference: Performance, proposed: Performance, how_far: str = ""
+) -> RuleFinding:
     pairs = [(name, value_of(proposed[name], metric), value_of(reference[name], metric)) for name in proposed]
     name, value, before = max(pairs, key=lambda pair: _excess(pair[1], no_worse(gate, metric, pair[2])))
     limit = no_worse(gate, metric, before)
     text = (
         f"{NAMES[metric]} in {name}: {in_words(value, metric)}, {whose} {in_words(before, metric)}; allowed: up to "
-        f"{in_words(limit, metric)}"
+        f"{in_words(limit, metric)}{how_far}"
     )
     return at_most(f"{RULE}: {NAMES[metric]}, {whose}", value, limit, UNITS[metric], text)
 

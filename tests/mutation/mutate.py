@@ -89,11 +89,11 @@ def main() -> None:
         path = f"{beside}{os.pathsep}{os.environ['PATH']}"
         single = {f"{name}_NUM_THREADS": "1" for name in ("OPENBLAS", "OMP", "NUMBA")}
         subprocess.run([beside / "mutmut", "run", *given.names], check=True, env=os.environ | {"PATH": path} | single)
-    sys.exit(told(list(mutants()), reasons))
+    sys.exit(told(list(mutants()), reasons, all_of_them=not given.names))
 
 
-def told(found: list[Mutant], reasons: set[tuple[str, str, str]]) -> bool:
-    """Print what lives, write the figures; whether any lives without a reason, or is not known yet."""
+def told(found: list[Mutant], reasons: set[tuple[str, str, str]], *, all_of_them: bool) -> bool:
+    """Print what lives, write the figures; whether any lives without a reason, or of all one is not known yet."""
     living = [one for one in found if one.lives]
     unexplained = [one for one in living if one.change not in reasons]
     unneeded = reasons - {one.change for one in living}
@@ -111,7 +111,7 @@ def told(found: list[Mutant], reasons: set[tuple[str, str, str]]) -> bool:
     paths = sorted({one.path for one in found})
     bench.tables["by file"] = {path: dict(Counter(one.status for one in found if one.path == path)) for path in paths}
     bench.finish()
-    return bool(unexplained or count[OPEN])
+    return bool(unexplained or (all_of_them and count[OPEN]))
 
 
 def explained() -> set[tuple[str, str, str]]:

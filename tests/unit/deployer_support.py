@@ -89,6 +89,7 @@ class FakeLoop:
         self.death = death
         self.now_s = 0.0
         self.runs = self.good = config_hash(FIRST)
+        self.region = self.good_region = Region()
         self.epoch = 0
         self.predictive: set[str] = set()  #: hashes
         self.lease_end_s: float | None = None
@@ -117,7 +118,7 @@ class FakeLoop:
             self.go_back("rolled back: the lease is over")
 
     def restart(self) -> None:
-        self.runs, self.lease_end_s, self.why = self.good, None, "start"
+        self.go_back("start")
 
     def in_service(self) -> InService:
         probation = self.lease_end_s is not None
@@ -125,11 +126,11 @@ class FakeLoop:
             hash=self.runs, kind="lqi", epoch=self.epoch, on_probation=probation,
             lease_left_s=self.lease_end_s - self.now_s if probation else None, last_known_good=self.good,
             good_if_kept=self.good if self.runs in self.predictive else self.runs,
-            region=Region(), watched=False, why=self.why,
+            region=self.region, watched=False, why=self.why,
         )  # fmt: skip
 
     def go_back(self, why: str) -> None:
-        self.runs, self.lease_end_s, self.why = self.good, None, why
+        self.runs, self.region, self.lease_end_s, self.why = self.good, self.good_region, None, why
 
     def _done(self, command: Command) -> Reply:
         ok, text = True, "done"
@@ -142,6 +143,7 @@ class FakeLoop:
             text = "deployed" if ok else "not its successor, or not now"
             if ok:
                 self.runs, self.epoch, self.why = deployment.hash, deployment.epoch, "deployed"
+                self.region = deployment.region
                 self.lease_end_s = self.now_s + deployment.lease_s
                 self.lease_s = deployment.lease_s
         elif isinstance(command, Renew | Keep) and (command.epoch != self.epoch or self.lease_end_s is None):
@@ -150,6 +152,7 @@ class FakeLoop:
             self.lease_end_s = self.now_s + self.lease_s
         elif isinstance(command, Keep):
             self.good = self.in_service().good_if_kept
+            self.good_region = self.region
             self.lease_end_s, self.why = None, "kept"
         elif isinstance(command, Rollback):
             self.go_back(f"rolled back: {command.reason}")

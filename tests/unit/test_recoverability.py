@@ -77,7 +77,8 @@ def test_the_prediction_is_what_the_law_does_with_the_model(name, size):
     x, before_nm, torque_nm = disturbed(size)
     recovery = Recovery(recovery_prediction(THETA, config, LINE, [SPEED]), config, LINE)
     found, looks = recovery.ahead(Measured(x[:6], x[6:], SPEED), TENSION_N, before_nm[None], torque_nm)
-    truth = rolled_out(config, x, before_nm, torque_nm, 2 * recovery.periods)
+    truth = rolled_out(config, x, before_nm, torque_nm, recovery.periods + 1)
+    assert looks[-1] <= recovery.periods
     # The model is linear near the recipe's tensions in both; a schedule's law is that of the node's speed.
     scheduled = 0.2 if name == "scheduled" else 0.0
     np.testing.assert_allclose(found[:6].T, truth[looks], atol=1e-3 * max(1.0, size / 10.0) + scheduled * size)
