@@ -17,6 +17,7 @@ import numpy as np
 from gateway.cli.identify_model import model_of_found
 from gateway.control.design import DesignRefused, DesignTask, design_lqi, design_pid, lqi_weights, task_of, task_on
 from gateway.core.controller import Controller, config_hash
+from gateway.core.deployment import Region
 from gateway.core.judge_context import DataReference, JudgeContext, LineState
 from gateway.core.line import Line
 from gateway.core.line_model import LineModel, model_hash
@@ -38,6 +39,7 @@ from tests.independent.truth import Truth, truth_of, with_unruly_effects
 
 NOW = datetime(2026, 8, 3, 14, 6, tzinfo=UTC)
 SPEEDS_M_PER_S = (0.05, 0.1)
+WHOLE = Region()
 SPEED_M_PER_S = 0.05  #: at which the line runs when it is judged
 CAUTION = 30.0  #: times the torque weight, of a first configuration for a line that nobody knows
 #: By how much a line may have changed since a controller was designed for it: a factor either way.
@@ -136,8 +138,11 @@ def instant(seconds: float) -> str:
     return (NOW + timedelta(seconds=seconds)).isoformat()
 
 
-def context_of(given: GateLine, in_service: Controller, baseline: Controller, *, first: bool = False) -> JudgeContext:
-    """`first`: before a model has been accepted, on a line that creeps."""
+def context_of(
+    given: GateLine, in_service: Controller, baseline: Controller | None, *, first: bool = False,
+    region: Region = WHOLE,
+) -> JudgeContext:  # fmt: skip
+    """`first`: before a model has been accepted, on a line that creeps. `region`: of what is in service."""
     return JudgeContext(
         format=1,
         now=instant(0.0),
@@ -148,6 +153,7 @@ def context_of(given: GateLine, in_service: Controller, baseline: Controller, *,
             since_change_s=3600.0,
         ),
         in_service=in_service,
+        region=region,
         baseline=baseline,
         model=None if first else given.model,
         data=[] if first else [data_reference(given.recording)],

@@ -43,7 +43,7 @@ class Asked:
     """A proposal to be: in which context, and of which class."""
 
     class_name: str
-    context: str  #: "plain", "initial", "adapted", "cautious", "drifted" or "first"
+    context: str  #: "plain", "initial", "adapted", "cautious", "drifted", "begun" or "first"
     change: Change
 
 
@@ -247,8 +247,9 @@ CLASSES: dict[str, tuple[float, Maker]] = {
     "model poisoned": (0.02, lambda line, g: _poisoned(line, g)),
     "experiment": (0.02, _experiment),
 }
-#: Each as often as it stands here. In half of them something safe but poor is in service, as before an adaptation.
-CONTEXTS = ("plain", "initial", "adapted", "cautious", "drifted", "drifted")
+#: Each as often as it stands here. In most of them something safe but poor is in service, as before an adaptation; with
+#: "begun" it was judged for little, and is a measure only there.
+CONTEXTS = ("plain", "initial", "adapted", "cautious", "drifted", "drifted", "begun")
 
 
 def proposals(line: GateLine, count: int, seed: int) -> list[Asked]:

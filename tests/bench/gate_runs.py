@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from gateway.core.controller import Controller
+from gateway.core.deployment import Region
 from gateway.core.judge_context import JudgeContext
 from gateway.core.line import Line
 from gateway.core.proposal import ExperimentChange, GainsChange, ModelChange
@@ -67,6 +68,7 @@ class LineBench:
             "adapted": context_of(given, given.adapted, given.initial),
             "cautious": context_of(given, given.cautious, given.cautious),
             "drifted": context_of(given, self._drifted, self._drifted),
+            "begun": context_of(given, given.initial, None, region=begun(given.line)),
             "first": context_of(given, given.initial, given.initial, first=True),
         }
 
@@ -97,12 +99,18 @@ class LineBench:
         if context not in self._judges:
             given, first = self.given, context == "first"
             in_service, baseline = self.contexts[context].in_service, self.contexts[context].baseline
-            assert baseline is not None
             top = FIRST_TOP_M_PER_S if first else self._top_m_per_s
             line = creeping(given.line) if first else given.line
             lets = everything if first else self._lets(in_service)
             self._judges[context] = GateJudge(
-                line, given.truth, in_service, baseline, top, given.number, given.line.limits.speed_max_m_per_s, lets
+                line,
+                given.truth,
+                in_service,
+                baseline or in_service,
+                top,
+                given.number,
+                given.line.limits.speed_max_m_per_s,
+                lets,
             )
         return self._judges[context]
 
@@ -166,6 +174,15 @@ class LineBench:
 def measured(one: Tried) -> bool:
     """Whether the rule that simulates has come to a figure."""
     return any(rule.startswith(ROLLOUT_RULE) and value is not None for rule, _, _, value in one.findings)
+
+
+def begun(line: Line) -> Region:
+    """For which a first configuration is judged: beyond it nothing is compared with it."""
+    return Region(
+        speed_max_m_per_s=FIRST_TOP_M_PER_S,
+        tension_step_max_n=line.gate.first_step_max_n,
+        speed_step_max_m_per_s=FIRST_TOP_M_PER_S,
+    )
 
 
 def creeping(line: Line) -> Line:

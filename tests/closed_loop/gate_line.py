@@ -123,7 +123,7 @@ class GateLine(WireLine):
     def _command(self, *words: str | Path) -> str:
         arguments = [sys.executable, "-m", "gateway.cli", *words]
         done = subprocess.run(arguments, capture_output=True, text=True, timeout=60, check=False)
-        assert done.returncode == 0, done.stderr
+        assert done.returncode == 0, (done.stdout[-3000:], done.stderr)
         return done.stdout
 
     def _ask(self, topic: Topic, payload: bytes) -> bytes:
