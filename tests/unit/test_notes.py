@@ -1,5 +1,6 @@
 """Notes of the knowledge: what is one, what is refused and why; that those that come with the product are."""
 
+import tomllib
 from collections import Counter
 from pathlib import Path
 from typing import get_args
@@ -75,3 +76,10 @@ def test_no_note_tells_what_a_line_must_find_out_by_itself(notes: list[Note]) ->
     for note in notes:
         said = f"{note.head.title} {note.head.sources} {note.text}".lower()
         assert not any(word in said for word in ("s_real", "s_sim", "benchmark", "the paper")), note.name
+
+
+def test_the_questions_that_retrieval_is_tried_on_are_answered_by_notes_that_there_are(notes: list[Note]) -> None:
+    questions = tomllib.loads(Path("tests/bench/questions.toml").read_text(encoding="utf-8"))["question"]
+    names = {note.name for note in notes}
+    assert len(questions) >= 60
+    assert {name for question in questions for name in question["answered_by"]} <= names
