@@ -8,6 +8,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from gateway.control.design import DesignTask, task_on
+from gateway.control.judged_courses import NEAR_M_PER_S
 from gateway.core.controller import Controller
 from gateway.core.experiment import Experiment
 from gateway.core.judge_context import JudgeContext
@@ -22,7 +23,6 @@ from safety.excitation import Excited, excited_parts, recent
 
 T = TypeVar("T")
 NOISIER = 1.2
-NEAR_M_PER_S = 1e-3  #: above the speed of data: a measured mean is not the round number that was asked for
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from gateway.core.theta import Noise
 from gateway.core.verdict import ScenarioFigures
 from safety import programme
 from safety.case import Case
-from safety.simulated import judged_of, setup_of
+from safety.simulated import compared_of, judged_of, setup_of
 
 QUIET = Noise(0.0, 0.0, 0.0)
 Whose = Literal["in service", "baseline", "proposed"]
@@ -97,9 +97,8 @@ def _of_proposed(case: Case, judged: Judged, in_service: Performance) -> Perform
 
 def beside_in_service(case: Case) -> tuple[Performance, Performance]:
     """What is in service and what is proposed, no further than the former was judged for: beyond it never runs."""
-    judged = judged_of(case)
-    known = judged.within(case.context.region)
-    if known is judged:
+    known = compared_of(case)
+    if known is None:
         found = performances(case)
         return found["in service"], found["proposed"]
     in_service = performance(case.context.in_service, case, known)

@@ -22,6 +22,13 @@ def judged_of(case: Case) -> Judged:
     return Judged(case.line, case.tension_n, case.speed_max_m_per_s, case.tension_step_n, case.speed_step_m_per_s)
 
 
+def compared_of(case: Case) -> Judged | None:
+    """How far what is in service is a measure for the proposal; None: in all that this is judged for."""
+    judged = judged_of(case)
+    known = judged.within(case.context.region)
+    return None if known is judged else known
+
+
 def stressed(theta: Theta, gate: Gate) -> Theta:
     """With the lag and the Coulomb friction that every simulated line has, where the model knows of less."""
     return replace(

@@ -27,7 +27,7 @@ STAND_S = 0.3  #: before the first change
 MOVE_S = 0.5  #: a shaped move, or longer where the line's rate asks for it
 MOVED = 0.25  #: of the largest step: more in so short a time is a matter of the torque limit
 LEAST_SPEED_M_PER_S = 0.005  #: the slowest that is looked at, where the line is to run faster
-SAME_M_PER_S = 1e-3  #: speeds that differ by no more are the same
+NEAR_M_PER_S = 1e-3  #: above a speed that was measured: it is not the round number that was asked for
 SLOW = 0.1  #: the slow speed, of the fast one
 BETWEEN_S = 2.0  #: that a course stands between its changes, at most
 LONGER_S = 1.0  #: that steps stand before their tail: what still settles there is no oscillation
@@ -56,7 +56,7 @@ class Judged:
         speed = region.speed_max_m_per_s
         mine = Region(
             speed_max_m_per_s=speed
-            if speed is not None and self.speed_max_m_per_s <= speed + SAME_M_PER_S
+            if speed is not None and self.speed_max_m_per_s <= speed + NEAR_M_PER_S
             else self.speed_max_m_per_s,
             tension_step_max_n=self.tension_step_n,
             speed_step_max_m_per_s=self.speed_step_m_per_s,

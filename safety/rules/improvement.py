@@ -7,7 +7,7 @@ from gateway.core.verdict import RuleFinding
 from safety.case import Case
 from safety.findings import at_most
 from safety.performance import Figures, Performance, beside_in_service, performances
-from safety.simulated import judged_of
+from safety.simulated import compared_of
 
 RULE = "improvement"
 UNITS = {"rmse_n": "N", "overshoot_pct": "%", "settling_s": "s"}
@@ -59,9 +59,8 @@ def in_words(value: float, metric: str) -> str:
 
 def _as_far_as(case: Case) -> str:
     """How far what is in service is a measure; empty: in everything that the change is proposed for."""
-    judged = judged_of(case)
-    known = judged.within(case.context.region)
-    if known is judged:
+    known = compared_of(case)
+    if known is None:
         return ""
     return f", compared up to {known.speed_max_m_per_s:.3g} m/s and steps of {known.tension_step_n:.3g} N"
 
