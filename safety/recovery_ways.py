@@ -44,6 +44,7 @@ class ClosedLoop:
 
 
 def closed_loop(node: RecoveryNode, law: LinearConfig | MpcConfig, looks: NDArray[np.int64]) -> ClosedLoop:
+    """Near the node's speed. `looks` (k,): periods after the next sample at which it is looked."""
     form = linear_form(law)
     F, G = Sampled(np.array(node.transition), [np.array(matrix) for matrix in node.inputs]).augmented()
     physical, n = G.shape
