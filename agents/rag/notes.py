@@ -22,27 +22,8 @@ from pydantic import Field, ValidationError, model_validator
 
 from gateway.core.json_problems import problems
 from gateway.core.line import Fraction, Strict
+from gateway.core.questions import Decision
 
-Decision = Literal[
-    "identify.data",
-    "identify.experiment",
-    "identify.structure",
-    "identify.method",
-    "identify.fidelity",
-    "design.model",
-    "design.architecture",
-    "design.weights",
-    "design.tuning",
-    "design.selection",
-    "adapt.diagnosis",
-    "adapt.change",
-    "adapt.convergence",
-    "monitor.detect",
-    "monitor.diagnosis",
-    "monitor.action",
-    "run.setpoint",
-    "run.safety",
-]
 FaultClass = Literal["material", "mechanical", "sensor", "environment", "process", "drive"]
 Words = Annotated[str, Field(min_length=1, max_length=300)]
 FENCE = "+++"

@@ -222,6 +222,21 @@ class Gate(Strict):
         return self
 
 
+class Agents(Strict):
+    """Who is asked where the phases leave something to judgement. The rules decide wherever nobody else answers."""
+
+    llm: Literal["off", "ollama"] = "off"
+    url: Annotated[str, Field(pattern=r"^https?://")] = "http://127.0.0.1:11434"
+    model: Annotated[str, Field(min_length=1, max_length=120)] = "qwen3:4b"
+    temperature: Annotated[float, Field(ge=0.0, le=2.0)] = 0.2
+    seed: Annotated[int, Field(ge=0, le=2_147_483_647)] = 1
+    context_tokens: Annotated[int, Field(ge=2048, le=262_144)] = 16_384
+    answer_tokens: Annotated[int, Field(ge=128, le=32_768)] = 2048
+    answer_max_s: Positive = 180.0  #: for a question with all its tries; after it the rules decide
+    load_max_s: Positive = 300.0  #: for a model to be loaded
+    task_max_tokens: Annotated[int, Field(ge=1024)] = 200_000  #: of one commissioning, asked and answered
+
+
 class Line(Strict):
     format: Annotated[int, Field(ge=1, le=1)]  #: not Literal: that takes `true` and 1.0 for 1
     site: Name
@@ -240,6 +255,7 @@ class Line(Strict):
     history: History = History()
     priorities: Priorities = Priorities()
     gate: Gate = Gate()
+    agents: Agents = Agents()
     recipes: Annotated[list[Recipe], Field(min_length=1)]  #: the first is the one a line starts with
 
     @property

@@ -33,6 +33,7 @@ HELP: dict[str, dict[str, str]] = {
         "history": "what the gateway keeps on disk; the oldest goes first",
         "priorities": "what matters on this line: the weights by which r2rgate design chooses among controllers",
         "gate": "what a change must show before it may reach a drive, and who decides",
+        "agents": "who is asked where a phase leaves something to judgement; every change is judged all the same",
         "recipes": "set-points for a grade; the line starts with the first",
     },
     "Control": {
@@ -172,6 +173,18 @@ HELP: dict[str, dict[str, str]] = {
         "first_speed_max_m_per_s": "fastest speed before a model is accepted",
         "first_step_max_n": "largest set-point step before a model is accepted",
         "first_corner_share": "of the tolerances: at its corners a first configuration and an experiment are simulated",
+    },
+    "Agents": {
+        "llm": '"off": the rules decide; "ollama": a language model is asked first',
+        "url": "where Ollama answers",
+        "model": "its name there, with its tag",
+        "temperature": "0: always the likeliest word; more: more varied",
+        "seed": "of its choice of words",
+        "context_tokens": "longest question with everything that goes with it; what is longer is refused",
+        "answer_tokens": "longest answer",
+        "answer_max_s": "for an answer with all its tries; after it the rules decide",
+        "load_max_s": "for the model to be loaded",
+        "task_max_tokens": "asked and answered in one commissioning; after it the rules decide",
     },
     "Recipe": {
         "name": "name of the grade",

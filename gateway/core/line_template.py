@@ -2,7 +2,7 @@
 
 import json
 
-from gateway.core.line import Gate
+from gateway.core.line import Agents, Gate
 from gateway.core.line_template_tables import entries, parameter, table, tables
 from gateway.core.line_template_wiring import DEMONSTRATION, Wiring, wired_tables
 
@@ -30,7 +30,7 @@ def line_template(spans: int = 6, out: str = "line.toml", wiring: Wiring = DEMON
     more = {1: "", 2: " ~~span 2~~ roller 2"}.get(spans, f" ~~span 2~~ ... ~~span {spans}~~ roller {spans}")
     parts = [_HEAD.format(more=more, out=out), _line(spans), _process(spans), _web()]
     parts += [_rollers(spans), _spans(spans), *wired_tables(wiring, spans)]
-    return "\n".join([*parts, _history(), _priorities(), _gate(), _recipes(spans)])
+    return "\n".join([*parts, _history(), _priorities(), _gate(), _agents(), _recipes(spans)])
 
 
 def _line(spans: int) -> str:
@@ -127,6 +127,11 @@ def _gate() -> str:
     return table(
         "gate", "Gate", {"autonomy": '"approve-all"', **{k: f"#{json.dumps(v)}" for k, v in thresholds.items()}}
     )
+
+
+def _agents() -> str:
+    settings = {key: value for key, value in Agents().model_dump(mode="json").items() if key != "llm"}
+    return table("agents", "Agents", {"llm": '"off"', **{k: f"#{json.dumps(v)}" for k, v in settings.items()}})
 
 
 def _recipes(spans: int) -> str:

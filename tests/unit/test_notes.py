@@ -7,7 +7,8 @@ from typing import get_args
 
 import pytest
 
-from agents.rag.notes import Decision, Note, NoteRefused, parse_note
+from agents.rag.notes import Note, NoteRefused, parse_note
+from gateway.core.questions import Decision
 
 KNOWLEDGE = Path("agents/knowledge")
 HEAD = """+++
