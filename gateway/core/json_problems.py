@@ -131,8 +131,14 @@ def _node(path: Path, root: Schema) -> Schema:
     node = _resolved(root, root)
     for part in path:
         inner = node.get("items", {}) if isinstance(part, int) else node.get("properties", {}).get(part)
-        node = _resolved(node.get("additionalProperties") or {} if inner is None else inner, root)
+        node = _resolved(_any_value(node) if inner is None else inner, root)
     return node
+
+
+def _any_value(node: Schema) -> Schema:
+    """What stands under a key that is no field, in an object whose keys are free or of a form."""
+    of_a_form: Schema = node.get("patternProperties", {})
+    return next(iter(of_a_form.values()), node.get("additionalProperties") or {})
 
 
 def _resolved(node: Schema, root: Schema) -> Schema:
