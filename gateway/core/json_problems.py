@@ -137,8 +137,9 @@ def _node(path: Path, root: Schema) -> Schema:
 
 def _any_value(node: Schema) -> Schema:
     """What stands under a key that is no field, in an object whose keys are free or of a form."""
-    of_a_form: Schema = node.get("patternProperties", {})
-    return next(iter(of_a_form.values()), node.get("additionalProperties") or {})
+    of_a_form: dict[str, Schema] = node.get("patternProperties", {})
+    free: Schema = node.get("additionalProperties") or {}
+    return next(iter(of_a_form.values()), free)
 
 
 def _resolved(node: Schema, root: Schema) -> Schema:
