@@ -7,117 +7,40 @@ candidate that cannot be made is found so again.
 
 import asyncio
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from datetime import timedelta
+from dataclasses import replace
 from math import inf
-from pathlib import Path
-from typing import Protocol
 
-from gateway.cli.commission_changes import Changes, LineNow, first_speed_m_per_s
-from gateway.cli.commission_measurements import keep, kept
-from gateway.commissioning.candidates import Exhausted, NotOffered, fastest_m_per_s
-from gateway.commissioning.chain import (
-    AS_IT_IS,
-    Ended,
-    Look,
-    Next,
-    Outcome,
-    Past,
-    Pending,
-    Step,
-    named,
-    next_step,
-    past_of,
-    refused_at_once,
-    region_speed,
+from gateway.cli.commission_changes import MOST_REASON, Changes, LineNow, Offer, first_speed_m_per_s
+from gateway.cli.commission_measurements import keep
+from gateway.cli.commission_questions import (
+    MORE_DATA,
+    diagnosis_question,
+    fidelity_question,
+    option_id,
+    step_question,
+    turned,
 )
-from gateway.commissioning.convergence import Convergence
-from gateway.core.controller import config_hash
+from gateway.cli.commission_result import Commissioned, candidate_name, commissioned
+from gateway.cli.commission_side import CannotGoOn, GateSide, measured_on, put, region_kept
+from gateway.commissioning.candidates import Exhausted, NotOffered, fastest_m_per_s
+from gateway.commissioning.chain import Look, Pending, next_step, refused_at_once, region_speed
+from gateway.commissioning.convergence import Convergence, Diagnosis
+from gateway.commissioning.decisions import RULES, Decided, Decider, Rules
+from gateway.commissioning.ladder import MOST_OWN, OWN, Ended, Next
+from gateway.commissioning.past import Follows, Outcome, Past, Step, named, past_of
 from gateway.core.decisions import ProposalShown
-from gateway.core.deployment import Region
 from gateway.core.line import Line
-from gateway.core.line_model import model_hash
-from gateway.core.messages import Reply
-from gateway.core.proposal import Change, Evidence, Proposal, canonical, proposal_hash
-from gateway.core.recording import Recording
+from gateway.core.questions import Choice, Question
+from gateway.identification.identify import Identified
 from gateway.supervisor.baselines import BaselinesError
 
-AUTHOR = "rules"
-STANDS_S = 8.0 * 3600.0  #: a proposal, until somebody decides
+RULES_DECIDE = Rules()
 KINDS = {
     Step.FIRST: "gains", Step.EXPERIMENT: "experiment", Step.MODEL: "model", Step.REDESIGN: "gains",
     Step.MEASUREMENT: "experiment",
 }  # fmt: skip
 
 Tell = Callable[[str], None]
-
-
-class CannotGoOn(Exception):
-    """The line or its gateway does not let the chain go on; the text says why, and what to do."""
-
-
-class GateSide(Protocol):
-    """A gate and the line behind it. Every method raises CannotGoOn."""
-
-    async def proposals(self) -> list[ProposalShown]:
-        """All of the line, the oldest first."""
-        ...
-
-    async def now(self) -> LineNow: ...
-
-    async def state(self) -> str:
-        """Of the loop: RUN, READY ..."""
-        ...
-
-    async def folder(self) -> Path:
-        """Of the line's data, where its baselines are."""
-        ...
-
-    async def recordings(self) -> list[Recording]:
-        """Of experiments, as the gate judges by them: the newest first."""
-        ...
-
-    async def ready(self) -> None:
-        """Until nothing moves, and the line may be changed again."""
-        ...
-
-    async def propose(self, payload: bytes) -> Reply: ...
-
-    async def wait_for(self, proposal: str) -> None:
-        """A while, or until it stands otherwise than now."""
-        ...
-
-
-@dataclass(frozen=True)
-class Tried:
-    """A candidate and what became of it."""
-
-    kind: str
-    step: str  #: of the chain; empty: somebody else's
-    rung: int
-    proposal: str  #: hash; empty: it could not be made
-    stage: str
-    why: str
-    rule: str = ""  #: the first that failed
-    value: float | None = None
-    limit: float | None = None
-    speed_m_per_s: float | None = None  #: of the region, where a configuration was let through
-    shown: Convergence | None = None  #: by a measurement
-
-    @property
-    def text(self) -> str:
-        what = f"{self.step or self.kind}, candidate {self.rung + 1}" if self.step else self.kind
-        by = f" by {self.rule}" if self.rule else ""
-        return f"{what}: {self.stage}{by}{f': {self.why}' if self.why else ''}"
-
-
-@dataclass(frozen=True)
-class Commissioned:
-    reached: bool
-    text: str
-    tried: list[Tried]
-    speed_m_per_s: float | None  #: up to which the configuration in service was judged; None: none was kept
-    converged: bool = False  #: it does what it should, and nothing significant is left to gain
 
 
 async def commission(
@@ -129,6 +52,7 @@ async def commission(
     adaptations: int = 1,
     most_redesigns: int | None = None,
     again: bool = False,
+    decider: Decider = RULES_DECIDE,
 ) -> Commissioned:
     """Until the chain has ended, one way or the other. Every rung is tried once, so that it does.
 
@@ -136,107 +60,147 @@ async def commission(
     `adaptations`: redesigns at least; `most_redesigns`: it is left there once so many have been kept.
     `again`: the line is no longer as it was (another grade, a new part). What is in service stays, and counts as a
     first configuration: for low speed, until experiments have shown more.
+    `decider`: who chooses among the candidates.
     """
     if why := refused_at_once(line):
         return Commissioned(False, why, [], None)
-    changes = Changes(line, inf if wanted_m_per_s is None else wanted_m_per_s)
-    unmade: list[tuple[int, Past]] = []  #: candidates that could not be made, by how many proposals there were
-    past: list[Past] = []
-    shown: list[ProposalShown] = []
-    measured: dict[str, Convergence] = {}
+    chain = _Chain(line, side, tell, decider, wanted_m_per_s)
     outdated = None if again else 0  #: so many proposals, the oldest, say nothing of the line as it is now
     while True:
         try:
-            shown, measured = await side.proposals(), await measured_on(line, side)
-            outdated = len(shown) if outdated is None else outdated
-            past = _merged(shown, unmade, measured)
-            if outdated:
-                past = [_begin(line, past[:outdated]), *past[outdated:]]
-            kept_now = sum(one.step is Step.REDESIGN and one.outcome is Outcome.DONE for one in past)
+            outdated = await chain.read(outdated)
+            kept_now = sum(one.step is Step.REDESIGN and one.outcome is Outcome.DONE for one in chain.past)
             if most_redesigns is not None and kept_now >= most_redesigns:
-                return _commissioned(Ended(True, f"{kept_now} redesigns are kept"), past, shown, measured)
-            now = await side.now()
-            fastest = fastest_m_per_s(line, now.model)
-            wanted = fastest if wanted_m_per_s is None else min(wanted_m_per_s, fastest)
-            step = next_step(past, first_speed_m_per_s(line), wanted, adaptations)
+                return chain.ended(Ended(True, f"{kept_now} redesigns are kept"))
+            step = await chain.next(adaptations)
             if isinstance(step, Ended):
-                return _commissioned(step, past, shown, measured)
+                return chain.ended(step)
             if isinstance(step, Pending):
                 await side.wait_for(step.proposal)
-                continue
-            if isinstance(step, Look):
-                try:
-                    await _look(changes, side, step.proposal, tell)
-                except NotOffered as error:
-                    text = f"an adapted configuration is in service up to {region_speed(past) or 0.0:.3g} m/s"
-                    ended = Ended(True, f"{text}; what was measured cannot be judged: {error}")
-                    return _commissioned(ended, past, shown, measured)
-                continue
-            await side.ready()
-            await _propose(changes, side, step, shown, unmade, tell)
+            elif isinstance(step, Look):
+                await chain.look(step.proposal)
+            else:
+                await side.ready()
+                await chain.propose(step)
+        except CannotBeJudged as error:
+            text = f"an adapted configuration is in service up to {region_speed(chain.past) or 0.0:.3g} m/s"
+            return chain.ended(Ended(True, f"{text}; what was measured cannot be judged: {error}"))
         except CannotGoOn as stopped:
-            return _commissioned(Ended(False, str(stopped)), past, shown, measured)
+            return chain.ended(Ended(False, str(stopped)))
 
 
-async def _look(changes: Changes, side: GateSide, proposal: str, tell: Tell) -> None:
-    """At what the measurement under `proposal`, the newest experiment, has shown. Raises CannotGoOn, NotOffered."""
-    now, recordings = await side.now(), await side.recordings()
-    if not recordings or now.model is None:
-        raise CannotGoOn("the data of the last measurement are no longer there: measure anew (--again)")
-    try:
-        found = await asyncio.to_thread(changes.looked_at, now, recordings)
-        keep(await side.folder(), changes.line, now, proposal, found, changes.effort_n2m2s(recordings[0]))
-    except BaselinesError as error:
-        raise CannotGoOn(f"what was measured cannot be kept: {error}") from error
-    tell(f"measurement: {found.text}")
+class CannotBeJudged(Exception):
+    """A measurement, and so whether the line does what it should."""
 
 
-async def measured_on(line: Line, side: GateSide) -> dict[str, Convergence]:
-    """By proposal. Raises CannotGoOn."""
-    try:
-        return kept(await side.folder(), line)
-    except BaselinesError as error:
-        raise CannotGoOn(str(error)) from error
+class _Chain:
+    """One run: what has been tried, as it was read last, and what could not be made since the run began."""
+
+    def __init__(self, line: Line, side: GateSide, tell: Tell, decider: Decider, wanted_m_per_s: float | None) -> None:
+        self._line = line
+        self._side = side
+        self._tell = tell
+        self._decider = decider
+        self._wanted_m_per_s = wanted_m_per_s
+        self._changes = Changes(line, inf if wanted_m_per_s is None else wanted_m_per_s)
+        self._unmade: list[tuple[int, Past]] = []  #: by how many proposals there were
+        self._shown: list[ProposalShown] = []
+        self._measured: dict[str, Convergence] = {}
+        self.past: list[Past] = []
+
+    async def read(self, outdated: int | None) -> int:
+        """What has been tried until now. Of the oldest `outdated` (None: all) only what was kept last counts."""
+        self._shown, self._measured = await self._side.proposals(), await measured_on(self._line, self._side)
+        outdated = len(self._shown) if outdated is None else outdated
+        self.past = _merged(self._shown, self._unmade, self._measured)
+        if outdated:
+            self.past = [_begin(self._line, self.past[:outdated]), *self.past[outdated:]]
+        return outdated
+
+    async def next(self, adaptations: int) -> Next | Pending | Look | Ended:
+        now = await self._side.now()
+        fastest = fastest_m_per_s(self._line, now.model)
+        wanted = fastest if self._wanted_m_per_s is None else min(self._wanted_m_per_s, fastest)
+        return next_step(self.past, first_speed_m_per_s(self._line), wanted, adaptations)
+
+    def ended(self, how: Ended) -> Commissioned:
+        return commissioned(how, self.past, self._shown, self._measured)
+
+    async def look(self, proposal: str) -> None:
+        """At what the measurement under `proposal`, the newest experiment, has shown.
+
+        Raises CannotGoOn and CannotBeJudged.
+        """
+        now, recordings = await self._side.now(), await self._side.recordings()
+        if not recordings or now.model is None:
+            raise CannotGoOn("the data of the last measurement are no longer there: measure anew (--again)")
+        try:
+            found = await asyncio.to_thread(self._changes.looked_at, now, recordings)
+        except NotOffered as error:
+            raise CannotBeJudged(str(error)) from error
+        self._tell(f"measurement: {found.text}")
+        decided = await self._decided(diagnosis_question(self._line, found, now, self.past))
+        follows, because = Follows(decided.choice.option), decided.choice.reason
+        if decided.by != RULES:
+            found = found.model_copy(update={"diagnosis": Diagnosis(follows=follows, by=decided.by, because=because)})
+        try:
+            effort = self._changes.effort_n2m2s(recordings[0])
+            keep(await self._side.folder(), self._line, now, proposal, found, effort)
+        except BaselinesError as error:
+            raise CannotGoOn(f"what was measured cannot be kept: {error}") from error
+
+    async def propose(self, step: Next) -> None:
+        """One of the step's candidates, or note that it cannot be made. Raises CannotGoOn."""
+        now, recordings = await self._side.now(), await self._side.recordings()
+        _require_slow(self._line, step, now)
+        rung = step.rung
+        try:
+            offers = await asyncio.to_thread(self._changes.offers, step, now, recordings, region_kept(self._shown))
+            decided, rung = await self._chosen(step, offers, now)
+            what = f"{step.step}, {candidate_name(rung)}"
+            self._tell(f"{what}: being made")
+            offer = next(one for one in offers if option_id(one.rung) == decided.choice.option)
+            made = await asyncio.to_thread(offer.make, turned(decided.choice.factors))
+            if made.identified is not None:
+                await self._require_faith(made.identified, now)
+        except NotOffered as refused:
+            self._tell(f"{step.step}, {candidate_name(rung)}: cannot be made: {refused}")
+            last = isinstance(refused, Exhausted)
+            failed = Past(KINDS[step.step], Outcome.FAILED, step.step, rung, str(refused), last=last)
+            self._unmade.append((len(self._shown), failed))
+            return
+        self._tell(f"{what}: {made.reason}")
+        await put(self._line, self._side, made.change, _reason(made.reason, decided), named(step.step, rung),
+                  decided.author)  # fmt: skip
+
+    async def _chosen(self, step: Next, offers: Sequence[Offer], now: LineNow) -> tuple[Decided, int]:
+        """And the rung under which it is known."""
+        if len(offers) == 1 and not offers[0].knobs:
+            only = Choice(option=option_id(step.rung), reason="there is no other candidate")
+            return Decided(only, RULES), step.rung
+        decided = await self._decided(step_question(self._line, step, offers, now, self.past))
+        if turned(decided.choice.factors):
+            return decided, OWN + MOST_OWN - step.own
+        return decided, next(one.rung for one in offers if option_id(one.rung) == decided.choice.option)
+
+    async def _require_faith(self, found: Identified, now: LineNow) -> None:
+        """Raises NotOffered where the model is not trusted enough to be proposed."""
+        decided = await self._decided(fidelity_question(self._line, found, now, self.past))
+        if decided.choice.option == MORE_DATA:
+            raise NotOffered(f"{decided.by} asks for more data first: {decided.choice.reason}"[:MOST_REASON])
+
+    async def _decided(self, question: Question) -> Decided:
+        decided = await asyncio.to_thread(self._decider.decide, question)
+        if decided.instead:
+            self._tell(f"{question.decision}: {decided.instead}: the rules decide")
+        elif decided.by != RULES:
+            self._tell(f"{question.decision}: {decided.by} chooses {decided.choice.option}: {decided.choice.reason}")
+        return decided
 
 
-async def _propose(
-    changes: Changes, side: GateSide, step: Next, shown: list[ProposalShown], unmade: list[tuple[int, Past]], tell: Tell
-) -> None:
-    line, now, recordings = changes.line, await side.now(), await side.recordings()
-    _require_slow(line, step, now)
-    what = f"{step.step}, candidate {step.rung + 1}"
-    tell(f"{what}: being made")
-    try:
-        change, reason = await asyncio.to_thread(changes.made, step, now, recordings, region_kept(shown))
-    except NotOffered as refused:
-        tell(f"{what}: cannot be made: {refused}")
-        rung = AS_IT_IS - 1 if isinstance(refused, Exhausted) else step.rung
-        unmade.append((len(shown), Past(KINDS[step.step], Outcome.FAILED, step.step, rung, str(refused))))
-        return
-    tell(f"{what}: {reason}")
-    await put(line, side, change, reason, named(step.step, step.rung))
-
-
-async def put(line: Line, side: GateSide, change: Change, reason: str, evidence: Evidence) -> str:
-    """Before the gate; its hash. Raises CannotGoOn where the gate does not take it."""
-    now = await side.now()
-    proposal = Proposal(
-        format=1,
-        site=line.site,
-        line=line.line,
-        change=change,
-        base=config_hash(now.in_service),
-        model=None if now.model is None else model_hash(now.model),
-        reason=reason,
-        evidence=[evidence],
-        author=AUTHOR,
-        created=now.at.isoformat(timespec="milliseconds"),
-        expires=(now.at + timedelta(seconds=min(STANDS_S, line.gate.expiry_max_s))).isoformat(timespec="milliseconds"),
-    )
-    reply = await side.propose(canonical(proposal))
-    if not reply.ok:
-        raise CannotGoOn("; ".join([reply.text, *reply.reasons]))
-    return proposal_hash(proposal)
+def _reason(made: str, decided: Decided) -> str:
+    """With the words of whoever chose, as a quotation."""
+    return made if decided.by == RULES else f'{made}. {decided.by} says: "{decided.choice.reason}"'
 
 
 def _require_slow(line: Line, step: Next, now: LineNow) -> None:
@@ -249,19 +213,13 @@ def _require_slow(line: Line, step: Next, now: LineNow) -> None:
         )
 
 
-def region_kept(shown: Sequence[ProposalShown]) -> Region | None:
-    """Of the configuration that was kept last."""
-    kept = [one.verdict for one in shown if one.proposal.kind == "gains" and one.stage == "kept"]
-    return kept[-1].region if kept and kept[-1] is not None else None
-
-
 def _merged(
     shown: Sequence[ProposalShown], unmade: Sequence[tuple[int, Past]], measured: Mapping[str, Convergence]
 ) -> list[Past]:
     past = [past_of(one) for one in shown]
     for at, one in enumerate(past):
         if found := measured.get(one.proposal):
-            past[at] = replace(one, settled=found.settled, gains=found.gains, why=found.text)
+            past[at] = replace(one, converged=found.settled, follows=found.follows, why=found.text)
     for before, (at, one) in enumerate(unmade):
         past.insert(at + before, one)
     return past
@@ -273,25 +231,3 @@ def _begin(line: Line, outdated: Sequence[Past]) -> Past:
     if not kept:
         raise CannotGoOn("nothing has been kept on this line yet: leave out --again")
     return replace(kept[-1], step=Step.FIRST, rung=0, speed_m_per_s=first_speed_m_per_s(line))
-
-
-def _commissioned(
-    ended: Ended, past: Sequence[Past], shown: Sequence[ProposalShown], measured: Mapping[str, Convergence]
-) -> Commissioned:
-    by_hash = {one.proposal_hash: one for one in shown}
-    tried = [_tried(one, by_hash.get(one.proposal), measured.get(one.proposal)) for one in past]
-    return Commissioned(ended.reached, ended.text, tried, region_speed(past), ended.converged)
-
-
-def _tried(one: Past, shown: ProposalShown | None, measured: Convergence | None) -> Tried:
-    step = one.step or ""
-    if shown is None:
-        return Tried(one.kind, step, one.rung, "", "not made", one.why)
-    verdict = shown.verdict
-    first = next((rule for rule in verdict.findings if not rule.passed), None) if verdict is not None else None
-    if first is None:
-        return Tried(
-            one.kind, step, one.rung, one.proposal, shown.stage, shown.why, speed_m_per_s=one.speed_m_per_s,
-            shown=measured,
-        )  # fmt: skip
-    return Tried(one.kind, step, one.rung, one.proposal, shown.stage, one.why, first.rule, first.value, first.limit)

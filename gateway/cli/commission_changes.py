@@ -1,17 +1,25 @@
-"""What the commissioning chain's steps bring, made from the line as it is now: configurations, experiments, models."""
+"""What the commissioning chain's steps bring, made from the line as it is now: configurations, experiments, models.
+
+Each step has offers: the candidate that the rules take, and those that may be taken in its place. An offer says what it
+is without being made; where its design has knobs, they may be turned.
+"""
 
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from math import inf
 
 import numpy as np
 
 from gateway.cli.identify_model import model_of_found
+from gateway.commissioning.architectures import ARCHITECTURES
 from gateway.commissioning.candidates import FIRST_LAWS, Exhausted, Law, NotOffered, configuration, experiment
-from gateway.commissioning.chain import AS_IT_IS, Next, Step, first_legs
+from gateway.commissioning.chain import first_legs
 from gateway.commissioning.convergence import Convergence, convergence, measurement
+from gateway.commissioning.ladder import AS_IT_IS, Next
+from gateway.commissioning.past import Step
+from gateway.commissioning.redesign import Offer as Redesign
 from gateway.commissioning.redesign import redesigns
 from gateway.core.controller import Controller, config_hash
 from gateway.core.deployment import Region
@@ -21,9 +29,11 @@ from gateway.core.line_model import LineModel, ModelRefused, model_hash
 from gateway.core.proposal import Change, ExperimentChange, GainsChange, ModelChange
 from gateway.core.recording import Recording
 from gateway.core.theta import Noise
-from gateway.identification.identify import NotIdentified, identify
+from gateway.identification.identify import Identified, NotIdentified, identify
 
 MOST_REASON = 1000  #: letters
+
+Factors = Mapping[str, float]
 
 
 @dataclass(frozen=True)
@@ -37,6 +47,25 @@ class LineNow:
     at: datetime
 
 
+@dataclass(frozen=True)
+class Made:
+    change: Change
+    reason: str
+    identified: Identified | None = None  #: of a model: how it was come by
+
+
+@dataclass(frozen=True)
+class Offer:
+    """A candidate. `make` with factors on its knobs, {} for none; it raises NotOffered."""
+
+    rung: int
+    title: str
+    make: Callable[[Factors], Made]
+    knobs: Sequence[str] = ()
+    law: Law | None = None
+    redesign: Redesign | None = field(default=None, repr=False)
+
+
 def first_speed_m_per_s(line: Line) -> float:
     """Up to which a first configuration is judged."""
     return min(line.gate.first_speed_max_m_per_s, line.limits.speed_max_m_per_s)
@@ -48,25 +77,26 @@ class Changes:
     def __init__(self, line: Line, wanted_m_per_s: float = inf) -> None:
         self.line = line
         self._wanted_m_per_s = wanted_m_per_s
-        #: And what it was designed from
-        self._designed: tuple[LineNow, Region | None, list[tuple[Law, Controller]]] | None = None
+        #: And what they were designed from
+        self._designed: tuple[LineNow, Region | None, list[Redesign]] | None = None
         self._experiment_for: tuple[object, Experiment] | None = None  #: and what it was designed from
 
-    def made(
-        self, step: Next, now: LineNow, recordings: Sequence[Recording], region: Region | None
-    ) -> tuple[Change, str]:
-        """The change, and the reason for it. `recordings`: the newest first. Raises NotOffered."""
+    def offers(self, step: Next, now: LineNow, recordings: Sequence[Recording], region: Region | None) -> list[Offer]:
+        """The candidate of `step`, and those of its `others` that there are. `recordings`: the newest first.
+
+        Raises NotOffered where there is no such candidate as the step's own.
+        """
         match step.step:
             case Step.FIRST:
-                return self._first(step, now)
+                return [self._first(one, now) for one in (step, *step.others)]
             case Step.EXPERIMENT:
-                return self._experiment(step, now)
+                return [self._experiment(one, now) for one in (step, *step.others)]
             case Step.MODEL:
-                return self._model(step, now, recordings)
+                return self._models(step, now, recordings)
             case Step.REDESIGN:
-                return self._redesign(step, now, region)
+                return self._redesigns(step, now, region)
             case Step.MEASUREMENT:
-                return self._measurement(step, now, region)
+                return [self._measurement(step, now, region)]
 
     def looked_at(self, now: LineNow, recordings: Sequence[Recording]) -> Convergence:
         """What the newest of `recordings` shows of the configuration in service. Raises NotOffered."""
@@ -77,21 +107,31 @@ class Changes:
         """Of the drives, as far as their torques are known."""
         return float(recording.period_s * np.nansum(recording.torque_nm**2))
 
-    def _first(self, step: Next, now: LineNow) -> tuple[Change, str]:
+    def _first(self, step: Next, now: LineNow) -> Offer:
         """One under which an experiment can be designed: without, the chain would end there."""
         law, speed = FIRST_LAWS[step.rung], first_speed_m_per_s(self.line)
-        controller = configuration(self.line, None, speed, law)
-        try:
-            self._asked(replace(now, in_service=controller), first_legs(speed), 1.0, 0)
-        except NotOffered as refused:
-            raise NotOffered(f"{law.text}: under it no experiment can be designed: {refused}") from refused
-        return GainsChange(controller=controller), f"{law.text} on the line's file, to begin with"
 
-    def _experiment(self, step: Next, now: LineNow) -> tuple[Change, str]:
-        asked = self._asked(now, step.speeds_m_per_s, step.size, step.number)
+        def make(factors: Factors) -> Made:
+            turned = law.turned(factors)
+            controller = configuration(self.line, None, speed, turned)
+            try:
+                self._asked(replace(now, in_service=controller), first_legs(speed), 1.0, 0)
+            except NotOffered as refused:
+                raise NotOffered(f"{turned.text}: under it no experiment can be designed: {refused}") from refused
+            return Made(GainsChange(controller=controller), f"{turned.text} on the line's file, to begin with")
+
+        return Offer(step.rung, f"{law.text} on the line's file", make, _knobs(law), law)
+
+    def _experiment(self, step: Next, now: LineNow) -> Offer:
         speeds = " and ".join(f"{speed:.3g}" for speed in step.speeds_m_per_s)
-        moves = f"set-points move by {max(asked.amplitude_n):g} N for {asked.duration_s:g} s"
-        return ExperimentChange(experiment=asked), f"to identify the line at {speeds} m/s: {moves}"
+
+        def make(factors: Factors) -> Made:
+            asked = self._asked(now, step.speeds_m_per_s, step.size * factors.get("size", 1.0), step.number)
+            moves = f"set-points move by {max(asked.amplitude_n):g} N for {asked.duration_s:g} s"
+            return Made(ExperimentChange(experiment=asked), f"to identify the line at {speeds} m/s: {moves}")
+
+        title = f"at {speeds} m/s, with moves of {step.size:g} times what is designed"
+        return Offer(step.rung, title, make, ("size",))
 
     def _asked(self, now: LineNow, speeds_m_per_s: tuple[float, ...], size: float, seed: int) -> Experiment:
         """Designed; what has been designed last, again. Raises NotOffered."""
@@ -106,47 +146,86 @@ class Changes:
             self._experiment_for = key, asked
         return self._experiment_for[1]
 
-    def _model(self, step: Next, now: LineNow, recordings: Sequence[Recording]) -> tuple[Change, str]:
+    def _models(self, step: Next, now: LineNow, recordings: Sequence[Recording]) -> list[Offer]:
         """Of the newest experiment, which goes the fastest; on the second rung of all.
 
         A fit takes as long as its data: of four times as much for what is at most half as wide an interval.
         """
-        used = list(recordings[:1] if step.rung == 0 else recordings)
-        if not used or (step.rung > 0 and len(recordings) == 1):
-            raise NotOffered("there is no other recording" if used else "there is no recording of an experiment")
-        try:
-            found = identify(used, self.line, Noise(), time.perf_counter)
-            parent = None if now.model is None else model_hash(now.model)
-            model = model_of_found(self.line, used, found, now.at.isoformat(timespec="milliseconds"), parent=parent)
-        except (NotIdentified, ModelRefused) as refused:
-            raise NotOffered("; ".join(refused.reasons)[:MOST_REASON]) from refused
+        if not recordings:
+            raise NotOffered("there is no recording of an experiment")
+        if step.rung > 0 and len(recordings) == 1:
+            raise NotOffered("there is no other recording")
+        rungs = [step.rung, *(one.rung for one in step.others if len(recordings) > 1)]
+        return [self._model(rung, now, list(recordings[:1] if rung == 0 else recordings)) for rung in rungs]
+
+    def _model(self, rung: int, now: LineNow, used: list[Recording]) -> Offer:
         which = "the last experiment" if len(used) == 1 else f"the last {len(used)} experiments"
-        speed = model.region.speed_to_m_per_s
-        return ModelChange(model=model), f"from {which}: {found.estimate.structure}, up to {speed:.3g} m/s"
 
-    def _measurement(self, step: Next, now: LineNow, region: Region | None) -> tuple[Change, str]:
-        asked = measurement(self.line, region, now.tension_n, step.speeds_m_per_s, step.size, step.number)
+        def make(_: Factors) -> Made:
+            try:
+                found = identify(used, self.line, Noise(), time.perf_counter)
+                parent = None if now.model is None else model_hash(now.model)
+                model = model_of_found(self.line, used, found, now.at.isoformat(timespec="milliseconds"), parent=parent)
+            except (NotIdentified, ModelRefused) as refused:
+                raise NotOffered("; ".join(refused.reasons)[:MOST_REASON]) from refused
+            speed = model.region.speed_to_m_per_s
+            reason = f"from {which}: {found.estimate.structure}, up to {speed:.3g} m/s"
+            return Made(ModelChange(model=model), reason, found)
+
+        return Offer(rung, f"from {which}, {sum(one.samples * one.period_s for one in used):.0f} s of data", make)
+
+    def _measurement(self, step: Next, now: LineNow, region: Region | None) -> Offer:
         speeds = " and ".join(f"{speed:.3g}" for speed in step.speeds_m_per_s)
-        steps = f"steps of up to {asked.step_max_n:.3g} N for {asked.duration_s:g} s"
-        return ExperimentChange(
-            experiment=asked
-        ), f"to see how the configuration in service does, {steps} at {speeds} m/s"
 
-    def _redesign(self, step: Next, now: LineNow, region: Region | None) -> tuple[Change, str]:
+        def make(_: Factors) -> Made:
+            asked = measurement(self.line, region, now.tension_n, step.speeds_m_per_s, step.size, step.number)
+            steps = f"steps of up to {asked.step_max_n:.3g} N for {asked.duration_s:g} s"
+            return Made(
+                ExperimentChange(experiment=asked),
+                f"to see how the configuration in service does, {steps} at {speeds} m/s",
+            )
+
+        return Offer(step.rung, f"steps at {speeds} m/s", make)
+
+    def _redesigns(self, step: Next, now: LineNow, region: Region | None) -> list[Offer]:
         """On the accepted model; in the end the configuration in service, for what data have shown since."""
         assert now.model is not None  # a redesign follows a model
         on = f"on model {model_hash(now.model)[:12]}, whose data go up to {now.model.region.speed_to_m_per_s:.3g} m/s"
-        if step.rung == AS_IT_IS:
-            return GainsChange(controller=now.in_service), f"the configuration in service, {on}"
+        as_it_is = Made(GainsChange(controller=now.in_service), f"the configuration in service, {on}")
+        rungs = [one.rung for one in (step, *step.others)]
+        designed = [] if rungs == [AS_IT_IS] else self._designs(now, region)
+        offers: list[Offer] = []
+        for rung in rungs:
+            if rung == AS_IT_IS:
+                offers.append(Offer(rung, "the configuration in service, as it is", lambda _: as_it_is))
+            elif rung < len(designed):
+                offers.append(self._redesign(rung, designed[rung], now, on))
+            elif rung == step.rung:
+                raise Exhausted(_nothing_left(len(designed)))
+        return offers
+
+    def _designs(self, now: LineNow, region: Region | None) -> list[Redesign]:
+        """What has been designed last, again."""
+        assert now.model is not None
         if self._designed is None or self._designed[1] != region or not _same(self._designed[0], now):
             judged = Region() if region is None else region
             found = redesigns(self.line, now.model, now.in_service, now.tension_n, judged, self._wanted_m_per_s)
             self._designed = now, region, found
-        found = self._designed[2]
-        if step.rung >= len(found):
-            raise Exhausted(_nothing_left(len(found)))
-        law, controller = found[step.rung]
-        return GainsChange(controller=controller), f"{law.text} {on}"
+        return self._designed[2]
+
+    def _redesign(self, rung: int, one: Redesign, now: LineNow, on: str) -> Offer:
+        def make(factors: Factors) -> Made:
+            law, controller = one.law, one.controller
+            if factors:
+                law = law.turned(factors)
+                controller = configuration(self.line, now.model, one.speed_m_per_s, law)
+            return Made(GainsChange(controller=controller), f"{law.text} {on}")
+
+        return Offer(rung, one.law.text, make, _knobs(one.law), one.law, one)
+
+
+def _knobs(law: Law) -> tuple[str, ...]:
+    return tuple(knob.name for knob in ARCHITECTURES[law.name].knobs)
 
 
 def _nothing_left(offered: int) -> str:

@@ -53,9 +53,9 @@ def commission(
     Example, to the speed at which the line produces, and once more on all data: r2rgate commission line.toml
     --speed 0.08 --adaptations 2
     """
-    from gateway.cli.commission import CannotGoOn
     from gateway.cli.commission import commission as carried_out
     from gateway.cli.commission_history import history as tried_on
+    from gateway.cli.commission_side import CannotGoOn
     from gateway.cli.waiting import interruptible
 
     line = read_line(file)

@@ -6,9 +6,10 @@ Read from the gate's list of proposals and the line's baselines, as the chain re
 from dataclasses import dataclass
 from typing import Any
 
-from gateway.cli.commission import CannotGoOn, GateSide, measured_on
-from gateway.commissioning.chain import Step, past_of
+from gateway.cli.commission_result import candidate_name
+from gateway.cli.commission_side import CannotGoOn, GateSide, measured_on
 from gateway.commissioning.convergence import Convergence
+from gateway.commissioning.past import Step, past_of
 from gateway.core.decisions import ProposalShown
 from gateway.core.line import Line
 
@@ -33,7 +34,7 @@ class Tried:
     def row(self) -> tuple[str, ...]:
         """For a table."""
         ended = ": ".join(part for part in (self.stage, ", ".join(self.against) or self.why) if part)
-        what = self.step if self.candidate is None else f"{self.step} {self.candidate}"
+        what = self.step if self.candidate is None else f"{self.step}, {candidate_name(self.candidate - 1)}"
         return (str(self.round), self.at[:19], what, self.reason, ended, self.measured.text if self.measured else "")
 
     def data(self) -> dict[str, Any]:

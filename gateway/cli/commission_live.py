@@ -8,9 +8,9 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from gateway.cli.commission import CannotGoOn
 from gateway.cli.commission_changes import LineNow
-from gateway.commissioning.chain import OPEN_STAGES, Outcome, past_of
+from gateway.cli.commission_side import CannotGoOn
+from gateway.commissioning.past import OPEN_STAGES, Outcome, past_of
 from gateway.core.decisions import Archive, ListProposals, ProposalList, ProposalShown, ShowProposal
 from gateway.core.line import Line
 from gateway.core.messages import Reply

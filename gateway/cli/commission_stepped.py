@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from gateway.cli.commission import CannotGoOn
 from gateway.cli.commission_changes import LineNow
+from gateway.cli.commission_side import CannotGoOn
 from gateway.cli.stepped import SteppedLoop
 from gateway.core.audit_record import Who
 from gateway.core.controller import canonical as canonical_controller

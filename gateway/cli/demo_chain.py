@@ -6,14 +6,16 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from gateway.cli.commission import Commissioned, GateSide, commission
+from gateway.cli.commission import commission
 from gateway.cli.commission_changes import LineNow
 from gateway.cli.commission_live import TOPICS, LiveGate
+from gateway.cli.commission_result import Commissioned
+from gateway.cli.commission_side import GateSide
 from gateway.cli.demo_cases import Window, again_after_stops, run_with_repeats
 from gateway.cli.demo_line import Setup
 from gateway.cli.demo_operator import DemoFailed, Operator
 from gateway.cli.demo_stepped import SteppedAside
-from gateway.commissioning.chain import Step, past_of
+from gateway.commissioning.past import Step, past_of
 from gateway.core.controller import Controller, config_hash
 from gateway.core.decisions import ProposalShown
 from gateway.core.deployment import Region

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from gateway.cli.commission import Tried
+from gateway.cli.commission_result import Tried
 from gateway.cli.demo_analysis import Evidence
 from gateway.cli.demo_chain import Chain
 from gateway.cli.demo_line import Setup

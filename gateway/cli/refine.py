@@ -11,10 +11,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-from gateway.cli.commission import CannotGoOn, GateSide, Tell, put, region_kept
+from gateway.cli.commission import Tell
 from gateway.cli.commission_changes import MOST_REASON, LineNow
+from gateway.cli.commission_side import CannotGoOn, GateSide, put, region_kept
 from gateway.cli.identify_model import model_of_found
-from gateway.commissioning.chain import OPEN_STAGES, refused_at_once
+from gateway.commissioning.chain import refused_at_once
+from gateway.commissioning.past import OPEN_STAGES
 from gateway.commissioning.redesign import redesigns
 from gateway.core.controller import config_hash
 from gateway.core.decisions import Archive, ProposalShown
@@ -80,11 +82,11 @@ async def refine(line: Line, side: RefinedSide, tell: Tell = lambda text: None) 
     # As fast as the newest data go: the others may be too old for the gate.
     region = (region_kept(shown) or Region()).model_copy(update={"speed_max_m_per_s": None})
     found = await asyncio.to_thread(redesigns, line, model, now.in_service, now.tension_n, region)
-    for rung, (law, controller) in enumerate(found):
+    for rung, offer in enumerate(found):
         await _require_downtime(side)
-        reason = f"{law.text} on the refined model"
+        reason = f"{offer.law.text} on the refined model"
         tell(reason)
-        hash_ = await put(line, side, GainsChange(controller=controller), reason, _named("redesign", rung))
+        hash_ = await put(line, side, GainsChange(controller=offer.controller), reason, _named("redesign", rung))
         tried.append(await _settled(side, hash_))
         if tried[-1].stage in ("kept", *ON_PROBATION):
             return Refined(True, True, f"{reason} is deployed; it is kept once the line has run with it", tried)

@@ -19,8 +19,8 @@ def refine(file: LineFile, run_dir: RunFolder = None) -> None:
 
     Example: r2rgate refine line.toml
     """
-    from gateway.cli.commission import CannotGoOn
     from gateway.cli.commission_commands import with_gate
+    from gateway.cli.commission_side import CannotGoOn
     from gateway.cli.refine import refine as carried_out
     from gateway.cli.waiting import interruptible
 

@@ -12,13 +12,14 @@ from pathlib import Path
 
 import numpy as np
 
-from gateway.cli.commission import Commissioned, Tried, commission
+from gateway.cli.commission import commission
 from gateway.cli.commission_changes import first_speed_m_per_s
+from gateway.cli.commission_result import Commissioned, Tried
 from gateway.cli.commission_stepped import SteppedGate, impatient
 from gateway.cli.rehearse_adaptations import Adapted, designs_on
 from gateway.cli.rehearse_result import AdaptationResult, Found
 from gateway.cli.stepped import SteppedLoop
-from gateway.commissioning.chain import Step
+from gateway.commissioning.past import Step
 from gateway.control.design import design_lqi, task_of, task_on
 from gateway.core.decisions import ProposalShown
 from gateway.core.line import Line

@@ -1,6 +1,6 @@
 """What the commissioning chain proposes: configurations and experiments, and how fast a line can go. Pure."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -53,6 +53,11 @@ class Law:
     @property
     def text(self) -> str:
         return self.name.upper() + "".join(f", {name} times {factor:g}" for name, factor in self.factors)
+
+    def turned(self, factors: Mapping[str, float]) -> "Law":
+        """With `factors` on top."""
+        own = dict(self.factors)
+        return Law(self.name, tuple({**own, **{k: own.get(k, 1.0) * v for k, v in factors.items()}}.items()))
 
 
 #: The most ambitious first.

@@ -12,49 +12,20 @@ where the criteria of convergence are met and no significant gain is predicted a
 otherwise another experiment, model, redesign and measurement follow, `MOST_ROUNDS` times at most. Where the model has
 foreseen what is not as it should be, so that a newer one has nothing to add, a calmer candidate follows at once.
 
-Where a proposal is refused, the next, less ambitious candidate of a short ladder is taken (`LADDERS`). What has been
-tried is read from the gate's own list of proposals, in which each says its step and its rung: whoever asks again after
-a restart goes on where it ended.
+Where a proposal is refused, the next, less ambitious candidate of a short ladder is taken (`LADDERS`), or whichever of
+those that are left somebody chooses, or one with numbers of its own. What has been tried is read from the gate's own
+list of proposals, in which each says its step and its rung: whoever asks again after a restart goes on where it ended.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from enum import StrEnum
+from dataclasses import dataclass, replace
 from math import sqrt
 
-from gateway.commissioning.candidates import FIRST_LAWS, NEAR
-from gateway.commissioning.redesign import RUNGS
-from gateway.core.decisions import ProposalShown
+from gateway.commissioning.candidates import NEAR
+from gateway.commissioning.ladder import AS_IT_IS, Ended, Next, on_ladder
+from gateway.commissioning.past import Follows, Outcome, Past, Step
 from gateway.core.line import Line
-from gateway.core.proposal import Evidence
-from gateway.core.verdict import Verdict
 
-
-class Step(StrEnum):
-    FIRST = "first configuration"
-    EXPERIMENT = "experiment"
-    MODEL = "model"
-    REDESIGN = "redesign"
-    MEASUREMENT = "measurement"
-
-
-class Outcome(StrEnum):
-    OPEN = "open"  #: it is being judged, decided, or done
-    DONE = "done"
-    AGAIN = "again"  #: nothing was against it but the moment
-    FAILED = "failed"
-
-
-#: Candidates of each step.
-LADDERS: dict[Step, int] = {
-    Step.FIRST: len(FIRST_LAWS),
-    Step.EXPERIMENT: 4,
-    Step.MODEL: 2,
-    Step.REDESIGN: RUNGS + 1,
-    Step.MEASUREMENT: 2,
-}
-AS_IT_IS = RUNGS  #: of a redesign: the configuration in service stays, and is judged for what data have shown since
-MOST_AGAIN = 3  #: times that one rung is proposed again, because the moment was wrong
 MOST_EXPERIMENTS = 3  #: in a row, without a model from their data
 MOST_ROUNDS = 3  #: measurements, before what they show is left as it is
 STRETCH = 3.0  #: of the speed that data have shown: an experiment goes no faster
@@ -66,40 +37,6 @@ MEASURED_AT = 0.75
 #: The same of the first experiment. Moves of tensions that creep turn rollers back, and dry friction with them: at half
 #: the first speed data of one line look like those of two.
 SLOWER_FIRST_LEG = 0.75
-PROPOSED_BY = "commissioning: "  #: how the evidence begins that names step and rung
-
-#: Rules that speak against the moment, not against what is proposed.
-OF_THE_MOMENT = frozenset({"state of the line", "cool-down", "freshness", "time", "judge process"})
-OPEN_STAGES = frozenset({"received", "waiting", "approved", "deploying", "probation", "keeping", "running"})
-STALE_STAGES = frozenset({"expired", "superseded", "not-deployed"})
-
-
-@dataclass(frozen=True)
-class Past:
-    """A proposal of the gate's list, or a candidate that could not even be made."""
-
-    kind: str
-    outcome: Outcome
-    step: Step | None = None  #: of this chain; None: somebody else has proposed it
-    rung: int = 0
-    why: str = ""
-    speed_m_per_s: float | None = None  #: up to which a verdict lets a configuration run
-    proposal: str = ""  #: hash; empty: it could not be made
-    settled: bool | None = None  #: of a measurement: converged, and nothing to gain; None: nobody has looked at it yet
-    gains: bool = (
-        False  #: the same: the line does otherwise than the model foresees, so that a newer one would tell more
-    )
-
-
-@dataclass(frozen=True)
-class Next:
-    """To be proposed."""
-
-    step: Step
-    rung: int
-    speeds_m_per_s: tuple[float, ...] = ()  #: of an experiment's legs
-    size: float = 1.0  #: of an experiment, times the amplitude that it is designed with
-    number: int = 0  #: of the experiment since the last model, from 0
 
 
 @dataclass(frozen=True)
@@ -108,18 +45,6 @@ class Pending:
 
     proposal: str
     kind: str
-
-
-@dataclass(frozen=True)
-class Ended:
-    """`reached`: an adapted configuration is in service over the line's range of speeds.
-
-    `converged`: and it does there what it should, with nothing significant left to gain.
-    """
-
-    reached: bool
-    text: str
-    converged: bool = False
 
 
 @dataclass(frozen=True)
@@ -141,21 +66,21 @@ def next_step(
     last = {kind: _last_done(past, kind) for kind in ("gains", "experiment", "model")}
     since = past[max(last.values()) + 1 :]
     if last["gains"] < 0:
-        return _on_ladder(Step.FIRST if last["model"] < 0 else Step.REDESIGN, since)
+        return on_ladder(Step.FIRST if last["model"] < 0 else Step.REDESIGN, since)
     newest = past[last["experiment"]] if last["experiment"] > last["model"] else None
     of_measurement = newest is not None and newest.step is Step.MEASUREMENT
     if newest is not None and of_measurement and last["experiment"] > last["gains"]:
         more = _experiment(past, since, first_speed_m_per_s, wanted_m_per_s, 0)
         return _measured(past, newest, since, adaptations, more)
     if newest is not None and not of_measurement:
-        found = _on_ladder(Step.MODEL, since)
+        found = on_ladder(Step.MODEL, since)
         number = sum(_is_done(one, "experiment") for one in past[last["model"] + 1 :])
         if isinstance(found, Next) or number >= MOST_EXPERIMENTS:
             return found
         return _experiment(past, since, first_speed_m_per_s, wanted_m_per_s, number)
     reached = region_speed(past) or 0.0
     if last["model"] > last["gains"]:
-        found = _on_ladder(Step.REDESIGN, since, _known_by_measurement(past))
+        found = on_ladder(Step.REDESIGN, since, _known_by_measurement(past))
         measured = any(one.step is Step.MEASUREMENT and _is_done(one, "experiment") for one in past)
         return Ended(True, found.text) if isinstance(found, Ended) and measured else found
     if last["model"] >= 0 and reached >= NEAR * wanted_m_per_s:
@@ -164,7 +89,7 @@ def next_step(
             "an adapted configuration" if adapted else "the configuration of the begin, judged on the line's own model,"
         )
         text = f"{what} is in service up to {reached:.3g} m/s"
-        found = _on_ladder(Step.MEASUREMENT, since)
+        found = on_ladder(Step.MEASUREMENT, since)
         if isinstance(found, Ended):
             return Ended(True, f"{text}; what it does there could not be measured: {found.text}")
         number = sum(one.step is Step.MEASUREMENT for one in past)
@@ -179,20 +104,20 @@ def _measured(
     past: Sequence[Past], measured: Past, since: Sequence[Past], adaptations: int, more: Next | Ended
 ) -> Next | Look | Ended:
     """After a measurement. `more`: the experiment with which another round begins."""
-    if measured.settled is None:
+    if measured.follows is None:
         return Look(measured.proposal)
     what = f"an adapted configuration is in service up to {region_speed(past) or 0.0:.3g} m/s"
     redesigned = sum(_is_done(one, "gains") for one in past[_first_model(past) :])
-    if measured.settled and redesigned >= adaptations:
-        return Ended(True, f"{what}; {measured.why}", converged=True)
+    if measured.follows is Follows.LEAVE and redesigned >= adaptations:
+        return Ended(True, f"{what}; {measured.why}", measured.converged)
     rounds = sum(one.step is Step.MEASUREMENT and _is_done(one, "experiment") for one in past)
     if rounds >= MOST_ROUNDS:
         return Ended(True, f"{what}, and after {rounds} measurements that is left as it is; {measured.why}")
-    calmer = redesigned >= adaptations and not (measured.settled or measured.gains)
+    calmer = redesigned >= adaptations and measured.follows is Follows.CALMER
     # What is in service has been judged for all that data have shown: as it is, it is no candidate here.
-    found = _on_ladder(Step.REDESIGN, since, _known_by_measurement(past), AS_IT_IS) if calmer else more
+    found = on_ladder(Step.REDESIGN, since, _known_by_measurement(past), AS_IT_IS) if calmer else more
     if isinstance(found, Ended):
-        return Ended(True, f"{what}; {measured.why}; {found.text}", measured.settled)
+        return Ended(True, f"{what}; {measured.why}; {found.text}", measured.converged)
     return found
 
 
@@ -212,48 +137,6 @@ def _stands_still(past: Sequence[Past]) -> bool:
     return len(speeds) == 3 and speeds[2] < LEAST_RISE**2 * speeds[0] and speeds[2] < LEAST_RISE * speeds[1]
 
 
-def past_of(shown: ProposalShown) -> Past:
-    """A proposal as the gate shows it."""
-    verdict = shown.verdict
-    step, rung = _named(shown.proposal.evidence)
-    region = None if verdict is None else verdict.region
-    return Past(
-        kind=shown.proposal.kind,
-        outcome=_outcome(shown.stage, shown.why, verdict),
-        step=step,
-        rung=rung,
-        why=shown.why,
-        speed_m_per_s=None if region is None else region.speed_max_m_per_s,
-        proposal=shown.proposal_hash,
-    )
-
-
-def named(step: Step, rung: int) -> Evidence:
-    """By which a proposal of the chain is known."""
-    return Evidence(what=f"{PROPOSED_BY}{step}", value=float(rung))
-
-
-def _named(evidence: Sequence[Evidence]) -> tuple[Step | None, int]:
-    for one in evidence:
-        name = one.what.removeprefix(PROPOSED_BY)
-        if one.what.startswith(PROPOSED_BY) and name in set(Step) and one.value is not None:
-            return Step(name), int(one.value)
-    return None, 0
-
-
-def _outcome(stage: str, why: str, verdict: Verdict | None) -> Outcome:
-    if stage in OPEN_STAGES:
-        return Outcome.OPEN
-    if stage in STALE_STAGES:
-        return Outcome.AGAIN
-    if stage == "kept" or (stage == "done" and not why):
-        return Outcome.DONE
-    if stage == "refused" and verdict is not None:
-        against = {one.rule for one in verdict.findings if not one.passed}
-        return Outcome.AGAIN if against <= OF_THE_MOMENT else Outcome.FAILED
-    return Outcome.FAILED
-
-
 def _is_done(one: Past, kind: str) -> bool:
     return one.kind == kind and one.outcome is Outcome.DONE
 
@@ -269,21 +152,7 @@ def _known_by_measurement(past: Sequence[Past]) -> int:
     """
     on_it = past[_last_done(past, "model") + 1 :]
     done = [one for one in on_it if one.step is Step.MEASUREMENT and _is_done(one, "experiment")]
-    return min(sum(one.settled is False and not one.gains for one in done), AS_IT_IS)
-
-
-def _on_ladder(step: Step, since: Sequence[Past], least: int = 0, end: int | None = None) -> Next | Ended:
-    """The first rung above those that have failed since something was done last; from `least` up to before `end`."""
-    end = LADDERS[step] if end is None else end
-    tried = [one for one in since if one.step is step]
-    rung = max(least, 1 + max((one.rung for one in tried if one.outcome is Outcome.FAILED), default=-1))
-    if rung >= end:
-        last = f"; the last one: {tried[-1].why}" if tried else ""
-        return Ended(False, f"no {step} of {end} candidates gets through{last}")
-    again = [one for one in tried if one.outcome is Outcome.AGAIN and one.rung == rung]
-    if len(again) > MOST_AGAIN:
-        return Ended(False, f"the {step} has come at a wrong moment {len(again)} times; the last time: {again[-1].why}")
-    return Next(step, rung)
+    return min(sum(one.follows is Follows.CALMER for one in done), AS_IT_IS)
 
 
 def _experiment(
@@ -293,19 +162,23 @@ def _experiment(
 
     Larger where the data of one before have given no model; the first one before that at one speed.
     """
-    found = _on_ladder(Step.EXPERIMENT, since)
+    found = on_ladder(Step.EXPERIMENT, since)
     if isinstance(found, Ended):
         return found
     shown = region_speed(past) or first_m_per_s
-    if _last_done(past, "model") < 0:
-        top = min(first_m_per_s, shown)
-        legs = first_legs(top) if number == 0 else (top,)
-        return Next(Step.EXPERIMENT, found.rung, legs, 2.0 ** max(number - 1, 0) * 0.5**found.rung, number)
-    top = min(wanted_m_per_s, STRETCH * shown)
-    if found.rung >= 2:
-        top = sqrt(shown * top)
-    size = 2.0**number * 0.5 ** (found.rung % 2)
-    return Next(Step.EXPERIMENT, found.rung, (SLOWER_LEG * top, top), size, number)
+    first = _last_done(past, "model") < 0
+
+    def at(rung: int) -> Next:
+        if first:
+            top = min(first_m_per_s, shown)
+            legs = first_legs(top) if number == 0 else (top,)
+            return Next(Step.EXPERIMENT, rung, legs, 2.0 ** max(number - 1, 0) * 0.5**rung, number)
+        top = min(wanted_m_per_s, STRETCH * shown)
+        if rung >= 2:
+            top = sqrt(shown * top)
+        return Next(Step.EXPERIMENT, rung, (SLOWER_LEG * top, top), 2.0**number * 0.5 ** (rung % 2), number)
+
+    return replace(at(found.rung), others=tuple(at(one.rung) for one in found.others), own=found.own)
 
 
 def first_legs(top_m_per_s: float) -> tuple[float, ...]:

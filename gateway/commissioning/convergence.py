@@ -21,6 +21,7 @@ from math import inf, isfinite
 import numpy as np
 
 from gateway.commissioning.candidates import NotOffered
+from gateway.commissioning.past import Follows
 from gateway.commissioning.simulated_loop import loop_of
 from gateway.control.rollout import Course, plants_of_thetas, simulate
 from gateway.core.controller import Controller
@@ -62,6 +63,14 @@ class SpanFigures(Strict):
         )
 
 
+class Diagnosis(Strict):
+    """What was decided to follow from a measurement."""
+
+    follows: Follows
+    by: str
+    because: str
+
+
 class Convergence(Strict):
     """Of a configuration on its line. Spans are those with a load cell; `gap` is measured over predicted less 1."""
 
@@ -69,6 +78,7 @@ class Convergence(Strict):
     predicted: dict[str, SpanFigures]  #: on the accepted model
     rmse_n: float  #: over all spans and changes
     gap: float  #: of that
+    diagnosis: Diagnosis | None = None  #: null: as the rules have it
 
     @property
     def converged(self) -> bool:
@@ -83,6 +93,13 @@ class Convergence(Strict):
     def gains(self) -> bool:
         """A newer model would lead to another design."""
         return abs(self.gap) >= SIGNIFICANT
+
+    @property
+    def follows(self) -> Follows:
+        """As was decided; as the rules have it where nobody else has."""
+        if self.diagnosis is not None:
+            return self.diagnosis.follows
+        return Follows.NEWER_MODEL if self.gains else Follows.LEAVE if self.converged else Follows.CALMER
 
     @property
     def worst(self) -> SpanFigures:

@@ -6,7 +6,7 @@ settling time in the gate's courses. The tracking error in all that it is propos
 model's corners is the gate's own to find: where it refuses one, the next of the ladder is a calmer one.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import takewhile
@@ -62,6 +62,17 @@ class Figures:
 
 
 @dataclass(frozen=True)
+class Offer:
+    """A design worth proposing, and what it does on the model, by course."""
+
+    law: Law
+    controller: Controller
+    speed_m_per_s: float  #: up to which it is designed
+    figures: Mapping[str, Figures]
+    before: Mapping[str, Figures]  #: the same of what is in service
+
+
+@dataclass(frozen=True)
 class Beside:
     """What is in service, and for what it was judged."""
 
@@ -72,7 +83,7 @@ class Beside:
 def redesigns(
     line: Line, model: LineModel, in_service: Controller, tension_n: Sequence[float], region: Region,
     wanted_m_per_s: float = inf,
-) -> list[tuple[Law, Controller]]:  # fmt: skip
+) -> list[Offer]:  # fmt: skip
     """At most `RUNGS`, for steps as the line's file permits and speeds up to those of the model's data.
 
     Or up to a higher one of `region`, for which the configuration in service was judged. Predictive control is offered
@@ -93,8 +104,9 @@ def redesigns(
     if speed < NEAR * min(wanted_m_per_s, fastest_m_per_s(line, model)):
         return linear
     predictive = _designed(line, model, speed, PREDICTIVE)
-    found = _worth([*predictive, *linear[:1]], beside, line, model, judged, BRIEF_S)
-    return [*takewhile(lambda each: each not in linear, found), *linear]
+    best = [(one.law, one.controller) for one in linear[:1]]
+    found = _worth([*predictive, *best], beside, line, model, judged, BRIEF_S)
+    return [*takewhile(lambda each: (each.law, each.controller) not in best, found), *linear]
 
 
 def _designed(line: Line, model: LineModel, speed_m_per_s: float, laws: Sequence[Law]) -> list[tuple[Law, Controller]]:
@@ -109,17 +121,18 @@ def _designed(line: Line, model: LineModel, speed_m_per_s: float, laws: Sequence
 def _worth(
     designed: Sequence[tuple[Law, Controller]], beside: Beside, line: Line, model: LineModel, judged: Judged,
     lasting_s: float,
-) -> list[tuple[Law, Controller]]:  # fmt: skip
+) -> list[Offer]:  # fmt: skip
     """Those that do no worse than what is in service, the one with the least tracking error first."""
     known = judged.within(beside.region)
     before, before_known = (predicted(beside.controller, line, model, of, lasting_s) for of in (judged, known))
-    found: list[tuple[float, Law, Controller]] = []
+    found: list[tuple[float, Offer]] = []
     for law, config in designed:
         figures = predicted(config, line, model, judged, lasting_s)
         figures_known = figures if known is judged else predicted(config, line, model, known, lasting_s)
         if all(_no_worse(line, figures_known[name], before_known[name]) for name in before_known):
-            found.append((sum(_beside(figures[name].rmse_n, before[name].rmse_n) for name in before), law, config))
-    return [each[1:] for each in sorted(found, key=lambda each: each[0])]
+            whole = sum(_beside(figures[name].rmse_n, before[name].rmse_n) for name in before)
+            found.append((whole, Offer(law, config, judged.speed_max_m_per_s, figures, before)))
+    return [offer for _, offer in sorted(found, key=lambda each: each[0])]
 
 
 def _slow(config: Controller) -> bool:

@@ -37,7 +37,7 @@ Decision = Literal[
 ]
 DECISIONS: tuple[Decision, ...] = get_args(Decision)
 Sentence = Annotated[str, Field(min_length=1, max_length=600)]
-OptionId = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9-]{0,63}$")]
+OptionId = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,63}$")]
 MOST_BYTES = 65_536  #: of a question or a choice as JSON
 AGENTS: dict[str, str] = {
     "identify": "sysid",
@@ -69,6 +69,7 @@ class Knob(Strict):
     meaning: Sentence  #: what more of it does
     least: Positive
     most: Positive
+    of: Annotated[list[OptionId], Field(max_length=40)] = []  #: options that have it; nothing: all
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -102,7 +103,10 @@ class Question(Strict):
         for what, names in (("options", [one.id for one in self.options]), ("knobs", [one.name for one in self.knobs])):
             if twice := sorted({name for name in names if names.count(name) > 1}):
                 raise ValueError(f"{what} has {', '.join(twice)} twice; allowed: each once")
-        if self.usual not in [one.id for one in self.options]:
+        options = [one.id for one in self.options]
+        if strange := sorted({name for knob in self.knobs for name in knob.of} - set(options)):
+            raise ValueError(f"knobs are of {', '.join(strange)}; allowed: the options, {', '.join(options)}")
+        if self.usual not in options:
             raise ValueError(f"usual is {self.usual}; allowed: one of the options")
         return self
 
@@ -147,7 +151,7 @@ def wrong_with(choice: Choice, question: Question) -> list[str]:
     """Why `choice` is no answer to `question`; empty: it is one."""
     options = [one.id for one in question.options]
     against = [] if choice.option in options else [_unknown("option", choice.option, options)]
-    knobs = {one.name: one for one in question.knobs}
+    knobs = {one.name: one for one in question.knobs if choice.option in one.of or not one.of}
     return against + _wrong_factors(choice.factors, knobs)
 
 

@@ -16,7 +16,8 @@ from pathlib import Path
 
 import numpy as np
 
-from gateway.cli.commission import Commissioned, Tried, commission
+from gateway.cli.commission import commission
+from gateway.cli.commission_result import Commissioned, Tried
 from gateway.cli.commission_stepped import SteppedGate, impatient
 from gateway.cli.stepped import SteppedLoop
 from gateway.control.design import design_lqi, task_of

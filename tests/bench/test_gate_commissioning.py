@@ -1,6 +1,6 @@
 """Part d of bench-gate by itself: what its tables say of lines that were commissioned, and of those that were not."""
 
-from gateway.cli.commission import Tried
+from gateway.cli.commission_result import Tried
 from gateway.commissioning.candidates import Law
 from gateway.control.design import design_lqi, task_on
 from tests.bench.figures import Bench

@@ -11,7 +11,7 @@ import pytest
 from gateway.cli.commission import commission
 from gateway.cli.commission_stepped import SteppedGate, impatient
 from gateway.cli.stepped import SteppedLoop, run_scenario
-from gateway.commissioning.chain import Step
+from gateway.commissioning.past import Step
 from gateway.control.design import design_lqi, task_of, task_on
 from gateway.core.controller import config_hash
 from gateway.core.scenario import Scenario

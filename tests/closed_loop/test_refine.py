@@ -5,7 +5,8 @@ import asyncio
 import numpy as np
 import pytest
 
-from gateway.cli.commission import CannotGoOn, commission, put
+from gateway.cli.commission import commission
+from gateway.cli.commission_side import CannotGoOn, put
 from gateway.cli.commission_stepped import SteppedGate, impatient
 from gateway.cli.refine import refine
 from gateway.cli.stepped import SteppedLoop, run_scenario

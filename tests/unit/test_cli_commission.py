@@ -1,22 +1,27 @@
 """`r2rgate commission` against a gateway in this process that keeps its promises, and no more."""
 
 import asyncio
+from dataclasses import replace
 from datetime import UTC, datetime
 
 import pytest
 
-from gateway.cli.commission import CannotGoOn, commission
+from gateway.cli.commission import commission
 from gateway.cli.commission_changes import LineNow
 from gateway.cli.commission_history import approvals, history
 from gateway.cli.commission_live import LiveGate
 from gateway.cli.commission_measurements import SCENARIO, keep, kept
-from gateway.commissioning.chain import LADDERS, Step
+from gateway.cli.commission_side import CannotGoOn
 from gateway.commissioning.convergence import Convergence, SpanFigures
+from gateway.commissioning.decisions import Decided, Rules
+from gateway.commissioning.ladder import LADDERS, MOST_OWN, OWN
+from gateway.commissioning.past import Step
 from gateway.control.design import design_lqi, task_of
 from gateway.core.controller import config_hash
 from gateway.core.decisions import QUERY, ListProposals, ProposalLine, ProposalList, ProposalShown
 from gateway.core.messages import Event, Reply
 from gateway.core.proposal import parse_proposal, proposal_hash
+from gateway.core.questions import Choice, Question, wrong_with
 from gateway.core.topics import GATEWAY_PROPOSALS, GATEWAY_PROPOSE, LOOP_EVENT, LOOP_TELEMETRY
 from gateway.core.verdict import RuleFinding, Verdict
 from gateway.mailbox.inprocess import Hub, InProcessMailbox
@@ -126,6 +131,51 @@ def test_each_candidate_is_proposed_once_and_the_end_says_why(tmp_path):
     again = OneProcess(tmp_path)
     again.shown = gateway.shown  # the command started anew
     assert asyncio.run(commission(LINE, again.side)).text == found.text and len(again.shown) == len(found.tried)
+
+
+class Picky:
+    """`Decider`: the last option, its first knob turned as far as it goes, as long as there are knobs."""
+
+    def __init__(self):
+        self.asked: list[Question] = []
+
+    def decide(self, question):
+        self.asked.append(question)
+        option = question.options[-1].id
+        knob = next((one for one in question.knobs if not one.of or option in one.of), None)
+        factors = {} if knob is None else {knob.name: knob.most}
+        choice = Choice(option=option, factors=factors, reason="it is the calmest")
+        assert not wrong_with(choice, question)
+        return Decided(choice, "initial-control")
+
+
+def test_what_an_agent_chooses_is_proposed_in_its_name_and_what_was_refused_is_told_the_next_time(tmp_path):
+    gateway, picky = OneProcess(tmp_path), Picky()
+    found = asyncio.run(commission(LINE, gateway.side, gateway.told.append, decider=picky))
+    assert not found.reached
+    own, ladder = [OWN + k for k in range(MOST_OWN)], list(reversed(range(LADDERS[Step.FIRST])))
+    assert [one.rung for one in found.tried] == [*own, *ladder]
+    shown = list(gateway.shown.values())
+    assert {one.proposal.author for one in shown[:-1]} == {"agents"}
+    assert shown[0].proposal.reason.endswith('initial-control says: "it is the calmest"')
+    assert "torque_per_nm2 times 64" in shown[0].proposal.reason
+    first, second = picky.asked[0], picky.asked[1]
+    assert first.decision == "design.architecture" and first.usual == first.options[0].id
+    assert not any("tried" in fact for fact in first.facts)
+    assert any("own numbers: failed: corners: error" in fact or "too far" in fact for fact in second.facts)
+    assert not picky.asked[MOST_OWN].knobs
+
+
+def test_where_an_agent_does_not_answer_the_rules_decide_and_it_is_told(tmp_path):
+    class Absent(Rules):
+        def decide(self, question):
+            return replace(super().decide(question), instead="initial-control does not answer")
+
+    gateway = OneProcess(tmp_path)
+    found = asyncio.run(commission(LINE, gateway.side, gateway.told.append, decider=Absent()))
+    assert [one.rung for one in found.tried] == list(range(LADDERS[Step.FIRST]))
+    assert {one.proposal.author for one in gateway.shown.values()} == {"rules"}
+    assert any("initial-control does not answer: the rules decide" in text for text in gateway.told)
 
 
 def test_the_history_says_what_was_tried_and_by_what_it_was_refused(tmp_path):

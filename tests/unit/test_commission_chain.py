@@ -15,24 +15,16 @@ from gateway.commissioning.candidates import (
     fastest_m_per_s,
 )
 from gateway.commissioning.chain import (
-    AS_IT_IS,
-    LADDERS,
-    MOST_AGAIN,
     MOST_EXPERIMENTS,
     MOST_ROUNDS,
     STRETCH,
-    Ended,
     Look,
-    Next,
-    Outcome,
-    Past,
     Pending,
-    Step,
-    named,
     next_step,
-    past_of,
     refused_at_once,
 )
+from gateway.commissioning.ladder import AS_IT_IS, LADDERS, MOST_AGAIN, MOST_OWN, OWN, Ended, Next
+from gateway.commissioning.past import Follows, Outcome, Past, Step, named, past_of
 from gateway.commissioning.redesign import LAWS, PREDICTIVE
 from gateway.control.design import design_lqi, is_stable, task_of
 from gateway.core.controller import config_hash
@@ -57,7 +49,8 @@ def asked(past, adaptations=1):
 def looked_at(past, settled=True, gains=False):
     """The last measurement, once somebody has looked at it."""
     why = "as it should" if settled else "span 2 overshoots"
-    return [*past[:-1], replace(past[-1], settled=settled, gains=gains, why=why)]
+    follows = Follows.LEAVE if settled else Follows.NEWER_MODEL if gains else Follows.CALMER
+    return [*past[:-1], replace(past[-1], converged=settled, follows=follows, why=why)]
 
 
 def after(step: Next, past, outcome=Outcome.DONE) -> Past:
@@ -98,6 +91,20 @@ def test_what_is_refused_is_followed_by_the_next_candidate_and_by_the_reason_in_
         and not asked(past).reached
         and f"corner {LADDERS[Step.FIRST] - 1}" in asked(past).text
     )
+
+
+def test_in_the_place_of_a_candidate_any_that_has_not_failed_may_be_taken():
+    first = asked([])
+    assert [one.rung for one in (first, *first.others)] == list(range(LADDERS[Step.FIRST])) and first.own == MOST_OWN
+    past = [after(first.others[1], [], Outcome.FAILED)]  # somebody began with the third
+    assert [one.rung for one in (asked(past), *asked(past).others)] == [0, 1, *range(3, LADDERS[Step.FIRST])]
+    past += [after(replace(first, rung=OWN), [], Outcome.FAILED)]
+    assert asked(past).rung == 0 and asked(past).own == MOST_OWN - 1
+
+
+def test_where_there_is_no_design_on_a_rung_there_is_none_above_it_but_what_is_in_service():
+    past = [*ADAPTED[:3], Past("gains", Outcome.FAILED, Step.REDESIGN, 2, "no other design", last=True)]
+    assert [one.rung for one in (asked(past), *asked(past).others)] == [0, 1, AS_IT_IS]
 
 
 def test_a_refused_experiment_is_smaller_then_slower():
@@ -208,15 +215,27 @@ def test_a_measurement_that_failed_is_followed_by_a_smaller_one():
     assert asked([*ADAPTED, failed]).size == 0.5 * asked(ADAPTED).size
 
 
+def picked(step: Next, pick: int) -> Next:
+    candidates = (step, *step.others)
+    assert len({one.rung for one in candidates}) == len(candidates) and step.own <= MOST_OWN
+    if pick > 10 and step.own > 0:
+        return replace(step, rung=OWN + MOST_OWN - step.own)
+    return candidates[pick % len(candidates)]
+
+
 @settings(max_examples=50)
 @given(
     st.lists(st.sampled_from([Outcome.DONE, Outcome.DONE, Outcome.FAILED, Outcome.AGAIN]), min_size=1, max_size=40),
     st.floats(0.2, 1.0),
+    st.lists(st.integers(0, 20), min_size=1, max_size=40),
 )
-def test_it_ends_whatever_the_gate_says(outcomes, share):
-    """It says the same again and again; `share` of what an experiment has shown is what a configuration gets."""
+def test_it_ends_whatever_the_gate_says_and_whoever_chooses(outcomes, share, picks):
+    """It says the same again and again; `share` of what an experiment has shown is what a configuration gets.
+
+    A pick is one of the candidates in turn, or the first of them with numbers of somebody's own.
+    """
     past: list[Past] = []
-    for outcome in islice(cycle(outcomes), 600):
+    for outcome, pick in islice(zip(cycle(outcomes), cycle(picks), strict=False), 900):
         step = asked(past)
         if isinstance(step, Ended):
             return
@@ -226,7 +245,7 @@ def test_it_ends_whatever_the_gate_says(outcomes, share):
         assert isinstance(step, Next) and step.rung < LADDERS[step.step]
         reached = max((one.speed_m_per_s or 0.0 for one in past if one.kind == "gains"), default=FIRST_M_PER_S)
         assert all(speed <= max(STRETCH * reached, FIRST_M_PER_S) * (1.0 + 1e-9) for speed in step.speeds_m_per_s)
-        one = after(step, past, outcome)
+        one = after(picked(step, pick), past, outcome)
         speed = None if one.speed_m_per_s is None else share * one.speed_m_per_s
         past.append(replace(one, speed_m_per_s=speed) if one.kind == "gains" else one)
     raise AssertionError(f"{len(past)} proposals, and no end")

@@ -19,7 +19,7 @@ from gateway.cli.demo_chain_table import print_chain
 from gateway.cli.demo_line import Setup, line_text
 from gateway.cli.demo_operator import DemoFailed
 from gateway.cli.demo_result import DemoResult, paper_improvement_pct
-from gateway.commissioning.chain import Step, named
+from gateway.commissioning.past import Step, named
 from gateway.control.design import design_lqi, task_of
 from gateway.core.controller import config_hash
 from gateway.core.deployment import Region

@@ -24,7 +24,11 @@ from gateway.core.questions import (
 QUESTION = Question(
     format=1, site="hall", line="coater", decision="adapt.change", task="which design is proposed next",
     options=[Option(id="lqi", title="LQI"), Option(id="pid-calm", title="PID, calmer")], usual="lqi",
-    why="the least tracking error", knobs=[Knob(name="torque", meaning="calmer", least=0.5, most=2.0)],
+    why="the least tracking error",
+    knobs=[
+        Knob(name="torque", meaning="calmer", least=0.5, most=2.0),
+        Knob(name="tension-share", meaning="quicker", least=0.25, most=4.0, of=["pid-calm"]),
+    ],
 )  # fmt: skip
 
 
@@ -55,6 +59,7 @@ def test_a_choice_with_factors_within_their_bounds_is_taken() -> None:
         (b"[]", "allowed: a JSON object"),
         (said(option="lqj"), "option is lqj; allowed: lqi, pid-calm; the nearest is lqi"),
         (said(factors={"torqe": 1.0}), "factors names is torqe; allowed: torque; the nearest is torque"),
+        (said(factors={"tension-share": 1.0}), "factors names is tension-share; allowed: torque"),
         (said(factors={"torque": 2.1}), "factors.torque is 2.1; allowed: 0.5 to 2"),
         (said(factors={"torque": float("nan")}), "is not a finite number; allowed: a number above 0"),
         (said(factors={"torque": True}), "factors"),
@@ -68,6 +73,11 @@ def test_a_choice_with_factors_within_their_bounds_is_taken() -> None:
 def test_what_is_no_answer_is_refused_with_its_reason(payload: bytes, told: str) -> None:
     with pytest.raises(ChoiceRefused, match=told):
         parse_choice(payload, QUESTION)
+
+
+def test_a_knob_of_some_options_is_turned_with_those() -> None:
+    found = parse_choice(said(option="pid-calm", factors={"tension-share": 4.0, "torque": 0.5}), QUESTION)
+    assert found.factors == {"tension-share": 4.0, "torque": 0.5}
 
 
 def test_every_reason_is_told() -> None:
@@ -92,6 +102,7 @@ def test_no_bytes_do_anything_but_choose_or_be_refused(payload: bytes) -> None:
         ({"usual": "best"}, "one of the options"),
         ({"options": [{"id": "lqi", "title": "a"}, {"id": "lqi", "title": "b"}]}, "twice"),
         ({"options": []}, "at least 1"),
+        ({"knobs": [{"name": "a", "meaning": "b", "least": 0.5, "most": 2.0, "of": ["lqr"]}]}, "knobs are of lqr"),
         ({"knobs": [{"name": "torque", "meaning": "calmer", "least": 2.0, "most": 4.0}]}, "1 between them"),
     ],
 )

@@ -35,20 +35,21 @@ def offered():
 
 
 def test_where_data_reach_the_highest_speed_predictive_control_comes_before_the_others(offered):
-    laws = [law for law, _ in offered]
+    laws = [one.law for one in offered]
     assert len(laws) <= RUNGS and laws[0] in PREDICTIVE
     predictive = [law in PREDICTIVE for law in laws]
     assert predictive == sorted(predictive, reverse=True) and 1 <= predictive.count(False) <= LINEAR_RUNGS
     slower = redesigns(LINE, believing(0.03), CALM, TENSION_N, Region())
-    assert slower and not any(law in PREDICTIVE for law, _ in slower)
+    assert slower and not any(one.law in PREDICTIVE for one in slower)
     shown = redesigns(LINE, believing(0.03), CALM, TENSION_N, Region(speed_max_m_per_s=0.06))
-    assert shown[0][0] in PREDICTIVE
+    assert shown[0].law in PREDICTIVE
 
 
 def test_nothing_is_offered_that_does_worse_on_the_model(offered):
     judged = Judged(LINE, np.array(TENSION_N), 0.06, LINE.limits.tension_step_max_n, 0.06)
     before = predicted(CALM, LINE, MODEL, judged)
-    linear = [predicted(config, LINE, MODEL, judged) for law, config in offered if law not in PREDICTIVE]
+    linear = [predicted(one.controller, LINE, MODEL, judged) for one in offered if one.law not in PREDICTIVE]
+    assert linear == [one.figures for one in offered if one.law not in PREDICTIVE]
     assert all(one[name].rmse_n < 1.02 * before[name].rmse_n for one in linear for name in before)
     errors = [sum(one[name].rmse_n / before[name].rmse_n for name in before) for one in linear]
     assert errors == sorted(errors)

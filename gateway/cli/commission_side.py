@@ -1,0 +1,94 @@
+"""What the commissioning chain needs of a gate and the line behind it, and how a proposal is put before one."""
+
+from collections.abc import Sequence
+from datetime import timedelta
+from pathlib import Path
+from typing import Protocol
+
+from gateway.cli.commission_changes import LineNow
+from gateway.cli.commission_measurements import kept
+from gateway.commissioning.convergence import Convergence
+from gateway.commissioning.decisions import RULES
+from gateway.core.controller import config_hash
+from gateway.core.decisions import ProposalShown
+from gateway.core.deployment import Region
+from gateway.core.line import Line
+from gateway.core.line_model import model_hash
+from gateway.core.messages import Reply
+from gateway.core.proposal import Change, Evidence, Proposal, canonical, proposal_hash
+from gateway.core.recording import Recording
+from gateway.supervisor.baselines import BaselinesError
+
+STANDS_S = 8.0 * 3600.0  #: a proposal, until somebody decides
+
+
+class CannotGoOn(Exception):
+    """The line or its gateway does not let the chain go on; the text says why, and what to do."""
+
+
+class GateSide(Protocol):
+    """A gate and the line behind it. Every method raises CannotGoOn."""
+
+    async def proposals(self) -> list[ProposalShown]:
+        """All of the line, the oldest first."""
+        ...
+
+    async def now(self) -> LineNow: ...
+
+    async def state(self) -> str:
+        """Of the loop: RUN, READY ..."""
+        ...
+
+    async def folder(self) -> Path:
+        """Of the line's data, where its baselines are."""
+        ...
+
+    async def recordings(self) -> list[Recording]:
+        """Of experiments, as the gate judges by them: the newest first."""
+        ...
+
+    async def ready(self) -> None:
+        """Until nothing moves, and the line may be changed again."""
+        ...
+
+    async def propose(self, payload: bytes) -> Reply: ...
+
+    async def wait_for(self, proposal: str) -> None:
+        """A while, or until it stands otherwise than now."""
+        ...
+
+
+async def measured_on(line: Line, side: GateSide) -> dict[str, Convergence]:
+    """By proposal. Raises CannotGoOn."""
+    try:
+        return kept(await side.folder(), line)
+    except BaselinesError as error:
+        raise CannotGoOn(str(error)) from error
+
+
+async def put(line: Line, side: GateSide, change: Change, reason: str, evidence: Evidence, author: str = RULES) -> str:
+    """Before the gate; its hash. Raises CannotGoOn where the gate does not take it."""
+    now = await side.now()
+    proposal = Proposal(
+        format=1,
+        site=line.site,
+        line=line.line,
+        change=change,
+        base=config_hash(now.in_service),
+        model=None if now.model is None else model_hash(now.model),
+        reason=reason,
+        evidence=[evidence],
+        author=author,
+        created=now.at.isoformat(timespec="milliseconds"),
+        expires=(now.at + timedelta(seconds=min(STANDS_S, line.gate.expiry_max_s))).isoformat(timespec="milliseconds"),
+    )
+    reply = await side.propose(canonical(proposal))
+    if not reply.ok:
+        raise CannotGoOn("; ".join([reply.text, *reply.reasons]))
+    return proposal_hash(proposal)
+
+
+def region_kept(shown: Sequence[ProposalShown]) -> Region | None:
+    """Of the configuration that was kept last."""
+    kept = [one.verdict for one in shown if one.proposal.kind == "gains" and one.stage == "kept"]
+    return kept[-1].region if kept and kept[-1] is not None else None

@@ -1,0 +1,98 @@
+"""What has been tried on a line, as the gate's list of proposals tells it. Pure."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+
+from gateway.core.decisions import ProposalShown
+from gateway.core.proposal import Evidence
+from gateway.core.verdict import Verdict
+
+
+class Step(StrEnum):
+    FIRST = "first configuration"
+    EXPERIMENT = "experiment"
+    MODEL = "model"
+    REDESIGN = "redesign"
+    MEASUREMENT = "measurement"
+
+
+class Follows(StrEnum):
+    """What a measurement leads to."""
+
+    NEWER_MODEL = "newer-model"  #: the line does otherwise than the model foresees: another round
+    CALMER = "calmer"  #: the model has foreseen it: a calmer configuration on the same one
+    LEAVE = "leave"  #: nothing significant is left to gain
+
+
+class Outcome(StrEnum):
+    OPEN = "open"  #: it is being judged, decided, or done
+    DONE = "done"
+    AGAIN = "again"  #: nothing was against it but the moment
+    FAILED = "failed"
+
+
+PROPOSED_BY = "commissioning: "  #: how the evidence begins that names step and rung
+
+#: Rules that speak against the moment, not against what is proposed.
+OF_THE_MOMENT = frozenset({"state of the line", "cool-down", "freshness", "time", "judge process"})
+OPEN_STAGES = frozenset({"received", "waiting", "approved", "deploying", "probation", "keeping", "running"})
+STALE_STAGES = frozenset({"expired", "superseded", "not-deployed"})
+
+
+@dataclass(frozen=True)
+class Past:
+    """A proposal of the gate's list, or a candidate that could not even be made."""
+
+    kind: str
+    outcome: Outcome
+    step: Step | None = None  #: of this chain; None: somebody else has proposed it
+    rung: int = 0
+    why: str = ""
+    speed_m_per_s: float | None = None  #: up to which a verdict lets a configuration run
+    proposal: str = ""  #: hash; empty: it could not be made
+    converged: bool = False  #: of a measurement: the line did what it should, as the model foresees
+    follows: Follows | None = None  #: from a measurement; None: nobody has looked at it yet
+    last: bool = False  #: there is no design on a higher rung either
+
+
+def past_of(shown: ProposalShown) -> Past:
+    """A proposal as the gate shows it."""
+    verdict = shown.verdict
+    step, rung = _named(shown.proposal.evidence)
+    region = None if verdict is None else verdict.region
+    return Past(
+        kind=shown.proposal.kind,
+        outcome=_outcome(shown.stage, shown.why, verdict),
+        step=step,
+        rung=rung,
+        why=shown.why,
+        speed_m_per_s=None if region is None else region.speed_max_m_per_s,
+        proposal=shown.proposal_hash,
+    )
+
+
+def named(step: Step, rung: int) -> Evidence:
+    """By which a proposal of the chain is known."""
+    return Evidence(what=f"{PROPOSED_BY}{step}", value=float(rung))
+
+
+def _named(evidence: Sequence[Evidence]) -> tuple[Step | None, int]:
+    for one in evidence:
+        name = one.what.removeprefix(PROPOSED_BY)
+        if one.what.startswith(PROPOSED_BY) and name in set(Step) and one.value is not None:
+            return Step(name), int(one.value)
+    return None, 0
+
+
+def _outcome(stage: str, why: str, verdict: Verdict | None) -> Outcome:
+    if stage in OPEN_STAGES:
+        return Outcome.OPEN
+    if stage in STALE_STAGES:
+        return Outcome.AGAIN
+    if stage == "kept" or (stage == "done" and not why):
+        return Outcome.DONE
+    if stage == "refused" and verdict is not None:
+        against = {one.rule for one in verdict.findings if not one.passed}
+        return Outcome.AGAIN if against <= OF_THE_MOMENT else Outcome.FAILED
+    return Outcome.FAILED
