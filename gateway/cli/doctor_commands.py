@@ -35,7 +35,7 @@ def doctor(
     data_dir: DataFolder = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print as JSON.")] = False,
 ) -> None:
-    """Look at everything that a line needs: file, software, permissions, computer, clocks, jitter, buses, devices.
+    """Look at all that a line needs: file, software, permissions, computer, clocks, model, jitter, buses, devices.
 
     Nothing is written to a device and nothing is commanded. While the line's loop runs its buses are left alone, and
     what the loop says of them is shown. Exit code: 0 nothing FAILs, 1 something does, 2 the line's file is not usable.
@@ -67,12 +67,14 @@ def doctor(
 async def examine(line: Line, run_folder: Path, data_folder: Path, seconds: float, tell: Progress) -> list[Check]:
     """Every check but that of the file."""
     from gateway.cli.doctor_clocks import clocks
+    from gateway.cli.doctor_language_model import language_model
     from gateway.cli.doctor_machine import machine
     from gateway.cli.doctor_permissions import permissions
     from gateway.cli.doctor_software import software
 
-    tell("software, permissions, computer")
+    tell("software, permissions, computer, language model")
     checks = [*software(), *permissions(line, run_folder, data_folder), *machine(line, data_folder), *clocks()]
+    checks += await language_model(line.agents)
     if living(run_folder / LOOP_SOCKET):
         why = f"the line's loop runs ({run_folder / LOOP_SOCKET})"
         checks.append(Check("real time", "lateness", "", "skipped", f"{why}: the measurement would take its processor"))

@@ -1,0 +1,172 @@
+"""A question asked of a language model: it reasons freely, then answers in the form, at most three times. Nothing that
+`wrong_with` refuses comes out of here, and no failure but as `Unanswered`; the caller then goes on by the rules.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from agents.language_model.asking import (
+    MOST_REPEATED,
+    Passage,
+    again_message,
+    answer_format,
+    first_messages,
+    form_message,
+    read_answer,
+)
+from agents.language_model.budget import Budget
+from agents.language_model.client import Heard, LanguageModel
+from agents.language_model.no_answer import Kind, NoAnswer
+from agents.language_model.replies import Said
+from gateway.core.line import NonNegative, Strict
+from gateway.core.questions import Choice, ChoiceRefused, Question
+
+MOST_TRIES = 3  #: of an answer in the form
+#: Another try may go better: what came was cut off, torn or nothing.
+WORTH_ANOTHER_TRY: frozenset[Kind] = frozenset({"length", "broken", "empty"})
+
+
+class Exchange(Strict):
+    """One call of the model and all that came of it."""
+
+    purpose: Literal["reason", "answer"]
+    number: int  #: of this purpose, from 1
+    model: str
+    digest: str  #: of its weights
+    messages: list[Said]  #: as they were sent
+    raw: str  #: the answer, byte for byte; of a failure, what had come
+    thinking: str = ""  #: apart from the answer, of models that do that
+    parsed: Choice | None = None
+    refused: list[str] = []  #: why it is no answer
+    failure: Kind | None = None  #: where there is no whole answer
+    tokens_in: int | None = None
+    tokens_out: int | None = None
+    seconds: NonNegative
+
+
+@dataclass(frozen=True)
+class Answered:
+    choice: Choice
+    exchanges: tuple[Exchange, ...]
+
+
+@dataclass(frozen=True)
+class Unanswered:
+    """`text` says why, in a sentence."""
+
+    kind: Kind
+    text: str
+    exchanges: tuple[Exchange, ...]
+
+
+async def decide(
+    model: LanguageModel,
+    prompt: str,
+    question: Question,
+    knowledge: Sequence[Passage] = (),
+    *,
+    budget: Budget,
+    heard: Heard | None = None,
+) -> Answered | Unanswered:
+    """What `model` chooses, with every exchange.
+
+    `prompt`: the system's message. `budget`: of the task that the question belongs to. `heard` is told each piece of
+    what the model says. The model's settings bound the time: `load_max_s` to be ready, then `answer_max_s` for all.
+    """
+    conversation: _Conversation | None = None
+    try:
+        budget.check()
+        ready = await model.ready()
+        conversation = _Conversation(model, ready.digest, budget, heard)
+        base = first_messages(prompt, question, knowledge)
+        reasons = await conversation.reasons(base)
+        choice = await conversation.answer(_asked_for_form(base, reasons, question), question)
+    except NoAnswer as error:
+        return Unanswered(error.kind, error.text, tuple(conversation.exchanges) if conversation else ())
+    return Answered(choice, tuple(conversation.exchanges))
+
+
+def _asked_for_form(base: Sequence[Said], reasons: str, question: Question) -> list[Said]:
+    return [*base, *([Said("assistant", reasons)] if reasons else []), form_message(question)]
+
+
+def _told_again(messages: list[Said], said: Exchange) -> list[Said]:
+    """The same, with what was wrong; a wire that broke is nothing that the model could do better."""
+    if said.failure == "broken":
+        return messages
+    repeated = [Said("assistant", said.raw[:MOST_REPEATED])] if said.raw.strip() else []
+    return [*messages, *repeated, again_message(said.refused)]
+
+
+class _Conversation:
+    """The calls of one question, and the time that is left for them."""
+
+    def __init__(self, model: LanguageModel, digest: str, budget: Budget, heard: Heard | None) -> None:
+        self.exchanges: list[Exchange] = []
+        self._model = model
+        self._digest = digest
+        self._budget = budget
+        self._heard = heard
+        self._until_s = model.now_s() + model.settings.answer_max_s
+
+    async def reasons(self, messages: list[Said]) -> str:
+        """What the model thinks of the question; "" where that has no end: it may answer all the same."""
+        said = await self._call("reason", 1, messages)
+        return "" if said.failure else said.raw
+
+    async def answer(self, messages: list[Said], question: Question) -> Choice:
+        """Raises NoAnswer when no try is one."""
+        told, think, refused = messages, False, list[str]()
+        for number in range(1, MOST_TRIES + 1):
+            said = await self._call("answer", number, told, question, think)
+            if said.parsed is not None:
+                return said.parsed
+            refused = said.refused
+            told = _told_again(messages, said)
+            if not said.raw.lstrip().startswith("{"):
+                think = None  # some engines keep to the form only where the model may think first
+        raise NoAnswer("no-choice", f"{MOST_TRIES} tries gave no answer; the last: {'; '.join(refused)}")
+
+    async def _call(
+        self,
+        purpose: Literal["reason", "answer"],
+        number: int,
+        messages: list[Said],
+        question: Question | None = None,
+        think: bool | None = False,
+    ) -> Exchange:
+        """One exchange, kept. `question`: the answer is to have its form. Raises NoAnswer where no other try helps."""
+        began_s = self._model.now_s()
+        form = None if question is None else answer_format(question)
+        failed: NoAnswer | None = None
+        try:
+            left_s = self._until_s - began_s
+            reply = await self._model.chat(messages, left_s, self._budget, form, think, self._heard)
+            came: dict[str, Any] = {"raw": reply.text, "thinking": reply.thinking}
+            came |= {"tokens_in": reply.tokens_in, "tokens_out": reply.tokens_out}
+            came |= {} if question is None else _read(reply.text, question)
+        except NoAnswer as error:
+            failed = error
+            came = {"raw": error.so_far, "failure": error.kind, "refused": [error.text]}
+        self.exchanges.append(
+            Exchange(
+                purpose=purpose,
+                number=number,
+                model=self._model.settings.model,
+                digest=self._digest,
+                messages=messages,
+                seconds=self._model.now_s() - began_s,
+                **came,
+            )
+        )
+        if failed is not None and failed.kind not in WORTH_ANOTHER_TRY:
+            raise failed
+        return self.exchanges[-1]
+
+
+def _read(text: str, question: Question) -> dict[str, Any]:
+    try:
+        return {"parsed": read_answer(text, question)}
+    except ChoiceRefused as refused:
+        return {"refused": refused.reasons}
