@@ -11,7 +11,7 @@ from gateway.commissioning.architectures import ARCHITECTURES
 from gateway.commissioning.convergence import Convergence, SpanFigures
 from gateway.commissioning.ladder import OWN, Next
 from gateway.commissioning.past import Follows, Outcome, Past, Step
-from gateway.commissioning.redesign import Figures
+from gateway.commissioning.redesign import Figures, beside
 from gateway.core.controller import config_hash
 from gateway.core.line import Line
 from gateway.core.questions import Decision, Figure, Knob, Option, Question
@@ -157,7 +157,9 @@ def _figures(offer: Offer) -> list[Figure]:
     if offer.redesign is None:
         return []
     figures, before = offer.redesign.figures, offer.redesign.before
+    share = sum(beside(figures[name].rmse_n, before[name].rmse_n) for name in before) / len(before)
     return [
+        _figure("tracking error over that in service, mean of the courses", share, ""),
         _worst("tracking error on the model", "N", figures.values(), lambda one: one.rmse_n),
         _worst("the same in service", "N", before.values(), lambda one: one.rmse_n),
         _worst("overshoot", "%", figures.values(), lambda one: one.overshoot_pct),
@@ -180,7 +182,8 @@ def _span_figures(name: str, one: SpanFigures) -> list[Figure]:
 
 
 def _figure(name: str, value: float | None, unit: str) -> Figure:
-    return Figure(name=name[:80], value=value if value is not None and isfinite(value) else None, unit=unit)
+    known = None if value is None or not isfinite(value) else float(f"{value:.4g}")  # more digits say nothing
+    return Figure(name=name[:80], value=known, unit=unit)
 
 
 def _knobs(step: Next, offers: Sequence[Offer]) -> list[Knob]:
