@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from gateway.control.design import MpcWeights, design_mpc
-from gateway.control.judged_courses import OTHERS_LOW, corner_courses, programme_courses
+from gateway.control.judged_courses import OTHERS_LOW, CornerCourses, corner_courses, programme_courses
 from gateway.control.rollout import Rollouts, course_through, plants_of_thetas, simulate
 from safety import corner_runs, programme
 from safety.rules import corners, improvement, paper, roller_speed
@@ -58,8 +58,9 @@ def test_small_moves_are_no_larger_than_a_newton_and_two_millimetres_a_second(of
 def test_changes_that_the_programme_makes_itself_last_two_seconds_and_are_looked_at_for_the_last_of_it(
     of, context, clear, monkeypatch
 ):
-    monkeypatch.setattr(programme, "in_courses", lambda case, courses: courses)
-    courses = programme.by_itself(case_of(gains(clear, context), context, of))
+    courses: CornerCourses = {}
+    monkeypatch.setattr(programme, "in_courses", lambda case, asked: courses.update(asked))
+    programme.by_itself(case_of(gains(clear, context), context, of))
     assert {one.course.tail for one in courses.values()} == {60}
     lasting = {name: one.course.periods - one.course.changes[-2] for name, one in courses.items()}
     assert lasting["speed change"] == lasting[OTHERS_LOW] == 200
@@ -96,11 +97,16 @@ def test_the_programme_itself_runs_on_the_corners_where_small_moves_are_worst(
     courses = {"held by none": course, "of all": course, "shared": replace(course, every=2)}
     monkeypatch.setattr(programme, "corners_held", lambda case: {"held by none": [], "of all": held, "shared": held})
     monkeypatch.setattr(programme, "in_small", lambda case: dict.fromkeys(("of all", "shared"), in_small_of(**figures)))
-    monkeypatch.setattr(programme, "simulate", lambda config, plants, asked, setup: (config, plants, asked))
-    found = programme.in_courses(case, courses)
-    which = {name: [stiffness.index(one) for one in plants.stiffness_n[:, 0]] for name, (_, plants, _) in found.items()}
-    assert which == {"of all": worst, "shared": worst[:1]}
-    assert all(config == clear and asked is course.course for config, _, asked in found.values())
+    whole = []
+
+    def simulated(config, plants, asked, setup):
+        assert config == clear and asked is course.course
+        whole.append([stiffness.index(one) for one in plants.stiffness_n[:, 0]])
+        return rollouts()
+
+    monkeypatch.setattr(programme, "simulate", simulated)
+    assert list(programme.in_courses(case, courses)) == ["of all", "shared"]
+    assert whole == [worst, worst[:1]]
 
 
 @pytest.mark.parametrize(
