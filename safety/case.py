@@ -36,13 +36,13 @@ class Case:
     recordings: Sequence[Recording]  #: as `context.data` names them, in that order
     seed: int
 
-    _kept: dict[str, object] = field(default_factory=dict[str, object], init=False, repr=False, compare=False)
+    _kept: dict[object, object] = field(default_factory=dict[object, object], init=False, repr=False, compare=False)
 
-    def once(self, name: str, compute: "Callable[[Case], T]") -> T:
+    def once(self, compute: "Callable[[Case], T]") -> T:
         """What `compute` finds of this case, the first time; the same again after that."""
-        if name not in self._kept:
-            self._kept[name] = compute(self)
-        found: Any = self._kept[name]
+        if compute not in self._kept:
+            self._kept[compute] = compute(self)
+        found: Any = self._kept[compute]
         return found
 
     @property

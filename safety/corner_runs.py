@@ -14,7 +14,7 @@ from safety.simulated import held, judged_of, plants_under_stress, setup_of, str
 
 def courses_of(case: Case) -> CornerCourses:
     """What the proposed law is put through on the corners. Computed once for a case."""
-    return case.once("courses on corners", lambda case: courses_through(case, judged_of(case)))
+    return case.once(_courses_of)
 
 
 def courses_through(case: Case, judged: Judged, lasting_s: float = 2.5, tail_s: float = 1.5) -> CornerCourses:
@@ -25,12 +25,12 @@ def courses_through(case: Case, judged: Judged, lasting_s: float = 2.5, tail_s: 
 
 def corners_held(case: Case) -> dict[str, list[Theta]]:
     """By course of the largest steps: the corners that it is for and that torque holds. Computed once for a case."""
-    return case.once("corners held", _corners_held)
+    return case.once(_corners_held)
 
 
 def in_largest_steps(case: Case) -> dict[str, Rollouts]:
     """By course, on the corners that are held there; no course that none is. Computed once for a case."""
-    return case.once("largest steps on corners", _in_largest_steps)
+    return case.once(_in_largest_steps)
 
 
 def rollouts(
@@ -39,6 +39,10 @@ def rollouts(
     """On stressed plants."""
     setup = setup_of(line, noise, seed, line.gate.stress_late_share)
     return simulate(config, plants_under_stress(thetas, line.gate, seed), course, setup)
+
+
+def _courses_of(case: Case) -> CornerCourses:
+    return courses_through(case, judged_of(case))
 
 
 def _corners_held(case: Case) -> dict[str, list[Theta]]:

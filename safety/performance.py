@@ -75,7 +75,7 @@ def figures_of(case: Case) -> list[ScenarioFigures]:
 
 def performances(case: Case) -> dict[Whose, Performance]:
     """In service, baseline where there is one, proposed; computed once for a case."""
-    return case.once("performances", _performances)
+    return case.once(_performances)
 
 
 def _performances(case: Case) -> dict[Whose, Performance]:

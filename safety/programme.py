@@ -33,19 +33,19 @@ def small_courses(case: Case) -> CornerCourses:
 
 def in_small(case: Case) -> dict[str, Rollouts]:
     """By course, on all corners that can be held there; computed once for a case."""
-    return case.once("programme in small moves", _in_small)
+    return case.once(_in_small)
 
 
 def fails_in_small(case: Case) -> bool:
     """Whether a programme is refused for its small moves: then what takes it many seconds decides nothing."""
     if not isinstance(case.controller, MpcConfig):
         return False
-    return case.once("programme fails in small moves", _fails_in_small)
+    return case.once(_fails_in_small)
 
 
 def by_itself(case: Case) -> dict[str, Rollouts]:
     """By course, of the largest steps, on `WHOLE` corners; computed once for a case."""
-    return case.once("programme", _by_itself)
+    return case.once(_by_itself)
 
 
 def in_courses(case: Case, courses: CornerCourses) -> dict[str, Rollouts]:

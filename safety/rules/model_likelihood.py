@@ -67,7 +67,7 @@ def check_sureness(case: Case) -> list[RuleFinding]:
     step = -supported @ gradient / scale
     shift = float(step @ np.linalg.solve(covariance + supported, step))
     worst = int(np.argmax(np.abs(step) / np.sqrt(np.diag(covariance + supported))))
-    more = max(1.0, _samples(case) / max(1, sum(one.predicted.stretch.predictions for one in look.found)))
+    more = _samples(case) / sum(one.predicted.stretch.predictions for one in look.found)
     root = np.linalg.cholesky(np.linalg.inv(supported) * more)
     least = float(np.linalg.eigvalsh(root.T @ covariance @ root)[0])
     most = SHIFT_MOST * len(names)
@@ -90,12 +90,11 @@ def check_noise(case: Case) -> list[RuleFinding]:
     """Each noise of the model, against half as large again and as much smaller."""
     look = look_at(case)
     gains = {
-        (name, factor): _gain(look, replace(look.noise, **{name: getattr(look.noise, name) * factor}))
+        (name, way): _gain(look, replace(look.noise, **{name: getattr(look.noise, name) * factor}))
         for name in vars(look.noise)
-        for factor in (NOISE_FACTOR, 1.0 / NOISE_FACTOR)
+        for way, factor in (("larger", NOISE_FACTOR), ("smaller", 1.0 / NOISE_FACTOR))
     }
-    (name, factor), gain = max(gains.items(), key=lambda each: each[1])
-    way = "larger" if factor > 1.0 else "smaller"
+    (name, way), gain = max(gains.items(), key=lambda each: each[1])
     text = (
         f"with noise.{name} {NOISE_FACTOR:g} times {way} than {getattr(look.noise, name):.3g} the data are likelier by "
         f"{gain:.3g} in the logarithm; allowed: up to {INSISTS:g}"
@@ -132,15 +131,14 @@ def derivatives(look: Look, names: Sequence[str]) -> tuple[FloatArray, FloatArra
 def prior_precision(line: Line, names: Sequence[str]) -> FloatArray:
     """P (p, p): uniform within the tolerance, as a variance; hardly any of what the file does not name.
 
-    Rollers and spans of one line have the tolerance in common, and differ by less.
+    Rollers and spans of one line have the widest tolerance of any in common, and differ by less.
     """
-    roller, span = line.rollers[0], line.spans[0]
     tolerances = {
         "stiffness_n": line.web.stiffness_n.tolerance,
-        "length_m": span.length_m.tolerance,
-        "radius_m": roller.radius_m.tolerance,
-        "inertia_kg_m2": roller.inertia_kg_m2.tolerance,
-        "friction_nms_per_rad": roller.friction_nms_per_rad.tolerance,
+        "length_m": max(span.length_m.tolerance for span in line.spans),
+        "radius_m": max(roller.radius_m.tolerance for roller in line.rollers),
+        "inertia_kg_m2": max(roller.inertia_kg_m2.tolerance for roller in line.rollers),
+        "friction_nms_per_rad": max(roller.friction_nms_per_rad.tolerance for roller in line.rollers),
     }
     families = [split_name(name)[0] for name in names]
     covariance = np.zeros((len(names), len(names)))

@@ -76,7 +76,7 @@ def check(case: Case) -> list[RuleFinding]:
 
 def steps_let(case: Case) -> Let:
     """Computed once for a case."""
-    return case.once("steps let", _steps_let)
+    return case.once(_steps_let)
 
 
 def _steps_let(case: Case) -> Let:

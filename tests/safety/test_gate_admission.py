@@ -8,6 +8,7 @@ import pytest
 from gateway.control.design import MpcWeights, design_lqi, design_mpc, task_of
 from gateway.core.proposal import proposal_hash
 from safety.case import Case
+from safety.findings import told
 from safety.rules import authority, cool_down, fits_line, freshness, line_state
 from tests.safety.case_support import EXPIRES, NOW, case_of, gains, proposal, refused, with_state
 
@@ -68,7 +69,8 @@ def test_state_of_the_line(of, context, redesigned):
     assert found(line_state.check_experiment) == [] == found(line_state.check_model, state="STOP", moving=True)
     everything = {"moving": True, "experiment": True, "on_probation": True, "doubts": ["cell 3"], "tension_n": [30.0]}
     assert len(found(line_state.check_gains, **everything)) == 5
-    assert len(found(line_state.check_model, on_probation=True)) == 1
+    probation = "a change is on probation: wait until it is kept or rolled back"
+    assert found(line_state.check_model, on_probation=True) == [probation]
 
 
 def test_set_points_of_another_number_than_spans_are_no_place_to_judge_from(of, context, redesigned):
@@ -110,6 +112,16 @@ def first_spans(line, n):
 
 def test_a_predictive_controller_plans_with_the_limits_of_the_line(of, context):
     mpc = design_mpc(of.task(), MpcWeights())
-    assert refused(fits_line.check(case_of(gains(mpc, context), context, of))) == []
-    strong = mpc.model_copy(update={"torque_nm": 61.0, "torque_rate_nm_per_s": 1e5, "tension_max_n": 61.0})
-    assert len(refused(fits_line.check(case_of(gains(strong, context), context, of)))) == 3
+
+    def found(**planned):
+        return fits_line.check(case_of(gains(mpc.model_copy(update=planned), context), context, of))
+
+    fits = [told("fits the line", True, "the controller is one for 6 spans at this period and latency")]
+    limits = {"torque_nm": 60.0, "torque_rate_nm_per_s": 1000.0, "tension_max_n": 60.0}
+    assert found() == fits == found(**limits)
+    assert found(**{name: most * (1.0 + 1e-9) for name, most in limits.items()}) == fits, "rounding"
+    assert refused(found(torque_nm=61.0, torque_rate_nm_per_s=1e5, tension_max_n=60.1)) == [
+        "the controller plans with torque_nm 61 Nm; allowed: up to the line's 60 Nm",
+        "the controller plans with torque_rate_nm_per_s 100000 Nm/s; allowed: up to the line's 1000 Nm/s",
+        "the controller plans with tension_max_n 60.1 N; allowed: up to the line's 60 N",
+    ]

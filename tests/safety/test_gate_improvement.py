@@ -8,6 +8,7 @@ import pytest
 from gateway.control.design import design_lqi, task_of
 from gateway.core.deployment import Region
 from gateway.core.line import Span
+from safety.findings import told
 from safety.rules import corners, improvement, promises
 from safety.simulated import judged_of
 from tests.safety.case_support import case_of, gains, refused
@@ -64,6 +65,22 @@ def test_a_promise_that_nobody_can_break(of, context, redesigned):
 
     assert refused(found()) == [] == refused(found(rmse_n=1e6, overshoot_pct=1e6, settling_s=1e6))
     assert len(refused(found(rmse_n=0.0, settling_s=0.0))) == 2
+
+
+def test_where_nothing_is_promised_nothing_is_broken(of, context, redesigned):
+    for predicted in ([], [{"scenario": "tension"}]):
+        case = case_of(gains(redesigned, context, predicted=predicted), context, of)
+        assert promises.check(case) == [told("promises", True, "nothing is promised")]
+
+
+def test_a_promise_of_no_course_of_the_gate_does_not_hide_the_others(of, context, redesigned):
+    promised = [{"scenario": "lunch", "rmse_n": 1e6}, {"scenario": "velocity", "rmse_n": 1e6}]
+    no_course, kept = promises.check(case_of(gains(redesigned, context, predicted=promised), context, of))
+    assert no_course == told(
+        "promises", False,
+        "lunch is no course of the gate, so that its promise cannot be checked; allowed: tension, velocity, moves",
+    )  # fmt: skip
+    assert (kept.rule, kept.passed, kept.limit, kept.unit) == ("promises: tracking error", True, 1.02e6, "N")
 
 
 def test_a_line_that_permits_no_steps_is_judged_standing(of, context, redesigned):

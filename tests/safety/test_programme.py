@@ -1,13 +1,14 @@
 """Predictive control in the judge: what its programme is put through, and what its plan keeps clear of."""
 
 from dataclasses import replace
+from math import inf, nan
 
 import numpy as np
 import pytest
 
 from gateway.control.design import MpcWeights, design_mpc
-from gateway.control.judged_courses import OTHERS_LOW, corner_courses, programme_courses
-from gateway.control.rollout import course_through, plants_of_thetas, simulate
+from gateway.control.judged_courses import OTHERS_LOW, CornerCourses, corner_courses, programme_courses
+from gateway.control.rollout import Rollouts, course_through, plants_of_thetas, simulate
 from safety import corner_runs, programme
 from safety.rules import corners, improvement, paper, roller_speed
 from safety.simulated import judged_of, setup_of
@@ -44,6 +45,84 @@ def test_set_points_that_the_plan_keeps_clear_of_are_held(of, context, clear, te
     course = course_through(0.01, [(2.5, np.full(6, tension_n), 0.05)], 1.5)
     found = simulate(clear, plants_of_thetas([case.believed]), course, setup_of(of.line, case.noise, 3, 0.0))
     assert found.tail_error_n.max() < 0.1 and found.tail_swing_n.max() < 0.6
+
+
+def test_small_moves_are_no_larger_than_a_newton_and_two_millimetres_a_second(of, context, clear):
+    case = case_of(gains(clear, context), context, of)
+    assert case.tension_step_n > 1.0 and case.speed_step_m_per_s > 0.002
+    courses = [one.course for one in programme.small_courses(case).values()]
+    assert max(np.abs(np.diff(one.tension_n, axis=0)).max() for one in courses) == pytest.approx(1.0)
+    assert max(np.abs(np.diff(one.unwind_speed_m_per_s)).max() for one in courses) == pytest.approx(0.002)
+
+
+def test_changes_that_the_programme_makes_itself_last_two_seconds_and_are_looked_at_for_the_last_of_it(
+    of, context, clear, monkeypatch
+):
+    courses: CornerCourses = {}
+    monkeypatch.setattr(programme, "in_courses", lambda case, asked: courses.update(asked))
+    programme.by_itself(case_of(gains(clear, context), context, of))
+    assert {one.course.tail for one in courses.values()} == {60}
+    lasting = {name: one.course.periods - one.course.changes[-2] for name, one in courses.items()}
+    assert lasting["speed change"] == lasting[OTHERS_LOW] == 200
+
+
+def in_small_of(**figures):
+    """Of seven plants; what is given is of one span of some of them, by their number, else 0."""
+    found = {name: np.zeros((7, 6)) for name in ("swing", "chatter", "beyond")}
+    for span, (name, values) in enumerate(figures.items()):
+        for plant, value in values.items():
+            found[name][plant, span] = value
+    one = np.ones((7, 6))
+    return Rollouts(one, one, one, one, found["beyond"], one, one, one, one, tail_swing_n=found["swing"],
+                    tail_error_n=one, chatter_nm=found["chatter"])  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("figures", "worst"),
+    [
+        ({"swing": {1: 3.0, 5: 1.0}, "chatter": {2: 4.0}, "beyond": {3: 5.0}}, [3, 2, 1, 5]),
+        # What adds up is the sum, and one that is no number, or has run away, comes before any that is.
+        ({"swing": {1: 3.0, 4: 0.9}, "chatter": {2: 4.0, 4: 0.9}, "beyond": {3: 5.0, 4: 0.9, 6: nan}}, [6, 3, 2, 1]),
+        ({"swing": {1: 3.0, 4: 1.1}, "chatter": {2: 4.0, 4: 1.1}, "beyond": {3: 1.0, 4: 1.1, 5: inf}}, [5, 2, 4, 1]),
+    ],
+)
+def test_the_programme_itself_runs_on_the_corners_where_small_moves_are_worst(
+    of, context, clear, monkeypatch, figures, worst
+):
+    """On one of those that share a course out; where none is held, the other courses are looked at all the same."""
+    case = case_of(gains(clear, context), context, of)
+    stiffness = [2000.0 + i for i in range(7)]
+    held = [replace(case.believed, web=replace(case.believed.web, stiffness_n=one)) for one in stiffness]
+    course = programme_courses(judged_of(case))["speed change"]
+    courses = {"held by none": course, "of all": course, "shared": replace(course, every=2)}
+    monkeypatch.setattr(programme, "corners_held", lambda case: {"held by none": [], "of all": held, "shared": held})
+    monkeypatch.setattr(programme, "in_small", lambda case: dict.fromkeys(("of all", "shared"), in_small_of(**figures)))
+    whole = []
+
+    def simulated(config, plants, asked, setup):
+        assert config == clear and asked is course.course
+        whole.append([stiffness.index(one) for one in plants.stiffness_n[:, 0]])
+        return rollouts()
+
+    monkeypatch.setattr(programme, "simulate", simulated)
+    assert list(programme.in_courses(case, courses)) == ["of all", "shared"]
+    assert whole == [worst, worst[:1]]
+
+
+@pytest.mark.parametrize(
+    ("figures", "fails"),
+    [
+        ({"low": 2.0, "high": 60.0, "swing": 1.0, "error": 3.0, "chatter": 5.0}, False),
+        ({"low": 1.99}, True),
+        ({"high": 60.01}, True),
+        ({"swing": 1.01}, True),
+        ({"error": 3.01}, True),
+        ({"chatter": 5.01}, True),
+    ],
+)
+def test_small_moves_fail_beyond_any_limit_and_not_at_it(of, context, clear, monkeypatch, figures, fails):
+    monkeypatch.setattr(programme, "simulate", lambda *_: rollouts(**figures))
+    assert programme.fails_in_small(case_of(gains(clear, context), context, of)) is fails
 
 
 def test_where_small_moves_leave_the_band_large_ones_are_not_looked_at(of, context, clear, monkeypatch):
