@@ -82,6 +82,7 @@ def test_a_span_without_a_cell_has_no_drift() -> None:
     ("change_n", "drift_n"),
     [
         ([0.0, DRIFT_N, -DRIFT_N, 0.0], [0.0, 0.0, 0.0, 0.0]),  # at the threshold
+        ([0.0, -DRIFT_N, DRIFT_N, 0.0], [0.0, 0.0, 0.0, 0.0]),
         ([0.0, 2.001, -2.003, 0.0], [0.0, 0.0, 2.002, 0.0]),
         ([0.0, -4.0, 6.0, 0.0], [0.0, 0.0, -5.0, 0.0]),  # the mean of what both rollers say
         ([0.0, 1.9, -1.9, 0.0], [0.0, 0.0, 0.0, 0.0]),
