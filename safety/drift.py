@@ -99,7 +99,7 @@ def drift_of(change_n: FloatArray) -> FloatArray:
     """Which cells (n,) drift by how much (N), from the change of rho_i / R_i (n,) since the reference; 0: none told."""
     drift_n = np.zeros(len(change_n))
     before, after = change_n[:-1], -change_n[1:]
-    agree = (np.minimum(np.abs(before), np.abs(after)) > DRIFT_N) & (before * after > 0)
+    agree = (np.minimum(before, after) > DRIFT_N) | (np.maximum(before, after) < -DRIFT_N)
     drift_n[1:] = np.where(agree, 0.5 * (before + after), 0.0)
     # What cell 2 explains of roller 1 is not cell 1's.
     alone = -change_n[0] + (drift_n[1] if len(change_n) > 1 else 0.0)

@@ -89,8 +89,7 @@ def reject_jumps(
         state.speed_m_per_s[:] = speed.value
         return []
     good = speed.quality == _GOOD
-    with np.errstate(invalid="ignore"):
-        jumped = good & (change > _reach(limits, state, inputs, torques_nm))
+    jumped = good & (change > _reach(limits, state, inputs, torques_nm))
     findings: list[Finding] = []
     if jumped.any():
         again = jumped & (state.period - state.jumped <= limits.memory_periods)

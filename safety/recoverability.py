@@ -85,8 +85,7 @@ class Recovery:
         self._fastest = self._envelope.roller_speed_watched_m_per_s
         self._torque_nm = limits.torque_nm * (1.0 + EXCUSED)
         self._step_nm = limits.torque_rate_nm_per_s * watch.period_s
-        draw = [i for i, span in enumerate(line.spans) if span.control == "draw"]
-        self._draw = np.array(draw, dtype=np.intp)
+        self._draw = [i for i, span in enumerate(line.spans) if span.control == "draw"]
         self._each: NDArray[np.int64] = np.arange(self.periods + 1, dtype=np.int64)
         self._looks = _looks(self._each, watch.n)
         # The first torque follows the one that is sent now.
@@ -97,7 +96,7 @@ class Recovery:
         self._middles = [0.5 * (low + high) for low, high in pairwise(speeds)]
         self._loops = [closed_loop(node, _law(fallback, node.speed_m_per_s), self._looks) for node in watch.nodes]
         self._law = Deviation(fallback.feedforward, fallback.draw_spans, fallback.period_s, fallback.latency_s)
-        self._model = Deviation(watch.model, draw, watch.period_s, 0.0)
+        self._model = Deviation(watch.model, self._draw, watch.period_s, 0.0)
         self._coulomb_nm = np.array(watch.coulomb_nm)
 
     def shortfall(
@@ -154,7 +153,7 @@ class Recovery:
         x_eq = self._model.state(reference, unwind)
         u_eq = self._model.torque(reference, unwind, 0) + self._coulomb_nm * np.sign(x_eq[n:])
         tension_n = measured.tension_n
-        if self._draw.size:
+        if self._draw:
             tension_n = tension_n.copy()
             tension_n[self._draw] = setpoint_n[self._draw]
         known = (
@@ -229,7 +228,7 @@ class Recovery:
         np.minimum(self._margin_n, NEAR_SETPOINT * (high_n - setpoint_n), out=most[:n])
         least[:n] = low_n + margins * least[:n]
         most[:n] = high_n - margins * most[:n]
-        if self._draw.size:  # nobody sees the tension of a draw span
+        if self._draw:  # nobody sees the tension of a draw span
             least[self._draw], most[self._draw] = -np.inf, np.inf
         least[n:], most[n:] = -fastest_m_per_s, fastest_m_per_s
         return least, most

@@ -6,7 +6,18 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from gateway.core.signals import Inputs
-from safety.frozen import REPEATS, FrozenState, find_frozen, restart, turning_m_per_s
+from safety.actions import Action, Finding
+from safety.frozen import (
+    LEARNT_REVERSALS,
+    RARE,
+    REMEMBERED_REVERSALS,
+    REPEATS,
+    FrozenState,
+    Jitter,
+    find_frozen,
+    restart,
+    turning_m_per_s,
+)
 from tests.closed_loop.conftest import demo_line
 
 TURNING_FROM_M_PER_S = 0.002
@@ -113,3 +124,61 @@ def test_a_ramp_does_not_teach_that_a_coarse_speed_jitters(counts: int) -> None:
     ramp = 0.02 + counts * COUNT_M_PER_S * np.arange(2000)
     speeds = np.repeat(np.concatenate((ramp, np.full(500, ramp[-1])))[:, None], 3, axis=1)
     assert not any(texts_of(speeds, line_m_per_s=speeds[:, 0]))
+
+
+def test_a_frozen_drive_is_told_with_its_speed_and_how_often_it_came() -> None:
+    state, inputs, found = FrozenState(), Inputs(3), list[Finding]()
+    texts_of(turning(300), state)
+    inputs.unwind_speed.put(0, LINE_M_PER_S, 0.0)
+    for speeds in frozen_run(0.051234):
+        assert found == []
+        for i, speed in enumerate(speeds):
+            inputs.speed.put(i, float(speed), 0.0)
+        found = find_frozen(TURNING_FROM_M_PER_S, state, inputs)
+    assert found == [
+        Finding(
+            "drive frozen",
+            Action.STOP,
+            "the drive of roller 2 has shown 0.051234 m/s 8 times in a row while the line runs: its samples are "
+            "frozen; restart the drive, and check what lies between",
+        )
+    ]
+
+
+def test_at_the_least_speed_of_the_line_nothing_is_judged_and_just_above_it_is() -> None:
+    state = FrozenState()
+    just_above = TURNING_FROM_M_PER_S * (1.0 + 1e-9)
+    texts_of(turning(300), state, line_m_per_s=just_above)
+    assert not any(texts_of(frozen_run(), state, line_m_per_s=TURNING_FROM_M_PER_S))
+    assert texts_of(frozen_run(), state, line_m_per_s=just_above)[-1]
+
+
+def test_repeats_from_before_a_standstill_do_not_count_nor_does_the_standstill() -> None:
+    state = FrozenState()
+    texts_of(turning(300), state)
+    texts_of(frozen_run()[:-1], state)
+    texts_of(frozen_run()[:1], state, line_m_per_s=0.0)
+    told = texts_of(frozen_run()[1:], state)
+    assert not any(told[:-1]) and told[-1], "as many repeats again as at first"
+
+
+def test_what_a_drive_does_at_one_speed_says_nothing_of_another() -> None:
+    state = FrozenState()
+    texts_of(turning(300), state)
+    for elsewhere in (0.5, 2.0):
+        assert not any(texts_of(frozen_run(), state, line_m_per_s=elsewhere * LINE_M_PER_S))
+    assert texts_of(frozen_run(), state)[-1]
+
+
+def test_repeats_are_forbidden_once_enough_is_learnt_and_they_are_rare() -> None:
+    assert not Jitter(LEARNT_REVERSALS - 1, 0).forbids_repeats()
+    assert Jitter(LEARNT_REVERSALS, 0).forbids_repeats()
+    assert Jitter(3 * RARE, 3).forbids_repeats() and not Jitter(3 * RARE - 1, 3).forbids_repeats()
+
+
+def test_half_of_what_was_learnt_long_ago_is_forgotten_and_the_share_of_repeats_stays() -> None:
+    jitter = Jitter(REMEMBERED_REVERSALS - 1, 100)
+    jitter.learn(1, 0)
+    assert jitter == Jitter(REMEMBERED_REVERSALS, 100)
+    jitter.learn(1, 4)
+    assert jitter == Jitter(REMEMBERED_REVERSALS // 2, 52)

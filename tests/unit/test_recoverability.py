@@ -5,69 +5,32 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gateway.control.design import design_lqg, design_lqi, design_lqr, design_pid, design_scheduled, task_of
 from gateway.control.design.sampling import with_dead_time
 from gateway.control.engagement import memory
 from gateway.control.law import Measured
 from gateway.control.laws import make_law
 from gateway.control.reference import Steady
-from gateway.core.line_file import load_line
-from gateway.core.line_template import line_template
-from gateway.core.theta import nominal_theta
-from gateway.core.web_model import equilibrium_torque, linearise, reference_speeds
+from gateway.core.web_model import linearise
 from safety.actions import Action
 from safety.limits import envelope_limits
 from safety.monitor import recoverable
 from safety.recoverability import Recovery
 from safety.recovery_prediction import recovery_prediction
-
-LINE = load_line(line_template(6, "line.toml"), "line.toml")
-TASK = task_of(LINE)
-THETA = nominal_theta(LINE)
-LAWS = {
-    "lqi": design_lqi(TASK),
-    "lqg": design_lqg(TASK),
-    "lqr": design_lqr(TASK),
-    "pid": design_pid(TASK),
-    "scheduled": design_scheduled(TASK, design_lqi, [0.02, 0.1]),
-}
-TENSION_N, SPEED = np.array([28.0, 36.0, 20.0, 40.0, 24.0, 32.0]), 0.05
-STEP_NM, MOST_NM = LINE.limits.torque_rate_nm_per_s * LINE.control.period_s, LINE.limits.torque_nm
-
-
-def rolled_out(config, x, before_nm, torque_nm, periods, in_use=0):
-    """Tensions (periods, n) of the linear model under the law that really runs, engaged after `in_use` periods."""
-    web, n = THETA.web, 6
-    v_eq = reference_speeds(web, TENSION_N, SPEED)
-    x_eq, u_eq = np.concatenate((TENSION_N, v_eq)), equilibrium_torque(web, TENSION_N, v_eq)
-    plant = with_dead_time(*linearise(web, TENSION_N, v_eq, SPEED), LINE.control.period_s, THETA.latency_s)
-    flight, law, state, found = [before_nm] * plant.depth, make_law(config), None, []
-    for k in range(periods + 1):
-        if k > 0:
-            measured = Measured(x[:n].copy(), x[n:].copy(), SPEED)
-            reference = Steady(TENSION_N)
-            state = law.engage(measured, reference, torque_nm) if state is None else state
-            decision = law.ask(state, measured, reference)
-            asked = np.clip(decision.torque_nm, torque_nm - STEP_NM, torque_nm + STEP_NM)
-            torque_nm = np.clip(asked, -MOST_NM, MOST_NM)
-            state = law.commit(state, decision, torque_nm)
-            found.append(x[:n])
-        sent = [torque_nm, *flight]
-        x = x_eq + plant.transition @ (x - x_eq) + sum(
-            G @ (u - u_eq) for G, u in zip(plant.inputs, sent, strict=True)
-        )  # fmt: skip
-        flight = sent[: plant.depth]
-    return np.array(found)
-
-
-def disturbed(size, seed=0):
-    dice = np.random.default_rng(seed)
-    v_eq = reference_speeds(THETA.web, TENSION_N, SPEED)
-    # Beyond what an observer takes to be at its set-point, so that prediction and law mean the same.
-    away_n = np.sign(dice.normal(size=6)) * dice.uniform(1.0, 2.0, 6) * size
-    u_eq = equilibrium_torque(THETA.web, TENSION_N, v_eq)
-    before_nm, torque_nm = u_eq + dice.normal(size=(2, 6)) * size
-    return np.concatenate((TENSION_N + away_n, v_eq + dice.normal(size=6) * 1e-3 * size)), before_nm, torque_nm
+from tests.safety.recovery_support import (
+    LAWS,
+    LINE,
+    MOST_NM,
+    SPEED,
+    STEP_NM,
+    TENSION_N,
+    THETA,
+    at_rest,
+    disturbed,
+    equilibrium,
+    recovery_of,
+    replace_speed,
+    rolled_out,
+)
 
 
 @pytest.mark.parametrize("size", [1.0, 8.0, 60.0])  # the greater ones meet torque rates and limits
@@ -75,9 +38,9 @@ def disturbed(size, seed=0):
 def test_the_prediction_is_what_the_law_does_with_the_model(name, size):
     config = LAWS[name]
     x, before_nm, torque_nm = disturbed(size)
-    recovery = Recovery(recovery_prediction(THETA, config, LINE, [SPEED]), config, LINE)
+    recovery = recovery_of(name)
     found, looks = recovery.ahead(Measured(x[:6], x[6:], SPEED), TENSION_N, before_nm[None], torque_nm)
-    truth = rolled_out(config, x, before_nm, torque_nm, recovery.periods + 1)
+    truth = rolled_out(config, x, before_nm, torque_nm, recovery.periods + 1)[0][:, :6]
     assert looks[-1] <= recovery.periods
     # The model is linear near the recipe's tensions in both; a schedule's law is that of the node's speed.
     scheduled = 0.2 if name == "scheduled" else 0.0
@@ -94,12 +57,11 @@ def test_a_fallback_that_runs_already_is_predicted_with_what_it_remembers(name):
     for _ in range(3):  # it has run: nothing in it is as if it took over now
         decision = law.ask(state, measured, reference)
         state = law.commit(state, decision, torque_nm)
-    recovery = Recovery(recovery_prediction(THETA, config, LINE, [SPEED]), config, LINE)
+    recovery = recovery_of(name)
     given = (Measured(x[:6], x[6:], SPEED), TENSION_N, before_nm[None], torque_nm)
     found, looks = recovery.ahead(*given, memory(state))
     other, _ = recovery.ahead(*given)
-    v_eq = reference_speeds(THETA.web, TENSION_N, SPEED)
-    u_eq = equilibrium_torque(THETA.web, TENSION_N, v_eq)
+    v_eq, u_eq = equilibrium()
     x_eq = np.concatenate((TENSION_N, v_eq))
     plant = with_dead_time(*linearise(THETA.web, TENSION_N, v_eq, SPEED), LINE.control.period_s, THETA.latency_s)
     sent, truth = [torque_nm, before_nm], []
@@ -115,16 +77,6 @@ def test_a_fallback_that_runs_already_is_predicted_with_what_it_remembers(name):
     assert np.abs(found[:6, 5:20].max() - other[:6, 5:20].max()) > 1e-3
 
 
-def recovery_of(name="lqi", line=LINE, **changes):
-    return Recovery(recovery_prediction(THETA, LAWS[name], line, [0.01, SPEED, 0.1], **changes), LAWS[name], line)
-
-
-def at_rest():
-    v_eq = reference_speeds(THETA.web, TENSION_N, SPEED)
-    u_eq = equilibrium_torque(THETA.web, TENSION_N, v_eq)
-    return Measured(TENSION_N.copy(), v_eq, SPEED), TENSION_N, u_eq[None], u_eq
-
-
 def test_a_line_at_rest_is_recoverable_and_one_that_runs_away_is_not():
     recovery = recovery_of()
     measured, setpoint_n, in_flight_nm, torque_nm = at_rest()
@@ -133,12 +85,6 @@ def test_a_line_at_rest_is_recoverable_and_one_that_runs_away_is_not():
     short = recovery.shortfall(away, setpoint_n, in_flight_nm, torque_nm)
     assert short is not None and short.what == "span" and short.index in (2, 3)
     assert f"span {short.index + 1}" in str(short) and "allowed" in str(short)
-
-
-def replace_speed(measured, roller, more):
-    speed = measured.speed_m_per_s.copy()
-    speed[roller] += more
-    return replace(measured, speed_m_per_s=speed)
 
 
 def test_what_is_sent_now_counts_before_it_acts():
@@ -158,12 +104,10 @@ def test_a_setpoint_near_a_limit_needs_half_of_what_it_keeps_itself():
     recovery = recovery_of()
     setpoint_n = TENSION_N.copy()
     setpoint_n[2] = LINE.limits.tension_min_n + 2.0
-    v_eq = reference_speeds(THETA.web, setpoint_n, SPEED)
-    u_eq = equilibrium_torque(THETA.web, setpoint_n, v_eq)
-    there = Measured(setpoint_n.copy(), v_eq, SPEED)
-    assert recovery.shortfall(there, setpoint_n, u_eq[None], u_eq) is None
+    there, *rest = at_rest(setpoint_n)
+    assert recovery.shortfall(there, *rest) is None
     below = replace(there, tension_n=setpoint_n - np.eye(6)[2] * 1.5)
-    assert recovery.shortfall(below, setpoint_n, u_eq[None], u_eq).index == 2
+    assert recovery.shortfall(below, *rest).index == 2
 
 
 def test_a_draw_span_is_not_looked_at():
@@ -189,14 +133,12 @@ def test_the_monitor_says_what_is_short_and_nothing_without_a_model():
 def test_a_step_leaves_rollers_a_tenth_of_the_room_that_the_monitor_watches():
     """The least step of all set-points that is too large for the monitor, and for a step that is foreseen."""
     config, reference = LAWS["lqi"], Steady(TENSION_N)
-    web = THETA.web
-    v_eq = reference_speeds(web, TENSION_N, SPEED)
-    u_eq = equilibrium_torque(web, TENSION_N, v_eq)
+    v_eq, u_eq = equilibrium()
     measured = Measured(TENSION_N.copy(), v_eq.copy(), SPEED)
     law = make_law(config)
     state = law.engage(measured, reference, u_eq)
     state = law.commit(state, law.ask(state, measured, reference), u_eq)
-    recovery = Recovery(recovery_prediction(THETA, config, LINE, [SPEED]), config, LINE)
+    recovery = recovery_of()
     given = (u_eq[None], u_eq, memory(state))
     watched = envelope_limits(LINE).roller_speed_watched_m_per_s
     assert recovery.shortfall_of_step(measured, TENSION_N, *given) is None
@@ -215,9 +157,8 @@ def test_a_step_leaves_rollers_a_tenth_of_the_room_that_the_monitor_watches():
 
 def test_a_step_leaves_more_room_than_it_would_be_stopped_for():
     config = LAWS["lqi"]
-    recovery = Recovery(recovery_prediction(THETA, config, LINE, [SPEED]), config, LINE)
-    v_eq = reference_speeds(THETA.web, TENSION_N, SPEED)
-    u_eq = equilibrium_torque(THETA.web, TENSION_N, v_eq)
+    recovery = recovery_of()
+    v_eq, u_eq = equilibrium()
     measured = Measured(TENSION_N.copy(), v_eq, SPEED)
     law = make_law(config)
     state = law.engage(measured, Steady(TENSION_N), u_eq)

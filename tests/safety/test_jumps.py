@@ -1,4 +1,4 @@
-"""Jumps, stuck and drifting cells at their boundaries, without a loop."""
+"""Speeds that jump are told from what a roller can do, without a loop."""
 
 import numpy as np
 import pytest
@@ -7,9 +7,7 @@ from hypothesis import strategies as st
 
 from gateway.core.signals import FloatArray, Inputs, Quality
 from safety.actions import Action
-from safety.drift import DRIFT_ALONE_N, DRIFT_N, DriftState, drift_limits, drift_of, restart, watch_balance
 from safety.jumps import NOISE_M_PER_S, UNWINDER_MARGIN, JumpState, jump_limits, reject_jumps, reject_unwinder
-from safety.stuck import LEARNT_REVERSALS, StuckLimits, StuckState, find_stuck, stuck_limits
 from tests.closed_loop.conftest import demo_line
 
 LINE = demo_line()
@@ -188,158 +186,65 @@ def test_a_v0_that_did_not_come_says_nothing() -> None:
     assert inputs.unwind_speed.quality[0] == Quality.STALE and state.unwind_speed_m_per_s == 0.05
 
 
-def test_cells_of_tension_spans_are_judged_after_the_time_of_the_lines_file() -> None:
-    limits = stuck_limits(LINE)
-    assert limits.measured.tolist() == [span.control == "tension" for span in LINE.spans]
-    assert limits.stuck_periods == round(LINE.limits.stuck_s / LINE.control.period_s)
-    slow = LINE.model_copy(update={"limits": LINE.limits.model_copy(update={"stuck_s": 1e-3})})
-    assert stuck_limits(slow).stuck_periods == 1
+def second_periods(periods: int) -> tuple[list[int], list[int]]:
+    """Periods with a finding, and those with a discarded sample, of a second spike so many periods after a first."""
+    found, _, discarded = jumping([0.05, 0.5, *[0.05] * (periods - 1), 0.5, 0.05])
+    return found, discarded
 
 
-STUCK = StuckLimits(np.array([True, True, False]), stuck_periods=5)
+def test_a_second_is_the_time_within_which_a_second_jump_is_no_coincidence() -> None:
+    assert second_periods(100) == ([101], [1, 101])
+    assert second_periods(101) == ([], [1, 102])
 
 
-def stuck_after(tensions: list[tuple[float, float, float]], alive: bool = True) -> tuple[StuckState, list[str]]:
-    state, inputs = StuckState(), Inputs(3)
-    texts: list[str] = []
-    for k, values in enumerate(tensions):
-        for i, value in enumerate(values):
-            inputs.tension.put(i, value, 0.0)
-            inputs.speed.put(i, 0.05 + (1e-4 * (k % 2) if alive else 0.0), 0.0)
-        findings = find_stuck(STUCK, state, inputs)
-        assert all((finding.rule, finding.action) == ("load cell stuck", Action.STOP) for finding in findings)
-        texts += [finding.text for finding in findings]
-    return state, texts
+def both_periods(second: list[float], third: list[float], missed: int | None = None) -> list[bool]:
+    """Whether the third period's samples are good, after one in which roller 2 jumped; all began at 0.05 m/s."""
+    limits, state, inputs = jump_limits(LINE, np.zeros(6)), JumpState(), at_30_n()
+    reject_jumps(limits, state, speeds(inputs, [0.05] * 6), [TORQUE_NM])
+    speeds(inputs, second)
+    if missed is not None:
+        inputs.speed.miss(missed)
+    reject_jumps(limits, state, inputs, [TORQUE_NM])
+    assert inputs.speed.quality[1] == Quality.BAD and inputs.speed.value[1] == 0.05
+    reject_jumps(limits, state, speeds(inputs, third), [TORQUE_NM])
+    return [quality == Quality.GOOD for quality in inputs.speed.quality.tolist()]
 
 
-def noisy(count: int) -> list[tuple[float, float, float]]:
-    """Fine cells: 0.01 N a count, noise of 0.1 N."""
-    samples = np.round(np.random.default_rng(2).normal(30.0, 0.1, (count, 3)) / 0.01) * 0.01
-    return [(float(a), float(b), float(c)) for a, b, c in samples]
+def test_time_goes_on_for_a_roller_whose_sample_was_discarded_or_missed_and_begins_anew_for_the_others() -> None:
+    one, two = reach_m_per_s(0.05), reach_m_per_s(0.05, 2)
+    jumped = [0.05, 0.5, *[0.05] * 4]
+    assert one < 0.999 * two
+    # Rollers 2 (discarded), 3 (missed) and 4 (believed) come to nearly what two periods allow.
+    third = [0.05, *[0.05 + 0.999 * two] * 3, 0.05, 0.05]
+    assert both_periods(jumped, third, missed=2) == [True, True, True, False, True, True]
+    third = [0.05, *[0.05 + 1.001 * two] * 2, 0.05 + 0.999 * one, 0.05, 0.05]
+    assert both_periods(jumped, third, missed=2) == [True, False, False, True, True, True]
 
 
-def test_a_cell_that_stands_still_while_rollers_move_is_stuck_after_its_time() -> None:
-    still = [(40.0 + 0.1 * k, 31.0, 30.0 + 0.1 * k) for k in range(6)]
-    assert not stuck_after(noisy(300) + still[:5])[0].stuck.any()
-    state, texts = stuck_after(noisy(300) + still)
-    assert list(state.stuck) == [False, True, False], "span 3 is not controlled by its cell"
-    assert texts == [
-        "the load cell of span 2 has shown 31.00 N 5 times in a row while rollers move: check it, its amplifier and "
-        "its cable"
+def test_samples_beside_a_jump_are_believed_and_are_what_the_next_are_held_against() -> None:
+    one = reach_m_per_s(0.05)
+    second = [0.05, 0.5, 0.05 + 0.9 * one, *[0.05] * 3]
+    assert both_periods(second, [0.05, 0.05, 0.05 + 1.8 * one, *[0.05] * 3])[2]
+    assert not both_periods(second, [0.05, 0.05, 0.05 - 0.5 * one, *[0.05] * 3])[2]
+
+
+@pytest.mark.parametrize("count_m_per_s", [0.0, 0.004])
+def test_nothing_that_acts_leaves_noise_and_two_counts_and_the_bound_itself_is_no_jump(count_m_per_s: float) -> None:
+    limits = jump_limits(LINE, np.full(6, count_m_per_s))
+    allowed = NOISE_M_PER_S + 2.0 * count_m_per_s
+    for first, rest, good in ((1.0, 0.0, [True] * 6), (1.0, 1.001, [True, *[False] * 5])):
+        state, inputs = JumpState(), Inputs(6)
+        for i in range(6):
+            inputs.tension.put(i, 0.0, 0.0)
+        reject_jumps(limits, state, speeds(inputs, [0.0] * 6), [np.zeros(6)])
+        reject_jumps(limits, state, speeds(inputs, [first * allowed, *[rest * allowed] * 5]), [np.zeros(6)])
+        assert (inputs.speed.quality == Quality.GOOD).tolist() == good
+
+
+def test_a_second_jump_says_from_where_to_where() -> None:
+    limits, state, inputs = jump_limits(LINE, np.zeros(6)), JumpState(), at_30_n()
+    for value in (0.05, 0.5, 0.6):
+        findings = reject_jumps(limits, state, speeds(inputs, [*[0.05] * 5, value]), [TORQUE_NM])
+    assert [finding.text for finding in findings] == [
+        "the speed of roller 6 jumped twice, to 0.6000 from 0.0500 m/s: check its encoder and the encoder's cable"
     ]
-
-
-def test_a_cell_is_judged_only_after_it_has_been_learnt() -> None:
-    assert not stuck_after(noisy(LEARNT_REVERSALS - 5) + [(30.0, 30.0, 30.0)] * 50)[0].stuck.any()
-
-
-@pytest.mark.parametrize("noise_n", [0.02, 0.03, 0.05])
-def test_a_healthy_cell_with_a_coarse_resolution_is_not_stuck(noise_n: float) -> None:
-    """0.1 N a count, a filter of 10 Hz: the same count may come for seconds."""
-    rng, filtered = np.random.default_rng(1), np.zeros(3)
-    tensions: list[tuple[float, float, float]] = []
-    for noise in rng.normal(0.0, noise_n, (30_000, 3)):
-        filtered += 0.47 * (noise - filtered)
-        one, two, three = np.round((30.0 + filtered) / 0.1) * 0.1
-        tensions.append((one, two, three))
-    assert stuck_after(tensions)[1] == [], "five minutes"
-
-
-def test_a_sample_that_did_not_come_tells_nothing_of_its_cell() -> None:
-    state, inputs = StuckState(), Inputs(3)
-    values = noisy(300) + [(31.0, 31.0, 31.0)] * 12
-    for k, row in enumerate(values):
-        for i, value in enumerate(row):
-            inputs.speed.put(i, 0.05 + 1e-4 * (k % 2), 0.0)
-            if k >= 300 and k % 2:
-                inputs.tension.miss(i)
-            else:
-                inputs.tension.put(i, value, 0.0)
-        find_stuck(STUCK, state, inputs)
-        assert list(state.stuck) == [k >= 310, k >= 310, False], "every other sample: the sixth like it is the eleventh"
-
-
-@pytest.mark.parametrize(("count_n", "step_n"), [(0.02, 5.0), (0.01, 2.0), (0.02, 10.0), (0.1, 20.0)])
-def test_a_ramp_does_not_teach_that_a_quiet_coarse_cell_is_fine(count_n: float, step_n: float) -> None:
-    """The set-point moves by 20 N/s; then the cell shows one count for long."""
-    rng = np.random.default_rng(3)
-    true_n = 30.0 + np.minimum(0.2 * np.arange(2000), step_n)
-    for _ in range(3):
-        cells = np.round((true_n[:, None] + rng.normal(0.0, 0.1 * count_n, (2000, 3))) / count_n) * count_n
-        assert stuck_after([(float(a), float(b), float(c)) for a, b, c in cells])[1] == []
-
-
-def test_a_line_on_which_nothing_moves_tells_nothing() -> None:
-    assert not stuck_after(noisy(300) + [(30.0, 30.0, 30.0)] * 200, alive=False)[0].stuck.any()
-
-
-@given(
-    cell=st.integers(0, 5),
-    drift_n=st.floats(DRIFT_ALONE_N * 1.01, 50.0) | st.floats(-50.0, -DRIFT_ALONE_N * 1.01),
-)
-def test_the_drift_of_one_cell_is_told_with_its_size(cell: int, drift_n: float) -> None:
-    change_n = np.zeros(6)
-    change_n[cell] -= drift_n
-    if cell:
-        change_n[cell - 1] += drift_n
-    told = drift_of(change_n)
-    assert told[cell] == pytest.approx(drift_n) and np.count_nonzero(told) == 1
-
-
-@given(roller=st.integers(1, 5), change_n=st.floats(-50.0, 50.0))
-def test_the_friction_of_one_roller_is_no_drift(roller: int, change_n: float) -> None:
-    changes_n = np.zeros(6)
-    changes_n[roller] = change_n
-    assert not drift_of(changes_n).any()
-
-
-def test_the_balance_of_the_model_itself_tells_no_drift_and_a_cell_that_lies_is_found() -> None:
-    from gateway.core.web_model import equilibrium_torque, reference_speeds
-
-    limits, state = drift_limits(LINE), DriftState()
-    true_n = np.array([28.0, 36.0, 20.0, 40.0, 24.0, 32.0])
-    speed = reference_speeds(limits.model, true_n, 0.05)
-    torque_nm = equilibrium_torque(limits.model, true_n, speed)
-    restart(limits, state)
-    for _ in range(3000):
-        watch_balance(limits, state, true_n, speed, torque_nm)
-    assert not state.drift_n.any()
-    shown_n = true_n + np.array([0.0, 0.0, 1.5 * DRIFT_N, 0.0, 0.0, 0.0])
-    for _ in range(1000):
-        watch_balance(limits, state, shown_n, speed, torque_nm)
-    assert state.drift_n[2] == pytest.approx(1.5 * DRIFT_N) and np.count_nonzero(state.drift_n) == 1
-
-
-def test_what_is_wrong_in_the_model_is_no_drift_and_the_reference_is_of_ten_blocks() -> None:
-    from gateway.core.web_model import equilibrium_torque, reference_speeds
-
-    limits, state = drift_limits(LINE), DriftState()
-    assert (limits.block_periods, limits.settle_periods, limits.measured.tolist()) == (100, 500, [1.0] * 6)
-    true_n = np.full(6, 30.0)
-    speed = reference_speeds(limits.model, true_n, 0.05)
-    torque_nm = equilibrium_torque(limits.model, true_n, speed) + np.array([5.0, -3.0, 2.0, 0.0, 4.0, -6.0])
-    restart(limits, state)
-    for _ in range(500 + 999):
-        watch_balance(limits, state, true_n, speed, torque_nm)
-    assert state.reference_nm is None
-    watch_balance(limits, state, true_n, speed, torque_nm)
-    assert state.reference_nm is not None and state.drift_n.tolist() == [0.0] * 6
-    for _ in range(1000):
-        watch_balance(limits, state, true_n, speed, torque_nm)
-    assert state.drift_n.tolist() == [0.0] * 6
-
-
-def test_a_span_without_a_cell_has_no_drift() -> None:
-    from gateway.core.web_model import equilibrium_torque, reference_speeds
-
-    spans = [span.model_copy(update={"control": "draw"}) if i == 2 else span for i, span in enumerate(LINE.spans)]
-    limits, state = drift_limits(LINE.model_copy(update={"spans": spans})), DriftState()
-    assert limits.measured.tolist() == [1.0, 1.0, 0.0, 1.0, 1.0, 1.0]
-    true_n = np.full(6, 30.0)
-    speed = reference_speeds(limits.model, true_n, 0.05)
-    torque_nm = equilibrium_torque(limits.model, true_n, speed)
-    restart(limits, state)
-    for k in range(3000):
-        shown_n = true_n + (k > 1600) * np.array([0.0, 0.0, 1.5 * DRIFT_N, 0.0, 0.0, 0.0])
-        watch_balance(limits, state, shown_n, speed, torque_nm)
-    assert state.drift_n.tolist() == [0.0] * 6
