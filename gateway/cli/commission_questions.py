@@ -11,7 +11,7 @@ from gateway.commissioning.architectures import ARCHITECTURES
 from gateway.commissioning.convergence import Convergence, SpanFigures
 from gateway.commissioning.ladder import OWN, Next
 from gateway.commissioning.past import Follows, Outcome, Past, Step
-from gateway.commissioning.redesign import Figures, beside
+from gateway.commissioning.redesign import Figures, ratio
 from gateway.core.controller import config_hash
 from gateway.core.line import Line
 from gateway.core.questions import Decision, Figure, Knob, Option, Question
@@ -157,7 +157,7 @@ def _figures(offer: Offer) -> list[Figure]:
     if offer.redesign is None:
         return []
     figures, before = offer.redesign.figures, offer.redesign.before
-    share = sum(beside(figures[name].rmse_n, before[name].rmse_n) for name in before) / len(before)
+    share = sum(ratio(figures[name].rmse_n, before[name].rmse_n) for name in before) / len(before)
     return [
         _figure("tracking error over that in service, mean of the courses", share, ""),
         _worst("tracking error on the model", "N", figures.values(), lambda one: one.rmse_n),

@@ -130,7 +130,7 @@ def _worth(
         figures = predicted(config, line, model, judged, lasting_s)
         figures_known = figures if known is judged else predicted(config, line, model, known, lasting_s)
         if all(_no_worse(line, figures_known[name], before_known[name]) for name in before_known):
-            whole = sum(beside(figures[name].rmse_n, before[name].rmse_n) for name in before)
+            whole = sum(ratio(figures[name].rmse_n, before[name].rmse_n) for name in before)
             found.append((whole, Offer(law, config, judged.speed_max_m_per_s, figures, before)))
     return [offer for _, offer in sorted(found, key=lambda each: each[0])]
 
@@ -163,7 +163,7 @@ def predicted(
     return found
 
 
-def beside(rmse_n: float, before_n: float) -> float:
+def ratio(rmse_n: float, before_n: float) -> float:
     """How large a tracking error is; by itself where what it is held against is none, or has no end."""
     return rmse_n / before_n if 0.0 < before_n < inf else rmse_n
 
