@@ -161,7 +161,8 @@ def _health(status: GatewayStatus) -> RenderableType:
         stored += f"; a damaged one is kept as {historian.moved_aside}"
     grid.add_row("history", Text(stored, "" if historian.storing else "bold red"))
     if agents := _agents(status):
-        grid.add_row("agents", Text(agents, "" if status.agents_bus.open else "yellow"))
+        style = "" if status.agents_bus.open else "yellow"
+        grid.add_row("agents", Text(agents, style, no_wrap=True, overflow="ellipsis"))
     return grid
 
 

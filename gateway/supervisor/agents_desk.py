@@ -57,10 +57,14 @@ class AgentsDesk:
         return self._status().model_dump_json().encode()
 
     async def _judge(self, agent: AgentName, payload: bytes) -> bytes:
+        """What is no proposal costs the judge nothing."""
         if self._gate.deployer is None:
             return _bytes(self._gate.shut_reply())
         try:
+            parse_proposal(payload, MAX_PAYLOAD)
             found = await self._dry_runs.run(payload, self._gate.deployer)
+        except ProposalRefused as malformed:
+            return _bytes(refused("it is no proposal", malformed.reasons))
         except (TooMany, NotKnown) as error:
             self._note("dry-run", f"agent {agent}: not judged: {error}")
             return _bytes(refused("it is not judged", [str(error)]))

@@ -359,7 +359,6 @@ PART = st.from_regex(r"[a-z][a-z0-9-]{0,11}", fullmatch=True)
 def test_any_topic_and_payload_comes_through_as_it_was() -> None:
     with short_folder() as folder:
         with asyncio.Runner() as runner:
-
             hall = runner.run(opened(unguarded(folder)))
             here, there = (runner.run(connect(folder, "demo", "line-1")) for _ in range(2))
             served: set[str] = set()

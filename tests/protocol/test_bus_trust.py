@@ -8,7 +8,15 @@ from typing import Any
 import pytest
 import zenoh
 
-from gateway.core.topics import AGENT_DECIDE, AGENT_TOPICS, ASK_JUDGE, ASK_PROPOSALS, ASK_PROPOSE, ASK_STATUS, AgentTopic
+from gateway.core.topics import (
+    AGENT_DECIDE,
+    AGENT_TOPICS,
+    ASK_JUDGE,
+    ASK_PROPOSALS,
+    ASK_PROPOSE,
+    ASK_STATUS,
+    AgentTopic,
+)
 from gateway.mailbox.bus import BusUnavailable, TlsEndpoint, client_settings, connect, open_router
 from gateway.mailbox.port import Unreachable
 from gateway.mailbox.zenoh_mailbox import ZenohMailbox
