@@ -147,15 +147,21 @@ def test_an_agent_that_is_killed_ends_what_waits_for_it_and_is_gone_and_the_next
     run(story)
 
 
-def test_an_agent_that_is_stopped_costs_the_time_of_the_request_and_answers_when_it_goes_on() -> None:
+def test_an_agent_that_is_stopped_costs_the_time_of_a_request_then_is_gone_and_comes_again_by_itself() -> None:
     async def story(folder: Path) -> None:
         async with router(folder) as gateway:
+            here: list[bool] = []
+            gateway.watch(DECIDE, here.append)
             with child(AGENT, folder) as (process, _):
-                await is_here(gateway, DECIDE)
+                await until(lambda: here == [True])
                 os.kill(process.pid, signal.SIGSTOP)
                 with pytest.raises(Unreachable, match="did not answer within 0.2 s"):
                     await gateway.request(DECIDE, b"a", 0.2)
+                with pytest.raises(Unreachable, match="went away|nobody answers"):
+                    await gateway.request(DECIDE, b"a", 1000.0)
+                await until(lambda: here == [True, False])
                 os.kill(process.pid, signal.SIGCONT)
+                await until(lambda: here == [True, False, True])
                 assert await gateway.request(DECIDE, b"a", LONG_S) == b"chosen: a"
 
     run(story)
