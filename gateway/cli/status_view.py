@@ -31,7 +31,7 @@ def render(status: GatewayStatus, width: int, height: int | None = None) -> Rend
     """With a `height` (lines), spans that need no attention and old events give way so that it fits."""
     spans, events = status.spans, len(status.events)
     if height is not None:
-        height -= status.change is not None
+        height -= (status.change is not None) + bool(_agents(status))
         room = max(1, height - FIXED_LINES - LEAST_EVENTS)
         if len(spans) > room:
             spans = _urgent(spans, max(1, room - 1), status.limits)
@@ -160,7 +160,16 @@ def _health(status: GatewayStatus) -> RenderableType:
     if historian.moved_aside:
         stored += f"; a damaged one is kept as {historian.moved_aside}"
     grid.add_row("history", Text(stored, "" if historian.storing else "bold red"))
+    if agents := _agents(status):
+        style = "" if status.agents_bus.open else "yellow"
+        grid.add_row("agents", Text(agents, style, no_wrap=True, overflow="ellipsis"))
     return grid
+
+
+def _agents(status: GatewayStatus) -> str:
+    """Who answers questions, or that nobody can; empty: there is no agent."""
+    bus = status.agents_bus
+    return ", ".join(bus.agents) if bus.open else printable(f"their bus is closed: {bus.text}")
 
 
 def _buses(buses: list[BusReport]) -> Text:

@@ -237,6 +237,16 @@ class Agents(Strict):
     task_max_tokens: Annotated[int, Field(ge=1024)] = 200_000  #: of one commissioning, asked and answered
 
 
+class Network(Strict):
+    """The agents' bus beyond this machine. Without this table it stays on it."""
+
+    listen: str  #: tls/HOST:PORT
+    certificate: str  #: file, PEM, with all that lead to its authority
+    private_key: str  #: file, PEM
+    authority: str  #: file, PEM: certificates of who signs the agents'
+    names: Annotated[list[Name], Field(min_length=1, max_length=32)]  #: common names of certificates of agents
+
+
 class Line(Strict):
     format: Annotated[int, Field(ge=1, le=1)]  #: not Literal: that takes `true` and 1.0 for 1
     site: Name
@@ -256,6 +266,7 @@ class Line(Strict):
     priorities: Priorities = Priorities()
     gate: Gate = Gate()
     agents: Agents = Agents()
+    network: Network | None = None
     recipes: Annotated[list[Recipe], Field(min_length=1)]  #: the first is the one a line starts with
 
     @property

@@ -34,6 +34,7 @@ HELP: dict[str, dict[str, str]] = {
         "priorities": "what matters on this line: the weights by which r2rgate design chooses among controllers",
         "gate": "what a change must show before it may reach a drive, and who decides",
         "agents": "who is asked where a phase leaves something to judgement; every change is judged all the same",
+        "network": "lets agents on other machines in, by certificate; without this table none is",
         "recipes": "set-points for a grade; the line starts with the first",
     },
     "Control": {
@@ -185,6 +186,13 @@ HELP: dict[str, dict[str, str]] = {
         "answer_max_s": "for an answer with all its tries; after it the rules decide",
         "load_max_s": "for the model to be loaded",
         "task_max_tokens": "asked and answered in one commissioning; after it the rules decide",
+    },
+    "Network": {
+        "listen": 'where agents reach the gateway, e.g. "tls/192.168.0.5:7447"',
+        "certificate": "file with the gateway's certificate, .pem",
+        "private_key": "file with its private key, .pem",
+        "authority": "file with the certificate of who signs the agents' certificates, .pem",
+        "names": "common names of the certificates that may be agents; all others are refused",
     },
     "Recipe": {
         "name": "name of the grade",

@@ -30,7 +30,7 @@ def line_template(spans: int = 6, out: str = "line.toml", wiring: Wiring = DEMON
     more = {1: "", 2: " ~~span 2~~ roller 2"}.get(spans, f" ~~span 2~~ ... ~~span {spans}~~ roller {spans}")
     parts = [_HEAD.format(more=more, out=out), _line(spans), _process(spans), _web()]
     parts += [_rollers(spans), _spans(spans), *wired_tables(wiring, spans)]
-    return "\n".join([*parts, _history(), _priorities(), _gate(), _agents(), _recipes(spans)])
+    return "\n".join([*parts, _history(), _priorities(), _gate(), _agents(), _network(), _recipes(spans)])
 
 
 def _line(spans: int) -> str:
@@ -132,6 +132,19 @@ def _gate() -> str:
 def _agents() -> str:
     settings = {key: value for key, value in Agents().model_dump(mode="json").items() if key != "llm"}
     return table("agents", "Agents", {"llm": '"off"', **{k: f"#{json.dumps(v)}" for k, v in settings.items()}})
+
+
+def _network() -> str:
+    """Commented out: what nobody asks for is not listened on."""
+    folder = "/etc/r2rgate/pki"
+    settings = {
+        "listen": '#"tls/192.168.0.5:7447"',
+        "certificate": f'#"{folder}/gateway.pem"',
+        "private_key": f'#"{folder}/gateway.key.pem"',
+        "authority": f'#"{folder}/authority.pem"',
+        "names": '#["agents"]',
+    }
+    return "# " + table("network", "Network", settings)
 
 
 def _recipes(spans: int) -> str:

@@ -160,7 +160,7 @@ def _resolve(node: Schema, value: Any) -> Schema:
     if "discriminator" in node:
         return _resolve_bus(node, value)
     if "anyOf" in node:
-        return node["anyOf"][0]  # "or nothing", which TOML cannot say
+        return _resolve(node["anyOf"][0], value)  # "or nothing", which TOML cannot say
     return _SCHEMA["$defs"][node["$ref"].rsplit("/", 1)[1]] if "$ref" in node else node
 
 
@@ -204,7 +204,10 @@ def _list_in_words(schema: Schema, path: Path) -> str:
     if schema["items"].get("type") == "number":
         return _with_unit("a list [ ... ] of numbers above 0, one per span, in", path)
     most = f" to {schema['maxItems']}" if "maxItems" in schema else " or more"
-    return f"{schema.get('minItems', 0)}{most} tables, each headed [[{path[-1]}]]"
+    count = f"{schema.get('minItems', 0)}{most}"
+    if schema["items"].get("type") == "string":
+        return f"a list [ ... ] of {count} texts in quotes"
+    return f"{count} tables, each headed [[{path[-1]}]]"
 
 
 def _with_unit(words: str, path: Path) -> str:

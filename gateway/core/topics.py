@@ -1,7 +1,13 @@
-"""The one table of what travels between processes: name, way, rate, and whether it is kept."""
+"""The one table of what travels between processes: name, way, rate, and whether it is kept.
+
+On the bus of the agents a site and a line stand before each name, so that two lines never meet.
+"""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
+
+AgentName = Literal["sysid", "initial-control", "adaptation", "monitoring", "code"]
+AGENT_NAMES: tuple[AgentName, ...] = get_args(AgentName)
 
 
 @dataclass(frozen=True)
@@ -10,6 +16,21 @@ class Topic:
     way: Literal["publish", "request"]
     rate: str  #: at most
     kept: bool  #: written to the historian
+    most_per_s: float | None = None  #: requests; more are refused where it is served. None: not limited
+
+
+@dataclass(frozen=True)
+class AgentTopic:
+    """A request of which each agent has a topic of its own: `of(agent)`."""
+
+    name: str  #: with * where the agent's name stands
+    asks: Literal["phases", "agent"]
+    answers: Literal["agent", "gateway"]
+    most_per_s: float  #: of each agent
+    kept: bool  #: written to the historian
+
+    def of(self, agent: AgentName) -> Topic:
+        return Topic(self.name.replace("*", agent), "request", f"{self.most_per_s:g}/s", self.kept, self.most_per_s)
 
 
 LOOP_TELEMETRY = Topic("loop/telemetry", "publish", "once a period", kept=True)
@@ -26,3 +47,12 @@ TOPICS = (
     LOOP_TELEMETRY, LOOP_EVENT, LOOP_BUSES, LOOP_COMMAND, GATEWAY_COMMAND, GATEWAY_STATUS, GATEWAY_PROPOSE,
     GATEWAY_PROPOSALS, GATEWAY_DECISION,
 )  # fmt: skip
+
+# The bus of the agents. What is no row here nobody may send there: its access rules are made from this table.
+AGENT_DECIDE = AgentTopic("agents/*/decide", "phases", "agent", 10.0, kept=False)  #: Question -> Choice
+ASK_PROPOSE = AgentTopic("ask/*/propose", "agent", "gateway", 1.0, kept=True)  #: Proposal -> Reply
+ASK_STATUS = AgentTopic("ask/*/status", "agent", "gateway", 10.0, kept=False)  #: nothing -> GatewayStatus
+ASK_PROPOSALS = AgentTopic("ask/*/proposals", "agent", "gateway", 10.0, kept=False)  #: Query -> as it says
+ASK_JUDGE = AgentTopic("ask/*/judge", "agent", "gateway", 1.0, kept=True)  #: Proposal -> DryRun; Reply: refused
+
+AGENT_TOPICS = (AGENT_DECIDE, ASK_PROPOSE, ASK_STATUS, ASK_PROPOSALS, ASK_JUDGE)

@@ -7,6 +7,7 @@ from gateway.core.line import Line
 from gateway.mailbox.listener import living
 
 GATEWAY_SOCKET = "gateway.sock"
+BUS_SOCKET = "bus.sock"  #: the agents'
 LOOP_SOCKET = "loop.sock"
 _SERVICE = Path("/run/r2rgate")  # made by the service manager for its user
 

@@ -1,4 +1,4 @@
-"""The one way in which processes talk. Transports: in-process (tests, stepped time) and unix socket; Zenoh later."""
+"""The one way in which processes talk. Transports: in-process (tests, stepped time), unix socket, Zenoh (agents)."""
 
 from collections.abc import Awaitable, Callable
 from contextvars import ContextVar
@@ -54,8 +54,11 @@ def no_answer(topic: Topic, timeout_s: float) -> str:
 
 
 def what_to_start(topic: Topic) -> str:
-    """The sentence for an unreachable topic; the first part of a topic's name is the process that serves it."""
-    process = topic.name.partition("/")[0]
+    """The sentence for an unreachable topic; the first part of a topic's name is the process that serves it.
+
+    What agents ask begins with `ask`, and the gateway serves it.
+    """
+    process = topic.name.partition("/")[0].replace("ask", "gateway")
     return f"{process} not running: start it with `r2rgate {process} LINE.toml`"
 
 

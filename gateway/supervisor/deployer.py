@@ -9,9 +9,11 @@ from collections.abc import Callable
 
 from gateway.core.audit_record import Who
 from gateway.core.decisions import Decide, ProposalLine, ProposalList, ProposalShown, shown_hash
+from gateway.core.judge_context import JudgeContext
 from gateway.core.line import Line
 from gateway.core.messages import Reply
 from gateway.core.proposal import GainsChange, Proposal
+from gateway.core.recording import Recording
 from gateway.core.small_change import beyond_small
 from gateway.mailbox.port import Unreachable
 from gateway.supervisor.audit_file import AuditUnavailable
@@ -126,6 +128,10 @@ class Deployer:
     async def judged(self) -> None:
         """Until nothing is being judged any more."""
         await self._inbox.judged()
+
+    async def context(self) -> tuple[JudgeContext, list[Recording]]:
+        """What a proposal would be judged against now. Raises NotKnown."""
+        return await self._surroundings.context(self.book)
 
     async def close(self) -> None:
         await self._inbox.close()

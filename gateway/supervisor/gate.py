@@ -115,7 +115,7 @@ class Gate:
         self._learned: str | None = None  #: what ran when `_learn` looked last
         self._telling: set[asyncio.Task[None]] = set()
         mailbox.serve(GATEWAY_PROPOSE, self._answer_propose)
-        mailbox.serve(GATEWAY_PROPOSALS, self._answer_query)
+        mailbox.serve(GATEWAY_PROPOSALS, self.answer_query)
         mailbox.serve(GATEWAY_DECISION, self._answer_decision)
 
     async def look(self) -> None:
@@ -219,19 +219,23 @@ class Gate:
                     models.mark(other.id, "superseded", now_s, f"by version {entry.version}")
             models.mark(entry.id, "accepted", now_s, proposal.reason[:400])
 
-    async def _answer_propose(self, payload: bytes) -> bytes:
-        who = _who(PEER.get())
-        reply = self._shut_reply() if self.deployer is None else await self.deployer.propose(payload, who)
+    async def propose(self, payload: bytes, who: Who) -> Reply:
+        """Take a proposal in, to be judged in the background."""
+        reply = self.shut_reply() if self.deployer is None else await self.deployer.propose(payload, who)
         self._note("proposal", f"{who.name}: {reply.text}", ok=reply.ok, reasons=reply.reasons)
-        return reply.model_dump_json().encode()
+        return reply
 
-    async def _answer_query(self, payload: bytes) -> bytes:
+    async def _answer_propose(self, payload: bytes) -> bytes:
+        return (await self.propose(payload, _who(PEER.get()))).model_dump_json().encode()
+
+    async def answer_query(self, payload: bytes) -> bytes:
+        """What is asked of proposals, and changes nothing."""
         try:
             query = QUERY.validate_json(payload)
         except ValidationError as error:
             return _not_understood(error)
         if self.deployer is None:
-            return self._shut_reply().model_dump_json().encode()
+            return self.shut_reply().model_dump_json().encode()
         if isinstance(query, ListProposals):
             return self.deployer.listed(query.most).model_dump_json().encode()
         found = self.deployer.shown(query.proposal)
@@ -246,7 +250,7 @@ class Gate:
             return _not_understood(error)
         who = _who(PEER.get())
         if self.deployer is None:
-            reply = self._shut_reply()
+            reply = self.shut_reply()
         elif isinstance(decision, Decide):
             if decision.script:
                 who = who.model_copy(update={"name": f"{decision.script}, run by {who.name}"})
@@ -260,7 +264,8 @@ class Gate:
         self._note("decision", f"{who.name}: {reply.text}", ok=reply.ok, reasons=reply.reasons)
         return reply.model_dump_json().encode()
 
-    def _shut_reply(self) -> Reply:
+    def shut_reply(self) -> Reply:
+        """To whoever asks before the gate is open."""
         return Reply(ok=False, state="", text="the gate is shut", reasons=[self._shut])
 
 

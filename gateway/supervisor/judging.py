@@ -21,7 +21,7 @@ from gateway.core.recording import Recording
 from gateway.core.verdict import Verdict
 from gateway.supervisor.spawned import end_with_parent, interrupt_later
 
-NICER = 10  #: than the process that starts them
+NICER, NICEST = 10, 19  #: than the process that starts them; and where nobody waits for a verdict
 BEGIN_S = 600.0  #: until one is ready: on a new machine it compiles first
 LARGEST_SEED = 2**53  #: below it every number is one in JSON, too
 SINGLE = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
@@ -40,10 +40,10 @@ class NoVerdict(Exception):
 class _Worker:
     """One process, and the pipe to it. Its methods block: they are for threads."""
 
-    def __init__(self, line: Line) -> None:
+    def __init__(self, line: Line, nicer: int) -> None:
         context = get_context("spawn")
         self._ours, theirs = context.Pipe()
-        self._process: BaseProcess = context.Process(target=_work, args=(theirs, line), daemon=True)
+        self._process: BaseProcess = context.Process(target=_work, args=(theirs, line, nicer), daemon=True)
         with _one_thread_each(), interrupt_later():
             self._process.start()
         theirs.close()
@@ -90,8 +90,9 @@ class _Worker:
 class JudgeWorkers:
     """Processes begin with the first proposal that needs them, or with `async with`; `close` ends them."""
 
-    def __init__(self, line: Line, count: int = 1) -> None:
+    def __init__(self, line: Line, count: int = 1, nicer: int = NICER) -> None:
         self._line = line
+        self._nicer = nicer
         self._idle: asyncio.Queue[_Worker | None] = asyncio.Queue()
         for _ in range(count):
             self._idle.put_nowait(None)
@@ -154,7 +155,7 @@ class JudgeWorkers:
         return verdict
 
     def _begun(self) -> _Worker:
-        worker = _Worker(self._line)
+        worker = _Worker(self._line, self._nicer)
         self._all.add(worker)
         return worker
 
@@ -171,11 +172,11 @@ def _forgotten(asked: "asyncio.Future[Verdict]") -> None:
         asked.exception()
 
 
-def _work(pipe: Connection, line: Line) -> None:
+def _work(pipe: Connection, line: Line, nicer: int) -> None:
     """A worker's life: ready, then a verdict for each job, until the other end is gone."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the process that has started this one
     end_with_parent()
-    os.nice(NICER)
+    os.nice(nicer)
     from safety.judge import failed, judge, warm_up
 
     warm_up(line)

@@ -17,13 +17,16 @@ from gateway.core.topics import LOOP_COMMAND
 from gateway.mailbox.listener import AlreadyRunning, CannotListen, PathTooLong
 from gateway.mailbox.paths import GATEWAY_SOCKET, LOOP_SOCKET
 from gateway.mailbox.unix import UnixMailbox
+from gateway.supervisor.agents_bus import AgentsBus
+from gateway.supervisor.agents_desk import AgentsDesk
 from gateway.supervisor.configurations import Configurations
 from gateway.supervisor.deployer_sides import JudgeSide
+from gateway.supervisor.dry_runs import DryRuns
 from gateway.supervisor.experiments import MOST_EXPERIMENTS, newest_experiments
 from gateway.supervisor.gate import Gate
 from gateway.supervisor.historian import Historian
 from gateway.supervisor.history import HistoryError
-from gateway.supervisor.judging import JudgeWorkers
+from gateway.supervisor.judging import NICEST, JudgeWorkers
 from gateway.supervisor.models import Models
 from gateway.supervisor.retention import retention_of
 from gateway.supervisor.service import Gateway
@@ -90,16 +93,24 @@ async def serve(
     judge.begin()
     gate = Gate(line, mailbox, data_folder, judge, around, gateway.note, clock, wall_clock)
     gateway.on_event, gateway.change = gate.hear, gate.change
+    dry_runs = DryRuns(line, JudgeWorkers(line, nicer=NICEST))
+    bus = AgentsBus(line, run_folder, AgentsDesk(gateway.status, gate, dry_runs, gateway.note), gateway.note, clock)
+    gateway.agents_bus = bus.status
+    opening = asyncio.create_task(bus.open())
     looking = asyncio.create_task(_look(gate, stop, watch_s))
     gateway.note("gateway-up", "the gateway has started")
     print(f"gateway of {line.site}/{line.line}: {run_folder / GATEWAY_SOCKET}, history {historian.path}", flush=True)
     try:
         while not stop.is_set():
             gateway.watch()
+            bus.watch()
             await _wait(stop, watch_s)
     finally:
         stop.set()
         await looking
+        await opening
+        await bus.close()
+        await dry_runs.close()
         await gate.close()
         await judge.close()
         await mailbox.close()

@@ -30,6 +30,7 @@ from gateway.mailbox.port import PEER, Counters, Mailbox, Peer, Unreachable
 from gateway.supervisor.historian import Historian
 from gateway.supervisor.recent import Recent
 from gateway.supervisor.status import (
+    BusStatus,
     ChangeStatus,
     EventStatus,
     GatewayStatus,
@@ -47,6 +48,7 @@ LOOP_TIME_S = 2.5  #: for the loop to answer a command
 ARM_TIME_S = 14.0  #: arming configures every drive and reads its watchdog back
 WALL_CLOCK_JUMP_S = 0.5  #: between two looks; less is a clock that is being disciplined
 EVENTS_SHOWN = 20
+NO_BUS = BusStatus(open=False, text="it is about to be opened", agents=[], refused=0)
 TEXT_SHOWN = 300  #: characters of an event's text in the status; the history keeps all
 
 
@@ -74,6 +76,7 @@ class Gateway:
         self._sink = TelemetrySink(line.n, self._frame)
         self.on_event: Callable[[Event], None] | None = None  #: who else wants to know what the loop tells
         self.change: Callable[[], ChangeStatus | None] = lambda: None  #: what the gate does to the line now
+        self.agents_bus: Callable[[], BusStatus] = lambda: NO_BUS
         self._events: deque[EventStatus] = deque(maxlen=EVENTS_SHOWN)
         self._buses: list[BusReport] = []
         self._malformed_events = 0
@@ -146,6 +149,7 @@ class Gateway:
                 refused=self._counters.refused,
             ),
             buses=self._buses if loop.running else [],
+            agents_bus=self.agents_bus(),
             historian=self._historian_status(now_s),
             events=list(self._events),
         )

@@ -117,6 +117,15 @@ class ChangeStatus(Strict):
     text: str  #: what is still missing; empty: nothing is
 
 
+class BusStatus(Strict):
+    """The bus of the agents."""
+
+    open: bool
+    text: str  #: why it is not; empty: it is
+    agents: list[str]  #: that answer questions now
+    refused: int  #: requests of agents turned away: too many, too long, for several keys
+
+
 class GatewayStatus(Strict):
     format: Annotated[int, Field(ge=1, le=1)]
     site: str
@@ -133,6 +142,7 @@ class GatewayStatus(Strict):
     timing: TimingStatus
     link: LinkStatus
     buses: list[BusReport]  #: as the loop sees them; empty until it has said so
+    agents_bus: BusStatus
     historian: HistorianStatus
     events: list[EventStatus]  #: the last ones, the newest at the end
 

@@ -13,7 +13,7 @@ from gateway.control.design import design_lqi
 from gateway.core.proposal import canonical
 from gateway.core.verdict import Verdict
 from gateway.core.verdict import canonical as verdict_bytes
-from gateway.supervisor.judging import JudgeWorkers
+from gateway.supervisor.judging import NICEST, JudgeWorkers
 from safety.judge import judge
 from tests.safety.case_support import EXAMPLES, gains, published
 
@@ -47,6 +47,18 @@ def test_a_worker_judges_as_the_judge_does_and_one_that_gives_none_is_replaced(o
     assert not late.accepted and [one.rule for one in late.findings] == ["time"]
     assert not dead.accepted and [one.rule for one in dead.findings] == ["judge process"]
     assert late.proposal == first.proposal and late.kind == "gains"
+
+
+def test_a_judge_for_whom_nobody_waits_gives_way_to_the_others(of, payload):
+    async def story():
+        async with JudgeWorkers(of.line, nicer=NICEST) as workers:
+            verdict = await workers.judge(payload, of.context(), [of.recording])
+            (pid,) = workers.pids
+            return verdict, os.getpriority(os.PRIO_PROCESS, pid)
+
+    verdict, nice = asyncio.run(story())
+    assert verdict.accepted
+    assert nice == 19
 
 
 def test_what_waits_for_a_verdict_may_be_cancelled_and_the_process_goes_with_it(of, payload):

@@ -78,7 +78,10 @@ def test_from_start_to_sigterm_everything_is_kept() -> None:
                     assert loop.publish(LOOP_TELEMETRY, frame_of(k, time.monotonic()))
                 event = Event(time_s=time.monotonic(), kind="state", text="TENSIONING to RUNNING")
                 loop.publish(LOOP_EVENT, event.model_dump_json().encode())
-                status = await status_with(client, lambda status: "loop-up" in {event.kind for event in status.events})
+                status = await status_with(
+                    client,
+                    lambda status: "loop-up" in {event.kind for event in status.events} and status.link.frames >= 150,
+                )
                 assert status.link.frames == 150
                 assert (status.loop.running, status.loop.state) == (True, "RUN")
                 process.terminate()

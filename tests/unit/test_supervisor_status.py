@@ -17,7 +17,7 @@ from gateway.mailbox.inprocess import Hub, InProcessMailbox
 from gateway.mailbox.port import MAX_PAYLOAD, PEER, Counters, Peer
 from gateway.supervisor.historian import Health, Historian
 from gateway.supervisor.service import EVENTS_SHOWN, TEXT_SHOWN, Gateway
-from gateway.supervisor.status import LOST_S, WORDS, GatewayStatus
+from gateway.supervisor.status import LOST_S, WORDS, BusStatus, GatewayStatus
 from tests.unit.supervisor_support import frame_of, line_of
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -295,6 +295,7 @@ def example() -> GatewayStatus:
     bench.say("state", "TENSIONING to RUNNING")
     bench.run_loop(100)
     bench.gateway.watch()
+    bench.gateway.agents_bus = lambda: BusStatus(open=True, text="", agents=["sysid"], refused=0)
     return bench.gateway.status()
 
 

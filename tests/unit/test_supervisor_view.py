@@ -21,7 +21,7 @@ from gateway.cli.status_commands import export_csv, status
 from gateway.cli.status_view import render
 from gateway.core.topics import GATEWAY_STATUS
 from gateway.mailbox.unix import UnixMailbox
-from gateway.supervisor.status import ChangeStatus, GatewayStatus
+from gateway.supervisor.status import BusStatus, ChangeStatus, GatewayStatus
 from tests.unit.supervisor_support import frame_of, short_folder
 from tests.unit.test_historian import writer_of
 from tests.unit.test_supervisor_status import Bench
@@ -71,6 +71,26 @@ def test_what_is_being_done_to_the_line_is_shown_and_the_screen_still_fits(stage
     lines = text_of(status.model_copy(update={"change": change}), 80, 24)
     assert len(lines) <= 24 and max(map(len, lines)) <= 80
     assert [line for line in lines if f"{kind.capitalize()} abababababab {said}" in line]
+
+
+@pytest.mark.parametrize(
+    ("bus", "said"),
+    [
+        (BusStatus(open=True, text="", agents=["monitoring", "sysid"], refused=0), "agents     monitoring, sysid"),
+        (
+            BusStatus(open=False, text="the port is in use " * 9, agents=[], refused=0),
+            "agents     their bus is closed:",
+        ),
+    ],
+)
+def test_agents_are_shown_or_that_their_bus_is_closed_and_the_screen_still_fits(bus: BusStatus, said: str) -> None:
+    lines = text_of(running(20).model_copy(update={"agents_bus": bus}), 80, 24)
+    assert len(lines) <= 24 and max(map(len, lines)) <= 80
+    assert [line for line in lines if line.startswith(said)]
+    nobody = BusStatus(open=True, text="", agents=[], refused=0)
+    assert not [
+        line for line in text_of(running(20).model_copy(update={"agents_bus": nobody}), 80, 24) if "agents" in line
+    ]
 
 
 def test_the_reason_of_the_newest_state_is_told_to_its_end() -> None:

@@ -1,0 +1,80 @@
+"""The agents' bus of a gateway process: opened beside everything else, and told of in events and in the status."""
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+from gateway.core.line import Line
+from gateway.core.topics import AGENT_DECIDE, AGENT_NAMES, AgentName
+from gateway.mailbox.allowance import Allowance
+from gateway.mailbox.bus import open_router
+from gateway.mailbox.zenoh_mailbox import ZenohMailbox
+from gateway.supervisor.agents_desk import AgentsDesk
+from gateway.supervisor.status import BusStatus
+
+MOST_EVENTS_PER_S = 0.1  #: of each kind: whoever comes and goes all the time, or floods, does not flood the history
+
+
+class AgentsBus:
+    """`open` it once, `watch` a few times a second, `close` at the end. Without it the gateway does all else."""
+
+    def __init__(
+        self, line: Line, run_folder: Path, desk: AgentsDesk, note: Callable[..., None], clock: Callable[[], float]
+    ) -> None:
+        self._line = line
+        self._run_folder = run_folder
+        self._desk = desk
+        self._note = note
+        self._clock = clock
+        self._mailbox: ZenohMailbox | None = None
+        self._text = "it is about to be opened"
+        self._agents: set[AgentName] = set()
+        self._told_agents: set[AgentName] = set()
+        self._told_refused = 0
+        self._of_agents = Allowance(MOST_EVENTS_PER_S)
+        self._of_refused = Allowance(MOST_EVENTS_PER_S)
+
+    async def open(self) -> None:
+        """Never raises: a gateway without the bus is better than none."""
+        try:
+            mailbox = await open_router(self._line, self._run_folder)
+            self._desk.serve_on(mailbox)
+            for agent in AGENT_NAMES:
+                mailbox.watch(AGENT_DECIDE.of(agent), partial(self._seen, agent))
+        except Exception as error:  # whatever it is
+            self._text = f"it could not be opened: {error}"
+            self._note("agents-bus", f"the agents' bus is closed: {error}")
+            return
+        self._mailbox, self._text = mailbox, ""
+        network = self._line.network
+        self._note("agents-bus", "the agents' bus is open" + ("" if network is None else f", also on {network.listen}"))
+
+    def watch(self) -> None:
+        """Notes agents that have come or gone, and requests that were turned away."""
+        if self._agents != self._told_agents and self._of_agents.take(self._clock()):
+            for words, names in (
+                ("answers questions", self._agents - self._told_agents),
+                ("answers no questions any more", self._told_agents - self._agents),
+            ):
+                for agent in sorted(names):
+                    self._note("agent", f"agent {agent} {words}")
+            self._told_agents = set(self._agents)
+        refused = 0 if self._mailbox is None else self._mailbox.counters.refused
+        if refused != self._told_refused and self._of_refused.take(self._clock()):
+            self._note("agents-refused", f"{refused - self._told_refused} requests of agents were turned away")
+            self._told_refused = refused
+
+    def status(self) -> BusStatus:
+        refused = 0 if self._mailbox is None else self._mailbox.counters.refused
+        opened = self._mailbox is not None
+        return BusStatus(open=opened, text=self._text, agents=sorted(self._agents), refused=refused)
+
+    async def close(self) -> None:
+        if self._mailbox is not None:
+            await self._mailbox.close()
+
+    def _seen(self, agent: AgentName, here: bool) -> None:
+        if here:
+            self._agents.add(agent)
+        else:
+            self._agents.discard(agent)

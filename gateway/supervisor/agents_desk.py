@@ -1,0 +1,93 @@
+"""What agents ask of the gateway, and what they get. They may propose, and look; nothing here decides or deploys.
+
+The agent's name is a part of what it asks on; whoever asks there is that agent, and is recorded as it.
+"""
+
+from collections.abc import Callable
+from functools import partial
+
+from gateway.core.audit_record import Who
+from gateway.core.dry_run import DryRun
+from gateway.core.messages import Reply
+from gateway.core.proposal import ProposalRefused, parse_proposal
+from gateway.core.topics import (
+    AGENT_NAMES,
+    ASK_JUDGE,
+    ASK_PROPOSALS,
+    ASK_PROPOSE,
+    ASK_STATUS,
+    AgentName,
+)
+from gateway.mailbox.port import MAX_PAYLOAD, Mailbox
+from gateway.supervisor.deployer_sides import NotKnown
+from gateway.supervisor.dry_runs import DryRuns, TooMany
+from gateway.supervisor.gate import Gate
+from gateway.supervisor.proposal_records import refused
+from gateway.supervisor.status import GatewayStatus
+
+AUTHOR = "agents"  #: of all their proposals
+NAMES_AGENT = "agent "  #: an evidence that begins so names who proposes
+
+
+class AgentsDesk:
+    def __init__(
+        self, status: Callable[[], GatewayStatus], gate: Gate, dry_runs: DryRuns, note: Callable[..., None]
+    ) -> None:
+        self._status = status
+        self._gate = gate
+        self._dry_runs = dry_runs
+        self._note = note
+
+    def serve_on(self, bus: Mailbox) -> None:
+        for agent in AGENT_NAMES:
+            bus.serve(ASK_PROPOSE.of(agent), partial(self._propose, agent))
+            bus.serve(ASK_STATUS.of(agent), self._tell_status)
+            bus.serve(ASK_PROPOSALS.of(agent), self._gate.answer_query)
+            bus.serve(ASK_JUDGE.of(agent), partial(self._judge, agent))
+
+    async def _propose(self, agent: AgentName, payload: bytes) -> bytes:
+        if reasons := _not_theirs(agent, payload):
+            reply = refused("it is not judged", reasons)
+            self._note("proposal", f"agent {agent}: {reply.text}", ok=False, reasons=reasons)
+        else:
+            reply = await self._gate.propose(payload, Who(name=f"agent {agent}"))
+        return _bytes(reply)
+
+    async def _tell_status(self, _: bytes) -> bytes:
+        return self._status().model_dump_json().encode()
+
+    async def _judge(self, agent: AgentName, payload: bytes) -> bytes:
+        """What is no proposal costs the judge nothing."""
+        if self._gate.deployer is None:
+            return _bytes(self._gate.shut_reply())
+        try:
+            parse_proposal(payload, MAX_PAYLOAD)
+            found = await self._dry_runs.run(payload, self._gate.deployer)
+        except ProposalRefused as malformed:
+            return _bytes(refused("it is no proposal", malformed.reasons))
+        except (TooMany, NotKnown) as error:
+            self._note("dry-run", f"agent {agent}: not judged: {error}")
+            return _bytes(refused("it is not judged", [str(error)]))
+        text = "would pass" if found.would_pass else f"would be refused: {found.reasons[0]}"
+        self._note("dry-run", f"agent {agent}: {text}", proposal=found.proposal)
+        return found.model_dump_json().encode()
+
+
+def _not_theirs(agent: AgentName, payload: bytes) -> list[str]:
+    """Why a proposal cannot come from this agent; what is no proposal is for the gate to refuse."""
+    try:
+        proposal = parse_proposal(payload, MAX_PAYLOAD)
+    except ProposalRefused:
+        return []
+    reasons = [] if proposal.author == AUTHOR else [f"author is {proposal.author}; allowed: {AUTHOR}"]
+    own = f"{NAMES_AGENT}{agent}"
+    reasons += [
+        f"evidence names {one.what}; allowed: {own}"
+        for one in proposal.evidence
+        if one.what.startswith(NAMES_AGENT) and one.what != own
+    ]
+    return reasons
+
+
+def _bytes(answer: Reply | DryRun) -> bytes:
+    return answer.model_dump_json().encode()

@@ -1,0 +1,150 @@
+"""The agents' bus for tests: a router in this process, agents in this and others, and certificates of their own."""
+
+import asyncio
+import datetime
+import socket
+from collections.abc import AsyncIterator, Callable, Coroutine
+from contextlib import asynccontextmanager
+from ipaddress import ip_address
+from pathlib import Path
+from typing import Any
+
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509.oid import NameOID
+
+from gateway.core.line import Line, Network
+from gateway.mailbox.bus import TlsEndpoint, connect, open_router, open_session
+from gateway.mailbox.zenoh_mailbox import ZenohMailbox
+from tests.unit.supervisor_support import line_of, short_folder, until
+
+LINE = line_of(1)
+
+#: An agent: it answers what it is asked, or sleeps on it; what it has to say at first is "up".
+AGENT = """
+import asyncio, sys
+from pathlib import Path
+from gateway.core.topics import AGENT_DECIDE
+from gateway.mailbox.bus import connect
+
+async def answer(payload):
+    if payload == b"sleep":
+        print("asleep", flush=True)
+        await asyncio.sleep(1000.0)
+    return b"chosen: " + payload
+
+async def main():
+    mailbox = await connect(Path(sys.argv[1]), "demo", "line-1")
+    mailbox.serve(AGENT_DECIDE.of("sysid"), answer)
+    print("up", flush=True)
+    await asyncio.sleep(1000.0)
+
+asyncio.run(main())
+"""
+
+
+def run(story: Callable[[Path], Coroutine[Any, Any, None]]) -> None:
+    async def bounded(folder: Path) -> None:
+        async with asyncio.timeout(60.0):
+            await story(folder)
+
+    with short_folder() as folder:
+        asyncio.run(bounded(folder))
+
+
+@asynccontextmanager
+async def router(folder: Path, line: Line = LINE) -> AsyncIterator[ZenohMailbox]:
+    mailbox = await open_router(line, folder)
+    try:
+        yield mailbox
+    finally:
+        await mailbox.close()
+
+
+@asynccontextmanager
+async def client(where: Path | TlsEndpoint, site: str = "demo", line: str = "line-1") -> AsyncIterator[ZenohMailbox]:
+    mailbox = await connect(where, site, line)
+    try:
+        yield mailbox
+    finally:
+        await mailbox.close()
+
+
+async def opened(settings: dict[str, Any], line: str = "line-1") -> ZenohMailbox:
+    """A mailbox over a session with settings of a test's own."""
+    return ZenohMailbox(await asyncio.to_thread(open_session, settings), "demo", line)
+
+
+async def is_here(mailbox: ZenohMailbox, topic: Any) -> None:
+    """Until somebody serves it, as this side sees it."""
+    here: list[bool] = []
+    mailbox.watch(topic, here.append)
+    await until(lambda: here[-1:] == [True])
+
+
+def free_port() -> int:
+    with socket.socket() as probing:
+        probing.bind(("127.0.0.1", 0))
+        return probing.getsockname()[1]
+
+
+class Authority:
+    """Signs certificates into a folder."""
+
+    def __init__(self, folder: Path, name: str) -> None:
+        self.folder = folder
+        self.file = folder / f"{name}.pem"
+        self._key = ec.generate_private_key(ec.SECP256R1())
+        self._name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
+        constraint = x509.BasicConstraints(ca=True, path_length=None)
+        certificate = self._of(self._name, self._key, constraint).sign(self._key, hashes.SHA256())
+        self.file.write_bytes(certificate.public_bytes(serialization.Encoding.PEM))
+
+    def certificate(self, name: str, days: float = 1.0) -> tuple[Path, Path]:
+        """Files of a certificate for 127.0.0.1, good for so many days from now, and its key."""
+        key = ec.generate_private_key(ec.SECP256R1())
+        subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
+        builder = self._of(subject, key, x509.BasicConstraints(ca=False, path_length=None), days).add_extension(
+            x509.SubjectAlternativeName([x509.IPAddress(ip_address("127.0.0.1"))]), critical=False
+        )
+        certificate = builder.sign(self._key, hashes.SHA256())
+        file, key_file = self.folder / f"{self.file.stem}-{name}.pem", self.folder / f"{self.file.stem}-{name}.key.pem"
+        file.write_bytes(certificate.public_bytes(serialization.Encoding.PEM))
+        key_file.write_bytes(
+            key.private_bytes(
+                serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+            )
+        )
+        return file, key_file
+
+    def _of(
+        self, subject: x509.Name, key: Any, constraint: x509.BasicConstraints, days: float = 1.0
+    ) -> x509.CertificateBuilder:
+        now = datetime.datetime.now(datetime.UTC)
+        return (
+            x509.CertificateBuilder()
+            .subject_name(subject)
+            .issuer_name(self._name)
+            .public_key(key.public_key())
+            .serial_number(x509.random_serial_number())
+            .not_valid_before(now - datetime.timedelta(days=2))
+            .not_valid_after(now + datetime.timedelta(days=days))
+            .add_extension(constraint, critical=True)
+        )
+
+
+def on_network(authority: Authority, names: list[str]) -> tuple[Line, str]:
+    """The line with a table [network], and the address on which its gateway will listen."""
+    file, key = authority.certificate("gateway")
+    address = f"127.0.0.1:{free_port()}"
+    network = Network(
+        listen=f"tls/{address}", certificate=str(file), private_key=str(key), authority=str(authority.file),
+        names=names,
+    )  # fmt: skip
+    return LINE.model_copy(update={"network": network}), address
+
+
+def endpoint(address: str, own: Authority, name: str, theirs: Authority) -> TlsEndpoint:
+    certificate, key = own.certificate(name)
+    return TlsEndpoint(address, certificate, key, theirs.file)

@@ -1,0 +1,153 @@
+"""The gateway process on the agents' bus: it serves agents, tells who is there, and does all else without the bus."""
+
+import asyncio
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from gateway.control.design import design_lqi, task_of
+from gateway.core.audit_record import Who
+from gateway.core.decisions import ProposalList
+from gateway.core.messages import Reply
+from gateway.core.proposal import Proposal, canonical
+from gateway.core.topics import AGENT_DECIDE, ASK_JUDGE, ASK_PROPOSALS, ASK_PROPOSE, ASK_STATUS, GATEWAY_STATUS
+from gateway.mailbox.paths import GATEWAY_SOCKET
+from gateway.mailbox.unix import UnixMailbox
+from gateway.mailbox.zenoh_mailbox import ZenohMailbox
+from gateway.supervisor.audit_file import AuditFile
+from gateway.supervisor.proposal_records import iso
+from gateway.supervisor.status import GatewayStatus
+from tests.protocol.bus_support import AGENT, LINE, client, run
+from tests.unit.supervisor_support import child
+
+LONG_S = 30.0
+GATEWAY = """
+import sys
+from pathlib import Path
+from gateway.core.line import Network
+from gateway.supervisor.process import run_gateway
+from tests.protocol.bus_support import LINE
+network = None
+if len(sys.argv) > 2:
+    network = Network(listen="tls/127.0.0.1:1", certificate="/no/a.pem", private_key="/no/k.pem",
+                      authority="/no/c.pem", names=["agents"])
+line = LINE.model_copy(update={"network": network})
+sys.exit(run_gateway(line, Path(sys.argv[1]), Path(sys.argv[1]) / "data"))
+"""
+
+
+@contextmanager
+def gateway(*arguments: Path) -> Iterator[None]:
+    with child(GATEWAY, *arguments) as (process, said):
+        assert said.startswith("gateway of demo/line-1")
+        yield
+        process.terminate()
+        assert process.wait(LONG_S) == 0
+
+
+async def status_with(folder: Path, condition: Callable[[GatewayStatus], bool]) -> GatewayStatus:
+    """As a person is told it, once it is so."""
+    mailbox = UnixMailbox()
+    mailbox.connect((GATEWAY_STATUS,), folder / GATEWAY_SOCKET)
+    try:
+        while True:
+            status = GatewayStatus.model_validate_json(await mailbox.request(GATEWAY_STATUS, b"", LONG_S))
+            if condition(status):
+                return status
+            await asyncio.sleep(0.01)
+    finally:
+        await mailbox.close()
+
+
+def told(text: str) -> Callable[[GatewayStatus], bool]:
+    return lambda status: text in {event.text for event in status.events}
+
+
+def of_agents() -> Proposal:
+    return Proposal.model_validate(
+        {
+            "format": 1, "site": LINE.site, "line": LINE.line, "base": "0" * 64, "model": None, "reason": "a test",
+            "change": {"kind": "gains", "controller": design_lqi(task_of(LINE)).model_dump()}, "author": "agents",
+            "created": iso(1.7e9), "expires": iso(4e9),
+        }
+    )  # fmt: skip
+
+
+async def proposed(agents: ZenohMailbox) -> Reply:
+    """Once the gate is open."""
+    while True:
+        reply = Reply.model_validate_json(await agents.request(ASK_PROPOSE.of("sysid"), canonical(of_agents()), LONG_S))
+        if reply.text != "the gate is shut":
+            return reply
+        await asyncio.sleep(1.0 / ASK_PROPOSE.most_per_s)
+
+
+def test_agents_propose_look_and_try_over_the_bus_and_are_named_in_the_audit() -> None:
+    async def story(folder: Path) -> None:
+        with gateway(folder):
+            await status_with(folder, lambda status: status.agents_bus.open)
+            async with client(folder) as agents:
+                seen = GatewayStatus.model_validate_json(await agents.request(ASK_STATUS.of("sysid"), b"", LONG_S))
+                assert (seen.site, seen.line) == ("demo", "line-1")
+                reply = await proposed(agents)
+                assert reply.ok, reply
+                query = b'{"command": "list"}'
+                listed = await agents.request(ASK_PROPOSALS.of("sysid"), query, LONG_S)
+                (entry,) = ProposalList.model_validate_json(listed).proposals
+                assert entry.author == "agents"
+                tried = await agents.request(ASK_JUDGE.of("sysid"), canonical(of_agents()), LONG_S)
+                assert "start it" in Reply.model_validate_json(tried).reasons[0]  # there is no loop
+            after = await status_with(folder, lambda status: "dry-run" in {event.kind for event in status.events})
+            assert any(one.kind == "proposal" and one.text.startswith("agent sysid: ") for one in after.events)
+        with AuditFile(folder / "data") as file:
+            who = [record.who for record in (row.record() for row in file.rows()) if record.kind == "proposed"]
+        assert who == [Who(name="agent sysid")]
+
+    run(story)
+
+
+def test_people_see_which_agents_are_there() -> None:
+    async def story(folder: Path) -> None:
+        with gateway(folder):
+            await status_with(folder, lambda status: status.agents_bus.open)
+            with child(AGENT, folder) as (process, said):
+                assert said == "up\n"
+                await status_with(folder, lambda status: status.agents_bus.agents == ["sysid"])
+                await status_with(folder, told("agent sysid answers questions"))
+                async with client(folder) as phases:
+                    assert await phases.request(AGENT_DECIDE.of("sysid"), b"x", LONG_S) == b"chosen: x"
+                process.kill()
+                await status_with(folder, lambda status: status.agents_bus.agents == [])
+            await status_with(folder, told("agent sysid answers no questions any more"))
+
+    run(story)
+
+
+def test_without_its_bus_the_gateway_does_all_else_and_says_why_it_is_closed() -> None:
+    async def story(folder: Path) -> None:
+        with gateway(folder, Path("with a network")):
+            status = await status_with(folder, lambda status: "could not be opened" in status.agents_bus.text)
+            assert not status.agents_bus.open
+            (event,) = [event for event in status.events if event.kind == "agents-bus"]
+            assert "the agents' bus is closed" in event.text
+            assert ".rs" not in event.text
+
+    run(story)
+
+
+def test_a_flood_of_requests_is_told_once_and_people_are_answered_meanwhile() -> None:
+    async def story(folder: Path) -> None:
+        with gateway(folder):
+            await status_with(folder, lambda status: status.agents_bus.open)
+            async with client(folder) as agents:
+                asked = [agents.request(ASK_STATUS.of("sysid"), b"", LONG_S) for _ in range(300)]
+                flood = asyncio.gather(*asked, return_exceptions=True)
+                await status_with(folder, lambda status: status.agents_bus.refused > 0)
+                await flood
+            status = await status_with(
+                folder, lambda status: any(event.kind == "agents-refused" for event in status.events)
+            )
+            texts = [event.text for event in status.events if event.kind == "agents-refused"]
+            assert len(texts) <= 5 and "requests of agents were turned away" in texts[0]
+
+    run(story)

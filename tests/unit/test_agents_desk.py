@@ -1,0 +1,314 @@
+"""What agents may ask of the gateway, and that none of it decides anything."""
+
+import asyncio
+import json
+from collections.abc import Coroutine
+from pathlib import Path
+from typing import Any
+
+import pytest
+from pydantic import ValidationError
+
+from gateway.core.controller import config_hash
+from gateway.core.decisions import ProposalList, ProposalShown
+from gateway.core.dry_run import DryRun
+from gateway.core.messages import Reply
+from gateway.core.proposal import Evidence, Proposal, canonical, proposal_hash
+from gateway.core.topics import AGENT_NAMES, ASK_JUDGE, ASK_PROPOSALS, ASK_PROPOSE, ASK_STATUS, AgentName, AgentTopic
+from gateway.core.verdict import Verdict
+from gateway.mailbox.inprocess import Hub, InProcessMailbox
+from gateway.mailbox.port import RemoteError, Unreachable
+from gateway.supervisor.agents_desk import AgentsDesk
+from gateway.supervisor.audit_file import AuditFile
+from gateway.supervisor.deployer_sides import NotKnown
+from gateway.supervisor.dry_runs import LONGER, MOST, DryRuns
+from gateway.supervisor.gate import Gate
+from gateway.supervisor.lifecycle import Stage
+from gateway.supervisor.status import GatewayStatus
+from tests.unit.deployer_support import FIRST, LINE, Death, FakeJudge, FakeLoop, FakeSurroundings, proposal
+from tests.unit.supervisor_support import until
+
+LONG_S = 60.0
+NOW_S = 1_700_000_000.0
+STATUS = GatewayStatus.model_validate_json(Path("docs/examples/status.json").read_bytes())
+
+
+class SlowJudge(FakeJudge):
+    """Judges when it is let, and tells what it was asked, in order."""
+
+    def __init__(self, name: str, asked: list[str]) -> None:
+        super().__init__()
+        self.name = name
+        self.asked = asked
+        self.let = asyncio.Event()
+        self.let.set()
+        self.limits_s: list[float | None] = []
+        self.closed = False
+
+    async def judge(self, payload, context, recordings, seed=None, limit_s=None):
+        self.asked.append(f"{self.name} {Proposal.model_validate_json(payload).reason}")
+        self.limits_s.append(limit_s)
+        await self.let.wait()
+        return await super().judge(payload, context, recordings)
+
+    async def close(self) -> None:
+        self.closed = True
+
+
+class Desk:
+    """A desk on a hub, with a real gate behind it whose judge and line are stand-ins."""
+
+    def __init__(self, folder: Path) -> None:
+        self.hub = Hub()
+        self.agents = InProcessMailbox(self.hub)
+        self.folder = folder
+        self.asked: list[str] = []
+        self.events: list[tuple[str, str]] = []
+        self.judge, self.dry = SlowJudge("real", self.asked), SlowJudge("dry", self.asked)
+        self.surroundings = FakeSurroundings(FakeLoop(Death()))
+        self.gate = Gate(
+            LINE, InProcessMailbox(self.hub), folder, self.judge, lambda configurations, models: self.surroundings,
+            self.note, lambda: 1.0, lambda: NOW_S,
+        )  # fmt: skip
+        self.dry_runs = DryRuns(LINE, self.dry)
+        AgentsDesk(lambda: STATUS, self.gate, self.dry_runs, self.note).serve_on(InProcessMailbox(self.hub))
+
+    def note(self, kind: str, text: str, **data: Any) -> None:
+        self.events.append((kind, text))
+
+    async def opened(self) -> None:
+        while self.gate.deployer is None:
+            await self.gate.look()
+
+    async def ask(self, row: AgentTopic, payload: bytes = b"", agent: AgentName = "sysid") -> bytes:
+        return await self.agents.request(row.of(agent), payload, LONG_S)
+
+    async def propose(self, one: Proposal, agent: AgentName = "sysid") -> Reply:
+        return Reply.model_validate_json(await self.ask(ASK_PROPOSE, canonical(one), agent))
+
+    def records(self) -> list[tuple[str, str]]:
+        """Kind and author of what the audit has."""
+        with AuditFile(self.folder) as file:
+            return [(record.kind, record.who.name) for record in (row.record() for row in file.rows())]
+
+
+def at_desk(story: Any, folder: Path) -> None:
+    async def whole() -> None:
+        desk = Desk(folder)
+        try:
+            async with asyncio.timeout(LONG_S):
+                await story(desk)
+        finally:
+            await desk.dry_runs.close()
+            await desk.gate.close()
+
+    asyncio.run(whole())
+
+
+def of_agents(number: int = 1, nonce: int = 0, **changes: Any) -> Proposal:
+    one = proposal(number, config_hash(FIRST), NOW_S, nonce)
+    return one.model_copy(update={"author": "agents", **changes})
+
+
+def test_a_proposal_is_taken_in_as_the_agents_on_whose_key_it_came(tmp_path):
+    async def story(desk: Desk) -> None:
+        await desk.opened()
+        evidence = [Evidence(what="agent adaptation"), Evidence(what="rmse before", value=1.0, unit="N")]
+        one = of_agents(evidence=evidence)
+        reply = await desk.propose(one, "adaptation")
+        assert reply.ok and "is being judged" in reply.text
+        assert desk.gate.deployer is not None
+        await desk.gate.deployer.judged()
+        assert desk.gate.deployer.book.entries[proposal_hash(one)].stage is Stage.WAITING  # for a person
+        assert ("proposed", "agent adaptation") in desk.records()
+        assert any(kind == "proposal" and text.startswith("agent adaptation: ") for kind, text in desk.events)
+
+    at_desk(story, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"author": "rules"}, "author is rules; allowed: agents"),
+        ({"author": "engineer"}, "author is engineer; allowed: agents"),
+        ({"evidence": [Evidence(what="agent adaptation")]}, "evidence names agent adaptation; allowed: agent sysid"),
+    ],
+)
+def test_nobody_proposes_in_anothers_name(tmp_path, changes, reason):
+    async def story(desk: Desk) -> None:
+        await desk.opened()
+        reply = await desk.propose(of_agents(**changes), "sysid")
+        assert not reply.ok and reply.reasons == [reason]
+        assert desk.gate.deployer is not None and not desk.gate.deployer.book.entries
+        assert desk.asked == []
+        assert any(kind == "proposal" and text.startswith("agent sysid: ") for kind, text in desk.events)
+
+    at_desk(story, tmp_path)
+
+
+def test_what_is_no_proposal_is_refused_and_recorded_with_the_agents_name(tmp_path):
+    async def story(desk: Desk) -> None:
+        await desk.opened()
+        for payload in (b"", b"\xff", b"[]", b"{" * 1000, canonical(of_agents())[:-1]):
+            reply = Reply.model_validate_json(await desk.ask(ASK_PROPOSE, payload, "code"))
+            assert not reply.ok and reply.reasons
+        assert desk.records().count(("malformed-proposal", "agent code")) == 5
+
+    at_desk(story, tmp_path)
+
+
+def test_agents_see_the_status_and_what_became_of_proposals(tmp_path):
+    async def story(desk: Desk) -> None:
+        assert GatewayStatus.model_validate_json(await desk.ask(ASK_STATUS)) == STATUS
+        await desk.opened()
+        one = of_agents()
+        await desk.propose(one)
+        listed = ProposalList.model_validate_json(await desk.ask(ASK_PROPOSALS, b'{"command": "list"}'))
+        assert [entry.proposal for entry in listed.proposals] == [proposal_hash(one)]
+        query = json.dumps({"command": "show", "proposal": proposal_hash(one)}).encode()
+        assert ProposalShown.model_validate_json(await desk.ask(ASK_PROPOSALS, query)).proposal == one
+
+    at_desk(story, tmp_path)
+
+
+@pytest.mark.parametrize("command", ["decide", "roll-back", "archive", "stop"])
+def test_no_query_of_an_agent_decides(tmp_path, command):
+    async def story(desk: Desk) -> None:
+        await desk.opened()
+        one = of_agents()
+        await desk.propose(one)
+        assert desk.gate.deployer is not None
+        await desk.gate.deployer.judged()
+        shown = desk.gate.deployer.shown(proposal_hash(one))
+        assert isinstance(shown, ProposalShown)
+        forged = {"command": command, "proposal": proposal_hash(one), "shown": shown.shown, "approve": True}
+        for row in (ASK_PROPOSALS, ASK_PROPOSE, ASK_JUDGE):
+            answer = await desk.agents.request(row.of("sysid"), json.dumps(forged).encode(), LONG_S)
+            assert not Reply.model_validate_json(answer).ok
+        assert desk.gate.deployer.book.entries[proposal_hash(one)].stage is Stage.WAITING
+
+    at_desk(story, tmp_path)
+
+
+def test_before_the_gate_is_open_all_that_needs_it_is_refused_with_the_reason(tmp_path):
+    async def story(desk: Desk) -> None:
+        for row in (ASK_PROPOSE, ASK_JUDGE):
+            reply = Reply.model_validate_json(await desk.ask(row, canonical(of_agents())))
+            assert not reply.ok and reply.text == "the gate is shut" and reply.reasons
+
+    at_desk(story, tmp_path)
+
+
+def test_a_dry_run_is_what_the_judge_finds_and_no_verdict_and_leaves_nothing_behind(tmp_path):
+    async def story(desk: Desk) -> None:
+        await desk.opened()
+        before = desk.records()
+        good, bad = of_agents(), of_agents(2)
+        desk.dry.refuses.add(proposal_hash(bad))
+        for one, would_pass in ((good, True), (bad, False)):
+            answer = await desk.ask(ASK_JUDGE, canonical(one), "sysid")
+            found = DryRun.model_validate_json(answer)
+            assert (found.proposal, found.would_pass) == (proposal_hash(one), would_pass)
+            assert (found.region is not None) == would_pass
+            assert found.reasons == ([] if would_pass else ["as the test wants it"])
+            with pytest.raises(ValidationError):
+                Verdict.model_validate_json(answer)
+            assert b"seed" not in answer
+        assert desk.records() == before
+        assert desk.gate.deployer is not None and not desk.gate.deployer.book.entries
+        assert desk.asked == ["dry trial 0", "dry trial 0"]  # the gate's own judge was not asked
+        assert desk.dry.limits_s == [LONGER * LINE.gate.verdict_max_s] * 2
+        told = [text for kind, text in desk.events if kind == "dry-run"]
+        assert told == ["agent sysid: would pass", "agent sysid: would be refused: as the test wants it"]
+        reply = await desk.propose(good)  # and it may be proposed for good
+        assert reply.ok
+
+    at_desk(story, tmp_path)
+
+
+def test_verdicts_go_first_and_dry_runs_one_after_the_other(tmp_path):
+    async def story(desk: Desk) -> None:
+        await desk.opened()
+        desk.judge.let.clear()
+        desk.dry.let.clear()
+        assert (await desk.propose(of_agents(1, nonce=1))).ok
+        await until(lambda: desk.asked == ["real trial 1"])
+        dry = [asyncio.create_task(desk.ask(ASK_JUDGE, canonical(of_agents(2, nonce=n)))) for n in (2, 3)]
+        for _ in range(100):
+            await asyncio.sleep(0)
+        assert desk.asked == ["real trial 1"]  # no dry run has begun beside it
+        desk.judge.let.set()
+        await until(lambda: len(desk.asked) == 2)
+        assert desk.asked[1:] == ["dry trial 2"]
+        assert (await desk.propose(of_agents(3, nonce=4))).ok  # one that comes meanwhile does not wait
+        await until(lambda: len(desk.asked) == 3)
+        assert desk.asked[2:] == ["real trial 4"]
+        assert desk.gate.deployer is not None
+        await desk.gate.deployer.judged()
+        desk.dry.let.set()
+        assert all(DryRun.model_validate_json(one).would_pass for one in await asyncio.gather(*dry))
+        assert desk.asked[3:] == ["dry trial 3"]
+
+    at_desk(story, tmp_path)
+
+
+def test_who_gives_up_a_dry_run_takes_no_verdict_along(tmp_path):
+    async def story(desk: Desk) -> None:
+        await desk.opened()
+        desk.judge.let.clear()
+        one = of_agents(1)
+        await desk.propose(one)
+        assert desk.gate.deployer is not None
+        waiting = asyncio.create_task(desk.dry_runs.run(canonical(of_agents(2)), desk.gate.deployer))
+        for _ in range(10):
+            await asyncio.sleep(0)
+        waiting.cancel()
+        await asyncio.gather(waiting, return_exceptions=True)
+        desk.judge.let.set()
+        await desk.gate.deployer.judged()
+        assert desk.gate.deployer.book.entries[proposal_hash(one)].stage is Stage.WAITING
+        assert DryRun.model_validate_json(await desk.ask(ASK_JUDGE, canonical(of_agents(2)))).would_pass
+
+    at_desk(story, tmp_path)
+
+
+def test_more_dry_runs_than_may_wait_are_refused(tmp_path):
+    async def story(desk: Desk) -> None:
+        await desk.opened()
+        desk.dry.let.clear()
+        agents = [AGENT_NAMES[k % len(AGENT_NAMES)] for k in range(MOST)]
+        waiting = [asyncio.create_task(desk.ask(ASK_JUDGE, canonical(of_agents()), agent)) for agent in agents]
+        await until(lambda: len(desk.asked) == 1)
+        reply = Reply.model_validate_json(await desk.ask(ASK_JUDGE, canonical(of_agents())))
+        assert not reply.ok and f"{MOST} dry runs wait already" in reply.reasons[0]
+        desk.dry.let.set()
+        assert len(await asyncio.gather(*waiting)) == MOST
+        assert DryRun.model_validate_json(await desk.ask(ASK_JUDGE, canonical(of_agents()))).would_pass
+
+    at_desk(story, tmp_path)
+
+
+def test_without_a_line_to_judge_against_a_dry_run_says_what_to_do(tmp_path):
+    async def story(desk: Desk) -> None:
+        await desk.opened()
+
+        async def unknown(book: object) -> None:
+            raise NotKnown("the loop has not told how the line stands: start it, then propose again")
+
+        desk.surroundings.context = unknown
+        reply = Reply.model_validate_json(await desk.ask(ASK_JUDGE, canonical(of_agents())))
+        assert not reply.ok and "start it" in reply.reasons[0]
+
+    at_desk(story, tmp_path)
+
+
+def test_an_agent_that_is_not_in_the_table_is_not_served(tmp_path):
+    async def story(desk: Desk) -> None:
+        stranger: Any = "stranger"
+        calls: list[Coroutine[Any, Any, bytes]] = [desk.ask(row, b"", stranger) for row in (ASK_STATUS, ASK_PROPOSE)]
+        for call in calls:
+            with pytest.raises(Unreachable) as refused:
+                await call
+            assert not isinstance(refused.value, RemoteError)
+
+    at_desk(story, tmp_path)
