@@ -13,10 +13,10 @@ from agents.rag.database import DatabaseError
 from agents.rag.documents import Document
 from agents.rag.embedder import Embedder, EmbedderId, Vectors
 from agents.rag.index_file import HEADS, PASSAGES, IndexRefused, open_index
-from agents.rag.injection import Flag
+from agents.rag.injection import Flag, flags_in
 from agents.rag.lexical import Words
 from agents.rag.question_words import concepts_of
-from agents.rag.ranking import MOST_RANKED, ranked
+from agents.rag.ranking import considered, ranked
 from agents.rag.stages import Asked, Conflict, Hit, Passage, Ranked, Retrieval
 from agents.rag.vectors import nearest_documents, nearest_passages
 
@@ -76,10 +76,9 @@ class Index:
         lexical, lexical_documents = self._words.search(concepts, asked.tiers)
         near = [] if vectors is None else nearest_passages(self._connection, vectors[0], asked.tiers)
         near_documents = None if vectors is None else nearest_documents(self._connection, vectors[0], asked.tiers, near)
-        lexical_best = lexical_documents[:MOST_RANKED]
-        shown = [*lexical[:SHOWN], *near[:SHOWN]]
-        documents = self._documents({one.document for one in (*lexical_best, *(near_documents or []), *shown)})
-        order = ranked(asked, lexical_best, near_documents, documents)
+        shown = [one.document for one in (*lexical[:SHOWN], *near[:SHOWN])]
+        documents = self._documents({*considered(lexical_documents, near_documents), *shown})
+        order = ranked(asked, lexical_documents, near_documents, documents)
         conflicts = conflicts_among([(one.document, self._around(one.chunk)) for one in order[:COMPARED]])
         return Retrieval(
             asked=asked,
@@ -135,7 +134,8 @@ class Index:
     def _hit(self, one: Ranked, conflicts: Sequence[Conflict]) -> Hit:
         row = self._connection.execute("SELECT heading, text, flags FROM chunk WHERE id = ?", (one.chunk,)).fetchone()
         heading, text, flags = row
-        passage = Passage(heading, text, [Flag(kind, shown) for kind, shown in json.loads(flags)])
+        found = [*(Flag(kind, shown) for kind, shown in json.loads(flags)), *flags_in(one.document.title)]
+        passage = Passage(heading, text, found)
         overruled = [conflict.winner for conflict in conflicts if conflict.loser == one.document.key]
         return Hit(one.document, passage, one.score, overruled)
 

@@ -35,7 +35,7 @@ def answer(file: str) -> dict[str, str]:
         return {"refused": f"is no PDF that can be read: {type(error).__name__}: {str(error)[:200]}"}
     if not text.strip():
         return {"refused": "has no text, only pictures of it: have its text recognised first"}
-    return {"title": title, "text": text.encode(errors="replace").decode()}
+    return {name: said.encode(errors="replace").decode() for name, said in (("title", title), ("text", text))}
 
 
 if __name__ == "__main__":

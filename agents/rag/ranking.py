@@ -1,10 +1,10 @@
 """The order of documents by all that speaks for them. Pure.
 
 Scores by words and by meaning are made comparable as shares of the best of their list - of cosines, which are never
-near zero, as shares of the way from the last to the best - and added; on the tuning questions that puts the right
-document first more often than reciprocal ranks do (docs/knowledge.md). What is known of a document beside that - whose
-it is, how sure, for what and for whom it was written - turns the sum by some per cent: enough between two that say the
-same, too little to lift what does not answer.
+near zero, as shares of the way from the last to the best - and added; on the tuning questions that finds more than
+reciprocal ranks do (docs/knowledge.md). What is known of a document beside that - whose it is, how sure, for what and
+for whom it was written - turns the sum by some per cent: enough between two that say the same, too little to lift what
+does not answer.
 """
 
 from collections.abc import Mapping, Sequence
@@ -13,8 +13,8 @@ from agents.rag.documents import Document
 from agents.rag.stages import Asked, FoundDocument, Ranked
 from agents.rag.words import left_out, stems
 
-LEXICAL_SHARE = 0.55  #: of the sum, where there is an embedder as well
-MOST_RANKED = 30
+LEXICAL_SHARE = 0.6  #: of the sum, where there is an embedder as well
+MOST_RANKED = 30  #: of a list
 TIER = {1: 1.0, 2: 1.02, 3: 1.08}  #: what is known of this line counts more than what is known of lines
 SERVES, SERVES_OTHERS = 1.1, 0.95  #: where a decision asks: written for it, or for others
 
@@ -25,12 +25,12 @@ def ranked(
     embedding: Sequence[FoundDocument] | None,
     documents: Mapping[int, Document],
 ) -> list[Ranked]:
-    """The best first, up to MOST_RANKED. `embedding` None: there is no embedder."""
+    """The best first, of those `considered`. `embedding` None: there is no embedder."""
     by_words = _shares(lexical, 0.0)
     by_meaning = _shares(embedding, embedding[-1].score) if embedding else {}
     words = frozenset(stems(asked.question)) - left_out()
     found: list[Ranked] = []
-    for number in dict.fromkeys(one.document for one in (*lexical, *(embedding or []))):
+    for number in considered(lexical, embedding):
         document = documents[number]
         word_rank, word_chunk, word_share = by_words.get(number, (None, None, 0.0))
         near_rank, near_chunk, near_share = by_meaning.get(number, (None, None, 0.0))
@@ -53,7 +53,12 @@ def ranked(
                 score=score,
             )
         )
-    return sorted(found, key=lambda one: -one.score)[:MOST_RANKED]
+    return sorted(found, key=lambda one: -one.score)
+
+
+def considered(lexical: Sequence[FoundDocument], embedding: Sequence[FoundDocument] | None) -> list[int]:
+    """The documents that are ordered: the best of either list."""
+    return list(dict.fromkeys(one.document for one in (*lexical[:MOST_RANKED], *(embedding or [])[:MOST_RANKED])))
 
 
 def _shares(found: Sequence[FoundDocument], nothing: float) -> dict[int, tuple[int, int, float]]:

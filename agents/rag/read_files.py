@@ -12,6 +12,7 @@ from agents.rag.documents import Document, Tier, of_note
 from agents.rag.notes import FENCE, NoteRefused, parse_note
 from agents.rag.pdf import text_of_pdf
 from agents.rag.tables import text_of_csv
+from gateway.core.line_problem import printable
 from gateway.core.nearest import nearest
 
 MOST_BYTES = 50_000_000  #: of a file
@@ -49,9 +50,9 @@ def read_files(paths: Sequence[Path], tier: Tier, known: Mapping[str, Document] 
             same = before is not None and before.stamp == stamp_of(file)
             documents.append(before if before and same else _document(name, file, tier))
         except FileRefused as error:
-            refused.append(Refused(name, str(error)))
+            refused.append(Refused(printable(name), str(error)))
         except OSError as error:
-            refused.append(Refused(name, f"cannot be read: {error.strerror}"))
+            refused.append(Refused(printable(name), f"cannot be read: {error.strerror}"))
     if len(found) > MOST_FILES:
         refused.append(Refused(f"{len(found) - MOST_FILES} more", f"{MOST_FILES} files are the most that are read"))
     return FilesRead(documents, refused)
@@ -76,6 +77,8 @@ def _files(paths: Sequence[Path]) -> Iterator[tuple[str, Path]]:
 
 
 def _document(name: str, file: Path, tier: Tier) -> Document:
+    if not name.isprintable():
+        raise FileRefused("has a name with letters that cannot be shown: rename it")
     read = _READERS.get(file.suffix.lower())
     if read is None:
         like = nearest(file.suffix.lower(), _READERS)

@@ -1,6 +1,7 @@
 """Embedders: the encoder against a plain one, word pieces, weights that are not known, an Ollama that errs."""
 
 import asyncio
+import importlib.util
 import json
 import threading
 from collections.abc import Callable, Iterator
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 
 from agents.rag.bert import Bert, tensors_in
 from agents.rag.embedder import EmbedderFailed, unit_rows
-from agents.rag.minilm import MiniLm
+from agents.rag.minilm import PACKAGE, MiniLm
 from agents.rag.ollama_embedder import OllamaEmbedder
 from agents.rag.wordpiece import WordPieces
 
@@ -134,6 +135,16 @@ def test_weights_that_are_not_the_known_ones_are_not_used(tmp_path: Path) -> Non
     (tmp_path / "model.safetensors").write_bytes(b"other weights")
     with pytest.raises(EmbedderFailed, match="SHA-256 .* it is not used"):
         MiniLm(tmp_path)
+
+
+@pytest.mark.skipif(importlib.util.find_spec(PACKAGE) is None, reason="make minilm installs its weights")
+def test_minilm_gives_the_cosines_that_its_authors_publish() -> None:
+    """From its model card: happy person against happy dog, very happy person, sunny day."""
+    sentences = [
+        "That is a happy person", "That is a happy dog", "That is a very happy person", "Today is a sunny day",
+    ]  # fmt: skip
+    vectors = asyncio.run(MiniLm().embed(sentences))
+    assert vectors[1:] @ vectors[0] == pytest.approx([0.695, 0.943, 0.257], abs=1e-3)
 
 
 def test_vectors_without_a_direction_or_of_another_shape_are_refused() -> None:

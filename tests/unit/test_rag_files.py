@@ -111,11 +111,12 @@ def test_what_is_no_document_is_refused_with_a_reason_and_the_rest_goes_on(tmp_p
     }
     for name, content in contents.items():
         (tmp_path / name).write_bytes(content)
+    (tmp_path / "tag\u202e.txt").write_text("a name that plays with the terminal")
     (tmp_path / ".hidden.txt").write_text("not looked at")
     read = read_files([tmp_path, tmp_path / "absent.txt"], 2)
     reasons = {one.file: one.reason for one in read.refused}
     assert [one.name for one in read.documents] == ["good.txt"]
-    assert set(reasons) == {"scan.pdf", "locked.pdf", "absent.txt", *contents} - {"good.txt"}
+    assert set(reasons) == {"scan.pdf", "locked.pdf", "absent.txt", "tag\\u202e.txt", *contents} - {"good.txt"}
     said = {
         "scan.pdf": "only pictures", "locked.pdf": "encrypted", "cut.pdf": "no PDF", "fake.pdf": "no PDF",
         "image.md": "binary", "latin.txt": "save it as UTF-8", "empty.txt": "empty", "note.md": "tier = 4",
