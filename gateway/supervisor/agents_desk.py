@@ -3,16 +3,19 @@
 The agent's name is a part of what it asks on; whoever asks there is that agent, and is recorded as it.
 """
 
+import asyncio
 from collections.abc import Callable
 from functools import partial
 
 from gateway.core.audit_record import Who
 from gateway.core.dry_run import DryRun
+from gateway.core.interactions import InteractionRefused, unpack
 from gateway.core.messages import Reply
 from gateway.core.proposal import ProposalRefused, parse_proposal
 from gateway.core.topics import (
     AGENT_NAMES,
     ASK_JUDGE,
+    ASK_LOG,
     ASK_PROPOSALS,
     ASK_PROPOSE,
     ASK_STATUS,
@@ -22,20 +25,24 @@ from gateway.mailbox.port import MAX_PAYLOAD, Mailbox
 from gateway.supervisor.deployer_sides import NotKnown
 from gateway.supervisor.dry_runs import DryRuns, TooMany
 from gateway.supervisor.gate import Gate
+from gateway.supervisor.interactions import Interactions, InteractionsError
 from gateway.supervisor.proposal_records import refused
 from gateway.supervisor.status import GatewayStatus
 
 AUTHOR = "agents"  #: of all their proposals
+MOST_TEXT = 400  #: letters of an event
 NAMES_AGENT = "agent "  #: an evidence that begins so names who proposes
 
 
 class AgentsDesk:
     def __init__(
-        self, status: Callable[[], GatewayStatus], gate: Gate, dry_runs: DryRuns, note: Callable[..., None]
-    ) -> None:
+        self, status: Callable[[], GatewayStatus], gate: Gate, dry_runs: DryRuns, log: Interactions,
+        note: Callable[..., None],
+    ) -> None:  # fmt: skip
         self._status = status
         self._gate = gate
         self._dry_runs = dry_runs
+        self._log = log
         self._note = note
 
     def serve_on(self, bus: Mailbox) -> None:
@@ -44,6 +51,7 @@ class AgentsDesk:
             bus.serve(ASK_STATUS.of(agent), self._tell_status)
             bus.serve(ASK_PROPOSALS.of(agent), self._gate.answer_query)
             bus.serve(ASK_JUDGE.of(agent), partial(self._judge, agent))
+            bus.serve(ASK_LOG.of(agent), partial(self._keep, agent))
 
     async def _propose(self, agent: AgentName, payload: bytes) -> bytes:
         if reasons := _not_theirs(agent, payload):
@@ -71,6 +79,21 @@ class AgentsDesk:
         text = "would pass" if found.would_pass else f"would be refused: {found.reasons[0]}"
         self._note("dry-run", f"agent {agent}: {text}", proposal=found.proposal)
         return found.model_dump_json().encode()
+
+    async def _keep(self, agent: AgentName, packed: bytes) -> bytes:
+        """An interaction of its own, into the log."""
+        try:
+            one = unpack(packed)
+            if one.agent != agent:
+                raise InteractionRefused([f"agent is {one.agent}; allowed: {agent}"])
+            number = await asyncio.to_thread(self._log.keep, packed, one)
+        except (InteractionRefused, InteractionsError) as error:
+            return _bytes(refused("it is not kept", [str(error)]))
+        answer = one.answer
+        why = f": {answer.instead}" if answer.instead else ""
+        text = f"agent {agent}, {one.question.decision}: {answer.choice.option}, by {answer.by}{why}"
+        self._note("interaction", text[:MOST_TEXT], id=one.id, number=number)
+        return _bytes(Reply(ok=True, state="", text=f"kept as {number}"))
 
 
 def _not_theirs(agent: AgentName, payload: bytes) -> list[str]:

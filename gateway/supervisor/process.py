@@ -26,6 +26,7 @@ from gateway.supervisor.experiments import MOST_EXPERIMENTS, newest_experiments
 from gateway.supervisor.gate import Gate
 from gateway.supervisor.historian import Historian
 from gateway.supervisor.history import HistoryError
+from gateway.supervisor.interactions import Interactions
 from gateway.supervisor.judging import NICEST, JudgeWorkers
 from gateway.supervisor.models import Models
 from gateway.supervisor.retention import retention_of
@@ -94,7 +95,8 @@ async def serve(
     gate = Gate(line, mailbox, data_folder, judge, around, gateway.note, clock, wall_clock)
     gateway.on_event, gateway.change = gate.hear, gate.change
     dry_runs = DryRuns(line, JudgeWorkers(line, nicer=NICEST))
-    bus = AgentsBus(line, run_folder, AgentsDesk(gateway.status, gate, dry_runs, gateway.note), gateway.note, clock)
+    desk = AgentsDesk(gateway.status, gate, dry_runs, Interactions(data_folder), gateway.note)
+    bus = AgentsBus(line, run_folder, desk, gateway.note, clock)
     gateway.agents_bus = bus.status
     opening = asyncio.create_task(bus.open())
     looking = asyncio.create_task(_look(gate, stop, watch_s))

@@ -71,7 +71,7 @@ class Desk:
             self.note, lambda: 1.0, lambda: NOW_S,
         )  # fmt: skip
         self.dry_runs = DryRuns(LINE, self.dry)
-        AgentsDesk(lambda: STATUS, self.gate, self.dry_runs, self.note).serve_on(InProcessMailbox(self.hub))
+        AgentsDesk(lambda: STATUS, self.gate, self.dry_runs, self.log, self.note).serve_on(InProcessMailbox(self.hub))
 
     def note(self, kind: str, text: str, **data: Any) -> None:
         self.events.append((kind, text))

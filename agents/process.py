@@ -1,0 +1,131 @@
+"""The agents' process: one session on the bus of a line, one task for each agent, until it is told to stop.
+
+It may come and go as it likes: whoever asks goes on by the rules while it is not there. It reads the line's file for
+nothing but its names and who is asked, and reaches the line by the bus alone.
+"""
+
+import asyncio
+import signal
+import sys
+from collections.abc import Awaitable, Callable
+from contextlib import AsyncExitStack
+from pathlib import Path
+
+from pydantic import ValidationError
+
+from agents.answering import Agent, Keep, NotTheirs, Search
+from agents.language_model.budget import Budget
+from agents.language_model.client import LanguageModel
+from agents.language_model.no_answer import NoAnswer
+from agents.rag.index import Index
+from agents.rag.index_file import IndexRefused
+from agents.rag.library import open_library
+from agents.rag.stages import Asked, Retrieval
+from agents.roles import ROLES
+from gateway.core.interactions import Interaction, pack
+from gateway.core.json_problems import problems
+from gateway.core.line import Line
+from gateway.core.messages import Reply
+from gateway.core.questions import Question
+from gateway.core.topics import AGENT_DECIDE, ASK_LOG, AgentName
+from gateway.mailbox.bus import BusUnavailable, TlsEndpoint, connect
+from gateway.mailbox.port import Mailbox, Unreachable
+
+EXIT_OK, EXIT_NO_BUS = 0, 2
+LOG_S = 5.0  #: for the gateway to take an interaction
+
+Tell = Callable[[str], None]
+
+
+def run_agents(line: Line, where: Path | TlsEndpoint, folder: Path) -> int:
+    """Serve until SIGTERM or SIGINT. `folder`: of the knowledge. Returns the process's exit code."""
+
+    def tell(text: str) -> None:
+        print(text, flush=True)
+
+    try:
+        return asyncio.run(serve(line, where, folder, tell))
+    except BusUnavailable as error:
+        print(f"the agents cannot reach the line: {error}", file=sys.stderr)
+        return EXIT_NO_BUS
+
+
+async def serve(line: Line, where: Path | TlsEndpoint, folder: Path, tell: Tell) -> int:
+    """All agents of `line`. Raises BusUnavailable."""
+    stop = asyncio.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        asyncio.get_running_loop().add_signal_handler(number, stop.set)
+    async with AsyncExitStack() as held:
+        bus = await connect(where, line.site, line.line)
+        held.push_async_callback(bus.close)
+        model = await _model(line, held, tell)
+        search = await _knowledge(folder, held, tell)
+        begin(bus, line, search, model, tell)
+        tell(f"agents of {line.site}/{line.line}: {', '.join(ROLES)}")
+        await stop.wait()
+    return EXIT_OK
+
+
+def begin(bus: Mailbox, line: Line, search: Search, model: LanguageModel | None, tell: Tell) -> None:
+    """Every agent answers on `bus` from now on."""
+    budget = Budget(line.agents.task_max_tokens)
+    asking = asyncio.Lock()  # one model, one question at a time
+    for name in ROLES:
+        agent = Agent(name, search, _keep(bus, name, tell), model, budget)
+        bus.serve(AGENT_DECIDE.of(name), _handler(agent, asking))
+
+
+def _handler(agent: Agent, asking: asyncio.Lock) -> Callable[[bytes], Awaitable[bytes]]:
+    async def decide(payload: bytes) -> bytes:
+        try:
+            question = Question.model_validate_json(payload)
+        except ValidationError as error:
+            raise NotTheirs("; ".join(problems(error, Question))) from error
+        async with asking:
+            return (await agent.answer(question)).model_dump_json().encode()
+
+    return decide
+
+
+def _keep(bus: Mailbox, name: AgentName, tell: Tell) -> Keep:
+    async def keep(interaction: Interaction) -> None:
+        try:
+            reply = Reply.model_validate_json(await bus.request(ASK_LOG.of(name), pack(interaction), LOG_S))
+            why = "" if reply.ok else reply.text
+        except (Unreachable, ValidationError) as error:
+            why = str(error)
+        if why:
+            tell(f"interaction {interaction.id} is not in the log: {why}")
+
+    return keep
+
+
+async def _model(line: Line, held: AsyncExitStack, tell: Tell) -> LanguageModel | None:
+    """None: the rules answer."""
+    if line.agents.llm == "off":
+        tell('the rules decide: agents.llm is "off"')
+        return None
+    model = await held.enter_async_context(LanguageModel(line.agents))
+    try:
+        found = await model.look()
+        tell(f"{found.model} {found.digest[:12]} answers on {line.agents.url}")
+    except NoAnswer as error:
+        tell(f"{error.text}; the rules decide until it answers")
+    return model
+
+
+async def _knowledge(folder: Path, held: AsyncExitStack, tell: Tell) -> Search:
+    """By words alone: what every machine can do."""
+    try:
+        opened = await open_library(folder, 3)
+    except (IndexRefused, OSError) as error:
+        reason = str(error)
+        tell(f"nothing can be looked up: {reason}")
+
+        async def nothing(_: Asked) -> Retrieval:
+            raise IndexRefused(reason)
+
+        return nothing
+    index: Index = held.enter_context(opened.index)
+    tell(f"{index.documents_count} documents are known")
+    return index.ask

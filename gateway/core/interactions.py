@@ -1,0 +1,85 @@
+"""What is known of one question that was asked of an agent: who, what, with which knowledge, what came of it. JSON.
+
+The record of checklist "every interaction is logged": an agent makes it, the gateway keeps it, people read it.
+"""
+
+import zlib
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, ValidationError
+
+from gateway.core.json_problems import NotJson, document_of, problems
+from gateway.core.line import NonNegative, Strict
+from gateway.core.line_model import Instant
+from gateway.core.questions import Choice, Question
+
+MOST_BYTES = 4 * 1024 * 1024  #: of an interaction as JSON, unpacked
+By = Annotated[str, Field(min_length=1, max_length=64)]
+
+
+class Note(Strict):
+    """A passage that the agent was shown."""
+
+    key: str  #: of its document
+    title: str
+    tier: Literal[1, 2, 3]
+    score: float
+    passage: str
+    overruled_by: list[str] = []
+    speaks_to_a_model: list[str] = []  #: why it was marked as an instruction in disguise
+
+
+class Answer(Strict):
+    """To a question: the choice, and how it came about."""
+
+    choice: Choice
+    by: By  #: the agent's name; "rules" where no language model has answered
+    instead: Annotated[str, Field(max_length=1000)] = ""  #: why the rules, where a model was asked
+    interaction: str = ""  #: its number in the log
+
+
+class Interaction(Strict):
+    format: Annotated[int, Field(ge=1, le=1)]
+    id: str
+    agent: str
+    at: Instant
+    question: Question
+    notes: list[Note]
+    conflicts: list[str]  #: among documents that were found, each with the rule that decided
+    prompt: str  #: SHA-256 of the agent's prompt
+    model: str  #: of the language model, with its digest; empty: none was asked
+    exchanges: list[dict[str, Any]]  #: every call of the model, in its order
+    answer: Answer
+    tokens_in: int
+    tokens_out: int
+    seconds: NonNegative
+
+
+class InteractionRefused(Exception):
+    """Bytes that are no interaction; `reasons` are all of them."""
+
+    def __init__(self, reasons: list[str]) -> None:
+        super().__init__("; ".join(reasons))
+        self.reasons = reasons
+
+
+def pack(interaction: Interaction) -> bytes:
+    """As it travels and is kept: JSON, compressed."""
+    return zlib.compress(interaction.model_dump_json().encode())
+
+
+def unpack(packed: bytes) -> Interaction:
+    """Raises InteractionRefused. What unpacks to more than `MOST_BYTES` is not unpacked further."""
+    unpacker = zlib.decompressobj()
+    try:
+        text = unpacker.decompress(packed, MOST_BYTES)
+    except zlib.error as error:
+        raise InteractionRefused([f"it is not compressed as it should be: {error}"]) from error
+    if not unpacker.eof or unpacker.unused_data:
+        raise InteractionRefused([f"it is cut off, or has more than {MOST_BYTES} bytes unpacked"])
+    try:
+        return Interaction.model_validate(document_of(text))
+    except NotJson as error:
+        raise InteractionRefused([str(error)]) from error
+    except ValidationError as error:
+        raise InteractionRefused(problems(error, Interaction)) from error
