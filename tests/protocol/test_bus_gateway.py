@@ -17,10 +17,9 @@ from gateway.mailbox.zenoh_mailbox import ZenohMailbox
 from gateway.supervisor.audit_file import AuditFile
 from gateway.supervisor.proposal_records import iso
 from gateway.supervisor.status import GatewayStatus
-from tests.protocol.bus_support import AGENT, LINE, client, run
+from tests.protocol.bus_support import AGENT, LINE, LONG_S, client, run
 from tests.unit.supervisor_support import child
 
-LONG_S = 30.0
 GATEWAY = """
 import sys
 from pathlib import Path
