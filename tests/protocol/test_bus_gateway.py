@@ -150,3 +150,17 @@ def test_a_flood_of_requests_is_told_once_and_people_are_answered_meanwhile() ->
             assert len(texts) <= 5 and "requests of agents were turned away" in texts[0]
 
     run(story)
+
+
+def test_after_a_gateway_was_killed_the_next_one_takes_its_socket_and_its_agents_are_back() -> None:
+    async def story(folder: Path) -> None:
+        with child(GATEWAY, folder) as (first, _):
+            await status_with(folder, lambda status: status.agents_bus.open)
+            with child(AGENT, folder):
+                await status_with(folder, lambda status: status.agents_bus.agents == ["sysid"])
+                first.kill()
+                first.wait()
+                with gateway(folder):
+                    await status_with(folder, lambda status: status.agents_bus.agents == ["sysid"])
+
+    run(story)
