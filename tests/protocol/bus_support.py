@@ -3,6 +3,7 @@
 import asyncio
 import datetime
 import socket
+import time
 from collections.abc import AsyncIterator, Callable, Coroutine
 from contextlib import asynccontextmanager
 from ipaddress import ip_address
@@ -15,7 +16,9 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
 
 from gateway.core.line import Line, Network
-from gateway.mailbox.bus import TlsEndpoint, connect, open_router, open_session
+from gateway.core.topics import AGENT_DECIDE, ASK_STATUS, Topic
+from gateway.mailbox.bus import TlsEndpoint, connect, open_router, open_session, router_settings
+from gateway.mailbox.paths import BUS_SOCKET
 from gateway.mailbox.zenoh_mailbox import ZenohMailbox
 from tests.unit.supervisor_support import line_of, short_folder, until
 
@@ -42,6 +45,25 @@ async def main():
 
 asyncio.run(main())
 """
+
+
+DECIDE, STATUS = AGENT_DECIDE.of("sysid"), ASK_STATUS.of("sysid")
+LONG_S = 30.0  #: that a test would notice, had it to wait for it
+
+
+async def echo(payload: bytes) -> bytes:
+    return b"echo " + payload
+
+
+async def never(_: bytes) -> bytes:
+    await asyncio.sleep(1000.0)
+    return b""
+
+
+def unguarded(folder: Path) -> dict[str, Any]:
+    """A router without access rules, for what the mailbox itself promises."""
+    settings = router_settings(LINE, folder / BUS_SOCKET)
+    return {key: value for key, value in settings.items() if key not in ("access_control", "low_pass_filter")}
 
 
 def run(story: Callable[[Path], Coroutine[Any, Any, None]]) -> None:
@@ -71,12 +93,19 @@ async def client(where: Path | TlsEndpoint, site: str = "demo", line: str = "lin
         await mailbox.close()
 
 
-async def opened(settings: dict[str, Any], line: str = "line-1") -> ZenohMailbox:
+async def opened(settings: dict[str, Any], clock: Callable[[], float] = time.monotonic) -> ZenohMailbox:
     """A mailbox over a session with settings of a test's own."""
-    return ZenohMailbox(await asyncio.to_thread(open_session, settings), "demo", line)
+    return ZenohMailbox(await asyncio.to_thread(open_session, settings), "demo", "line-1", clock)
 
 
-async def is_here(mailbox: ZenohMailbox, topic: Any) -> None:
+async def raw_answers(mailbox: ZenohMailbox, key: str, payload: bytes) -> list[str]:
+    """What is answered to a request that no mailbox has looked at before it was sent; refusals as they are worded."""
+    session = mailbox._session  # noqa: SLF001
+    replies = await asyncio.to_thread(lambda: list(session.get(key, payload=payload, timeout=0.5)))
+    return [bytes((reply.ok or reply.err).payload).decode() for reply in replies]
+
+
+async def is_here(mailbox: ZenohMailbox, topic: Topic) -> None:
     """Until somebody serves it, as this side sees it."""
     here: list[bool] = []
     mailbox.watch(topic, here.append)

@@ -4,39 +4,30 @@ import asyncio
 import os
 import signal
 from pathlib import Path
-from typing import Any
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+import zenoh
 
-from gateway.core.topics import AGENT_DECIDE, ASK_JUDGE, ASK_PROPOSE, ASK_STATUS, Topic
-from gateway.mailbox.bus import BusUnavailable, client_settings, connect, open_router, router_settings
+from gateway.core.topics import ASK_JUDGE, Topic
+from gateway.mailbox.bus import BusUnavailable, connect, open_router
 from gateway.mailbox.paths import BUS_SOCKET
-from gateway.mailbox.port import MAX_PAYLOAD, RemoteError, Unreachable
-from gateway.mailbox.zenoh_bridge import MOST_WAITING
-from gateway.mailbox.zenoh_served import MAX_IN_FLIGHT
-from tests.protocol.bus_support import AGENT, LINE, client, is_here, opened, router, run
-from tests.unit.supervisor_support import child, line_of, short_folder, until
-
-DECIDE = AGENT_DECIDE.of("sysid")
-STATUS = ASK_STATUS.of("sysid")
-LONG_S = 30.0  #: that a test would notice, had it to wait for it
-
-
-async def echo(payload: bytes) -> bytes:
-    return b"echo " + payload
-
-
-async def never(_: bytes) -> bytes:
-    await asyncio.sleep(1000.0)
-    return b""
-
-
-def unguarded(folder: Path, **changes: Any) -> dict[str, Any]:
-    """A router without access rules, for what the mailbox itself promises."""
-    settings = router_settings(LINE, folder / BUS_SOCKET) | changes
-    return {key: value for key, value in settings.items() if key not in ("access_control", "low_pass_filter")}
+from gateway.mailbox.port import RemoteError, Unreachable
+from tests.protocol.bus_support import (
+    AGENT,
+    DECIDE,
+    LINE,
+    LONG_S,
+    STATUS,
+    client,
+    echo,
+    is_here,
+    never,
+    opened,
+    router,
+    run,
+    unguarded,
+)
+from tests.unit.supervisor_support import child, line_of, until
 
 
 def test_agents_ask_the_gateway_and_the_phases_ask_agents() -> None:
@@ -183,131 +174,21 @@ def test_when_the_gateway_comes_again_its_agents_are_back_by_themselves() -> Non
     run(story)
 
 
-def test_a_flood_of_messages_and_of_requests_is_turned_away_and_the_gateway_answers_others() -> None:
-    async def story(folder: Path) -> None:
-        async with router(folder) as gateway, client(folder) as flooding, client(folder) as calm:
-            heard: list[bytes] = []
-            gateway.serve(STATUS, echo)
-            gateway.serve(ASK_STATUS.of("monitoring"), echo)
-            topic = Topic("ask/sysid/status", "publish", "1/s", kept=False)
-            gateway.subscribe(topic, heard.append)
-            for _ in range(10_000):  # no row of the table is published: not one comes through
-                flooding.publish(topic, b"x" * 100)
-            asked = [flooding.request(STATUS, b"", LONG_S) for _ in range(500)]
-            answers = asyncio.gather(*asked, return_exceptions=True)
-            assert await calm.request(ASK_STATUS.of("monitoring"), b"", LONG_S) == b"echo "
-            found = await answers
-            refused = [one for one in found if isinstance(one, RemoteError)]
-            assert len(refused) + sum(one == b"echo " for one in found) == len(found)
-            assert len(refused) == gateway.counters.refused > 0
-            assert "ask again later" in str(refused[-1]) or "at once" in str(refused[-1])
-            assert heard == []
-
-    run(story)
-
-
-def test_a_subscriber_that_does_not_keep_up_loses_messages_which_are_counted_and_the_order_stays() -> None:
-    async def story(folder: Path) -> None:
-        hall, flooding = await opened(unguarded(folder)), await connect(folder, "demo", "line-1")
-        heard: list[int] = []
-        topic = Topic("news", "publish", "1/s", kept=False)
-        try:
-            hall.subscribe(topic, lambda payload: heard.append(int(payload)))
-            await until(lambda: flooding.publish(topic, b"-1"))
-            told = 0
-            while hall.counters.dropped == 0:  # this event loop does not turn meanwhile
-                flooding.publish(topic, b"%d" % told)
-                told += 1
-            assert told > MOST_WAITING
-            await until(lambda: flooding.publish(topic, b"%d" % told) and heard[-1:] == [told])
-            assert heard == sorted(heard)
-            assert len(set(heard)) < told
-        finally:
-            await flooding.close()
-            await hall.close()
-
-    run(story)
-
-
-def test_no_more_requests_than_allowed_are_answered_at_once() -> None:
+def test_a_request_ends_with_the_token_of_who_serves_even_where_zenoh_still_waits() -> None:
     async def story(folder: Path) -> None:
         async with router(folder) as gateway, client(folder) as agents:
-            topic = Topic(STATUS.name, "request", "", kept=False)  # without a rate
-            gateway.serve(topic, never)
-            asked = [asyncio.create_task(agents.request(topic, b"", LONG_S)) for _ in range(MAX_IN_FLIGHT + 2)]
-            done: set[asyncio.Task[bytes]] = set()
-            while len(done) < 2:
-                done, _ = await asyncio.wait(asked, return_when=asyncio.FIRST_COMPLETED, timeout=0.01)
-            assert all(f"more than {MAX_IN_FLIGHT} requests at once" in str(one.exception()) for one in done)
-            assert gateway.counters.refused == len(done) == 2
-            for one in asked:
-                one.cancel()
-            await asyncio.gather(*asked, return_exceptions=True)
-
-    run(story)
-
-
-def test_what_is_too_long_is_refused_on_either_side() -> None:
-    async def long(payload: bytes) -> bytes:
-        return payload + b"x"
-
-    async def story(folder: Path) -> None:
-        async with router(folder) as gateway, client(folder) as agents:
-            gateway.serve(STATUS, long)
-            whole = await agents.request(STATUS, bytes(MAX_PAYLOAD - 1), LONG_S)
-            assert len(whole) == MAX_PAYLOAD
-            with pytest.raises(RemoteError, match=f"answer of {MAX_PAYLOAD + 1} bytes"):
-                await agents.request(STATUS, bytes(MAX_PAYLOAD), LONG_S)
-            with pytest.raises(RemoteError, match=f"{MAX_PAYLOAD + 1} bytes of payload"):
-                await agents.request(STATUS, bytes(MAX_PAYLOAD + 1), LONG_S)
-            assert not agents.publish(Topic("news", "publish", "", kept=False), bytes(MAX_PAYLOAD + 1))
-
-    run(story)
-
-
-def test_whoever_has_no_limit_of_its_own_meets_that_of_the_router() -> None:
-    async def story(folder: Path) -> None:
-        async with router(folder) as gateway:
-            came: list[bytes] = []
-
-            async def note(payload: bytes) -> bytes:
-                came.append(payload)
-                return b""
-
-            gateway.serve(STATUS, note)
-            hostile = await opened(client_settings(f"unixsock-stream/{folder / BUS_SOCKET}"))
-            try:
-                session = hostile._session  # noqa: SLF001
-                for length in (MAX_PAYLOAD + 1, 64 * MAX_PAYLOAD):
-                    key = f"demo/line-1/{STATUS.name}"
-                    replies = await asyncio.to_thread(
-                        lambda length=length, key=key: list(session.get(key, payload=bytes(length), timeout=0.2))
-                    )
-                    assert all(reply.ok is None for reply in replies)
-                assert came == []
-                assert await hostile.request(STATUS, b"1", LONG_S) == b""
-            finally:
-                await hostile.close()
-
-    run(story)
-
-
-@pytest.mark.parametrize("key", ["demo/line-1/ask/*/propose", "demo/line-1/ask/sysid/*", "**"])
-def test_a_question_for_several_agents_at_once_reaches_nobody(key: str) -> None:
-    async def story(folder: Path) -> None:
-        async with router(folder) as gateway, client(folder) as agents:
-            came: list[bytes] = []
-
-            async def note(payload: bytes) -> bytes:
-                came.append(payload)
-                return b""
-
-            for topic in (ASK_PROPOSE.of("sysid"), ASK_PROPOSE.of("adaptation"), STATUS):
-                gateway.serve(topic, note)
-            session = agents._session  # noqa: SLF001
-            replies = await asyncio.to_thread(lambda: list(session.get(key, payload=b"x", timeout=LONG_S)))
-            assert all(reply.ok is None for reply in replies)
-            assert came == []
+            session, key = agents._session, f"demo/line-1/{DECIDE.name}"  # noqa: SLF001
+            asked: list[zenoh.Query] = []
+            served = session.declare_queryable(key, zenoh.handlers.Callback(asked.append, indirect=False))
+            token = session.liveliness().declare_token(key)
+            await is_here(gateway, DECIDE)
+            waiting = asyncio.create_task(gateway.request(DECIDE, b"", 1000.0))
+            await until(lambda: bool(asked))
+            await asyncio.to_thread(token.undeclare)
+            with pytest.raises(Unreachable, match="went away before there was an answer"):
+                await waiting
+            await asyncio.to_thread(asked[0].drop)
+            await asyncio.to_thread(served.undeclare)
 
     run(story)
 
@@ -356,45 +237,3 @@ def test_a_bus_that_cannot_be_is_refused_with_the_reason() -> None:
             assert ".rs" not in str(refused.value)
 
     run(story)
-
-
-NAME = st.from_regex(r"[a-z0-9]([a-z0-9-]{0,30}[a-z0-9])?", fullmatch=True)
-PART = st.from_regex(r"[a-z][a-z0-9-]{0,11}", fullmatch=True)
-
-
-def test_any_topic_and_payload_comes_through_as_it_was() -> None:
-    with short_folder() as folder:
-        with asyncio.Runner() as runner:
-            hall = runner.run(opened(unguarded(folder)))
-            here, there = (runner.run(connect(folder, "demo", "line-1")) for _ in range(2))
-            served: set[str] = set()
-            heard: list[tuple[str, bytes]] = []
-
-            @settings(max_examples=60)
-            @given(st.lists(PART, min_size=1, max_size=3).map("/".join), st.binary(max_size=300), st.booleans())
-            def comes_through(name: str, payload: bytes, long: bool) -> None:
-                payload = payload * (1000 if long else 1)
-                asked = Topic(f"r/{name}", "request", "", kept=False)
-                told = Topic(f"p/{name}", "publish", "", kept=False)
-
-                async def there_and_back() -> None:
-                    if name not in served:
-                        served.add(name)
-                        here.serve(asked, echo)
-                        here.subscribe(told, lambda payload: heard.append((name, payload)))
-                        await is_here(there, asked)
-                    if len(payload) <= MAX_PAYLOAD - 5:
-                        assert await there.request(asked, payload, LONG_S) == b"echo " + payload
-                    heard.clear()
-                    if len(payload) <= 60_000:  # longer ones take several buffers and may be dropped
-                        await until(lambda: there.publish(told, payload))
-                        await until(lambda: bool(heard))
-                        assert heard[0] == (name, payload)
-
-                runner.run(there_and_back())
-
-            try:
-                comes_through()
-            finally:
-                for mailbox in (there, here, hall):
-                    runner.run(mailbox.close())

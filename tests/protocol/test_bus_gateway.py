@@ -17,10 +17,9 @@ from gateway.mailbox.zenoh_mailbox import ZenohMailbox
 from gateway.supervisor.audit_file import AuditFile
 from gateway.supervisor.proposal_records import iso
 from gateway.supervisor.status import GatewayStatus
-from tests.protocol.bus_support import AGENT, LINE, client, run
+from tests.protocol.bus_support import AGENT, LINE, LONG_S, client, run
 from tests.unit.supervisor_support import child
 
-LONG_S = 30.0
 GATEWAY = """
 import sys
 from pathlib import Path
@@ -149,5 +148,19 @@ def test_a_flood_of_requests_is_told_once_and_people_are_answered_meanwhile() ->
             )
             texts = [event.text for event in status.events if event.kind == "agents-refused"]
             assert len(texts) <= 5 and "requests of agents were turned away" in texts[0]
+
+    run(story)
+
+
+def test_after_a_gateway_was_killed_the_next_one_takes_its_socket_and_its_agents_are_back() -> None:
+    async def story(folder: Path) -> None:
+        with child(GATEWAY, folder) as (first, _):
+            await status_with(folder, lambda status: status.agents_bus.open)
+            with child(AGENT, folder):
+                await status_with(folder, lambda status: status.agents_bus.agents == ["sysid"])
+                first.kill()
+                first.wait()
+                with gateway(folder):
+                    await status_with(folder, lambda status: status.agents_bus.agents == ["sysid"])
 
     run(story)

@@ -21,9 +21,13 @@ from gateway.mailbox.bus import BusUnavailable, TlsEndpoint, client_settings, co
 from gateway.mailbox.port import Unreachable
 from gateway.mailbox.zenoh_mailbox import ZenohMailbox
 from tests.protocol.bus_support import (
+    DECIDE,
     LINE,
+    LONG_S,
+    STATUS,
     Authority,
     client,
+    echo,
     endpoint,
     free_port,
     is_here,
@@ -33,13 +37,6 @@ from tests.protocol.bus_support import (
     run,
 )
 from tests.unit.supervisor_support import until
-
-LONG_S = 30.0
-DECIDE, STATUS = AGENT_DECIDE.of("sysid"), ASK_STATUS.of("sysid")
-
-
-async def echo(payload: bytes) -> bytes:
-    return b"echo " + payload
 
 
 async def forged(_: bytes) -> bytes:

@@ -62,7 +62,7 @@ def test_what_is_right_is_taken_without_a_word(changes: dict[str, str]) -> None:
 )
 def test_an_address_without_tls_or_with_zenohs_own_options_is_refused(listen: str, meant: str) -> None:
     (complaint,) = complaints(listen=f'"{listen}"')
-    assert 'network.listen' in complaint and 'allowed: "tls/HOST:PORT"' in complaint
+    assert "network.listen" in complaint and 'allowed: "tls/HOST:PORT"' in complaint
     assert complaint.endswith(meant)
 
 
