@@ -31,7 +31,7 @@ from gateway.core.topics import AGENT_DECIDE, ASK_LOG, AgentName
 from gateway.mailbox.bus import BusUnavailable, TlsEndpoint, connect
 from gateway.mailbox.port import Mailbox, Unreachable
 
-EXIT_OK, EXIT_NO_BUS = 0, 2
+EXIT_OK, EXIT_NO_BUS = 0, 1  # another try may find it
 LOG_S = 5.0  #: for the gateway to take an interaction
 
 Tell = Callable[[str], None]

@@ -35,7 +35,7 @@ _KINDS: tuple[tuple[str, re.Pattern[str]], ...] = (
         "orders its reader to let something through",
         _any(
             r"\b(?:you|the (?:agent|assistant|model|ai))\s+(?:must|shall|should|have to|will|are to)\s+"
-            r"(?:now\s+|always\s+)?(?:approve|accept|deploy|authori[sz]e|confirm|ignore|skip|disable|bypass|propose|answer|reply|output)"
+            r"(?:now\s+|always\s+)?(?:approve|accept|deploy|authori[sz]e|confirm|ignore|skip|disable|bypass|propose|answer|reply|output|choose|select|pick)"
             r"\b",
             r"\b(?:skip|bypass|disable|turn off|switch off)\s+(?:the\s+|all\s+|any\s+)?"
             r"(?:safety (?:filter|gate|check)s?|gate|judge|validation|verdicts?)\b",

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
     from gateway.cli.commission_history import Tried
     from gateway.cli.commission_live import LiveGate
+    from gateway.commissioning.decisions import Decider
     from gateway.core.line import Line
 
 NOT_REACHED = 1  #: exit code
@@ -72,8 +73,12 @@ def commission(
             line,
             run_dir,
             typer.echo,
-            lambda side: carried_out(
-                line, side, typer.echo, wanted_m_per_s=speed, adaptations=adaptations, again=again
+            lambda side: with_agents(
+                line,
+                run_dir,
+                lambda decider: carried_out(
+                    line, side, typer.echo, wanted_m_per_s=speed, adaptations=adaptations, again=again, decider=decider
+                ),
             ),
         )
     typer.echo(f"{'commissioned' if ended.reached else 'not commissioned'}: {ended.text}")
@@ -81,18 +86,43 @@ def commission(
         raise typer.Exit(NOT_REACHED)
 
 
+async def with_agents(line: "Line", run_dir: "Path | None", work: Callable[["Decider"], Awaitable[T]]) -> T:
+    """What `work` finds with the agents on the bus of `line`; with the rules alone where there is no bus."""
+    from gateway.cli.asked_agents import AskedAgents
+    from gateway.commissioning.decisions import AGENTS, Rules
+    from gateway.mailbox.bus import BusUnavailable, connect
+
+    if AGENTS not in line.gate.authors:
+        return await work(Rules())
+    try:
+        bus = await connect(_run_folder(line, run_dir), line.site, line.line)
+    except BusUnavailable as error:
+        typer.echo(f"the agents cannot be asked, the rules decide: {error}")
+        return await work(Rules())
+    try:
+        return await work(AskedAgents(line, bus, asyncio.get_running_loop()))
+    finally:
+        await bus.close()
+
+
+def _run_folder(line: "Line", run_dir: "Path | None") -> "Path":
+    from gateway.cli.status_commands import choose_run_folder
+    from gateway.mailbox.paths import default_run_folder, running_lines
+
+    own = default_run_folder(line)
+    return choose_run_folder(run_dir or (own if own in running_lines() else None))
+
+
 def with_gate(
     line: "Line", run_dir: "Path | None", tell: Callable[[str], None], work: Callable[["LiveGate"], Awaitable[T]]
 ) -> T:
     """What `work` finds with the gateway of `line`."""
     from gateway.cli.commission_live import TOPICS, LiveGate
-    from gateway.cli.status_commands import choose_run_folder
     from gateway.mailbox.listener import PathTooLong
-    from gateway.mailbox.paths import GATEWAY_SOCKET, default_run_folder, running_lines
+    from gateway.mailbox.paths import GATEWAY_SOCKET
     from gateway.mailbox.unix import UnixMailbox
 
-    own = default_run_folder(line)
-    folder = choose_run_folder(run_dir or (own if own in running_lines() else None))
+    folder = _run_folder(line, run_dir)
 
     async def run() -> T:
         mailbox = UnixMailbox()

@@ -7,6 +7,7 @@ import typer
 from pydantic import ValidationError
 
 from gateway.cli import (
+    agents_commands,
     ask_commands,
     audit_commands,
     audit_replay,
@@ -60,6 +61,7 @@ app.command(rich_help_panel=ENGINEER)(judge_commands.judge)
 app.command(rich_help_panel=PROCESSES)(process_commands.run)
 app.command(rich_help_panel=PROCESSES)(process_commands.loop)
 app.command(rich_help_panel=PROCESSES)(process_commands.gateway)
+app.command(rich_help_panel=PROCESSES)(agents_commands.agents)
 app.command(rich_help_panel=PROCESSES)(process_commands.sim)
 app.command(rich_help_panel=PROCESSES)(process_commands.demo)
 app.add_typer(fault_commands.app, rich_help_panel=PROCESSES)
@@ -76,6 +78,7 @@ app.command(rich_help_panel=OVERSIGHT)(proposal_commands.proposals)
 app.command(rich_help_panel=OVERSIGHT)(proposal_commands.approve)
 app.command(rich_help_panel=OVERSIGHT)(proposal_commands.reject)
 app.command(rich_help_panel=OVERSIGHT)(proposal_commands.rollback)
+app.command(rich_help_panel=EVIDENCE)(agents_commands.log)
 app.command("export", rich_help_panel=EVIDENCE)(recordings_export.export)
 audit_commands.app.command()(audit_replay.replay)
 app.add_typer(audit_commands.app, rich_help_panel=EVIDENCE)

@@ -1,4 +1,4 @@
-"""`r2rgate run`: gateway and loop (and, where asked for, the simulated line) as children of one terminal.
+"""`r2rgate run`: gateway, loop and agents (and, where asked for, the simulated line) as children of one terminal.
 
 A child that ends is started again, with growing pauses; the loop comes back SILENT, as after a reboot. What a start
 cannot mend (a refused file, a line that runs already) ends all of it, with that child's exit code.
@@ -48,6 +48,7 @@ def run_together(
     children = [
         Child("gateway", lambda: gateway, data_folder / "gateway.log"),
         Child("loop", lambda: loop, data_folder / "loop.log"),
+        Child("agents", lambda: gateway, data_folder / "agents.log"),
     ]
     if plant is not None:
         loop.append("--simulated")  # it is the line that is started here

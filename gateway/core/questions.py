@@ -14,6 +14,7 @@ from pydantic import Field, ValidationError, model_validator
 from gateway.core.json_problems import NotJson, document_of, problems
 from gateway.core.line import Name, Positive, Strict
 from gateway.core.nearest import nearest
+from gateway.core.topics import AgentName
 
 Decision = Literal[
     "identify.data",
@@ -39,7 +40,7 @@ DECISIONS: tuple[Decision, ...] = get_args(Decision)
 Sentence = Annotated[str, Field(min_length=1, max_length=600)]
 OptionId = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,63}$")]
 MOST_BYTES = 65_536  #: of a question or a choice as JSON
-AGENTS: dict[str, str] = {
+AGENTS: dict[str, AgentName] = {
     "identify": "sysid",
     "design": "initial-control",
     "adapt": "adaptation",
@@ -94,7 +95,7 @@ class Question(Strict):
     knobs: Annotated[list[Knob], Field(max_length=16)] = []
 
     @property
-    def agent(self) -> str:
+    def agent(self) -> AgentName:
         """Who answers it."""
         return AGENTS[self.decision.partition(".")[0]]
 

@@ -23,6 +23,7 @@ from gateway.supervisor.audit_file import AuditFile
 from gateway.supervisor.deployer_sides import NotKnown
 from gateway.supervisor.dry_runs import LONGER, MOST, DryRuns
 from gateway.supervisor.gate import Gate
+from gateway.supervisor.interactions import Interactions
 from gateway.supervisor.lifecycle import Stage
 from gateway.supervisor.status import GatewayStatus
 from tests.unit.deployer_support import FIRST, LINE, Death, FakeJudge, FakeLoop, FakeSurroundings, proposal
@@ -71,6 +72,7 @@ class Desk:
             self.note, lambda: 1.0, lambda: NOW_S,
         )  # fmt: skip
         self.dry_runs = DryRuns(LINE, self.dry)
+        self.log = Interactions(folder)
         AgentsDesk(lambda: STATUS, self.gate, self.dry_runs, self.log, self.note).serve_on(InProcessMailbox(self.hub))
 
     def note(self, kind: str, text: str, **data: Any) -> None:

@@ -1,0 +1,79 @@
+"""`r2rgate agents`: the process of the agents. `r2rgate log`: what they were asked, and all that came of it."""
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from gateway.cli.operate_commands import RunFolder
+from gateway.cli.process_commands import REFUSED, DataFolder, LineFile, default_data_folder, read_line
+from gateway.core.topics import AGENT_NAMES
+
+LINE = Annotated[Path | None, typer.Option("--line", help="The line's file; needed where several lines have a log.")]
+
+
+def agents(
+    file: LineFile,
+    run_dir: RunFolder = None,
+    data_dir: DataFolder = None,
+) -> None:
+    """The agents: they answer what the phases leave to judgement, with a language model if the line's file names one.
+
+    They reach the line by its bus alone, look things up in its knowledge (`r2rgate ask`), and each answer with all that
+    led to it is kept (`r2rgate log`). Without them, and wherever they fail, the rules decide.
+
+    Example: r2rgate agents line.toml
+    """
+    from agents.process import run_agents
+    from gateway.cli.ask_run import FOLDER
+    from gateway.mailbox.paths import default_run_folder
+
+    line = read_line(file)
+    knowledge = (data_dir or default_data_folder(line)) / FOLDER
+    raise typer.Exit(run_agents(line, run_dir or default_run_folder(line), knowledge))
+
+
+def log(
+    which: Annotated[
+        str | None, typer.Argument(help="One of them: its number, or its id or the beginning of it.")
+    ] = None,
+    line_file: LINE = None,
+    data_dir: DataFolder = None,
+    agent: Annotated[str | None, typer.Option(help="Only this agent's.")] = None,
+    most: Annotated[int, typer.Option(min=1, help="The newest so many.")] = 20,
+    as_json: Annotated[bool, typer.Option("--json", help="For machines: with everything.")] = False,
+) -> None:
+    """What agents were asked: the question, what they were shown, what the model said word by word, what was chosen.
+
+    Example: r2rgate log --line line.toml
+
+    Example, one of them whole: r2rgate log 17 --line line.toml
+    """
+    from gateway.cli.agents_view import as_story, as_table
+    from gateway.cli.data_place import data_folder
+    from gateway.core.nearest import nearest
+    from gateway.supervisor.interactions import FILE_NAME, Interactions, InteractionsError
+
+    if agent is not None and agent not in AGENT_NAMES:
+        like = nearest(agent, AGENT_NAMES)
+        _refuse(f"--agent is {agent}; allowed: {', '.join(AGENT_NAMES)}{f'; did you mean {like}?' if like else ''}")
+    try:
+        folder = data_dir or data_folder(
+            None if line_file is None else read_line(line_file), FILE_NAME, "interactions of agents",
+            "they begin with `r2rgate commission` while `r2rgate agents` runs", InteractionsError,
+        )  # fmt: skip
+        kept = Interactions(folder)
+        if which is None:
+            rows = kept.newest(most, agent)
+            typer.echo(json.dumps([vars(one) for one in rows], indent=2) if as_json else as_table(rows))
+        else:
+            found = kept.find(which)
+            typer.echo(found.model_dump_json(indent=2) if as_json else as_story(found))
+    except InteractionsError as error:
+        _refuse(str(error))
+
+
+def _refuse(text: str) -> None:
+    typer.echo(text, err=True)
+    raise typer.Exit(REFUSED)

@@ -1,0 +1,91 @@
+"""Interactions of agents for a person to read: a table of many, one as a story."""
+
+from collections.abc import Sequence
+from textwrap import indent
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from gateway.core.interactions import Interaction
+from gateway.core.line_problem import printable
+from gateway.core.questions import Figure, Option
+from gateway.supervisor.interactions import Row
+
+WIDTH = 120
+
+
+def as_table(rows: Sequence[Row]) -> str:
+    """The newest first."""
+    if not rows:
+        return "nothing was asked"
+    table = Table(box=None, pad_edge=False)
+    for head in ("number", "at", "agent", "decision", "chosen", "by", "why the rules"):
+        table.add_column(head, overflow="fold")
+    for one in rows:
+        cells = (str(one.number), one.at[:19], one.agent, one.decision, one.chosen, one.decided_by, one.instead)
+        table.add_row(*map(printable, cells))
+    console = Console(width=WIDTH, color_system=None)
+    with console.capture() as captured:
+        console.print(table, markup=False)
+    return captured.get().rstrip()
+
+
+def as_story(one: Interaction) -> str:
+    """Question, options, what was looked up, every word of the model, the answer: in the order in which it happened."""
+    question, answer = one.question, one.answer
+    parts = [
+        f"{one.agent} was asked at {one.at}: {question.task} ({question.decision})",
+        _listed("known", question.facts),
+        _listed("figures", [_figure(figure) for figure in question.figures]),
+        _listed("offered", [_option(option) for option in question.options]),
+        f"the rules would choose {question.usual}: {question.why}",
+        _listed("looked up", [_note(note.model_dump()) for note in one.notes]),
+        _listed("conflicts among it", one.conflicts),
+        *(_exchange(number, exchange) for number, exchange in enumerate(one.exchanges, 1)),
+        _answer(one),
+    ]
+    if answer.instead:
+        parts.append(f"the rules, because {answer.instead}")
+    return "\n\n".join(part for part in parts if part)
+
+
+def _answer(one: Interaction) -> str:
+    choice = one.answer.choice
+    turned = ", ".join(f"{name} times {factor:g}" for name, factor in choice.factors.items())
+    tokens = f", {one.tokens_in} tokens read and {one.tokens_out} written" if one.exchanges else ""
+    return (
+        f"chosen by {one.answer.by}: {choice.option}{f', {turned}' if turned else ''}\n"
+        f"{indent(choice.reason, '  > ', lambda _: True)}\n({one.seconds:.1f} s{tokens})"
+    )
+
+
+def _exchange(number: int, exchange: dict[str, Any]) -> str:
+    said = exchange.get("raw") or "(nothing)"
+    refused = exchange.get("refused") or []
+    head = f"call {number} of {exchange['model']} {str(exchange['digest'])[:12]}, to {exchange['purpose']}:"
+    return "\n".join([
+        head,
+        *(indent(f"{message['role']}: {message['content']}", "  | ") for message in exchange["messages"]),
+        indent(f"said: {said}", "  | "),
+        *(f"  refused: {reason}" for reason in refused),
+    ])  # fmt: skip
+
+
+def _listed(head: str, rows: Sequence[str]) -> str:
+    return "\n".join([f"{head}:", *(f"  - {row}" for row in rows)]) if rows else ""
+
+
+def _option(option: Option) -> str:
+    figures = "; ".join(_figure(figure) for figure in option.figures)
+    return f"{option.id}: {option.title}{f' ({figures})' if figures else ''}"
+
+
+def _figure(figure: Figure) -> str:
+    value = "not known" if figure.value is None else f"{figure.value:g} {figure.unit}".rstrip()
+    return f"{figure.name} {value}"
+
+
+def _note(note: dict[str, Any]) -> str:
+    marks = [f"overruled by {key}" for key in note["overruled_by"]] + list(note["speaks_to_a_model"])
+    return f"{note['title']} (tier {note['tier']}, {note['score']:.2f}){'; '.join(['', *marks]) if marks else ''}"
