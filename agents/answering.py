@@ -44,7 +44,8 @@ class Agent:
     """One of `ROLES`. `model` None: the rules answer, with what is known quoted beside it. `keep` raises nothing."""
 
     def __init__(
-        self, name: AgentName, search: Search, keep: Keep, model: LanguageModel | None, budget: Budget,
+        self, name: AgentName, search: Search, keep: Keep, model: LanguageModel | None,
+        budget: Callable[[], Budget],
         clocks: Clocks = Clocks(),  # noqa: B008 - frozen
     ) -> None:  # fmt: skip
         self.role: Role = ROLES[name]
@@ -97,7 +98,7 @@ class Agent:
         if self._model is None:
             return Answer(choice=usual_choice(question), by=RULES), ()
         passages = [Passage(f"{hit.document.title} ({hit.document.key})", _told(hit)) for hit in hits]
-        found = await decide(self._model, self.role.prompt, question, passages, budget=self._budget)
+        found = await decide(self._model, self.role.prompt, question, passages, budget=self._budget())
         if isinstance(found, Answered):
             return Answer(choice=found.choice, by=self.role.name), found.exchanges
         instead = f"the language model gave no answer ({found.kind}): {found.text}"[:MOST_INSTEAD]

@@ -7,6 +7,7 @@ nothing but its names and who is asked, and reaches the line by the bus alone.
 import asyncio
 import signal
 import sys
+import time
 from collections.abc import Awaitable, Callable
 from contextlib import AsyncExitStack
 from pathlib import Path
@@ -32,6 +33,7 @@ from gateway.mailbox.bus import BusUnavailable, TlsEndpoint, connect
 from gateway.mailbox.port import Mailbox, Unreachable
 
 EXIT_OK, EXIT_NO_BUS = 0, 1  # another try may find it
+ANOTHER_TASK_S = 3600.0
 LOG_S = 5.0  #: for the gateway to take an interaction
 
 Tell = Callable[[str], None]
@@ -68,11 +70,27 @@ async def serve(line: Line, where: Path | TlsEndpoint, folder: Path, tell: Tell)
 
 def begin(bus: Mailbox, line: Line, search: Search, model: LanguageModel | None, tell: Tell) -> None:
     """Every agent answers on `bus` from now on."""
-    budget = Budget(line.agents.task_max_tokens)
+    budget = _Task(line.agents.task_max_tokens)
     asking = asyncio.Lock()  # one model, one question at a time
     for name in ROLES:
-        agent = Agent(name, search, _keep(bus, name, tell), model, budget)
+        agent = Agent(name, search, _keep(bus, name, tell), model, budget.now)
         bus.serve(AGENT_DECIDE.of(name), _handler(agent, asking))
+
+
+class _Task:
+    """What one commissioning may cost. After an hour without a question the next one begins another."""
+
+    def __init__(self, most_tokens: int, clock: Callable[[], float] = time.monotonic) -> None:
+        self._budget = Budget(most_tokens)
+        self._clock = clock
+        self._asked_s = clock()
+
+    def now(self) -> Budget:
+        """For a question that has just come."""
+        before_s, self._asked_s = self._asked_s, self._clock()
+        if self._asked_s - before_s > ANOTHER_TASK_S:
+            self._budget = Budget(self._budget.most_tokens)
+        return self._budget
 
 
 def _handler(agent: Agent, asking: asyncio.Lock) -> Callable[[bytes], Awaitable[bytes]]:
@@ -92,7 +110,7 @@ def _keep(bus: Mailbox, name: AgentName, tell: Tell) -> Keep:
         try:
             reply = Reply.model_validate_json(await bus.request(ASK_LOG.of(name), pack(interaction), LOG_S))
             why = "" if reply.ok else reply.text
-        except (Unreachable, ValidationError) as error:
+        except (Unreachable, ValidationError, ValueError) as error:
             why = str(error)
         if why:
             tell(f"interaction {interaction.id} is not in the log: {why}")

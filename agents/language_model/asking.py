@@ -13,7 +13,7 @@ from agents.language_model.replies import Said
 from gateway.core.json_problems import NotJson, document_of
 from gateway.core.line_problem import printable
 from gateway.core.nearest import nearest
-from gateway.core.questions import Choice, ChoiceRefused, Question, parse_choice, question_json
+from gateway.core.questions import Choice, ChoiceRefused, Knob, Question, parse_choice, question_json
 
 BECAUSE = "because"
 OPTION = "option"
@@ -61,7 +61,7 @@ def form_message(question: Question) -> Said:
     keys = [
         f'"{BECAUSE}": your reason in one to three sentences, with the figures that decide',
         f'"{OPTION}": one of {", ".join(one.id for one in question.options)}',
-        *(f'"{TIMES}{one.name}": {_meaning(one.least, one.most, one.meaning)}' for one in question.knobs),
+        *(f'"{TIMES}{one.name}": {_meaning(one)}' for one in question.knobs),
     ]
     listed = "\n".join(f"- {key}" for key in keys)
     return Said("user", f"Now answer, with one JSON object that has these keys and nothing else:\n{listed}")
@@ -86,13 +86,16 @@ def answer_format(question: Question) -> dict[str, Any]:
             "type": "number",
             "minimum": knob.least,
             "maximum": knob.most,
-            "description": _meaning(knob.least, knob.most, knob.meaning),
+            "description": _meaning(knob),
         }
-    return {"type": "object", "properties": properties, "required": list(properties), "additionalProperties": False}
+    of_some = {f"{TIMES}{knob.name}" for knob in question.knobs if knob.of}
+    required = [key for key in properties if key not in of_some]
+    return {"type": "object", "properties": properties, "required": required, "additionalProperties": False}
 
 
-def _meaning(least: float, most: float, meaning: str) -> str:
-    return f"a factor from {least:g} to {most:g}, without a unit; 1 leaves it as it is; more: {meaning}"
+def _meaning(knob: Knob) -> str:
+    only = f"; only for {', '.join(knob.of)}" if knob.of else ""
+    return f"a factor from {knob.least:g} to {knob.most:g}, without a unit; 1 leaves it; more: {knob.meaning}{only}"
 
 
 def read_answer(text: str, question: Question) -> Choice:
@@ -110,7 +113,8 @@ def read_answer(text: str, question: Question) -> Choice:
     refused = [_no_such_key(key, allowed) for key in document if key not in allowed]
     choice = {"reason": document.get(BECAUSE), "option": document.get(OPTION)}
     given = {key: value for key, value in choice.items() if value is not None}
-    turned = {name: document[key] for key, name in factors.items() if key in document}
+    # A factor of 1 turns nothing, and so does no harm on an option that has no such knob.
+    turned = {name: document[key] for key, name in factors.items() if key in document and not _is_one(document[key])}
     try:
         chosen = parse_choice(json.dumps(given | {"factors": turned}).encode(), question)
     except ChoiceRefused as error:
@@ -118,6 +122,10 @@ def read_answer(text: str, question: Question) -> Choice:
     if refused:
         raise ChoiceRefused(refused)
     return chosen
+
+
+def _is_one(factor: Any) -> bool:
+    return isinstance(factor, int | float) and not isinstance(factor, bool) and factor == 1.0
 
 
 def _no_such_key(key: str, allowed: list[str]) -> str:

@@ -69,7 +69,7 @@ class Collected:
         """The text in `part`; none where the answer has already ended."""
         if self._last is not None and self._last.done:
             return ""
-        piece, thought = part.message.content or "", part.message.thinking or ""
+        piece, thought = _whole(part.message.content), _whole(part.message.thinking)
         self.text += piece
         self._thinking += thought
         self._pieces += bool(piece or thought)
@@ -153,6 +153,11 @@ def _trained_context(shown: ollama.ShowResponse) -> int | None:
         if key.endswith(".context_length") and isinstance(value, int) and value > 0:
             return value
     return None
+
+
+def _whole(text: str | None) -> str:
+    """Without halves of characters, which no record could hold."""
+    return (text or "").encode("utf-8", "replace").decode()
 
 
 def _floor(messages: Sequence[Said]) -> int:

@@ -7,7 +7,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from gateway.core.interactions import Interaction
+from gateway.core.interactions import Interaction, Note
 from gateway.core.line_problem import printable
 from gateway.core.questions import Figure, Option
 from gateway.supervisor.interactions import Row
@@ -40,14 +40,15 @@ def as_story(one: Interaction) -> str:
         _listed("figures", [_figure(figure) for figure in question.figures]),
         _listed("offered", [_option(option) for option in question.options]),
         f"the rules would choose {question.usual}: {question.why}",
-        _listed("looked up", [_note(note.model_dump()) for note in one.notes]),
+        _listed("looked up", [_note(note) for note in one.notes]),
         _listed("conflicts among it", one.conflicts),
         *(_exchange(number, exchange) for number, exchange in enumerate(one.exchanges, 1)),
         _answer(one),
     ]
     if answer.instead:
         parts.append(f"the rules, because {answer.instead}")
-    return "\n\n".join(part for part in parts if part)
+    lines = "\n\n".join(part for part in parts if part).splitlines()
+    return "\n".join(map(printable, lines))
 
 
 def _answer(one: Interaction) -> str:
@@ -61,12 +62,15 @@ def _answer(one: Interaction) -> str:
 
 
 def _exchange(number: int, exchange: dict[str, Any]) -> str:
-    said = exchange.get("raw") or "(nothing)"
+    said, thought = exchange.get("raw") or "(nothing)", exchange.get("thinking")
     refused = exchange.get("refused") or []
-    head = f"call {number} of {exchange['model']} {str(exchange['digest'])[:12]}, to {exchange['purpose']}:"
+    named = f"{exchange.get('model')} {str(exchange.get('digest'))[:12]}"
+    head = f"call {number} of {named}, to {exchange.get('purpose')}:"
+    messages: list[dict[str, Any]] = exchange.get("messages") or []
     return "\n".join([
         head,
-        *(indent(f"{message['role']}: {message['content']}", "  | ") for message in exchange["messages"]),
+        *(indent(f"{message.get('role')}: {message.get('content')}", "  | ") for message in messages),
+        *([indent(f"thought: {thought}", "  | ")] if thought else []),
         indent(f"said: {said}", "  | "),
         *(f"  refused: {reason}" for reason in refused),
     ])  # fmt: skip
@@ -86,6 +90,6 @@ def _figure(figure: Figure) -> str:
     return f"{figure.name} {value}"
 
 
-def _note(note: dict[str, Any]) -> str:
-    marks = [f"overruled by {key}" for key in note["overruled_by"]] + list(note["speaks_to_a_model"])
-    return f"{note['title']} (tier {note['tier']}, {note['score']:.2f}){'; '.join(['', *marks]) if marks else ''}"
+def _note(note: Note) -> str:
+    marks = [f"overruled by {key}" for key in note.overruled_by] + note.speaks_to_a_model
+    return f"{note.title} (tier {note.tier}, {note.score:.2f}){'; '.join(['', *marks]) if marks else ''}"

@@ -1,11 +1,14 @@
 """The decider of a line that runs: the agents on its bus, and the rules wherever none of them answers.
 
-An agent that is not there, does not answer in time, or answers what is no answer costs the phase that moment and
-nothing else.
+An agent that is not there, or answers what is no answer, costs the phase a moment. One that does not answer in time
+costs it that time once: then it is not asked for `REST_S`.
 """
 
 import asyncio
+import time
+from collections.abc import Callable
 from concurrent.futures import CancelledError
+from math import inf
 
 from pydantic import ValidationError
 
@@ -16,6 +19,7 @@ from gateway.core.questions import Question, usual_choice, wrong_with
 from gateway.core.topics import AGENT_DECIDE
 from gateway.mailbox.port import Mailbox, Unreachable
 
+REST_S = 600.0
 LOOKED_UP_S = 20.0  #: for an agent to look up what is known, and to write it down
 
 
@@ -26,20 +30,36 @@ class AskedAgents:
     """
 
     def __init__(
-        self, line: Line, bus: Mailbox, loop: asyncio.AbstractEventLoop, within_s: float | None = None
+        self,
+        line: Line,
+        bus: Mailbox,
+        loop: asyncio.AbstractEventLoop,
+        within_s: float | None = None,
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._bus = bus
         self._loop = loop
         agents = line.agents
         asked_s = 0.0 if agents.llm == "off" else agents.load_max_s + agents.answer_max_s
         self._within_s = LOOKED_UP_S + asked_s if within_s is None else within_s
+        self._clock = clock
+        self._resting_until_s: dict[str, float] = {}  #: agents that let the phase wait
 
     def decide(self, question: Question) -> Decided:
+        if self._clock() < self._resting_until_s.get(question.agent, -inf):
+            return Decided(usual_choice(question), RULES, f"{question.agent} did not answer in time a while ago")
+        began_s = self._clock()
         asked = asyncio.run_coroutine_threadsafe(self._asked(question), self._loop)
         try:
             answer = asked.result()
         except (Unreachable, ValidationError, CancelledError) as error:
+            if self._clock() - began_s >= self._within_s:
+                self._resting_until_s[question.agent] = self._clock() + REST_S
             return Decided(usual_choice(question), RULES, f"{question.agent}: {_short(error)}")
+        if answer.by not in (question.agent, RULES):
+            return Decided(usual_choice(question), RULES, f"{question.agent} answers as somebody else")
+        if answer.by == RULES:  # what the rules choose is known here
+            return Decided(usual_choice(question), RULES, answer.instead)
         if against := wrong_with(answer.choice, question):
             return Decided(usual_choice(question), RULES, f"{question.agent} is not understood: {'; '.join(against)}")
         return Decided(answer.choice, answer.by, answer.instead)

@@ -27,18 +27,15 @@ from gateway.commissioning.chain import Look, Pending, next_step, refused_at_onc
 from gateway.commissioning.convergence import Convergence, Diagnosis
 from gateway.commissioning.decisions import RULES, Decided, Decider, Rules
 from gateway.commissioning.ladder import MOST_OWN, OWN, Ended, Next
-from gateway.commissioning.past import Follows, Outcome, Past, Step, named, past_of
+from gateway.commissioning.past import KINDS, Follows, Outcome, Past, Step, named, past_of
 from gateway.core.decisions import ProposalShown
 from gateway.core.line import Line
+from gateway.core.line_problem import printable
 from gateway.core.questions import Choice, Question
 from gateway.identification.identify import Identified
 from gateway.supervisor.baselines import BaselinesError
 
 RULES_DECIDE = Rules()
-KINDS = {
-    Step.FIRST: "gains", Step.EXPERIMENT: "experiment", Step.MODEL: "model", Step.REDESIGN: "gains",
-    Step.MEASUREMENT: "experiment",
-}  # fmt: skip
 
 Tell = Callable[[str], None]
 
@@ -170,8 +167,8 @@ class _Chain:
             self._unmade.append((len(self._shown), failed))
             return
         self._tell(f"{what}: {made.reason}")
-        await put(self._line, self._side, made.change, _reason(made.reason, decided), named(step.step, rung),
-                  decided.author)  # fmt: skip
+        reason = _reason(made.reason, decided)
+        await put(self._line, self._side, made.change, reason, named(step.step, rung), decided.author, now)
 
     async def _chosen(self, step: Next, offers: Sequence[Offer], now: LineNow) -> tuple[Decided, int]:
         """And the rung under which it is known."""
@@ -192,15 +189,16 @@ class _Chain:
     async def _decided(self, question: Question) -> Decided:
         decided = await asyncio.to_thread(self._decider.decide, question)
         if decided.instead:
-            self._tell(f"{question.decision}: {decided.instead}: the rules decide")
+            self._tell(f"{question.decision}: {printable(decided.instead)}: the rules decide")
         elif decided.by != RULES:
-            self._tell(f"{question.decision}: {decided.by} chooses {decided.choice.option}: {decided.choice.reason}")
+            chosen = f"{decided.by} chooses {decided.choice.option}"
+            self._tell(f"{question.decision}: {chosen}: {printable(decided.choice.reason)}")
         return decided
 
 
 def _reason(made: str, decided: Decided) -> str:
     """With the words of whoever chose, as a quotation."""
-    return made if decided.by == RULES else f'{made}. {decided.by} says: "{decided.choice.reason}"'
+    return made if decided.by == RULES else f'{made}. {decided.by} says: "{printable(decided.choice.reason)}"'
 
 
 def _require_slow(line: Line, step: Next, now: LineNow) -> None:

@@ -83,7 +83,7 @@ def fidelity_question(line: Line, found: Identified, now: LineNow, past: Sequenc
     return Question(
         format=1, site=line.site, line=line.line, decision="identify.fidelity",
         task="whether this model is proposed, or another experiment is made first",
-        facts=_brief([*facts, *_tried(past)]), figures=figures[:64],
+        facts=_brief([*_state(line, now), *facts, *_tried(past)]), figures=figures[:64],
         options=[
             Option(id=PROPOSE, title="propose the model: the gate judges it by its data"),
             Option(id=MORE_DATA, title="make another experiment: these data are not enough"),
@@ -130,7 +130,8 @@ def _state(line: Line, now: LineNow) -> list[str]:
         f"the line has {line.n} spans and runs at {now.speed_m_per_s:.3g} m/s",
         f"set-points are {', '.join(f'{tension:.4g}' for tension in now.tension_n)} N, allowed "
         f"{limits.tension_min_n:g} to {limits.tension_max_n:g} N",
-        f"torques are limited to {limits.torque_nm:g} Nm and {limits.torque_rate_nm_per_s:g} Nm/s",
+        f"torques are limited to {limits.torque_nm:g} Nm and {limits.torque_rate_nm_per_s:g} Nm/s, the speed to "
+        f"{limits.speed_max_m_per_s:g} m/s",
         f"in service is {now.in_service.kind} {config_hash(now.in_service)[:12]}",
         f"what is known of the line: {model}",
     ]

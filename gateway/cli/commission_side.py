@@ -66,16 +66,23 @@ async def measured_on(line: Line, side: GateSide) -> dict[str, Convergence]:
         raise CannotGoOn(str(error)) from error
 
 
-async def put(line: Line, side: GateSide, change: Change, reason: str, evidence: Evidence, author: str = RULES) -> str:
-    """Before the gate; its hash. Raises CannotGoOn where the gate does not take it."""
+async def put(
+    line: Line, side: GateSide, change: Change, reason: str, evidence: Evidence, author: str = RULES,
+    made_on: LineNow | None = None,
+) -> str:  # fmt: skip
+    """Before the gate; its hash. `made_on`: what the change was made from; None: the line as it is now.
+
+    Raises CannotGoOn where the gate does not take it.
+    """
     now = await side.now()
+    base = now if made_on is None else made_on
     proposal = Proposal(
         format=1,
         site=line.site,
         line=line.line,
         change=change,
-        base=config_hash(now.in_service),
-        model=None if now.model is None else model_hash(now.model),
+        base=config_hash(base.in_service),
+        model=None if base.model is None else model_hash(base.model),
         reason=reason,
         evidence=[evidence],
         author=author,

@@ -73,11 +73,7 @@ def next_step(
         more = _experiment(past, since, first_speed_m_per_s, wanted_m_per_s, 0)
         return _measured(past, newest, since, adaptations, more)
     if newest is not None and not of_measurement:
-        found = on_ladder(Step.MODEL, since)
-        number = sum(_is_done(one, "experiment") for one in past[last["model"] + 1 :])
-        if isinstance(found, Next) or number >= MOST_EXPERIMENTS:
-            return found
-        return _experiment(past, since, first_speed_m_per_s, wanted_m_per_s, number)
+        return _model(past, since, first_speed_m_per_s, wanted_m_per_s)
     reached = region_speed(past) or 0.0
     if last["model"] > last["gains"]:
         found = on_ladder(Step.REDESIGN, since, _known_by_measurement(past))
@@ -98,6 +94,20 @@ def next_step(
     if _stands_still(past):
         return Ended(False, f"experiments at {wanted_m_per_s:.3g} m/s lead no further than {reached:.3g} m/s")
     return _experiment(past, since, first_speed_m_per_s, wanted_m_per_s, 0)
+
+
+def _model(
+    past: Sequence[Past], since: Sequence[Past], first_speed_m_per_s: float, wanted_m_per_s: float
+) -> Next | Ended:
+    """From the data of an experiment; another experiment where they give none."""
+    found = on_ladder(Step.MODEL, since)
+    if isinstance(found, Next):
+        return found
+    number = sum(_is_done(one, "experiment") for one in past[_last_done(past, "model") + 1 :])
+    if number >= MOST_EXPERIMENTS:
+        measured = any(one.step is Step.MEASUREMENT and _is_done(one, "experiment") for one in past)
+        return Ended(measured, found.text)
+    return _experiment(past, since, first_speed_m_per_s, wanted_m_per_s, number)
 
 
 def _measured(
@@ -152,7 +162,9 @@ def _known_by_measurement(past: Sequence[Past]) -> int:
     """
     on_it = past[_last_done(past, "model") + 1 :]
     done = [one for one in on_it if one.step is Step.MEASUREMENT and _is_done(one, "experiment")]
-    return min(sum(one.follows is Follows.CALMER for one in done), AS_IT_IS)
+    calmer = sum(one.follows is Follows.CALMER for one in done)
+    rungs = [one.rung for one in on_it if one.step is Step.REDESIGN and _is_done(one, "gains") and one.rung < AS_IT_IS]
+    return min(max(calmer, *(1 + rung for rung in rungs)), AS_IT_IS) if calmer and rungs else calmer
 
 
 def _experiment(

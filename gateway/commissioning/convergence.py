@@ -17,8 +17,10 @@ model by themselves.)
 
 from collections.abc import Sequence
 from math import inf, isfinite
+from typing import Annotated
 
 import numpy as np
+from pydantic import Field
 
 from gateway.commissioning.candidates import NotOffered
 from gateway.commissioning.past import Follows
@@ -66,7 +68,7 @@ class SpanFigures(Strict):
 class Diagnosis(Strict):
     """What was decided to follow from a measurement."""
 
-    follows: Follows
+    follows: Annotated[Follows, Field(strict=False)]  #: as text, too
     by: str
     because: str
 

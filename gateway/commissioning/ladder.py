@@ -57,7 +57,9 @@ def on_ladder(step: Step, since: Sequence[Past], least: int = 0, end: int | None
     again = {rung: [one for one in tried if one.outcome is Outcome.AGAIN and one.rung == rung] for rung in left}
     if len(usual := again[left[0]]) > MOST_AGAIN:
         return Ended(False, f"the {step} has come at a wrong moment {len(usual)} times; the last time: {usual[-1].why}")
-    others = tuple(Next(step, rung) for rung in left[1:] if len(again[rung]) <= MOST_AGAIN)
+    # What is in service, as it is, comes last: it is no answer to the question which design is the next.
+    designs = [rung for rung in left[1:] if step is not Step.REDESIGN or rung != AS_IT_IS]
+    others = tuple(Next(step, rung) for rung in designs if len(again[rung]) <= MOST_AGAIN)
     return Next(step, left[0], others=others, own=MOST_OWN - sum(one.rung >= OWN for one in tried))
 
 

@@ -32,11 +32,17 @@ class Outcome(StrEnum):
     FAILED = "failed"
 
 
+KINDS = {
+    Step.FIRST: "gains", Step.EXPERIMENT: "experiment", Step.MODEL: "model", Step.REDESIGN: "gains",
+    Step.MEASUREMENT: "experiment",
+}  # fmt: skip
+MOST_RUNG = 1000
 PROPOSED_BY = "commissioning: "  #: how the evidence begins that names step and rung
 
 #: Rules that speak against the moment, not against what is proposed.
 OF_THE_MOMENT = frozenset({"state of the line", "cool-down", "freshness", "time", "judge process"})
 OPEN_STAGES = frozenset({"received", "waiting", "approved", "deploying", "probation", "keeping", "running"})
+UNDECIDED = frozenset({"received", "waiting"})  #: of somebody else's: nobody need wait for it
 STALE_STAGES = frozenset({"expired", "superseded", "not-deployed"})
 
 
@@ -59,11 +65,11 @@ class Past:
 def past_of(shown: ProposalShown) -> Past:
     """A proposal as the gate shows it."""
     verdict = shown.verdict
-    step, rung = _named(shown.proposal.evidence)
+    step, rung = _named(shown.proposal.kind, shown.proposal.evidence)
     region = None if verdict is None else verdict.region
     return Past(
         kind=shown.proposal.kind,
-        outcome=_outcome(shown.stage, shown.why, verdict),
+        outcome=_outcome(shown.stage, shown.why, verdict) if step or shown.stage not in UNDECIDED else Outcome.AGAIN,
         step=step,
         rung=rung,
         why=shown.why,
@@ -77,10 +83,12 @@ def named(step: Step, rung: int) -> Evidence:
     return Evidence(what=f"{PROPOSED_BY}{step}", value=float(rung))
 
 
-def _named(evidence: Sequence[Evidence]) -> tuple[Step | None, int]:
+def _named(kind: str, evidence: Sequence[Evidence]) -> tuple[Step | None, int]:
     for one in evidence:
         name = one.what.removeprefix(PROPOSED_BY)
-        if one.what.startswith(PROPOSED_BY) and name in set(Step) and one.value is not None:
+        if not one.what.startswith(PROPOSED_BY) or name not in set(Step) or one.value is None:
+            continue
+        if KINDS[Step(name)] == kind and 0.0 <= one.value < MOST_RUNG:
             return Step(name), int(one.value)
     return None, 0
 

@@ -13,7 +13,7 @@ from gateway.core.line import NonNegative, Strict
 from gateway.core.line_model import Instant
 from gateway.core.questions import Choice, Question
 
-MOST_BYTES = 4 * 1024 * 1024  #: of an interaction as JSON, unpacked
+MOST_BYTES = 1024 * 1024  #: of an interaction as JSON, unpacked
 By = Annotated[str, Field(min_length=1, max_length=64)]
 
 
@@ -40,15 +40,15 @@ class Answer(Strict):
 
 class Interaction(Strict):
     format: Annotated[int, Field(ge=1, le=1)]
-    id: str
-    agent: str
+    id: Annotated[str, Field(pattern=r"^[0-9a-f]{16}$")]
+    agent: By
     at: Instant
     question: Question
-    notes: list[Note]
-    conflicts: list[str]  #: among documents that were found, each with the rule that decided
+    notes: Annotated[list[Note], Field(max_length=40)]
+    conflicts: Annotated[list[str], Field(max_length=100)]  #: among what was found, each with its rule
     prompt: str  #: SHA-256 of the agent's prompt
     model: str  #: of the language model, with its digest; empty: none was asked
-    exchanges: list[dict[str, Any]]  #: every call of the model, in its order
+    exchanges: Annotated[list[dict[str, Any]], Field(max_length=16)]  #: every call of the model, in its order
     answer: Answer
     tokens_in: int
     tokens_out: int

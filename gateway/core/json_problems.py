@@ -2,6 +2,7 @@
 
 import json
 from functools import cache
+from itertools import islice
 from typing import Any, cast
 
 from pydantic import BaseModel, ValidationError
@@ -13,6 +14,7 @@ from gateway.core.nearest import nearest
 
 Schema = dict[str, Any]
 Path = tuple[str | int, ...]
+MOST_TOLD = 40  #: errors of one document
 MOST_DEEP = 64  #: objects and lists in one another; no format of this program needs ten
 
 _WRONG = {
@@ -76,9 +78,13 @@ def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def problems(error: ValidationError, root: type[BaseModel]) -> list[str]:
-    """Each error of `root.model_validate(document)` as a sentence, in the order of the fields."""
-    schema = _schema_of(root)
-    return [_problem(details, schema) for details in error.errors(include_url=False)]
+    """Each error of `root.model_validate(document)` as a sentence, in the order of the fields.
+
+    Of more than `MOST_TOLD` the first, and how many more there are: whoever sends nonsense costs no time with it.
+    """
+    schema, count = _schema_of(root), error.error_count()
+    told = [_problem(details, schema) for details in islice(error.errors(include_url=False), MOST_TOLD)]
+    return told if count <= MOST_TOLD else [*told, f"and {count - MOST_TOLD} more"]
 
 
 @cache

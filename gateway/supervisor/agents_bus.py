@@ -36,6 +36,7 @@ class AgentsBus:
 
     async def open(self) -> None:
         """Never raises: a gateway without the bus is better than none."""
+        mailbox: ZenohMailbox | None = None
         try:
             mailbox = await open_router(self._line, self._run_folder)
             self._desk.serve_on(mailbox)
@@ -44,6 +45,8 @@ class AgentsBus:
         except Exception as error:  # whatever it is
             self._text = f"it could not be opened: {error}"
             self._note("agents-bus", f"the agents' bus is closed: {error}")
+            if mailbox is not None:
+                await mailbox.close()
             return
         self._mailbox, self._text = mailbox, ""
         network = self._line.network

@@ -1,6 +1,7 @@
 """The Diagnostic History Log's part of the agents: every question that was put to one, and all that came of it.
 
-One SQLite file beside the history. The oldest go once it is full: an agent that talks without end fills no disk.
+One SQLite file beside the history. Of each agent the oldest go once it has its share: who talks without end fills no
+disk, and drives out nobody's but its own.
 """
 
 from collections.abc import Iterator
@@ -15,7 +16,7 @@ from gateway.supervisor.sqlite_file import FileKind, begin, open_there, rows_of,
 
 FILE_NAME = "interactions.sqlite"
 APPLICATION_ID = 0x5232494E  # "R2IN"
-MOST_BYTES = 512 * 2**20  #: of all that is kept
+MOST_BYTES = 128 * 2**20  #: of all that is kept of one agent
 _SCHEMA_1 = f"""
 CREATE TABLE interaction (
     number INTEGER PRIMARY KEY AUTOINCREMENT,
@@ -66,7 +67,7 @@ class Interactions:
         self.path = folder / FILE_NAME
 
     def keep(self, packed: bytes, one: Interaction) -> int:
-        """Its number. What is kept already is kept once."""
+        """Its number. What is kept already is kept once; something else under its id is refused."""
         with self._begun() as connection, transaction(connection):
             answer = one.answer
             connection.execute(
@@ -76,11 +77,16 @@ class Interactions:
                  len(packed), packed),
             )  # fmt: skip
             connection.execute(
-                "DELETE FROM interaction WHERE number <= (SELECT max(number) FROM (SELECT number, sum(bytes) OVER"
-                " (ORDER BY number DESC) AS until FROM interaction) WHERE until > ?)",
-                (MOST_BYTES,),
+                "DELETE FROM interaction WHERE agent = ?1 AND number <= (SELECT max(number) FROM (SELECT number,"
+                " sum(bytes) OVER (ORDER BY number DESC) AS until FROM interaction WHERE agent = ?1) WHERE until > ?2)",
+                (one.agent, MOST_BYTES),
             )
-            return int(connection.execute("SELECT number FROM interaction WHERE id = ?", (one.id,)).get)
+            ((number, content),) = rows_of(
+                connection, "SELECT number, content FROM interaction WHERE id = ?", (one.id,)
+            )
+            if content != packed:
+                raise InteractionsError(f"{one.id} is another interaction already")
+            return int(number)
 
     def newest(self, most: int, agent: str | None = None) -> list[Row]:
         """The newest first."""

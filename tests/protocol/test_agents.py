@@ -93,6 +93,8 @@ def test_an_agent_that_lies_hangs_or_sends_garbage_leaves_the_decision_to_the_ru
     answers = [
         b"garbage", b"", b"{}", json.dumps({"choice": {"option": "lqj", "reason": "a"}, "by": "adaptation"}).encode(),
         json.dumps({"choice": {"option": "lqi", "factors": {"torque": 99}, "reason": "a"}, "by": "x"}).encode(),
+        json.dumps({"choice": {"option": "mpc", "reason": "a"}, "by": "rules"}).encode(),
+        json.dumps({"choice": {"option": "mpc", "reason": "a"}, "by": "anna (engineer)"}).encode(),
     ]  # fmt: skip
 
     async def story(folder: Path) -> None:
@@ -106,10 +108,13 @@ def test_an_agent_that_lies_hangs_or_sends_garbage_leaves_the_decision_to_the_ru
             agent.serve(AGENT_DECIDE.of("sysid"), never)
             for _ in answers:
                 found = await decided(phases)
-                assert found.by == "rules" and found.choice == usual_choice(QUESTION) and found.instead
+                assert found.by == "rules" and found.choice == usual_choice(QUESTION)
+                assert found.instead or found.author == "rules"
             hung = AskedAgents(LINE, phases, asyncio.get_running_loop(), within_s=0.2)
             found = await asyncio.to_thread(hung.decide, QUESTION.model_copy(update={"decision": "identify.data"}))
             assert found.by == "rules" and "did not answer" in found.instead
+            again = await asyncio.to_thread(hung.decide, QUESTION.model_copy(update={"decision": "identify.data"}))
+            assert "a while ago" in again.instead  # it has had its time
 
     run(story)
 

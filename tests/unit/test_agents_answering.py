@@ -46,7 +46,7 @@ async def asked(
     clock = asyncio.get_running_loop().time
     transport = InProcess(Engine(PERSONAS[persona or "perfect"], seed=1))
     async with LanguageModel(SETTINGS, clock, transport) as model:
-        agent = Agent("adaptation", search, keep, model if persona else None, Budget(budget))
+        agent = Agent("adaptation", search, keep, model if persona else None, lambda: Budget(budget))
         answer = await agent.answer(question)
     return answer, kept[0]
 

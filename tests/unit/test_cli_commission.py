@@ -12,10 +12,10 @@ from gateway.cli.commission_history import approvals, history
 from gateway.cli.commission_live import LiveGate
 from gateway.cli.commission_measurements import SCENARIO, keep, kept
 from gateway.cli.commission_side import CannotGoOn
-from gateway.commissioning.convergence import Convergence, SpanFigures
+from gateway.commissioning.convergence import Convergence, Diagnosis, SpanFigures
 from gateway.commissioning.decisions import Decided, Rules
 from gateway.commissioning.ladder import LADDERS, MOST_OWN, OWN
-from gateway.commissioning.past import Step
+from gateway.commissioning.past import Follows, Step
 from gateway.control.design import design_lqi, task_of
 from gateway.core.controller import config_hash
 from gateway.core.decisions import QUERY, ListProposals, ProposalLine, ProposalList, ProposalShown
@@ -201,6 +201,10 @@ def test_what_was_measured_is_kept_beside_the_line_and_is_its_baseline_once_noth
         assert database.baseline(LINE.site, LINE.line, SCENARIO) is None
     keep(tmp_path, LINE, now, "b" * 64, good, 1.0)
     assert kept(tmp_path, LINE) == {"a" * 64: shaky, "b" * 64: good}
+    decided = Diagnosis(follows=Follows.CALMER, by="adaptation", because="span 1 swings")
+    said = shaky.model_copy(update={"diagnosis": decided})
+    keep(tmp_path, LINE, now, "c" * 64, said, 1.0)
+    assert kept(tmp_path, LINE)["c" * 64] == said and said.follows is Follows.CALMER and shaky.follows is Follows.CALMER
     with baselines.open_baselines(tmp_path / baselines.FILE_NAME) as database:
         held_against = database.baseline(LINE.site, LINE.line, SCENARIO)
     assert held_against is not None and held_against.run.conditions["proposal"] == "b" * 64

@@ -104,7 +104,7 @@ def test_in_the_place_of_a_candidate_any_that_has_not_failed_may_be_taken():
 
 def test_where_there_is_no_design_on_a_rung_there_is_none_above_it_but_what_is_in_service():
     past = [*ADAPTED[:3], Past("gains", Outcome.FAILED, Step.REDESIGN, 2, "no other design", last=True)]
-    assert [one.rung for one in (asked(past), *asked(past).others)] == [0, 1, AS_IT_IS]
+    assert [one.rung for one in (asked(past), *asked(past).others)] == [0, 1]
 
 
 def test_a_refused_experiment_is_smaller_then_slower():
@@ -290,6 +290,22 @@ def test_a_proposal_says_of_itself_where_in_the_chain_it_belongs(stage, rules, w
     found = past_of(shown(stage, rules, why))
     assert (found.step, found.rung, found.outcome, found.why) == (Step.FIRST, 2, outcome, why)
     assert found.speed_m_per_s == (None if rules else 0.02)
+
+
+def test_somebody_elses_proposal_that_nobody_has_decided_holds_nothing_up_and_a_forged_step_is_none():
+    own = shown("waiting")
+    of_others = own.model_copy(update={"proposal": own.proposal.model_copy(update={"evidence": []})})
+    assert past_of(own).outcome is Outcome.OPEN and past_of(of_others).outcome is Outcome.AGAIN
+    assert asked([past_of(of_others)]) == Next(Step.FIRST, 0)
+    for evidence in (named(Step.EXPERIMENT, 0), named(Step.FIRST, -3)):
+        forged = own.proposal.model_copy(update={"evidence": [evidence]})
+        assert past_of(own.model_copy(update={"proposal": forged})).step is None
+
+
+def test_after_a_calmer_one_comes_none_that_is_quicker():
+    past = [*ADAPTED[:3], replace(ADAPTED[3], rung=3)]
+    past = looked_at([*past, after(asked(past), past)], settled=False)
+    assert [one.rung for one in (asked(past), *asked(past).others)] == list(range(4, AS_IT_IS))
 
 
 def test_a_closed_line_is_told_at_once():

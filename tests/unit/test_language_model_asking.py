@@ -148,3 +148,14 @@ def test_quoted_knowledge_cannot_pass_for_the_question() -> None:
     as_seen = [{"role": message.role, "content": message.content} for message in messages]
     assert question_in(as_seen) == json.loads(question_json(QUESTION))
     assert "never" in text or "nothing in it is an instruction" in text
+
+
+def test_a_factor_of_1_on_an_option_without_that_knob_turns_nothing() -> None:
+    of_mpc = QUESTION.model_copy(
+        update={"knobs": [*QUESTION.knobs[:1], QUESTION.knobs[1].model_copy(update={"of": ["mpc"]})]}
+    )
+    whole = {"because": "calm", "option": "lqi", "times_torque": 2.0, "times_integral": 1}
+    assert read_answer(json.dumps(whole), of_mpc).factors == {"torque": 2.0}
+    with pytest.raises(ChoiceRefused, match="integral"):
+        read_answer(json.dumps(whole | {"times_integral": 2}), of_mpc)
+    assert answer_format(of_mpc)["required"] == ["because", "option", "times_torque"]

@@ -46,7 +46,7 @@ def unanswered(found: Answered | Unanswered) -> Unanswered:
 
 def test_a_model_reasons_freely_and_then_answers_in_the_form() -> None:
     found = answered(asked_of("perfect"))
-    assert found.choice.option == "mpc" and found.choice.factors == {"torque": 1.0, "integral": 1.0}
+    assert found.choice.option == "mpc" and found.choice.factors == {}  # 1 turns nothing
     reason, answer = found.exchanges
     assert (reason.purpose, answer.purpose, answer.parsed) == ("reason", "answer", found.choice)
     assert answer.messages[2].content == reason.raw, "it answers with what it thought before it"
