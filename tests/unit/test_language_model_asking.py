@@ -108,7 +108,7 @@ def test_every_choice_that_fits_can_be_said(option: str, torque: float, integral
     answer = json.dumps(
         {"because": because, "option": option, "times_integral": integral, "times_torque": torque}, ensure_ascii=False
     )
-    factors = {"torque": torque, "integral": integral}
+    factors = {name: factor for name, factor in (("torque", torque), ("integral", integral)) if factor != 1.0}
     assert read_answer(answer, QUESTION) == Choice(option=option, factors=factors, reason=because)
 
 
