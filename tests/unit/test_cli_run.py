@@ -30,12 +30,13 @@ PLANT = ROOT / "sim_plant" / "plants" / "s_real.toml"
 TEXT = line_template(6)
 
 Scripts = dict[str, str]
+WAITS = "import signal; signal.sigwait([signal.SIGTERM])"
 
 
 @pytest.fixture
 def scripts(monkeypatch: pytest.MonkeyPatch) -> Iterator[Scripts]:
     """In place of r2rgate's processes: a line of Python for each child, by its name; it finds its arguments in argv."""
-    playing: Scripts = {}
+    playing: Scripts = {"agents": WAITS}
     begun: list[subprocess.Popen[str]] = []
 
     def start(arguments: list[str], log: Path) -> subprocess.Popen[str]:
@@ -108,9 +109,6 @@ def run(folder: Path, plant: Path | None = None) -> int:
     return run_together(folder / "line.toml", line, folder / "c.json", plant, folder, folder)
 
 
-WAITS = "import signal; signal.sigwait([signal.SIGTERM])"
-
-
 @pytest.mark.parametrize("code", [2, 3])
 def test_a_refused_child_ends_all_with_its_words_and_its_code(
     code: int, scripts: Scripts, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -132,6 +130,22 @@ def test_a_refused_child_ends_all_with_its_words_and_its_code(
         f"gateway has ended with exit code {code}\n  the end of {tmp_path / 'gateway.log'}:\n    no such thing" in told
     )
     assert rests.exists()
+
+
+@pytest.mark.parametrize("code", [2, 3])
+def test_agents_that_are_refused_are_told_and_end_nothing(
+    code: int, scripts: Scripts, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scripts["gateway"] = scripts["loop"] = WAITS
+    # The first start is refused, the second asks the parent to end, as Ctrl-C does.
+    scripts["agents"] = (
+        "import os, pathlib, signal\n"
+        f"again = pathlib.Path({str(tmp_path / 'again')!r})\n"
+        "if again.exists():\n    os.kill(os.getppid(), signal.SIGINT); signal.sigwait([signal.SIGTERM])\n"
+        f"again.touch(); raise SystemExit({code})"
+    )
+    assert run(tmp_path) == 0
+    assert f"agents has ended with exit code {code}" in capsys.readouterr().err
 
 
 def test_a_crash_is_told_and_the_child_comes_back(
