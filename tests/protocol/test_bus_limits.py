@@ -66,7 +66,7 @@ def test_a_subscriber_that_does_not_keep_up_loses_messages_which_are_counted_and
             assert told > MOST_WAITING
             await until(lambda: flooding.publish(topic, b"%d" % told) and heard[-1:] == [told])
             assert heard == sorted(heard)
-            assert len(set(heard)) < told
+            assert len(set(heard)) < told + 2  # -1 and the last are heard as well
         finally:
             await flooding.close()
             await hall.close()

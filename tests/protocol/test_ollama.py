@@ -59,9 +59,11 @@ def test_the_slow_one_ends_when_it_has_the_time() -> None:
     assert isinstance(late, Unanswered) and late.kind == "late"
 
 
-@pytest.mark.parametrize("seed", range(5))
-def test_the_sloppy_one_answers_all_the_same(seed: int) -> None:
-    assert option(asked(Engine(PERSONAS["sloppy"], seed))) in ("lqi", "pid-calm", "mpc")
+def test_the_sloppy_one_mostly_answers_all_the_same() -> None:
+    found = [asked(Engine(PERSONAS["sloppy"], seed)) for seed in range(10)]
+    answered = [option(one) for one in found if isinstance(one, Answered)]
+    assert len(answered) > 5 and set(answered) <= {"lqi", "pid-calm", "mpc"}
+    assert all(one.kind == "no-choice" for one in found if isinstance(one, Unanswered))
 
 
 def test_the_adversary_gets_no_further_than_the_worst_that_was_offered() -> None:
