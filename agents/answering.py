@@ -40,13 +40,16 @@ class Clocks:
     now: Callable[[], datetime] = lambda: datetime.now(UTC)
 
 
+SYSTEM = Clocks()
+
+
 class Agent:
     """One of `ROLES`. `model` None: the rules answer, with what is known quoted beside it. `keep` raises nothing."""
 
     def __init__(
         self, name: AgentName, search: Search, keep: Keep, model: LanguageModel | None,
         budget: Callable[[], Budget],
-        clocks: Clocks = Clocks(),  # noqa: B008 - frozen
+        clocks: Clocks = SYSTEM,
     ) -> None:  # fmt: skip
         self.role: Role = ROLES[name]
         self._search = search

@@ -24,6 +24,7 @@ MOST_FACTS = 24
 MOST_LETTERS = 600
 PROPOSE, MORE_DATA = "propose", "more-data"
 
+#: A measurement leaves nothing to choose.
 _ASKED: dict[Step, tuple[Decision, str, str]] = {
     Step.FIRST: (
         "design.architecture",
@@ -44,11 +45,6 @@ _ASKED: dict[Step, tuple[Decision, str, str]] = {
         "adapt.change",
         "which configuration is proposed on the accepted model",
         "the first has the least tracking error on the model of those that do no worse than what is in service",
-    ),
-    Step.MEASUREMENT: (
-        "adapt.convergence",
-        "how what the configuration in service does is measured",
-        "the line's own steps, as far as the region permits",
     ),
 }
 

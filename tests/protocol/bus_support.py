@@ -10,6 +10,7 @@ from ipaddress import ip_address
 from pathlib import Path
 from typing import Any
 
+import zenoh
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
@@ -75,6 +76,11 @@ def run(story: Callable[[Path], Coroutine[Any, Any, None]]) -> None:
         asyncio.run(bounded(folder))
 
 
+def session_of(mailbox: ZenohMailbox) -> zenoh.Session:
+    """Its own, for what a forger or a spy does beside the mailbox."""
+    return mailbox._session  # noqa: SLF001 - no product code may have it
+
+
 @asynccontextmanager
 async def router(folder: Path, line: Line = LINE) -> AsyncIterator[ZenohMailbox]:
     mailbox = await open_router(line, folder)
@@ -100,7 +106,7 @@ async def opened(settings: dict[str, Any], clock: Callable[[], float] = time.mon
 
 async def raw_answers(mailbox: ZenohMailbox, key: str, payload: bytes) -> list[str]:
     """What is answered to a request that no mailbox has looked at before it was sent; refusals as they are worded."""
-    session = mailbox._session  # noqa: SLF001
+    session = session_of(mailbox)
     replies = await asyncio.to_thread(lambda: list(session.get(key, payload=payload, timeout=0.5)))
     return [bytes((reply.ok or reply.err).payload).decode() for reply in replies]
 

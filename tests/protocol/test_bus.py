@@ -25,6 +25,7 @@ from tests.protocol.bus_support import (
     opened,
     router,
     run,
+    session_of,
     unguarded,
 )
 from tests.unit.supervisor_support import child, line_of, until
@@ -177,7 +178,7 @@ def test_when_the_gateway_comes_again_its_agents_are_back_by_themselves() -> Non
 def test_a_request_ends_with_the_token_of_who_serves_even_where_zenoh_still_waits() -> None:
     async def story(folder: Path) -> None:
         async with router(folder) as gateway, client(folder) as agents:
-            session, key = agents._session, f"demo/line-1/{DECIDE.name}"  # noqa: SLF001
+            session, key = session_of(agents), f"demo/line-1/{DECIDE.name}"
             asked: list[zenoh.Query] = []
             served = session.declare_queryable(key, zenoh.handlers.Callback(asked.append, indirect=False))
             token = session.liveliness().declare_token(key)

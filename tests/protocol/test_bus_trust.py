@@ -35,6 +35,7 @@ from tests.protocol.bus_support import (
     opened,
     router,
     run,
+    session_of,
 )
 from tests.unit.supervisor_support import until
 
@@ -183,9 +184,9 @@ def test_nothing_is_published_and_nothing_is_overheard(key: str) -> None:
         async with router(folder) as gateway, client(folder) as forger, client(folder) as spy:
             heard: list[str] = []
             overheard: list[str] = []
-            inside, outside = _session(gateway), _session(forger)
+            inside, outside = session_of(gateway), session_of(forger)
             hears = inside.declare_subscriber(key, _into(heard))
-            overhears = _session(spy).declare_subscriber(key, _into(overheard))
+            overhears = session_of(spy).declare_subscriber(key, _into(overheard))
             gateway.serve(STATUS, echo)
             plain = key if key != "**" else "demo/line-1/x"
             for _ in range(100):
@@ -209,7 +210,7 @@ def test_the_line_beside_cannot_be_reached_with_the_certificate_of_this_one() ->
         line, address = on_network(authority, ["agents"])
         own = endpoint(address, authority, "agents", authority)
         async with router(folder, line) as gateway:
-            beside = ZenohMailbox(_session(gateway), "demo", "line-2")  # whose gateway has the same router
+            beside = ZenohMailbox(session_of(gateway), "demo", "line-2")  # whose gateway has the same router
             beside.serve(STATUS, forged)
             gateway.serve(STATUS, echo)
             async with client(own, line="line-2") as agents:
@@ -266,10 +267,6 @@ def _links() -> list[Path]:
             link.readlink()
             found.append(link)
     return found
-
-
-def _session(mailbox: ZenohMailbox) -> zenoh.Session:
-    return mailbox._session  # noqa: SLF001
 
 
 def _into(heard: list[str]) -> Any:
