@@ -14,7 +14,7 @@ import numpy as np
 
 from gateway.cli.identify_model import model_of_found
 from gateway.commissioning.architectures import ARCHITECTURES
-from gateway.commissioning.candidates import FIRST_LAWS, Exhausted, Law, NotOffered, configuration, experiment
+from gateway.commissioning.candidates import FIRST_LAWS, Exhausted, Law, NotOffered, at_end, configuration, experiment
 from gateway.commissioning.chain import first_legs
 from gateway.commissioning.convergence import Convergence, convergence, measurement
 from gateway.commissioning.ladder import AS_IT_IS, Next
@@ -118,7 +118,9 @@ class Changes:
                 self._asked(replace(now, in_service=controller), first_legs(speed), 1.0, 0)
             except NotOffered as refused:
                 raise NotOffered(f"{turned.text}: under it no experiment can be designed: {refused}") from refused
-            return Made(GainsChange(controller=controller), f"{turned.text} on the line's file, to begin with")
+            said = [f"{turned.text} on the line's file, to begin with"]
+            said += at_end(self.line, None, speed, turned) if factors else []
+            return Made(GainsChange(controller=controller), "; ".join(said))
 
         return Offer(step.rung, f"{law.text} on the line's file", make, _knobs(law), law)
 
@@ -215,11 +217,12 @@ class Changes:
 
     def _redesign(self, rung: int, one: Redesign, now: LineNow, on: str) -> Offer:
         def make(factors: Factors) -> Made:
-            law, controller = one.law, one.controller
-            if factors:
-                law = law.turned(factors)
-                controller = configuration(self.line, now.model, one.speed_m_per_s, law)
-            return Made(GainsChange(controller=controller), f"{law.text} {on}")
+            if not factors:
+                return Made(GainsChange(controller=one.controller), f"{one.law.text} {on}")
+            law = one.law.turned(factors)
+            controller = configuration(self.line, now.model, one.speed_m_per_s, law)
+            said = [f"{law.text} {on}", *at_end(self.line, now.model, one.speed_m_per_s, law)]
+            return Made(GainsChange(controller=controller), "; ".join(said))
 
         return Offer(rung, one.law.text, make, _knobs(one.law), one.law, one)
 

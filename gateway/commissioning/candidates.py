@@ -25,6 +25,7 @@ from safety.limits import envelope_limits
 
 HELD = 0.9  #: of the torque limit: more leaves no room to move
 LEFT_OPEN = 0.05  #: of a value that was found: what data leave open, and what drifts
+ENDS = 1e-6  #: relative: a knob that is turned no further
 NEAR = 0.98  #: of the speed that is wanted, which is as good
 GRID = 20  #: parts of the greatest speed that are looked at
 #: Of what rollers may run ahead of the web in an experiment: the gate looks at more than the mean, under stress.
@@ -83,12 +84,28 @@ def configuration(line: Line, model: LineModel | None, speed_m_per_s: float, law
 
 def designed(task: DesignTask, law: Law) -> Controller:
     """Raises DesignRefused."""
-    architecture = ARCHITECTURES[law.name]
-    values = architecture.first(task)
-    for knob in architecture.knobs:
-        factor = dict(law.factors).get(knob.name, 1.0)
-        values[knob.name] = min(max(values[knob.name] * factor, knob.least), knob.most)
-    return architecture.design(task, values)
+    return ARCHITECTURES[law.name].design(task, values_of(task, law))
+
+
+def values_of(task: DesignTask, law: Law) -> dict[str, float]:
+    """Of the knobs: what the architecture begins with, times the law's factors, within the knobs' ends."""
+    architecture, factors = ARCHITECTURES[law.name], dict(law.factors)
+    first = architecture.first(task)
+    return {
+        knob.name: min(max(first[knob.name] * factors.get(knob.name, 1.0), knob.least), knob.most)
+        for knob in architecture.knobs
+    }
+
+
+def at_end(line: Line, model: LineModel | None, speed_m_per_s: float, law: Law) -> list[str]:
+    """Knobs of `law` that end before its factors do; see `configuration`."""
+    task, factors = _task(_no_faster(line, speed_m_per_s), model), dict(law.factors)
+    first, values = ARCHITECTURES[law.name].first(task), values_of(task, law)
+    return [
+        f"{name} ends at {values[name]:g}, times {values[name] / first[name]:.3g}"
+        for name, factor in factors.items()
+        if abs(values[name] - first[name] * factor) > ENDS * values[name]
+    ]
 
 
 def experiment(

@@ -103,7 +103,8 @@ def _model(
     found = on_ladder(Step.MODEL, since)
     if isinstance(found, Next):
         return found
-    number = sum(_is_done(one, "experiment") for one in past[_last_done(past, "model") + 1 :])
+    since_model = past[_last_done(past, "model") + 1 :]
+    number = sum(_is_done(one, "experiment") and one.step is not Step.MEASUREMENT for one in since_model)
     if number >= MOST_EXPERIMENTS:
         measured = any(one.step is Step.MEASUREMENT and _is_done(one, "experiment") for one in past)
         return Ended(measured, found.text)

@@ -4,7 +4,10 @@ and how much rollers and spans of one line differ.
 Normal in the logarithm where a standard deviation has no unit.
 """
 
+from collections.abc import Iterable
 from math import log, sqrt
+
+from gateway.core.line import Parameter
 
 COULOMB_SHARE, COULOMB_SD = 0.02, 1.0  #: median over the torque limit; standard deviation of the logarithm
 LAG_S, LAG_SD = 0.003, 0.7  #: median of the drives' torque lag; standard deviation of the logarithm
@@ -16,3 +19,8 @@ COULOMB_DIFFERS = 3.0  #: times as much
 def deviation(tolerance: float) -> float:
     """Standard deviation of the logarithm of what lies within this fraction either way, anywhere alike."""
     return log(1.0 + tolerance) / sqrt(3.0)
+
+
+def widest(parameters: Iterable[Parameter]) -> float:
+    """The tolerance that all rollers, or all spans, have in common: a fraction either way."""
+    return max(parameter.tolerance for parameter in parameters)

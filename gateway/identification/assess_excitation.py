@@ -9,6 +9,7 @@ import numpy as np
 from gateway.core.line import Line
 from gateway.core.recording import Recording
 from gateway.core.signals import FloatArray
+from gateway.core.unnamed_terms import widest
 from gateway.identification.findings import Finding, Severity
 from gateway.identification.regressions import MOVING, WINDOW_S, EquationFit, moving
 
@@ -36,20 +37,18 @@ def predicted_intervals(fits: Sequence[EquationFit], line: Line) -> dict[str, fl
     if spans:
         found["stiffness_per_length"] = _pooled([_relative(fit, [1.0, 0.0]) for fit in spans])
         apart = _pooled([_relative(fit, [0.0, 1.0]) for fit in spans])
-        tolerance = line.spans[0].length_m.tolerance
-        found["length_m"] = min(apart, tolerance)
+        found["length_m"] = min(apart, widest([span.length_m for span in line.spans]))
         found["stiffness_n"] = float(np.hypot(found["length_m"], found["stiffness_per_length"]))
     if rollers:
         found["radius_per_inertia"] = _pooled([_relative(fit, [1.0, 0.0, 0.0, 0.0]) for fit in rollers])
         found["friction_per_inertia"] = _pooled([_relative(fit, [0.0, 1.0, 0.0, 0.0]) for fit in rollers])
         found["radius2_per_inertia"] = _pooled([_relative(fit, [0.0, 0.0, 1.0, 0.0]) for fit in rollers])
-        tolerance = line.rollers[0].radius_m.tolerance
         radius = _pooled([_relative(fit, [-1.0, 0.0, 1.0, 0.0]) for fit in rollers])
         inertia = _pooled([_relative(fit, [-2.0, 0.0, 1.0, 0.0]) for fit in rollers])
         friction = _pooled([_relative(fit, [-2.0, 1.0, 1.0, 0.0]) for fit in rollers])
-        found["radius_m"] = min(radius, tolerance)
-        found["inertia_kg_m2"] = min(inertia, line.rollers[0].inertia_kg_m2.tolerance)
-        found["friction_nms_per_rad"] = min(friction, line.rollers[0].friction_nms_per_rad.tolerance)
+        found["radius_m"] = min(radius, widest([one.radius_m for one in line.rollers]))
+        found["inertia_kg_m2"] = min(inertia, widest([one.inertia_kg_m2 for one in line.rollers]))
+        found["friction_nms_per_rad"] = min(friction, widest([one.friction_nms_per_rad for one in line.rollers]))
         found["coulomb_nm"] = float(np.median([_coulomb(fit) for fit in rollers]))
     return found
 

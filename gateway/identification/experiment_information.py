@@ -19,9 +19,10 @@ from scipy.linalg import expm, solve_discrete_are
 from gateway.control.design.sampling import sampled
 from gateway.control.rollout import Course, Plants, Setup, plants_of, simulate, start
 from gateway.core.controller import Controller
-from gateway.core.line import Line, Parameter
+from gateway.core.line import Line
 from gateway.core.signals import FloatArray
 from gateway.core.theta import Noise
+from gateway.core.unnamed_terms import widest
 from gateway.core.web_model import WebModel, linearise, reference_speeds
 
 #: The factors that are estimated; the last is the Coulomb friction c of all bearings, in Nm and not as a logarithm.
@@ -56,10 +57,10 @@ def prior_precision(line: Line, *, coulomb: bool) -> FloatArray:
     """Of the parameters (p, p): log-normal with standard deviation log(1 + tolerance) / sqrt(3), as if uniform."""
     tolerances = [
         line.web.stiffness_n.tolerance,
-        _widest([span.length_m for span in line.spans]),
-        _widest([roller.radius_m for roller in line.rollers]),
-        _widest([roller.inertia_kg_m2 for roller in line.rollers]),
-        _widest([roller.friction_nms_per_rad for roller in line.rollers]),
+        widest([span.length_m for span in line.spans]),
+        widest([roller.radius_m for roller in line.rollers]),
+        widest([roller.inertia_kg_m2 for roller in line.rollers]),
+        widest([roller.friction_nms_per_rad for roller in line.rollers]),
     ]
     deviations = np.log1p(tolerances) / np.sqrt(3.0)
     if coulomb:
@@ -140,10 +141,6 @@ def sensitivities(
         found[k] = root @ x[measured]
         x = closed @ x + forced
     return found
-
-
-def _widest(parameters: list[Parameter]) -> float:
-    return max(parameter.tolerance for parameter in parameters)
 
 
 def _moved(plants: Plants, index: int, parameter: int, by: float) -> Plants:

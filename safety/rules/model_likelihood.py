@@ -23,7 +23,7 @@ from gateway.core.line_model import LineModel, noise_of, theta_of
 from gateway.core.line_model_names import split_name
 from gateway.core.signals import FloatArray
 from gateway.core.theta import Noise, Theta, nominal_theta
-from gateway.core.unnamed_terms import COULOMB_DIFFERS, ROLLERS_DIFFER, deviation
+from gateway.core.unnamed_terms import COULOMB_DIFFERS, ROLLERS_DIFFER, deviation, widest
 from gateway.core.verdict import RuleFinding
 from safety.believed import Unbelievable, stated
 from safety.case import Case
@@ -135,10 +135,10 @@ def prior_precision(line: Line, names: Sequence[str]) -> FloatArray:
     """
     tolerances = {
         "stiffness_n": line.web.stiffness_n.tolerance,
-        "length_m": max(span.length_m.tolerance for span in line.spans),
-        "radius_m": max(roller.radius_m.tolerance for roller in line.rollers),
-        "inertia_kg_m2": max(roller.inertia_kg_m2.tolerance for roller in line.rollers),
-        "friction_nms_per_rad": max(roller.friction_nms_per_rad.tolerance for roller in line.rollers),
+        "length_m": widest(span.length_m for span in line.spans),
+        "radius_m": widest(roller.radius_m for roller in line.rollers),
+        "inertia_kg_m2": widest(roller.inertia_kg_m2 for roller in line.rollers),
+        "friction_nms_per_rad": widest(roller.friction_nms_per_rad for roller in line.rollers),
     }
     families = [split_name(name)[0] for name in names]
     covariance = np.zeros((len(names), len(names)))

@@ -7,12 +7,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from gateway.commissioning.architectures import ARCHITECTURES
 from gateway.commissioning.candidates import (
     FIRST_LAWS,
+    Law,
     NotOffered,
+    at_end,
     configuration,
     experiment,
     fastest_m_per_s,
+    values_of,
 )
 from gateway.commissioning.chain import (
     MOST_EXPERIMENTS,
@@ -132,6 +136,19 @@ def test_data_that_give_no_model_are_followed_by_a_larger_experiment_a_few_times
         sizes += [] if failed else [(step.size, step.number)]
         past.append(after(step, past, Outcome.FAILED if failed else Outcome.DONE))
     assert sizes == [(1.0, 0), (1.0, 1), (2.0, 2)] and len(sizes) == MOST_EXPERIMENTS and not step.reached
+
+
+def test_a_measurement_is_no_experiment_that_gave_no_model():
+    past = looked_at([*ADAPTED, after(asked(ADAPTED), ADAPTED)], settled=False, gains=True)
+    sizes: list[float] = []
+    for _ in range(2):
+        step = asked(past)
+        assert isinstance(step, Next) and step.step is Step.EXPERIMENT
+        sizes.append(step.size)
+        past.append(after(step, past))
+        while isinstance(step := asked(past), Next) and step.step is Step.MODEL:
+            past.append(after(step, past, Outcome.FAILED))
+    assert sizes == [1.0, 2.0]
 
 
 def test_nothing_is_proposed_while_something_is_on_its_way_and_a_wrong_moment_costs_no_candidate():
@@ -316,6 +333,15 @@ def test_a_closed_line_is_told_at_once():
 @pytest.mark.parametrize("law", [*FIRST_LAWS, *LAWS, *PREDICTIVE], ids=lambda law: law.text)
 def test_every_candidate_holds_the_line_that_it_is_made_for(law):
     assert is_stable(configuration(LINE, None, 0.02, law), task_of(LINE))
+
+
+def test_a_knob_that_ends_before_somebodys_number_says_so():
+    knob = next(one for one in ARCHITECTURES["lqi"].knobs if one.name == "torque_per_nm2")
+    law = Law("lqi", (("torque_per_nm2", 1e12), ("integral_per_n2s2", 1.0)))
+    (said,) = at_end(LINE, None, FIRST_M_PER_S, law)
+    assert f"torque_per_nm2 ends at {knob.most:g}" in said
+    assert values_of(task_of(LINE), law)["torque_per_nm2"] == knob.most
+    assert not at_end(LINE, None, FIRST_M_PER_S, Law("lqi", (("torque_per_nm2", 2.0),)))
 
 
 def test_the_line_goes_as_fast_as_its_drives_hold():
