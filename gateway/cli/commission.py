@@ -48,24 +48,20 @@ async def commission(
     wanted_m_per_s: float | None = None,
     adaptations: int = 1,
     most_redesigns: int | None = None,
-    again: bool = False,
     decider: Decider = RULES_DECIDE,
 ) -> Commissioned:
     """Until the chain has ended, one way or the other. Every rung is tried once, so that it does.
 
     `wanted_m_per_s`: up to which the line is to be adapted; None: as fast as its drives hold.
     `adaptations`: redesigns at least; `most_redesigns`: it is left there once so many have been kept.
-    `again`: the line is no longer as it was (another grade, a new part). What is in service stays, and counts as a
-    first configuration: for low speed, until experiments have shown more.
     `decider`: who chooses among the candidates.
     """
     if why := refused_at_once(line):
         return Commissioned(False, why, [], None)
     chain = _Chain(line, side, tell, decider, wanted_m_per_s)
-    outdated = None if again else 0  #: so many proposals, the oldest, say nothing of the line as it is now
     while True:
         try:
-            outdated = await chain.read(outdated)
+            await chain.read()
             kept_now = sum(one.step is Step.REDESIGN and one.outcome is Outcome.DONE for one in chain.past)
             if most_redesigns is not None and kept_now >= most_redesigns:
                 return chain.ended(Ended(True, f"{kept_now} redesigns are kept"))
@@ -105,14 +101,10 @@ class _Chain:
         self._measured: dict[str, Convergence] = {}
         self.past: list[Past] = []
 
-    async def read(self, outdated: int | None) -> int:
-        """What has been tried until now. Of the oldest `outdated` (None: all) only what was kept last counts."""
+    async def read(self) -> None:
+        """What has been tried until now."""
         self._shown, self._measured = await self._side.proposals(), await measured_on(self._line, self._side)
-        outdated = len(self._shown) if outdated is None else outdated
         self.past = _merged(self._shown, self._unmade, self._measured)
-        if outdated:
-            self.past = [_begin(self._line, self.past[:outdated]), *self.past[outdated:]]
-        return outdated
 
     async def next(self, adaptations: int) -> Next | Pending | Look | Ended:
         now = await self._side.now()
@@ -130,7 +122,7 @@ class _Chain:
         """
         now, recordings = await self._side.now(), await self._side.recordings()
         if not recordings or now.model is None:
-            raise CannotGoOn("the data of the last measurement are no longer there: measure anew (--again)")
+            raise CannotGoOn("the data of the last measurement are no longer there: begin anew (--again)")
         try:
             found = await asyncio.to_thread(self._changes.looked_at, now, recordings)
         except NotOffered as error:
@@ -221,11 +213,3 @@ def _merged(
     for before, (at, one) in enumerate(unmade):
         past.insert(at + before, one)
     return past
-
-
-def _begin(line: Line, outdated: Sequence[Past]) -> Past:
-    """What was kept last, as a first configuration of the line as it is now."""
-    kept = [one for one in outdated if one.kind == "gains" and one.outcome is Outcome.DONE]
-    if not kept:
-        raise CannotGoOn("nothing has been kept on this line yet: leave out --again")
-    return replace(kept[-1], step=Step.FIRST, rung=0, speed_m_per_s=first_speed_m_per_s(line))

@@ -33,11 +33,13 @@ def commission(
         bool, typer.Option("--history", help="Show what has been tried on the line until now; propose nothing.")
     ] = False,
     again: Annotated[
-        bool,
+        str,
         typer.Option(
-            "--again", help="The line is no longer as it was (another grade, a new part): again from low speed on."
+            "--again",
+            metavar="WHY",
+            help="The line is no longer as it was (another grade, a new part): anew from its file and low speed on.",
         ),
-    ] = False,
+    ] = "",
     as_json: Annotated[bool, typer.Option("--json", help="With --history: print as JSON.")] = False,
 ) -> None:
     """Bring a new line that runs to an adapted configuration over its range of speeds, each step through the gate.
@@ -53,9 +55,12 @@ def commission(
 
     Example, to the speed at which the line produces, and once more on all data: r2rgate commission line.toml
     --speed 0.08 --adaptations 2
+
+    Example, after another web was threaded: r2rgate commission line.toml --again "PET 50 um instead of 36"
     """
     from gateway.cli.commission import commission as carried_out
     from gateway.cli.commission_history import history as tried_on
+    from gateway.cli.commission_result import Commissioned
     from gateway.cli.commission_side import CannotGoOn
     from gateway.cli.waiting import interruptible
 
@@ -68,19 +73,23 @@ def commission(
             raise typer.Exit(REFUSED) from None
         _show(found, as_json)
         return
-    with interruptible("nothing of what is approved is lost; the same command goes on from here"):
-        ended = with_gate(
+
+    async def whole(side: "LiveGate") -> Commissioned:
+        try:
+            if again:
+                await side.line_changed(again)
+        except CannotGoOn as error:
+            return Commissioned(False, str(error), [], None)
+        return await with_agents(
             line,
             run_dir,
-            typer.echo,
-            lambda side: with_agents(
-                line,
-                run_dir,
-                lambda decider: carried_out(
-                    line, side, typer.echo, wanted_m_per_s=speed, adaptations=adaptations, again=again, decider=decider
-                ),
+            lambda decider: carried_out(
+                line, side, typer.echo, wanted_m_per_s=speed, adaptations=adaptations, decider=decider
             ),
         )
+
+    with interruptible("nothing of what is approved is lost; the same command goes on from here"):
+        ended = with_gate(line, run_dir, typer.echo, whole)
     typer.echo(f"{'commissioned' if ended.reached else 'not commissioned'}: {ended.text}")
     if not ended.converged:
         raise typer.Exit(NOT_REACHED)

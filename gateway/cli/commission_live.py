@@ -11,7 +11,7 @@ from pydantic import ValidationError
 from gateway.cli.commission_changes import LineNow
 from gateway.cli.commission_side import CannotGoOn
 from gateway.commissioning.past import OPEN_STAGES, Outcome, past_of
-from gateway.core.decisions import Archive, ListProposals, ProposalList, ProposalShown, ShowProposal
+from gateway.core.decisions import Archive, LineChanged, ListProposals, ProposalList, ProposalShown, ShowProposal
 from gateway.core.line import Line
 from gateway.core.messages import Reply
 from gateway.core.recording import Recording
@@ -55,7 +55,7 @@ class LiveGate:
 
     async def proposals(self) -> list[ProposalShown]:
         listed = await self._listed()
-        return [await self._shown(one.proposal) for one in reversed(listed.proposals)]
+        return [await self._shown(one.proposal) for one in reversed(listed.proposals[: listed.since_change])]
 
     async def now(self) -> LineNow:
         listed, status = await self._listed(), await self._status()
@@ -87,7 +87,8 @@ class LiveGate:
         status = await self._stored()
         if status is None:
             return []
-        begin_s = status.wall_s - self._line.gate.data_max_age_s
+        changed_s = (await self._listed()).line_changed_s or 0.0
+        begin_s = max(status.wall_s - self._line.gate.data_max_age_s, changed_s)
         path, until_s = Path(status.historian.path), status.wall_s + 1.0
         try:
             found = await asyncio.to_thread(newest_experiments, path, begin_s, until_s, MOST_EXPERIMENTS)
@@ -125,6 +126,14 @@ class LiveGate:
 
     async def propose(self, payload: bytes) -> Reply:
         return Reply.model_validate_json(await self._ask(GATEWAY_PROPOSE, payload))
+
+    async def line_changed(self, because: str) -> None:
+        """The line is no longer as it was. Raises CannotGoOn where the gate does not take that."""
+        said = LineChanged(because=because).model_dump_json().encode()
+        reply = Reply.model_validate_json(await self._ask(GATEWAY_DECISION, said))
+        if not reply.ok:
+            raise CannotGoOn("; ".join([reply.text, *reply.reasons]))
+        self._tell(reply.text)
 
     async def archive(self, command: Archive) -> Reply:
         return Reply.model_validate_json(await self._ask(GATEWAY_DECISION, command.model_dump_json().encode()))

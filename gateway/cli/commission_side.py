@@ -30,7 +30,7 @@ class GateSide(Protocol):
     """A gate and the line behind it. Every method raises CannotGoOn."""
 
     async def proposals(self) -> list[ProposalShown]:
-        """All of the line, the oldest first."""
+        """All that were made since the line was said to have changed last; the oldest first."""
         ...
 
     async def now(self) -> LineNow: ...
@@ -44,7 +44,7 @@ class GateSide(Protocol):
         ...
 
     async def recordings(self) -> list[Recording]:
-        """Of experiments, as the gate judges by them: the newest first."""
+        """Of experiments on the line as it is now, as the gate judges by them: the newest first."""
         ...
 
     async def ready(self) -> None:

@@ -14,7 +14,7 @@ from gateway.cli.commission_side import CannotGoOn
 from gateway.cli.stepped import SteppedLoop
 from gateway.core.audit_record import Who
 from gateway.core.controller import canonical as canonical_controller
-from gateway.core.decisions import Archive, Decide, ProposalShown
+from gateway.core.decisions import Archive, Decide, LineChanged, ProposalShown
 from gateway.core.judge_context import JudgeContext
 from gateway.core.line import Line
 from gateway.core.messages import Reply, parse_command
@@ -119,7 +119,7 @@ class SteppedGate:
         return self._gate.deployer
 
     async def proposals(self) -> list[ProposalShown]:
-        found = [self.deployer.shown(hash_) for hash_ in self.deployer.book.entries]
+        found = [self.deployer.shown(entry.proposal) for entry in self.deployer.book.since_change]
         return [one for one in found if isinstance(one, ProposalShown)]
 
     async def now(self) -> LineNow:
@@ -141,7 +141,8 @@ class SteppedGate:
         return self._folder
 
     async def recordings(self) -> list[Recording]:
-        return [one for one, _ in self._kept(self.line.gate.data_max_age_s)]
+        changed_s = self.deployer.book.line_changed_s or 0.0
+        return [one for one, end_s in self._kept(self.line.gate.data_max_age_s) if end_s > changed_s]
 
     async def ready(self) -> None:
         began_s = self.loop.now_s
@@ -160,7 +161,16 @@ class SteppedGate:
         await self.deployer.judged()
         return reply
 
+    async def line_changed(self, because: str) -> None:
+        """The line is no longer as it was. Raises CannotGoOn where the gate does not take that."""
+        reply = await self._told(LineChanged(because=because))
+        if not reply.ok:
+            raise CannotGoOn("; ".join([reply.text, *reply.reasons]))
+
     async def archive(self, command: Archive) -> Reply:
+        return await self._told(command)
+
+    async def _told(self, command: Archive | LineChanged) -> Reply:
         payload = command.model_dump_json().encode()
         return Reply.model_validate_json(await self._mailboxes[0].request(GATEWAY_DECISION, payload, ANSWER_S))
 

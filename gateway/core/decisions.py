@@ -45,8 +45,18 @@ class Archive(Strict):
     because: Annotated[str, Field(max_length=1000)]
 
 
-Decision = Annotated[Decide | RollBackNow | Archive, Field(discriminator="command")]
-DECISION: TypeAdapter[Decide | RollBackNow | Archive] = TypeAdapter(Decision)
+class LineChanged(Strict):
+    """The line is no longer as it was: another web, a new part. Puts nothing into service.
+
+    What was learned of it counts no more: proposals are judged on the line's file, as in the beginning.
+    """
+
+    command: Literal["line-changed"] = "line-changed"
+    because: Annotated[str, Field(min_length=1, max_length=1000)]
+
+
+Decision = Annotated[Decide | RollBackNow | Archive | LineChanged, Field(discriminator="command")]
+DECISION: TypeAdapter[Decide | RollBackNow | Archive | LineChanged] = TypeAdapter(Decision)
 
 
 class ListProposals(Strict):
@@ -86,6 +96,8 @@ class ProposalList(Strict):
     last_known_good: Digest | None
     epoch: int
     model: Digest | None  #: by which proposals are judged; null: the line's file
+    line_changed_s: float | None = None  #: Unix time at which somebody said last that the line has changed
+    since_change: int  #: proposals that have been made since then
     proposals: list[ProposalLine]
 
 

@@ -18,7 +18,7 @@ from gateway.core.small_change import beyond_small
 from gateway.mailbox.port import Unreachable
 from gateway.supervisor.audit_file import AuditUnavailable
 from gateway.supervisor.deployer_sides import AuditSide, JudgeSide, LoopSide, NotKnown, NotTakenUp, Surroundings
-from gateway.supervisor.lifecycle import PERSON, SCRIPT, VERDICT, Book, Entry, Impossible, Stage
+from gateway.supervisor.lifecycle import LINE_CHANGED, PERSON, SCRIPT, VERDICT, Book, Entry, Impossible, Stage
 from gateway.supervisor.on_the_line import OnTheLine
 from gateway.supervisor.proposal_inbox import Inbox
 from gateway.supervisor.proposal_records import GATEWAY, ProposalRecords, done, refused
@@ -99,6 +99,17 @@ class Deployer:
             further = "; to go further back, propose what ran before (`r2rgate configurations list`)"
         return reply.model_copy(update={"text": reply.text + further + recorded})
 
+    async def line_changed(self, because: str, who: Who) -> Reply:
+        """From now on it is another line: what was learned of it, and what was judged by that, counts no more."""
+        async with self._records.one_step:
+            try:
+                await self._records.step(LINE_CHANGED, {"because": because}, who)
+            except (AuditUnavailable, Impossible) as error:
+                return refused("nothing is changed", [str(error)])
+        return done(
+            "proposals are judged on the line's file again; what is in service stays until something else is approved"
+        )
+
     def look_again(self) -> None:
         """The loop has told of a change that this process did not order, or of its start."""
         self._on_the_line.settled = False
@@ -147,6 +158,8 @@ class Deployer:
             last_known_good=self.book.last_known_good,
             epoch=self.book.epoch,
             model=self.book.model,
+            line_changed_s=self.book.line_changed_s,
+            since_change=len(self.book.since_change),
             proposals=[_line_of(entry, self._why(entry)) for entry in newest],
         )
 

@@ -8,11 +8,11 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import ValidationError
 
 from gateway.core.audit_record import Who
 from gateway.core.controller import Controller, ControllerRefused, config_hash, parse_controller
-from gateway.core.decisions import DECISION, QUERY, Archive, Decide, ListProposals
+from gateway.core.decisions import DECISION, QUERY, Archive, Decide, LineChanged, ListProposals
 from gateway.core.line import Line
 from gateway.core.messages import Command, Deploy, Event, Keep, Reply, WatchGood, command_bytes
 from gateway.core.proposal import GainsChange, ModelChange, Proposal
@@ -23,12 +23,11 @@ from gateway.supervisor import models as models_store
 from gateway.supervisor.archiving import archive
 from gateway.supervisor.audit import Audit
 from gateway.supervisor.audit_file import AuditFile, AuditUnavailable
-from gateway.supervisor.audit_writer import NOT_DONE
+from gateway.supervisor.book_file import CannotBegin, book_in
 from gateway.supervisor.configurations import Configurations, ConfigurationsError, Origin, begin_configurations
 from gateway.supervisor.deployer import Deployer
 from gateway.supervisor.deployer_sides import JudgeSide, NotTakenUp
 from gateway.supervisor.experiments import ENDS as EXPERIMENT_ENDS
-from gateway.supervisor.lifecycle import Book, Impossible, book_of
 from gateway.supervisor.model_store import ModelsError
 from gateway.supervisor.models import Models, begin_repository
 from gateway.supervisor.proposal_records import GATEWAY
@@ -45,13 +44,6 @@ STARTED_WITH: dict[str, Callable[[bytes], Controller]] = {
     "started-with.json": parse_controller,
     "configuration.json": lambda content: parse_controller(json.dumps(json.loads(content)["controller"]).encode()),
 }
-
-
-_SEQUENCES: TypeAdapter[set[int]] = TypeAdapter(set[int])
-
-
-class CannotBegin(Exception):
-    """The gate stays shut: its records cannot be read, or do not fit together. The text says why."""
 
 
 class KeptAudit:
@@ -259,30 +251,26 @@ class Gate:
             assert self._stores is not None  # they are open before the gate is
             line, now_s = self._line, self._wall_clock()
             reply = await archive(self._audit, self._stores[0], line.site, line.line, decision, who, now_s)
+        elif isinstance(decision, LineChanged):
+            reply = await self._line_changed(self.deployer, decision, who)
         else:
             reply = await self.deployer.roll_back(decision.comment, who)
         self._note("decision", f"{who.name}: {reply.text}", ok=reply.ok, reasons=reply.reasons)
         return reply.model_dump_json().encode()
 
+    async def _line_changed(self, deployer: Deployer, said: LineChanged, who: Who) -> Reply:
+        model = deployer.book.model
+        reply = await deployer.line_changed(said.because, who)
+        if reply.ok and model is not None and self._stores is not None:
+            try:
+                self._stores[1].mark(model, "superseded", self._wall_clock(), f"the line has changed: {said.because}")
+            except ModelsError as error:  # nothing is judged by it any more all the same
+                self._note("gate", f"model {model[:12]} is not marked as superseded: {error}")
+        return reply
+
     def shut_reply(self) -> Reply:
         """To whoever asks before the gate is open."""
         return Reply(ok=False, state="", text="the gate is shut", reasons=[self._shut])
-
-
-def book_in(folder: Path) -> Book:
-    """What the audit of a folder says; what a record calls not done was not. Raises CannotBegin."""
-    try:
-        with AuditFile(folder) as file:
-            records = [row.record() for row in file.rows()]
-        not_done: set[int] = set()
-        for record in records:
-            if record.kind == NOT_DONE:
-                not_done |= _SEQUENCES.validate_python(record.what["sequences"])
-        return book_of((record.kind, record.what) for record in records if record.sequence not in not_done)
-    except AuditUnavailable as error:
-        raise CannotBegin(str(error)) from error
-    except (Impossible, ValueError, KeyError) as error:
-        raise CannotBegin(f"the records of the audit do not fit together: {error}; `r2rgate audit verify`") from error
 
 
 def _who(peer: Peer | None) -> Who:

@@ -7,6 +7,7 @@ have been done, and the loop says what was: `Book.explains` holds the one agains
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
+from itertools import islice
 from typing import Any
 
 from gateway.core.deployment import InService, Region
@@ -55,7 +56,8 @@ STEPS: dict[str, tuple[tuple[Stage, ...], Stage]] = {
 }
 WELL = ("kept", "model-in-service", "experiment-ends")  #: the ends of changes that went well
 PERSON, SCRIPT, VERDICT = "person", "script", "verdict"  #: who approved
-PROPOSED, FOUND = "proposed", "found-in-service"
+PROPOSED, FOUND, LINE_CHANGED = "proposed", "found-in-service", "line-changed"
+OF_NO_PROPOSAL = (FOUND, LINE_CHANGED)
 OWN_KIND: dict[str, Kind] = {"deploying": "gains", "experiment-begins": "experiment", "model-in-service": "model"}
 
 
@@ -95,6 +97,8 @@ class Book:
     region: Region = Region()  #: in which the loop lets it run
     model: str | None = None
     changed_s: float | None = None  #: Unix time at which how the line is controlled has changed last
+    line_changed_s: float | None = None  #: Unix time at which somebody said last that the line itself has changed
+    before_change: int = 0  #: proposals that there were then: they say nothing of the line as it is now
     #: By kind the proposal that a person approved last, and that went well; empty after anything was rolled back.
     trusted: dict[str, str] = field(default_factory=dict[str, str])
 
@@ -108,10 +112,15 @@ class Book:
         return [entry for entry in self.entries.values() if entry.stage in UNDECIDED]
 
     @property
+    def since_change(self) -> list[Entry]:
+        """Of the line as it is now."""
+        return list(islice(self.entries.values(), self.before_change, None))
+
+    @property
     def judged_for(self) -> Region:
         """As far as the configuration in service has been judged and kept, now or before: data become too old again."""
         found = self.region
-        for entry in self.entries.values():
+        for entry in self.since_change:
             if entry.changes == self.in_service and entry.stage is Stage.KEPT and entry.region is not None:
                 found = found.and_also(entry.region)
         return found
@@ -122,7 +131,9 @@ class Book:
         entry = self.entries.get(proposal)
         if kind == PROPOSED and entry is not None:
             return f"proposal {proposal[:12]} was made before: {entry.stage}"
-        if kind in (PROPOSED, FOUND):
+        if kind == LINE_CHANGED and (other := self.on_the_line) is not None:
+            return f"proposal {other.proposal[:12]} is {other.stage}: wait for its end, or roll it back"
+        if kind == PROPOSED or kind in OF_NO_PROPOSAL:
             return ""
         if entry is None:
             return f"there is no proposal {proposal[:12]}"
@@ -145,12 +156,15 @@ class Book:
 
     def apply(self, kind: str, what: Mapping[str, Any]) -> None:
         """Take in a record that has been stored. Raises Impossible; other kinds of the audit are passed over."""
-        if kind not in STEPS and kind not in (PROPOSED, FOUND):
+        if kind not in STEPS and kind != PROPOSED and kind not in OF_NO_PROPOSAL:
             return
         if reason := self.why_not(kind, what):
             raise Impossible(reason)
         if kind == FOUND:
             self._found(what)
+            return
+        if kind == LINE_CHANGED:
+            self._line_changed(what)
             return
         proposal = str(what["proposal"])
         if kind == PROPOSED:
@@ -203,6 +217,16 @@ class Book:
         self.last_known_good = str(what["last_known_good"])
         self.epoch = int(what["epoch"])
         self.region = _region(what)
+
+    def _line_changed(self, what: Mapping[str, Any]) -> None:
+        """Nothing is believed any more, and nothing goes through that was judged by what was."""
+        self.model = None
+        self.trusted.clear()
+        for entry in self.undecided:
+            self.entries[entry.proposal] = replace(
+                entry, stage=Stage.SUPERSEDED, why=f"the line has changed: {what['because']}", since_s=_at(what)
+            )
+        self.line_changed_s, self.before_change = _at(what), len(self.entries)
 
     def explains(self, configuration: str, epoch: int) -> bool:
         """Whether the records say how the line may have come to this configuration, at this epoch of the loop."""

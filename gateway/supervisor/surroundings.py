@@ -56,6 +56,7 @@ class LineSurroundings:
         await self._stands()
         now_s = self._wall_clock()
         found = await asyncio.to_thread(self._experiments, self._line.gate.data_max_age_s)
+        found = [one for one in found if book.line_changed_s is None or one[1] > book.line_changed_s]
         return JudgeContext(
             format=1,
             now=iso(now_s),

@@ -34,7 +34,6 @@ from tests.closed_loop.recorded import demonstration_line, real_plant
 GOALS = "gate-commissioning"  #: part of goals.toml
 REGRADED_EVERY = 5  #: lines: on so many one sees its grade change
 GRADE = 0.8  #: times the stiffness of the web
-DATA_S = 1500.0  #: that data count: longer than a commissioning, shorter than the line stands for another grade
 
 
 @dataclass(frozen=True)
@@ -150,7 +149,7 @@ def _told(by_case: dict[str, float]) -> str:
 def commissioned(job: tuple[int, bool, bool]) -> OfLine:
     """Of a line of six spans that runs its first recipe when it begins; number, unruly, whether its grade changes."""
     number, unruly, regrade = job
-    line, plant, began_s = line_of_grades(), plant_of(number, unruly), time.process_time()
+    line, plant, began_s = impatient(demonstration_line()), plant_of(number, unruly), time.process_time()
 
     async def run() -> OfLine:
         loop = producing(line, plant, design_lqi(task_of(line)), number)
@@ -164,17 +163,12 @@ def commissioned(job: tuple[int, bool, bool]) -> OfLine:
                 other = scaled(plant, {"stiffness_n": GRADE})
                 again = producing(line, other, now.in_service, number + 1)
                 async with SteppedGate(again, Path(folder), number + 1, before=side) as then:
-                    regraded = _chain(then, await commission(line, then, again=True))
+                    await then.line_changed("a web of another stiffness")
+                    regraded = _chain(then, await commission(line, then))
         what = worth(line, plant, now.in_service, law, number, plain=not unruly)
         return OfLine(number, unruly, found, law.text, what, regraded, time.process_time() - began_s)
 
     return asyncio.run(run())
-
-
-def line_of_grades() -> Line:
-    """On which data from before a change of grade are too old when it runs again."""
-    line = impatient(demonstration_line())
-    return line.model_copy(update={"gate": line.gate.model_copy(update={"data_max_age_s": DATA_S})})
 
 
 def producing(line: Line, plant: Plant, config: Controller, seed: int) -> SteppedLoop:

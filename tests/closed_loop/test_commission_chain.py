@@ -15,7 +15,7 @@ from gateway.commissioning.past import Step
 from gateway.control.design import design_lqi, task_of, task_on
 from gateway.core.controller import config_hash
 from gateway.core.scenario import Scenario
-from gateway.supervisor.gate import book_in
+from gateway.supervisor.book_file import book_in
 from gateway.supervisor.lifecycle import Stage
 from tests.bench.control_plants import random_plant
 from tests.closed_loop.recorded import demonstration_line

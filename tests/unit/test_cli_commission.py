@@ -115,6 +115,7 @@ class OneProcess:
             for one in reversed(self.shown.values())
         ]  # fmt: skip
         return ProposalList(
+            since_change=len(self.shown),
             format=1, site=LINE.site, line=LINE.line, in_service=config_hash(CONFIG),
             last_known_good=config_hash(CONFIG), epoch=0, model=None, proposals=lines,
         ).model_dump_json().encode()  # fmt: skip

@@ -92,6 +92,10 @@ class LifeCycle(RuleBasedStateMachine):
     def taken_back(self):
         self._run(self.gateway.deployer.roll_back("", ANNA))
 
+    @rule()
+    def the_line_changes(self):
+        self._run(self.gateway.deployer.line_changed("another web", ANNA))
+
     @rule(effects=st.integers(1, 6), after=st.booleans())
     def death_is_near(self, effects, after):
         self.gateway.death.effects, self.gateway.death.after = effects, after
@@ -124,6 +128,17 @@ class LifeCycle(RuleBasedStateMachine):
                 entry = book_of(self.gateway.audit.records).entries[what["proposal"]]
                 kept.add(entry.changes)
         assert self.gateway.loop.good in kept
+
+    @invariant()
+    def nothing_goes_through_that_was_judged_before_the_line_changed(self):
+        judged: set[str] = set()
+        for kind, what in self.gateway.audit.records:
+            if kind == "line-changed":
+                judged.clear()
+            elif kind == "accepted":
+                judged.add(what["proposal"])
+            elif kind in ("approved", "deploying"):
+                assert what["proposal"] in judged
 
     @invariant()
     def no_approval_is_left_lying(self):

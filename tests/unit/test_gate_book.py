@@ -5,7 +5,7 @@ import asyncio
 from gateway.core.audit_record import Who
 from gateway.supervisor.audit import Audit
 from gateway.supervisor.audit_writer import NOT_DONE
-from gateway.supervisor.gate import book_in
+from gateway.supervisor.book_file import book_in
 from gateway.supervisor.lifecycle import Stage
 
 ANNA = Who(name="anna", uid=1000, pid=1)
