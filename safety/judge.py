@@ -68,7 +68,7 @@ def warm_up(line: Line) -> None:
     """Compile and load what verdicts need, so that the first one is as quick as the others."""
     config = design_lqi(task_of(line))
     plants = plants_under_stress([nominal_theta(line)], line.gate, 0)
-    course = course_through(line.control.period_s, [(0.1, np.array(line.recipes[0].tension_n), 0.01)], 0.05)
+    course = course_through(line.control.period_s, [(0.1, np.array(line.recipes[0].tension_n), 0.01)])
     simulate(config, plants, course, setup_of(line, Noise(), 0, line.gate.stress_late_share))
     _predict_standing(line)
 

@@ -63,8 +63,7 @@ def _improved(case: Case) -> RuleFinding:
     course = "tension" if "tension" in found["proposed"] else next(iter(found["proposed"]))
     now, proposed = _norm(found["in service"][course]), _norm(found["proposed"][course])
     text = f"P_improved: ||P|| is {proposed:.3g} in {course}; allowed: below {now:.3g}, as in service"
-    finding = at_most("paper: P_improved", proposed, now, "", text)
-    return finding.model_copy(update={"passed": proposed < now})
+    return _below("paper: P_improved", proposed, now, "", text)
 
 
 def _norm(figures: Figures) -> float:
@@ -84,7 +83,12 @@ def _robust(case: Case) -> RuleFinding:
     error = float(np.nan_to_num(np.abs(run.tension_n - course.tension_n), nan=np.inf).max())
     limit = _tolerated(course)
     text = f"S_robust: tension is up to {error:.1f} N from its set-point ({name}); allowed: below {limit:.1f} N"
-    return at_most("paper: S_robust", error, limit, "N", text)
+    return _below("paper: S_robust", error, limit, "N", text)
+
+
+def _below(rule: str, value: float, limit: float, unit: str, text: str) -> RuleFinding:
+    """Passed below `limit`, as the paper has it, and not at it."""
+    return at_most(rule, value, limit, unit, text).model_copy(update={"passed": value < limit})
 
 
 def _tolerated(course: Course) -> float:

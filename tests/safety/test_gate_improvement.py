@@ -8,7 +8,10 @@ import pytest
 from gateway.control.design import design_lqi, task_of
 from gateway.core.deployment import Region
 from gateway.core.line import Span
+from gateway.core.verdict import ScenarioFigures
+from safety import performance
 from safety.findings import told
+from safety.performance import LOST, Figures
 from safety.rules import corners, improvement, promises
 from safety.simulated import judged_of
 from tests.safety.case_support import case_of, gains, refused
@@ -48,6 +51,29 @@ def test_nothing_is_worse_than_what_in_service_would_do_beyond_what_it_was_judge
     small = Region(speed_max_m_per_s=0.01, tension_step_max_n=0.1, speed_step_max_m_per_s=0.0)
     # What they differ by there is within the tolerances; overshoot is a share of the step.
     assert against(small) == {"improvement: overshoot, in service"} <= everywhere
+
+
+def test_figures_of_a_verdict_are_those_of_each_configuration_and_course_and_endless_ones_are_not_known(
+    case, monkeypatch
+):
+    found = {
+        "in service": {"tension": Figures(1.0, 2.0, 3.0, 4.0), "moves": Figures(5.0, 0.0, inf, 6.0)},
+        "baseline": {"tension": Figures(7.0, inf, 8.0, 9.0)},
+        "proposed": {"tension": LOST, "moves": Figures(inf, 10.0, 11.0, inf)},
+    }
+    monkeypatch.setattr(performance, "performances", lambda _: found)
+
+    def figures(whose, name, rmse_n, overshoot_pct, settling_s, effort_n2m2s):
+        return ScenarioFigures(configuration=whose, scenario=name, rmse_n=rmse_n, overshoot_pct=overshoot_pct,
+                               settling_s=settling_s, effort_n2m2s=effort_n2m2s)  # fmt: skip
+
+    assert performance.figures_of(case) == [
+        figures("in service", "tension", 1.0, 2.0, 3.0, 4.0),
+        figures("in service", "moves", 5.0, 0.0, None, 6.0),
+        figures("baseline", "tension", 7.0, None, 8.0, 9.0),
+        figures("proposed", "tension", None, None, None, None),
+        figures("proposed", "moves", None, 10.0, 11.0, None),
+    ]
 
 
 def test_a_small_overshoot_is_no_worse_than_none_but_breaks_a_promise(of):

@@ -10,9 +10,10 @@ from gateway.control.prediction import gains_of, imagined, innovations, predict,
 from gateway.core.line_model import theta_of
 from gateway.core.theta import Noise
 from safety.excitation import excited_parts, newest, recent, same_speed
-from safety.predicting import Foretold, with_swings
+from safety.findings import at_most, told
+from safety.predicting import Foretold, foretold, with_swings
 from safety.rules import alignment, validity
-from tests.safety.case_support import case_of, gains, refused
+from tests.safety.case_support import case_of, gains, refused, with_state
 
 
 def test_validity_at_its_limits(of, context, case, redesigned):
@@ -45,15 +46,77 @@ def test_models_that_cannot_be_looked_at_are_not_valid(of, context, redesigned):
     assert "says nothing of the noise" in refused(validity.check(case))[0]
     assert "no data by which" in refused(alignment.check(case))[0]
     none = case_of(gains(redesigned, context), context.model_copy(update={"model": None}), of)
-    assert refused(validity.check(none)) and refused(alignment.check(none))
-    old = case_of(gains(redesigned, context), context.model_copy(update={"now": "2026-08-20T00:00:00+00:00"}), of)
-    assert "1 of them older" in refused(validity.check(old))[0]
+    assert validity.check(none) == [
+        told("model validity", False, "no model is accepted, and none is needed for a first configuration")
+    ]
+    assert alignment.check(none) == [
+        told("alignment", False, "no model is accepted by which channels could be compared")
+    ]
+
+
+def test_data_that_are_too_old_or_too_quiet_are_told_from_each_other(of, context, redesigned):
+    still = replace(of, recording=replace(of.recording, tension_n=np.full_like(of.recording.tension_n, 30.0)))
+
+    def found(*ages_d):
+        recorded = [f"2026-08-{20 - age_d}T14:00:00+00:00" for age_d in ages_d]
+        (data,) = still.context().data
+        asked = still.context(
+            now="2026-08-20T15:00:00+00:00", data=[data.model_copy(update={"recorded": one}) for one in recorded]
+        )
+        return validity.check(case_of(gains(redesigned, asked), asked, still))
+
+    lacking = (
+        "none has 2 s at one speed in which every tension moves by 2 times its noise; run an experiment at 0.05 m/s or "
+        "more (r2rgate experiment), then propose again"
+    )
+    for ages_d, had in (
+        ((), "0 recordings"),
+        ((0, 1), "2 recordings"),
+        ((0, 1, 8), "3 recordings, 1 of them older than 604800 s"),
+        ((8, 0, 9), "3 recordings, 2 of them older than 604800 s"),
+    ):
+        text = f"no recent data show the model: of {had}, {lacking}"
+        assert found(*ages_d) == [told("model validity", False, text)]
+
+
+@pytest.mark.parametrize(("factor", "share", "more"), [(1.0, 0.05, 0.0), (0.2, 0.0, 2e-3)])
+def test_the_line_runs_no_faster_than_data_have_shown_but_for_a_twentieth_or_two_millimetres_a_second(
+    of, redesigned, factor, share, more
+):
+    at = replace(of, recording=replace(of.recording, unwind_speed_m_per_s=factor * of.recording.unwind_speed_m_per_s))
+
+    def found(speed_m_per_s):
+        context = with_state(at.context(), speed_m_per_s=speed_m_per_s)
+        return validity.check(case_of(gains(redesigned, context), context, at))[-1]
+
+    (part,) = excited_parts(at.recording)
+    shown = part.speed_m_per_s
+    most = (1.0 + share) * shown + more
+    faster = most + 1e-9
+    said = f"data have shown the model up to {shown:.3g} m/s; the line runs at {most:g} m/s"
+    assert found(most) == at_most("model validity", most, most, "m/s", said)
+    said += f": run an experiment at {faster:g} m/s or more (r2rgate experiment), then propose again"
+    assert found(faster) == at_most("model validity", faster, most, "m/s", said)
+    assert not found(faster).passed
 
 
 def test_parts_at_one_speed_are_judged_together(of, context, redesigned):
     twice = of.context(data=[*context.data, *context.data])
     found = validity.check(case_of(gains(redesigned, context), twice, of))
     assert len(found) == 2 and "over 5.2 s" in found[0].text
+
+
+@pytest.mark.parametrize(("shaken_m_per_s", "way"), [(1e-3, "held"), (5e-3, "linear")])
+def test_between_samples_the_unwinder_goes_the_way_that_explains_more(of, case, shaken_m_per_s, way):
+    (part,) = excited_parts(of.recording)
+    recording = part.recording
+    shaken = np.random.default_rng(1).standard_normal(recording.samples) * shaken_m_per_s
+    recording = replace(recording, unwind_speed_m_per_s=recording.unwind_speed_m_per_s + shaken)
+    (found,) = foretold(case.believed, case.noise, [replace(part, recording=recording)])
+    said = {way: predict(case.believed, case.noise, stretch_of(recording, way)) for way in ("linear", "held")}
+    likely = {way: one.log_likelihood.sum() for way, one in said.items()}
+    assert max(likely, key=likely.get) == way == found.predicted.stretch.unwinder
+    assert found.predicted.log_likelihood.sum() == max(likely.values()) > min(likely.values()) + 0.5
 
 
 @pytest.mark.parametrize("channel", ["tension_n", "speed_m_per_s"])
@@ -130,4 +193,5 @@ def test_of_much_data_the_newest_are_looked_at_and_every_speed(of):
     (part,) = excited_parts(of.recording)
     slow = replace(part, speed_m_per_s=0.01)
     assert newest([part] * 5 + [slow] * 5, 5.0) == [part, part, slow]
+    assert same_speed(0.004, 0.002) and same_speed(0.002, 0.004), "as far apart as one speed may be"
     assert same_speed(0.05, 0.0524) and same_speed(0.002, 0.0039) and not same_speed(0.1, 0.106)

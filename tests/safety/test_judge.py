@@ -10,7 +10,7 @@ from gateway.core.experiment import Abort, Experiment, Leg
 from gateway.core.proposal import canonical as proposal_bytes
 from gateway.core.verdict import canonical
 from safety import judge as judging
-from safety.judge import failed, judge, refusal, warm_up
+from safety.judge import failed, judge, refusal
 from safety.rules.table import RULES, Rule
 from tests.safety.case_support import gains, proposal, verdict_of
 
@@ -158,6 +158,18 @@ def test_what_could_not_be_judged_is_refused_by_name(of, context, redesigned):
     assert stumbled.reasons == ["rule judge failed: KeyError: 'x'"]
 
 
+def test_of_what_is_larger_than_the_line_takes_nothing_is_read(of, context, redesigned):
+    given = proposal_bytes(gains(redesigned, context))
+
+    def read(most_bytes):
+        gate = of.line.gate.model_copy(update={"proposal_max_bytes": most_bytes})
+        late = refusal(given, context, of.line.model_copy(update={"gate": gate}), 7, "time", "none came")
+        assert late.reasons == ["none came"]
+        return late.kind
+
+    assert read(len(given)) == "gains" and read(len(given) - 1) is None
+
+
 def experiment(**changes):
     fields = {
         "format": 1, "amplitude_n": [1.0] * 6, "dwell_s": 0.1, "legs": [Leg(duration_s=2.0, speed_m_per_s=0.06)],
@@ -276,7 +288,3 @@ def test_a_line_with_a_draw_span_takes_its_first_configuration(of):
     context = drawn.context(model=None, data=[])
     verdict = verdict_of(gains(context.in_service, context), context, drawn)
     assert verdict.accepted, verdict.reasons
-
-
-def test_a_judge_that_is_warm_has_compiled_what_it_needs(of):
-    warm_up(of.line)

@@ -16,6 +16,11 @@ from tests.safety.case_support import case_of, gains, proposal, refused, verdict
 SLOW = "span 3 alone, slow"  #: a course
 
 
+def stepped_n(one):
+    """The largest step of any span in a course."""
+    return np.abs(np.diff(one.course.tension_n, axis=0)).max()
+
+
 def slow_line(of, speed_max_m_per_s):
     limits = of.line.limits.model_copy(update={"speed_max_m_per_s": speed_max_m_per_s})
     return replace(of, line=of.line.model_copy(update={"limits": limits}))
@@ -49,6 +54,17 @@ def test_with_a_model_steps_are_as_large_as_the_loop_lets_them_and_corners_stay_
     assert found.share[SLOW] == 1.0 > found.share["neighbours"] > 0.05
     assert max(found.fastest_m_per_s.values()) <= limits.roller_speed_m_per_s
     assert refused(roller_speed.check(case)) == []
+    region = verdict_of(case.proposal, context, slow).region
+    assert region.tension_step_max_n == slow.line.limits.tension_step_max_n, "the loop itself refuses what is too large"
+    assert region.speed_step_max_m_per_s == case.speed_step_m_per_s
+
+
+def test_the_region_of_a_first_configuration_has_the_shares_that_are_let(of, monkeypatch):
+    context = of.context(model=None, data=[])
+    share = {"speed change": 0.25, SLOW: 0.75, "neighbours": 0.5}
+    monkeypatch.setattr(roller_speed, "steps_let", lambda _: roller_speed.Let(share, dict.fromkeys(share, 0.01)))
+    region = verdict_of(gains(design_lqi(task_of(of.line)), context), context, of).region
+    assert region == Region(speed_max_m_per_s=0.02, tension_step_max_n=0.5 * 4.0, speed_step_max_m_per_s=0.25 * 0.02)
 
 
 def test_a_law_that_lets_no_step_and_one_that_runs_away_are_refused(of, context):
@@ -119,7 +135,12 @@ def test_an_experiment_that_makes_rollers_run_ahead_is_refused(of, context):
     assert small.limit == pytest.approx(0.05 + 0.9 * (watched - 0.05))
 
 
-@pytest.mark.parametrize("fastest", [lambda *_: 1.0, lambda *_: np.nan, lambda *_: 0.2])
+def away_but_at_rest(_, one):
+    """Rollers run away in any course in which something is asked to move."""
+    return np.inf if stepped_n(one) > 0.0 or np.ptp(one.course.unwind_speed_m_per_s) > 0.0 else 0.05
+
+
+@pytest.mark.parametrize("fastest", [lambda *_: 1.0, lambda *_: np.nan, lambda *_: 0.2, away_but_at_rest])
 def test_what_no_share_of_a_step_makes_slow_is_refused(of, context, monkeypatch, fastest):
     monkeypatch.setattr(roller_speed, "_in_whole_steps", lambda *_: {})
     monkeypatch.setattr(roller_speed, "_looks", lambda _: (fastest, fastest))
@@ -135,3 +156,44 @@ def test_a_line_whose_set_points_only_ramp_is_looked_at_in_its_speed_changes(of,
     found = roller_speed.steps_let(case)
     assert set(found.share) == {"speed change"} and found.of_tension() == 1.0
     assert refused(roller_speed.check(case)) == []
+
+
+@pytest.fixture
+def first_steps(of, monkeypatch):
+    """What a first configuration is let, where rollers run at `fastest(unwinder's speed, N stepped)`; all looks."""
+
+    def let(fastest):
+        context = of.context(model=None, data=[])
+        case = case_of(gains(design_lqi(task_of(of.line)), context), context, of)
+        looks = []
+
+        def look(name, one):
+            web_m_per_s, step_n = one.course.unwind_speed_m_per_s.max(), stepped_n(one)
+            looks.append((name, web_m_per_s, step_n, fastest(web_m_per_s, step_n)))
+            return looks[-1][-1]
+
+        monkeypatch.setattr(roller_speed, "_in_whole_steps", lambda *_: {"speed change": 0.0})
+        monkeypatch.setattr(roller_speed, "_looks", lambda _: (look, look))
+        return roller_speed.steps_let(case), looks
+
+    return let
+
+
+def test_where_rollers_run_ahead_in_proportion_to_the_step_the_share_follows_from_a_small_one(first_steps):
+    """0.05 m/s a newton: of what is left to the limit three hundredths stay unused."""
+    allowed = 0.85 * 1.5 * 0.12
+    let, looks = first_steps(lambda web, step_n: web + 0.05 * step_n)
+    small, following = looks[::2], looks[1::2]
+    names = [name for name in let.share if name != "speed change"]
+    assert [one[0] for one in small] == [one[0] for one in following] == names
+    for (name, web, smallest_n, _), (_, _, step_n, reached) in zip(small, following, strict=True):
+        assert smallest_n == pytest.approx(4.0 / 16.0)
+        assert step_n == pytest.approx(0.97 * (allowed - web) / 0.05) == 4.0 * let.share[name]
+        assert reached == let.fastest_m_per_s[name] < allowed
+
+
+def test_a_step_in_which_rollers_come_to_the_limit_itself_is_let(of, first_steps):
+    allowed = envelope_limits(of.line).roller_speed_watched_m_per_s
+    let, looks = first_steps(lambda web, step_n: allowed if step_n > 0.3 else 0.06)
+    assert set(let.fastest_m_per_s.values()) == {0.0, allowed}
+    assert len(looks) == 2 * (len(let.share) - 1) and all(np.isfinite(list(let.share.values())))
