@@ -15,6 +15,8 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from agents.answering import Agent, Keep, NotTheirs, Search
+from agents.code.agent import CodeAgent
+from agents.code.materials import Given, Materials
 from agents.language_model.budget import Budget
 from agents.language_model.client import LanguageModel
 from agents.language_model.no_answer import NoAnswer
@@ -23,18 +25,20 @@ from agents.rag.index_file import IndexRefused
 from agents.rag.library import open_library
 from agents.rag.stages import Asked, Retrieval
 from agents.roles import ROLES
+from gateway.core.computations import ComputeReply, ComputeRequest
 from gateway.core.interactions import Interaction, pack
 from gateway.core.json_problems import problems
 from gateway.core.line import Line
 from gateway.core.messages import Reply
 from gateway.core.questions import Question
-from gateway.core.topics import AGENT_DECIDE, ASK_LOG, AgentName
+from gateway.core.topics import AGENT_COMPUTE, AGENT_DECIDE, ASK_LOG, AgentName
 from gateway.mailbox.bus import BusUnavailable, TlsEndpoint, connect
 from gateway.mailbox.port import Mailbox, Unreachable
 
 EXIT_OK, EXIT_NO_BUS = 0, 1  # another try may find it
 ANOTHER_TASK_S = 3600.0
 LOG_S = 5.0  #: for the gateway to take an interaction
+COMPUTE_MAX_S = 120.0  #: for all calls of a request
 
 Tell = Callable[[str], None]
 
@@ -62,19 +66,25 @@ async def serve(line: Line, where: Path | TlsEndpoint, folder: Path, tell: Tell)
         held.push_async_callback(bus.close)
         model = await _model(line, held, tell)
         search = await _knowledge(folder, held, tell)
-        begin(bus, line, search, model, tell)
+        begin(bus, line, search, model, tell, Given())
         tell(f"agents of {line.site}/{line.line}: {', '.join(ROLES)}")
         await stop.wait()
     return EXIT_OK
 
 
-def begin(bus: Mailbox, line: Line, search: Search, model: LanguageModel | None, tell: Tell) -> None:
-    """Every agent answers on `bus` from now on."""
+def begin(
+    bus: Mailbox, line: Line, search: Search, model: LanguageModel | None, tell: Tell, materials: Materials
+) -> None:  # fmt: skip
+    """Every agent answers on `bus` from now on. `materials`: what the Code agent computes with."""
     budget = _Task(line.agents.task_max_tokens)
     asking = asyncio.Lock()  # one model, one question at a time
+    code = CodeAgent(line, materials, _keep(bus, "code", tell))
     for name in ROLES:
-        agent = Agent(name, search, _keep(bus, name, tell), model, budget.now)
+        if not ROLES[name].decides:
+            continue
+        agent = Agent(name, search, _keep(bus, name, tell), model, budget.now, code=code)
         bus.serve(AGENT_DECIDE.of(name), _handler(agent, asking))
+    bus.serve(AGENT_COMPUTE.of("code"), _computing(code))
 
 
 class _Task:
@@ -103,6 +113,19 @@ def _handler(agent: Agent, asking: asyncio.Lock) -> Callable[[bytes], Awaitable[
             return (await agent.answer(question)).model_dump_json().encode()
 
     return decide
+
+
+def _computing(code: CodeAgent) -> Callable[[bytes], Awaitable[bytes]]:
+    async def compute(payload: bytes) -> bytes:
+        try:
+            request = ComputeRequest.model_validate_json(payload)
+        except ValidationError as error:
+            raise NotTheirs("; ".join(problems(error, ComputeRequest))) from error
+        task = code.task(request.asked_by, request.task)
+        results, number = await task.compute_and_note(request.calls, COMPUTE_MAX_S)
+        return ComputeReply(results=results, interaction=number).model_dump_json().encode()
+
+    return compute
 
 
 def _keep(bus: Mailbox, name: AgentName, tell: Tell) -> Keep:

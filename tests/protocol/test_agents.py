@@ -6,6 +6,7 @@ import sys
 from contextlib import asynccontextmanager
 from pathlib import Path
 
+from agents.code.materials import Given
 from agents.process import begin
 from agents.rag.stages import Asked, Retrieval
 from gateway.cli.asked_agents import AskedAgents
@@ -126,7 +127,7 @@ def test_a_question_for_another_agent_is_an_error_to_who_asked_and_the_process_g
     async def story(folder: Path) -> None:
         async with router(folder) as gateway, client(folder) as agents, client(folder) as phases:
             serve_log(gateway)
-            begin(agents, LINE, nothing, None, lambda text: None)
+            begin(agents, LINE, nothing, None, lambda text: None, Given())
             topic = AGENT_DECIDE.of("sysid")
             for payload in (b"garbage", QUESTION.model_dump_json().encode()):
                 try:
