@@ -74,7 +74,7 @@ async def job_of(call: AnyCall, line: Line, materials: Materials, designed: Call
     """
     return Job(
         call, line,
-        models=tuple([await _model(name, materials) for name in _models(call)]),
+        models=tuple([await _model(name, line, materials) for name in _models(call)]),
         controllers=tuple([await _controller(name, line, materials, designed) for name in _controllers(call)]),
         recordings=tuple(await _recordings(_recordings_named(call), line, materials)),
     )  # fmt: skip
@@ -104,7 +104,7 @@ def _recordings_named(call: AnyCall) -> list[str]:
             return []
 
 
-async def _model(name: str, materials: Materials) -> Believed:
+async def _model(name: str, line: Line, materials: Materials) -> Believed:
     if name == NOMINAL:
         return Believed("the nominal model of the line's file", None)
     found = await materials.model()
@@ -115,6 +115,8 @@ async def _model(name: str, materials: Materials) -> Believed:
     whole = model_hash(found)
     if name != IN_SERVICE and not whole.startswith(name):
         raise CallRefused([f"model {name} is not known; allowed: {IN_SERVICE} ({whole[:SHOWN]}), {NOMINAL}"])
+    if found.n != line.n:
+        raise CallRefused([f"the accepted model has {found.n} spans, the line {line.n}; allowed: {NOMINAL}"])
     return Believed(f"the accepted model {whole[:SHOWN]}", found)
 
 
