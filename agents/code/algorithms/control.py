@@ -124,7 +124,7 @@ def task_on_model(line: Line, believed: Believed) -> DesignTask:
 def gain_margin(config: Controller, task: DesignTask) -> float:
     """By how much all drives may give more torque than is asked for until the loop is unstable; `MOST_GAIN`: and more.
 
-    Below 1: it is unstable as it is. Of a schedule at the task's speed.
+    0: it is unstable as it is. Of a schedule at the task's speed.
     """
     law = law_at(config, task.unwind_speed_m_per_s) if isinstance(config, ScheduledConfig) else config
     form, (A, B) = without_constants(linear_form(law)), linear(task)
