@@ -11,6 +11,7 @@ import time
 from collections.abc import Awaitable, Callable
 from contextlib import AsyncExitStack
 from pathlib import Path
+from typing import TypeVar
 
 from pydantic import ValidationError
 
@@ -27,8 +28,8 @@ from agents.rag.stages import Asked, Retrieval
 from agents.roles import ROLES
 from gateway.core.computations import ComputeReply, ComputeRequest
 from gateway.core.interactions import Interaction, pack
-from gateway.core.json_problems import problems
-from gateway.core.line import Line
+from gateway.core.json_problems import NotJson, document_of, problems
+from gateway.core.line import Line, Strict
 from gateway.core.messages import Reply
 from gateway.core.questions import Question
 from gateway.core.topics import AGENT_COMPUTE, AGENT_DECIDE, ASK_LOG, AgentName
@@ -41,6 +42,7 @@ LOG_S = 5.0  #: for the gateway to take an interaction
 COMPUTE_MAX_S = 120.0  #: for all calls of a request
 
 Tell = Callable[[str], None]
+T = TypeVar("T", bound=Strict)
 
 
 def run_agents(line: Line, where: Path | TlsEndpoint, folder: Path) -> int:
@@ -105,10 +107,7 @@ class _Task:
 
 def _handler(agent: Agent, asking: asyncio.Lock) -> Callable[[bytes], Awaitable[bytes]]:
     async def decide(payload: bytes) -> bytes:
-        try:
-            question = Question.model_validate_json(payload)
-        except ValidationError as error:
-            raise NotTheirs("; ".join(problems(error, Question))) from error
+        question = _read(payload, Question)
         async with asking:
             return (await agent.answer(question)).model_dump_json().encode()
 
@@ -117,15 +116,22 @@ def _handler(agent: Agent, asking: asyncio.Lock) -> Callable[[bytes], Awaitable[
 
 def _computing(code: CodeAgent) -> Callable[[bytes], Awaitable[bytes]]:
     async def compute(payload: bytes) -> bytes:
-        try:
-            request = ComputeRequest.model_validate_json(payload)
-        except ValidationError as error:
-            raise NotTheirs("; ".join(problems(error, ComputeRequest))) from error
+        request = _read(payload, ComputeRequest)
         task = code.task(request.asked_by, request.task)
         results, number = await task.compute_and_note(request.calls, COMPUTE_MAX_S)
         return ComputeReply(results=results, interaction=number).model_dump_json().encode()
 
     return compute
+
+
+def _read(payload: bytes, kind: type[T]) -> T:
+    """Raises NotTheirs with every reason."""
+    try:
+        return kind.model_validate(document_of(payload))
+    except NotJson as error:
+        raise NotTheirs(str(error)) from error
+    except ValidationError as error:
+        raise NotTheirs("; ".join(problems(error, kind))) from error
 
 
 def _keep(bus: Mailbox, name: AgentName, tell: Tell) -> Keep:

@@ -36,8 +36,8 @@ _READY = b"ready"
 class Limits:
     """Of one computation."""
 
-    wall_s: float = 60.0
-    processor_s: int = 60
+    wall_s: float = 120.0
+    processor_s: int = 120
     memory_bytes: int = 2 * 2**30  #: of addresses; loading all that computes takes a quarter of it
     begin_s: float = 300.0  #: until it is loaded: on a new machine it compiles first
 

@@ -18,7 +18,7 @@ from gateway.core.line_problem import printable
 from gateway.core.questions import Figure
 
 CALLS_KEY = "calls"
-MOST_TOLD_WORDS, MOST_TOLD_LETTERS = 12, 300  #: of each result; all of it is on record
+MOST_TOLD_WORDS, MOST_TOLD_LETTERS = 10, 240  #: of each result; all of it is on record
 _LEFT_AWAY = ("title", "default", "description")
 _FORM = f'one JSON object {{"{CALLS_KEY}": [ ... ]}} and nothing else'
 

@@ -93,9 +93,7 @@ async def decide(
         base = first_messages(prompt, question, knowledge)
         reasons = await conversation.reasons(base)
         told = [*base, *([Said("assistant", reasons)] if reasons else [])]
-        if compute is not None:
-            told = await conversation.computations(told, compute)
-        choice = await conversation.answer([*told, form_message(question)], question)
+        choice = await conversation.answer_with(compute, told, question)
     except NoAnswer as error:
         return Unanswered(error.kind, error.text, tuple(conversation.exchanges) if conversation else ())
     return Answered(choice, tuple(conversation.exchanges))
@@ -125,9 +123,21 @@ class _Conversation:
         said = await self._call("reason", 1, messages)
         return "" if said.failure else said.raw
 
+    async def answer_with(self, compute: Compute | None, told: list[Said], question: Question) -> Choice:
+        """After what it wants computed; without it where it does not fit into the context. Raises NoAnswer."""
+        form = form_message(question)
+        if compute is not None:
+            try:
+                more = await self.computations(told, compute)
+                return await self.answer([*more, form], question)
+            except NoAnswer as error:
+                if error.kind != "too-long":
+                    raise
+        return await self.answer([*told, form], question)
+
     async def computations(self, messages: list[Said], compute: Compute) -> list[Said]:
         """`messages`, with what the model has had computed. Each call costs one of those that it may ask for, as does a
-        list that is none; what is wrong is told, and it may ask again while there are some left."""
+        list that is none; what is wrong is told, and it may ask again while there are some left. Raises NoAnswer."""
         left, number = self._model.settings.computations_max, 0
         while left > 0:
             number += 1

@@ -183,13 +183,13 @@ async def nothing_known(_: Asked) -> Retrieval:
 
 
 async def asked(
-    persona: Persona, question: Question = QUESTION, most: int = 3, budget: Budget | None = None
+    persona: Persona, question: Question = QUESTION, most: int = 3, budget: Budget | None = None, **settings: Any
 ) -> tuple[Answer, Interaction, Kept, Runs]:
     """The answer of the adaptation agent, its record, those of the Code agent, and what was run."""
     kept, of_code, runs = Kept(), Kept(), Runs()
-    settings = SETTINGS.model_copy(update={"computations_max": most})
+    changed = SETTINGS.model_copy(update={"computations_max": most} | settings)
     clock = asyncio.get_running_loop().time
-    async with LanguageModel(settings, clock, InProcess(Engine(persona, seed=1))) as model:
+    async with LanguageModel(changed, clock, InProcess(Engine(persona, seed=1))) as model:
         agent = Agent(
             "adaptation", nothing_known, kept.keep, model, lambda: budget or Budget(200_000),
             code=code(of_code, runs),
@@ -299,3 +299,30 @@ def test_a_computation_may_take_half_of_the_time_that_is_left_and_no_more() -> N
     answer, kept = virtually(story())
     assert answer.by == "adaptation" and given and given[0] <= 0.5 * SETTINGS.answer_max_s
     assert "not done within" in said(kept)
+
+
+def test_where_computations_do_not_fit_into_the_context_it_answers_without_them() -> None:
+    narrow = {"context_tokens": 3600, "answer_tokens": 512}
+    answer, kept, of_code, _ = virtually(asked(PERSONAS["perfect"], **narrow))
+    assert (answer.choice.option, answer.by) == ("mpc", "adaptation") and not of_code
+    assert purposes(kept) == ["reason", "compute", "answer"] and kept.exchanges[1]["failure"] == "too-long"
+
+
+def test_where_the_results_do_not_fit_it_answers_without_them() -> None:
+    class Long(Runs):
+        async def __call__(self, job: Job, within_s: float) -> Outcome:
+            return Outcome(words=["0123456789 " * 20] * 10)
+
+    async def story() -> tuple[Answer, Interaction]:
+        kept = Kept()
+        settings = SETTINGS.model_copy(update={"context_tokens": 5200, "answer_tokens": 512})
+        clock = asyncio.get_running_loop().time
+        async with LanguageModel(settings, clock, InProcess(Engine(PERSONAS["perfect"]))) as model:
+            agent = Agent(
+                "adaptation", nothing_known, kept.keep, model, lambda: Budget(200_000), code=code(Kept(), Long())
+            )
+            return await agent.answer(QUESTION), kept[0]
+
+    answer, kept = virtually(story())
+    assert answer.by == "adaptation" and purposes(kept) == ["reason", "compute", "answer", "answer"]
+    assert kept.exchanges[2]["failure"] == "too-long" and kept.exchanges[1]["computed"]
