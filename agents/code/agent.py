@@ -22,6 +22,7 @@ Keep = Callable[[Interaction], Awaitable[None]]
 Run = Callable[[Job, float], Awaitable[Outcome]]  #: within so many seconds, always an outcome
 MOST_REASONS = 20
 MOST_FAILED = 600
+MOST_SHOWN = 200  #: letters of a call that is too large
 
 
 class CodeAgent:
@@ -127,6 +128,6 @@ class Task:
 def shown(document: Any) -> Any:
     """A call as it goes on record: as it is, or the beginning of it where it is too large or no JSON."""
     size = size_of(document)
-    if size is not None and size <= MOST_BYTES:
-        return document
-    return f"{json.dumps(document, default=repr) if size is not None else repr(document)}"[:200]
+    if size is None:
+        return repr(document)[:MOST_SHOWN]
+    return document if size <= MOST_BYTES else json.dumps(document)[:MOST_SHOWN]

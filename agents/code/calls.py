@@ -187,7 +187,7 @@ def parse_call(document: Any) -> AnyCall:
     call = cast(dict[str, Any], document)
     size = size_of(call)
     if size is None:
-        raise CallRefused(["it is no JSON: numbers must be finite"])
+        raise CallRefused(["it is no JSON: numbers must be finite, and text whole characters"])
     if size > MOST_BYTES:
         raise CallRefused([f"it has {size} bytes; allowed: {MOST_BYTES}: things are named here, not given"])
     kind = call.get("call")
@@ -200,9 +200,9 @@ def parse_call(document: Any) -> AnyCall:
 
 
 def size_of(document: Any) -> int | None:
-    """Bytes as JSON; None where it is none."""
+    """Bytes as JSON; None where it is none: numbers without end, halves of characters."""
     try:
-        return len(json.dumps(document, allow_nan=False).encode())
+        return len(json.dumps(document, allow_nan=False, ensure_ascii=False).encode())
     except (ValueError, TypeError, RecursionError):
         return None
 

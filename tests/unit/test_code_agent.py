@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from typing import Any
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from agents.answering import Agent
 from agents.code.agent import CodeAgent, Task
@@ -14,6 +16,7 @@ from agents.code.job import Job, Outcome
 from agents.code.materials import Given, Materials
 from agents.language_model.budget import Budget
 from agents.language_model.client import LanguageModel
+from agents.language_model.computing import results_message
 from agents.language_model.deciding import MOST_TRIES
 from agents.rag.stages import Asked, Retrieval
 from gateway.cli.agents_view import as_story, as_table
@@ -326,3 +329,22 @@ def test_where_the_results_do_not_fit_it_answers_without_them() -> None:
     answer, kept = virtually(story())
     assert answer.by == "adaptation" and purposes(kept) == ["reason", "compute", "answer", "answer"]
     assert kept.exchanges[2]["failure"] == "too-long" and kept.exchanges[1]["computed"]
+
+
+ODD = st.recursive(
+    st.none() | st.integers() | st.floats() | st.text(st.characters(), max_size=8),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(st.characters()), inner),
+    max_leaves=8,
+)
+
+
+@given(
+    st.lists(
+        ODD | ODD.map(lambda odd: {"call": odd}) | ODD.map(lambda odd: DESIGN | {"knobs": odd}), min_size=1, max_size=3
+    )
+)
+def test_whatever_is_asked_is_refused_told_and_on_record(calls: list[Any]) -> None:
+    results, _, kept = computed(*calls)
+    assert len(results) == len(calls) and unpack(pack(kept)) == kept
+    results_message(results, []).content.encode()
+    as_story(kept).encode()
