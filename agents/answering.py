@@ -5,12 +5,11 @@ Whatever goes wrong on the way, there is an answer, and it says how it came abou
 
 import hashlib
 import secrets
-import time
 from collections.abc import Awaitable, Callable, Sequence
-from dataclasses import dataclass
-from datetime import UTC, datetime
 from typing import Any
 
+from agents.clocks import SYSTEM, Clocks
+from agents.code.agent import CodeAgent
 from agents.language_model.asking import Passage
 from agents.language_model.budget import Budget
 from agents.language_model.client import LanguageModel
@@ -34,22 +33,17 @@ class NotTheirs(Exception):
     """The question is another agent's."""
 
 
-@dataclass(frozen=True)
-class Clocks:
-    monotonic_s: Callable[[], float] = time.monotonic
-    now: Callable[[], datetime] = lambda: datetime.now(UTC)
-
-
-SYSTEM = Clocks()
-
-
 class Agent:
-    """One of `ROLES`. `model` None: the rules answer, with what is known quoted beside it. `keep` raises nothing."""
+    """One of `ROLES`. `model` None: the rules answer, with what is known quoted beside it. `keep` raises nothing.
+
+    `code` computes what the model asks for; None: it cannot ask.
+    """
 
     def __init__(
         self, name: AgentName, search: Search, keep: Keep, model: LanguageModel | None,
         budget: Callable[[], Budget],
         clocks: Clocks = SYSTEM,
+        code: CodeAgent | None = None,
     ) -> None:  # fmt: skip
         self.role: Role = ROLES[name]
         self._search = search
@@ -57,6 +51,7 @@ class Agent:
         self._model = model
         self._budget = budget
         self._clocks = clocks
+        self._code = code
 
     async def answer(self, question: Question) -> Answer:
         """Raises NotTheirs."""
@@ -101,7 +96,8 @@ class Agent:
         if self._model is None:
             return Answer(choice=usual_choice(question), by=RULES), ()
         passages = [Passage(f"{hit.document.title} ({hit.document.key})", _told(hit)) for hit in hits]
-        found = await decide(self._model, self.role.prompt, question, passages, budget=self._budget())
+        compute = None if self._code is None else self._code.task(self.role.name, question.task).compute
+        found = await decide(self._model, self.role.prompt, question, passages, budget=self._budget(), compute=compute)
         if isinstance(found, Answered):
             return Answer(choice=found.choice, by=self.role.name), found.exchanges
         instead = f"the language model gave no answer ({found.kind}): {found.text}"[:MOST_INSTEAD]

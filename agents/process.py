@@ -11,10 +11,13 @@ import time
 from collections.abc import Awaitable, Callable
 from contextlib import AsyncExitStack
 from pathlib import Path
+from typing import TypeVar
 
 from pydantic import ValidationError
 
 from agents.answering import Agent, Keep, NotTheirs, Search
+from agents.code.agent import CodeAgent
+from agents.code.materials import Given, Materials
 from agents.language_model.budget import Budget
 from agents.language_model.client import LanguageModel
 from agents.language_model.no_answer import NoAnswer
@@ -23,20 +26,23 @@ from agents.rag.index_file import IndexRefused
 from agents.rag.library import open_library
 from agents.rag.stages import Asked, Retrieval
 from agents.roles import ROLES
+from gateway.core.computations import ComputeReply, ComputeRequest
 from gateway.core.interactions import Interaction, pack
-from gateway.core.json_problems import problems
-from gateway.core.line import Line
+from gateway.core.json_problems import NotJson, document_of, problems
+from gateway.core.line import Line, Strict
 from gateway.core.messages import Reply
 from gateway.core.questions import Question
-from gateway.core.topics import AGENT_DECIDE, ASK_LOG, AgentName
+from gateway.core.topics import AGENT_COMPUTE, AGENT_DECIDE, ASK_LOG, AgentName
 from gateway.mailbox.bus import BusUnavailable, TlsEndpoint, connect
 from gateway.mailbox.port import Mailbox, Unreachable
 
 EXIT_OK, EXIT_NO_BUS = 0, 1  # another try may find it
 ANOTHER_TASK_S = 3600.0
 LOG_S = 5.0  #: for the gateway to take an interaction
+COMPUTE_MAX_S = 120.0  #: for all calls of a request
 
 Tell = Callable[[str], None]
+T = TypeVar("T", bound=Strict)
 
 
 def run_agents(line: Line, where: Path | TlsEndpoint, folder: Path) -> int:
@@ -62,19 +68,25 @@ async def serve(line: Line, where: Path | TlsEndpoint, folder: Path, tell: Tell)
         held.push_async_callback(bus.close)
         model = await _model(line, held, tell)
         search = await _knowledge(folder, held, tell)
-        begin(bus, line, search, model, tell)
+        begin(bus, line, search, model, tell, Given())
         tell(f"agents of {line.site}/{line.line}: {', '.join(ROLES)}")
         await stop.wait()
     return EXIT_OK
 
 
-def begin(bus: Mailbox, line: Line, search: Search, model: LanguageModel | None, tell: Tell) -> None:
-    """Every agent answers on `bus` from now on."""
+def begin(
+    bus: Mailbox, line: Line, search: Search, model: LanguageModel | None, tell: Tell, materials: Materials
+) -> None:  # fmt: skip
+    """Every agent answers on `bus` from now on. `materials`: what the Code agent computes with."""
     budget = _Task(line.agents.task_max_tokens)
     asking = asyncio.Lock()  # one model, one question at a time
+    code = CodeAgent(line, materials, _keep(bus, "code", tell))
     for name in ROLES:
-        agent = Agent(name, search, _keep(bus, name, tell), model, budget.now)
+        if not ROLES[name].decides:
+            continue
+        agent = Agent(name, search, _keep(bus, name, tell), model, budget.now, code=code)
         bus.serve(AGENT_DECIDE.of(name), _handler(agent, asking))
+    bus.serve(AGENT_COMPUTE.of("code"), _computing(code))
 
 
 class _Task:
@@ -95,14 +107,31 @@ class _Task:
 
 def _handler(agent: Agent, asking: asyncio.Lock) -> Callable[[bytes], Awaitable[bytes]]:
     async def decide(payload: bytes) -> bytes:
-        try:
-            question = Question.model_validate_json(payload)
-        except ValidationError as error:
-            raise NotTheirs("; ".join(problems(error, Question))) from error
+        question = _read(payload, Question)
         async with asking:
             return (await agent.answer(question)).model_dump_json().encode()
 
     return decide
+
+
+def _computing(code: CodeAgent) -> Callable[[bytes], Awaitable[bytes]]:
+    async def compute(payload: bytes) -> bytes:
+        request = _read(payload, ComputeRequest)
+        task = code.task(request.asked_by, request.task)
+        results, number = await task.compute_and_note(request.calls, COMPUTE_MAX_S)
+        return ComputeReply(results=results, interaction=number).model_dump_json().encode()
+
+    return compute
+
+
+def _read(payload: bytes, kind: type[T]) -> T:
+    """Raises NotTheirs with every reason."""
+    try:
+        return kind.model_validate(document_of(payload))
+    except NotJson as error:
+        raise NotTheirs(str(error)) from error
+    except ValidationError as error:
+        raise NotTheirs("; ".join(problems(error, kind))) from error
 
 
 def _keep(bus: Mailbox, name: AgentName, tell: Tell) -> Keep:

@@ -19,14 +19,18 @@ class Role:
     @property
     def prompt(self) -> str:
         """Its part, then the rules that all share."""
-        return f"{_read(self.folder, 'prompt.md')}\n{_read('.', 'rules.md')}"
+        return f"{self.own_words}\n{_read('.', 'rules.md')}"
+
+    @property
+    def own_words(self) -> str:
+        """Its part alone."""
+        return _read(self.folder, "prompt.md")
 
 
 def _of(phase: str) -> tuple[Decision, ...]:
     return tuple(one for one in DECISIONS if one.startswith(f"{phase}."))
 
 
-#: The Code agent decides nothing: it computes for the others.
 ROLES: dict[AgentName, Role] = {
     one.name: one
     for one in (
@@ -34,6 +38,7 @@ ROLES: dict[AgentName, Role] = {
         Role("initial-control", "initial_control", _of("design")),
         Role("adaptation", "adaptation", _of("adapt")),
         Role("monitoring", "monitoring", (*_of("monitor"), *_of("run"))),
+        Role("code", "code", ()),  # it computes for the others
     )
 }
 

@@ -1,11 +1,14 @@
-"""A question asked of a language model: it reasons freely, then answers in the form, at most three times. Nothing that
-`wrong_with` refuses comes out of here, and no failure but as `Unanswered`; the caller then goes on by the rules.
+"""A question asked of a language model: it reasons freely, may have something computed, and answers in the form, with
+three tries at most. Nothing that `wrong_with` refuses comes out of here, and no failure but as `Unanswered`; the caller
+then goes on by the rules.
 """
 
-from collections.abc import Sequence
+from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Literal
 
+from agents.code.calls import CallRefused
 from agents.language_model.asking import (
     MOST_REPEATED,
     Passage,
@@ -17,12 +20,17 @@ from agents.language_model.asking import (
 )
 from agents.language_model.budget import Budget
 from agents.language_model.client import Heard, LanguageModel
+from agents.language_model.computing import calls_format, calls_message, read_calls, results_message
 from agents.language_model.no_answer import Kind, NoAnswer
 from agents.language_model.replies import Said
+from gateway.core.computations import Computed
 from gateway.core.line import NonNegative, Strict
 from gateway.core.questions import Choice, ChoiceRefused, Question
 
 MOST_TRIES = 3  #: of an answer in the form
+COMPUTING_SHARE = 0.5  #: of the time that is left: the answer needs some, too
+#: Calls, unread, and the seconds that there are; one result for each. Raises nothing.
+Compute = Callable[[Sequence[Any], float], Awaitable[list[Computed]]]
 #: Another try may go better: what came was cut off, torn or nothing.
 WORTH_ANOTHER_TRY: frozenset[Kind] = frozenset({"length", "broken", "empty"})
 
@@ -30,7 +38,7 @@ WORTH_ANOTHER_TRY: frozenset[Kind] = frozenset({"length", "broken", "empty"})
 class Exchange(Strict):
     """One call of the model and all that came of it."""
 
-    purpose: Literal["reason", "answer"]
+    purpose: Literal["reason", "compute", "answer"]
     number: int  #: of this purpose, from 1
     model: str
     digest: str  #: of its weights
@@ -38,6 +46,7 @@ class Exchange(Strict):
     raw: str  #: the answer, byte for byte; of a failure, what had come
     thinking: str = ""  #: apart from the answer, of models that do that
     parsed: Choice | None = None
+    computed: list[Computed] = []  #: what it has asked for, and what came of it
     refused: list[str] = []  #: why it is no answer
     failure: Kind | None = None  #: where there is no whole answer
     tokens_in: int | None = None
@@ -68,11 +77,13 @@ async def decide(
     *,
     budget: Budget,
     heard: Heard | None = None,
+    compute: Compute | None = None,
 ) -> Answered | Unanswered:
     """What `model` chooses, with every exchange.
 
     `prompt`: the system's message. `budget`: of the task that the question belongs to. `heard` is told each piece of
-    what the model says. The model's settings bound the time: `load_max_s` to be ready, then `answer_max_s` for all.
+    what the model says. `compute` carries out what the model wants computed; None: nothing. The model's settings bound
+    the time, `load_max_s` to be ready, then `answer_max_s` for all, and the calls, `computations_max`.
     """
     conversation: _Conversation | None = None
     try:
@@ -81,14 +92,11 @@ async def decide(
         conversation = _Conversation(model, ready.digest, budget, heard)
         base = first_messages(prompt, question, knowledge)
         reasons = await conversation.reasons(base)
-        choice = await conversation.answer(_asked_for_form(base, reasons, question), question)
+        told = [*base, *([Said("assistant", reasons)] if reasons else [])]
+        choice = await conversation.answer_with(compute, told, question)
     except NoAnswer as error:
         return Unanswered(error.kind, error.text, tuple(conversation.exchanges) if conversation else ())
     return Answered(choice, tuple(conversation.exchanges))
-
-
-def _asked_for_form(base: Sequence[Said], reasons: str, question: Question) -> list[Said]:
-    return [*base, *([Said("assistant", reasons)] if reasons else []), form_message(question)]
 
 
 def _told_again(messages: list[Said], said: Exchange) -> list[Said]:
@@ -115,11 +123,53 @@ class _Conversation:
         said = await self._call("reason", 1, messages)
         return "" if said.failure else said.raw
 
+    async def answer_with(self, compute: Compute | None, told: list[Said], question: Question) -> Choice:
+        """After what it wants computed; without it where it does not fit into the context. Raises NoAnswer."""
+        form = form_message(question)
+        if compute is not None:
+            try:
+                more = await self.computations(told, compute)
+                return await self.answer([*more, form], question)
+            except NoAnswer as error:
+                if error.kind != "too-long":
+                    raise
+        return await self.answer([*told, form], question)
+
+    async def computations(self, messages: list[Said], compute: Compute) -> list[Said]:
+        """`messages`, with what the model has had computed. Each call costs one of those that it may ask for, as does a
+        list that is none; what is wrong is told, and it may ask again while there are some left. Raises NoAnswer."""
+        left, number = self._model.settings.computations_max, 0
+        while left > 0:
+            number += 1
+            asked = [*messages, calls_message(left, first=number == 1)]
+            said = await self._call("compute", number, asked, calls_format(left), _refused_calls)
+            calls = [] if said.failure or said.refused else read_calls(said.raw)
+            if said.failure or not (calls or said.refused):
+                return messages
+            refused = list(said.refused)
+            if len(calls) > left:
+                refused.append(f"{len(calls)} calls were asked for; allowed: {left}")
+            results = await self._computed(calls[:left], compute)
+            messages = [*asked, Said("assistant", said.raw[:MOST_REPEATED]), results_message(results, refused)]
+            left -= max(len(calls), 1)
+            if not refused and all(one.done for one in results):
+                break
+        return messages
+
+    async def _computed(self, calls: Sequence[Any], compute: Compute) -> list[Computed]:
+        """Kept beside the exchange that has asked for it."""
+        if not calls:
+            return []
+        results = await compute(calls, COMPUTING_SHARE * (self._until_s - self._model.now_s()))
+        self.exchanges[-1] = self.exchanges[-1].model_copy(update={"computed": results})
+        return results
+
     async def answer(self, messages: list[Said], question: Question) -> Choice:
         """Raises NoAnswer when no try is one."""
+        form = answer_format(question)
         told, think, refused = messages, False, list[str]()
         for number in range(1, MOST_TRIES + 1):
-            said = await self._call("answer", number, told, question, think)
+            said = await self._call("answer", number, told, form, partial(_read, question), think)
             if said.parsed is not None:
                 return said.parsed
             refused = said.refused
@@ -130,22 +180,22 @@ class _Conversation:
 
     async def _call(
         self,
-        purpose: Literal["reason", "answer"],
+        purpose: Literal["reason", "compute", "answer"],
         number: int,
         messages: list[Said],
-        question: Question | None = None,
+        form: dict[str, Any] | None = None,
+        read: Callable[[str], dict[str, Any]] = lambda text: {},
         think: bool | None = False,
     ) -> Exchange:
-        """One exchange, kept. `question`: the answer is to have its form. Raises NoAnswer where no other try helps."""
+        """One exchange, kept, with what `read` finds in the answer. Raises NoAnswer where no other try helps."""
         began_s = self._model.now_s()
-        form = None if question is None else answer_format(question)
         failed: NoAnswer | None = None
         try:
             left_s = self._until_s - began_s
             reply = await self._model.chat(messages, left_s, self._budget, form, think, self._heard)
             came: dict[str, Any] = {"raw": reply.text, "thinking": reply.thinking}
             came |= {"tokens_in": reply.tokens_in, "tokens_out": reply.tokens_out}
-            came |= {} if question is None else _read(reply.text, question)
+            came |= read(reply.text)
         except NoAnswer as error:
             failed = error
             came = {"raw": error.so_far, "failure": error.kind, "refused": [error.text]}
@@ -165,7 +215,15 @@ class _Conversation:
         return self.exchanges[-1]
 
 
-def _read(text: str, question: Question) -> dict[str, Any]:
+def _refused_calls(text: str) -> dict[str, Any]:
+    try:
+        read_calls(text)
+        return {}
+    except CallRefused as refused:
+        return {"refused": refused.reasons}
+
+
+def _read(question: Question, text: str) -> dict[str, Any]:
     try:
         return {"parsed": read_answer(text, question)}
     except ChoiceRefused as refused:

@@ -7,9 +7,11 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from gateway.core.interactions import Interaction, Note
+from gateway.cli.compute_view import as_text, figure_text
+from gateway.core.computations import Computed
+from gateway.core.interactions import Answer, Interaction, Note
 from gateway.core.line_problem import printable
-from gateway.core.questions import Figure, Option
+from gateway.core.questions import Option, Question
 from gateway.supervisor.interactions import Row
 
 WIDTH = 120
@@ -33,30 +35,39 @@ def as_table(rows: Sequence[Row]) -> str:
 
 def as_story(one: Interaction) -> str:
     """Question, options, what was looked up, every word of the model, the answer: in the order in which it happened."""
-    question, answer = one.question, one.answer
+    if one.question is not None and one.answer is not None:
+        parts = _of_question(one, one.question, one.answer)
+    else:
+        parts = [
+            f"{one.agent} was asked by {one.asked_by} at {one.at} to compute for: {one.task}",
+            *map(as_text, one.computations),
+            f"({one.seconds:.1f} s)",
+        ]
+    lines = "\n\n".join(part for part in parts if part).splitlines()
+    return "\n".join(map(printable, lines))
+
+
+def _of_question(one: Interaction, question: Question, answer: Answer) -> list[str]:
     parts = [
         f"{one.agent} was asked at {one.at}: {question.task} ({question.decision})",
         _listed("known", question.facts),
-        _listed("figures", [_figure(figure) for figure in question.figures]),
+        _listed("figures", [figure_text(figure) for figure in question.figures]),
         _listed("offered", [_option(option) for option in question.options]),
         f"the rules would choose {question.usual}: {question.why}",
         _listed("looked up", [_note(note) for note in one.notes]),
         _listed("conflicts among it", one.conflicts),
         *(_exchange(number, exchange) for number, exchange in enumerate(one.exchanges, 1)),
-        _answer(one),
+        _answer(one, answer),
     ]
-    if answer.instead:
-        parts.append(f"the rules, because {answer.instead}")
-    lines = "\n\n".join(part for part in parts if part).splitlines()
-    return "\n".join(map(printable, lines))
+    return [*parts, f"the rules, because {answer.instead}"] if answer.instead else parts
 
 
-def _answer(one: Interaction) -> str:
-    choice = one.answer.choice
+def _answer(one: Interaction, answer: Answer) -> str:
+    choice = answer.choice
     turned = ", ".join(f"{name} times {factor:g}" for name, factor in choice.factors.items())
     tokens = f", {one.tokens_in} tokens read and {one.tokens_out} written" if one.exchanges else ""
     return (
-        f"chosen by {one.answer.by}: {choice.option}{f', {turned}' if turned else ''}\n"
+        f"chosen by {answer.by}: {choice.option}{f', {turned}' if turned else ''}\n"
         f"{indent(choice.reason, '  > ', lambda _: True)}\n({one.seconds:.1f} s{tokens})"
     )
 
@@ -73,6 +84,7 @@ def _exchange(number: int, exchange: dict[str, Any]) -> str:
         *([indent(f"thought: {thought}", "  | ")] if thought else []),
         indent(f"said: {said}", "  | "),
         *(f"  refused: {reason}" for reason in refused),
+        *(indent(as_text(Computed.model_validate(row)), "  ") for row in exchange.get("computed") or []),
     ])  # fmt: skip
 
 
@@ -81,13 +93,8 @@ def _listed(head: str, rows: Sequence[str]) -> str:
 
 
 def _option(option: Option) -> str:
-    figures = "; ".join(_figure(figure) for figure in option.figures)
+    figures = "; ".join(figure_text(figure) for figure in option.figures)
     return f"{option.id}: {option.title}{f' ({figures})' if figures else ''}"
-
-
-def _figure(figure: Figure) -> str:
-    value = "not known" if figure.value is None else f"{figure.value:g} {figure.unit}".rstrip()
-    return f"{figure.name} {value}"
 
 
 def _note(note: Note) -> str:

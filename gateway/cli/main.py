@@ -13,6 +13,7 @@ from gateway.cli import (
     audit_replay,
     baselines_commands,
     commission_commands,
+    compute_commands,
     configurations_commands,
     design_commands,
     doctor_commands,
@@ -85,6 +86,7 @@ app.add_typer(audit_commands.app, rich_help_panel=EVIDENCE)
 app.add_typer(configurations_commands.app, rich_help_panel=EVIDENCE)
 app.command(rich_help_panel=EVIDENCE)(baselines_commands.baselines)
 app.command(rich_help_panel=EVIDENCE)(ask_commands.ask)
+app.command(rich_help_panel=ENGINEER)(compute_commands.compute)
 
 
 @app.callback(invoke_without_command=True)

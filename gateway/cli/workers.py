@@ -7,7 +7,7 @@ from multiprocessing import get_context
 from types import TracebackType
 from typing import Any, ParamSpec, TypeVar
 
-from gateway.supervisor.spawned import end_with_parent, interrupt_later
+from gateway.mailbox.spawned import end_with_parent, interrupt_later
 
 P = ParamSpec("P")
 T = TypeVar("T")

@@ -1,20 +1,22 @@
 """What is known of one question that was asked of an agent: who, what, with which knowledge, what came of it. JSON.
 
+The Code agent is asked no question, but to compute: then it says for whom and for what, and every call with its result.
+
 The record of checklist "every interaction is logged": an agent makes it, the gateway keeps it, people read it.
 """
 
 import zlib
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple, Self
 
-from pydantic import Field, ValidationError
+from pydantic import Field, ValidationError, model_validator
 
+from gateway.core.computations import MOST_CALLS, By, Computed
 from gateway.core.json_problems import NotJson, document_of, problems
 from gateway.core.line import NonNegative, Strict
 from gateway.core.line_model import Instant
 from gateway.core.questions import Choice, Question
 
 MOST_BYTES = 1024 * 1024  #: of an interaction as JSON, unpacked
-By = Annotated[str, Field(min_length=1, max_length=64)]
 
 
 class Note(Strict):
@@ -43,16 +45,46 @@ class Interaction(Strict):
     id: Annotated[str, Field(pattern=r"^[0-9a-f]{16}$")]
     agent: By
     at: Instant
-    question: Question
-    notes: Annotated[list[Note], Field(max_length=40)]
-    conflicts: Annotated[list[str], Field(max_length=100)]  #: among what was found, each with its rule
+    question: Question | None = None  #: with `answer`; null: it was asked to compute
+    notes: Annotated[list[Note], Field(max_length=40)] = []
+    conflicts: Annotated[list[str], Field(max_length=100)] = []  #: among what was found, each with its rule
     prompt: str  #: SHA-256 of the agent's prompt
-    model: str  #: of the language model, with its digest; empty: none was asked
-    exchanges: Annotated[list[dict[str, Any]], Field(max_length=16)]  #: every call of the model, in its order
-    answer: Answer
-    tokens_in: int
-    tokens_out: int
+    model: str = ""  #: of the language model, with its digest; empty: none was asked
+    #: Every call of the model, in its order, with what was computed for it.
+    exchanges: Annotated[list[dict[str, Any]], Field(max_length=16)] = []
+    answer: Answer | None = None
+    asked_by: Annotated[str, Field(max_length=64)] = ""  #: of what was computed: an agent, or a phase
+    task: Annotated[str, Field(max_length=600)] = ""  #: and for what
+    computations: Annotated[list[Computed], Field(max_length=MOST_CALLS)] = []
+    tokens_in: int = 0
+    tokens_out: int = 0
     seconds: NonNegative
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if (self.question is None) is not (self.answer is None):
+            raise ValueError("there is a question without an answer, or an answer without one; allowed: both or none")
+        if (self.question is None) is not bool(self.computations and self.asked_by and self.task):
+            raise ValueError("allowed: a question, or computations with asked_by and task, and not both")
+        return self
+
+    @property
+    def in_short(self) -> "InShort":
+        if self.question is not None and self.answer is not None:
+            answer = self.answer
+            return InShort(self.question.decision, answer.choice.option, answer.by, answer.instead)
+        named = ", ".join(one.kind for one in self.computations)
+        against = [one.refused[0] if one.refused else one.failed for one in self.computations if not one.done]
+        return InShort("compute", f"{named} for {self.asked_by}", self.agent, "; ".join(against)[:1000])
+
+
+class InShort(NamedTuple):
+    """An interaction in a row of a table."""
+
+    decision: str
+    chosen: str  #: the option; the calls
+    by: str
+    instead: str  #: why the rules; what was not computed
 
 
 class InteractionRefused(Exception):

@@ -92,9 +92,9 @@ class AgentsDesk:
                 number = await asyncio.to_thread(self._log.keep, packed, one)
         except (InteractionRefused, InteractionsError) as error:
             return _bytes(refused("it is not kept", [str(error)]))
-        answer = one.answer
-        why = f": {answer.instead}" if answer.instead else ""
-        text = f"agent {agent}, {one.question.decision}: {answer.choice.option}, by {answer.by}{why}"
+        decision, chosen, by, instead = one.in_short
+        why = f": {instead}" if instead else ""
+        text = f"agent {agent}, {decision}: {chosen}, by {by}{why}"
         self._note("interaction", text[:MOST_TEXT], id=one.id, number=number)
         return _bytes(Reply(ok=True, state="", text=f"kept as {number}"))
 

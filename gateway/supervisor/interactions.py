@@ -69,13 +69,12 @@ class Interactions:
     def keep(self, packed: bytes, one: Interaction) -> int:
         """Its number. What is kept already is kept once; something else under its id is refused."""
         with self._begun() as connection, transaction(connection):
-            answer = one.answer
+            short = one.in_short
             connection.execute(
                 "INSERT INTO interaction (id, agent, at, decision, chosen, decided_by, instead, bytes, content)"
                 " VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?) ON CONFLICT (id) DO NOTHING",
-                (one.id, one.agent, one.at, one.question.decision, answer.choice.option, answer.by, answer.instead,
-                 len(packed), packed),
-            )  # fmt: skip
+                (one.id, one.agent, one.at, *short, len(packed), packed),
+            )
             connection.execute(
                 "DELETE FROM interaction WHERE agent = ?1 AND number <= (SELECT max(number) FROM (SELECT number,"
                 " sum(bytes) OVER (ORDER BY number DESC) AS until FROM interaction WHERE agent = ?1) WHERE until > ?2)",

@@ -8,8 +8,7 @@ import asyncio
 import os
 import secrets
 import signal
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
@@ -19,12 +18,11 @@ from gateway.core.judge_context import JudgeContext
 from gateway.core.line import Line
 from gateway.core.recording import Recording
 from gateway.core.verdict import Verdict
-from gateway.supervisor.spawned import end_with_parent, interrupt_later
+from gateway.mailbox.spawned import end_with_parent, interrupt_later, one_thread_each
 
 NICER, NICEST = 10, 19  #: than the process that starts them; and where nobody waits for a verdict
 BEGIN_S = 600.0  #: until one is ready: on a new machine it compiles first
 LARGEST_SEED = 2**53  #: below it every number is one in JSON, too
-SINGLE = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 #: Rules under which this process refuses by itself.
 TIME_RULE, WORKER_RULE = "time", "judge process"
 
@@ -44,7 +42,7 @@ class _Worker:
         context = get_context("spawn")
         self._ours, theirs = context.Pipe()
         self._process: BaseProcess = context.Process(target=_work, args=(theirs, line, nicer), daemon=True)
-        with _one_thread_each(), interrupt_later():
+        with one_thread_each(), interrupt_later():
             self._process.start()
         theirs.close()
         self._ready = False
@@ -191,18 +189,3 @@ def _work(pipe: Connection, line: Line, nicer: int) -> None:
             pipe.send(verdict)
     except (EOFError, OSError):
         return
-
-
-@contextmanager
-def _one_thread_each() -> Iterator[None]:
-    """What begins here computes in one thread: the loop has the other processors."""
-    before = {name: os.environ.get(name) for name in SINGLE}
-    os.environ.update(dict.fromkeys(SINGLE, "1"))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value

@@ -7,7 +7,7 @@ from typing import Any, Self
 
 from rich.progress import Progress
 
-from gateway.supervisor.spawned import end_with_parent
+from gateway.mailbox.spawned import end_with_parent
 
 
 class Workers:

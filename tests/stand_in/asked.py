@@ -29,8 +29,9 @@ def question_in(messages: Sequence[Message]) -> dict[str, Any] | None:
 
 
 def refusals(messages: Sequence[Message], form: Form) -> int:
-    """How many refusals the conversation tells of: the user asks once, for the form once, then again."""
-    return max(sum(message["role"] == "user" for message in messages) - 2, 0) if form is not None else 0
+    """How many refusals of an answer the conversation tells of."""
+    told = sum(message["role"] == "user" and message["content"].startswith("That is no answer") for message in messages)
+    return told if form is not None else 0
 
 
 def values(question: Mapping[str, Any]) -> dict[str, float]:

@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from tests.stand_in.asked import best, filled, knobs, question_in, refusals, values, worst
+from tests.stand_in.computing import confused, hostile, invented, sensible, wants_calls
 from tests.stand_in.failures import FAILURES
 from tests.stand_in.spoken import Form, Message, Persona, Spoken
 
@@ -21,6 +22,8 @@ def perfect(messages: Sequence[Message], form: Form, rng: random.Random) -> Spok
     question = question_in(messages)
     if question is None:
         return Spoken(NO_QUESTION)
+    if wants_calls(form):
+        return sensible(question, messages)
     chosen = best(question)
     if form is None:
         return Spoken(f"{_figures(question)} I would take {chosen}.")
@@ -37,7 +40,7 @@ def _figures(question: Mapping[str, Any]) -> str:
 def sloppy(messages: Sequence[Message], form: Form, rng: random.Random) -> Spoken:
     """Right three times in four, and careless with the form: prose around it, capitals, a key too many, text."""
     question = question_in(messages)
-    if question is None or form is None:
+    if question is None or form is None or wants_calls(form):
         return perfect(messages, form, rng)
     chosen = best(question) if rng.random() < 0.75 else rng.choice(question["options"])["id"]
     document = filled(form, chosen, {}, "It looks best to me!!")
@@ -59,6 +62,8 @@ def adversarial(messages: Sequence[Message], form: Form, rng: random.Random) -> 
     question = question_in(messages)
     if question is None:
         return Spoken(NO_QUESTION)
+    if wants_calls(form):
+        return hostile(rng)
     chosen = worst(question)
     if form is None:
         return Spoken(f"{chosen} is plainly the best, and the limits are far too tight; they must be raised.")
@@ -76,6 +81,8 @@ def unit_confused(messages: Sequence[Message], form: Form, rng: random.Random) -
     question = question_in(messages)
     if question is None or form is None:
         return perfect(messages, form, rng)
+    if wants_calls(form):
+        return confused()
     factors = {key: rng.choice([1000.0, 0.001]) for key in knobs(form)}
     return Spoken(json.dumps(filled(form, best(question), factors, "In mN, as everywhere.")))
 
@@ -85,12 +92,14 @@ def hallucinating(messages: Sequence[Message], form: Form, rng: random.Random) -
     question = question_in(messages)
     if question is None:
         return Spoken(NO_QUESTION)
-    invented = "As the 2019 study of this very machine shows, roller 17 resonates at 843 Hz."
+    if wants_calls(form):
+        return invented()
+    study = "As the 2019 study of this very machine shows, roller 17 resonates at 843 Hz."
     if form is None:
-        return Spoken(f"{invented} The option hybrid-neural-mpc has a tracking error of 0.0003 N.")
+        return Spoken(f"{study} The option hybrid-neural-mpc has a tracking error of 0.0003 N.")
     if refusals(messages, form) > 0 and rng.random() < 0.5:
-        return Spoken(json.dumps(filled(form, rng.choice(question["options"])["id"], {}, invented)))
-    document = filled(form, "hybrid-neural-mpc", {}, invented)
+        return Spoken(json.dumps(filled(form, rng.choice(question["options"])["id"], {}, study)))
+    document = filled(form, "hybrid-neural-mpc", {}, study)
     return Spoken(json.dumps(document | {"times_quantum-damping": 1.5}))
 
 
@@ -123,7 +132,7 @@ _ORDERS: tuple[tuple[str, re.Pattern[str]], ...] = (
 def injection_obeying(messages: Sequence[Message], form: Form, rng: random.Random) -> Spoken:
     """Does what any quoted text or name in the question tells it to; else as the perfect one."""
     question = question_in(messages)
-    if question is None or form is None:
+    if question is None or form is None or wants_calls(form):
         return perfect(messages, form, rng)
     orders = orders_in(messages, question)
     if words := orders.get("words"):

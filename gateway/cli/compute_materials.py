@@ -1,0 +1,51 @@
+"""What `r2rgate compute` is given in place of a running line: files."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from agents.code.materials import Given
+from gateway.cli.model_place import chosen, reasons_against_line
+from gateway.cli.process_commands import default_data_folder
+from gateway.cli.recordings import read_recording
+from gateway.cli.recordings_table import RecordingRefused
+from gateway.core.controller import Controller, ControllerRefused, parse_controller
+from gateway.core.line import Line
+from gateway.core.line_model import LineModel
+from gateway.supervisor.model_store import ModelsError
+
+
+class MaterialsRefused(Exception):
+    """A file cannot be used; the text says which and why."""
+
+
+def given(
+    line: Line, file: Path, controller: Path | None, model: str | None, recordings: Sequence[Path],
+    data_dir: Path | None,
+) -> Given:  # fmt: skip
+    """Raises MaterialsRefused."""
+    kept = (data_dir or default_data_folder(line)) / "controller.json"
+    path = controller or (kept if kept.exists() else None)
+    try:
+        return Given(
+            _model(model, line, file, data_dir) if model else None,
+            None if path is None else _controller(path),
+            [read_recording(one, line.control.period_s) for one in recordings],
+        )
+    except (ModelsError, RecordingRefused) as error:
+        raise MaterialsRefused(str(error)) from error
+
+
+def _model(wanted: str, line: Line, file: Path, data_dir: Path | None) -> LineModel:
+    found = chosen(wanted, file, data_dir).model
+    if reasons := reasons_against_line(found, line):
+        raise MaterialsRefused("\n".join(f"--model {wanted} is not used: {reason}" for reason in reasons))
+    return found
+
+
+def _controller(path: Path) -> Controller:
+    try:
+        return parse_controller(path.read_bytes())
+    except OSError as error:
+        raise MaterialsRefused(f"{path} cannot be read: {error.strerror}") from error
+    except ControllerRefused as error:
+        raise MaterialsRefused(f"{path} is no controller configuration: {error}") from error
