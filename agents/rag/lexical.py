@@ -92,8 +92,9 @@ class Words:
                 _field(keywords, KEYWORDS, self._mean_keywords),
                 _field(body, BODY, self._mean_text * len(own)),
             ]
-            # Its title is in the score of each passage, so that the first is the best by its own words.
-            found.append(FoundDocument(document, _score(worth, words, fields), own[0]))
+            # By its own words: a short passage that has them in nothing but its document's title tells nothing.
+            said = {chunk: _score(worth, words, [_field(texts[chunk][0], BODY, self._mean_text)]) for chunk in own}
+            found.append(FoundDocument(document, _score(worth, words, fields), max(own, key=said.__getitem__)))
         return sorted(found, key=lambda one: -one.score)
 
     def _worth(self, concepts: Sequence[Concept], known: dict[str, int]) -> Worth:

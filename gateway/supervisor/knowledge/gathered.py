@@ -23,7 +23,7 @@ from gateway.supervisor.baselines import BaselinesError, Measurement, open_basel
 from gateway.supervisor.configurations import Archived, ConfigurationsError, open_configurations
 from gateway.supervisor.knowledge.of_changes import REFUSED, Change, of_change, teaches
 from gateway.supervisor.knowledge.of_line import of_line
-from gateway.supervisor.knowledge.of_measurements import ControlNow, of_archive, of_control, of_measurement
+from gateway.supervisor.knowledge.of_measurements import ControlNow, of_archive, of_control, of_measurement, of_recent
 from gateway.supervisor.knowledge.of_models import of_model
 from gateway.supervisor.lifecycle import Book, Entry
 from gateway.supervisor.model_store import ModelsError
@@ -83,15 +83,14 @@ class LineKnowledge:
         left_out: list[str] = []
         measured = self._from("measurements", self._measurements, [], left_out)
         archived = self._from("archived configurations", self._archives, [], left_out)
-        documents = [
-            *of_line(self._line),
-            self._from("what is in service", lambda: self._control(now), of_control(_without_stores(now)), left_out),
+        control = self._from("what is in service", lambda: self._control(now), of_control(_bare(now)), left_out)
+        happened = [
             *self._from("models", lambda: self._models(now, left_out), [], left_out),
             *self._from("proposals", lambda: self._changes(now, measured, archived, left_out), [], left_out),
             *map(of_measurement, _newest(measured, MOST_MEASUREMENTS, "measurements", left_out)),
             *(of_archive(*one) for one in _newest(archived, MOST_ARCHIVED, "archived configurations", left_out)),
         ]
-        bounded = [_bounded(one) for one in documents]
+        bounded = [_bounded(one) for one in (*of_line(self._line), control, of_recent(happened), *happened)]
         return Known(bounded, left_out, _revision(bounded, left_out))
 
     def _from(self, what: str, read: Callable[[], _T], otherwise: _T, left_out: list[str]) -> _T:
@@ -216,7 +215,7 @@ def _bounded(one: Generated) -> Generated:
     return one.model_copy(update={"text": f"{one.text[:MOST_LETTERS]}\n\n(cut here: it goes on in the line's records)"})
 
 
-def _without_stores(now: BookNow) -> ControlNow:
+def _bare(now: BookNow) -> ControlNow:
     return ControlNow(now.in_service, now.last_known_good, now.epoch, now.model, since_s=now.changed_s)
 
 

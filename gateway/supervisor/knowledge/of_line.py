@@ -13,6 +13,13 @@ from gateway.core.line_words import name_and_unit
 from gateway.supervisor.knowledge.words import listed, number, quoted, section, whole
 
 _TABLES = {"limits": "Limits", "moves": "Moves", "control": "Control", "gate": "Gate", "priorities": "Priorities"}
+_KEYWORDS = {
+    "limits": ["torque limit", "tension limit", "speed limit", "largest step", "watchdog"],
+    "moves": ["ramp", "set-point rates", "controlled stop"],
+    "control": ["control period", "latency"],
+    "gate": ["who approves", "rules of the gate", "probation", "cool-down"],
+    "priorities": ["weights of the score", "what matters"],
+}
 
 
 def of_line(line: Line) -> list[Generated]:
@@ -70,13 +77,13 @@ def _table(line: Line, key: str, model: str) -> Generated:
     fields: dict[str, Any] = table.model_dump()
     return Generated(
         name=f"line-{key}",
-        title=f"The {key} of this line, as its file has them: {HELP['Line'][key].partition(';')[0]}",
-        text=listed(key.capitalize(), (
+        title=f"The {key} of this line",
+        text=f"As the line's file has it: {HELP['Line'][key].partition(';')[0]}.\n\n" + listed(key.capitalize(), (
             f"{_named(key, name)} is {_value('' if key == 'priorities' else name, value)}: {HELP[model][name]}."
             for name, value in fields.items() if value is not None
         )),
         date="",
-        keywords=[key, f"{key} of the line", *([] if key != "limits" else ["what must never be left"])],
+        keywords=_KEYWORDS[key],
     )  # fmt: skip
 
 

@@ -16,6 +16,7 @@ _SERVES: list[Decision] = [
     "adapt.diagnosis", "adapt.change", "adapt.convergence", "monitor.detect", "monitor.diagnosis", "monitor.action",
     "design.weights", "design.selection",
 ]  # fmt: skip
+MOST_RECENT = 12
 _FOLLOWS = {
     "newer-model": "the line does otherwise than the model foresees: a newer model is wanted",
     "calmer": "the model has foreseen it: a calmer configuration on the same model is wanted",
@@ -54,7 +55,7 @@ def of_measurement(one: Measurement) -> Generated:
     diagnosis = found.get("diagnosis")
     return Generated(
         name=f"measurement-{one.number}",
-        title=f"Measured on this line {on(date)}: tracking error against the model's prediction, and its cause",
+        title=f"A measurement on this line, {on(date)}: tracking error and prediction",
         text=whole([
             in_words(one),
             f"Configuration {run.configuration[:12]} controlled the line"
@@ -108,6 +109,19 @@ def of_control(now: ControlNow) -> Generated:
         date=moment(now.since_s),
         keywords=["in service", "controller", "control law", "configuration now", "which model"],
     )  # fmt: skip
+
+
+def of_recent(documents: Sequence[Generated]) -> Generated:
+    """What happened last, of documents of what happened."""
+    newest = sorted(documents, key=lambda one: one.date, reverse=True)[:MOST_RECENT]
+    return Generated(
+        name="recent",
+        title="What happened last on this line",
+        text=listed("The newest first", (f"{on(one.date).removeprefix('on ')}: {one.title}." for one in newest))
+        or "Nothing is on record yet.",
+        date=newest[0].date if newest else "",
+        keywords=["last deployment", "last measurement", "last experiment", "last refusal", "history"],
+    )
 
 
 def _found(one: Measurement) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from gateway.core.line_model_names import OF_THE_LINE, UNITS
 from gateway.core.line_model_quantities import interval_at, values_of
 from gateway.core.line_queries import Generated
 from gateway.core.questions import DECISIONS, Decision
-from gateway.supervisor.knowledge.words import listed, moment, number, on, quoted, section, whole
+from gateway.supervisor.knowledge.words import moment, number, on, quoted, section, whole
 from gateway.supervisor.models import Entry
 
 SERVES: list[Decision] = [one for one in DECISIONS if one.startswith(("identify", "design", "adapt", "monitor"))]
@@ -30,28 +30,46 @@ _WORDS = {
     "eccentricity": "eccentricity of the rollers",
 }
 
+_SHORT = ("stiffness_n", "inertia_kg_m2", "friction_nms_per_rad", "coulomb_nm", "torque_lag_s", "latency_s")
+_KEYWORDS = ["stiffness of the web", "friction of the rollers", "inertia of the rollers", "identified parameters"]
+
 
 def of_model(entry: Entry, model: LineModel, before: LineModel | None, in_service: bool) -> Generated:
     """`before`: the model that was accepted before it; None: there was none."""
     accepted = [mark for mark in entry.marks if mark.state == "accepted"]
     date = moment(accepted[-1].time_s) if accepted else model.created
     state = "in service: it is the model by which proposals are judged" if in_service else "no longer in service"
-    title = "The model of this line: stiffness of the web, friction and inertia of the rollers, torque lag"
     return Generated(
         name=f"model-{entry.version}",
-        title=f"{title} (version {entry.version}, {'in service' if in_service else 'an earlier one'})",
+        title="The model of this line: web stiffness, roller inertia and friction, torque lag"
+        if in_service
+        else f"An earlier model of this line, version {entry.version}",
         text=whole([
+            _in_short(model) if in_service else "",
             f"Model version {entry.version} of this line ({entry.id[:12]}) was accepted {on(date)}. It is {state}.",
-            section("What the line is like", *(_parameters(model))),
-            listed("What differs from the model before", differences(before, model)),
-            section("What it was made from", _made_from(model)),
-            section("How it did on data that it was not made from", _validated(model)),
-            section("Why it was proposed", quoted(accepted[-1].reason)) if accepted else "",
+            section("What the line is like", *_parameters(model)),
+            section(
+                "How it was found",
+                f"Against the model before: {'; '.join(differences(before, model))}.",
+                _made_from(model), _validated(model),
+                *(["It was proposed because:", quoted(accepted[-1].reason)] if accepted else []),
+            ),
         ]),
         date=date,
-        keywords=["identified parameters", "stiffness", "model", "theta", *(["in service"] if in_service else [])],
+        keywords=_KEYWORDS if in_service else ["model history", "identification"],
         serves=SERVES,
     )  # fmt: skip
+
+
+def _in_short(model: LineModel) -> str:
+    """What is asked for most, in one sentence."""
+    told = [f"the {_WORDS[name]} is {_middle(values_of(model)[name].tolist(), UNITS[name])}" for name in _SHORT]
+    return f"On this line {', '.join(told)}."
+
+
+def _middle(values: list[float], unit: str) -> str:
+    low, high = min(values), max(values)
+    return number(low, unit) if low == high else f"{number(low)} to {number(high, unit)}"
 
 
 def _parameters(model: LineModel) -> list[str]:
@@ -84,7 +102,7 @@ def _made_from(model: LineModel) -> str:
     has = [name.replace("_", " ") for name, there in model.structure.model_dump().items() if there]
     tensions = [one for one in (*region.tension_from_n, *region.tension_to_n) if one is not None]
     return " ".join([
-        f"Method: {model.method}. Beside the paper's parameters it has: {', '.join(has) or 'nothing'}.",
+        f"Method: {model.method}. Beside the usual parameters it has: {', '.join(has) or 'nothing'}.",
         f"Data: {data.samples} samples at {number(1e3 * data.period_s, 'ms')} ({data.digest[:12]}, {data.source}).",
         f"The unwinder ran from {number(region.speed_from_m_per_s)} to {number(region.speed_to_m_per_s, 'm/s')} in them"
         + (f", tensions went from {number(min(tensions))} to {number(max(tensions), 'N')}." if tensions else "."),
