@@ -15,6 +15,7 @@ from agents.rag.question_words import Concept, Phrase
 from agents.rag.stages import FoundDocument, FoundPassage
 
 MOST_PASSAGES = 100  #: taken from the first search
+MOST_OWN = 30  #: further ones, by the question's own words alone
 PASSAGES_A_DOCUMENT = 4  #: of a long document, the best ones count
 MOST_MENTIONS = 3000  #: passages with a word of the question that are scored in the first search, over all words
 SATURATION = 5.0  #: k1: how much more a second mention says than a first
@@ -38,10 +39,15 @@ class Words:
     def search(
         self, concepts: Sequence[Concept], tiers: Sequence[Tier]
     ) -> tuple[list[FoundPassage], list[FoundDocument]]:
-        """Passages, up to MOST_PASSAGES, and the documents that they are of; of either the best first."""
+        """Passages, up to MOST_PASSAGES and then MOST_OWN, and the documents that they are of; the best first."""
         known = self._frequencies(concepts)
         telling = self._telling(concepts, known)
         passages = self._passages(telling, tiers) if telling else []
+        # FTS5 weighs what stands for a word as the word itself: whatever has the question's own words is looked at too.
+        said = {concept.said for concept in concepts}
+        if own := [phrase for phrase in telling if phrase in said]:
+            seen = {one.chunk for one in passages}
+            passages += [one for one in self._passages(own, tiers)[:MOST_OWN] if one.chunk not in seen]
         return passages, self._documents(self._worth(concepts, known), passages)
 
     def _passages(self, wanted: Sequence[Phrase], tiers: Sequence[Tier]) -> list[FoundPassage]:
