@@ -235,6 +235,7 @@ class Agents(Strict):
     answer_max_s: Positive = 180.0  #: for a question with all its tries; after it the rules decide
     load_max_s: Positive = 300.0  #: for a model to be loaded
     task_max_tokens: Annotated[int, Field(ge=1024)] = 200_000  #: of one commissioning, asked and answered
+    embedder: Annotated[str, Field(min_length=1, max_length=120)] = "lexical"  #: or minilm, or ollama:MODEL
 
 
 class Network(Strict):

@@ -186,6 +186,7 @@ HELP: dict[str, dict[str, str]] = {
         "answer_max_s": "for an answer with all its tries; after it the rules decide",
         "load_max_s": "for the model to be loaded",
         "task_max_tokens": "asked and answered in one commissioning; after it the rules decide",
+        "embedder": 'what finds knowledge by meaning: "minilm", "ollama:MODEL"; "lexical": by words alone',
     },
     "Network": {
         "listen": 'where agents reach the gateway, e.g. "tls/192.168.0.5:7447"',
