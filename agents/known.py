@@ -51,7 +51,7 @@ class Knowledge:
         """Until something can be looked up: by an embedder only where that costs no vectors."""
         with suppress(TimeoutError):
             async with asyncio.timeout(FIRST_S):
-                await self._hear()
+                await self.hear()
         if self._embedder is None:
             await self.look()
             return
@@ -63,7 +63,7 @@ class Knowledge:
     async def keep_up(self) -> None:
         """For as long as the agents run."""
         while True:
-            await self._hear()
+            await self.hear()
             await self.look()
             await asyncio.sleep(LOOK_S)
 
@@ -78,7 +78,8 @@ class Knowledge:
             raise IndexRefused(self._told.get("index", "nothing is indexed yet"))
         return self._index.retrieve(asked, vectors if self._comparable() else None)
 
-    async def _hear(self) -> None:
+    async def hear(self) -> None:
+        """What is known of the line, where that has changed."""
         try:
             known = await self._line.knowledge_since(None if self._of_line is None else self._of_line.revision)
         except LineNotTold as error:

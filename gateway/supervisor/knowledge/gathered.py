@@ -162,7 +162,8 @@ class LineKnowledge:
     ) -> None:  # fmt: skip
         if not entries:
             return
-        befores = self._controllers({entry.base for entry in entries if entry.kind == "gains"})
+        bases = {entry.base for entry in entries if entry.kind == "gains"}
+        befores = self._from("what was in service before", lambda: self._controllers(bases), {}, left_out)
         with AuditFile(self._folder) as audit:
             for entry in entries:
                 try:
