@@ -8,6 +8,7 @@ those of the words that stand for it. A passage alone does not say what it is ab
 import math
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 
 from agents.rag.database import Database
 from agents.rag.documents import TIERS, Tier
@@ -15,6 +16,7 @@ from agents.rag.question_words import Concept, Phrase
 from agents.rag.stages import FoundDocument, FoundPassage
 
 MOST_PASSAGES = 100  #: taken from the first search
+MOST_SHOWN = 10  #: documents of which the passage that says most is looked for
 MOST_OWN = 30  #: further ones, by the question's own words alone
 PASSAGES_A_DOCUMENT = 4  #: of a long document, the best ones count
 MOST_MENTIONS = 3000  #: passages with a word of the question that are scored in the first search, over all words
@@ -98,10 +100,15 @@ class Words:
                 _field(keywords, KEYWORDS, self._mean_keywords),
                 _field(body, BODY, self._mean_text * len(own)),
             ]
-            # By its own words: a short passage that has them in nothing but its document's title tells nothing.
-            said = {chunk: _score(worth, words, [_field(texts[chunk][0], BODY, self._mean_text)]) for chunk in own}
-            found.append(FoundDocument(document, _score(worth, words, fields), max(own, key=said.__getitem__)))
-        return sorted(found, key=lambda one: -one.score)
+            found.append(FoundDocument(document, _score(worth, words, fields), own[0]))
+        found.sort(key=lambda one: -one.score)
+
+        def own_words(chunk: int) -> float:
+            return _score(worth, words, [_field(texts[chunk][0], BODY, self._mean_text)])
+
+        # A short passage that has the words in nothing but its document's title tells nothing.
+        best = [replace(one, chunk=max(chunks[one.document], key=own_words)) for one in found[:MOST_SHOWN]]
+        return best + found[MOST_SHOWN:]
 
     def _worth(self, concepts: Sequence[Concept], known: dict[str, int]) -> Worth:
         worth: Worth = []
