@@ -63,8 +63,12 @@ class Knowledge:
     async def keep_up(self) -> None:
         """For as long as the agents run."""
         while True:
-            await self.hear()
-            await self.look()
+            try:
+                await self.hear()
+                await self.look()
+                self._say("looking", "")
+            except Exception as error:  # whatever it is: the agents answer with what they have
+                self._say("looking", f"what is known stays as it was: {type(error).__name__}: {error}")
             await asyncio.sleep(LOOK_S)
 
     async def look(self) -> None:

@@ -29,10 +29,13 @@ class Line:
     def __init__(self, *documents: Generated) -> None:
         self.documents = list(documents)
         self.why = ""
+        self.fails = False
         self.asked: list[str | None] = []
 
     async def knowledge_since(self, revision: str | None) -> LineKnown | None:
         self.asked.append(revision)
+        if self.fails:
+            raise ValueError("nobody has thought of it")
         if self.why:
             raise LineNotTold(self.why)
         now = str([one.text for one in self.documents])
@@ -220,7 +223,10 @@ def test_it_goes_on_looking_by_itself(tmp_path, monkeypatch):
     async def story() -> None:
         async with begun(Story(tmp_path, made("zanzibar"))) as one:
             said = len(one.told)
+            one.line.fails = True
             keeping = asyncio.create_task(one.known.keep_up())
+            await until(lambda: "what is known stays as it was: ValueError: nobody has thought of it" in one.told)
+            one.line.fails = False
             one.line.documents = [made("timbuktu")]
             await until(lambda: any("documents are known" in text for text in one.told[said:]))
             assert await one.names("timbuktu") == ["line:model-1"]
