@@ -9,7 +9,7 @@ import signal
 import sys
 import time
 from collections.abc import Awaitable, Callable
-from contextlib import AsyncExitStack
+from contextlib import AbstractAsyncContextManager, AsyncExitStack
 from pathlib import Path
 from typing import TypeVar
 
@@ -17,14 +17,14 @@ from pydantic import ValidationError
 
 from agents.answering import Agent, Keep, NotTheirs, Search
 from agents.code.agent import CodeAgent
-from agents.code.materials import Given, Materials
+from agents.code.materials import Materials
+from agents.known import Knowledge
 from agents.language_model.budget import Budget
 from agents.language_model.client import LanguageModel
 from agents.language_model.no_answer import NoAnswer
-from agents.rag.index import Index
-from agents.rag.index_file import IndexRefused
-from agents.rag.library import open_library
-from agents.rag.stages import Asked, Retrieval
+from agents.line_on_bus import LineOnBus
+from agents.rag.embedder import Embedder, EmbedderFailed
+from agents.rag.embedders import embedder_named
 from agents.roles import ROLES
 from gateway.core.computations import ComputeReply, ComputeRequest
 from gateway.core.interactions import Interaction, pack
@@ -38,6 +38,8 @@ from gateway.mailbox.port import Mailbox, Unreachable
 
 EXIT_OK, EXIT_NO_BUS = 0, 1  # another try may find it
 ANOTHER_TASK_S = 3600.0
+LOOKS: AgentName = "monitoring"  #: in whose name the process asks what is known of the line
+CODE: AgentName = "code"
 LOG_S = 5.0  #: for the gateway to take an interaction
 COMPUTE_MAX_S = 120.0  #: for all calls of a request
 
@@ -67,8 +69,11 @@ async def serve(line: Line, where: Path | TlsEndpoint, folder: Path, tell: Tell)
         bus = await connect(where, line.site, line.line)
         held.push_async_callback(bus.close)
         model = await _model(line, held, tell)
-        search = await _knowledge(folder, held, tell)
-        begin(bus, line, search, model, tell, Given())
+        embedder = await _embedder(line, held, tell)
+        known = await held.enter_async_context(Knowledge(folder, LineOnBus(bus, LOOKS), embedder, tell))
+        await known.begin()
+        begin(bus, line, known.search, model, tell, LineOnBus(bus, CODE))
+        held.push_async_callback(_stopped, asyncio.create_task(known.keep_up()))
         tell(f"agents of {line.site}/{line.line}: {', '.join(ROLES)}")
         await stop.wait()
     return EXIT_OK
@@ -161,18 +166,18 @@ async def _model(line: Line, held: AsyncExitStack, tell: Tell) -> LanguageModel 
     return model
 
 
-async def _knowledge(folder: Path, held: AsyncExitStack, tell: Tell) -> Search:
-    """By words alone: what every machine can do."""
+async def _embedder(line: Line, held: AsyncExitStack, tell: Tell) -> Embedder | None:
+    """None: things are looked up by words alone."""
     try:
-        opened = await open_library(folder, 3)
-    except (IndexRefused, OSError) as error:
-        reason = str(error)
-        tell(f"nothing can be looked up: {reason}")
+        found = await embedder_named(line.agents.embedder, line.agents.url)
+    except EmbedderFailed as error:
+        tell(f"things are looked up by words: {error}")
+        return None
+    if isinstance(found, AbstractAsyncContextManager):
+        await held.enter_async_context(found)
+    return found
 
-        async def nothing(_: Asked) -> Retrieval:
-            raise IndexRefused(reason)
 
-        return nothing
-    index: Index = held.enter_context(opened.index)
-    tell(f"{index.documents_count} documents are known")
-    return index.ask
+async def _stopped(task: asyncio.Task[None]) -> None:
+    task.cancel()
+    await asyncio.gather(task, return_exceptions=True)

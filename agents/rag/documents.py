@@ -10,24 +10,14 @@ from typing import Literal, get_args
 
 from agents.rag.notes import Note
 from gateway.core.line import Strict
-from gateway.core.questions import DECISIONS, Decision
+from gateway.core.line_queries import Generated
+from gateway.core.questions import Decision
 
 Tier = Literal[1, 2, 3]
 TIERS: tuple[Tier, ...] = get_args(Tier)
 Origin = Literal["note", "file", "line"]  #: written for this program, added by somebody, made of the line's own state
 NOTES_CONFIDENCE = 0.9  #: of a note without a head that a person has added: they know their line
 MADE_CONFIDENCE = 0.95  #: of what the program has made of what it measured
-
-
-class Generated(Strict):
-    """A document that the program makes of the line's own state: its configuration, a model, a deployment ..."""
-
-    name: str  #: of one thing for ever, so that a newer document replaces the older: "model", "diagnosis-17"
-    title: str
-    text: str  #: Markdown
-    date: str  #: ISO 8601, of the day or the moment from which it is
-    keywords: list[str] = []
-    serves: list[Decision] = list(DECISIONS)
 
 
 class Document(Strict):

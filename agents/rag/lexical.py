@@ -8,6 +8,7 @@ those of the words that stand for it. A passage alone does not say what it is ab
 import math
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 
 from agents.rag.database import Database
 from agents.rag.documents import TIERS, Tier
@@ -15,6 +16,8 @@ from agents.rag.question_words import Concept, Phrase
 from agents.rag.stages import FoundDocument, FoundPassage
 
 MOST_PASSAGES = 100  #: taken from the first search
+MOST_SHOWN = 10  #: documents of which the passage that says most is looked for
+MOST_OWN = 30  #: further ones, by the question's own words alone
 PASSAGES_A_DOCUMENT = 4  #: of a long document, the best ones count
 MOST_MENTIONS = 3000  #: passages with a word of the question that are scored in the first search, over all words
 SATURATION = 5.0  #: k1: how much more a second mention says than a first
@@ -38,10 +41,15 @@ class Words:
     def search(
         self, concepts: Sequence[Concept], tiers: Sequence[Tier]
     ) -> tuple[list[FoundPassage], list[FoundDocument]]:
-        """Passages, up to MOST_PASSAGES, and the documents that they are of; of either the best first."""
+        """Passages, up to MOST_PASSAGES and then MOST_OWN, and the documents that they are of; the best first."""
         known = self._frequencies(concepts)
         telling = self._telling(concepts, known)
         passages = self._passages(telling, tiers) if telling else []
+        # FTS5 weighs what stands for a word as the word itself: whatever has the question's own words is looked at too.
+        said = {concept.said for concept in concepts}
+        if own := [phrase for phrase in telling if phrase in said]:
+            seen = {one.chunk for one in passages}
+            passages += [one for one in self._passages(own, tiers)[:MOST_OWN] if one.chunk not in seen]
         return passages, self._documents(self._worth(concepts, known), passages)
 
     def _passages(self, wanted: Sequence[Phrase], tiers: Sequence[Tier]) -> list[FoundPassage]:
@@ -92,9 +100,15 @@ class Words:
                 _field(keywords, KEYWORDS, self._mean_keywords),
                 _field(body, BODY, self._mean_text * len(own)),
             ]
-            # Its title is in the score of each passage, so that the first is the best by its own words.
             found.append(FoundDocument(document, _score(worth, words, fields), own[0]))
-        return sorted(found, key=lambda one: -one.score)
+        found.sort(key=lambda one: -one.score)
+
+        def own_words(chunk: int) -> float:
+            return _score(worth, words, [_field(texts[chunk][0], BODY, self._mean_text)])
+
+        # A short passage that has the words in nothing but its document's title tells nothing.
+        best = [replace(one, chunk=max(chunks[one.document], key=own_words)) for one in found[:MOST_SHOWN]]
+        return best + found[MOST_SHOWN:]
 
     def _worth(self, concepts: Sequence[Concept], known: dict[str, int]) -> Worth:
         worth: Worth = []

@@ -13,8 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
+from agents.rag.chunks import Chunk
 from agents.rag.documents import Document, Generated, Tier, consistent, of_generated, of_note
-from agents.rag.embedder import Embedder, Vectors
+from agents.rag.embedder import Embedder, EmbedderId, Vectors
 from agents.rag.index import Index
 from agents.rag.index_file import (
     Content,
@@ -77,12 +78,41 @@ async def open_library(
     Raises IndexRefused, also where the index was made with another embedder; EmbedderFailed.
     """
     path = folder / INDEX
+    identity = None if embedder is None else embedder.identity
+    gathered = await asyncio.to_thread(_gathered, folder, tier, identity, generated, reindex)
+    if isinstance(gathered, Opened):
+        return gathered
+    content = Content(gathered.documents, gathered.passages, gathered.state)
+    if embedder is not None:
+        texts = embedded_texts(gathered.documents, gathered.passages)
+        embedded = await _embedded(texts, embedder, gathered.vectors)
+        content = Content(gathered.documents, gathered.passages, gathered.state, embedder.identity, embedded)
+    await asyncio.to_thread(write_index, path, content)
+    return Opened(await asyncio.to_thread(Index, path), True, gathered.refused, gathered.left_out)
+
+
+@dataclass(frozen=True)
+class _Gathered:
+    """What the next index is made of."""
+
+    documents: list[Document]
+    passages: list[list[Chunk]]
+    state: str
+    vectors: dict[str, Vectors]  #: known already, by text
+    refused: list[Refused]
+    left_out: list[str]
+
+
+def _gathered(
+    folder: Path, tier: Tier, embedder: EmbedderId | None, generated: Sequence[Generated] | None, reindex: bool
+) -> Opened | _Gathered:
+    """The index that is there, where it is up to date. It blocks. Raises IndexRefused."""
     state = _state(folder, tier)
     made_of = "" if generated is None else _hash(*(one.model_dump_json() for one in generated))
-    before = _open_usable(path)
+    before = _open_usable(folder / INDEX)
     if before is not None and not reindex:
         try:
-            before.require(embedder.identity if embedder else None)
+            before.require(embedder)
         except IndexRefused:
             before.close()
             raise
@@ -96,12 +126,7 @@ async def open_library(
     of_line = [one for one in kept if one.origin == "line"] if generated is None else list(map(of_generated, generated))
     whole = consistent([*program_notes(), *read.documents, *of_line])
     passages = passages_of(whole.documents)
-    content = Content(whole.documents, passages, state + made_of)
-    if embedder is not None:
-        embedded = await _embedded(embedded_texts(whole.documents, passages), embedder, vectors)
-        content = Content(whole.documents, passages, state + made_of, embedder.identity, embedded)
-    await asyncio.to_thread(write_index, path, content)
-    return Opened(Index(path), True, read.refused, whole.left_out)
+    return _Gathered(whole.documents, passages, state + made_of, vectors, read.refused, whole.left_out)
 
 
 def _open_usable(path: Path) -> Index | None:
@@ -112,13 +137,13 @@ def _open_usable(path: Path) -> Index | None:
         return None
 
 
-def _kept(before: Index | None, embedder: Embedder | None) -> tuple[list[Document], dict[str, Vectors]]:
+def _kept(before: Index | None, embedder: EmbedderId | None) -> tuple[list[Document], dict[str, Vectors]]:
     """What the next index takes over from the one before: documents, and vectors of the same embedder by text."""
     if before is None:
         return [], {}
     with before:
         try:
-            same = embedder is not None and before.embedder == embedder.identity
+            same = embedder is not None and before.embedder == embedder
             return before.documents(), before.vectors() if same else {}
         except IndexRefused:  # damaged within
             return [], {}

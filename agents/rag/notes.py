@@ -76,8 +76,13 @@ class Note:
     @property
     def parts(self) -> dict[str, str]:
         """Of a failure mode, by heading: symptom, signature, test, action."""
-        pieces = _PART.split(self.text)
-        return {title.strip(): text.strip() for title, text in zip(pieces[1::2], pieces[2::2], strict=True)}
+        return parts_of(self.text)
+
+
+def parts_of(text: str) -> dict[str, str]:
+    """Of Markdown, by heading of the second level."""
+    pieces = _PART.split(text)
+    return {title.strip(): part.strip() for title, part in zip(pieces[1::2], pieces[2::2], strict=True)}
 
 
 def parse_note(name: str, content: str) -> Note:

@@ -23,7 +23,10 @@ def ask(
         list[Path] | None, typer.Option("--add", help="Take a file or folder in first (Markdown, text, CSV, PDF).")
     ] = None,
     most: Annotated[int, typer.Option("--most", min=1, max=20, help="How many notes or documents to quote.")] = 3,
-    embedder: Annotated[str, typer.Option("--embedder", help=f"What finds by meaning: {EMBEDDERS}.")] = "lexical",
+    embedder: Annotated[
+        str | None,
+        typer.Option("--embedder", help=f"What finds by meaning: {EMBEDDERS}; else that of the line."),
+    ] = None,
     reindex: Annotated[bool, typer.Option("--reindex", help="Make the index anew, with another embedder too.")] = False,
     explain: Annotated[bool, typer.Option("--explain", help="Show every stage of the search with its scores.")] = False,
     data_dir: DataFolder = None,
@@ -41,7 +44,8 @@ def ask(
 
     try:
         described = None if line is None else read_line(line)
-        search = Search(described, data_dir, embedder, add or [], reindex)
+        chosen = embedder or ("lexical" if described is None else described.agents.embedder)
+        search = Search(described, data_dir, chosen, add or [], reindex)
         asked = asked_of(question, decision, most, nothing=bool(add))
         done = run(search, asked)
     except AskRefused as error:

@@ -8,15 +8,17 @@ from pathlib import Path
 import typer
 
 from agents.rag.documents import Tier
-from agents.rag.embedder import Embedder, EmbedderFailed
+from agents.rag.embedder import EmbedderFailed
+from agents.rag.embedders import embedder_named
 from agents.rag.index_file import IndexRefused
-from agents.rag.library import INDEX, add_files, open_library
+from agents.rag.library import INDEX, Opened, add_files, open_library
 from agents.rag.stages import Asked, Retrieval
-from gateway.cli.ask_commands import EMBEDDERS
 from gateway.cli.process_commands import default_data_folder
 from gateway.core.line import Agents, Line
 from gateway.core.nearest import nearest
 from gateway.core.questions import DECISIONS, Decision
+from gateway.supervisor.knowledge.gathered import Known
+from gateway.supervisor.knowledge.stored import known_in
 
 FOLDER = "knowledge"  #: in the data folder of a line
 
@@ -83,34 +85,23 @@ def run(search: Search, asked: Asked | None) -> Done:
         raise AskRefused(f"{error.filename}: {error.strerror}; --data-dir names another folder") from error
 
 
+def _left_out(opened: Opened, of_line: Known | None) -> list[str]:
+    return [f"left out: {text}" for text in (*opened.left_out, *(of_line.left_out if of_line else []))]
+
+
 async def _run(search: Search, asked: Asked | None) -> Done:
-    embedder = await _embedder(search)
+    url = (search.line.agents if search.line else Agents()).url
+    embedder = await embedder_named(search.embedder, url)
+    of_line = None if search.line is None else await asyncio.to_thread(known_in, search.folder.parent, search.line)
     added = add_files(search.folder, search.add, search.tier)
     if embedder is not None and (search.reindex or not (search.folder / INDEX).is_file()):
         typer.echo(f"making vectors of every passage with {embedder.identity.name}: this takes minutes, once", err=True)
-    opened = await open_library(search.folder, search.tier, embedder, reindex=search.reindex)
+    generated = None if of_line is None else of_line.documents
+    opened = await open_library(search.folder, search.tier, embedder, generated, reindex=search.reindex)
     told = [f"{len(added.documents)} documents taken in: {search.folder}"] if search.add else []
     refused = dict.fromkeys((*added.refused, *opened.refused))
     told += [f"{one.file}: not taken in: {one.reason}" for one in refused]
-    told += [f"left out: {text}" for text in opened.left_out]
+    told += _left_out(opened, of_line)
     with opened.index as index:
         found = await index.ask(asked, embedder) if asked else None
     return Done(found, told, bool(refused))
-
-
-async def _embedder(search: Search) -> Embedder | None:
-    """Raises EmbedderFailed, AskRefused."""
-    kind, _, model = search.embedder.partition(":")
-    if search.embedder == "lexical":
-        return None
-    if search.embedder == "minilm":
-        from agents.rag.minilm import MiniLm
-
-        return MiniLm()
-    if kind == "ollama" and model:
-        from agents.rag.ollama_embedder import OllamaEmbedder
-
-        return await OllamaEmbedder.begin(model, (search.line.agents if search.line else Agents()).url)
-    like = nearest(kind, ("lexical", "minilm", "ollama"))
-    hint = f"; did you mean {like}{':MODEL' if like == 'ollama' else ''}?" if like else ""
-    raise AskRefused(f"--embedder is {search.embedder}; allowed: {EMBEDDERS}{hint}")

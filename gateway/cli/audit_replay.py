@@ -12,12 +12,12 @@ from gateway.core.audit_record import BEFORE_FIRST, AuditRecord
 from gateway.core.judge_context import JudgeContext
 from gateway.core.line import Line
 from gateway.core.line_problem import printable
+from gateway.core.packed_recording import unpacked
 from gateway.core.recording import Recording
 from gateway.core.verdict import Verdict, canonical
 from gateway.supervisor.audit_file import AuditFile, AuditUnavailable
 from gateway.supervisor.audit_verify import chained
 from gateway.supervisor.find_version import LEAST_PREFIX
-from gateway.supervisor.kept_recording import unpacked
 
 JUDGED = ("accepted", "refused")  #: kinds of records
 

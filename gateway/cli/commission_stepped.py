@@ -112,6 +112,10 @@ class SteppedGate:
             await mailbox.close()
 
     @property
+    def gate(self) -> Gate:
+        return self._gate
+
+    @property
     def deployer(self) -> Deployer:
         """Raises CannotGoOn where the gate is shut."""
         if self._gate.deployer is None:

@@ -6,7 +6,7 @@ from enum import StrEnum
 
 from gateway.core.decisions import ProposalShown
 from gateway.core.proposal import Evidence
-from gateway.core.verdict import Verdict
+from gateway.core.verdict import OF_THE_MOMENT, Verdict
 
 
 class Step(StrEnum):
@@ -39,8 +39,6 @@ KINDS = {
 MOST_RUNG = 1000
 PROPOSED_BY = "commissioning: "  #: how the evidence begins that names step and rung
 
-#: Rules that speak against the moment, not against what is proposed.
-OF_THE_MOMENT = frozenset({"state of the line", "cool-down", "freshness", "time", "judge process"})
 OPEN_STAGES = frozenset({"received", "waiting", "approved", "deploying", "probation", "keeping", "running"})
 UNDECIDED = frozenset({"received", "waiting"})  #: of somebody else's: nobody need wait for it
 STALE_STAGES = frozenset({"expired", "superseded", "not-deployed"})

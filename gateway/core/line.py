@@ -236,6 +236,7 @@ class Agents(Strict):
     load_max_s: Positive = 300.0  #: for a model to be loaded
     task_max_tokens: Annotated[int, Field(ge=1024)] = 200_000  #: of one commissioning, asked and answered
     computations_max: Annotated[int, Field(ge=0, le=8)] = 3  #: that a model may ask for before it answers; 0: none
+    embedder: Annotated[str, Field(min_length=1, max_length=120)] = "lexical"  #: or minilm, or ollama:MODEL
 
 
 class Network(Strict):

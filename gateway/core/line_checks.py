@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
 
+from gateway.core import line_rules_agents as agents
 from gateway.core import line_rules_network as network
 from gateway.core import line_rules_process as process
 from gateway.core import line_rules_wiring as wiring
@@ -44,6 +45,7 @@ RULES: tuple[Rule, ...] = (
     _rule("buses", wiring.buses_are_reachable),
     _rule(f"buses {_DEVICES}", wiring.canopen_addresses),
     _rule(f"control buses {_DEVICES}", wiring.can_buses_have_room),
+    _rule("agents", agents.embedder_is_known),
     _rule("network", network.listens_with_tls),
     _rule("network", network.files_are_named),
     _rule("network", network.names_differ),

@@ -187,6 +187,7 @@ HELP: dict[str, dict[str, str]] = {
         "load_max_s": "for the model to be loaded",
         "task_max_tokens": "asked and answered in one commissioning; after it the rules decide",
         "computations_max": "simulations and the like that a model may ask for before it answers; 0: none",
+        "embedder": 'what finds knowledge by meaning: "minilm", "ollama:MODEL"; "lexical": by words alone',
     },
     "Network": {
         "listen": 'where agents reach the gateway, e.g. "tls/192.168.0.5:7447"',

@@ -210,10 +210,16 @@ def _list_in_words(schema: Schema, path: Path) -> str:
     return f"{count} tables, each headed [[{path[-1]}]]"
 
 
+def name_and_unit(key: str) -> tuple[str, str]:
+    """("torque", "Nm") of "torque_nm"; no unit where the key has none."""
+    ending, unit = next(((ending, unit) for ending, unit in _UNITS.items() if key.endswith(ending)), ("", ""))
+    return key.removesuffix(ending), unit
+
+
 def _with_unit(words: str, path: Path) -> str:
     """`words` with the unit of the innermost key that names one; a tolerance has none."""
     if path[-1] == "tolerance":
         return f"{words}, a fraction: 0.3 means 30 % either way"
     keys = [part for part in path if isinstance(part, str) and part != "value"]
-    unit = next((unit for ending, unit in _UNITS.items() if keys[-1].endswith(ending)), "")
+    _, unit = name_and_unit(keys[-1])
     return f"{words} {unit}".rstrip() if unit else words.removesuffix(", value in").removesuffix(", in")

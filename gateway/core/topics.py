@@ -56,5 +56,14 @@ ASK_STATUS = AgentTopic("ask/*/status", "agent", "gateway", 10.0, kept=False)  #
 ASK_PROPOSALS = AgentTopic("ask/*/proposals", "agent", "gateway", 10.0, kept=False)  #: Query -> as it says
 ASK_JUDGE = AgentTopic("ask/*/judge", "agent", "gateway", 1.0, kept=True)  #: Proposal -> DryRun; Reply: refused
 ASK_LOG = AgentTopic("ask/*/log", "agent", "gateway", 2.0, kept=True)  #: Interaction, packed -> Reply
+#: What is known of the line; the messages are those of gateway/core/line_queries.py. None of them changes anything.
+ASK_MODEL = AgentTopic("ask/*/model", "agent", "gateway", 2.0, kept=False)  #: OfHash -> ModelTold
+ASK_CONTROLLER = AgentTopic("ask/*/controller", "agent", "gateway", 2.0, kept=False)  #: OfHash -> ControllerTold
+ASK_RECORDINGS = AgentTopic("ask/*/recordings", "agent", "gateway", 0.5, kept=False)  #: nothing -> RecordingList
+ASK_RECORDING = AgentTopic("ask/*/recording", "agent", "gateway", 20.0, kept=False)  #: OfRecording -> packed
+ASK_KNOWLEDGE = AgentTopic("ask/*/knowledge", "agent", "gateway", 5.0, kept=False)  #: OfKnowledge -> KnowledgePart
 
-AGENT_TOPICS = (AGENT_DECIDE, AGENT_COMPUTE, ASK_PROPOSE, ASK_STATUS, ASK_PROPOSALS, ASK_JUDGE, ASK_LOG)
+AGENT_TOPICS = (
+    AGENT_DECIDE, AGENT_COMPUTE, ASK_PROPOSE, ASK_STATUS, ASK_PROPOSALS, ASK_JUDGE, ASK_LOG, ASK_MODEL, ASK_CONTROLLER,
+    ASK_RECORDINGS, ASK_RECORDING, ASK_KNOWLEDGE,
+)  # fmt: skip

@@ -11,6 +11,9 @@ from gateway.core.line import Line, NonNegative, Strict
 from gateway.core.line_model import Digest, Instant
 from gateway.core.proposal import Kind
 
+#: Rules that speak against the moment, not against what is proposed.
+OF_THE_MOMENT = frozenset({"state of the line", "cool-down", "freshness", "time", "judge process"})
+
 Text = Annotated[str, Field(max_length=2000)]
 
 

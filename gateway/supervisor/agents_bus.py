@@ -1,29 +1,37 @@
 """The agents' bus of a gateway process: opened beside everything else, and told of in events and in the status."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Protocol
 
 from gateway.core.line import Line
 from gateway.core.topics import AGENT_DECIDE, AGENT_NAMES, AgentName
 from gateway.mailbox.allowance import Allowance
 from gateway.mailbox.bus import open_router
+from gateway.mailbox.port import Mailbox
 from gateway.mailbox.zenoh_mailbox import ZenohMailbox
-from gateway.supervisor.agents_desk import AgentsDesk
 from gateway.supervisor.status import BusStatus
 
 MOST_EVENTS_PER_S = 0.1  #: of each kind: whoever comes and goes all the time, or floods, does not flood the history
+
+
+class Desk(Protocol):
+    def serve_on(self, bus: Mailbox) -> None:
+        """Answer what agents ask of it."""
+        ...
 
 
 class AgentsBus:
     """`open` it once, `watch` a few times a second, `close` at the end. Without it the gateway does all else."""
 
     def __init__(
-        self, line: Line, run_folder: Path, desk: AgentsDesk, note: Callable[..., None], clock: Callable[[], float]
-    ) -> None:
+        self, line: Line, run_folder: Path, desks: Sequence[Desk], note: Callable[..., None],
+        clock: Callable[[], float],
+    ) -> None:  # fmt: skip
         self._line = line
         self._run_folder = run_folder
-        self._desk = desk
+        self._desks = desks
         self._note = note
         self._clock = clock
         self._mailbox: ZenohMailbox | None = None
@@ -39,7 +47,8 @@ class AgentsBus:
         mailbox: ZenohMailbox | None = None
         try:
             mailbox = await open_router(self._line, self._run_folder)
-            self._desk.serve_on(mailbox)
+            for desk in self._desks:
+                desk.serve_on(mailbox)
             for agent in AGENT_NAMES:
                 mailbox.watch(AGENT_DECIDE.of(agent), partial(self._seen, agent))
         except Exception as error:  # whatever it is

@@ -196,6 +196,21 @@ class Configurations:
         also = f"or a name ({known})" if known else "or a name (none is archived yet)"
         return find_version(wanted, found, "configuration", self.path, ConfigurationsError, also)
 
+    def get(self, site: str, line: str, id_: str) -> Configuration | None:
+        """By its whole id; None: it was never stored for this line."""
+        found = self._read("site = ? AND line = ? AND id = ?", site, line, id_)
+        return found[0] if found else None
+
+    def archives(self, site: str, line: str) -> list[tuple[str, Archived]]:
+        """What was archived of a line, with the id of each, in the order in which it was done; nothing is parsed."""
+        with told(self.path, KIND):
+            rows = rows_of(
+                self._connection,
+                "SELECT id, number, name, time_s, who, why FROM archive WHERE site = ? AND line = ? ORDER BY number",
+                (site, line),
+            )
+        return [(id_, Archived(*given)) for id_, *given in rows]
+
     def _read(self, where: str, *values: str | None) -> list[Configuration]:
         origins: dict[_Key, list[Origin]] = {}
         archived: dict[_Key, list[Archived]] = {}

@@ -105,6 +105,11 @@ class Models:
         """The models of a line, or of all; by line, in the order of their versions."""
         return self._entries("site = coalesce(?, site) AND line = coalesce(?, line)", (site, line))
 
+    def get(self, id_: str) -> Entry | None:
+        """By its whole id; None: it was never stored."""
+        found = self._entries("id = ?", (id_,))
+        return found[0] if found else None
+
     def find(self, wanted: str, site: str | None = None, line: str | None = None) -> Entry:
         """The one that a person means: "newest", a version ("3" or "v3"), or the beginning of an id."""
         found = self.entries(site, line)

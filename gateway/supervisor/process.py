@@ -28,6 +28,7 @@ from gateway.supervisor.historian import Historian
 from gateway.supervisor.history import HistoryError
 from gateway.supervisor.interactions import Interactions
 from gateway.supervisor.judging import NICEST, JudgeWorkers
+from gateway.supervisor.line_desk import LineDesk
 from gateway.supervisor.models import Models
 from gateway.supervisor.retention import retention_of
 from gateway.supervisor.service import Gateway
@@ -96,7 +97,8 @@ async def serve(
     gateway.on_event, gateway.change = gate.hear, gate.change
     dry_runs = DryRuns(line, JudgeWorkers(line, nicer=NICEST))
     desk = AgentsDesk(gateway.status, gate, dry_runs, Interactions(data_folder), gateway.note)
-    bus = AgentsBus(line, run_folder, desk, gateway.note, clock)
+    line_desk = LineDesk(line, gate, data_folder, experiments)
+    bus = AgentsBus(line, run_folder, (desk, line_desk), gateway.note, clock)
     gateway.agents_bus = bus.status
     opening = asyncio.create_task(bus.open())
     looking = asyncio.create_task(_look(gate, stop, watch_s))

@@ -13,6 +13,7 @@ from gateway.core.judge_context import context_hash
 from gateway.core.line import Line
 from gateway.core.line_model import model_hash
 from gateway.core.messages import Reply
+from gateway.core.packed_recording import packed
 from gateway.core.proposal import (
     ExperimentChange,
     GainsChange,
@@ -26,7 +27,6 @@ from gateway.core.verdict import Verdict, canonical_line, verdict_hash
 from gateway.core.verdict import canonical as canonical_verdict
 from gateway.supervisor.audit_file import AuditUnavailable
 from gateway.supervisor.deployer_sides import JudgeSide, Surroundings
-from gateway.supervisor.kept_recording import packed
 from gateway.supervisor.lifecycle import PROPOSED, Impossible, Stage
 from gateway.supervisor.proposal_records import GATEWAY, ProposalRecords, done, refused
 

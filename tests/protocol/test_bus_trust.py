@@ -11,9 +11,6 @@ import zenoh
 from gateway.core.topics import (
     AGENT_DECIDE,
     AGENT_TOPICS,
-    ASK_JUDGE,
-    ASK_PROPOSALS,
-    ASK_PROPOSE,
     ASK_STATUS,
     AgentTopic,
 )
@@ -168,11 +165,12 @@ def test_nobody_answers_in_the_gateways_place(over: str) -> None:
         own = endpoint(address, authority, "agents", authority)
         async with router(folder, line), client(folder) as honest:
             async with client(folder if over == "the machine" else own) as forging:
-                for row in (ASK_PROPOSE, ASK_STATUS, ASK_PROPOSALS, ASK_JUDGE):
+                rows = [row for row in AGENT_TOPICS if row.answers == "gateway"]
+                for row in rows:
                     forging.serve(row.of("sysid"), forged)
                 forging.serve(AGENT_DECIDE.of("sysid"), echo)
                 await is_here(honest, AGENT_DECIDE.of("sysid"))  # by now the others would be, too
-                for row in (ASK_PROPOSE, ASK_STATUS, ASK_PROPOSALS, ASK_JUDGE):
+                for row in rows:
                     with pytest.raises(Unreachable, match="nobody answers"):
                         await honest.request(row.of("sysid"), b"", LONG_S)
 

@@ -8,6 +8,7 @@ from typer.testing import CliRunner
 
 from gateway.cli.main import app
 from gateway.core.line_template import line_template
+from tests.unit.knowledge_support import Records
 
 ROLLER = "Why does the torque of one roller rise from week to week?"
 
@@ -93,3 +94,37 @@ def test_what_cannot_be_asked_is_refused(given: list[str], part: str, tmp_path: 
 def test_nothing_found_is_told() -> None:
     code, said, _ = ask("xyzzy plugh")
     assert code == 1 and "Nothing was found" in said
+
+
+def test_what_the_lines_own_records_tell_is_known_without_a_gateway(tmp_path: Path) -> None:
+    line, data = tmp_path / "line.toml", tmp_path / "data"
+    line.write_text(line_template(2))
+    of_line = ["--line", line, "--data-dir", data]
+    manual = tmp_path / "belt.md"
+    manual.write_text("# The belt\n\nTimbuktu belts slip.\n")
+    with Records(data) as records:
+        records.deployed(rolled_back="zanzibar: tension 2 swings")
+        before = {file.name: file.read_bytes() for file in data.glob("*.sqlite")}
+        code, said, told = ask("which deployment was rolled back, zanzibar?", *of_line)
+        assert code == 0 and "rolled back on" in said.splitlines()[0] and "tier 3, this line" in said and not told
+        assert "> zanzibar: tension 2 swings" in said
+        code, said, _ = ask("timbuktu", "--add", manual, *of_line)
+        assert code == 0 and "file:belt.md" in said
+        assert {file.name: file.read_bytes() for file in data.glob("*.sqlite")} == before  # nothing is written there
+        records.rejected("zanzibar again")
+        code, said, _ = ask("zanzibar again rejected", *of_line)
+        assert code == 0 and "rejected by a person" in said  # it follows
+        assert ask("timbuktu", *of_line)[0] == 0  # and what was added stays
+    (data / "audit.sqlite").write_bytes(b"no database" * 1000)
+    code, said, told = ask("how many spans has the line", *of_line)
+    assert code == 0 and "This line, demo/line-1" in said and "left out: what became of proposals" in told
+
+
+def test_without_another_word_the_embedder_is_the_lines(tmp_path: Path) -> None:
+    line = tmp_path / "line.toml"
+    line.write_text(
+        line_template(1).replace("[agents]", '[agents]\nembedder = "ollama:words"\nurl = "http://127.0.0.1:9"')
+    )
+    code, _, told = ask("why does tension swing", "--line", line)
+    assert code == 2 and "Ollama at http://127.0.0.1:9 does not answer" in told
+    assert ask("why does tension swing", "--line", line, "--embedder", "lexical")[0] == 0
