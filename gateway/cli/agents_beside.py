@@ -11,6 +11,7 @@ from gateway.commissioning.decisions import AGENTS
 from gateway.core.line import Line
 from gateway.mailbox.bus import BusUnavailable, connect
 from gateway.mailbox.paths import default_run_folder
+from gateway.mailbox.port import Mailbox
 
 
 class CannotBeAsked(Exception):
@@ -31,10 +32,19 @@ def agents_beside(line: Line, run_dir: Path | None) -> Iterator[AskedAgents]:
         try:
             yield AskedAgents(line, bus, loop)
         finally:
-            asyncio.run_coroutine_threadsafe(bus.close(), loop).result()
+            asyncio.run_coroutine_threadsafe(_ended(bus), loop).result()
     except BusUnavailable as error:
         raise CannotBeAsked(str(error)) from error
     finally:
         loop.call_soon_threadsafe(loop.stop)
         thread.join()
         loop.close()
+
+
+async def _ended(bus: Mailbox) -> None:
+    """Whoever still waits for an answer goes on by the rules."""
+    waiting = asyncio.all_tasks() - {asyncio.current_task()}
+    for task in waiting:
+        task.cancel()
+    await asyncio.gather(*waiting, return_exceptions=True)
+    await bus.close()
