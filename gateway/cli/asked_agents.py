@@ -41,7 +41,7 @@ class AskedAgents:
         self._loop = loop
         agents = line.agents
         asked_s = 0.0 if agents.llm == "off" else agents.load_max_s + agents.answer_max_s
-        self._within_s = LOOKED_UP_S + asked_s if within_s is None else within_s
+        self.within_s = LOOKED_UP_S + asked_s if within_s is None else within_s  #: for an answer
         self._clock = clock
         self._resting_until_s: dict[str, float] = {}  #: agents that let the phase wait
 
@@ -53,7 +53,7 @@ class AskedAgents:
         try:
             answer = asked.result()
         except (Unreachable, ValidationError, CancelledError) as error:
-            if self._clock() - began_s >= self._within_s:
+            if self._clock() - began_s >= self.within_s:
                 self._resting_until_s[question.agent] = self._clock() + REST_S
             return Decided(usual_choice(question), RULES, f"{question.agent}: {_short(error)}")
         if answer.by not in (question.agent, RULES):
@@ -68,7 +68,7 @@ class AskedAgents:
         """Raises Unreachable, ValidationError."""
         payload = question.model_dump_json().encode()
         return Answer.model_validate_json(
-            await self._bus.request(AGENT_DECIDE.of(question.agent), payload, self._within_s)
+            await self._bus.request(AGENT_DECIDE.of(question.agent), payload, self.within_s)
         )
 
 

@@ -18,7 +18,6 @@ from gateway.cli.commission_questions import (
     fidelity_question,
     option_id,
     step_question,
-    turned,
 )
 from gateway.cli.commission_result import Commissioned, candidate_name, commissioned
 from gateway.cli.commission_side import CannotGoOn, GateSide, measured_on, put, region_kept
@@ -31,7 +30,7 @@ from gateway.commissioning.past import KINDS, Follows, Outcome, Past, Step, name
 from gateway.core.decisions import ProposalShown
 from gateway.core.line import Line
 from gateway.core.line_problem import printable
-from gateway.core.questions import Choice, Question
+from gateway.core.questions import Choice, Question, factors_that_turn
 from gateway.identification.identify import Identified
 from gateway.supervisor.baselines import BaselinesError
 
@@ -149,7 +148,7 @@ class _Chain:
             what = f"{step.step}, {candidate_name(rung)}"
             self._tell(f"{what}: being made")
             offer = next(one for one in offers if option_id(one.rung) == decided.choice.option)
-            made = await asyncio.to_thread(offer.make, turned(decided.choice.factors))
+            made = await asyncio.to_thread(offer.make, factors_that_turn(decided.choice))
             if made.identified is not None:
                 await self._require_faith(made.identified, now)
         except NotOffered as refused:
@@ -168,7 +167,7 @@ class _Chain:
             only = Choice(option=option_id(step.rung), reason="there is no other candidate")
             return Decided(only, RULES), step.rung
         decided = await self._decided(step_question(self._line, step, offers, now, self.past))
-        if turned(decided.choice.factors):
+        if factors_that_turn(decided.choice):
             return decided, OWN + MOST_OWN - step.own
         return decided, next(one.rung for one in offers if option_id(one.rung) == decided.choice.option)
 

@@ -3,8 +3,7 @@
 What the rules would choose is always the first option. What is shown of it is what the rules go by.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from math import isfinite
+from collections.abc import Callable, Iterable, Sequence
 
 from gateway.cli.commission_changes import LineNow, Offer
 from gateway.commissioning.architectures import ARCHITECTURES
@@ -14,7 +13,7 @@ from gateway.commissioning.past import Follows, Outcome, Past, Step
 from gateway.commissioning.redesign import Figures, ratio
 from gateway.core.controller import config_hash
 from gateway.core.line import Line
-from gateway.core.questions import Decision, Figure, Knob, Option, Question
+from gateway.core.questions import Decision, Figure, Knob, Option, Question, figure
 from gateway.identification.identify import Identified
 
 LEAST, MOST = 0.25, 4.0  #: times what is offered: a knob
@@ -63,11 +62,10 @@ def step_question(line: Line, step: Next, offers: Sequence[Offer], now: LineNow,
 def fidelity_question(line: Line, found: Identified, now: LineNow, past: Sequence[Past]) -> Question:
     """Whether a model that was identified is proposed; the gate judges it by its data all the same."""
     said = found.validation
-    figures = [_figure("normalised innovation squared", said.normalised, "")]
+    figures = [figure("normalised innovation squared", said.normalised, "")]
     for output in said.outputs:
         figures += [
-            _figure(f"R2 of {output.name}", output.r2, ""), _figure(f"mean absolute error of {output.name}",
-                                                                    output.mae, ""),
+            figure(f"R2 of {output.name}", output.r2), figure(f"mean absolute error of {output.name}", output.mae),
         ]  # fmt: skip
     facts = [
         f"the structure is {found.estimate.structure}",
@@ -90,7 +88,7 @@ def fidelity_question(line: Line, found: Identified, now: LineNow, past: Sequenc
 
 def diagnosis_question(line: Line, found: Convergence, now: LineNow, past: Sequence[Past]) -> Question:
     """Why the line does not do what it should, and so what follows."""
-    figures = [_figure("measured tracking error over the predicted one, less 1", found.gap, "")]
+    figures = [figure("measured tracking error over the predicted one, less 1", found.gap, "")]
     for name, one in found.spans.items():
         figures += _span_figures(f"span {name}, measured", one)
         figures += _span_figures(f"span {name}, predicted", found.predicted[name])
@@ -156,7 +154,7 @@ def _figures(offer: Offer) -> list[Figure]:
     figures, before = offer.redesign.figures, offer.redesign.before
     share = sum(ratio(figures[name].rmse_n, before[name].rmse_n) for name in before) / len(before)
     return [
-        _figure("tracking error over that in service, mean of the courses", share, ""),
+        figure("tracking error over that in service, mean of the courses", share, ""),
         _worst("tracking error on the model", "N", figures.values(), lambda one: one.rmse_n),
         _worst("the same in service", "N", before.values(), lambda one: one.rmse_n),
         _worst("overshoot", "%", figures.values(), lambda one: one.overshoot_pct),
@@ -167,20 +165,15 @@ def _figures(offer: Offer) -> list[Figure]:
 
 
 def _worst(name: str, unit: str, figures: Iterable[Figures], of: Callable[[Figures], float]) -> Figure:
-    return _figure(f"{name}, worst course", max(map(of, figures)), unit)
+    return figure(f"{name}, worst course", max(map(of, figures)), unit)
 
 
 def _span_figures(name: str, one: SpanFigures) -> list[Figure]:
     return [
-        _figure(f"{name} tracking error", one.rmse_n, "N"),
-        _figure(f"{name} overshoot", one.overshoot_pct, "%"),
-        _figure(f"{name} settling time", one.settling_s, "s"),
+        figure(f"{name} tracking error", one.rmse_n, "N"),
+        figure(f"{name} overshoot", one.overshoot_pct, "%"),
+        figure(f"{name} settling time", one.settling_s, "s"),
     ]
-
-
-def _figure(name: str, value: float | None, unit: str) -> Figure:
-    known = None if value is None or not isfinite(value) else float(f"{value:.4g}")  # more digits say nothing
-    return Figure(name=name[:80], value=known, unit=unit)
 
 
 def _knobs(step: Next, offers: Sequence[Offer]) -> list[Knob]:
@@ -200,8 +193,3 @@ def _knob(name: str, of: list[str]) -> Knob:
         return Knob(name=name, meaning=SIZE, least=LEAST_SIZE, most=MOST_SIZE, of=of)
     knob = next(knob for one in ARCHITECTURES.values() for knob in one.knobs if knob.name == name)
     return Knob(name=name, meaning=f"more of it: {knob.more}; less: {knob.less}", least=LEAST, most=MOST, of=of)
-
-
-def turned(factors: Mapping[str, float]) -> dict[str, float]:
-    """Those that turn anything."""
-    return {name: factor for name, factor in factors.items() if factor != 1.0}

@@ -2,17 +2,23 @@
 
 import json
 import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, nullcontext
 from enum import StrEnum
 from os import W_OK, access
 from pathlib import Path
 from shlex import quote
-from typing import Annotated, NoReturn
+from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
+from gateway.cli.operate_commands import RunFolder
 from gateway.cli.process_commands import REFUSED, DataFolder, LineFile, read_line
 from gateway.core.line import Line
 from gateway.core.line_model import LineModel
+
+if TYPE_CHECKING:
+    from gateway.cli.asked_agents import AskedAgents
 
 
 class LawName(StrEnum):
@@ -48,6 +54,10 @@ def design(
         typer.Option(help="An identified model in place of FILE's values: a file, a version, an id, or newest."),
     ] = None,
     data_dir: DataFolder = None,
+    agents: Annotated[
+        bool, typer.Option("--agents", help="Ask the agents of the line that runs; the rules where none answers.")
+    ] = False,
+    run_dir: RunFolder = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
     """Design a controller: tune each architecture on the line's model, compare, choose, and say why.
@@ -56,6 +66,7 @@ def design(
     delay, or leave the tension limits, is not offered. Weights of the score: \\[priorities] of the line's file. Beside
     OUT lie OUT's .design.json (every attempt with its reason) and .design.html (the report). About three minutes.
     With --model (r2rgate models) the identified model and its intervals stand in place of FILE's values and tolerances.
+    With --agents they are asked what there is to choose (docs/agents.md); what they say stands in the report.
 
     Exit code: 0 written, 2 refused, 130 interrupted.
 
@@ -73,6 +84,8 @@ def design(
         _refuse("--schedule: mpc has no schedule, its programme belongs to one model; allowed: pid, lqr, lqi, lqg")
     if untuned and scenario:
         _refuse("--untuned simulates nothing: leave --scenario away")
+    if untuned and agents:
+        _refuse("--untuned leaves nothing to choose: leave --agents away")
     names = list(dict.fromkeys(one.value for one in law or LawName if law or not speeds or one is not LawName.MPC))
     _may_write(out, [file, *map(Path, scenario or []), *([Path(model)] if model else [])], only=untuned)
     identified = _identified(line, file, model, data_dir) if model else None
@@ -80,9 +93,24 @@ def design(
         if untuned:
             _first_guess(line, identified, names, speeds, out, as_json)
         else:
-            _phase(line, identified, names, scenario or [], speeds, iterations, seed, out, as_json)
+            with _asked(line, run_dir) if agents else nullcontext() as asked:
+                _phase(line, identified, names, scenario or [], speeds, iterations, seed, out, as_json, asked)
     except DesignRefused as refused:
         _refuse(f"no controller for {file}: {refused}")
+
+
+@contextmanager
+def _asked(line: Line, run_dir: Path | None) -> Iterator["AskedAgents | None"]:
+    """The agents of the line where it runs; None, said once, where they cannot be asked."""
+    from gateway.cli.agents_beside import CannotBeAsked, agents_beside
+
+    with ExitStack() as held:
+        try:
+            asked = held.enter_context(agents_beside(line, run_dir))
+        except CannotBeAsked as error:
+            typer.echo(f"the agents cannot be asked, the rules decide: {error}", err=True)
+            asked = None
+        yield asked
 
 
 def _identified(line: Line, file: Path, wanted: str, data_dir: Path | None) -> LineModel:
@@ -150,8 +178,9 @@ def _phase(
     seed: int,
     out: Path,
     as_json: bool,
+    asked: "AskedAgents | None",
 ) -> None:
-    from gateway.cli.design_phase import run_design
+    from gateway.cli.design_phase import ANSWER_S, RULES_DECIDE, run_design
     from gateway.cli.design_progress import Progress
     from gateway.cli.design_report import page_of
     from gateway.cli.design_result import result_of
@@ -169,7 +198,12 @@ def _phase(
         _refuse(f"--scenario: {refused}")
     began_s = time.monotonic()
     with interruptible(f"{out} and its record are as before"), Progress(names, iterations, as_json) as progress:
-        found = run_design(line, scenarios, names, iterations, seed, progress.attempted, speeds, model)
+        found = run_design(
+            line, scenarios, names, iterations, seed, progress.attempted, speeds, model,
+            decider=RULES_DECIDE if asked is None else asked,
+            answer_s=ANSWER_S if asked is None else 2.0 * asked.within_s,  # they see to their own time
+            on_decision=progress.decided,
+        )  # fmt: skip
     result = result_of(line, found, seed, model)
     if found.chosen is not None and found.chosen.config is not None:
         _write(out, canonical(found.chosen.config) + b"\n")

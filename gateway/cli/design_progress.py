@@ -6,7 +6,9 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TaskID, TextColumn
 from rich.progress import Progress as Bars
 
-from gateway.commissioning.records import Attempt
+from gateway.commissioning.decisions import RULES
+from gateway.commissioning.records import Attempt, DecisionRecord
+from gateway.core.line_problem import printable
 
 BESIDE_A_BAR = 48  #: characters
 
@@ -25,6 +27,7 @@ class Progress:
             name: self._bars.add_task(name, total=iterations + 1, law=name, told="waiting") for name in names
         }
         self._best: dict[str, float] = {}
+        self._said: set[str] = set()
 
     def __enter__(self) -> "Progress":
         self._bars.start()
@@ -41,4 +44,18 @@ class Progress:
         best = f"J {self._best[name]:.2f} N2s" if name in self._best else f"not yet: {attempt.refused}"
         self._bars.update(self._tasks[name], completed=attempt.number + 1, told=best[:BESIDE_A_BAR])
         if not self._console.is_terminal and (attempt.accepted or attempt.number == 0):
-            self._console.print(f"{name} {attempt.number}: {best}", markup=False, soft_wrap=True)
+            whose = "" if attempt.by == RULES else f" ({attempt.by})"
+            self._console.print(f"{name} {attempt.number}{whose}: {best}", markup=False, soft_wrap=True)
+        self._say_once(attempt.instead)
+
+    def decided(self, decision: DecisionRecord) -> None:
+        if decision.by != RULES:
+            said = f"{decision.decision}: {decision.by} chooses {decision.option}: {printable(decision.reason)}"
+            self._console.print(said, markup=False, soft_wrap=True)
+        self._say_once(decision.instead)
+
+    def _say_once(self, instead: str) -> None:
+        """Why the rules have decided though somebody was asked."""
+        if instead and instead not in self._said:
+            self._said.add(instead)
+            self._console.print(f"{printable(instead)}: the rules decide", markup=False, soft_wrap=True)

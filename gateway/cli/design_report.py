@@ -1,13 +1,19 @@
 """Phase 1 as a page: the choice first, then the comparison, the courses, and every attempt with its reason."""
 
+from collections.abc import Mapping, Sequence
+
 import numpy as np
 
-from gateway.cli.design_phase import Design, Finished
+from gateway.cli.design_phase import Design
 from gateway.cli.design_result import DesignResult, TuningResult
 from gateway.cli.design_table import cells
+from gateway.cli.design_tuning import Finished
 from gateway.cli.report.page import Chart, Page, Section, Series, Table
 from gateway.commissioning.architectures import ARCHITECTURES
+from gateway.commissioning.decisions import RULES
+from gateway.commissioning.records import Attempt, DecisionRecord
 from gateway.commissioning.selection import TERMS
+from gateway.core.line import Priorities
 from gateway.core.scenario import Scenario
 from gateway.core.signals import FloatArray
 
@@ -34,6 +40,7 @@ def page_of(result: DesignResult, found: Design) -> Page:
         answer=tuple(result.explanation),
         sections=(
             Section("The line", tuple(result.assessment.sentences)),
+            _decisions(result),
             _comparison(result),
             *(_courses(scenario, found) for scenario in result.scenarios),
             _tuning(result),
@@ -53,21 +60,67 @@ def _comparison(result: DesignResult) -> Section:
     rows = tuple((ARCHITECTURES[one.architecture].title, *cells(one)[1:]) for one in result.candidates)
     scored = [one for one in result.candidates if one.score is not None]
     parts = tuple((one.architecture, *(f"{part:.3f}" for part in one.terms), f"{one.score:.3f}") for one in scored)
-    weights = ", ".join(f"{name} {value:g}" for name, value in result.priorities.model_dump().items())
+    title = f"Each architecture at its best, the least score first. Chosen: {result.chosen or 'none'}."
     return Section(
         "Comparison",
         (),
         (
-            Table("Each architecture at its best. The first is chosen.", HEADS, rows, frozenset(range(1, len(HEADS)))),
+            Table(title, HEADS, rows, frozenset(range(1, len(HEADS)))),
             Table(
                 "What the scores are made of: each metric times its weight.",
                 ("Law", *(term.capitalize() for term in TERMS), "S"),
                 parts,
                 frozenset(range(1, len(TERMS) + 2)),
-                note=f"Weights: {weights}.",
+                note=f"Weights: {_weights(result.priorities)}.",
             ),
+            *_other_scores(result),
         ),
     )
+
+
+def _other_scores(result: DesignResult) -> tuple[Table, ...]:
+    """S by the weights of the line's file beside S by those that somebody has proposed."""
+    other = result.priorities_otherwise
+    if other is None:
+        return ()
+    rows = tuple(
+        (one.architecture, f"{one.score:.3f}", f"{one.score_otherwise:.3f}")
+        for one in result.candidates
+        if one.score is not None and one.score_otherwise is not None
+    )
+    return (
+        Table(
+            "The scores by other weights, which were proposed. The rules go by those of the line's file.",
+            ("Law", "S, line's file", "S, proposed"),
+            rows,
+            frozenset({1, 2}),
+            note=f"Proposed: {_weights(other)}.",
+        ),
+    )
+
+
+def _weights(priorities: Priorities) -> str:
+    return ", ".join(f"{name} {value:g}" for name, value in priorities.model_dump().items())
+
+
+def _decisions(result: DesignResult) -> Section:
+    """What was left to judgement; who has decided, and what the rules would have."""
+    rows = tuple(
+        (
+            one.task,
+            one.option + "".join(f", {name} times {factor:g}" for name, factor in one.factors.items()),
+            one.by,
+            one.why if one.by == RULES else f'"{one.reason}"',
+            f"asked, {one.instead}" if one.instead else "the same" if _as_usual(one) else f"{one.usual}: {one.why}",
+        )
+        for one in result.decisions
+    )
+    heads = ("Question", "Decided", "By", "Reason", "The rules")
+    return Section("Decisions", (), (Table("What was left to judgement.", heads, rows, frozenset()),))
+
+
+def _as_usual(one: DecisionRecord) -> bool:
+    return one.option == one.usual and not one.factors
 
 
 def _courses(scenario: Scenario, found: Design) -> Section:
@@ -127,16 +180,40 @@ def _best_so_far(one: TuningResult, most: int) -> FloatArray:
 
 def _attempts(one: TuningResult) -> Section:
     knobs = [knob.name for knob in ARCHITECTURES[one.architecture].knobs]
+    asked = any(attempt.by != RULES or attempt.instead for attempt in one.history)
     rows = tuple(
         (
             str(attempt.number),
-            *(f"{attempt.values[name]:g}" if name in attempt.values else "-" for name in knobs),
+            *_values(attempt.values, knobs),
             "-" if attempt.trial is None or attempt.trial.cost_n2s is None else f"{attempt.trial.cost_n2s:.2f}",
             "accepted" if attempt.accepted else attempt.refused or "not better",
-            attempt.reason,
+            attempt.reason if attempt.by == RULES else f'"{attempt.reason}"',
+            *((attempt.by, _rules_instead(attempt, knobs)) if asked else ()),
         )
         for attempt in one.history
     )
     numeric = frozenset(range(len(knobs) + 2))
-    table = Table("Every attempt.", ("No.", *knobs, "J, N² s", "Verdict", "Reason"), rows, numeric)
-    return Section(f"Attempts: {one.architecture}", (), (table,))
+    heads = ("No.", *knobs, "J, N² s", "Verdict", "Reason", *(("By", "The rules") if asked else ()))
+    return Section(f"Attempts: {one.architecture}", _ended(one), (Table("Every attempt.", heads, rows, numeric),))
+
+
+def _values(values: Mapping[str, float], knobs: Sequence[str]) -> tuple[str, ...]:
+    return tuple(f"{values[name]:g}" if name in values else "-" for name in knobs)
+
+
+def _rules_instead(attempt: Attempt, knobs: Sequence[str]) -> str:
+    """What the rules would have tried, or why they have suggested it."""
+    if attempt.usual is None:
+        return f"asked, {attempt.instead}" if attempt.instead else ""
+    if attempt.usual.values == attempt.values:
+        return "the same"
+    if not attempt.usual.values:
+        return f"an end: {attempt.usual.reason}"
+    return f"{', '.join(_values(attempt.usual.values, knobs))}: {attempt.usual.reason}"
+
+
+def _ended(one: TuningResult) -> tuple[str, ...]:
+    """Who has ended it, where that was not the rules."""
+    if one.stopped is None:
+        return ()
+    return (f'Ended by {one.stopped.by}: "{one.stopped.reason}" The rules: {one.stopped.usual.reason}.',)

@@ -8,7 +8,7 @@ from importlib.metadata import version
 
 from gateway.cli.design_phase import Design
 from gateway.commissioning.assessment import Assessment
-from gateway.commissioning.records import Attempt
+from gateway.commissioning.records import Attempt, DecisionRecord, Stop
 from gateway.commissioning.selection import Candidate
 from gateway.core.line import Line, Priorities, Strict
 from gateway.core.line_model import LineModel, model_hash
@@ -20,6 +20,7 @@ class TuningResult(Strict):
 
     architecture: str
     converged: bool  #: the proposer expected nothing better; otherwise the iterations were used up
+    stopped: Stop | None = None  #: somebody else has expected nothing better
     history: list[Attempt]
 
 
@@ -37,7 +38,9 @@ class DesignResult(Strict):
     assessment: Assessment
     scenarios: list[Scenario]
     priorities: Priorities
-    candidates: list[Candidate]  #: the chosen one first
+    priorities_otherwise: Priorities | None = None  #: weights that somebody has proposed; None: nobody has
+    decisions: list[DecisionRecord] = []  #: what was left to judgement; of the tuning it stands with each attempt
+    candidates: list[Candidate]  #: the one with the least score first
     tuning: list[TuningResult]
     chosen: str  #: the architecture; "" where none can be offered
     controller: str  #: hash of the configuration; "" likewise
@@ -49,7 +52,8 @@ LIBRARIES = ("r2rgate", "numpy", "scipy", "numba", "osqp")
 
 def result_of(line: Line, found: Design, seed: int, model: LineModel | None = None) -> DesignResult:
     """The outcome of phase 1, to be kept."""
-    chosen = found.candidates[0] if found.chosen is not None else None
+    name = "" if found.chosen is None else found.chosen.architecture
+    chosen = next((one for one in found.candidates if one.architecture == name), None)
     return DesignResult(
         command=" ".join(["r2rgate", *sys.argv[1:]]),
         date=datetime.now(UTC).isoformat(timespec="seconds"),
@@ -63,12 +67,19 @@ def result_of(line: Line, found: Design, seed: int, model: LineModel | None = No
         assessment=found.assessment,
         scenarios=list(found.ground.scenarios),
         priorities=line.priorities,
+        priorities_otherwise=found.priorities_otherwise,
+        decisions=found.decisions,
         candidates=found.candidates,
         tuning=[
-            TuningResult(architecture=one.architecture, converged=one.tuned.converged, history=list(one.tuned.history))
+            TuningResult(
+                architecture=one.architecture,
+                converged=one.tuned.converged,
+                stopped=one.tuned.stopped,
+                history=list(one.tuned.history),
+            )  # fmt: skip
             for one in found.finished
         ],
-        chosen=chosen.architecture if chosen else "",
+        chosen=name,
         controller=chosen.hash if chosen else "",
         explanation=found.explanation,
     )

@@ -1,13 +1,57 @@
 """What the phases write down: every attempt with its reason and its figures. Plain data, kept and sent as JSON."""
 
+from gateway.commissioning.decisions import RULES, Decided
 from gateway.core.line import NonNegative, Positive, Strict
+from gateway.core.questions import Decision, Question, factors_that_turn
+
+
+class DecisionRecord(Strict):
+    """A question of a phase, and what was decided; of the question what a reader needs to judge that."""
+
+    decision: Decision
+    task: str
+    options: dict[str, str]  #: name and title
+    option: str  #: that was chosen
+    factors: dict[str, Positive] = {}  #: on numbers of it; none: as they are
+    by: str  #: "rules", or the agent's name
+    reason: str
+    usual: str  #: what the rules would choose
+    why: str  #: and why
+    instead: str = ""  #: why the rules have decided though somebody else was asked
+
+
+def decision_record(question: Question, decided: Decided) -> DecisionRecord:
+    """What was decided on `question`."""
+    return DecisionRecord(
+        decision=question.decision, task=question.task, options={one.id: one.title for one in question.options},
+        option=decided.choice.option, factors=factors_that_turn(decided.choice), by=decided.by,
+        reason=decided.choice.reason, usual=question.usual, why=question.why, instead=decided.instead,
+    )  # fmt: skip
+
+
+class Usual(Strict):
+    """What the rules would have tried, where somebody else decides. No values: they would have ended the search."""
+
+    values: dict[str, Positive]
+    reason: str
 
 
 class Suggestion(Strict):
     """Values of an architecture's knobs, and why."""
 
     values: dict[str, Positive]
+    reason: str  #: of whoever suggests, in their words
+    by: str = RULES  #: or the agent's name
+    instead: str = ""  #: why the rules have decided though somebody else was asked
+    usual: Usual | None = None  #: None: they have decided
+
+
+class Stop(Strict):
+    """Somebody other than the rules ends a search: they expect nothing better."""
+
     reason: str
+    by: str
+    usual: Usual
 
 
 class Trial(Strict):
@@ -35,6 +79,9 @@ class Attempt(Strict):
     number: int  #: from 0
     values: dict[str, Positive]
     reason: str
+    by: str = RULES  #: who suggested it: the rules, or an agent's name
+    instead: str = ""  #: why the rules have, though somebody else was asked
+    usual: Usual | None = None  #: what the rules would have tried; None: they have suggested it
     trial: Trial | None  #: None: no design came of it
     refused: str  #: why it does not count, "" where it does: not stable, a limit left, too little delay margin
     accepted: bool  #: validated, and better than everything before

@@ -4,7 +4,7 @@ It keeps nothing: where it stands follows from the history, so that it takes ove
 after an interruption, as if nothing had happened.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from math import log
 
@@ -44,29 +44,45 @@ class PatternSearch:
         best = best_of(history)
         if best is None:
             return self._calmer(architecture, ground, history)
-        seen = [attempt.values for attempt in history]
-        factor = FIRST_FACTOR
-        while factor >= LAST_FACTOR:
-            for turn in _turns(architecture, history, best, factor):
-                values = turn.applied(best.values)
-                if values is not None and not any(_alike(values, other) for other in seen):
-                    return Suggestion(values=values, reason=_reason(best, ground, turn))
-            factor = factor**0.5
-        return None
+        return next(untried_turns(architecture, ground, history, best), None)
 
     def _calmer(self, architecture: Architecture, ground: Ground, history: Sequence[Attempt]) -> Suggestion | None:
         """Nothing has been valid yet: all knobs towards a calmer loop at once."""
         told = history[-1].values  # somebody else's, perhaps: of knobs that there are not
         first = architecture.first(ground.task)
         last = first | {name: told[name] for name in first if name in told}
-        values = dict(last)
-        for knob in architecture.knobs:
-            if direction := CALMER.get(knob.name, 0):
-                factor = 2.0**direction
-                values[knob.name] = _rounded(min(max(last[knob.name] * factor, knob.least), knob.most))
-        if _alike(values, told):
+        values = calmer(architecture, last)
+        if alike(values, told):
             return None
         return Suggestion(values=values, reason=f"{history[-1].refused}: a calmer loop")
+
+
+def untried_turns(
+    architecture: Architecture, ground: Ground, history: Sequence[Attempt], best: Attempt
+) -> Iterator[Suggestion]:
+    """Turns of `best` that lead to values not in `history`, in the order in which the search would try them."""
+    seen = [attempt.values for attempt in history]
+    factor = FIRST_FACTOR
+    while factor >= LAST_FACTOR:
+        for turn in _turns(architecture, history, best, factor):
+            values = turn.applied(best.values)
+            if values is not None and not any(alike(values, other) for other in seen):
+                yield Suggestion(values=values, reason=_reason(best, ground, turn))
+        factor = factor**0.5
+
+
+def calmer(architecture: Architecture, values: Mapping[str, float]) -> dict[str, float]:
+    """All knobs that make a loop calmer, by a factor of 2 within their ranges."""
+    factors = {name: 2.0**direction for name, direction in CALMER.items()}
+    return turned(architecture, values, {name: factor for name, factor in factors.items() if name in values})
+
+
+def turned(architecture: Architecture, values: Mapping[str, float], factors: Mapping[str, float]) -> dict[str, float]:
+    """`values` with some times a factor, within the knobs' ranges, to three digits."""
+    knobs = {knob.name: knob for knob in architecture.knobs}
+    ends = {name: (knobs[name].least, knobs[name].most) for name in factors}
+    moved = {name: _rounded(min(max(values[name] * factors[name], low), high)) for name, (low, high) in ends.items()}
+    return {**values, **moved}
 
 
 def _turns(architecture: Architecture, history: Sequence[Attempt], best: Attempt, factor: float) -> list[Turn]:
@@ -98,5 +114,6 @@ def _same(a: float, b: float) -> bool:
     return abs(log(a / b)) < SAME
 
 
-def _alike(a: dict[str, float], b: dict[str, float]) -> bool:
+def alike(a: Mapping[str, float], b: Mapping[str, float]) -> bool:
+    """Whether they are the same values, as far as anybody would notice."""
     return a.keys() == b.keys() and all(_same(a[name], b[name]) for name in a)

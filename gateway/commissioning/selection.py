@@ -23,6 +23,7 @@ class Candidate(Strict):
     compute_s: NonNegative | None  #: median of a step
     refused: str  #: why it is not offered; "" where it is
     score: NonNegative | None  #: S; None: not offered, or a metric is without bound
+    score_otherwise: NonNegative | None = None  #: S by the weights that somebody has proposed; None: nobody has
     terms: list[float]  #: the parts of S, in the order of TERMS
 
 
@@ -35,13 +36,15 @@ def candidate(
     compute_s: float | None,
     refused: str,
     priorities: Priorities,
+    otherwise: Priorities | None = None,
 ) -> Candidate:
-    """With its score, where it has one."""
+    """With its score, where it has one; `otherwise`: other weights, by which it is scored, too."""
     performance = None if refused or trial is None or compute_s is None else performance_of(trial, compute_s)
     whole = score(performance, priorities) if performance else None
     return Candidate(
         architecture=architecture, title=title, hash=config_hash, values=dict(values), trial=trial,
         compute_s=compute_s, refused=refused, score=whole,
+        score_otherwise=score(performance, otherwise) if performance and otherwise else None,
         terms=(weights(priorities) * performance.vector()).tolist() if performance else [],
     )  # fmt: skip
 
@@ -65,17 +68,35 @@ def ranked(candidates: Sequence[Candidate]) -> list[Candidate]:
     return sorted(candidates, key=lambda one: (one.score is None, one.score or 0.0))
 
 
-def explanation(candidates: Sequence[Candidate]) -> list[str]:
-    """Why the first of `ranked` is chosen and what it costs, from the numbers alone."""
+def explanation(candidates: Sequence[Candidate], chosen: str = "", by: str = "") -> list[str]:
+    """Why the first of `ranked` is chosen and what it costs, from the numbers alone.
+
+    Or that `by` has chosen another of those with a score, `chosen`, and what that costs.
+    """
     order = ranked(candidates)
     said: list[str] = []
     scored = [one for one in order if one.score is not None]
     if scored:
         best = scored[0]
-        said.append(f"{best.architecture} is chosen: its score of {best.score:.3f} is the least.")
-        said += [_against(best, other) for other in scored[1:2]]
+        if chosen in ("", best.architecture):
+            said.append(f"{best.architecture} is chosen: its score of {best.score:.3f} is the least.")
+            said += [_against(best, other) for other in scored[1:2]]
+        else:
+            taken = next(one for one in scored if one.architecture == chosen)
+            said.append(
+                f"{chosen} is chosen by {by}: its score is {taken.score:.3f}. The least, which the rules would choose, "
+                f"is the {best.score:.3f} of {best.architecture}."
+            )
+            said.append(_against(best, taken, f"{best.architecture} is ahead of {chosen}"))
     else:
         said.append("No architecture can be offered.")
+    said += _unscored(order)
+    return said
+
+
+def _unscored(order: Sequence[Candidate]) -> list[str]:
+    """Of each that is not offered, or does not settle."""
+    said: list[str] = []
     for one in order:
         if one.refused:
             said.append(f"{one.architecture} is not offered: {one.refused}.")
@@ -84,14 +105,14 @@ def explanation(candidates: Sequence[Candidate]) -> list[str]:
     return said
 
 
-def _against(best: Candidate, other: Candidate) -> str:
+def _against(best: Candidate, other: Candidate, ahead_of: str = "") -> str:
     """The two side by side: where the difference of their scores comes from."""
     assert best.score is not None and other.score is not None
     ahead = other.score - best.score
     parts = sorted(((b - a, name) for a, b, name in zip(best.terms, other.terms, TERMS, strict=True)), reverse=True)
     gains = [f"{name} ({difference:+.3f})" for difference, name in parts if difference > 0.05 * abs(ahead)]
     costs = [f"{name} ({difference:+.3f})" for difference, name in parts if difference < -0.05 * abs(ahead)]
-    text = f"It is ahead of {other.architecture} by {ahead:.3f}"
+    text = f"{ahead_of or f'It is ahead of {other.architecture}'} by {ahead:.3f}"
     text += f" through {_listed(gains)}" if gains else ""
     text += f", and behind it in {_listed(costs)}" if costs else ""
     return f"{text}.{_if_close(best, other) if ahead < CLOSE * best.score else ''}"

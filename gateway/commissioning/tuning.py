@@ -7,10 +7,14 @@ proposed is designed, simulated and validated here; it is accepted only where it
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
+from warnings import catch_warnings
+
+from numpy.linalg import LinAlgError
+from scipy.linalg import LinAlgWarning
 
 from gateway.commissioning.architectures import Architecture
 from gateway.commissioning.ground import Ground
-from gateway.commissioning.records import Attempt, Suggestion
+from gateway.commissioning.records import Attempt, Stop, Suggestion, Trial
 from gateway.commissioning.trial import reasons_against, tried
 from gateway.control.design import DesignRefused
 from gateway.core.controller import Controller
@@ -21,8 +25,13 @@ MOST_ITERATIONS = 50
 class Proposer(Protocol):
     """Who chooses the next values."""
 
-    def suggest(self, architecture: Architecture, ground: Ground, history: Sequence[Attempt]) -> Suggestion | None:
-        """The next values, the first when there is no history; None: nothing better is to be expected."""
+    def suggest(
+        self, architecture: Architecture, ground: Ground, history: Sequence[Attempt]
+    ) -> Suggestion | Stop | None:
+        """The next values, the first when there is no history; None: nothing better is to be expected.
+
+        A Stop says the same for somebody other than the rules.
+        """
         ...
 
 
@@ -30,6 +39,7 @@ class Proposer(Protocol):
 class Tuned:
     history: tuple[Attempt, ...]
     converged: bool  #: the proposer had nothing more to say
+    stopped: Stop | None = None  #: and it was not the rules that saw an end there
 
     @property
     def best(self) -> Attempt | None:
@@ -68,6 +78,8 @@ def tune(
         suggestion = proposer.suggest(architecture, ground, done)
         if suggestion is None:
             return Tuned(tuple(done), converged=True)
+        if isinstance(suggestion, Stop):
+            return Tuned(tuple(done), converged=True, stopped=suggestion)
         attempt = attempted(architecture, ground, suggestion, done)
         done.append(attempt)
         on_attempt(attempt)
@@ -78,14 +90,22 @@ def attempted(
     architecture: Architecture, ground: Ground, suggestion: Suggestion, history: Sequence[Attempt]
 ) -> Attempt:
     """What became of a suggestion: designed, simulated, validated, and compared with the best before."""
-    number, values, reason = len(history), dict(suggestion.values), suggestion.reason
+
+    def attempt(trial: Trial | None, refused: str, accepted: bool) -> Attempt:
+        return Attempt(
+            number=len(history), values=dict(suggestion.values), reason=suggestion.reason, by=suggestion.by,
+            instead=suggestion.instead, usual=suggestion.usual, trial=trial, refused=refused, accepted=accepted,
+        )  # fmt: skip
+
     try:
-        trial = tried(architecture.design(ground.task, values, ground.speeds_m_per_s), ground)
+        # At the far ends of knobs a loop may be such that its figures mean nothing: it is no candidate.
+        with catch_warnings(action="error", category=LinAlgWarning):
+            trial = tried(architecture.design(ground.task, suggestion.values, ground.speeds_m_per_s), ground)
     except DesignRefused as refused:
-        return Attempt(number=number, values=values, reason=reason, trial=None, refused=str(refused), accepted=False)
+        return attempt(None, str(refused), accepted=False)
+    except (LinAlgError, LinAlgWarning) as error:
+        return attempt(None, f"its figures cannot be computed: {error}", accepted=False)
     against = "; ".join(reasons_against(trial, ground))
     best = best_of(history)
     better = best is None or (trial.cost_n2s or 0.0) < (best.cost_n2s or 0.0)
-    return Attempt(
-        number=number, values=values, reason=reason, trial=trial, refused=against, accepted=not against and better
-    )
+    return attempt(trial, against, accepted=not against and better)

@@ -7,6 +7,7 @@ limit, or another line. What comes of it is a proposal like any other, which the
 
 import json
 from collections.abc import Mapping
+from math import isfinite
 from typing import Annotated, Literal, Self, get_args
 
 from pydantic import Field, ValidationError, model_validator
@@ -55,6 +56,12 @@ class Figure(Strict):
     name: Annotated[str, Field(min_length=1, max_length=80)]
     value: float | None
     unit: Annotated[str, Field(max_length=20)] = ""
+
+
+def figure(name: str, value: float | None, unit: str = "") -> Figure:
+    """With four digits: more say nothing. What is no finite number is not known."""
+    known = None if value is None or not isfinite(value) else float(f"{value:.4g}")
+    return Figure(name=name[:80], value=known, unit=unit)
 
 
 class Option(Strict):
@@ -131,6 +138,11 @@ class ChoiceRefused(Exception):
 def usual_choice(question: Question) -> Choice:
     """What the rules answer."""
     return Choice(option=question.usual, reason=question.why)
+
+
+def factors_that_turn(choice: Choice) -> dict[str, float]:
+    """Those other than 1, by knob."""
+    return {name: factor for name, factor in choice.factors.items() if factor != 1.0}
 
 
 def parse_choice(payload: bytes, question: Question) -> Choice:
