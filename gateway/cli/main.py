@@ -23,6 +23,7 @@ from gateway.cli import (
     line_commands,
     models_commands,
     operate_commands,
+    pki_commands,
     process_commands,
     proposal_commands,
     recordings_export,
@@ -50,6 +51,7 @@ app.command(rich_help_panel=ENGINEER)(line_commands.init)
 app.command(rich_help_panel=ENGINEER)(line_commands.check)
 app.add_typer(scan_commands.app, rich_help_panel=ENGINEER)
 app.command(rich_help_panel=ENGINEER)(doctor_commands.doctor)
+app.add_typer(pki_commands.app, rich_help_panel=ENGINEER)
 app.command(rich_help_panel=ENGINEER)(identify_commands.identify)
 app.command(rich_help_panel=ENGINEER)(design_commands.design)
 app.add_typer(models_commands.app, rich_help_panel=ENGINEER)
