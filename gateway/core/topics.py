@@ -50,10 +50,11 @@ TOPICS = (
 
 # The bus of the agents. What is no row here nobody may send there: its access rules are made from this table.
 AGENT_DECIDE = AgentTopic("agents/*/decide", "phases", "agent", 10.0, kept=False)  #: Question -> Answer
+ASK_UNANSWERED = AgentTopic("ask/*/unanswered", "phases", "gateway", 1.0, kept=True)  #: Unanswered -> Reply
 ASK_PROPOSE = AgentTopic("ask/*/propose", "agent", "gateway", 1.0, kept=True)  #: Proposal -> Reply
 ASK_STATUS = AgentTopic("ask/*/status", "agent", "gateway", 10.0, kept=False)  #: nothing -> GatewayStatus
 ASK_PROPOSALS = AgentTopic("ask/*/proposals", "agent", "gateway", 10.0, kept=False)  #: Query -> as it says
 ASK_JUDGE = AgentTopic("ask/*/judge", "agent", "gateway", 1.0, kept=True)  #: Proposal -> DryRun; Reply: refused
 ASK_LOG = AgentTopic("ask/*/log", "agent", "gateway", 2.0, kept=True)  #: Interaction, packed -> Reply
 
-AGENT_TOPICS = (AGENT_DECIDE, ASK_PROPOSE, ASK_STATUS, ASK_PROPOSALS, ASK_JUDGE, ASK_LOG)
+AGENT_TOPICS = (AGENT_DECIDE, ASK_UNANSWERED, ASK_PROPOSE, ASK_STATUS, ASK_PROPOSALS, ASK_JUDGE, ASK_LOG)

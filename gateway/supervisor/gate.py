@@ -264,6 +264,14 @@ class Gate:
         self._note("decision", f"{who.name}: {reply.text}", ok=reply.ok, reasons=reply.reasons)
         return reply.model_dump_json().encode()
 
+    async def record_agents(self, what: dict[str, Any]) -> bool:
+        """A record of kind "agents": what went wrong with them. False: the audit does not take it now."""
+        try:
+            await self._audit.append("agents", GATEWAY, what)
+        except AuditUnavailable:
+            return False
+        return True
+
     def shut_reply(self) -> Reply:
         """To whoever asks before the gate is open."""
         return Reply(ok=False, state="", text="the gate is shut", reasons=[self._shut])
