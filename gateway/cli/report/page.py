@@ -34,6 +34,26 @@ class Table:
             raise ValueError(f"{where}: numeric columns are {sorted(self.numeric)}; allowed: 0 to {width - 1}")
 
 
+@dataclass(frozen=True, slots=True)
+class Fold:
+    """What a reader opens who wants to know it word by word."""
+
+    title: str
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Story:
+    """Something that happened, told from its beginning to its end, with the details folded away."""
+
+    title: str
+    paragraphs: tuple[str, ...] = ()
+    tables: tuple[Table, ...] = ()
+    quote: str = ""  #: somebody's own words
+    after: tuple[str, ...] = ()  #: paragraphs behind the quotation
+    folds: tuple[Fold, ...] = ()
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Series:
     name: str
@@ -85,6 +105,7 @@ class Section:
     title: str
     paragraphs: tuple[str, ...] = ()
     tables: tuple[Table, ...] = ()
+    stories: tuple[Story, ...] = ()
     charts: tuple[Chart, ...] = ()
 
 
