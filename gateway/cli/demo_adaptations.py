@@ -16,7 +16,10 @@ def selection_section(chain: ChainResult) -> Section:
     """Which configuration was chosen to begin with, among which, and why."""
     tried = [one for one in chain.changes if one.step == Step.FIRST]
     changes = {one.proposal: one for one in tried if one.proposal}
-    stories = tuple(story_of(one, changes) for one in chain.asked if one.decision.startswith(SELECTS))
+    asked = [one for one in chain.asked if one.decision.startswith(SELECTS)]
+    kept = {one.proposal for one in tried if one.stage == "kept"}
+    chosen = [one for one in asked if one.proposal in kept] or asked
+    stories = tuple(story_of(one, changes) for one in chosen[-1:])
     rows = tuple((one.name, one.reason or one.why, verdict_words(one), result_words(one)) for one in tried)
     heads = ("Candidate", "What it is", "Verdict", "Result")
     table = Table(
@@ -26,7 +29,7 @@ def selection_section(chain: ChainResult) -> Section:
         "The loop was started with an LQI on the line's file, which is Initial. "
         "This is what the gate let take its place for the first experiment."
     )
-    return Section("Selection, with its justification", (said,), (table,), stories)
+    return Section("Selection, with its justification", (said,), (table,), stories=stories)
 
 
 def adaptations_section(result: DemoResult, chain: ChainResult) -> Section:
@@ -37,10 +40,10 @@ def adaptations_section(result: DemoResult, chain: ChainResult) -> Section:
         if change.step == Step.REDESIGN and change.stage == "kept":
             stories.append(_adaptation(result, chain, chain.changes[begin:end], change))
             begin = end + 1
-    after = chain.changes[begin:]
     said = "Each begins with what the line showed, and ends with what was measured on it."
-    left = f" After the last: {'; '.join(f'{one.step}, {one.name}: {one.stage}' for one in after)}." if after else ""
-    return Section("Adaptations: diagnosis, change, verdict, result", (said + left,), stories=tuple(stories))
+    if not stories:
+        said = "No redesign came to be kept: what the gate found against each stands below, under Through the gate."
+    return Section("Adaptations: diagnosis, change, verdict, result", (said,), stories=tuple(stories))
 
 
 def _adaptation(result: DemoResult, chain: ChainResult, before: Sequence[ChangeResult], kept: ChangeResult) -> Story:
@@ -55,12 +58,13 @@ def _adaptation(result: DemoResult, chain: ChainResult, before: Sequence[ChangeR
         ("Verdict", f"{verdict_words(kept)}. Approved by {kept.approved_by or 'nobody'}"),
         ("Result", f"{result_words(kept)} {_measured(result, place)}"),
     ]  # fmt: skip
-    asked = [one for one in chain.asked if one.proposal == kept.proposal]
+    asked = [one for one in chain.asked if one.proposal == kept.proposal and one.decision != DIAGNOSES]
+    last = asked[-1] if asked else None
     return Story(
         f"{earlier} \u2192 {name}",
         tables=(Table("What led to it, and what it came to.", ("", "What"), tuple(rows)),),
-        quote=asked[-1].reason if asked else "",
-        after=(f"So said {_who(asked[-1])} of the choice among {len(asked[-1].options)}.",) if asked else (),
+        lead="" if last is None else f"Why this one of {len(last.options)}, in the words of {_who(last)}:",
+        quote="" if last is None else last.reason,
     )
 
 

@@ -1,6 +1,7 @@
 """What was asked of the agents, as a reader follows it: question, options, notes, choice, what came of it."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from datetime import datetime
 
 from gateway.cli.agents_view import as_story
@@ -21,7 +22,7 @@ def asked_section(chain: ChainResult, interactions: Sequence[Interaction]) -> Se
     changes = {one.proposal: one for one in chain.changes if one.proposal}
     stories = tuple(_story(number, one, changes, whole.get(one.interaction)) for number, one in
                     enumerate(chain.asked, 1))  # fmt: skip
-    return Section(title, (in_short(chain.asked),), stories=stories)
+    return Section(title, (f"{in_short(chain.asked)}.",), stories=stories)
 
 
 def in_short(asked: Sequence[AskedResult]) -> str:
@@ -36,14 +37,15 @@ def in_short(asked: Sequence[AskedResult]) -> str:
     return f"{text}; in {failed} of them the rules stood in for an agent" if failed else text
 
 
-def story_of(one: AskedResult, changes: Mapping[str, ChangeResult], title: str = "") -> Story:
+def story_of(one: AskedResult, changes: Mapping[str, ChangeResult]) -> Story:
     """Without the details."""
     return Story(
-        title or one.task,
-        tables=tuple(_tables(one)),
-        paragraphs=(_choice(one),),
-        quote=one.reason,
-        after=(came_of(one, changes),),
+        _sentence(one.task),
+        (f"{_clock(one.at)}, agent {one.agent}, {one.decision}. {_looked_up(one)}",),
+        tuple(_tables(one)),
+        _choice(one),
+        one.reason,
+        (came_of(one, changes),),
     )
 
 
@@ -71,21 +73,16 @@ def verdict_words(change: ChangeResult) -> str:
 
 def result_words(change: ChangeResult) -> str:
     """What came of a candidate after its verdict, as far as there is anything to say."""
-    parts = [f"It is {change.stage}", f": {change.why}" if change.why and change.why != change.measured else ""]
+    parts = [change.stage.capitalize(), f": {change.why}" if change.why and change.why != change.measured else ""]
     parts.append(f", up to {change.speed_m_per_s:.3g} m/s" if change.speed_m_per_s is not None else "")
     measured = f" Measured: {change.measured}." if change.measured else ""
     return f"{''.join(parts)}.{measured}"
 
 
 def _story(number: int, one: AskedResult, changes: Mapping[str, ChangeResult], whole: Interaction | None) -> Story:
-    plain = story_of(one, changes)
-    folds = (
-        () if whole is None else (Fold(f"Everything, word by word (r2rgate log {one.interaction})", as_story(whole)),)
-    )
-    said = f"{_clock(one.at)}, agent {one.agent}, {one.decision}. {_looked_up(one)}"
-    return Story(
-        f"{number}. {_sentence(one.task)}", (said,), plain.tables, plain.quote, (*plain.paragraphs, *plain.after), folds
-    )
+    story = story_of(one, changes)
+    folds = () if whole is None else (Fold(f"Word by word (r2rgate log {one.interaction})", as_story(whole)),)
+    return replace(story, title=f"{number}. {story.title}", folds=folds)
 
 
 def _choice(one: AskedResult) -> str:
@@ -113,7 +110,7 @@ def _tables(one: AskedResult) -> list[Table]:
     heads = ("Option", "What it is", *(_head(one.options, name) for name in names))
     rows = tuple((_mark(option, one), option.title, *(_value(option, name) for name in names)) for option in shown)
     left = len(one.options) - len(shown)
-    note = f"{left} more stand in the details." if left else ""
+    note = f"And {left} more, in the details." if left else ""
     return [Table("What was offered.", heads, rows, frozenset(range(2, len(heads))), note=note)]
 
 

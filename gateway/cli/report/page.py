@@ -49,8 +49,9 @@ class Story:
     title: str
     paragraphs: tuple[str, ...] = ()
     tables: tuple[Table, ...] = ()
+    lead: str = ""  #: whose words follow
     quote: str = ""  #: somebody's own words
-    after: tuple[str, ...] = ()  #: paragraphs behind the quotation
+    after: tuple[str, ...] = ()  #: paragraphs behind them
     folds: tuple[Fold, ...] = ()
 
 
@@ -105,8 +106,8 @@ class Section:
     title: str
     paragraphs: tuple[str, ...] = ()
     tables: tuple[Table, ...] = ()
-    stories: tuple[Story, ...] = ()
     charts: tuple[Chart, ...] = ()
+    stories: tuple[Story, ...] = ()  #: before the charts
 
 
 @dataclass(frozen=True, slots=True)

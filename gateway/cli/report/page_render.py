@@ -44,6 +44,8 @@ def _section(index: int, section: Section) -> str:
 def _story(one: Story) -> str:
     parts = [f"<h3>{escape(one.title)}</h3>", *(f"<p>{escape(text)}</p>" for text in one.paragraphs)]
     parts += [_table(each) for each in one.tables]
+    if one.lead:
+        parts.append(f"<p>{escape(one.lead)}</p>")
     if one.quote:
         parts.append(f"<blockquote>{escape(one.quote)}</blockquote>")
     parts += [f"<p>{escape(text)}</p>" for text in one.after]
