@@ -14,6 +14,7 @@ from gateway.cli import (
     baselines_commands,
     commission_commands,
     configurations_commands,
+    demo_commands,
     design_commands,
     doctor_commands,
     experiment_commands,
@@ -65,7 +66,7 @@ app.command(rich_help_panel=PROCESSES)(process_commands.loop)
 app.command(rich_help_panel=PROCESSES)(process_commands.gateway)
 app.command(rich_help_panel=PROCESSES)(agents_commands.agents)
 app.command(rich_help_panel=PROCESSES)(process_commands.sim)
-app.command(rich_help_panel=PROCESSES)(process_commands.demo)
+app.command(rich_help_panel=PROCESSES)(demo_commands.demo)
 app.add_typer(fault_commands.app, rich_help_panel=PROCESSES)
 app.command(rich_help_panel=LINE)(operate_commands.arm)
 app.command(rich_help_panel=LINE)(operate_commands.start)

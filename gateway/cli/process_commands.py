@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from shlex import quote
-from typing import TYPE_CHECKING, Annotated, Literal, NoReturn
+from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
@@ -114,7 +114,7 @@ def gateway(file: LineFile, run_dir: RunFolder = None, data_dir: DataFolder = No
     from gateway.supervisor.process import run_gateway
 
     line = read_line(file)
-    data = _folder(data_dir or default_data_folder(line), "--data-dir")
+    data = writable_folder(data_dir or default_data_folder(line), "--data-dir")
     with _a_crash_is_no_refusal():
         code = run_gateway(line, run_dir or default_run_folder(line), data)
     raise typer.Exit(code)
@@ -190,8 +190,8 @@ def run(
     data = data_dir or default_data_folder(line)
     run_folder = run_dir or default_run_folder(line)
     _require_alone(run_folder)
-    _folder(run_folder, "--run-dir", 0o700)
-    _folder(data, "--data-dir")
+    writable_folder(run_folder, "--run-dir", 0o700)
+    writable_folder(data, "--data-dir")
     opening: list[str] = []
     if controller is None:
         try:
@@ -206,51 +206,7 @@ def run(
     raise typer.Exit(run_together(file, line, controller, plant, run_folder, data, opening))
 
 
-def demo(
-    out: Annotated[Path, typer.Option(help="Folder for result, report and logs; what was there is replaced.")] = Path(
-        "out/demo"
-    ),
-    seed: Annotated[int, typer.Option(min=0, help="Of the simulated line's noise.")] = 1,
-    quick: Annotated[
-        bool, typer.Option("--quick", help="Only both cases on one configuration, without the gate: some 45 s.")
-    ] = False,
-    law: Annotated[
-        Literal["lqi", "pid"] | None, typer.Option(help="With --quick: the control law; LQI without it.")
-    ] = None,
-    model: Annotated[
-        str | None, typer.Option(help="The agents ask this language model, as Ollama names it; without it the rules.")
-    ] = None,
-    url: Annotated[str | None, typer.Option(help="With --model: where Ollama answers, if not on this machine.")] = None,
-) -> None:
-    """The demonstration: from a wrong model of a line to adapted configurations, each change through the gate.
-
-    A simulated six-span line, loop, gateway and agents run in processes of their own, in real time. A first
-    configuration, an experiment, a model and a redesign, and once more: agents are asked over their bus which, each is
-    judged by the gate and approved by a scripted operator; both cases of the paper run on each configuration. Some four
-    minutes; Ctrl-C brings the line to rest and ends all. Exit code: 0 done, 1 failed or not adapted, 130 interrupted.
-
-    Example: r2rgate demo --out out/demo
-
-    Example, one configuration: r2rgate demo --quick --law pid
-
-    Example, with a language model: r2rgate demo --model qwen3:4b
-    """
-    from gateway.cli.demo import run_demo
-    from gateway.cli.demo_line import LanguageModelAsked
-    from gateway.core.line import Agents
-
-    if law is not None and not quick:
-        _refuse(f"--law {law} is for --quick; without it the gate decides which law controls the line")
-    if url is not None and model is None:
-        _refuse(f"--url {url} says where a language model answers; name it with --model")
-    if model is not None and quick:
-        _refuse(f"--model {model} is for the whole demonstration; with --quick nothing is asked of the agents")
-    _folder(out, "--out")
-    asked = None if model is None else LanguageModelAsked(url or Agents().url, model)
-    raise typer.Exit(run_demo(out, seed, (law or "lqi") if quick else None, asked))
-
-
-def _folder(path: Path, option: str, mode: int = 0o777) -> Path:
+def writable_folder(path: Path, option: str, mode: int = 0o777) -> Path:
     """`path` as a folder that exists and may be written."""
     from os import W_OK, X_OK, access
 

@@ -9,14 +9,17 @@ from dataclasses import dataclass
 from math import inf
 from typing import Any, Literal
 
+from gateway.core.audit_record import Who
 from gateway.core.topics import AgentName
+from gateway.supervisor.audit_file import AuditUnavailable
+from gateway.supervisor.proposal_records import GATEWAY
 
 Case = Literal["gone", "turned-away", "refused", "unanswered", "rules-instead"]
 RECORD_EVERY_S = 60.0  #: of each case
 MOST_LETTERS = 400
 
-#: Stores a record of kind "agents"; False: it could not be stored.
-Record = Callable[[dict[str, Any]], Awaitable[bool]]
+#: As `Audit.append`. Raises AuditUnavailable.
+Append = Callable[[str, Who, dict[str, Any]], Awaitable[object]]
 
 
 @dataclass
@@ -36,8 +39,8 @@ class AgentsCases:
     rules-instead: an agent answered by the rules, because its language model or its knowledge failed.
     """
 
-    def __init__(self, record: Record, clock: Callable[[], float] = time.monotonic) -> None:
-        self._record = record
+    def __init__(self, append: Append, clock: Callable[[], float] = time.monotonic) -> None:
+        self._append = append
         self._clock = clock
         self._open: dict[Case, _Open] = {}
         self._recorded_s: dict[Case, float] = {}
@@ -57,7 +60,9 @@ class AgentsCases:
             self._recorded_s[case] = self._clock()
             found = self._open.pop(case)
             what = {"case": case, "times": found.times, "agents": list(found.agents), "newest": found.newest}
-            if not await self._record(what):
+            try:
+                await self._append("agents", GATEWAY, what)
+            except AuditUnavailable:
                 self._merge(case, found)
 
     def _merge(self, case: Case, before: _Open) -> None:

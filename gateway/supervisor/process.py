@@ -96,7 +96,7 @@ async def serve(
     gate = Gate(line, mailbox, data_folder, judge, around, gateway.note, clock, wall_clock)
     gateway.on_event, gateway.change = gate.hear, gate.change
     dry_runs = DryRuns(line, JudgeWorkers(line, nicer=NICEST))
-    cases = AgentsCases(gate.record_agents, clock)
+    cases = AgentsCases(gate.audit.append, clock)
     desk = AgentsDesk(gateway.status, gate, dry_runs, Interactions(data_folder), gateway.note, cases)
     bus = AgentsBus(line, run_folder, desk, gateway.note, cases, clock)
     gateway.agents_bus = bus.status

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
+from gateway.core.audit_record import Who
 from gateway.core.controller import config_hash
 from gateway.core.decisions import ProposalList, ProposalShown
 from gateway.core.dry_run import DryRun
@@ -29,7 +30,7 @@ from gateway.mailbox.inprocess import Hub, InProcessMailbox
 from gateway.mailbox.port import RemoteError, Unreachable
 from gateway.supervisor.agents_cases import RECORD_EVERY_S, AgentsCases
 from gateway.supervisor.agents_desk import AgentsDesk
-from gateway.supervisor.audit_file import AuditFile
+from gateway.supervisor.audit_file import AuditFile, AuditUnavailable
 from gateway.supervisor.deployer_sides import NotKnown
 from gateway.supervisor.dry_runs import LONGER, MOST, DryRuns
 from gateway.supervisor.gate import Gate
@@ -84,7 +85,7 @@ class Desk:
         self.dry_runs = DryRuns(LINE, self.dry)
         self.log = Interactions(folder)
         self.now_s = 0.0
-        self.cases = AgentsCases(self.gate.record_agents, lambda: self.now_s)
+        self.cases = AgentsCases(self.gate.audit.append, lambda: self.now_s)
         desk = AgentsDesk(lambda: STATUS, self.gate, self.dry_runs, self.log, self.note, self.cases)
         desk.serve_on(InProcessMailbox(self.hub))
 
@@ -380,14 +381,14 @@ def test_each_case_has_a_record_of_its_own_and_one_that_could_not_be_stored_come
     stored: list[tuple[str, int, str]] = []
     now_s, there = 0.0, False
 
-    async def record(what: dict[str, Any]) -> bool:
-        if there:
-            stored.append((what["case"], what["times"], what["newest"]))
-        return there
+    async def append(kind: str, who: Who, what: dict[str, Any]) -> None:
+        if not there:
+            raise AuditUnavailable("the disk is full")
+        stored.append((what["case"], what["times"], what["newest"]))
 
     async def story() -> None:
         nonlocal now_s, there
-        cases = AgentsCases(record, lambda: now_s)
+        cases = AgentsCases(append, lambda: now_s)
         await cases.look()
         cases.note("gone", "first", "sysid")
         await cases.look()
