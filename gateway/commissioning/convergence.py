@@ -196,7 +196,7 @@ def _figures(line: Line, recording: Recording, tension_n: FloatArray) -> dict[st
     smooth = _smoothed(tension_n, max(1, round(SMOOTHED_S / period_s)))
     windows = _windows(line, recording)
     if not windows:
-        raise NotOffered("no step of the recording can be looked at: the speed moved throughout, or samples are missing")
+        raise NotOffered("no step of the recording can be looked at: the speed moved, or samples are missing")
     found = np.zeros((3, line.n))  # RMSE, overshoot, settling time: the worst of all changes
     for begin, end in windows:
         rows, asked, changed_s = slice(begin - 1, end), setpoint[begin - 1 : end], float(time_s[begin])
