@@ -2,13 +2,16 @@
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
 from gateway.cli.operate_commands import RunFolder
 from gateway.cli.process_commands import REFUSED, DataFolder, LineFile, default_data_folder, read_line
 from gateway.core.topics import AGENT_NAMES
+
+if TYPE_CHECKING:
+    from gateway.mailbox.bus import TlsEndpoint
 
 LINE = Annotated[Path | None, typer.Option("--line", help="The line's file; needed where several lines have a log.")]
 
@@ -17,6 +20,15 @@ def agents(
     file: LineFile,
     run_dir: RunFolder = None,
     data_dir: DataFolder = None,
+    gateway: Annotated[
+        str | None, typer.Option(help="HOST:PORT of a gateway on another machine, as its line's [network] has it.")
+    ] = None,
+    certificate: Annotated[
+        Path | None,
+        typer.Option(
+            help="With --gateway: NAME.pem of `r2rgate pki init`, with NAME.key.pem and authority.pem beside it."
+        ),
+    ] = None,
 ) -> None:
     """The agents: they answer what the phases leave to judgement, with a language model if the line's file names one.
 
@@ -24,6 +36,8 @@ def agents(
     led to it is kept (`r2rgate log`). Without them, and wherever they fail, the rules decide.
 
     Example: r2rgate agents line.toml
+
+    Example, on another machine: r2rgate agents line.toml --gateway 192.168.0.5:7447 --certificate pki/agents.pem
     """
     from agents.process import run_agents
     from gateway.cli.ask_run import FOLDER
@@ -31,7 +45,23 @@ def agents(
 
     line = read_line(file)
     knowledge = (data_dir or default_data_folder(line)) / FOLDER
-    raise typer.Exit(run_agents(line, run_dir or default_run_folder(line), knowledge))
+    where = run_dir or default_run_folder(line)
+    raise typer.Exit(run_agents(line, _remote(gateway, certificate) or where, knowledge))
+
+
+def _remote(address: str | None, certificate: Path | None) -> "TlsEndpoint | None":
+    """A gateway on another machine; None: on this one."""
+    from gateway.cli.pki_bus import AUTHORITY
+    from gateway.mailbox.bus import TlsEndpoint
+
+    if address is None and certificate is None:
+        return None
+    if address is None or certificate is None:
+        _refuse("--gateway and --certificate belong together: where the gateway is, and as whom it is met")
+    key, authority = certificate.with_suffix(".key.pem"), certificate.with_name(f"{AUTHORITY}.pem")
+    if missing := [str(path) for path in (certificate, key, authority) if not path.is_file()]:
+        _refuse(f"there is no {', no '.join(missing)}; `r2rgate pki init` makes them, together")
+    return TlsEndpoint(address, certificate, key, authority)
 
 
 def log(
@@ -74,6 +104,6 @@ def log(
         _refuse(str(error))
 
 
-def _refuse(text: str) -> None:
+def _refuse(text: str) -> NoReturn:
     typer.echo(text, err=True)
     raise typer.Exit(REFUSED)

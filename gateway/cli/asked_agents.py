@@ -1,26 +1,28 @@
 """The decider of a line that runs: the agents on its bus, and the rules wherever none of them answers.
 
 An agent that is not there, or answers what is no answer, costs the phase a moment. One that does not answer in time
-costs it that time once: then it is not asked for `REST_S`.
+costs it that time once: then it is not asked for `REST_S`. The gateway is told of each, for the audit.
 """
 
 import asyncio
 import time
 from collections.abc import Callable
 from concurrent.futures import CancelledError
+from contextlib import suppress
 from math import inf
 
 from pydantic import ValidationError
 
 from gateway.commissioning.decisions import RULES, Decided
-from gateway.core.interactions import Answer
+from gateway.core.interactions import MOST_WHY, Answer, Unanswered
 from gateway.core.line import Line
 from gateway.core.questions import Question, usual_choice, wrong_with
-from gateway.core.topics import AGENT_DECIDE
+from gateway.core.topics import AGENT_DECIDE, ASK_UNANSWERED
 from gateway.mailbox.port import Mailbox, Unreachable
 
 REST_S = 600.0
 LOOKED_UP_S = 20.0  #: for an agent to look up what is known, and to write it down
+TELL_S = 2.0  #: for the gateway to hear that an agent has failed
 
 
 class AskedAgents:
@@ -47,7 +49,7 @@ class AskedAgents:
 
     def decide(self, question: Question) -> Decided:
         if self._clock() < self._resting_until_s.get(question.agent, -inf):
-            return Decided(usual_choice(question), RULES, f"{question.agent} did not answer in time a while ago")
+            return self._by_rules(question, f"{question.agent} did not answer in time a while ago")
         began_s = self._clock()
         asked = asyncio.run_coroutine_threadsafe(self._asked(question), self._loop)
         try:
@@ -55,14 +57,26 @@ class AskedAgents:
         except (Unreachable, ValidationError, CancelledError) as error:
             if self._clock() - began_s >= self.within_s:
                 self._resting_until_s[question.agent] = self._clock() + REST_S
-            return Decided(usual_choice(question), RULES, f"{question.agent}: {_short(error)}")
+            return self._by_rules(question, f"{question.agent}: {_short(error)}")
         if answer.by not in (question.agent, RULES):
-            return Decided(usual_choice(question), RULES, f"{question.agent} answers as somebody else")
+            return self._by_rules(question, f"{question.agent} answers as somebody else")
         if answer.by == RULES:  # what the rules choose is known here
-            return Decided(usual_choice(question), RULES, answer.instead)
+            return Decided(usual_choice(question), RULES, answer.instead, answer.interaction)
         if against := wrong_with(answer.choice, question):
-            return Decided(usual_choice(question), RULES, f"{question.agent} is not understood: {'; '.join(against)}")
-        return Decided(answer.choice, answer.by, answer.instead)
+            return self._by_rules(question, f"{question.agent} is not understood: {'; '.join(against)}")
+        return Decided(answer.choice, answer.by, answer.instead, answer.interaction)
+
+    def _by_rules(self, question: Question, why: str) -> Decided:
+        """Because the agent has failed; the gateway is told."""
+        with suppress(CancelledError):
+            asyncio.run_coroutine_threadsafe(self._tell(question, why), self._loop).result()
+        return Decided(usual_choice(question), RULES, why)
+
+    async def _tell(self, question: Question, why: str) -> None:
+        """It is the gateway's to keep; a phase goes on without it, too."""
+        payload = Unanswered(decision=question.decision, why=why[:MOST_WHY]).model_dump_json().encode()
+        with suppress(Unreachable):
+            await self._bus.request(ASK_UNANSWERED.of(question.agent), payload, TELL_S)
 
     async def _asked(self, question: Question) -> Answer:
         """Raises Unreachable, ValidationError."""

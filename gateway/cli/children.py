@@ -1,4 +1,4 @@
-"""The processes of a demonstration: simulated line, gateway, loop; started in order, ended in order."""
+"""The processes of a demonstration: simulated line, gateway, loop, agents; started in order, ended in order."""
 
 import json
 import shutil
@@ -33,7 +33,7 @@ class Children:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        for name in ("loop", "gateway", "sim"):
+        for name in ("loop", "agents", "gateway", "sim"):
             self.end(name)
         shutil.rmtree(self.run_folder, ignore_errors=True)
 

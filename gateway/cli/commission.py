@@ -26,7 +26,7 @@ from gateway.commissioning.chain import Look, Pending, next_step, refused_at_onc
 from gateway.commissioning.convergence import Convergence, Diagnosis
 from gateway.commissioning.decisions import RULES, Decided, Decider, Rules
 from gateway.commissioning.ladder import MOST_OWN, OWN, Ended, Next
-from gateway.commissioning.past import KINDS, Follows, Outcome, Past, Step, named, past_of
+from gateway.commissioning.past import KINDS, Follows, Outcome, Past, Step, asked, named, past_of
 from gateway.core.decisions import ProposalShown
 from gateway.core.line import Line
 from gateway.core.line_problem import printable
@@ -98,6 +98,7 @@ class _Chain:
         self._unmade: list[tuple[int, Past]] = []  #: by how many proposals there were
         self._shown: list[ProposalShown] = []
         self._measured: dict[str, Convergence] = {}
+        self._asked: list[str] = []  #: of agents since the last candidate: ids in their log
         self.past: list[Past] = []
 
     async def read(self) -> None:
@@ -156,10 +157,13 @@ class _Chain:
             last = isinstance(refused, Exhausted)
             failed = Past(KINDS[step.step], Outcome.FAILED, step.step, rung, str(refused), last=last)
             self._unmade.append((len(self._shown), failed))
+            self._asked.clear()
             return
         self._tell(f"{what}: {made.reason}")
         reason = _reason(made.reason, decided)
-        await put(self._line, self._side, made.change, reason, named(step.step, rung), decided.author, now)
+        evidence = [named(step.step, rung), *map(asked, self._asked)]
+        await put(self._line, self._side, made.change, reason, evidence, decided.author, now)
+        self._asked.clear()
 
     async def _chosen(self, step: Next, offers: Sequence[Offer], now: LineNow) -> tuple[Decided, int]:
         """And the rung under which it is known."""
@@ -179,6 +183,8 @@ class _Chain:
 
     async def _decided(self, question: Question) -> Decided:
         decided = await asyncio.to_thread(self._decider.decide, question)
+        if decided.interaction:
+            self._asked.append(decided.interaction)
         if decided.instead:
             self._tell(f"{question.decision}: {printable(decided.instead)}: the rules decide")
         elif decided.by != RULES:

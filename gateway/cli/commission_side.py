@@ -67,7 +67,7 @@ async def measured_on(line: Line, side: GateSide) -> dict[str, Convergence]:
 
 
 async def put(
-    line: Line, side: GateSide, change: Change, reason: str, evidence: Evidence, author: str = RULES,
+    line: Line, side: GateSide, change: Change, reason: str, evidence: Sequence[Evidence], author: str = RULES,
     made_on: LineNow | None = None,
 ) -> str:  # fmt: skip
     """Before the gate; its hash. `made_on`: what the change was made from; None: the line as it is now.
@@ -84,7 +84,7 @@ async def put(
         base=config_hash(base.in_service),
         model=None if base.model is None else model_hash(base.model),
         reason=reason,
-        evidence=[evidence],
+        evidence=list(evidence),
         author=author,
         created=now.at.isoformat(timespec="milliseconds"),
         expires=(now.at + timedelta(seconds=min(STANDS_S, line.gate.expiry_max_s))).isoformat(timespec="milliseconds"),

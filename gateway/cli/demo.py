@@ -13,7 +13,7 @@ from rich.console import Console
 
 from gateway.cli.children import ChildFailed, Children
 from gateway.cli.demo_cases import Window, begin_with_repeats, run_with_repeats, settle_with_repeats
-from gateway.cli.demo_line import Setup, begin, clear, end_in_order
+from gateway.cli.demo_line import LanguageModelAsked, Setup, begin, begin_agents, clear, end_in_order
 from gateway.cli.demo_operator import DemoFailed, Operator
 from gateway.cli.demo_progress import Progress
 from gateway.core.messages import Stop
@@ -33,8 +33,10 @@ OPENING_QUICK = (
 NOT_REACHED = "the chain has ended before its aim: {}. The report says which rule refused what, and by how much"
 
 
-def run_demo(out: Path, seed: int, quick: str | None) -> int:
+def run_demo(out: Path, seed: int, quick: str | None, asked: LanguageModelAsked | None = None) -> int:
     """Run it and write everything into `out`. `quick`: the law of the one configuration that is run.
+
+    `asked`: the language model whom the agents ask; None: the rules answer.
 
     Returns the exit code: 0, 1 when something failed, 130 on Ctrl-C.
     """
@@ -44,7 +46,7 @@ def run_demo(out: Path, seed: int, quick: str | None) -> int:
     try:
         clear(out)
         with Children(out / "logs") as children:
-            setup, world_start_s = begin(children, out, quick or "lqi", seed)
+            setup, world_start_s = begin(children, out, quick or "lqi", seed, asked)
             with _stepped_aside(setup) as stepped:
                 windows, chain, stops = asyncio.run(_story(children, setup, stepped, console, quick is None))
                 end_in_order(children)
@@ -92,15 +94,16 @@ def _conclude(
         text = page(setup, result, windows, evidence)
         print_cases(result, console)
     else:
+        from gateway.cli.demo_asked import read_interactions
         from gateway.cli.demo_chain import name_of
         from gateway.cli.demo_chain_page import page
         from gateway.cli.demo_chain_table import print_chain
         from gateway.cli.demo_gate import chain_result
 
-        result = measure(
-            setup, windows, stops, evidence, started_s, name_of, chain_result(setup, chain, evidence), stepped
-        )
-        text = page(setup, result, windows, evidence)
+        interactions = read_interactions(setup)
+        carried = chain_result(setup, chain, evidence, interactions)
+        result = measure(setup, windows, stops, evidence, started_s, name_of, carried, stepped)
+        text = page(setup, result, windows, evidence, interactions)
         print_chain(result, console)
     (setup.out / "result.json").write_text(result.model_dump_json(indent=2) + "\n", encoding="utf-8")
     (setup.out / "report.html").write_text(text, encoding="utf-8")
@@ -123,6 +126,8 @@ async def _story(
             for config in (setup.config, stepped.on_truth())[whole:]:
                 stepped.ask(config)
             await operator.wait(lambda status: status.loop.running, READY_TIME_S, "the loop")
+            if whole:
+                await _with_agents(children, setup, operator)
             await begin_with_repeats(operator)
             if whole:
                 windows, chain = await _whole(operator, setup, stepped)
@@ -140,6 +145,13 @@ async def _story(
             raise
         finally:
             await operator.close()
+
+
+async def _with_agents(children: Children, setup: Setup, operator: Operator) -> None:
+    """Until they answer on the bus."""
+    await operator.wait(lambda status: status.agents_bus.open, READY_TIME_S, "the bus of the agents")
+    begin_agents(children, setup)
+    await operator.wait(lambda status: bool(status.agents_bus.agents), READY_TIME_S, "the agents' process")
 
 
 async def _whole(operator: Operator, setup: Setup, stepped: "SteppedAside") -> "tuple[list[Window], Chain]":

@@ -6,6 +6,7 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from gateway.cli.asked_agents import AskedAgents
 from gateway.cli.commission import commission
 from gateway.cli.commission_changes import LineNow
 from gateway.cli.commission_live import TOPICS, LiveGate
@@ -23,8 +24,10 @@ from gateway.core.messages import Reply, SelectRecipe
 from gateway.core.proposal import GainsChange
 from gateway.core.recording import Recording
 from gateway.core.scenario import PAPER, Scenario
+from gateway.mailbox.bus import BusUnavailable, connect
 from gateway.mailbox.paths import GATEWAY_SOCKET
 from gateway.mailbox.unix import UnixMailbox
+from gateway.mailbox.zenoh_mailbox import ZenohMailbox
 
 FASTEST_M_PER_S = max(case.speed_end_m_per_s for case in PAPER)
 ADAPTATIONS = 2  #: as the paper's table has them for both cases
@@ -140,6 +143,7 @@ async def carry_out(operator: Operator, setup: Setup, stepped: SteppedAside) -> 
         chain.windows += found
 
     chain.windows = await _initial(operator, setup, stepped)
+    bus = await _bus(operator, setup)
     mailbox = UnixMailbox()
     mailbox.connect(TOPICS, operator.run_folder / GATEWAY_SOCKET)
     side = Measured(
@@ -154,6 +158,7 @@ async def carry_out(operator: Operator, setup: Setup, stepped: SteppedAside) -> 
             wanted_m_per_s=FASTEST_M_PER_S,
             adaptations=ADAPTATIONS,
             most_redesigns=ADAPTATIONS,
+            decider=AskedAgents(setup.line, bus, asyncio.get_running_loop()),
         )
         await side.measure_kept()
         return found
@@ -166,8 +171,17 @@ async def carry_out(operator: Operator, setup: Setup, stepped: SteppedAside) -> 
         showing.cancel()
         with contextlib.suppress(asyncio.CancelledError):
             await showing
+        await bus.close()
         await mailbox.close()
     return chain
+
+
+async def _bus(operator: Operator, setup: Setup) -> ZenohMailbox:
+    """On which the agents are asked."""
+    try:
+        return await connect(operator.run_folder, setup.line.site, setup.line.line)
+    except BusUnavailable as error:
+        raise DemoFailed(f"the agents cannot be asked: {error}") from error
 
 
 def _rules(shown: ProposalShown) -> int:

@@ -5,13 +5,16 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from gateway.cli.demo_adaptations import adaptations_section, selection_section
 from gateway.cli.demo_analysis import CaseTrace, Evidence, trace_of
+from gateway.cli.demo_asked_page import asked_section, in_short
 from gateway.cli.demo_cases import Window
 from gateway.cli.demo_line import STATED, Setup
 from gateway.cli.demo_result import PAPER_RMSE_N, ChainResult, ChangeResult, DemoResult, paper_improvement_pct
 from gateway.cli.demo_stepped import SEEDS
 from gateway.cli.report import Chart, Page, Section, Series, Table, render_page
 from gateway.core.controller import config_hash
+from gateway.core.interactions import Interaction
 from gateway.core.scenario import PAPER, Scenario
 
 PLOT_EVERY = 10  #: milliseconds between the samples of a chart
@@ -19,14 +22,27 @@ WHOLE_EVERY = 200  #: the same where the whole run is shown
 NONE = "-"
 
 
-def page(setup: Setup, result: DemoResult, windows: list[Window], evidence: Evidence) -> str:
+def page(
+    setup: Setup,
+    result: DemoResult,
+    windows: list[Window],
+    evidence: Evidence,
+    interactions: Sequence[Interaction],
+) -> str:
     """`report.html`."""
     chain = result.chain
     assert chain is not None
     traces = [trace_of(window, evidence) for window in windows]
-    sections = [_beside_the_paper(result), _against_stepped(result)]
+    sections = [_beside_the_paper(result), selection_section(chain), adaptations_section(result, chain)]
+    sections += [_against_stepped(result)]
     sections += [_case(case, result, [one for one in traces if one.window.case == case], evidence) for case in PAPER]
-    sections += [_through_the_gate(chain), _whole_run(evidence), _safety(result, chain), _timing(result)]
+    sections += [
+        asked_section(chain, interactions),
+        _through_the_gate(chain),
+        _whole_run(evidence),
+        _safety(result, chain),
+        _timing(result),
+    ]
     return render_page(
         Page(
             title="r2rgate demonstration",
@@ -74,8 +90,13 @@ def answer(result: DemoResult, chain: ChainResult) -> list[str]:
         f"{safety} {', '.join(one.name for one in result.configurations)} came to the running line through the gate"
         f"{': ' + ', '.join(came) if came else ''}.",
         f"The chain {'reached its aim' if chain.reached else 'ended before its aim'}: {chain.text}. "
-        f"{tried} candidates, {let_through} let through and approved, {chain.deployments} deployments.",
+        f"{tried} candidates, {let_through} let through and approved, {chain.deployments} deployments. "
+        f"{_sentence(in_short(chain.asked))}.",
     ]
+
+
+def _sentence(text: str) -> str:
+    return f"{text[0].upper()}{text[1:]}"
 
 
 def _signed(percent: float) -> str:
@@ -163,7 +184,7 @@ def _through_the_gate(chain: ChainResult) -> Section:
     rows = tuple(_row(one) for one in chain.changes)
     heads = ("Step", "What", "Verdict", "Came to", "Approved by")
     table = Table("Each candidate of the chain, in order. A proposal is accepted where every rule passes.", heads, rows)
-    refused = tuple((f"{one.step}, {one.candidate}", text) for one in chain.changes for text in one.against)
+    refused = tuple((f"{one.step}, {one.name}", text) for one in chain.changes for text in one.against)
     tables = [table]
     if refused:
         tables.append(Table("What the gate has found against those it refused.", ("Candidate", "Rule"), refused))
@@ -172,11 +193,11 @@ def _through_the_gate(chain: ChainResult) -> Section:
 
 def _row(one: ChangeResult) -> tuple[str, ...]:
     if not one.proposal:
-        return f"{one.step}, {one.candidate}", one.why, NONE, "not made", NONE
+        return f"{one.step}, {one.name}", one.why, NONE, "not made", NONE
     verdict = f"refused by {len(one.against)} of {one.rules} rules" if one.against else f"accepted by {one.rules} rules"
     speed = "" if one.speed_m_per_s is None else f", up to {one.speed_m_per_s:.3g} m/s"
     what = f"{one.reason} ({one.proposal[:12]})"
-    return f"{one.step}, {one.candidate}", what, verdict + speed, one.stage, one.approved_by or NONE
+    return f"{one.step}, {one.name}", what, verdict + speed, one.stage, one.approved_by or NONE
 
 
 def _whole_run(evidence: Evidence) -> Section:

@@ -4,6 +4,7 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
+from gateway.cli.demo_asked_page import in_short
 from gateway.cli.demo_result import PAPER_RMSE_N, ChainResult, DemoResult, paper_improvement_pct
 from gateway.cli.demo_table import print_common
 from gateway.core.scenario import PAPER
@@ -61,6 +62,7 @@ def _of_the_gate(chain: ChainResult) -> list[str]:
         f"the chain {'reached its aim' if chain.reached else 'ended before its aim'}: {chain.text}",
         f"{len(chain.changes)} candidates, {len(approved)} accepted by the gate and approved by {by}; "
         f"{chain.deployments} deployments",
+        in_short(chain.asked),
     ]
     if chain.swaps:
         swap = max(chain.swaps, key=lambda one: one.largest_step_nm)

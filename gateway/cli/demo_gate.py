@@ -4,13 +4,18 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from gateway.cli.commission_result import Tried
+from gateway.cli.commission_result import Tried, candidate_name
 from gateway.cli.demo_analysis import Evidence
+from gateway.cli.demo_asked import asked_result
 from gateway.cli.demo_chain import Chain
 from gateway.cli.demo_line import Setup
-from gateway.cli.demo_result import AuditResult, ChainResult, ChangeResult, SwapResult
+from gateway.cli.demo_result import AuditResult, ChainResult, ChangeResult, RuleResult, SwapResult
+from gateway.core.controller import config_hash
 from gateway.core.decisions import ProposalShown
+from gateway.core.interactions import Interaction
+from gateway.core.proposal import GainsChange
 from gateway.core.signals import FloatArray
+from gateway.core.verdict import RuleFinding
 from gateway.supervisor.audit_file import AuditFile
 from gateway.supervisor.audit_verify import verify
 from gateway.supervisor.historian import FILE_NAME
@@ -21,8 +26,8 @@ AROUND_S = 1.0  #: a swap: half before it, half after it
 FAR_S = 4e9  #: beyond any wall clock
 
 
-def chain_result(setup: Setup, chain: Chain, evidence: Evidence) -> ChainResult:
-    """After every process has ended."""
+def chain_result(setup: Setup, chain: Chain, evidence: Evidence, interactions: Sequence[Interaction]) -> ChainResult:
+    """After every process has ended. `interactions`: with the agents."""
     found = chain.commissioned
     assert found is not None  # the chain was carried out
     approved, deployments = _decided(setup)
@@ -32,6 +37,7 @@ def chain_result(setup: Setup, chain: Chain, evidence: Evidence) -> ChainResult:
         reached=found.reached,
         text=found.text,
         changes=[_change(one, shown.get(one.proposal), approved.get(one.proposal, "")) for one in found.tried],
+        asked=asked_result(interactions, chain.shown),
         deployments=deployments,
         swaps=_swaps(setup, evidence, steps),
         step_allowed_nm=limits.torque_rate_nm_per_s * setup.line.control.period_s,
@@ -43,29 +49,52 @@ def chain_result(setup: Setup, chain: Chain, evidence: Evidence) -> ChainResult:
 
 def audit_result(setup: Setup) -> AuditResult:
     """As `r2rgate audit verify` finds it."""
-    found = verify(setup.out / "data")
+    found = verify(setup.data)
     return AuditResult(records=found.records, head=found.head, sound=found.sound, problems=found.problems)
 
 
 def _change(tried: Tried, shown: ProposalShown | None, approved_by: str) -> ChangeResult:
     findings = [] if shown is None or shown.verdict is None else shown.verdict.findings
+    change = None if shown is None else shown.proposal.change
     return ChangeResult(
         step=tried.step or tried.kind,
-        candidate=tried.rung + 1,
+        name=candidate_name(tried.rung),
         proposal=tried.proposal,
+        configuration=config_hash(change.controller) if isinstance(change, GainsChange) else "",
+        author="" if shown is None else shown.proposal.author,
         reason="" if shown is None else shown.proposal.reason,
         stage=tried.stage,
         why=tried.why,
         rules=len(findings),
         against=[f"{one.rule}: {one.text}" for one in findings if not one.passed],
+        closest=_closest(findings),
+        measured="" if tried.shown is None else tried.shown.text,
         approved_by=approved_by,
         speed_m_per_s=tried.speed_m_per_s,
     )
 
 
+def _closest(findings: Sequence[RuleFinding]) -> RuleResult | None:
+    """The first rule that failed; of rules that all passed the one whose margin is the smallest share of its limit."""
+    failed = [one for one in findings if not one.passed]
+    narrow = sorted((one for one in findings if one.margin is not None and one.limit), key=_share)
+    found = next(iter(failed or narrow), None)
+    if found is None:
+        return None
+    return RuleResult(
+        rule=found.rule, passed=found.passed, value=found.value, limit=found.limit, margin=found.margin,
+        unit=found.unit,
+    )  # fmt: skip
+
+
+def _share(one: RuleFinding) -> float:
+    assert one.margin is not None and one.limit
+    return one.margin / abs(one.limit)
+
+
 def _decided(setup: Setup) -> tuple[dict[str, str], int]:
     """By proposal who approved it, and how often anything was deployed."""
-    with AuditFile(setup.out / "data") as file:
+    with AuditFile(setup.data) as file:
         records = [row.record() for row in file.rows()]
     approved = {str(one.what["proposal"]): one.who.name for one in records if one.kind == "approved"}
     return approved, sum(one.kind == "deployed" for one in records)
@@ -82,7 +111,7 @@ def _steps(recording: Recording) -> list[tuple[FloatArray, FloatArray]]:
 
 def _swaps(setup: Setup, evidence: Evidence, steps: Sequence[tuple[FloatArray, FloatArray]]) -> list[SwapResult]:
     start_s = float(evidence.history["time_s"][0])
-    with History(setup.out / "data" / FILE_NAME) as file:
+    with History(setup.data / FILE_NAME) as file:
         deployed = [event for event in file.events(0.0, FAR_S) if event.kind == "deployed"]
     return [
         SwapResult(

@@ -1,5 +1,6 @@
-"""The line of the demonstration: the simulated one, its file, and the three processes."""
+"""The line of the demonstration: the simulated one, its file, and the processes."""
 
+import json
 import shutil
 from dataclasses import dataclass
 from importlib.resources import as_file, files
@@ -9,7 +10,7 @@ from gateway.cli.children import Children, free_udp_port
 from gateway.cli.demo_operator import DemoFailed
 from gateway.cli.line_commands import known_maps
 from gateway.core.controller import Controller, canonical
-from gateway.core.line import Line
+from gateway.core.line import Agents, Line
 from gateway.core.line_file import load_line
 from gateway.core.line_template import line_template
 
@@ -35,6 +36,14 @@ STATED: tuple[tuple[str, str, str], ...] = (
 
 
 @dataclass(frozen=True)
+class LanguageModelAsked:
+    """Whom the agents ask; without it the rules answer."""
+
+    url: str
+    model: str
+
+
+@dataclass(frozen=True)
 class Setup:
     """What a run is made of, and where it writes."""
 
@@ -42,6 +51,11 @@ class Setup:
     line: Line
     config: Controller  #: with which the loop is started
     seed: int
+
+    @property
+    def data(self) -> Path:
+        """History, audit, stores, the agents' log."""
+        return self.out / "data"
 
 
 def clear(out: Path) -> None:
@@ -56,8 +70,10 @@ def clear(out: Path) -> None:
     (out / "logs").mkdir()
 
 
-def begin(children: Children, out: Path, law: str, seed: int) -> tuple[Setup, float]:
-    """Start the three processes. The line's file describes what the simulated line offers on the wire."""
+def begin(
+    children: Children, out: Path, law: str, seed: int, asked: LanguageModelAsked | None = None
+) -> tuple[Setup, float]:
+    """Start all but the agents. The line's file describes what the simulated line offers on the wire."""
     from gateway.control.design import design_lqi, design_pid, task_of
 
     with as_file(files("sim_plant") / "plants" / "s_real.toml") as plant:
@@ -66,31 +82,50 @@ def begin(children: Children, out: Path, law: str, seed: int) -> tuple[Setup, fl
         out / "plant.toml", "--record", out / "recording", "--seed", str(seed),
         "--can-port", str(free_udp_port()), "--modbus-port", "0", "--priority", str(SIM_PRIORITY),
     )  # fmt: skip
-    text = line_text(ready["can_port"], ready["modbus_port"])
+    text = line_text(ready["can_port"], ready["modbus_port"], asked)
     (out / "line.toml").write_text(text, encoding="utf-8")
     line = load_line(text, "line.toml", known_maps())
     config = {"lqi": design_lqi, "pid": design_pid}[law](task_of(line))
     (out / "controller.json").write_bytes(canonical(config) + b"\n")
-    folders = ("--run-dir", children.run_folder, "--data-dir", out / "data")
+    setup = Setup(out, line, config, seed)
+    folders = ("--run-dir", children.run_folder, "--data-dir", setup.data)
     children.start("gateway", out / "line.toml", *folders)
     children.start("loop", out / "line.toml", "--controller", out / "controller.json", *folders)
-    return Setup(out, line, config, seed), ready["monotonic_start_s"]
+    return setup, ready["monotonic_start_s"]
 
 
-def line_text(can_port: int, modbus_port: int) -> str:
+def begin_agents(children: Children, setup: Setup) -> None:
+    """Their process, once the gateway's bus is open."""
+    folders = ("--run-dir", children.run_folder, "--data-dir", setup.data)
+    children.start("agents", setup.out / "line.toml", *folders)
+
+
+def line_text(can_port: int, modbus_port: int, asked: LanguageModelAsked | None = None) -> str:
     """The template's line on these ports, with what is stated. Raises DemoFailed where the template has changed."""
     text = line_template(SPANS, "line.toml")
     ports = (("port = 43113", f"port = {can_port}"), ("port = 5020", f"port = {modbus_port}"))
     stated = ((default, f"# {why}:\n{said}") for default, said, why in STATED)
-    for default, said in (*ports, *stated):
+    for default, said in (*ports, *stated, *_agents(asked)):
         if default not in text:
             raise DemoFailed(f"the line template does not say {default!r}")
         text = text.replace(default, said)
     return text
 
 
+def _agents(asked: LanguageModelAsked | None) -> list[tuple[str, str]]:
+    """What the template says, and what is said in its place."""
+    if asked is None:
+        return []
+    default = Agents()
+    return [
+        ('llm = "off" ', 'llm = "ollama" '),
+        (f"# url = {json.dumps(default.url)}", f"url = {json.dumps(asked.url)}"),
+        (f"# model = {json.dumps(default.model)}", f"model = {json.dumps(asked.model)}"),
+    ]
+
+
 def end_in_order(children: Children) -> None:
-    for name in ("loop", "gateway", "sim"):
+    for name in ("loop", "agents", "gateway", "sim"):
         code = children.end(name)
         if code != 0:
             raise DemoFailed(f"{name} ended with exit code {code}: see {children.log(name)}")

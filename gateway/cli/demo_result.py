@@ -34,19 +34,76 @@ class ConfigurationResult(Strict):
     cases: list[CaseResult]
 
 
+class RuleResult(Strict):
+    """What a rule of the gate found, as a number. null: it has none."""
+
+    rule: str
+    passed: bool
+    value: float | None
+    limit: float | None
+    margin: float | None  #: to the limit, in the rule's unit; above 0: it passes
+    unit: str
+
+
 class ChangeResult(Strict):
     """A candidate of the chain."""
 
     step: str
-    candidate: int  #: from 1
+    name: str  #: "candidate 1", or "own numbers 1" of an agent's
     proposal: str  #: hash; empty: it could not even be made
+    configuration: str  #: hash of what it brings, where that is a configuration
+    author: str  #: rules, or agents
     reason: str  #: of the proposal
     stage: str  #: that it came to
     why: str  #: it ended there
     rules: int  #: that judged it
     against: list[str]  #: what the rules that failed have found
+    closest: RuleResult | None  #: the rule that decided: the first that failed, or the one that passed most narrowly
+    measured: str  #: of a measurement: what it has shown
     approved_by: str  #: as the audit has it; empty: nobody was asked
     speed_m_per_s: float | None  #: up to which a configuration was let through
+
+
+class FigureResult(Strict):
+    name: str
+    value: float | None
+    unit: str
+
+
+class OptionResult(Strict):
+    id: str
+    title: str
+    figures: list[FigureResult]
+
+
+class NoteResult(Strict):
+    """What an agent looked up before it answered."""
+
+    title: str
+    tier: int
+    score: float
+
+
+class AskedResult(Strict):
+    """A question that was asked of an agent, and what came of it."""
+
+    interaction: str  #: id in the agents' log (`r2rgate log`)
+    at: str  #: ISO 8601
+    agent: str
+    decision: str
+    task: str  #: what was to be decided
+    options: list[OptionResult]
+    usual: str  #: what the rules choose
+    notes: list[NoteResult]
+    chosen: str
+    factors: dict[str, float]  #: by knob; what is not named stayed
+    by: str  #: the agent, or "rules"
+    instead: str  #: why the rules, where a model was asked; empty: it answered, or none was
+    reason: str
+    model: str  #: language model and digest; empty: none was asked
+    tokens: int  #: read and written
+    seconds: float
+    proposal: str  #: hash of what was proposed next; empty: nothing came of it
 
 
 class SwapResult(Strict):
@@ -71,6 +128,7 @@ class ChainResult(Strict):
     reached: bool
     text: str
     changes: list[ChangeResult]
+    asked: list[AskedResult]  #: in the order in which they were
     deployments: int
     swaps: list[SwapResult]
     step_allowed_nm: float  #: in one period, by the line's limits
@@ -95,7 +153,7 @@ class TimingResult(Strict):
 
 
 class DemoResult(Strict):
-    format: Literal[2] = 2
+    format: Literal[3] = 3
     command: str
     date: str  #: ISO 8601
     seed: int

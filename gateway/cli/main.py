@@ -15,6 +15,7 @@ from gateway.cli import (
     commission_commands,
     compute_commands,
     configurations_commands,
+    demo_commands,
     design_commands,
     doctor_commands,
     experiment_commands,
@@ -24,6 +25,7 @@ from gateway.cli import (
     line_commands,
     models_commands,
     operate_commands,
+    pki_commands,
     process_commands,
     proposal_commands,
     recordings_export,
@@ -51,6 +53,7 @@ app.command(rich_help_panel=ENGINEER)(line_commands.init)
 app.command(rich_help_panel=ENGINEER)(line_commands.check)
 app.add_typer(scan_commands.app, rich_help_panel=ENGINEER)
 app.command(rich_help_panel=ENGINEER)(doctor_commands.doctor)
+app.add_typer(pki_commands.app, rich_help_panel=ENGINEER)
 app.command(rich_help_panel=ENGINEER)(identify_commands.identify)
 app.command(rich_help_panel=ENGINEER)(design_commands.design)
 app.add_typer(models_commands.app, rich_help_panel=ENGINEER)
@@ -64,7 +67,7 @@ app.command(rich_help_panel=PROCESSES)(process_commands.loop)
 app.command(rich_help_panel=PROCESSES)(process_commands.gateway)
 app.command(rich_help_panel=PROCESSES)(agents_commands.agents)
 app.command(rich_help_panel=PROCESSES)(process_commands.sim)
-app.command(rich_help_panel=PROCESSES)(process_commands.demo)
+app.command(rich_help_panel=PROCESSES)(demo_commands.demo)
 app.add_typer(fault_commands.app, rich_help_panel=PROCESSES)
 app.command(rich_help_panel=LINE)(operate_commands.arm)
 app.command(rich_help_panel=LINE)(operate_commands.start)

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from shlex import quote
-from typing import TYPE_CHECKING, Annotated, Literal, NoReturn
+from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
@@ -114,7 +114,7 @@ def gateway(file: LineFile, run_dir: RunFolder = None, data_dir: DataFolder = No
     from gateway.supervisor.process import run_gateway
 
     line = read_line(file)
-    data = _folder(data_dir or default_data_folder(line), "--data-dir")
+    data = writable_folder(data_dir or default_data_folder(line), "--data-dir")
     with _a_crash_is_no_refusal():
         code = run_gateway(line, run_dir or default_run_folder(line), data)
     raise typer.Exit(code)
@@ -190,8 +190,8 @@ def run(
     data = data_dir or default_data_folder(line)
     run_folder = run_dir or default_run_folder(line)
     _require_alone(run_folder)
-    _folder(run_folder, "--run-dir", 0o700)
-    _folder(data, "--data-dir")
+    writable_folder(run_folder, "--run-dir", 0o700)
+    writable_folder(data, "--data-dir")
     opening: list[str] = []
     if controller is None:
         try:
@@ -206,38 +206,7 @@ def run(
     raise typer.Exit(run_together(file, line, controller, plant, run_folder, data, opening))
 
 
-def demo(
-    out: Annotated[Path, typer.Option(help="Folder for result, report and logs; what was there is replaced.")] = Path(
-        "out/demo"
-    ),
-    seed: Annotated[int, typer.Option(min=0, help="Of the simulated line's noise.")] = 1,
-    quick: Annotated[
-        bool, typer.Option("--quick", help="Only both cases on one configuration, without the gate: some 45 s.")
-    ] = False,
-    law: Annotated[
-        Literal["lqi", "pid"] | None, typer.Option(help="With --quick: the control law; LQI without it.")
-    ] = None,
-) -> None:
-    """The demonstration: from a wrong model of a line to adapted configurations, each change through the gate.
-
-    A simulated six-span line, loop and gateway run in processes of their own, in real time. A first configuration, an
-    experiment, a model and a redesign, and once more: each is judged by the gate and approved by a scripted operator;
-    both cases of the paper run on each configuration. Some four minutes; Ctrl-C brings the line to rest and ends all.
-    Exit code: 0 done, 1 failed or not adapted, 130 interrupted.
-
-    Example: r2rgate demo --out out/demo
-
-    Example, one configuration: r2rgate demo --quick --law pid
-    """
-    from gateway.cli.demo import run_demo
-
-    if law is not None and not quick:
-        _refuse(f"--law {law} is for --quick; without it the gate decides which law controls the line")
-    _folder(out, "--out")
-    raise typer.Exit(run_demo(out, seed, (law or "lqi") if quick else None))
-
-
-def _folder(path: Path, option: str, mode: int = 0o777) -> Path:
+def writable_folder(path: Path, option: str, mode: int = 0o777) -> Path:
     """`path` as a folder that exists and may be written."""
     from os import W_OK, X_OK, access
 

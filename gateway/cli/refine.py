@@ -75,7 +75,7 @@ async def refine(line: Line, side: RefinedSide, tell: Tell = lambda text: None) 
     tried: list[ProposalShown] = []
     await _require_downtime(side)
     change, reason = ModelChange(model=model), f"refined on the newest experiment; {words}"
-    tried.append(await _settled(side, await put(line, side, change, reason[:MOST_REASON], _named("model", 0))))
+    tried.append(await _settled(side, await put(line, side, change, reason[:MOST_REASON], [_named("model", 0)])))
     if tried[-1].stage != "kept":
         return Refined(False, False, f"the refined model is {tried[-1].stage}: {tried[-1].why}", tried)
     tell("the refined model is in service")
@@ -86,7 +86,7 @@ async def refine(line: Line, side: RefinedSide, tell: Tell = lambda text: None) 
         await _require_downtime(side)
         reason = f"{offer.law.text} on the refined model"
         tell(reason)
-        hash_ = await put(line, side, GainsChange(controller=offer.controller), reason, _named("redesign", rung))
+        hash_ = await put(line, side, GainsChange(controller=offer.controller), reason, [_named("redesign", rung)])
         tried.append(await _settled(side, hash_))
         if tried[-1].stage in ("kept", *ON_PROBATION):
             return Refined(True, True, f"{reason} is deployed; it is kept once the line has run with it", tried)

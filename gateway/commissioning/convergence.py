@@ -196,7 +196,7 @@ def _figures(line: Line, recording: Recording, tension_n: FloatArray) -> dict[st
     smooth = _smoothed(tension_n, max(1, round(SMOOTHED_S / period_s)))
     windows = _windows(line, recording)
     if not windows:
-        raise NotOffered("the recording has no step whose course could be looked at: the speed moved throughout")
+        raise NotOffered("no step of the recording can be looked at: the speed moved, or samples are missing")
     found = np.zeros((3, line.n))  # RMSE, overshoot, settling time: the worst of all changes
     for begin, end in windows:
         rows, asked, changed_s = slice(begin - 1, end), setpoint[begin - 1 : end], float(time_s[begin])
@@ -235,8 +235,12 @@ def _windows(line: Line, recording: Recording) -> list[tuple[int, int]]:
 
 
 def _smoothed(values: FloatArray, samples: int) -> FloatArray:
-    """Mean over so many samples until each (k, n); at the begin over those that are there."""
-    sums = np.cumsum(np.vstack((np.zeros((1, values.shape[1])), values)), axis=0)
+    """Mean over so many samples until each (k, n), of those that are there; NaN where none is."""
+    known = np.isfinite(values)
+    before = np.zeros((1, values.shape[1]))
+    sums = np.cumsum(np.vstack((before, np.where(known, values, 0.0))), axis=0)
+    counts = np.cumsum(np.vstack((before, known)), axis=0)
     last = np.arange(1, len(values) + 1)
     first = np.maximum(last - samples, 0)
-    return (sums[last] - sums[first]) / (last - first)[:, None]
+    there = counts[last] - counts[first]
+    return np.divide(sums[last] - sums[first], there, out=np.full(values.shape, np.nan), where=there > 0.0)

@@ -17,6 +17,7 @@ class Decided:
     choice: Choice
     by: str  #: "rules", or the agent's name
     instead: str = ""  #: why the rules have decided though somebody else was asked; empty: nobody was
+    interaction: str = ""  #: its id in the agents' log; empty: there is none
 
     @property
     def author(self) -> str:

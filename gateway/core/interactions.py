@@ -14,9 +14,10 @@ from gateway.core.computations import MOST_CALLS, By, Computed
 from gateway.core.json_problems import NotJson, document_of, problems
 from gateway.core.line import NonNegative, Strict
 from gateway.core.line_model import Instant
-from gateway.core.questions import Choice, Question
+from gateway.core.questions import Choice, Decision, Question
 
 MOST_BYTES = 1024 * 1024  #: of an interaction as JSON, unpacked
+MOST_WHY = 400  #: letters
 
 
 class Note(Strict):
@@ -37,7 +38,14 @@ class Answer(Strict):
     choice: Choice
     by: By  #: the agent's name; "rules" where no language model has answered
     instead: Annotated[str, Field(max_length=1000)] = ""  #: why the rules, where a model was asked
-    interaction: str = ""  #: its number in the log
+    interaction: Annotated[str, Field(pattern=r"^([0-9a-f]{16})?$")] = ""  #: its id in the log
+
+
+class Unanswered(Strict):
+    """A question that a phase has decided by the rules, because the agent it asked did not answer it."""
+
+    decision: Decision
+    why: Annotated[str, Field(min_length=1, max_length=MOST_WHY)]
 
 
 class Interaction(Strict):

@@ -34,7 +34,7 @@ HELP: dict[str, dict[str, str]] = {
         "priorities": "what matters on this line: the weights by which r2rgate design chooses among controllers",
         "gate": "what a change must show before it may reach a drive, and who decides",
         "agents": "who is asked where a phase leaves something to judgement; every change is judged all the same",
-        "network": "lets agents on other machines in, by certificate; without this table none is",
+        "network": "lets agents on other machines in, by certificate (r2rgate pki init); without this table none is",
         "recipes": "set-points for a grade; the line starts with the first",
     },
     "Control": {

@@ -51,6 +51,7 @@ TOPICS = (
 # The bus of the agents. What is no row here nobody may send there: its access rules are made from this table.
 AGENT_DECIDE = AgentTopic("agents/*/decide", "phases", "agent", 10.0, kept=False)  #: Question -> Answer
 AGENT_COMPUTE = AgentTopic("agents/*/compute", "phases", "agent", 1.0, kept=False)  #: ComputeRequest -> ComputeReply
+ASK_UNANSWERED = AgentTopic("ask/*/unanswered", "phases", "gateway", 1.0, kept=True)  #: Unanswered -> Reply
 ASK_PROPOSE = AgentTopic("ask/*/propose", "agent", "gateway", 1.0, kept=True)  #: Proposal -> Reply
 ASK_STATUS = AgentTopic("ask/*/status", "agent", "gateway", 10.0, kept=False)  #: nothing -> GatewayStatus
 ASK_PROPOSALS = AgentTopic("ask/*/proposals", "agent", "gateway", 10.0, kept=False)  #: Query -> as it says
@@ -64,6 +65,6 @@ ASK_RECORDING = AgentTopic("ask/*/recording", "agent", "gateway", 20.0, kept=Fal
 ASK_KNOWLEDGE = AgentTopic("ask/*/knowledge", "agent", "gateway", 5.0, kept=False)  #: OfKnowledge -> KnowledgePart
 
 AGENT_TOPICS = (
-    AGENT_DECIDE, AGENT_COMPUTE, ASK_PROPOSE, ASK_STATUS, ASK_PROPOSALS, ASK_JUDGE, ASK_LOG, ASK_MODEL, ASK_CONTROLLER,
-    ASK_RECORDINGS, ASK_RECORDING, ASK_KNOWLEDGE,
+    AGENT_DECIDE, AGENT_COMPUTE, ASK_UNANSWERED, ASK_PROPOSE, ASK_STATUS, ASK_PROPOSALS, ASK_JUDGE, ASK_LOG, ASK_MODEL,
+    ASK_CONTROLLER, ASK_RECORDINGS, ASK_RECORDING, ASK_KNOWLEDGE,
 )  # fmt: skip

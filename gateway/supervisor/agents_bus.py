@@ -11,6 +11,7 @@ from gateway.mailbox.allowance import Allowance
 from gateway.mailbox.bus import open_router
 from gateway.mailbox.port import Mailbox
 from gateway.mailbox.zenoh_mailbox import ZenohMailbox
+from gateway.supervisor.agents_cases import AgentsCases
 from gateway.supervisor.status import BusStatus
 
 MOST_EVENTS_PER_S = 0.1  #: of each kind: whoever comes and goes all the time, or floods, does not flood the history
@@ -26,13 +27,14 @@ class AgentsBus:
     """`open` it once, `watch` a few times a second, `close` at the end. Without it the gateway does all else."""
 
     def __init__(
-        self, line: Line, run_folder: Path, desks: Sequence[Desk], note: Callable[..., None],
+        self, line: Line, run_folder: Path, desks: Sequence[Desk], note: Callable[..., None], cases: AgentsCases,
         clock: Callable[[], float],
     ) -> None:  # fmt: skip
         self._line = line
         self._run_folder = run_folder
         self._desks = desks
         self._note = note
+        self._cases = cases
         self._clock = clock
         self._mailbox: ZenohMailbox | None = None
         self._text = "it is about to be opened"
@@ -73,7 +75,9 @@ class AgentsBus:
             self._told_agents = set(self._agents)
         refused = 0 if self._mailbox is None else self._mailbox.counters.refused
         if refused != self._told_refused and self._of_refused.take(self._clock()):
-            self._note("agents-refused", f"{refused - self._told_refused} requests of agents were turned away")
+            told = f"{refused - self._told_refused} requests of agents were turned away"
+            self._note("agents-refused", told)
+            self._cases.note("turned-away", told, times=refused - self._told_refused)
             self._told_refused = refused
 
     def status(self) -> BusStatus:
@@ -90,3 +94,4 @@ class AgentsBus:
             self._agents.add(agent)
         else:
             self._agents.discard(agent)
+            self._cases.note("gone", f"agent {agent} answers no questions any more", agent)

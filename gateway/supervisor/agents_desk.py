@@ -7,9 +7,12 @@ import asyncio
 from collections.abc import Callable
 from functools import partial
 
+from pydantic import ValidationError
+
 from gateway.core.audit_record import Who
 from gateway.core.dry_run import DryRun
-from gateway.core.interactions import InteractionRefused, unpack
+from gateway.core.interactions import InteractionRefused, Unanswered, unpack
+from gateway.core.json_problems import NotJson, document_of, problems
 from gateway.core.messages import Reply
 from gateway.core.proposal import ProposalRefused, parse_proposal
 from gateway.core.topics import (
@@ -19,9 +22,11 @@ from gateway.core.topics import (
     ASK_PROPOSALS,
     ASK_PROPOSE,
     ASK_STATUS,
+    ASK_UNANSWERED,
     AgentName,
 )
 from gateway.mailbox.port import MAX_PAYLOAD, Mailbox
+from gateway.supervisor.agents_cases import AgentsCases
 from gateway.supervisor.deployer_sides import NotKnown
 from gateway.supervisor.dry_runs import DryRuns, TooMany
 from gateway.supervisor.gate import Gate
@@ -38,7 +43,7 @@ NAMES_AGENT = "agent "  #: an evidence that begins so names who proposes
 class AgentsDesk:
     def __init__(
         self, status: Callable[[], GatewayStatus], gate: Gate, dry_runs: DryRuns, log: Interactions,
-        note: Callable[..., None],
+        note: Callable[..., None], cases: AgentsCases,
     ) -> None:  # fmt: skip
         self._status = status
         self._gate = gate
@@ -46,6 +51,7 @@ class AgentsDesk:
         self._log = log
         self._writing = asyncio.Lock()  #: one thread for the log, however many agents talk
         self._note = note
+        self._cases = cases
 
     def serve_on(self, bus: Mailbox) -> None:
         for agent in AGENT_NAMES:
@@ -54,10 +60,11 @@ class AgentsDesk:
             bus.serve(ASK_PROPOSALS.of(agent), self._gate.answer_query)
             bus.serve(ASK_JUDGE.of(agent), partial(self._judge, agent))
             bus.serve(ASK_LOG.of(agent), partial(self._keep, agent))
+            bus.serve(ASK_UNANSWERED.of(agent), partial(self._hear, agent))
 
     async def _propose(self, agent: AgentName, payload: bytes) -> bytes:
         if reasons := _not_theirs(agent, payload):
-            reply = refused("it is not judged", reasons)
+            reply = self._refused(agent, "it is not judged", reasons)
             self._note("proposal", f"agent {agent}: {reply.text}", ok=False, reasons=reasons)
         else:
             reply = await self._gate.propose(payload, Who(name=f"agent {agent}"))
@@ -74,7 +81,7 @@ class AgentsDesk:
             parse_proposal(payload, MAX_PAYLOAD)
             found = await self._dry_runs.run(payload, self._gate.deployer)
         except ProposalRefused as malformed:
-            return _bytes(refused("it is no proposal", malformed.reasons))
+            return _bytes(self._refused(agent, "it is no proposal", malformed.reasons))
         except (TooMany, NotKnown) as error:
             self._note("dry-run", f"agent {agent}: not judged: {error}")
             return _bytes(refused("it is not judged", [str(error)]))
@@ -91,20 +98,37 @@ class AgentsDesk:
                     raise InteractionRefused([f"agent is {one.agent}; allowed: {agent}"])
                 number = await asyncio.to_thread(self._log.keep, packed, one)
         except (InteractionRefused, InteractionsError) as error:
-            return _bytes(refused("it is not kept", [str(error)]))
+            return _bytes(self._refused(agent, "it is not kept", [str(error)]))
         decision, chosen, by, instead = one.in_short
+        if instead and one.question is not None:
+            self._cases.note("rules-instead", f"{decision}: {instead}", agent)
         why = f": {instead}" if instead else ""
         text = f"agent {agent}, {decision}: {chosen}, by {by}{why}"
         self._note("interaction", text[:MOST_TEXT], id=one.id, number=number)
         return _bytes(Reply(ok=True, state="", text=f"kept as {number}"))
 
+    async def _hear(self, agent: AgentName, payload: bytes) -> bytes:
+        """From a phase: it went on by the rules."""
+        try:
+            told = Unanswered.model_validate(document_of(payload))
+        except NotJson as error:
+            return _bytes(self._refused(agent, "it is not understood", [str(error)]))
+        except ValidationError as error:
+            return _bytes(self._refused(agent, "it is not understood", problems(error, Unanswered)))
+        self._cases.note("unanswered", f"{told.decision}: {told.why}", agent)
+        return _bytes(Reply(ok=True, state="", text="it is noted"))
+
+    def _refused(self, agent: AgentName, text: str, reasons: list[str]) -> Reply:
+        self._cases.note("refused", f"{text}: {'; '.join(reasons)}", agent)
+        return refused(text, reasons)
+
 
 def _not_theirs(agent: AgentName, payload: bytes) -> list[str]:
-    """Why a proposal cannot come from this agent; what is no proposal is for the gate to refuse."""
+    """Why these bytes are no proposal, or not one of this agent."""
     try:
         proposal = parse_proposal(payload, MAX_PAYLOAD)
-    except ProposalRefused:
-        return []
+    except ProposalRefused as malformed:
+        return malformed.reasons
     reasons = [] if proposal.author == AUTHOR else [f"author is {proposal.author}; allowed: {AUTHOR}"]
     own = f"{NAMES_AGENT}{agent}"
     reasons += [

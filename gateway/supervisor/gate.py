@@ -99,8 +99,8 @@ class Gate:
         self._clock = clock
         self._wall_clock = wall_clock
         self._loop = LoopOverMailbox(mailbox)
-        self._audit = Audit(folder, clock=clock, wall_clock=wall_clock)
-        self._audit.start()
+        self.audit = Audit(folder, clock=clock, wall_clock=wall_clock)
+        self.audit.start()
         self._stores: tuple[Configurations, Models] | None = None
         self._shut = "the gate is about to open"  #: why it is, while it is
         self._told = ""
@@ -147,12 +147,12 @@ class Gate:
             await self.deployer.close()
         for store in self._stores or ():
             store.close()
-        await asyncio.to_thread(self._audit.close)
+        await asyncio.to_thread(self.audit.close)
 
     async def _open(self) -> None:
         """Once a record of the start is on the disk, the records before it are read."""
         try:
-            await self._audit.append("gateway-start", GATEWAY, {"version": version("r2rgate")})
+            await self.audit.append("gateway-start", GATEWAY, {"version": version("r2rgate")})
             book = await asyncio.to_thread(book_in, self._folder)
             if self._stores is None:
                 self._stores = (
@@ -164,7 +164,7 @@ class Gate:
             self._shut = str(error)
             return
         self.deployer = Deployer(
-            self._line, book, KeptAudit(self._folder, self._audit), self._loop, self._judge,
+            self._line, book, KeptAudit(self._folder, self.audit), self._loop, self._judge,
             self._around(*self._stores), self._take_up, self._clock, self._wall_clock,
         )  # fmt: skip
 
@@ -250,7 +250,7 @@ class Gate:
         elif isinstance(decision, Archive):
             assert self._stores is not None  # they are open before the gate is
             line, now_s = self._line, self._wall_clock()
-            reply = await archive(self._audit, self._stores[0], line.site, line.line, decision, who, now_s)
+            reply = await archive(self.audit, self._stores[0], line.site, line.line, decision, who, now_s)
         elif isinstance(decision, LineChanged):
             reply = await self._line_changed(self.deployer, decision, who)
         else:

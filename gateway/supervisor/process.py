@@ -7,7 +7,7 @@ import asyncio
 import signal
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Protocol
 
@@ -18,6 +18,7 @@ from gateway.mailbox.listener import AlreadyRunning, CannotListen, PathTooLong
 from gateway.mailbox.paths import GATEWAY_SOCKET, LOOP_SOCKET
 from gateway.mailbox.unix import UnixMailbox
 from gateway.supervisor.agents_bus import AgentsBus
+from gateway.supervisor.agents_cases import AgentsCases
 from gateway.supervisor.agents_desk import AgentsDesk
 from gateway.supervisor.configurations import Configurations
 from gateway.supervisor.deployer_sides import JudgeSide
@@ -96,12 +97,13 @@ async def serve(
     gate = Gate(line, mailbox, data_folder, judge, around, gateway.note, clock, wall_clock)
     gateway.on_event, gateway.change = gate.hear, gate.change
     dry_runs = DryRuns(line, JudgeWorkers(line, nicer=NICEST))
-    desk = AgentsDesk(gateway.status, gate, dry_runs, Interactions(data_folder), gateway.note)
+    cases = AgentsCases(gate.audit.append, clock)
+    desk = AgentsDesk(gateway.status, gate, dry_runs, Interactions(data_folder), gateway.note, cases)
     line_desk = LineDesk(line, gate, data_folder, experiments)
-    bus = AgentsBus(line, run_folder, (desk, line_desk), gateway.note, clock)
+    bus = AgentsBus(line, run_folder, (desk, line_desk), gateway.note, cases, clock)
     gateway.agents_bus = bus.status
     opening = asyncio.create_task(bus.open())
-    looking = asyncio.create_task(_look(gate, stop, watch_s))
+    looking = [asyncio.create_task(_look(look, stop, watch_s)) for look in (gate.look, cases.look)]
     gateway.note("gateway-up", "the gateway has started")
     print(f"gateway of {line.site}/{line.line}: {run_folder / GATEWAY_SOCKET}, history {historian.path}", flush=True)
     try:
@@ -111,7 +113,7 @@ async def serve(
             await _wait(stop, watch_s)
     finally:
         stop.set()
-        await looking
+        await asyncio.gather(*looking)
         await opening
         await bus.close()
         await dry_runs.close()
@@ -125,10 +127,10 @@ async def serve(
     return EXIT_OK if flushed else EXIT_NOT_FLUSHED
 
 
-async def _look(gate: Gate, stop: asyncio.Event, watch_s: float) -> None:
-    """Beside the rest: it waits for the loop's answers."""
+async def _look(look: Callable[[], Awaitable[None]], stop: asyncio.Event, watch_s: float) -> None:
+    """Beside the rest: it waits for the loop's answers, or for the disk."""
     while not stop.is_set():
-        await gate.look()
+        await look()
         await _wait(stop, watch_s)
 
 

@@ -64,7 +64,7 @@ async def moved(side):
     asked = moves.model_copy(update={"rate_n_per_s": None})
     await side.ready()
     what = Evidence(what="how does it do")
-    return await settled(side, await put(LINE, side, ExperimentChange(experiment=asked), "a look", what))
+    return await settled(side, await put(LINE, side, ExperimentChange(experiment=asked), "a look", [what]))
 
 
 def test_a_line_that_has_drifted_is_refined_in_downtime_and_can_go_back(tmp_path):
@@ -111,4 +111,4 @@ async def back_to_stable(side, folder):
         kinds = [row.record().kind for row in audit.rows()]
     assert "archived" in kinds
     await side.ready()
-    return await put(LINE, side, GainsChange(controller=stable.controller), "back", Evidence(what="as it was"))
+    return await put(LINE, side, GainsChange(controller=stable.controller), "back", [Evidence(what="as it was")])

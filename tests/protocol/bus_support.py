@@ -1,21 +1,17 @@
 """The agents' bus for tests: a router in this process, agents in this and others, and certificates of their own."""
 
 import asyncio
-import datetime
 import socket
 import time
 from collections.abc import AsyncIterator, Callable, Coroutine
 from contextlib import asynccontextmanager
-from ipaddress import ip_address
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import zenoh
-from cryptography import x509
-from cryptography.hazmat.primitives import hashes, serialization
-from cryptography.hazmat.primitives.asymmetric import ec
-from cryptography.x509.oid import NameOID
 
+from gateway.cli import certificates
 from gateway.core.line import Line, Network
 from gateway.core.topics import AGENT_DECIDE, ASK_STATUS, Topic
 from gateway.mailbox.bus import TlsEndpoint, connect, open_router, open_session, router_settings
@@ -125,48 +121,22 @@ def free_port() -> int:
 
 
 class Authority:
-    """Signs certificates into a folder."""
+    """Signs certificates into a folder, as `r2rgate pki init` does."""
 
     def __init__(self, folder: Path, name: str) -> None:
         self.folder = folder
         self.file = folder / f"{name}.pem"
-        self._key = ec.generate_private_key(ec.SECP256R1())
-        self._name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
-        constraint = x509.BasicConstraints(ca=True, path_length=None)
-        certificate = self._of(self._name, self._key, constraint).sign(self._key, hashes.SHA256())
-        self.file.write_bytes(certificate.public_bytes(serialization.Encoding.PEM))
+        self._signing = certificates.Authority.begin(name, datetime.now(UTC))
+        self.file.write_bytes(self._signing.pair.certificate)
 
-    def certificate(self, name: str, days: float = 1.0) -> tuple[Path, Path]:
-        """Files of a certificate for 127.0.0.1, good for so many days from now, and its key."""
-        key = ec.generate_private_key(ec.SECP256R1())
-        subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
-        builder = self._of(subject, key, x509.BasicConstraints(ca=False, path_length=None), days).add_extension(
-            x509.SubjectAlternativeName([x509.IPAddress(ip_address("127.0.0.1"))]), critical=False
-        )
-        certificate = builder.sign(self._key, hashes.SHA256())
+    def certificate(self, name: str, now: datetime | None = None) -> tuple[Path, Path]:
+        """Files of a certificate for 127.0.0.1, signed `now`, and its key."""
+        purpose = "server" if name == "gateway" else "client"
+        pair = self._signing.sign(name, purpose, ["127.0.0.1"], now or datetime.now(UTC))
         file, key_file = self.folder / f"{self.file.stem}-{name}.pem", self.folder / f"{self.file.stem}-{name}.key.pem"
-        file.write_bytes(certificate.public_bytes(serialization.Encoding.PEM))
-        key_file.write_bytes(
-            key.private_bytes(
-                serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
-            )
-        )
+        file.write_bytes(pair.certificate)
+        key_file.write_bytes(pair.private_key)
         return file, key_file
-
-    def _of(
-        self, subject: x509.Name, key: Any, constraint: x509.BasicConstraints, days: float = 1.0
-    ) -> x509.CertificateBuilder:
-        now = datetime.datetime.now(datetime.UTC)
-        return (
-            x509.CertificateBuilder()
-            .subject_name(subject)
-            .issuer_name(self._name)
-            .public_key(key.public_key())
-            .serial_number(x509.random_serial_number())
-            .not_valid_before(now - datetime.timedelta(days=2))
-            .not_valid_after(now + datetime.timedelta(days=days))
-            .add_extension(constraint, critical=True)
-        )
 
 
 def on_network(authority: Authority, names: list[str]) -> tuple[Line, str]:

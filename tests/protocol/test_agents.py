@@ -68,10 +68,11 @@ def test_the_process_answers_until_it_is_killed_and_then_the_rules_do_at_once() 
         async with router(folder) as gateway, client(folder) as phases:
             kept = serve_log(gateway)
             absent = await decided(phases)
-            assert absent.instead and absent.choice == usual_choice(QUESTION)
+            assert absent.instead and absent.choice == usual_choice(QUESTION) and not absent.interaction
             async with process(folder) as child:
                 found = await decided(phases)
                 assert (found.choice, found.by, found.instead) == (usual_choice(QUESTION), "rules", "")
+                assert kept[0].id == found.interaction
                 assert kept[0].question == QUESTION and kept[0].notes and kept[0].agent == "adaptation"
                 child.kill()
                 await child.wait()
@@ -96,6 +97,7 @@ def test_an_agent_that_lies_hangs_or_sends_garbage_leaves_the_decision_to_the_ru
         json.dumps({"choice": {"option": "lqi", "factors": {"torque": 99}, "reason": "a"}, "by": "x"}).encode(),
         json.dumps({"choice": {"option": "mpc", "reason": "a"}, "by": "rules"}).encode(),
         json.dumps({"choice": {"option": "mpc", "reason": "a"}, "by": "anna (engineer)"}).encode(),
+        json.dumps({"choice": {"option": "mpc", "reason": "a"}, "by": "adaptation", "interaction": "x" * 99}).encode(),
     ]  # fmt: skip
 
     async def story(folder: Path) -> None:

@@ -4,13 +4,15 @@ import asyncio
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
+from gateway.cli.asked_agents import AskedAgents
 from gateway.control.design import design_lqi, task_of
 from gateway.core.audit_record import Who
 from gateway.core.decisions import ProposalList
 from gateway.core.messages import Reply
 from gateway.core.proposal import Proposal, canonical
-from gateway.core.topics import AGENT_DECIDE, ASK_JUDGE, ASK_PROPOSALS, ASK_PROPOSE, ASK_STATUS, GATEWAY_STATUS
+from gateway.core.topics import AGENT_DECIDE, ASK_JUDGE, ASK_LOG, ASK_PROPOSALS, ASK_PROPOSE, ASK_STATUS, GATEWAY_STATUS
 from gateway.mailbox.paths import GATEWAY_SOCKET
 from gateway.mailbox.unix import UnixMailbox
 from gateway.mailbox.zenoh_mailbox import ZenohMailbox
@@ -18,7 +20,8 @@ from gateway.supervisor.audit_file import AuditFile
 from gateway.supervisor.proposal_records import iso
 from gateway.supervisor.status import GatewayStatus
 from tests.protocol.bus_support import AGENT, LINE, LONG_S, client, run
-from tests.unit.supervisor_support import child
+from tests.unit.language_model_support import QUESTION
+from tests.unit.supervisor_support import child, until
 
 GATEWAY = """
 import sys
@@ -148,6 +151,36 @@ def test_a_flood_of_requests_is_told_once_and_people_are_answered_meanwhile() ->
             )
             texts = [event.text for event in status.events if event.kind == "agents-refused"]
             assert len(texts) <= 5 and "requests of agents were turned away" in texts[0]
+
+    run(story)
+
+
+def test_agents_that_die_flood_or_talk_nonsense_are_on_record_and_so_is_who_went_on_without_them() -> None:
+    def recorded(folder: Path) -> dict[str, dict[str, Any]]:
+        with AuditFile(folder / "data") as file:
+            found = [record.what for record in (row.record() for row in file.rows()) if record.kind == "agents"]
+        assert len(found) == len({str(what["case"]) for what in found})  # no case twice in a minute
+        return {str(what["case"]): dict(what) for what in found}
+
+    async def story(folder: Path) -> None:
+        with gateway(folder):
+            await status_with(folder, lambda status: status.agents_bus.open)
+            async with client(folder) as agents, client(folder) as phases:
+                with child(AGENT, folder) as (process, _):
+                    await status_with(folder, lambda status: status.agents_bus.agents == ["sysid"])
+                    process.kill()
+                    await status_with(folder, lambda status: status.agents_bus.agents == [])
+                question = QUESTION.model_copy(update={"decision": "identify.data"})
+                decider = AskedAgents(LINE, phases, asyncio.get_running_loop())
+                assert (await asyncio.to_thread(decider.decide, question)).by == "rules"
+                assert not Reply.model_validate_json(await agents.request(ASK_LOG.of("code"), b"garbage", LONG_S)).ok
+                asked = [agents.request(ASK_STATUS.of("sysid"), b"", LONG_S) for _ in range(300)]
+                await asyncio.gather(*asked, return_exceptions=True)
+            await until(lambda: len(recorded(folder)) == 4)
+            found = recorded(folder)
+            assert found["gone"]["agents"] == found["unanswered"]["agents"] == ["sysid"]
+            assert "nobody answers" in found["unanswered"]["newest"]
+            assert found["refused"]["agents"] == ["code"] and found["turned-away"]["times"] > 100
 
     run(story)
 

@@ -2,12 +2,14 @@
 
 import asyncio
 from contextlib import suppress
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
 import pytest
 import zenoh
 
+from gateway.cli.certificates import CERTIFICATE_DAYS
 from gateway.core.topics import (
     AGENT_DECIDE,
     AGENT_TOPICS,
@@ -110,7 +112,8 @@ def test_a_certificate_whose_time_is_over_is_refused() -> None:
     async def story(folder: Path) -> None:
         authority = Authority(folder, "plant")
         line, address = on_network(authority, ["agents"])
-        file, key = authority.certificate("agents", days=-1.0)
+        long_ago = datetime.now(UTC) - timedelta(days=CERTIFICATE_DAYS + 1.0)
+        file, key = authority.certificate("agents", long_ago)
         async with router(folder, line):
             with pytest.raises(BusUnavailable):
                 await connect(TlsEndpoint(address, file, key, authority.file), "demo", "line-1")
@@ -143,8 +146,8 @@ def test_the_table_is_all_that_is_allowed(over: str) -> None:
         line, address = on_network(authority, ["agents"])
         own = endpoint(address, authority, "agents", authority)
         async with router(folder, line) as gateway, client(folder) as other:
-            asked = [row for row in AGENT_TOPICS if row.answers == "gateway"]
-            for row in asked:
+            asked = [row for row in AGENT_TOPICS if row.asks == "agent"]
+            for row in (row for row in AGENT_TOPICS if row.answers == "gateway"):
                 gateway.serve(row.of("sysid"), echo)
             for row in (row for row in AGENT_TOPICS if row.answers == "agent"):
                 other.serve(row.of("sysid"), echo)

@@ -9,17 +9,28 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
+from gateway.core.audit_record import Who
 from gateway.core.controller import config_hash
 from gateway.core.decisions import ProposalList, ProposalShown
 from gateway.core.dry_run import DryRun
 from gateway.core.messages import Reply
 from gateway.core.proposal import Evidence, Proposal, canonical, proposal_hash
-from gateway.core.topics import AGENT_NAMES, ASK_JUDGE, ASK_PROPOSALS, ASK_PROPOSE, ASK_STATUS, AgentName, AgentTopic
+from gateway.core.topics import (
+    AGENT_NAMES,
+    ASK_JUDGE,
+    ASK_PROPOSALS,
+    ASK_PROPOSE,
+    ASK_STATUS,
+    ASK_UNANSWERED,
+    AgentName,
+    AgentTopic,
+)
 from gateway.core.verdict import Verdict
 from gateway.mailbox.inprocess import Hub, InProcessMailbox
 from gateway.mailbox.port import RemoteError, Unreachable
+from gateway.supervisor.agents_cases import RECORD_EVERY_S, AgentsCases
 from gateway.supervisor.agents_desk import AgentsDesk
-from gateway.supervisor.audit_file import AuditFile
+from gateway.supervisor.audit_file import AuditFile, AuditUnavailable
 from gateway.supervisor.deployer_sides import NotKnown
 from gateway.supervisor.dry_runs import LONGER, MOST, DryRuns
 from gateway.supervisor.gate import Gate
@@ -73,7 +84,10 @@ class Desk:
         )  # fmt: skip
         self.dry_runs = DryRuns(LINE, self.dry)
         self.log = Interactions(folder)
-        AgentsDesk(lambda: STATUS, self.gate, self.dry_runs, self.log, self.note).serve_on(InProcessMailbox(self.hub))
+        self.now_s = 0.0
+        self.cases = AgentsCases(self.gate.audit.append, lambda: self.now_s)
+        desk = AgentsDesk(lambda: STATUS, self.gate, self.dry_runs, self.log, self.note, self.cases)
+        desk.serve_on(InProcessMailbox(self.hub))
 
     def note(self, kind: str, text: str, **data: Any) -> None:
         self.events.append((kind, text))
@@ -92,6 +106,11 @@ class Desk:
         """Kind and author of what the audit has."""
         with AuditFile(self.folder) as file:
             return [(record.kind, record.who.name) for record in (row.record() for row in file.rows())]
+
+    def recorded(self) -> list[dict[str, Any]]:
+        """What the audit has of agents that went wrong."""
+        with AuditFile(self.folder) as file:
+            return [dict(one.what) for one in (row.record() for row in file.rows()) if one.kind == "agents"]
 
 
 def at_desk(story: Any, folder: Path) -> None:
@@ -154,7 +173,10 @@ def test_what_is_no_proposal_is_refused_and_recorded_with_the_agents_name(tmp_pa
         for payload in (b"", b"\xff", b"[]", b"{" * 1000, canonical(of_agents())[:-1]):
             reply = Reply.model_validate_json(await desk.ask(ASK_PROPOSE, payload, "code"))
             assert not reply.ok and reply.reasons
-        assert desk.records().count(("malformed-proposal", "agent code")) == 5
+        assert any(text.startswith("agent code: ") for _, text in desk.events)
+        await desk.cases.look()
+        (found,) = desk.recorded()
+        assert (found["case"], found["times"], found["agents"]) == ("refused", 5, ["code"])
 
     at_desk(story, tmp_path)
 
@@ -314,3 +336,72 @@ def test_an_agent_that_is_not_in_the_table_is_not_served(tmp_path):
             assert not isinstance(refused.value, RemoteError)
 
     at_desk(story, tmp_path)
+
+
+def unanswered(why: str = "sysid: nobody answers") -> bytes:
+    return json.dumps({"decision": "identify.data", "why": why}).encode()
+
+
+def test_a_phase_that_went_on_by_the_rules_is_on_record_once_a_minute_with_how_often(tmp_path):
+    async def story(desk: Desk) -> None:
+        await desk.opened()
+        for number in range(50):
+            for agent in ("sysid", "adaptation"):
+                told = await desk.ask(ASK_UNANSWERED, unanswered(f"{agent}: the {number}."), agent)
+                assert Reply.model_validate_json(told).ok
+            await desk.cases.look()
+        first, *more = desk.recorded()
+        assert not more and (first["case"], first["times"]) == ("unanswered", 2)
+        assert first["newest"] == "identify.data: adaptation: the 0."
+        desk.now_s = RECORD_EVERY_S
+        await desk.cases.look()
+        await desk.cases.look()
+        _, second = desk.recorded()
+        assert (second["times"], second["agents"]) == (98, ["sysid", "adaptation"])
+
+    at_desk(story, tmp_path)
+
+
+@pytest.mark.parametrize(
+    "payload", [b"", b"\xff", b"[]", b'{"decision": "run.away", "why": "x"}', unanswered("x" * 100_000)]
+)
+def test_what_is_no_word_of_a_phase_is_refused_and_on_record(tmp_path, payload):
+    async def story(desk: Desk) -> None:
+        await desk.opened()
+        reply = Reply.model_validate_json(await desk.ask(ASK_UNANSWERED, payload))
+        assert not reply.ok and reply.reasons
+        await desk.cases.look()
+        (found,) = desk.recorded()
+        assert found["case"] == "refused" and len(found["newest"]) <= 400
+
+    at_desk(story, tmp_path)
+
+
+def test_each_case_has_a_record_of_its_own_and_one_that_could_not_be_stored_comes_later():
+    stored: list[tuple[str, int, str]] = []
+    now_s, there = 0.0, False
+
+    async def append(kind: str, who: Who, what: dict[str, Any]) -> None:
+        if not there:
+            raise AuditUnavailable("the disk is full")
+        stored.append((what["case"], what["times"], what["newest"]))
+
+    async def story() -> None:
+        nonlocal now_s, there
+        cases = AgentsCases(append, lambda: now_s)
+        await cases.look()
+        cases.note("gone", "first", "sysid")
+        await cases.look()
+        cases.note("gone", "second", "sysid")
+        cases.note("turned-away", "a flood", times=1000)
+        there = True
+        await cases.look()
+        assert stored == [("turned-away", 1000, "a flood")]
+        now_s = RECORD_EVERY_S
+        await cases.look()
+        assert stored[1:] == [("gone", 2, "second")]
+        now_s *= 2
+        await cases.look()
+        assert len(stored) == 2  # nothing has come since
+
+    asyncio.run(story())

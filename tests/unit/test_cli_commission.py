@@ -15,7 +15,7 @@ from gateway.cli.commission_side import CannotGoOn
 from gateway.commissioning.convergence import Convergence, Diagnosis, SpanFigures
 from gateway.commissioning.decisions import Decided, Rules
 from gateway.commissioning.ladder import LADDERS, MOST_OWN, OWN
-from gateway.commissioning.past import Follows, Step
+from gateway.commissioning.past import Follows, Step, interactions_of
 from gateway.control.design import design_lqi, task_of
 from gateway.core.controller import config_hash
 from gateway.core.decisions import QUERY, ListProposals, ProposalLine, ProposalList, ProposalShown
@@ -147,7 +147,7 @@ class Picky:
         factors = {} if knob is None else {knob.name: knob.most}
         choice = Choice(option=option, factors=factors, reason="it is the calmest")
         assert not wrong_with(choice, question)
-        return Decided(choice, "initial-control")
+        return Decided(choice, "initial-control", interaction=f"{len(self.asked):016x}")
 
 
 def test_what_an_agent_chooses_is_proposed_in_its_name_and_what_was_refused_is_told_the_next_time(tmp_path):
@@ -160,6 +160,9 @@ def test_what_an_agent_chooses_is_proposed_in_its_name_and_what_was_refused_is_t
     assert {one.proposal.author for one in shown[:-1]} == {"agents"}
     assert shown[0].proposal.reason.endswith('initial-control says: "it is the calmest"')
     assert "torque_per_nm2 times 64" in shown[0].proposal.reason
+    assert interactions_of(shown[0].proposal.evidence) == [f"{1:016x}"]
+    named_in = [each for one in shown for each in interactions_of(one.proposal.evidence)]
+    assert len(set(named_in)) == len(named_in)  # each question stands in the proposal that came of it
     first, second = picky.asked[0], picky.asked[1]
     assert first.decision == "design.architecture" and first.usual == first.options[0].id
     assert not any("tried" in fact for fact in first.facts)

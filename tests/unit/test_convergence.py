@@ -133,3 +133,16 @@ def test_while_the_speed_moves_nothing_is_looked_at():
     setpoint = stepped().tension_setpoint_n
     with pytest.raises(NotOffered, match="speed"):
         convergence(LINE, recording(setpoint, setpoint, np.linspace(0.01, 0.1, 900)), CONFIG, MODEL)
+
+
+@pytest.mark.parametrize("lost", [slice(100, 102), slice(297, 299), slice(0, 60)])
+def test_samples_that_were_lost_before_a_step_take_nothing_from_it(lost):
+    whole, holed = stepped(), stepped()
+    holed.tension_n[lost] = np.nan
+    expected = convergence(LINE, whole, CONFIG, MODEL).spans
+    found = convergence(LINE, holed, CONFIG, MODEL).spans
+    for name, one in expected.items():
+        assert found[name].model_dump() == pytest.approx(one.model_dump(), abs=1e-9)
+    holed.tension_n[500, 1] = np.nan
+    with pytest.raises(NotOffered):
+        convergence(LINE, holed, CONFIG, MODEL)

@@ -119,7 +119,10 @@ def example() -> DemoResult:
     with open("docs/examples/demo-result.json", encoding="utf-8") as file:
         document = json.load(file)
     for one, config in zip(document["configurations"], CONFIGS, strict=True):
+        brought = [change for change in document["chain"]["changes"] if change["configuration"] == one["controller"]]
         one["controller"] = config_hash(config)
+        for change in brought:
+            change["configuration"] = one["controller"]
     return DemoResult.model_validate_json(json.dumps(document))
 
 
@@ -201,7 +204,7 @@ def test_the_page_holds_every_figure_and_a_case_that_was_not_run(tmp_path):
         "speed_setpoint_m_per_s": np.full(periods, 0.01),
     }
     evidence = Evidence(recording, time_s, history, {"plant": "s-real"})
-    shown = Page(page(Setup(tmp_path, LINE, CONFIGS[0], 1), result, windows, evidence))
+    shown = Page(page(Setup(tmp_path, LINE, CONFIGS[0], 1), result, windows, evidence, []))
     assert shown.open == []
     for one in result.configurations:
         assert all(
@@ -212,4 +215,9 @@ def test_the_page_holds_every_figure_and_a_case_that_was_not_run(tmp_path):
     assert chain is not None and chain.audit.head in shown.words
     refused = [text for one in chain.changes for text in one.against]
     assert refused and all(text in shown.words for text in refused)
+    assert all(" ".join(one.reason.split()) in shown.words for one in chain.asked)
+    for title in ("Initial → Adapt1", "Adapt1 → Adapt2", "Selection, with its justification"):
+        assert title in shown.words
+    for k in (1, 2):
+        assert f"to {result.rmse_n(k, 'tension'):.3f} N" in shown.words
     assert all(why in shown.words for *_, why in demo_line.STATED)

@@ -8,7 +8,7 @@ import re
 import numpy as np
 import pytest
 
-from gateway.cli.report import Chart, Page, Section, Series, Table, render_page
+from gateway.cli.report import Chart, Fold, Page, Section, Series, Story, Table, render_page
 from tests.unit.test_report import HOSTILE, decoded
 from tests.unit.test_report import Page as Parsed
 
@@ -39,10 +39,18 @@ def make_table(**changes):
     return dataclasses.replace(table, **changes)
 
 
+def make_story(**changes):
+    story = Story(
+        "Which one?", ("Asked at noon.",), (make_table(),), "Chosen by the rules:", "the calmest\nof all", ("Kept.",),
+        (Fold("Word by word", "first\n  second"),),
+    )  # fmt: skip
+    return dataclasses.replace(story, **changes)
+
+
 def make_page(**changes):
     sections = (
         Section("Tier A", ("10 ms period.",), (make_table(),), (make_chart(), make_chart(title="Torque", unit="Nm"))),
-        Section("Growth", charts=(make_growth(),)),
+        Section("Growth", charts=(make_growth(),), stories=(make_story(),)),
         Section("What is left open", ("Nothing.",)),
     )
     page = Page(
@@ -93,8 +101,30 @@ def test_everything_said_stands_in_the_text():
     assert "S_real, 6 spans" in words
 
 
+def test_a_story_is_told_in_its_order_and_its_details_are_folded():
+    html = render_page(make_page(sections=(Section("Asked", stories=(make_story(), Story("Nothing came of it"))),)))
+    page = Parsed(html)
+    places = [
+        page.words.index(said)
+        for said in (
+            "Which one?",
+            "Asked at noon.",
+            "20 seeds",
+            "Chosen by the rules:",
+            "the calmest",
+            "Kept.",
+            "Word by",
+        )
+    ]
+    assert places == sorted(places)
+    (details,) = page.all("details")
+    assert "open" not in details and "<pre>first\n  second</pre>" in html
+    assert len(page.all("article")) == 2 and len(page.all("blockquote")) == 1
+
+
 def test_text_from_outside_is_text():
     table = Table(HOSTILE, (HOSTILE, "x"), ((HOSTILE, HOSTILE),), foot=(HOSTILE, HOSTILE), note=HOSTILE)
+    story = Story(HOSTILE, (HOSTILE,), (), HOSTILE, HOSTILE, (HOSTILE,), (Fold(HOSTILE, HOSTILE),))
     series = tuple(make_series(HOSTILE, one.dashed) for one in make_chart().series)
     chart = make_chart(title=HOSTILE, unit=HOSTILE, series=series, x_label=HOSTILE)
     page = make_page(
@@ -104,10 +134,11 @@ def test_text_from_outside_is_text():
         versions={HOSTILE: HOSTILE},
         machine=HOSTILE,
         answer=(HOSTILE,),
-        sections=(Section(HOSTILE, (HOSTILE,), (table,), (chart,)),),
+        sections=(Section(HOSTILE, (HOSTILE,), (table,), (chart,), (story,)),),
         notes=(HOSTILE,),
     )
-    tame = make_page(sections=(Section("x", ("x",), (table,), (make_chart(),)),))
+    calm = Story("x", ("x",), (), "x", "x", ("x",), (Fold("x", "x"),))
+    tame = make_page(sections=(Section("x", ("x",), (table,), (make_chart(),), (calm,)),))
     found, plain = Parsed(render_page(page)), Parsed(render_page(tame))
     assert found.open == []
     assert found.scripts[1:] == plain.scripts[1:]

@@ -4,7 +4,7 @@
 """
 
 from gateway.cli.report.data import Case, Comparison, EventCount, Machine, Report, RunEvent, Timing
-from gateway.cli.report.page import Chart, Page, Section, Series, Table
+from gateway.cli.report.page import Chart, Fold, Page, Section, Series, Story, Table
 from gateway.cli.report.page_render import render_page
 from gateway.cli.report.render import render_report
 
@@ -13,12 +13,14 @@ __all__ = [
     "Chart",
     "Comparison",
     "EventCount",
+    "Fold",
     "Machine",
     "Page",
     "Report",
     "RunEvent",
     "Section",
     "Series",
+    "Story",
     "Table",
     "Timing",
     "render_page",

@@ -34,6 +34,27 @@ class Table:
             raise ValueError(f"{where}: numeric columns are {sorted(self.numeric)}; allowed: 0 to {width - 1}")
 
 
+@dataclass(frozen=True, slots=True)
+class Fold:
+    """What a reader opens who wants to know it word by word."""
+
+    title: str
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Story:
+    """Something that happened, told from its beginning to its end, with the details folded away."""
+
+    title: str
+    paragraphs: tuple[str, ...] = ()
+    tables: tuple[Table, ...] = ()
+    lead: str = ""  #: whose words follow
+    quote: str = ""  #: somebody's own words
+    after: tuple[str, ...] = ()  #: paragraphs behind them
+    folds: tuple[Fold, ...] = ()
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Series:
     name: str
@@ -86,6 +107,7 @@ class Section:
     paragraphs: tuple[str, ...] = ()
     tables: tuple[Table, ...] = ()
     charts: tuple[Chart, ...] = ()
+    stories: tuple[Story, ...] = ()  #: before the charts
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,7 +9,7 @@ from gateway.cli.report import shell
 from gateway.cli.report.data import FloatArray
 from gateway.cli.report.embed import packed, script_json
 from gateway.cli.report.markup import chart_place, plural, range_words, swatch, table, versions_text, zoom_bar
-from gateway.cli.report.page import Chart, Page, Section, Table
+from gateway.cli.report.page import Chart, Page, Section, Story, Table
 
 HINT = """<p class="muted hint">Point at a chart to read its values above it. Drag across it to look closer,
 double-click to see all of it again. In a chart that has the focus, arrow keys move the cursor, + and − zoom, 0 shows
@@ -32,12 +32,28 @@ def render_page(page: Page) -> str:
 def _section(index: int, section: Section) -> str:
     parts = [f"<p>{escape(paragraph)}</p>" for paragraph in section.paragraphs]
     parts += [_table(one) for one in section.tables]
+    parts += [_story(one) for one in section.stories]
     if section.charts:
         parts += [HINT, f'<div class="readout">{zoom_bar("Whole range")}</div>']
         parts.append(f'<div class="charts">{"".join(_chart(i, chart) for i, chart in enumerate(section.charts))}</div>')
     title = f'<h2 id="section-{index}-title">{escape(section.title)}</h2>'
     content = "\n".join((title, *parts))
     return f'<section id="section-{index}" data-section aria-labelledby="section-{index}-title">\n{content}\n</section>'
+
+
+def _story(one: Story) -> str:
+    parts = [f"<h3>{escape(one.title)}</h3>", *(f"<p>{escape(text)}</p>" for text in one.paragraphs)]
+    parts += [_table(each) for each in one.tables]
+    if one.lead:
+        parts.append(f"<p>{escape(one.lead)}</p>")
+    if one.quote:
+        parts.append(f"<blockquote>{escape(one.quote)}</blockquote>")
+    parts += [f"<p>{escape(text)}</p>" for text in one.after]
+    parts += [
+        f"<details><summary>{escape(fold.title)}</summary><pre>{escape(fold.text)}</pre></details>"
+        for fold in one.folds
+    ]
+    return f'<article class="story">{"".join(parts)}</article>'
 
 
 def _table(one: Table) -> str:

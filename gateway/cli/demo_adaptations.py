@@ -1,0 +1,115 @@
+"""The report's account of selection, and of each adaptation with diagnosis, change, verdict and result."""
+
+from collections.abc import Sequence
+
+from gateway.cli.demo_asked_page import result_words, story_of, verdict_words
+from gateway.cli.demo_result import PAPER_RMSE_N, AskedResult, ChainResult, ChangeResult, DemoResult
+from gateway.cli.report import Section, Story, Table
+from gateway.commissioning.past import Step
+from gateway.core.scenario import PAPER
+
+SELECTS = "design."
+DIAGNOSES = "adapt.diagnosis"
+
+
+def selection_section(chain: ChainResult) -> Section:
+    """Which configuration was chosen to begin with, among which, and why."""
+    tried = [one for one in chain.changes if one.step == Step.FIRST]
+    changes = {one.proposal: one for one in tried if one.proposal}
+    asked = [one for one in chain.asked if one.decision.startswith(SELECTS)]
+    kept = {one.proposal for one in tried if one.stage == "kept"}
+    chosen = [one for one in asked if one.proposal in kept] or asked
+    stories = tuple(story_of(one, changes) for one in chosen[-1:])
+    rows = tuple((one.name, one.reason or one.why, verdict_words(one), result_words(one)) for one in tried)
+    heads = ("Candidate", "What it is", "Verdict", "Result")
+    table = Table(
+        "What was proposed to begin with, in order, on the line's file: no model is accepted yet.", heads, rows
+    )
+    said = (
+        "The loop was started with an LQI on the line's file, which is Initial. "
+        "This is what the gate let take its place for the first experiment."
+    )
+    return Section("Selection, with its justification", (said,), (table,), stories=stories)
+
+
+def adaptations_section(result: DemoResult, chain: ChainResult) -> Section:
+    """One story for each redesign that was kept."""
+    stories: list[Story] = []
+    begin = 0
+    for end, change in enumerate(chain.changes):
+        if change.step == Step.REDESIGN and change.stage == "kept":
+            stories.append(_adaptation(result, chain, chain.changes[begin:end], change))
+            begin = end + 1
+    said = "Each begins with what the line showed, and ends with what was measured on it."
+    if not stories:
+        said = "No redesign came to be kept: what the gate found against each stands below, under Through the gate."
+    return Section("Adaptations: diagnosis, change, verdict, result", (said,), stories=tuple(stories))
+
+
+def _adaptation(result: DemoResult, chain: ChainResult, before: Sequence[ChangeResult], kept: ChangeResult) -> Story:
+    place = next((k for k, one in enumerate(result.configurations) if one.controller == kept.configuration), None)
+    name = "a redesign that was not measured" if place is None else result.configurations[place].name
+    earlier = result.configurations[place - 1].name if place else "what ran before"
+    rows = [
+        *(("Diagnosis", text) for text in _diagnosis(chain, before)),
+        *(("Tried before", f"{one.name}: {one.reason or one.why}; {verdict_words(one)}") for one in before
+          if one.step == Step.REDESIGN),
+        ("Change", f"{kept.reason} ({kept.proposal[:12]}, author {kept.author})"),
+        ("Verdict", f"{verdict_words(kept)}. Approved by {kept.approved_by or 'nobody'}"),
+        ("Result", f"{result_words(kept)} {_measured(result, place)}"),
+    ]  # fmt: skip
+    asked = [one for one in chain.asked if one.proposal == kept.proposal and one.decision != DIAGNOSES]
+    last = asked[-1] if asked else None
+    return Story(
+        f"{earlier} \u2192 {name}",
+        tables=(Table("What led to it, and what it came to.", ("", "What"), tuple(rows)),),
+        lead="" if last is None else f"Why this one of {len(last.options)}, in the words of {_who(last)}:",
+        quote="" if last is None else last.reason,
+    )
+
+
+def _diagnosis(chain: ChainResult, before: Sequence[ChangeResult]) -> list[str]:
+    """What the line showed since the configuration before, and what was concluded from it."""
+    said: list[str] = []
+    for one in before:
+        if one.step == Step.MEASUREMENT:
+            said.append(f"Measured on the line: {one.measured or one.why or one.stage}")
+            said += [_concluded(asked) for asked in _diagnoses(chain, one, before)]
+        elif one.step in (Step.EXPERIMENT, Step.MODEL) and one.stage in ("done", "kept"):
+            said.append(f"{one.step.capitalize()}: {one.reason}; {verdict_words(one)}")
+    return said
+
+
+def _diagnoses(chain: ChainResult, measurement: ChangeResult, before: Sequence[ChangeResult]) -> list[AskedResult]:
+    """Of this measurement: those whose proposal came after it, before the redesign."""
+    later = {one.proposal for one in before[before.index(measurement) + 1 :] if one.proposal}
+    return [one for one in chain.asked if one.decision == DIAGNOSES and one.proposal in later]
+
+
+def _concluded(one: AskedResult) -> str:
+    option = next((option.title for option in one.options if option.id == one.chosen), one.chosen)
+    return f"{_who(one).capitalize()} concluded: {option}. \u201c{one.reason}\u201d"
+
+
+def _who(one: AskedResult) -> str:
+    return "the rules" if one.by == "rules" else f"agent {one.by}"
+
+
+def _measured(result: DemoResult, place: int | None) -> str:
+    """RMSE of both cases beside the configuration before, and the paper's own change."""
+    if not place:
+        return ""
+    parts: list[str] = []
+    names = list(PAPER_RMSE_N)
+    for case in PAPER:
+        before, now = result.rmse_n(place - 1, case.name), result.rmse_n(place, case.name)
+        change = result.improvement_pct(place, case.name)
+        if before is None or now is None or change is None:
+            parts.append(f"{case.heading.lower()} not run")
+            continue
+        text = f"{case.heading.lower()} from {before:.3f} to {now:.3f} N ({-change:+.1f} %"
+        if place < len(names):
+            paper = [PAPER_RMSE_N[names[k]][case.name] for k in (place - 1, place)]
+            text += f"; the paper's {paper[0]:.3f} to {paper[1]:.3f} N"
+        parts.append(f"{text})")
+    return f"RMSE: {', '.join(parts)}."

@@ -1,0 +1,65 @@
+"""Whether the certificates of the agents' bus can be read, fit together, and are good for a while."""
+
+import stat
+from collections.abc import Iterator
+from datetime import datetime, timedelta
+from pathlib import Path
+
+from gateway.cli.certificates import NoCertificate, Pair, belongs, certificates_of
+from gateway.cli.doctor_check import Check
+from gateway.core.line import Network
+
+GROUP = "certificates"
+SOON = timedelta(days=30)
+_TODO = "make them with `r2rgate pki init`; until then the bus stays on this machine, and the rest runs"
+
+
+def certificates(network: Network | None, now: datetime) -> Iterator[Check]:
+    """Warnings at most: a line runs without agents of other machines."""
+    if network is None:
+        yield Check(GROUP, "network", "", "OK", "no table [network]: the agents' bus stays on this machine")
+        return
+    for name in ("certificate", "authority"):
+        yield _certificate(name, Path(getattr(network, name)), now)
+    yield _private_key(Path(network.certificate), Path(network.private_key))
+
+
+def _certificate(name: str, path: Path, now: datetime) -> Check:
+    """The one of a file that ends first."""
+    wanted = f"good for {SOON.days} days or longer"
+    try:
+        found = certificates_of(path.read_bytes())
+    except OSError as error:
+        return Check(GROUP, name, "", "warning", f"{path} cannot be read: {error.strerror}", wanted, _TODO)
+    except NoCertificate as error:
+        return Check(GROUP, name, "", "warning", f"{path}: {error}", wanted, _TODO)
+    until = min(one.not_valid_after_utc for one in found)
+    begins = max(one.not_valid_before_utc for one in found)
+    days = (until - now) / timedelta(days=1)
+    if begins > now:
+        measured = f"{path} is good only from {begins:%Y-%m-%d %H:%M} UTC"
+        return Check(GROUP, name, "", "warning", measured, wanted, "is this computer's clock right?")
+    ends = f"ended {-days:.0f} days ago" if days < 0 else f"ends in {days:.0f} days"
+    measured = f"{path} {ends}, on {until:%Y-%m-%d}"
+    if until - now >= SOON:
+        return Check(GROUP, name, "", "OK", measured, wanted)
+    todo = "move it and its key away and run `r2rgate pki init` again; then start the gateway again"
+    return Check(GROUP, name, "", "warning", measured, wanted, todo)
+
+
+def _private_key(certificate: Path, path: Path) -> Check:
+    """It is the certificate's, and nobody else may read it."""
+    wanted = "the certificate's, for its owner alone"
+    try:
+        mode = stat.S_IMODE(path.stat().st_mode)
+        fits = belongs(Pair(certificate.read_bytes(), path.read_bytes()))
+    except OSError as error:
+        measured = f"{error.filename} cannot be read: {error.strerror}"
+        return Check(GROUP, "private key", "", "warning", measured, wanted, _TODO)
+    except NoCertificate as error:
+        return Check(GROUP, "private key", "", "warning", f"{path}: {error}", wanted, _TODO)
+    if not fits:
+        return Check(GROUP, "private key", "", "warning", f"{path} is another certificate's", wanted, _TODO)
+    if mode & (stat.S_IRWXG | stat.S_IRWXO):
+        return Check(GROUP, "private key", "", "warning", f"{path} has mode {mode:o}", wanted, f"`chmod 600 {path}`")
+    return Check(GROUP, "private key", "", "OK", f"{path}, mode {mode:o}", wanted)
