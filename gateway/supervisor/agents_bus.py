@@ -8,7 +8,7 @@ from typing import Protocol
 from gateway.core.line import Line
 from gateway.core.topics import AGENT_DECIDE, AGENT_NAMES, AgentName
 from gateway.mailbox.allowance import Allowance
-from gateway.mailbox.bus import open_router
+from gateway.mailbox.bus import BusUnavailable, open_router
 from gateway.mailbox.port import Mailbox
 from gateway.mailbox.zenoh_mailbox import ZenohMailbox
 from gateway.supervisor.agents_cases import AgentsCases
@@ -47,8 +47,16 @@ class AgentsBus:
     async def open(self) -> None:
         """Never raises: a gateway without the bus is better than none."""
         mailbox: ZenohMailbox | None = None
+        open_to, trouble = self._line.network, ""
         try:
-            mailbox = await open_router(self._line, self._run_folder)
+            try:
+                mailbox = await open_router(self._line, self._run_folder)
+            except BusUnavailable as error:
+                if open_to is None:
+                    raise
+                # Certificates of a bus beyond this machine are no reason to have none on it.
+                open_to, trouble = None, f"it is not open on {open_to.listen}: {error}"
+                mailbox = await open_router(self._line.model_copy(update={"network": None}), self._run_folder)
             for desk in self._desks:
                 desk.serve_on(mailbox)
             for agent in AGENT_NAMES:
@@ -59,9 +67,9 @@ class AgentsBus:
             if mailbox is not None:
                 await mailbox.close()
             return
-        self._mailbox, self._text = mailbox, ""
-        network = self._line.network
-        self._note("agents-bus", "the agents' bus is open" + ("" if network is None else f", also on {network.listen}"))
+        self._mailbox, self._text = mailbox, trouble
+        beyond = f", also on {open_to.listen}" if open_to is not None else f"; {trouble}" if trouble else ""
+        self._note("agents-bus", f"the agents' bus is open{beyond}")
 
     def watch(self) -> None:
         """Notes agents that have come or gone, and requests that were turned away."""

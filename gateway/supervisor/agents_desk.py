@@ -4,6 +4,7 @@ The agent's name is a part of what it asks on; whoever asks there is that agent,
 """
 
 import asyncio
+import time
 from collections.abc import Callable
 from functools import partial
 
@@ -25,6 +26,7 @@ from gateway.core.topics import (
     ASK_UNANSWERED,
     AgentName,
 )
+from gateway.mailbox.allowance import Allowance
 from gateway.mailbox.port import MAX_PAYLOAD, Mailbox
 from gateway.supervisor.agents_cases import AgentsCases
 from gateway.supervisor.deployer_sides import NotKnown
@@ -36,6 +38,8 @@ from gateway.supervisor.status import GatewayStatus
 
 AUTHOR = "agents"  #: of all their proposals
 MOST_TEXT = 400  #: letters of an event
+#: Of all agents, beyond the first few. The list of proposals is a person's, and what the phases know of their past.
+PROPOSALS_PER_S = 30.0 / 3600.0
 STEP_OF_CHAIN = "commissioning:"  #: by which the chain knows its own proposals (gateway/commissioning/past.py)
 NAMES_AGENT = "agent "  #: an evidence that begins so names who proposes
 
@@ -43,7 +47,7 @@ NAMES_AGENT = "agent "  #: an evidence that begins so names who proposes
 class AgentsDesk:
     def __init__(
         self, status: Callable[[], GatewayStatus], gate: Gate, dry_runs: DryRuns, log: Interactions,
-        note: Callable[..., None], cases: AgentsCases,
+        note: Callable[..., None], cases: AgentsCases, clock: Callable[[], float] = time.monotonic,
     ) -> None:  # fmt: skip
         self._status = status
         self._gate = gate
@@ -52,6 +56,8 @@ class AgentsDesk:
         self._writing = asyncio.Lock()  #: one thread for the log, however many agents talk
         self._note = note
         self._cases = cases
+        self._clock = clock
+        self._proposals = Allowance(PROPOSALS_PER_S)
 
     def serve_on(self, bus: Mailbox) -> None:
         for agent in AGENT_NAMES:
@@ -63,7 +69,10 @@ class AgentsDesk:
             bus.serve(ASK_UNANSWERED.of(agent), partial(self._hear, agent))
 
     async def _propose(self, agent: AgentName, payload: bytes) -> bytes:
-        if reasons := _not_theirs(agent, payload):
+        reasons = _not_theirs(agent, payload)
+        if not reasons and not self._proposals.take(self._clock()):
+            reasons = [f"agents propose too often; allowed: {3600.0 * PROPOSALS_PER_S:g} an hour, of all together"]
+        if reasons:
             reply = self._refused(agent, "it is not judged", reasons)
             self._note("proposal", f"agent {agent}: {reply.text}", ok=False, reasons=reasons)
         else:

@@ -13,7 +13,7 @@ from gateway.core.decisions import ProposalList
 from gateway.core.messages import Reply
 from gateway.core.proposal import Proposal, canonical
 from gateway.core.topics import AGENT_DECIDE, ASK_JUDGE, ASK_LOG, ASK_PROPOSALS, ASK_PROPOSE, ASK_STATUS, GATEWAY_STATUS
-from gateway.mailbox.paths import GATEWAY_SOCKET
+from gateway.mailbox.paths import BUS_SOCKET, GATEWAY_SOCKET
 from gateway.mailbox.unix import UnixMailbox
 from gateway.mailbox.zenoh_mailbox import ZenohMailbox
 from gateway.supervisor.audit_file import AuditFile
@@ -125,9 +125,23 @@ def test_people_see_which_agents_are_there() -> None:
     run(story)
 
 
-def test_without_its_bus_the_gateway_does_all_else_and_says_why_it_is_closed() -> None:
+def test_certificates_that_cannot_be_read_close_the_bus_beyond_this_machine_alone() -> None:
     async def story(folder: Path) -> None:
         with gateway(folder, Path("with a network")):
+            status = await status_with(folder, lambda status: status.agents_bus.open)
+            assert status.agents_bus.text.startswith("it is not open on tls/127.0.0.1:1: ")
+            (event,) = [event for event in status.events if event.kind == "agents-bus"]
+            assert status.agents_bus.text in event.text and ".rs" not in event.text
+            async with client(folder) as agents:
+                assert await agents.request(ASK_STATUS.of("sysid"), b"", LONG_S)
+
+    run(story)
+
+
+def test_without_its_bus_the_gateway_does_all_else_and_says_why_it_is_closed() -> None:
+    async def story(folder: Path) -> None:
+        (folder / BUS_SOCKET).mkdir()
+        with gateway(folder):
             status = await status_with(folder, lambda status: "could not be opened" in status.agents_bus.text)
             assert not status.agents_bus.open
             (event,) = [event for event in status.events if event.kind == "agents-bus"]

@@ -86,7 +86,9 @@ class Desk:
         self.log = Interactions(folder)
         self.now_s = 0.0
         self.cases = AgentsCases(self.gate.audit.append, lambda: self.now_s)
-        desk = AgentsDesk(lambda: STATUS, self.gate, self.dry_runs, self.log, self.note, self.cases)
+        desk = AgentsDesk(
+            lambda: STATUS, self.gate, self.dry_runs, self.log, self.note, self.cases, lambda: self.now_s
+        )  # fmt: skip
         desk.serve_on(InProcessMailbox(self.hub))
 
     def note(self, kind: str, text: str, **data: Any) -> None:
@@ -143,6 +145,22 @@ def test_a_proposal_is_taken_in_as_the_agents_on_whose_key_it_came(tmp_path):
         assert desk.gate.deployer.book.entries[proposal_hash(one)].stage is Stage.WAITING  # for a person
         assert ("proposed", "agent adaptation") in desk.records()
         assert any(kind == "proposal" and text.startswith("agent adaptation: ") for kind, text in desk.events)
+
+    at_desk(story, tmp_path)
+
+
+def test_all_agents_together_fill_no_list_of_proposals(tmp_path):
+    async def story(desk: Desk) -> None:
+        await desk.opened()
+        took = []
+        for k in range(200):  # for an hour
+            desk.now_s = 18.0 * k
+            reply = await desk.propose(of_agents(nonce=k), ("sysid", "adaptation")[k % 2])
+            took.append(reply.ok)
+        assert 30 <= sum(took) <= 36 and took[:5] == [True] * 5
+        assert "agents propose too often; allowed: 30 an hour, of all together" in reply.reasons[0]
+        assert desk.gate.deployer is not None and len(desk.gate.deployer.book.entries) == sum(took)
+        await desk.gate.deployer.judged()
 
     at_desk(story, tmp_path)
 
