@@ -98,14 +98,19 @@ def _meaning(knob: Knob) -> str:
     return f"a factor from {knob.least:g} to {knob.most:g}, without a unit; 1 leaves it; more: {knob.meaning}{only}"
 
 
+def document_in(text: str) -> dict[str, Any]:
+    """The JSON object that `text` is; one fence around the whole is forgiven. Raises NotJson."""
+    fenced = _FENCED.match(text)
+    return document_of((fenced[1] if fenced else text).encode("utf-8", "replace"))
+
+
 def read_answer(text: str, question: Question) -> Choice:
     """The choice in `text`. Raises ChoiceRefused with every reason, in the words of the form.
 
     One fence around the whole is forgiven, words beside the object are not. A factor that is missing is 1.
     """
-    fenced = _FENCED.match(text)
     try:
-        document = document_of((fenced[1] if fenced else text).encode("utf-8", "replace"))
+        document = document_in(text)
     except NotJson as error:
         raise ChoiceRefused([str(error)]) from error
     factors = {f"{TIMES}{one.name}": one.name for one in question.knobs}

@@ -56,13 +56,7 @@ class AskedAgents:
             if self._clock() - began_s >= self._within_s:
                 self._resting_until_s[question.agent] = self._clock() + REST_S
             return Decided(usual_choice(question), RULES, f"{question.agent}: {_short(error)}")
-        if answer.by not in (question.agent, RULES):
-            return Decided(usual_choice(question), RULES, f"{question.agent} answers as somebody else")
-        if answer.by == RULES:  # what the rules choose is known here
-            return Decided(usual_choice(question), RULES, answer.instead)
-        if against := wrong_with(answer.choice, question):
-            return Decided(usual_choice(question), RULES, f"{question.agent} is not understood: {'; '.join(against)}")
-        return Decided(answer.choice, answer.by, answer.instead)
+        return decided_by(answer, question)
 
     async def _asked(self, question: Question) -> Answer:
         """Raises Unreachable, ValidationError."""
@@ -70,6 +64,17 @@ class AskedAgents:
         return Answer.model_validate_json(
             await self._bus.request(AGENT_DECIDE.of(question.agent), payload, self._within_s)
         )
+
+
+def decided_by(answer: Answer, question: Question) -> Decided:
+    """What an agent's answer to `question` comes to; an answer that is none is the rules'."""
+    if answer.by not in (question.agent, RULES):
+        return Decided(usual_choice(question), RULES, f"{question.agent} answers as somebody else")
+    if answer.by == RULES:  # what the rules choose is known here
+        return Decided(usual_choice(question), RULES, answer.instead)
+    if against := wrong_with(answer.choice, question):
+        return Decided(usual_choice(question), RULES, f"{question.agent} is not understood: {'; '.join(against)}")
+    return Decided(answer.choice, answer.by, answer.instead)
 
 
 def _short(error: BaseException) -> str:
