@@ -1,8 +1,8 @@
 """The decider of a simulated line: the agents in this process, without a bus.
 
-The same agents, client of the language model, knowledge and records as in the agents' own process. The event loop that
-a question is answered in is made by whoever begins this, so that its time need not be that of the clock: where the model
-is in the process as well, a slow one then costs no waiting.
+The same agents, client of the language model, knowledge and records as in the agents' own process. The event loop in
+which a question is answered is made by whoever begins this, so that its time need not be that of the clock: where the
+model is in the process as well, a slow one then costs no waiting.
 """
 
 import asyncio
@@ -23,8 +23,8 @@ from gateway.core.questions import Question
 class AgentsHere:
     """`Decider` of one task: its tokens are those of `settings.task_max_tokens`.
 
-    `keep` is told of each interaction. `transport`: of the client's requests; None: the network. `loops` makes the event
-    loop in which a question is answered, by whose time deadlines are kept and durations told.
+    `keep` is told of each interaction. `transport`: of the client's requests; None: the network. `loops` makes the
+    event loop in which a question is answered, by whose time deadlines are kept and durations told.
     """
 
     def __init__(

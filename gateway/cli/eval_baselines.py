@@ -1,13 +1,13 @@
 """Searches without any reasoning, in the place of whoever chooses a redesign: what they find is proposed as theirs.
 
 They turn the knobs that the chain's redesigns have, within the bounds of its question, and look at what the rules look
-at: the courses of the gate's improvement on the accepted model, beside what is in service. They may look as often as the
-rules do. The truth they do not know. What they find goes before the gate like anything else: the best first, then, where
-that is refused, the next. Everything but a redesign they leave to the rules.
+at: the courses of the gate's improvement on the accepted model, beside what is in service. They may look as often as
+the rules do. The truth they do not know. What they find goes before the gate like anything else: the best first, then,
+where that is refused, the next. Everything but a redesign they leave to the rules.
 """
 
 import asyncio
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from math import exp, inf, log
 
@@ -25,6 +25,7 @@ from gateway.core.deployment import Region
 from gateway.core.line import Line
 from gateway.core.line_model import LineModel, model_hash
 from gateway.core.questions import Choice, Question, usual_choice
+from gateway.core.signals import FloatArray
 
 EVALUATIONS = len(LAWS) + len(PREDICTIVE) + 1  #: designs that the rules simulate for one redesign at the greatest speed
 WORSE = 10.0  #: what is worse than in service in any figure comes behind everything that is not
@@ -111,7 +112,8 @@ class Searching:
         if not bounds:
             return []
         found = (self._nelder_mead if self._policy == "nelder-mead" else self._at_random)(question, bounds, cost)
-        return sorted((one for one in found if one.cost < WORSE), key=lambda one: one.cost)
+        each = {(one.option, *one.factors.values()): one for one in found if one.cost < WORSE}  # none is tried twice
+        return sorted(each.values(), key=lambda one: one.cost)
 
     def _nelder_mead(
         self, question: Question, bounds: Mapping[str, Mapping[str, tuple[float, float]]],
@@ -121,10 +123,10 @@ class Searching:
         option = question.usual if question.usual in bounds else next(iter(bounds))
         knobs, found = bounds[option], list[Found]()
 
-        def looked_at(logs: Sequence[float]) -> float:
+        def looked_at(logs: FloatArray) -> float:
             factors = {
                 name: min(max(exp(value), least), most)
-                for (name, (least, most)), value in zip(knobs.items(), logs, strict=True)
+                for (name, (least, most)), value in zip(knobs.items(), logs.tolist(), strict=True)
             }
             if len(found) < EVALUATIONS:  # a step may ask for one more than it was given
                 found.append(Found(option, factors, cost(option, factors)))
@@ -151,6 +153,6 @@ class Searching:
         return found
 
 
-def _simplex(n: int) -> np.ndarray:
+def _simplex(n: int) -> FloatArray:
     """About the origin: a factor of 2 along each knob."""
     return np.vstack([np.zeros(n), log(2.0) * np.eye(n)])

@@ -1,5 +1,6 @@
-"""What a configuration is worth on the true plant of a task, and what the rules would have designed knowing the truth."""
+"""What a configuration is worth on the true plant of a task, and what the rules would design if they knew the truth."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,15 +30,19 @@ class Worth:
     unsafe_events: int
 
 
-def worth(task: Task, config: Controller) -> Worth:
-    """Of `config` on the plant of `task`."""
+def worth(task: Task, config: Controller, noises: Sequence[int] = NOISES) -> Worth:
+    """Of `config` on the plant of `task`, in each of `noises`."""
     found: dict[str, float] = {}
     stopped: list[str] = []
     unsafe = 0
     for case in task.cases:
-        line, plant, scenario = case.tier.line(task.line, case.scenario), case.tier.plant(task.plant), case.tier.scenario
+        line, plant, scenario = (
+            case.tier.line(task.line, case.scenario),
+            case.tier.plant(task.plant),
+            case.tier.scenario,
+        )
         errors: list[float] = []
-        for seed in NOISES:
+        for seed in noises:
             try:
                 run = run_scenario(line, config, plant, scenario(case.scenario), task.seed + seed)
             except CommandRefused as refused:
@@ -48,7 +53,7 @@ def worth(task: Task, config: Controller) -> Worth:
                 errors.append(run.rmse_n)
             else:
                 stopped.append(f"{case.name}: {run.stopped}")
-        if len(errors) == len(NOISES):
+        if len(errors) == len(noises):
             found[case.name] = float(np.mean(errors))
     return Worth(found, stopped, unsafe)
 

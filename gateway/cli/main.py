@@ -16,6 +16,7 @@ from gateway.cli import (
     configurations_commands,
     design_commands,
     doctor_commands,
+    eval_commands,
     experiment_commands,
     fault_commands,
     identify_commands,
@@ -85,6 +86,7 @@ app.add_typer(audit_commands.app, rich_help_panel=EVIDENCE)
 app.add_typer(configurations_commands.app, rich_help_panel=EVIDENCE)
 app.command(rich_help_panel=EVIDENCE)(baselines_commands.baselines)
 app.command(rich_help_panel=EVIDENCE)(ask_commands.ask)
+app.command("eval", rich_help_panel=EVIDENCE)(eval_commands.evaluate)
 
 
 @app.callback(invoke_without_command=True)
