@@ -108,7 +108,9 @@ def test_without_a_model_the_rules_answer() -> None:
 
 def test_the_tokens_of_a_task_are_counted_over_its_questions() -> None:
     kept: list[Interaction] = []
-    agents = here("perfect", kept, SETTINGS.model_copy(update={"task_max_tokens": 1024}))
+    here("perfect", kept).decide(QUESTION)
+    one = kept[0].tokens_in + kept[0].tokens_out
+    agents = here("perfect", kept, SETTINGS.model_copy(update={"task_max_tokens": one + 1}))
     said = [agents.decide(QUESTION) for _ in range(3)]
     assert said[0].by == "adaptation" and said[-1].by == RULES and "spent" in said[-1].instead
 
