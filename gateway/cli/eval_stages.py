@@ -11,11 +11,14 @@ from gateway.core.interactions import Interaction
 from gateway.core.json_problems import NotJson
 
 Key = tuple[Stage, str]
+NO_CALL = "no call"  #: nobody listens, or the model is not there, or was not loaded in time
 
 
 def rejections(tried: Sequence[Tried], interactions: Sequence[Interaction]) -> list[Rejections]:
     """In the order of the stages."""
     found = Counter[Key](key for one in interactions for key in _of_answers(one.exchanges))
+    found["unanswered", NO_CALL] += sum(_was_never_called(one) for one in interactions)
+    found = +found
     found.update(key for one in tried if (key := _of_candidate(one)) is not None)
     return as_rows(found)
 
@@ -43,6 +46,10 @@ def _of_answers(exchanges: Sequence[dict[str, Any]]) -> list[Key]:
         elif one["refused"]:
             keys.append((_as_answer(one["raw"]), ""))
     return keys
+
+
+def _was_never_called(one: Interaction) -> bool:
+    return not one.exchanges and "gave no answer" in one.answer.instead
 
 
 def _as_answer(raw: str) -> Stage:

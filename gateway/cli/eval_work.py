@@ -14,14 +14,14 @@ from typing import Any
 from agents.rag.library import open_library
 from gateway.cli.agents_here import AgentsHere
 from gateway.cli.eval_baselines import Searching
-from gateway.cli.eval_result import Policy, TaskResult
+from gateway.cli.eval_result import Policy, TaskResult, Trial
 from gateway.cli.eval_run import Carrying, Decides
 from gateway.cli.eval_tasks import TOP_M_PER_S, Task, task_of
 from gateway.cli.workers import Workers
 from gateway.commissioning.decisions import Rules
 from gateway.core.interactions import Interaction, pack
 from gateway.core.line import Agents
-from gateway.supervisor.interactions import Interactions
+from gateway.supervisor.interactions import Interactions, InteractionsError
 
 BASELINES: tuple[Policy, ...] = ("rules", "nelder-mead", "random")
 Tell = Callable[[str], None]
@@ -49,42 +49,47 @@ def carried_out(job: Job, tell: Tell = lambda text: None) -> TaskResult:
     """In this process."""
     carrying = Carrying(task_of(job.number, job.seed, job.spans))
     policies: tuple[Policy, ...] = BASELINES if job.agents is None else ("model", *BASELINES)
-    trials = []
+    trials: list[Trial] = []
     for policy in policies:
         kept: list[Interaction] = []
-        with _decides(policy, job, carrying.task, kept.append) as decides:
 
-            def said(text: str, policy: str = policy) -> None:
-                tell(f"task {job.number + 1}, {policy}: {text}")
+        def said(text: str, policy: str = policy) -> None:
+            tell(f"task {job.number + 1}, {policy}: {text}")
 
+        with _decides(policy, job, carrying.task, kept.append, said) as decides:
             trials.append(carrying.trial(policy, carrying.carried_out(decides, said), kept))
     return carrying.result(trials)
 
 
 @contextmanager
-def _decides(policy: Policy, job: Job, task: Task, keep: Callable[[Interaction], None]) -> Iterator[Decides]:
+def _decides(
+    policy: Policy, job: Job, task: Task, keep: Callable[[Interaction], None], tell: Tell
+) -> Iterator[Decides]:
     if policy == "rules":
         yield lambda side, loop: Rules()
     elif policy != "model":
         yield lambda side, loop: Searching(policy, task.line, side, loop, TOP_M_PER_S, task.seed)
     else:
         assert job.agents is not None  # else there is no such policy
-        agents, keep_whole = job.agents, _kept_in(job.log, keep)
+        agents, keep_whole = job.agents, _kept_in(job.log, keep, tell)
         with tempfile.TemporaryDirectory() as folder:
             opened = asyncio.run(open_library(Path(folder), 3, generated=[]))
             with opened.index as index:
                 yield lambda side, loop: AgentsHere(agents, index.ask, keep_whole)
 
 
-def _kept_in(log: Path | None, keep: Callable[[Interaction], None]) -> Callable[[Interaction], None]:
-    """In the log as well. Raises InteractionsError where that cannot be written."""
+def _kept_in(log: Path | None, keep: Callable[[Interaction], None], tell: Tell) -> Callable[[Interaction], None]:
+    """In the log as well, as far as that can be written."""
     if log is None:
         return keep
     interactions = Interactions(log)
 
     def both(one: Interaction) -> None:
         keep(one)
-        interactions.keep(pack(one), one)
+        try:
+            interactions.keep(pack(one), one)
+        except InteractionsError as error:
+            tell(f"interaction {one.id} is not in the log: {error}")
 
     return both
 
@@ -113,8 +118,6 @@ def _told(tell: Tell) -> Iterator[Any]:
 
     thread = Thread(target=pass_on, daemon=True)
     thread.start()
-    try:
-        yield queue
-    finally:
-        queue.put(None)
-        thread.join(1.0)  # a worker that was ended in the middle of a word may have left half of it
+    yield queue  # interrupted, it is left as it is: who was ended in the middle of a word has the lock for good
+    queue.put(None)
+    thread.join()

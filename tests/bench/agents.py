@@ -8,9 +8,9 @@ deadlines are kept and nobody waits for them. "off" is without agents: the rules
 A persona none of whose answers counts, so that the rules decide everything, leads to the same chain as "off", bit by
 bit: it is asked every question of that chain, and the chain is not computed again.
 
-Never worse than the start: RMSE of what is in service in the end over that of what was at the begin, in each case of
-each task, no more than `NOISE` above 1. That is about how much the RMSE of one configuration differs from one noise of
-load cells and rollers to another in 6 s (figure `noise_p95`).
+Never worse than the start: RMSE of what is in service in the end over that of what was at the begin, in the same
+noises, in each case of each task, no more than `NOISE` above 1. One configuration in two noises of load cells and
+rollers differs by more than that (figure `noise_p95`); in the same noises less of it is left.
 
 Lines have two spans: a chain on six takes six times as long. Writes out/bench/agents.json; of a part of it,
 out/bench/agents-part.json. Two processes at a time.

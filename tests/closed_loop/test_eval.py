@@ -32,9 +32,9 @@ def test_the_command_scores_the_baselines_and_the_same_seed_gives_the_same(tmp_p
 
 
 def test_whoever_decides_for_the_worst_nothing_unsafe_gets_through() -> None:
-    found = of_task((1, 21, (OFF, "adversarial", "slow")))
-    off, adversarial, slow = found.result.trials
+    found = of_task((1, 21, (OFF, "adversarial", "absent")))
+    off, adversarial, absent = found.result.trials
     assert not any(one.unsafe_accepted or one.stopped for one in found.result.trials)
-    assert adversarial.asked.answered > 0 and found.again == ("slow",)
-    assert slow.controller == off.controller and slow.asked.answered == 0
-    assert slow.asked.seconds >= 180.0 * slow.asked.questions  # virtual
+    assert adversarial.asked.answered > 0 and found.again == ("absent",)
+    assert absent.controller == off.controller and absent.asked.answered == 0
+    assert {one.stage for one in absent.rejections} == {"unanswered"}

@@ -27,6 +27,7 @@ from gateway.core.line_model import theta_of
 from gateway.core.questions import usual_choice, wrong_with
 from sim_plant.drawn import random_plant, unruly_plant
 from sim_plant.plant import plant_of
+from tests.bench.agents import Nobody
 from tests.closed_loop.virtual_time import VirtualTimeLoop
 from tests.stand_in.engine import Engine
 from tests.stand_in.in_process import InProcess
@@ -132,6 +133,13 @@ def test_answers_that_are_none_are_counted_by_what_is_wrong_with_them(persona: s
     assert [(one.stage, one.by, one.times) for one in rejections([], kept)] == stages
 
 
+def test_where_nobody_listens_each_question_is_counted_without_an_exchange() -> None:
+    kept: list[Interaction] = []
+    agents = AgentsHere(SETTINGS, nothing_known, kept.append, Nobody, VirtualTimeLoop)
+    assert [agents.decide(QUESTION).by for _ in range(2)] == [RULES, RULES]
+    assert [(one.stage, one.by, one.times) for one in rejections([], kept)] == [("unanswered", "no call", 2)]
+
+
 def test_candidates_are_counted_by_where_they_came_to_nothing() -> None:
     tried = [
         Tried("gains", "redesign", 0, "a", "kept", ""),
@@ -192,6 +200,22 @@ def test_a_place_that_cannot_be_written_is_told_before_the_work(tmp_path: Path) 
     (tmp_path / "file").write_text("")
     ended = CliRunner().invoke(app, ["eval", "--out", str(tmp_path / "file" / "eval.json")])
     assert ended.exit_code == 2 and "cannot be written" in ended.output
+
+
+def test_interrupted_it_keeps_the_tasks_that_were_finished(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    finished = EvalResult.model_validate_json(EXAMPLE.read_bytes()).tasks[0]
+
+    def carry_out(jobs: Any, workers: int, tell: Any, done: Any) -> None:
+        assert len(jobs) == 3
+        done(finished)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("gateway.cli.eval_work.carry_out", carry_out)
+    out = tmp_path / "eval.json"
+    ended = CliRunner().invoke(app, ["eval", "--tasks", "3", "--out", str(out)])
+    assert ended.exit_code == 130 and "interrupted: 1 of 3 tasks" in ended.output
+    kept = EvalResult.model_validate_json(out.read_bytes())
+    assert not kept.complete and kept.tasks == [finished] and kept.figures[0].trials == 1
 
 
 def test_a_result_with_a_strange_key_is_refused() -> None:
