@@ -7,7 +7,7 @@ from gateway.core.line import NonNegative, Strict
 Policy = Literal["rules", "model", "nelder-mead", "random"]
 
 #: Where something was refused, in the order in which it can be:
-#: "unanswered"   the model gave no answer; `by`: late, broken ... (docs/agents.md), or "no call": it could not even be asked
+#: "unanswered"   the model gave no answer; `by`: late, broken ... (docs/agents.md); "no call": it could not be asked
 #: "malformed"    an answer that is no JSON object
 #: "not-offered"  an answer that names what the question does not offer, or is beyond its bounds
 #: "unmade"       what was chosen cannot be made; `by`: the step of the chain

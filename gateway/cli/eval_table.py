@@ -9,9 +9,13 @@ from rich.table import Table
 from gateway.cli.eval_result import EvalResult, PolicyFigures, Rejections
 from gateway.core.line_problem import printable
 
-HEADS = ("who decides", "reached", "converged", "tried", "deployed", "/truth p50", "p95", "worst", "/begin worst",
-         "unsafe", "answered", "tokens", "asked s", "CPU s")  # fmt: skip
-RATIOS = "/truth: RMSE over that of the rules' design on the truth; /begin: over what was in service at the begin"
+HEADS = (
+    "decides", "reached", "conv.", "tried", "kept", "/truth", "worst", "/begin", "unsafe", "own", "CPU s"
+)  # fmt: skip
+RATIOS = (
+    "/truth: RMSE over that of the rules' design on the truth, median and worst of all cases; /begin: over that of "
+    "what was in service at the begin, worst; own: questions that it answered itself"
+)
 
 
 def print_result(result: EvalResult, out: Path, console: Console) -> None:
@@ -30,8 +34,11 @@ def print_result(result: EvalResult, out: Path, console: Console) -> None:
 def remarks(result: EvalResult) -> list[str]:
     """What the table does not say, in sentences."""
     count = f"{len(result.tasks)} of {result.tasks_asked}" if not result.complete else f"{len(result.tasks)}"
-    told = [f"{count} tasks, {result.spans} spans, seed {result.seed}; each was tried once. {RATIOS}"]
+    told = [f"tasks: {count}, {result.spans} spans, seed {result.seed}; each was tried once; {RATIOS}"]
     told += [f"{one.policy}: {rejected(one.rejections)}" for one in result.figures if one.rejections]
+    for one in result.figures:
+        if spent := one.asked.tokens_in + one.asked.tokens_out:
+            told.append(f"{one.policy}: {spent} tokens, {one.asked.seconds:.0f} s for answers")
     for task in result.tasks:
         for trial in task.trials:
             told += [f"task {task.number + 1}, {trial.policy}: {stopped}" for stopped in trial.stopped]
@@ -54,11 +61,9 @@ def _cells(one: PolicyFigures) -> list[str]:
         f"{one.converged}/{one.trials}",
         f"{one.iterations:.1f}",
         f"{one.deployments:.1f}",
-        *(_ratio(value) for value in (one.to_truth_p50, one.to_truth_p95, one.to_truth_worst, one.to_begin_worst)),
+        *(_ratio(value) for value in (one.to_truth_p50, one.to_truth_worst, one.to_begin_worst)),
         str(one.unsafe_accepted),
         f"{asked.answered}/{asked.questions}",
-        str(asked.tokens_in + asked.tokens_out),
-        f"{asked.seconds:.0f}",
         f"{one.processor_s:.0f}",
     ]
 

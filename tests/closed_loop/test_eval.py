@@ -21,7 +21,7 @@ def test_the_command_scores_the_baselines_and_the_same_seed_gives_the_same(tmp_p
         out = tmp_path / f"{name}.json"
         ended = CliRunner().invoke(app, ["eval", "--tasks", "1", "--spans", "1", "--seed", "3", "--out", str(out)])
         assert ended.exit_code == 0, ended.output
-        assert "1 tasks, 1 spans, seed 3" in ended.output
+        assert "tasks: 1, 1 spans, seed 3" in ended.output
         result = EvalResult.model_validate_json(out.read_bytes())
         assert result.complete and [trial.policy for trial in result.tasks[0].trials] == list(BASELINES)
         assert not any(trial.unsafe_accepted or trial.stopped for trial in result.tasks[0].trials)

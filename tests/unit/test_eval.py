@@ -2,11 +2,13 @@
 
 import asyncio
 import json
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from rich.console import Console
 from typer.testing import CliRunner
 
 from agents.language_model.client import Transport
@@ -17,6 +19,7 @@ from gateway.cli.eval_baselines import EVALUATIONS, Searching
 from gateway.cli.eval_figures import policy_figures
 from gateway.cli.eval_result import EvalResult
 from gateway.cli.eval_stages import rejections
+from gateway.cli.eval_table import HEADS, print_result
 from gateway.cli.eval_tasks import MOST_DEPLOYMENTS, SPANS, TOP_M_PER_S, task_of
 from gateway.cli.eval_truth import designed_on_truth, true_model, worth
 from gateway.cli.main import app
@@ -177,6 +180,15 @@ def test_the_figures_of_a_policy_are_those_of_its_trials() -> None:
     ratios = [ratio for trial in trials for ratio in trial.to_truth.values()]
     assert figures.to_truth_worst == max(ratios) and figures.trials == len(example.tasks)
     assert all(trial.deployments <= MOST_DEPLOYMENTS for trial in trials)
+
+
+def test_the_table_fits_a_terminal_of_eighty_columns() -> None:
+    example = EvalResult.model_validate_json(EXAMPLE.read_bytes())
+    console = Console(width=80, file=StringIO(), highlight=False)
+    print_result(example, Path("eval.json"), console)
+    assert isinstance(console.file, StringIO)
+    said = console.file.getvalue()
+    assert all(head in said for head in HEADS) and "nelder-mead" in said and "…" not in said
 
 
 def test_the_command_says_how_it_is_used() -> None:
