@@ -25,6 +25,10 @@ LOOKED_UP_S = 20.0  #: for an agent to look up what is known, and to write it do
 TELL_S = 2.0  #: for the gateway to hear that an agent has failed
 
 
+class NotAnswered(Exception):
+    """An agent's answer answers nothing; the text says why."""
+
+
 class AskedAgents:
     """`Decider` of `line`. `bus` belongs to `loop`; `decide` is called from another thread, and blocks that one.
 
@@ -58,13 +62,10 @@ class AskedAgents:
             if self._clock() - began_s >= self.within_s:
                 self._resting_until_s[question.agent] = self._clock() + REST_S
             return self._by_rules(question, f"{question.agent}: {_short(error)}")
-        if answer.by not in (question.agent, RULES):
-            return self._by_rules(question, f"{question.agent} answers as somebody else")
-        if answer.by == RULES:  # what the rules choose is known here
-            return Decided(usual_choice(question), RULES, answer.instead, answer.interaction)
-        if against := wrong_with(answer.choice, question):
-            return self._by_rules(question, f"{question.agent} is not understood: {'; '.join(against)}")
-        return Decided(answer.choice, answer.by, answer.instead, answer.interaction)
+        try:
+            return decided_by(answer, question)
+        except NotAnswered as error:
+            return self._by_rules(question, str(error))
 
     def _by_rules(self, question: Question, why: str) -> Decided:
         """Because the agent has failed; the gateway is told."""
@@ -84,6 +85,17 @@ class AskedAgents:
         return Answer.model_validate_json(
             await self._bus.request(AGENT_DECIDE.of(question.agent), payload, self.within_s)
         )
+
+
+def decided_by(answer: Answer, question: Question) -> Decided:
+    """What an agent's answer to `question` comes to. Raises NotAnswered."""
+    if answer.by not in (question.agent, RULES):
+        raise NotAnswered(f"{question.agent} answers as somebody else")
+    if answer.by == RULES:  # what the rules choose is known here
+        return Decided(usual_choice(question), RULES, answer.instead, answer.interaction)
+    if against := wrong_with(answer.choice, question):
+        raise NotAnswered(f"{question.agent} is not understood: {'; '.join(against)}")
+    return Decided(answer.choice, answer.by, answer.instead, answer.interaction)
 
 
 def _short(error: BaseException) -> str:

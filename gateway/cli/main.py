@@ -18,6 +18,7 @@ from gateway.cli import (
     demo_commands,
     design_commands,
     doctor_commands,
+    eval_commands,
     experiment_commands,
     fault_commands,
     identify_commands,
@@ -90,6 +91,7 @@ app.add_typer(configurations_commands.app, rich_help_panel=EVIDENCE)
 app.command(rich_help_panel=EVIDENCE)(baselines_commands.baselines)
 app.command(rich_help_panel=EVIDENCE)(ask_commands.ask)
 app.command(rich_help_panel=ENGINEER)(compute_commands.compute)
+app.command("eval", rich_help_panel=EVIDENCE)(eval_commands.evaluate)
 
 
 @app.callback(invoke_without_command=True)

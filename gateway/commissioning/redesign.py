@@ -129,7 +129,7 @@ def _worth(
     for law, config in designed:
         figures = predicted(config, line, model, judged, lasting_s)
         figures_known = figures if known is judged else predicted(config, line, model, known, lasting_s)
-        if all(_no_worse(line, figures_known[name], before_known[name]) for name in before_known):
+        if all(no_worse(line, figures_known[name], before_known[name]) for name in before_known):
             whole = sum(ratio(figures[name].rmse_n, before[name].rmse_n) for name in before)
             found.append((whole, Offer(law, config, judged.speed_max_m_per_s, figures, before)))
     return [offer for _, offer in sorted(found, key=lambda each: each[0])]
@@ -168,7 +168,7 @@ def ratio(rmse_n: float, before_n: float) -> float:
     return rmse_n / before_n if 0.0 < before_n < inf else rmse_n
 
 
-def _no_worse(line: Line, one: Figures, before: Figures) -> bool:
+def no_worse(line: Line, one: Figures, before: Figures) -> bool:
     """As the gate compares them, but with a part of its tolerances. What is no number is worse."""
     gate = line.gate
     rows = (

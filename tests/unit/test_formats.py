@@ -14,6 +14,7 @@ from pydantic import TypeAdapter
 
 from gateway.cli.demo_result import DemoResult
 from gateway.cli.design_result import DesignResult
+from gateway.cli.eval_result import EvalResult
 from gateway.cli.identify_result import IdentifyResult
 from gateway.cli.rehearse_result import RehearseResult
 from gateway.core.audit_export import AuditLine, wrong_in
@@ -50,6 +51,7 @@ FORMATS: dict[str, tuple[TypeAdapter[Any], Callable[[bytes], object], str]] = {
     "rehearse": (TypeAdapter(RehearseResult), _json(TypeAdapter(RehearseResult)), "json"),
     "design": (TypeAdapter(DesignResult), _json(TypeAdapter(DesignResult)), "json"),
     "identify": (TypeAdapter(IdentifyResult), _json(TypeAdapter(IdentifyResult)), "json"),
+    "eval": (TypeAdapter(EvalResult), _json(TypeAdapter(EvalResult)), "json"),
     "bench": (TypeAdapter(BenchResult), _json(TypeAdapter(BenchResult)), "json"),
     "audit-export": (TypeAdapter(AuditLine), _audit, "jsonl"),
     "experiment": (TypeAdapter(Experiment), parse_experiment, "json"),

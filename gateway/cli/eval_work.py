@@ -1,0 +1,123 @@
+"""The tasks of an evaluation in processes of their own, which say what they are at: without a model several at once."""
+
+import asyncio
+import tempfile
+from collections.abc import Callable, Iterator
+from concurrent.futures import as_completed
+from contextlib import contextmanager
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+from threading import Thread
+from typing import Any
+
+from agents.rag.library import open_library
+from gateway.cli.agents_here import AgentsHere
+from gateway.cli.eval_baselines import Searching
+from gateway.cli.eval_result import Policy, TaskResult, Trial
+from gateway.cli.eval_run import Carrying, Decides
+from gateway.cli.eval_tasks import TOP_M_PER_S, Task, task_of
+from gateway.cli.workers import Workers
+from gateway.commissioning.decisions import Rules
+from gateway.core.interactions import Interaction, pack
+from gateway.core.line import Agents
+from gateway.supervisor.interactions import Interactions, InteractionsError
+
+BASELINES: tuple[Policy, ...] = ("rules", "nelder-mead", "random")
+Tell = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Job:
+    """A task, under the language model of `agents` (None: none) and the baselines."""
+
+    number: int
+    seed: int
+    spans: int
+    agents: Agents | None = None
+    log: Path | None = None  #: folder in which what is asked of the model is kept
+
+
+def carry_out(jobs: list[Job], workers: int, tell: Tell, done: Callable[[TaskResult], None]) -> None:
+    """Each of `jobs`; `done` is told of each as it ends. Interrupted, all that works on the others ends at once."""
+    with _told(tell) as told, Workers(workers, _begin, (told,)) as pool:
+        for future in as_completed([pool.submit(_of_job, job) for job in jobs]):
+            done(future.result())
+
+
+def carried_out(job: Job, tell: Tell = lambda text: None) -> TaskResult:
+    """In this process."""
+    carrying = Carrying(task_of(job.number, job.seed, job.spans))
+    policies: tuple[Policy, ...] = BASELINES if job.agents is None else ("model", *BASELINES)
+    trials: list[Trial] = []
+    for policy in policies:
+        kept: list[Interaction] = []
+
+        def said(text: str, policy: str = policy) -> None:
+            tell(f"task {job.number + 1}, {policy}: {text}")
+
+        with _decides(policy, job, carrying.task, kept.append, said) as decides:
+            trials.append(carrying.trial(policy, carrying.carried_out(decides, said), kept))
+    return carrying.result(trials)
+
+
+@contextmanager
+def _decides(
+    policy: Policy, job: Job, task: Task, keep: Callable[[Interaction], None], tell: Tell
+) -> Iterator[Decides]:
+    if policy == "rules":
+        yield lambda side, loop: Rules()
+    elif policy != "model":
+        yield lambda side, loop: Searching(policy, task.line, side, loop, TOP_M_PER_S, task.seed)
+    else:
+        assert job.agents is not None  # else there is no such policy
+        agents, keep_whole = job.agents, _kept_in(job.log, keep, tell)
+        with tempfile.TemporaryDirectory() as folder:
+            opened = asyncio.run(open_library(Path(folder), 3, generated=[]))
+            with opened.index as index:
+                yield lambda side, loop: AgentsHere(agents, index.ask, keep_whole)
+
+
+def _kept_in(log: Path | None, keep: Callable[[Interaction], None], tell: Tell) -> Callable[[Interaction], None]:
+    """In the log as well, as far as that can be written."""
+    if log is None:
+        return keep
+    interactions = Interactions(log)
+
+    def both(one: Interaction) -> None:
+        keep(one)
+        try:
+            interactions.keep(pack(one), one)
+        except InteractionsError as error:
+            tell(f"interaction {one.id} is not in the log: {error}")
+
+    return both
+
+
+# In a worker.
+
+_tell: list[Tell] = []
+
+
+def _begin(told: Any) -> None:
+    _tell[:] = [told.put]
+
+
+def _of_job(job: Job) -> TaskResult:
+    return carried_out(job, _tell[0])
+
+
+@contextmanager
+def _told(tell: Tell) -> Iterator[Any]:
+    """A queue; what workers put there, `tell` is told."""
+    queue = get_context("spawn").SimpleQueue()
+
+    def pass_on() -> None:
+        while (text := queue.get()) is not None:
+            tell(text)
+
+    thread = Thread(target=pass_on, daemon=True)
+    thread.start()
+    yield queue  # interrupted, it is left as it is: who was ended in the middle of a word has the lock for good
+    queue.put(None)
+    thread.join()
