@@ -22,7 +22,7 @@ from gateway.cli.commission_questions import (
 from gateway.cli.commission_result import Commissioned, candidate_name, commissioned
 from gateway.cli.commission_side import CannotGoOn, GateSide, measured_on, put, region_kept
 from gateway.commissioning.candidates import Exhausted, NotOffered, fastest_m_per_s
-from gateway.commissioning.chain import Look, Pending, next_step, refused_at_once, region_speed
+from gateway.commissioning.chain import Look, Pending, next_step, refused_at_once, region_speed, still_due
 from gateway.commissioning.convergence import Convergence, Diagnosis
 from gateway.commissioning.decisions import RULES, Decided, Decider, Rules
 from gateway.commissioning.ladder import MOST_OWN, OWN, Ended, Next
@@ -35,6 +35,7 @@ from gateway.identification.identify import Identified
 from gateway.supervisor.baselines import BaselinesError
 
 RULES_DECIDE = Rules()
+MOST_QUOTED = 2000  #: letters of what an agent says, in a proposal
 
 Tell = Callable[[str], None]
 
@@ -57,14 +58,14 @@ async def commission(
     """
     if why := refused_at_once(line):
         return Commissioned(False, why, [], None)
-    chain = _Chain(line, side, tell, decider, wanted_m_per_s)
+    chain = _Chain(line, side, tell, decider, wanted_m_per_s, adaptations)
     while True:
         try:
             await chain.read()
             kept_now = sum(one.step is Step.REDESIGN and one.outcome is Outcome.DONE for one in chain.past)
             if most_redesigns is not None and kept_now >= most_redesigns:
                 return chain.ended(Ended(True, f"{kept_now} redesigns are kept"))
-            step = await chain.next(adaptations)
+            step = await chain.next()
             if isinstance(step, Ended):
                 return chain.ended(step)
             if isinstance(step, Pending):
@@ -88,16 +89,20 @@ class CannotBeJudged(Exception):
 class _Chain:
     """One run: what has been tried, as it was read last, and what could not be made since the run began."""
 
-    def __init__(self, line: Line, side: GateSide, tell: Tell, decider: Decider, wanted_m_per_s: float | None) -> None:
+    def __init__(
+        self, line: Line, side: GateSide, tell: Tell, decider: Decider, wanted_m_per_s: float | None, adaptations: int
+    ) -> None:  # fmt: skip
         self._line = line
         self._side = side
         self._tell = tell
         self._decider = decider
         self._wanted_m_per_s = wanted_m_per_s
+        self._adaptations = adaptations
         self._changes = Changes(line, inf if wanted_m_per_s is None else wanted_m_per_s)
         self._unmade: list[tuple[int, Past]] = []  #: by how many proposals there were
         self._shown: list[ProposalShown] = []
         self._measured: dict[str, Convergence] = {}
+        self._doubted = False  #: more data have been asked for since a model was proposed
         self._asked: list[str] = []  #: of agents since the last candidate: ids in their log
         self.past: list[Past] = []
 
@@ -106,11 +111,11 @@ class _Chain:
         self._shown, self._measured = await self._side.proposals(), await measured_on(self._line, self._side)
         self.past = _merged(self._shown, self._unmade, self._measured)
 
-    async def next(self, adaptations: int) -> Next | Pending | Look | Ended:
+    async def next(self) -> Next | Pending | Look | Ended:
         now = await self._side.now()
         fastest = fastest_m_per_s(self._line, now.model)
         wanted = fastest if self._wanted_m_per_s is None else min(self._wanted_m_per_s, fastest)
-        return next_step(self.past, first_speed_m_per_s(self._line), wanted, adaptations)
+        return next_step(self.past, first_speed_m_per_s(self._line), wanted, self._adaptations)
 
     def ended(self, how: Ended) -> Commissioned:
         return commissioned(how, self.past, self._shown, self._measured)
@@ -122,13 +127,16 @@ class _Chain:
         """
         now, recordings = await self._side.now(), await self._side.recordings()
         if not recordings or now.model is None:
-            raise CannotGoOn("the data of the last measurement are no longer there: begin anew (--again)")
+            raise CannotGoOn(
+                "the data of the last measurement are older than gate.data_max_age_s: propose an experiment, then go on"
+            )
         try:
             found = await asyncio.to_thread(self._changes.looked_at, now, recordings)
         except NotOffered as error:
             raise CannotBeJudged(str(error)) from error
         self._tell(f"measurement: {found.text}")
-        decided = await self._decided(diagnosis_question(self._line, found, now, self.past))
+        due = still_due(self.past, self._adaptations)
+        decided = await self._decided(diagnosis_question(self._line, found, now, self.past, due))
         follows, because = Follows(decided.choice.option), decided.choice.reason
         if decided.by != RULES:
             found = found.model_copy(update={"diagnosis": Diagnosis(follows=follows, by=decided.by, because=because)})
@@ -164,6 +172,7 @@ class _Chain:
         evidence = [named(step.step, rung), *map(asked, self._asked)]
         await put(self._line, self._side, made.change, reason, evidence, decided.author, now)
         self._asked.clear()
+        self._doubted = self._doubted and step.step is not Step.MODEL
 
     async def _chosen(self, step: Next, offers: Sequence[Offer], now: LineNow) -> tuple[Decided, int]:
         """And the rung under which it is known."""
@@ -176,9 +185,12 @@ class _Chain:
         return decided, next(one.rung for one in offers if option_id(one.rung) == decided.choice.option)
 
     async def _require_faith(self, found: Identified, now: LineNow) -> None:
-        """Raises NotOffered where the model is not trusted enough to be proposed."""
+        """Raises NotOffered where the model is not trusted enough to be proposed: once, then the gate judges it."""
+        if self._doubted:
+            return
         decided = await self._decided(fidelity_question(self._line, found, now, self.past))
         if decided.choice.option == MORE_DATA:
+            self._doubted = True
             raise NotOffered(f"{decided.by} asks for more data first: {decided.choice.reason}"[:MOST_REASON])
 
     async def _decided(self, question: Question) -> Decided:
@@ -195,7 +207,8 @@ class _Chain:
 
 def _reason(made: str, decided: Decided) -> str:
     """With the words of whoever chose, as a quotation."""
-    return made if decided.by == RULES else f'{made}. {decided.by} says: "{printable(decided.choice.reason)}"'
+    said = printable(decided.choice.reason)[:MOST_QUOTED]
+    return made if decided.by == RULES else f'{made}. {decided.by} says: "{said}"'
 
 
 def _require_slow(line: Line, step: Next, now: LineNow) -> None:

@@ -22,7 +22,7 @@ from gateway.commissioning.past import Step
 from gateway.commissioning.redesign import Offer as Redesign
 from gateway.commissioning.redesign import redesigns
 from gateway.core.controller import Controller, config_hash
-from gateway.core.deployment import Region
+from gateway.core.deployment import Region, first_region
 from gateway.core.experiment import Experiment
 from gateway.core.line import Line
 from gateway.core.line_model import LineModel, ModelRefused, model_hash
@@ -68,7 +68,7 @@ class Offer:
 
 def first_speed_m_per_s(line: Line) -> float:
     """Up to which a first configuration is judged."""
-    return min(line.gate.first_speed_max_m_per_s, line.limits.speed_max_m_per_s)
+    return first_region(line).speed_max_m_per_s or line.limits.speed_max_m_per_s
 
 
 class Changes:

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from gateway.core.line import Line
 
 NOT_REACHED = 1  #: exit code
+MOST_WHY = 1000
 T = TypeVar("T")
 
 
@@ -33,13 +34,13 @@ def commission(
         bool, typer.Option("--history", help="Show what has been tried on the line until now; propose nothing.")
     ] = False,
     again: Annotated[
-        str,
+        str | None,
         typer.Option(
             "--again",
             metavar="WHY",
             help="The line is no longer as it was (another grade, a new part): anew from its file and low speed on.",
         ),
-    ] = "",
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="With --history: print as JSON.")] = False,
 ) -> None:
     """Bring a new line that runs to an adapted configuration over its range of speeds, each step through the gate.
@@ -56,13 +57,15 @@ def commission(
     Example, to the speed at which the line produces, and once more on all data: r2rgate commission line.toml
     --speed 0.08 --adaptations 2
 
-    Example, after another web was threaded: r2rgate commission line.toml --again "PET 50 um instead of 36"
+    Example, after another web was threaded, and its stiffness written into the file: r2rgate commission line.toml
+    --again "PET 50 um instead of 36"
     """
     from gateway.cli.commission import commission as carried_out
     from gateway.cli.commission_history import history as tried_on
     from gateway.cli.commission_result import Commissioned
     from gateway.cli.commission_side import CannotGoOn
     from gateway.cli.waiting import interruptible
+    from gateway.commissioning.chain import refused_at_once
 
     line = read_line(file)
     if history:
@@ -74,9 +77,12 @@ def commission(
         _show(found, as_json)
         return
 
+    if again is not None:
+        _require_reason(again, refused_at_once(line))
+
     async def whole(side: "LiveGate") -> Commissioned:
         try:
-            if again:
+            if again is not None:
                 await side.line_changed(again)
         except CannotGoOn as error:
             return Commissioned(False, str(error), [], None)
@@ -88,11 +94,20 @@ def commission(
             ),
         )
 
-    with interruptible("nothing of what is approved is lost; the same command goes on from here"):
+    without = "" if again is None else ", without --again,"
+    with interruptible(f"nothing of what is approved is lost; the same command{without} goes on from here"):
         ended = with_gate(line, run_dir, typer.echo, whole)
     typer.echo(f"{'commissioned' if ended.reached else 'not commissioned'}: {ended.text}")
     if not ended.converged:
         raise typer.Exit(NOT_REACHED)
+
+
+def _require_reason(again: str, closed: str) -> None:
+    """Nothing that was learned of a line is given up for a slip of the hand."""
+    why = closed or ("" if 0 < len(again.strip()) <= MOST_WHY else f"--again takes the reason, 1 to {MOST_WHY} letters")
+    if why:
+        typer.echo(why, err=True)
+        raise typer.Exit(REFUSED)
 
 
 async def with_agents(line: "Line", run_dir: "Path | None", work: Callable[["Decider"], Awaitable[T]]) -> T:

@@ -22,6 +22,7 @@ SIZE = "larger moves tell more, and take tensions further from their set-points"
 MOST_FACTS = 24
 MOST_LETTERS = 600
 PROPOSE, MORE_DATA = "propose", "more-data"
+IN_ANY_CASE = "another adaptation is asked for: an experiment, a model and a redesign follow in any case"
 
 #: A measurement leaves nothing to choose.
 _ASKED: dict[Step, tuple[Decision, str, str]] = {
@@ -86,16 +87,21 @@ def fidelity_question(line: Line, found: Identified, now: LineNow, past: Sequenc
     )  # fmt: skip
 
 
-def diagnosis_question(line: Line, found: Convergence, now: LineNow, past: Sequence[Past]) -> Question:
-    """Why the line does not do what it should, and so what follows."""
+def diagnosis_question(
+    line: Line, found: Convergence, now: LineNow, past: Sequence[Past], due: bool = False
+) -> Question:
+    """Why the line does not do what it should, and so what follows. `due`: another adaptation does in any case."""
+    in_any_case = [IN_ANY_CASE] if due else []
     figures = [figure("measured tracking error over the predicted one, less 1", found.gap, "")]
-    for name, one in found.spans.items():
+    worst_first = sorted(found.spans.items(), key=lambda each: -each[1].rmse_n)  # those of many spans are too many
+    for name, one in worst_first:
         figures += _span_figures(f"span {name}, measured", one)
         figures += _span_figures(f"span {name}, predicted", found.predicted[name])
     return Question(
         format=1, site=line.site, line=line.line, decision="adapt.diagnosis",
         task="why the line does what was measured, and what follows from it",
-        facts=_brief([f"measured: {found.text}", *_state(line, now), *_tried(past)]), figures=figures[:64],
+        facts=_brief([f"measured: {found.text}", *in_any_case, *_state(line, now), *_tried(past)]),
+        figures=figures[:64],
         options=[
             Option(id=Follows.NEWER_MODEL, title="the model does not foresee it: another experiment and a newer model"),
             Option(id=Follows.CALMER, title="the model foresees it: a calmer configuration on the same model"),
@@ -112,7 +118,9 @@ def option_id(rung: int) -> str:
 
 
 def _facts(line: Line, step: Next, now: LineNow, past: Sequence[Past]) -> list[str]:
-    return _brief([*_state(line, now), *_tried([one for one in past if one.step is step.step])])
+    measured = [one for one in past if one.step is Step.MEASUREMENT and one.follows is not None]
+    shown = [f"measured last: {one.why}; concluded from it: {one.follows}" for one in measured[-1:]]
+    return _brief([*shown, *_state(line, now), *_tried([one for one in past if one.step is step.step])])
 
 
 def _state(line: Line, now: LineNow) -> list[str]:

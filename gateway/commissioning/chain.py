@@ -118,18 +118,23 @@ def _measured(
     if measured.follows is None:
         return Look(measured.proposal)
     what = f"an adapted configuration is in service up to {region_speed(past) or 0.0:.3g} m/s"
-    redesigned = sum(_is_done(one, "gains") for one in past[_first_model(past) :])
-    if measured.follows is Follows.LEAVE and redesigned >= adaptations:
+    due = still_due(past, adaptations)
+    if measured.follows is Follows.LEAVE and not due:
         return Ended(True, f"{what}; {measured.why}", measured.converged)
     rounds = sum(one.step is Step.MEASUREMENT and _is_done(one, "experiment") for one in past)
     if rounds >= MOST_ROUNDS:
         return Ended(True, f"{what}, and after {rounds} measurements that is left as it is; {measured.why}")
-    calmer = redesigned >= adaptations and measured.follows is Follows.CALMER
+    calmer = not due and measured.follows is Follows.CALMER
     # What is in service has been judged for all that data have shown: as it is, it is no candidate here.
     found = on_ladder(Step.REDESIGN, since, _known_by_measurement(past), AS_IT_IS) if calmer else more
     if isinstance(found, Ended):
         return Ended(True, f"{what}; {measured.why}; {found.text}", measured.converged)
     return found
+
+
+def still_due(past: Sequence[Past], adaptations: int) -> bool:
+    """Whether a further adaptation follows whatever a measurement has shown. A model has been accepted."""
+    return sum(_is_done(one, "gains") for one in past[_first_model(past) :]) < adaptations
 
 
 def region_speed(past: Sequence[Past]) -> float | None:

@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 
 from gateway.core.controller import ControllerConfig
 from gateway.core.controller_laws import Feedforward, Matrix
-from gateway.core.line import NonNegative, Positive, Strict
+from gateway.core.line import Line, NonNegative, Positive, Strict
 
 Hash = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]  #: `controller.config_hash`
 Epoch = Annotated[int, Field(ge=1, le=2**53)]  #: of deployments, one after the other, also over restarts
@@ -30,10 +30,26 @@ class Region(Strict):
         both = ((name, value, getattr(other, name)) for name, value in self.model_dump().items())
         return Region(**{name: None if None in (a, b) else max(a, b) for name, a, b in both})
 
+    def no_further(self, other: "Region") -> "Region":
+        """Only as far as both go."""
+        both = ((name, value, getattr(other, name)) for name, value in self.model_dump().items())
+        return Region(**{name: min((one for one in (a, b) if one is not None), default=None) for name, a, b in both})
+
     def within(self, other: "Region") -> bool:
         """Whether it goes nowhere beyond `other`."""
         mine, its = self.model_dump(), other.model_dump()
         return all(its[name] is None or (mine[name] is not None and mine[name] <= its[name]) for name in its)
+
+
+def first_region(line: Line) -> Region:
+    """Of a first configuration, and of whatever runs once nothing is known of the line any more."""
+    limits, gate = line.limits, line.gate
+    fastest = min(gate.first_speed_max_m_per_s, limits.speed_max_m_per_s)
+    return Region(
+        speed_max_m_per_s=fastest,
+        tension_step_max_n=min(limits.tension_step_max_n, gate.first_step_max_n),
+        speed_step_max_m_per_s=min(limits.speed_step_max_m_per_s, fastest),
+    )
 
 
 class RecoveryNode(Strict):

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, TypeAdapter, ValidationError
 
-from gateway.core.deployment import Deployment, Epoch, Hash, InService, RecoveryPrediction
+from gateway.core.deployment import Deployment, Epoch, Hash, InService, RecoveryPrediction, Region
 from gateway.core.experiment import Experiment, experiment_hash
 from gateway.core.line import Strict
 
@@ -104,6 +104,15 @@ class WatchGood(Strict):
     watch: RecoveryPrediction
 
 
+class Narrow(Strict):
+    """The line is no longer as it was: what runs, and what it would go back to, goes no further than `region` from now
+    on, and no prediction watches it. From the gateway only.
+    """
+
+    command: Literal["narrow"] = "narrow"
+    region: Region
+
+
 class Rollback(Strict):
     """Back to the last known good, now. Where that runs, nothing changes."""
 
@@ -118,10 +127,11 @@ class AskConfiguration(Strict):
 
 
 Operating = Arm | Start | Hold | Stop | SetTension | SetSpeed | SelectRecipe | RunExperiment | AbortExperiment
-Configuring = Deploy | Renew | Keep | WatchGood | Rollback | AskConfiguration
+Configuring = Deploy | Renew | Keep | WatchGood | Narrow | Rollback | AskConfiguration
 Command = Annotated[Operating | Configuring, Field(discriminator="command")]
 _command: TypeAdapter[Command] = TypeAdapter(Command)
-Deploying = Deploy | Renew | Keep | WatchGood  #: what only the gateway's deployer says, never a person directly
+#: What only the gateway's deployer says, never a person directly.
+Deploying = Deploy | Renew | Keep | WatchGood | Narrow
 
 MAX_COMMAND = 4096  #: bytes of a command as JSON
 #: The same for those with matrices, unpacked. What parses it holds the interpreter for about 10 ms a megabyte.
@@ -136,6 +146,8 @@ def in_words(command: Command) -> str:
         return f"deploy {command.deployment.hash[:12]} as epoch {command.deployment.epoch}"
     if isinstance(command, Keep):
         return f"keep {command.epoch}"
+    if isinstance(command, Narrow):
+        return "narrow"
     if isinstance(command, WatchGood):
         return f"watch-good {command.watch.fallback[:12]}"
     values = command.model_dump().items()

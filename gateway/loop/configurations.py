@@ -160,6 +160,17 @@ class Configurations:
         self._watch(watch, recovery)
         self._say("watched", "is watched by the model that was accepted last")
 
+    def narrow(self, region: Region) -> None:
+        """The line is another one. Only where nothing is on probation."""
+        alone = self.running is self.good
+        self.good = replace(self.good, region=self.good.region.no_further(region), watch=None, recovery=None)
+        self.running = self.good if alone else replace(
+            self.running, region=self.running.region.no_further(region), watch=None, recovery=None
+        )  # fmt: skip
+        self.to_keep = True
+        self._no_faster(self.running.region)
+        self._say("narrowed", "is no longer known to hold: it goes no further than a first configuration")
+
     def _watch(self, watch: RecoveryPrediction | None, recovery: Recovery | None) -> None:
         good = replace(self.good, watch=watch, recovery=recovery)
         self.running = good if self.running is self.good else replace(self.running, watch=watch, recovery=recovery)
@@ -176,10 +187,14 @@ class Configurations:
         self.path.take_over(self.good.law)
         text = f"takes over again from {given_up.hash[:12]}: {reason}"
         self._say("rolled-back", text, given_up=given_up.hash, reason=reason)
-        most = self.good.region.speed_max_m_per_s
-        if most is not None and self._setpoints.speed_target_m_per_s > most:  # further than what runs was judged for
-            self._setpoints.speed_target_m_per_s = most
+        self._no_faster(self.good.region)
         return True
+
+    def _no_faster(self, region: Region) -> None:
+        """Than what runs was judged for."""
+        most = region.speed_max_m_per_s
+        if most is not None and self._setpoints.speed_target_m_per_s > most:
+            self._setpoints.speed_target_m_per_s = most
 
     def look(self, now_s: float) -> None:
         """Once a period, before control."""

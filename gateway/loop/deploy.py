@@ -3,7 +3,7 @@
 from gateway.core.controller import Controller, ControllerRefused
 from gateway.core.deployment import Deployment, RecoveryPrediction
 from gateway.core.doubts import in_words
-from gateway.core.messages import AskConfiguration, Configuring, Deploy, Keep, Renew, Rollback, WatchGood
+from gateway.core.messages import AskConfiguration, Configuring, Deploy, Keep, Narrow, Renew, Rollback, WatchGood
 from gateway.core.states import Phase
 from gateway.loop.configurations import Configurations
 from gateway.loop.cycle import Cycle
@@ -26,6 +26,8 @@ def configure(cycle: Cycle, command: Configuring, now_s: float) -> str:
             return _keep(cycle, command)
         case WatchGood():
             return _watch_good(cycle, command)
+        case Narrow():
+            return _narrow(cycle, command)
         case Rollback():
             done = cycle.configurations.roll_back(command.reason)
             runs = f"{cycle.configurations.good.hash[:12]}, the last known good, runs"
@@ -97,6 +99,22 @@ def _watch_good(cycle: Cycle, command: WatchGood) -> str:
         command.watch, _recovery(configurations, command.watch, good.config, "not watched by another model")
     )
     return f"{configurations.running.hash[:12]} is watched by the model that was accepted last"
+
+
+def _narrow(cycle: Cycle, command: Narrow) -> str:
+    configurations, speed = cycle.configurations, cycle.setpoints.speed_target_m_per_s
+    reasons: list[str] = []
+    if configurations.probation is not None:
+        reasons.append(f"epoch {configurations.epoch} is on probation: keep it or roll it back first")
+    if cycle.experiments.run is not None:
+        reasons.append("an experiment is under way: wait for its end, or abort it")
+    most = command.region.speed_max_m_per_s
+    if most is not None and speed > most and cycle.machine.phase is not Phase.SILENT:
+        reasons.append(f"the line shall run at {speed:g} m/s; allowed: up to {most:g} m/s, `r2rgate speed {most:g}`")
+    if reasons:
+        raise Refused("not narrowed", reasons)
+    configurations.narrow(command.region)
+    return f"{configurations.running.hash[:12]} goes no further than a first configuration"
 
 
 def _recovery(configurations: Configurations, watch: RecoveryPrediction, fallback: Controller, not_: str) -> Recovery:

@@ -103,11 +103,19 @@ class Deployer:
         """From now on it is another line: what was learned of it, and what was judged by that, counts no more."""
         async with self._records.one_step:
             try:
+                if reason := self.book.why_not(LINE_CHANGED, {}):
+                    return refused("nothing is changed", [reason])
+                # The loop first: it can only become narrower by it, whatever becomes of the record.
+                narrowed = await self._on_the_line.narrow()
+                if not narrowed.ok:
+                    return refused("nothing is changed", narrowed.reasons or [narrowed.text])
                 await self._records.step(LINE_CHANGED, {"because": because}, who)
-            except (AuditUnavailable, Impossible) as error:
+            except (AuditUnavailable, Unreachable, Impossible) as error:
                 return refused("nothing is changed", [str(error)])
         return done(
-            "proposals are judged on the line's file again; what is in service stays until something else is approved"
+            "from now on proposals are judged on the line's file: it must be right for the new web and parts, so write "
+            "its values there and start the gateway anew where they lie beyond its tolerances. What is in service "
+            "stays, for low speed and small steps, until something else is approved"
         )
 
     def look_again(self) -> None:

@@ -206,9 +206,7 @@ class Gate:
             configurations.store(line.site, line.line, change.controller, origin)
         elif isinstance(change, ModelChange):
             entry = models.store(change.model, now_s)
-            for other in models.entries(line.site, line.line):
-                if other.state == "accepted" and other.id != entry.id:
-                    models.mark(other.id, "superseded", now_s, f"by version {entry.version}")
+            _supersede(models, line, entry.id, now_s, f"by version {entry.version}")
             models.mark(entry.id, "accepted", now_s, proposal.reason[:400])
 
     async def propose(self, payload: bytes, who: Who) -> Reply:
@@ -259,18 +257,24 @@ class Gate:
         return reply.model_dump_json().encode()
 
     async def _line_changed(self, deployer: Deployer, said: LineChanged, who: Who) -> Reply:
-        model = deployer.book.model
         reply = await deployer.line_changed(said.because, who)
-        if reply.ok and model is not None and self._stores is not None:
+        if reply.ok and self._stores is not None:
             try:
-                self._stores[1].mark(model, "superseded", self._wall_clock(), f"the line has changed: {said.because}")
+                _supersede(self._stores[1], self._line, deployer.book.model, self._wall_clock(), said.because)
             except ModelsError as error:  # nothing is judged by it any more all the same
-                self._note("gate", f"model {model[:12]} is not marked as superseded: {error}")
+                self._note("gate", f"a model is not marked as superseded: {error}")
         return reply
 
     def shut_reply(self) -> Reply:
         """To whoever asks before the gate is open."""
         return Reply(ok=False, state="", text="the gate is shut", reasons=[self._shut])
+
+
+def _supersede(models: Models, line: Line, but: str | None, now_s: float, why: str) -> None:
+    """Every accepted model of the line `but` this one. Raises ModelsError."""
+    for other in models.entries(line.site, line.line):
+        if other.state == "accepted" and other.id != but:
+            models.mark(other.id, "superseded", now_s, why)
 
 
 def _who(peer: Peer | None) -> Who:

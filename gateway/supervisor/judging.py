@@ -134,7 +134,13 @@ class JudgeWorkers:
         """
         seed = secrets.randbelow(LARGEST_SEED) if seed is None else seed
         limit_s = self._line.gate.verdict_max_s if limit_s is None else limit_s
-        worker = await self._idle.get() or await asyncio.to_thread(self._begun)
+        worker = await self._idle.get()
+        if worker is None:
+            try:
+                worker = await asyncio.to_thread(self._begun)
+            except BaseException:
+                self._idle.put_nowait(None)  # another one may begin
+                raise
         asked = asyncio.ensure_future(
             asyncio.to_thread(worker.ask, (payload, context, list(recordings), seed), limit_s)
         )

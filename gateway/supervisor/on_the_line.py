@@ -6,9 +6,19 @@ What the loop says of itself settles what a record left open: after a restart, a
 from collections.abc import Callable
 
 from gateway.core.audit_record import Who
-from gateway.core.deployment import Deployment, InService
+from gateway.core.deployment import Deployment, InService, first_region
 from gateway.core.line import Line
-from gateway.core.messages import AskConfiguration, Deploy, Keep, Renew, Reply, Rollback, RunExperiment, WatchGood
+from gateway.core.messages import (
+    AskConfiguration,
+    Deploy,
+    Keep,
+    Narrow,
+    Renew,
+    Reply,
+    Rollback,
+    RunExperiment,
+    WatchGood,
+)
 from gateway.core.proposal import ExperimentChange, GainsChange, Proposal
 from gateway.mailbox.port import RemoteError, Unreachable
 from gateway.supervisor.audit_file import AuditUnavailable
@@ -88,6 +98,12 @@ class OnTheLine:
         await self.settle()
         return reply
 
+    async def narrow(self) -> Reply:
+        """To what a first configuration is judged for. Raises as `settle`."""
+        reply = await self._loop.tell(Narrow(region=first_region(self._line)))
+        await self.settle()
+        return reply
+
     async def experiment_ended(self, hash_: str, because: str) -> None:
         """The loop has told that an experiment is over; `because` empty: complete."""
         async with self._records.one_step:
@@ -135,6 +151,8 @@ class OnTheLine:
     async def _look_after(self, found: InService) -> None:
         entry, now_s = self._records.book.on_the_line, self._clock()
         if entry is None:
+            if self._goes_too_far(found):  # a loop that was started anew before its disk knew
+                await self.narrow()
             await self._look_after_good(found)
             return
         if entry.stage is Stage.RUNNING:
@@ -148,6 +166,12 @@ class OnTheLine:
         elif now_s - self._renewed_s >= LEASE_S / 3.0:
             await self._loop.tell(Renew(epoch=entry.epoch or found.epoch))
             self._renewed_s = now_s
+
+    def _goes_too_far(self, found: InService) -> bool:
+        """For a line that has changed, and of which nothing has been learned since."""
+        book = self._records.book
+        changed = book.line_changed_s is not None and book.model is None
+        return changed and not found.on_probation and not found.region.within(first_region(self._line))
 
     def _to_look_after(self) -> bool:
         book = self._records.book

@@ -63,7 +63,7 @@ class LineSurroundings:
             state=self._state(book, now_s),
             in_service=self._controller(book.in_service),
             region=book.judged_for,
-            baseline=self._baseline(),
+            baseline=self._baseline(book),
             model=self._model(book),
             data=[
                 DataReference(path=f"{one.digest()}.npz", digest=one.digest(), recorded=iso(end_s))
@@ -143,9 +143,14 @@ class LineSurroundings:
             raise NotKnown(f"the configuration in service, {hash_[:12]}, is damaged in the store")
         return controller
 
-    def _baseline(self) -> Controller | None:
+    def _baseline(self, book: Book) -> Controller | None:
+        """What was archived on the line as it is now: on another web it was never judged."""
+        site, line, changed_s = self._line.site, self._line.line, book.line_changed_s
         try:
-            return self._configurations.find(STABLE, self._line.site, self._line.line).controller
+            archived = [one.time_s for _, one in self._configurations.archives(site, line) if one.name == STABLE]
+            if not archived or (changed_s is not None and archived[-1] <= changed_s):
+                return None
+            return self._configurations.find(STABLE, site, line).controller
         except ConfigurationsError:
             return None
 

@@ -14,10 +14,11 @@ from gateway.cli.stepped import SteppedLoop, run_scenario
 from gateway.commissioning.past import Step
 from gateway.control.design import design_lqi, task_of, task_on
 from gateway.core.controller import config_hash
+from gateway.core.messages import SetSpeed
 from gateway.core.scenario import Scenario
 from gateway.supervisor.book_file import book_in
 from gateway.supervisor.lifecycle import Stage
-from tests.bench.control_plants import random_plant
+from sim_plant.drawn import random_plant, scaled
 from tests.closed_loop.recorded import demonstration_line
 from tests.closed_loop.truths import truth_of, with_friction_and_lag
 
@@ -113,3 +114,29 @@ def test_a_new_line_with_friction_that_nobody_knows_of_ends_with_an_adapted_conf
     adapted, best = (run_scenario(LINE, config, plant, STEP, SEED) for config in (in_service, on_truth))
     assert adapted.stopped is None and adapted.unsafe_events == 0
     assert adapted.rmse_n < 1.05 * best.rmse_n
+
+
+def test_another_web_on_the_same_line_is_adapted_to_from_the_beginning_and_nothing_goes_fast_before(tmp_path):
+    plant = random_plant(SEED + 1, SPANS)
+    other = scaled(plant, {"stiffness_n": 0.85})
+
+    async def run():
+        loop = producing(plant)
+        async with SteppedGate(loop, tmp_path, SEED) as side:
+            before = await commission(LINE, side, wanted_m_per_s=0.05)
+            now = await side.now()
+        assert before.reached, before.text
+        again = SteppedLoop(LINE, now.in_service, other, SEED)
+        recipe = LINE.recipes[0]
+        again.begin_in_production(np.array(recipe.tension_n), recipe.speed_m_per_s)
+        async with SteppedGate(again, tmp_path, SEED + 1, before=side) as then:
+            await then.line_changed("a thinner web")
+            assert (await then.now()).model is None and not await then.recordings() and not await then.proposals()
+            assert not again.command(SetSpeed(speed_m_per_s=0.05)).ok
+            found = await commission(LINE, then, wanted_m_per_s=0.05)
+            return again, found, (await then.now()).model
+
+    loop, found, model = asyncio.run(run())
+    assert found.reached and found.converged, found.text
+    assert found.tried[0].step == Step.FIRST
+    assert model is not None and loop.truth.recorder.unsafe_total == 0 and not loop.transitions

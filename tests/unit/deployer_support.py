@@ -6,9 +6,9 @@ from dataclasses import dataclass, field
 
 from gateway.control.design import design_lqi, task_of
 from gateway.core.controller import config_hash
-from gateway.core.deployment import InService, RecoveryNode, RecoveryPrediction, Region
+from gateway.core.deployment import Deployment, InService, RecoveryNode, RecoveryPrediction, Region
 from gateway.core.judge_context import JudgeContext, LineState, context_hash
-from gateway.core.messages import Command, Deploy, Keep, Renew, Reply, Rollback, RunExperiment, WatchGood
+from gateway.core.messages import Command, Deploy, Keep, Narrow, Renew, Reply, Rollback, RunExperiment, WatchGood
 from gateway.core.proposal import GainsChange, Proposal, proposal_hash
 from gateway.core.verdict import RuleFinding, Verdict
 from gateway.mailbox.port import Unreachable
@@ -97,6 +97,7 @@ class FakeLoop:
         self.reachable = True
         self.answers = True
         self.takes = True
+        self.fast = False
         self.watches: list[tuple[str, RecoveryPrediction | None]] = []  #: by command
 
     async def tell(self, command: Command) -> Reply:
@@ -132,20 +133,30 @@ class FakeLoop:
     def go_back(self, why: str) -> None:
         self.runs, self.region, self.lease_end_s, self.why = self.good, self.good_region, None, why
 
+    def _narrowed(self, region: Region) -> tuple[bool, str]:
+        if self.lease_end_s is not None or self.fast:
+            return False, "the line shall run at 1 m/s"
+        self.region, self.good_region = (one.no_further(region) for one in (self.region, self.good_region))
+        return True, "narrowed"
+
+    def _deployed(self, deployment: Deployment) -> tuple[bool, str]:
+        self.watches.append(("deploy", deployment.watch))
+        if not self.takes or deployment.epoch != self.epoch + 1 or self.lease_end_s is not None:
+            return False, "not its successor, or not now"
+        self.runs, self.epoch, self.why = deployment.hash, deployment.epoch, "deployed"
+        self.region = deployment.region
+        self.lease_end_s = self.now_s + deployment.lease_s
+        self.lease_s = deployment.lease_s
+        return True, "deployed"
+
     def _done(self, command: Command) -> Reply:
         ok, text = True, "done"
+        if isinstance(command, Narrow):
+            ok, text = self._narrowed(command.region)
         if isinstance(command, WatchGood | Keep):
             self.watches.append((command.command, command.watch))
         if isinstance(command, Deploy):
-            deployment = command.deployment
-            self.watches.append(("deploy", deployment.watch))
-            ok = self.takes and deployment.epoch == self.epoch + 1 and self.lease_end_s is None
-            text = "deployed" if ok else "not its successor, or not now"
-            if ok:
-                self.runs, self.epoch, self.why = deployment.hash, deployment.epoch, "deployed"
-                self.region = deployment.region
-                self.lease_end_s = self.now_s + deployment.lease_s
-                self.lease_s = deployment.lease_s
+            ok, text = self._deployed(command.deployment)
         elif isinstance(command, Renew | Keep) and (command.epoch != self.epoch or self.lease_end_s is None):
             ok, text = False, "nothing is on probation under this epoch"
         elif isinstance(command, Renew):

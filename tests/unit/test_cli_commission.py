@@ -170,6 +170,18 @@ def test_what_an_agent_chooses_is_proposed_in_its_name_and_what_was_refused_is_t
     assert not picky.asked[MOST_OWN].knobs
 
 
+def test_no_words_of_an_agent_end_the_phase_however_long_they_are_once_printed(tmp_path):
+    class Breathless(Picky):
+        def decide(self, question):
+            decided = super().decide(question)
+            return replace(decided, choice=decided.choice.model_copy(update={"reason": "\n" * 2000}))
+
+    gateway = OneProcess(tmp_path)
+    found = asyncio.run(commission(LINE, gateway.side, gateway.told.append, decider=Breathless()))
+    assert len(found.tried) == MOST_OWN + LADDERS[Step.FIRST]
+    assert all(len(one.proposal.reason) <= 4000 for one in gateway.shown.values())
+
+
 def test_where_an_agent_does_not_answer_the_rules_decide_and_it_is_told(tmp_path):
     class Absent(Rules):
         def decide(self, question):

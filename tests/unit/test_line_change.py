@@ -3,10 +3,10 @@
 from dataclasses import replace
 
 from gateway.core.controller import config_hash
-from gateway.core.deployment import Region
+from gateway.core.deployment import Region, first_region
 from gateway.supervisor.lifecycle import LINE_CHANGED, Book, Entry, Stage, book_of
 from tests.unit.deployer_gateway import ANNA, PROBATION_S, deployed, run, started
-from tests.unit.deployer_support import FIRST, controller, hash_of, proposal
+from tests.unit.deployer_support import FIRST, LINE, controller, hash_of, proposal
 
 WIDE = Region(speed_max_m_per_s=0.1)
 WHY = "PET 50 um in place of 36"
@@ -56,6 +56,31 @@ async def test_it_waits_for_the_end_of_what_is_being_done_to_the_line():
     await gateway.pass_time(PROBATION_S + 1.0)
     assert gateway.stage(one) is Stage.KEPT
     assert (await gateway.deployer.line_changed(WHY, ANNA)).ok
+
+
+@run
+async def test_the_loop_goes_no_further_than_a_first_configuration_from_then_on_and_again_after_a_restart_of_it():
+    gateway, _ = await deployed()
+    await gateway.pass_time(PROBATION_S + 1.0)
+    gateway.loop.fast = True
+    reply = await gateway.deployer.line_changed(WHY, ANNA)
+    assert not reply.ok and "the line shall run" in reply.reasons[0] and LINE_CHANGED not in gateway.audit.kinds
+    gateway.loop.fast = False
+    assert (await gateway.deployer.line_changed(WHY, ANNA)).ok
+    first = first_region(LINE)
+    assert gateway.loop.region == gateway.loop.good_region == gateway.deployer.book.region == first
+    gateway.loop.region = gateway.loop.good_region = WIDE  # its disk did not know
+    gateway.deployer.look_again()
+    await gateway.pass_time(1.0)
+    assert gateway.loop.region == gateway.deployer.book.region == first
+
+
+@run
+async def test_without_a_loop_nothing_is_said_of_the_line():
+    gateway = await started()
+    gateway.loop.reachable = False
+    assert not (await gateway.deployer.line_changed(WHY, ANNA)).ok
+    assert gateway.deployer.book.line_changed_s is None
 
 
 @run
