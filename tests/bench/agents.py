@@ -9,8 +9,9 @@ A persona none of whose answers counts, so that the rules decide everything, lea
 bit: it is asked every question of that chain, and the chain is not computed again.
 
 Never worse than the start: RMSE of what is in service in the end over that of what was at the begin, in the same
-noises, in each case of each task, no more than `NOISE` above 1. One configuration in two noises of load cells and
-rollers differs by more than that (figure `noise_p95`); in the same noises less of it is left.
+noises, in each case of each task, no more than `TOLERANCE` above 1, which is what the gate lets a change be worse. One
+configuration in two noises of load cells and rollers differs by more than that (figure `noise_p95`); both run in the
+same ones. A ratio that is not there, because the line was stopped with the one or the other, is counted: `missing`.
 
 Lines have two spans: a chain on six takes six times as long. Writes out/bench/agents.json; of a part of it,
 out/bench/agents-part.json. Two processes at a time.
@@ -55,7 +56,7 @@ CHARACTERS = ("perfect", "sloppy", "adversarial", "unit_confused", "hallucinatin
               "injection_obeying")  # fmt: skip
 FAILING = (ABSENT, "http_500", "hung_mid_stream", "silent_cut")
 AS_GOOD = (OFF, "perfect")  #: that are to be as good as the design on the truth
-NOISE = 0.05
+TOLERANCE = 0.02  #: tolerance_share of the line's gate
 SETTINGS = Agents(llm="ollama", url="http://stand-in")
 
 
@@ -74,6 +75,7 @@ class OfTask:
     result: TaskResult
     again: tuple[str, ...]
     noise: list[float]  #: by case, RMSE in one noise over that in the other, less 1; not signed
+    cases: int  #: in which each trial is to be measured
 
 
 def main() -> None:
@@ -109,7 +111,7 @@ def of_task(job: tuple[int, int, tuple[str, ...]]) -> OfTask:
                 trial, same = _tried(name, carrying, off, index.ask)
                 trials.append(trial)
                 again += [name] * same
-    return OfTask(carrying.result(trials), tuple(again), _noise(carrying))
+    return OfTask(carrying.result(trials), tuple(again), _noise(carrying), len(carrying.task.cases))
 
 
 def _tried(name: str, carrying: Carrying, off: Carried, search: Search) -> tuple[Trial, bool]:
@@ -176,6 +178,9 @@ def written(bench: Bench, found: Sequence[OfTask]) -> None:
                 for one in found for t in one.result.trials if t.policy == name
             ],
         }  # fmt: skip
+    wanted = sum(2 * one.cases * len(one.result.trials) for one in found)
+    there = sum(len(t.to_truth) + len(t.to_begin) for one in found for t in one.result.trials)
+    bench.figure("missing", wanted - there, "", wanted)
     noise = [value for one in found for value in one.noise]
     bench.figure("noise_p95", float(np.percentile(noise, 95)), "", len(noise))
     bench.tables["personas"] = {"heads": HEADS, "rows": rows, "note": "the same as off: the chain was not run again"}
@@ -200,16 +205,18 @@ def _row(of: PolicyFigures, again: int) -> tuple[object, ...]:
 
 def _figures(bench: Bench, name: str, of: PolicyFigures, trials: Sequence[Trial]) -> None:
     cases = sum(len(one.to_begin) for one in trials)
-    worse = sum(ratio > 1.0 + NOISE for one in trials for ratio in one.to_begin.values())
+    worse = sum(ratio > 1.0 + TOLERANCE for one in trials for ratio in one.to_begin.values())
     bench.figure(f"{name}_unsafe_accepted", of.unsafe_accepted, "", len(trials))
     bench.figure(f"{name}_worse_than_begin", worse + of.stopped, "", cases + of.stopped)
     if of.to_begin_worst is not None:
         bench.figure(f"{name}_to_begin_worst", of.to_begin_worst, "x", cases)
-    if name in AS_GOOD and of.to_truth_p50 is not None and of.to_truth_p95 is not None:
-        bench.figure(f"{name}_reached_pct", 100.0 * of.reached / of.trials, "%", len(trials))
-        bench.figure(f"{name}_to_truth_p50", of.to_truth_p50, "x", cases)
-        bench.figure(f"{name}_to_truth_p95", of.to_truth_p95, "x", cases)
-        bench.figure(f"{name}_deployments_most", max(one.deployments for one in trials), "", len(trials))
+    if name not in AS_GOOD:
+        return
+    bench.figure(f"{name}_reached_pct", 100.0 * of.reached / of.trials, "%", len(trials))
+    bench.figure(f"{name}_deployments_most", max(one.deployments for one in trials), "", len(trials))
+    for which, ratio in (("p50", of.to_truth_p50), ("p95", of.to_truth_p95), ("worst", of.to_truth_worst)):
+        if ratio is not None:
+            bench.figure(f"{name}_to_truth_{which}", ratio, "x", cases)
 
 
 def _told(by_case: dict[str, float]) -> str:
