@@ -21,7 +21,7 @@ def of(step: Step, proposal: str, stage: str = "done", **changes: Any) -> Change
     return change(proposal, step=step, stage=stage, **changes)
 
 
-def told(changes: list[ChangeResult], questions: list[AskedResult]) -> list[list[tuple[str, str]]]:
+def told(changes: list[ChangeResult], questions: list[AskedResult]) -> list[list[tuple[str, ...]]]:
     """The rows of each story."""
     result = DemoResult.model_construct(configurations=[])
     chain = ChainResult.model_construct(changes=changes, asked=questions)
