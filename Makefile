@@ -101,7 +101,7 @@ bench-kill: setup ## the gateway process killed a thousand times while proposals
 bench-gate-live: $(VENV)/.compiled ## the gate on a running line: rollback, swaps, and the loop while verdicts are computed (about 5 min)
 	@$(PY) -m tests.bench.gate_live $(ARGS)
 
-bench-agents-live: $(VENV)/.compiled ## agents that die, hang, flood or lie beside a running line (about 20 min; ARGS="--rounds 1")
+bench-agents-live: $(VENV)/.compiled ## agents that die, hang, flood or lie beside a running line (about 30 min; ARGS="--rounds 1")
 	@$(PY) -m tests.bench.agents_live $(ARGS)
 
 bench-gate: setup ## proposals of every way of going wrong, judged by the gate and by the truth (ARGS="--parts a --plants 5 --proposals 200")

@@ -51,7 +51,7 @@ def _adaptation(result: DemoResult, chain: ChainResult, before: Sequence[ChangeR
     name = "a redesign that was not measured" if place is None else result.configurations[place].name
     earlier = result.configurations[place - 1].name if place else "what ran before"
     rows = [
-        *(("Diagnosis", text) for text in _diagnosis(chain, before)),
+        *(("Diagnosis", text) for text in _diagnosis(chain, [*before, kept])),
         *(("Tried before", f"{one.name}: {one.reason or one.why}; {verdict_words(one)}") for one in before
           if one.step == Step.REDESIGN),
         ("Change", f"{kept.reason} ({kept.proposal[:12]}, author {kept.author})"),
@@ -68,22 +68,26 @@ def _adaptation(result: DemoResult, chain: ChainResult, before: Sequence[ChangeR
     )
 
 
-def _diagnosis(chain: ChainResult, before: Sequence[ChangeResult]) -> list[str]:
-    """What the line showed since the configuration before, and what was concluded from it."""
+def _diagnosis(chain: ChainResult, changes: Sequence[ChangeResult]) -> list[str]:
+    """What the line showed in `changes`, the last of which is the one that was kept, and what was concluded from it."""
     said: list[str] = []
-    for one in before:
+    for place, one in enumerate(changes):
         if one.step == Step.MEASUREMENT:
             said.append(f"Measured on the line: {one.measured or one.why or one.stage}")
-            said += [_concluded(asked) for asked in _diagnoses(chain, one, before)]
+            said += [_concluded(asked) for asked in _diagnoses(chain, changes[place + 1 :])]
         elif one.step in (Step.EXPERIMENT, Step.MODEL) and one.stage in ("done", "kept"):
             said.append(f"{one.step.capitalize()}: {one.reason}; {verdict_words(one)}")
     return said
 
 
-def _diagnoses(chain: ChainResult, measurement: ChangeResult, before: Sequence[ChangeResult]) -> list[AskedResult]:
-    """Of this measurement: those whose proposal came after it, before the redesign."""
-    later = {one.proposal for one in before[before.index(measurement) + 1 :] if one.proposal}
-    return [one for one in chain.asked if one.decision == DIAGNOSES and one.proposal in later]
+def _diagnoses(chain: ChainResult, later: Sequence[ChangeResult]) -> list[AskedResult]:
+    """Of a measurement: those that whatever was proposed after it names, up to the next measurement.
+
+    A newer model is begun with an experiment; a calmer configuration is the next thing that is proposed.
+    """
+    until = next((k + 1 for k, one in enumerate(later) if one.step == Step.MEASUREMENT), len(later))
+    named = {one.proposal for one in later[:until] if one.proposal}
+    return [one for one in chain.asked if one.decision == DIAGNOSES and one.proposal in named]
 
 
 def _concluded(one: AskedResult) -> str:

@@ -3,6 +3,8 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from datetime import datetime
+from pathlib import Path
+from shlex import quote
 
 from gateway.cli.agents_view import as_story
 from gateway.cli.demo_result import AskedResult, ChainResult, ChangeResult, FigureResult, OptionResult, RuleResult
@@ -14,14 +16,16 @@ MOST_OPTIONS = 6  #: in a table; all stand in the details
 MOST_FIGURES = 4
 
 
-def asked_section(chain: ChainResult, interactions: Sequence[Interaction]) -> Section:
+def asked_section(chain: ChainResult, interactions: Sequence[Interaction], data: Path) -> Section:
+    """`data`: the folder in which the agents' log is."""
     title = "What was asked of the agents"
     if not chain.asked:
         return Section(title, ("Nothing: every step had one candidate.",))
     whole = {one.id: one for one in interactions}
     changes = {one.proposal: one for one in chain.changes if one.proposal}
-    stories = tuple(_story(number, one, changes, whole.get(one.interaction)) for number, one in
-                    enumerate(chain.asked, 1))  # fmt: skip
+    stories = tuple(
+        _story(number, one, changes, whole.get(one.interaction), data) for number, one in enumerate(chain.asked, 1)
+    )
     return Section(title, (f"{in_short(chain.asked)}.",), stories=stories)
 
 
@@ -79,9 +83,12 @@ def result_words(change: ChangeResult) -> str:
     return f"{''.join(parts)}.{measured}"
 
 
-def _story(number: int, one: AskedResult, changes: Mapping[str, ChangeResult], whole: Interaction | None) -> Story:
+def _story(
+    number: int, one: AskedResult, changes: Mapping[str, ChangeResult], whole: Interaction | None, data: Path
+) -> Story:
     story = story_of(one, changes)
-    folds = () if whole is None else (Fold(f"Word by word (r2rgate log {one.interaction})", as_story(whole)),)
+    command = f"r2rgate log {one.interaction} --data-dir {quote(str(data))}"
+    folds = () if whole is None else (Fold(f"Word by word ({command})", as_story(whole)),)
     return replace(story, title=f"{number}. {story.title}", folds=folds)
 
 

@@ -37,7 +37,7 @@ def page(
     sections += [_against_stepped(result)]
     sections += [_case(case, result, [one for one in traces if one.window.case == case], evidence) for case in PAPER]
     sections += [
-        asked_section(chain, interactions),
+        asked_section(chain, interactions, setup.data),
         _through_the_gate(chain),
         _whole_run(evidence),
         _safety(result, chain),

@@ -1,9 +1,11 @@
 """Searches without any reasoning, in the place of whoever chooses a redesign: what they find is proposed as theirs.
 
 They turn the knobs that the chain's redesigns have, within the bounds of its question, and look at what the rules look
-at: the courses of the gate's improvement on the accepted model, beside what is in service. They may look as often as
-the rules do. The truth they do not know. What they find goes before the gate like anything else: the best first, then,
-where that is refused, the next. Everything but a redesign they leave to the rules.
+at: the courses of the gate's improvement on the accepted model, beside what is in service. What counts is the tracking
+error in all that is proposed; in what the configuration in service was judged for nothing may be worse. Courses last
+as long as those in which the rules compare predictive control with the rest, wherever that is offered or in service.
+They may look as often as the rules do. The truth they do not know. What they find goes before the gate like
+anything else: the best first, then, where that is refused, the next. Everything but a redesign they leave to the rules.
 """
 
 import asyncio
@@ -19,8 +21,19 @@ from gateway.cli.commission_side import GateSide, region_kept
 from gateway.cli.eval_result import Policy
 from gateway.commissioning.candidates import NotOffered, configuration
 from gateway.commissioning.decisions import RULES, Decided
-from gateway.commissioning.redesign import BRIEF_S, LAWS, PREDICTIVE, Offer, no_worse, predicted, ratio, redesigns
+from gateway.commissioning.redesign import (
+    BRIEF_S,
+    LASTING_S,
+    LAWS,
+    PREDICTIVE,
+    Offer,
+    no_worse,
+    predicted,
+    ratio,
+    redesigns,
+)
 from gateway.control.judged_courses import Judged
+from gateway.core.controller_laws import MpcConfig
 from gateway.core.deployment import Region
 from gateway.core.line import Line
 from gateway.core.line_model import LineModel, model_hash
@@ -92,16 +105,19 @@ class Searching:
         self, question: Question, model: LineModel, offers: Mapping[str, Offer], judged: Judged, region: Region
     ) -> list[Found]:
         line, known = self._line, judged.within(region)
-        before = predicted(self._in_service, line, model, known, BRIEF_S)
+        slow = any(isinstance(one, MpcConfig) for one in (self._in_service, *(of.controller for of in offers.values())))
+        lasting_s = BRIEF_S if slow else LASTING_S
+        before, before_known = (predicted(self._in_service, line, model, of, lasting_s) for of in (judged, known))
 
         def cost(option: str, factors: Factors) -> float:
             try:
                 config = configuration(line, model, offers[option].speed_m_per_s, offers[option].law.turned(factors))
             except NotOffered:
                 return RUNS_AWAY
-            figures = predicted(config, line, model, known, BRIEF_S)
+            figures = predicted(config, line, model, judged, lasting_s)
+            figures_known = figures if known is judged else predicted(config, line, model, known, lasting_s)
             share = float(np.mean([ratio(figures[name].rmse_n, before[name].rmse_n) for name in before]))
-            worse = not all(no_worse(line, figures[name], before[name]) for name in before)
+            worse = not all(no_worse(line, figures_known[name], before_known[name]) for name in before_known)
             return min(share + WORSE * worse, RUNS_AWAY) if share < inf else RUNS_AWAY
 
         bounds = {

@@ -36,7 +36,7 @@ def evaluate(
     in the end beside the design on the truth, unsafe events, tokens and time. The same seed gives the same tasks.
 
     With a model tasks run one after another, and all that is said is kept: `r2rgate log --data-dir out/eval`. Ctrl-C
-    ends it; the tasks that were finished are in the result.
+    ends it; the tasks that were finished are in the result. A task that fails is in it as well, with the reason.
 
     Exit code: 0 done, 1 done and unsafe events were seen at the simulated drives, 2 refused, 130 interrupted.
 

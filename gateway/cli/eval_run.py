@@ -3,7 +3,7 @@
 import asyncio
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -23,8 +23,18 @@ from gateway.core.controller import Controller, config_hash
 from gateway.core.interactions import Interaction
 from gateway.core.questions import Question
 
+MOST_LETTERS = 600  #: of why something failed
+
 Tell = Callable[[str], None]
 Decides = Callable[[SteppedGate, asyncio.AbstractEventLoop], Decider]  #: who decides over a gate, in whose loop
+
+
+class TrialFailed(Exception):
+    """The chain did not come to an end; the text says why. `unsafe_events`: at the simulated drives until then."""
+
+    def __init__(self, why: str, unsafe_events: int) -> None:
+        super().__init__(why)
+        self.unsafe_events = unsafe_events
 
 
 @dataclass
@@ -70,7 +80,10 @@ class Carrying:
         return self._worth[hash_]
 
     def carried_out(self, decides: Decides, tell: Tell = lambda text: None) -> Carried:
-        """From the line's file to where the chain ends, or `MOST_DEPLOYMENTS` redesigns are in service."""
+        """From the line's file to where the chain ends, or `MOST_DEPLOYMENTS` redesigns are in service.
+
+        Raises TrialFailed, whatever goes wrong on the way.
+        """
         task, began_s, processor_s = self.task, time.monotonic(), time.process_time()
         loop = SteppedLoop(task.line, task.begin, task.plant, task.seed)
         recipe = task.line.recipes[0]
@@ -85,8 +98,11 @@ class Carrying:
                 )  # fmt: skip
                 return found, (await side.now()).in_service, decider
 
-        with tempfile.TemporaryDirectory() as folder:
-            found, in_service, decider = asyncio.run(run(Path(folder)))
+        try:
+            with tempfile.TemporaryDirectory() as folder:
+                found, in_service, decider = asyncio.run(run(Path(folder)))
+        except Exception as error:  # who decides is under test, and may raise anything
+            raise TrialFailed(told(error), loop.truth.recorder.unsafe_total) from error
         return Carried(
             found, in_service, decider.asked, loop.truth.recorder.unsafe_total, loop.now_s,
             time.process_time() - processor_s, time.monotonic() - began_s,
@@ -105,13 +121,7 @@ class Carrying:
             experiments=sum(one.kind == "experiment" and one.stage == "done" for one in found.tried),
             deployments=sum(one.step == Step.REDESIGN and one.stage == "kept" for one in found.tried),
             rejections=rejections(found.tried, interactions),
-            asked=Asked(
-                questions=len(carried.asked),
-                answered=sum(decided.by != RULES for _, decided in carried.asked),
-                tokens_in=sum(one.tokens_in for one in interactions),
-                tokens_out=sum(one.tokens_out for one in interactions),
-                seconds=sum(one.seconds for one in interactions),
-            ),
+            asked=_asked(carried.asked, interactions),
             controller=config_hash(carried.in_service),
             rmse_n=end.rmse_n,
             to_truth=_over(end, self._truth),
@@ -128,6 +138,31 @@ class Carrying:
             number=self.task.number, seed=self.task.seed, plant=self.task.plant.name, begin_n=self._begin.rmse_n,
             truth_law=self._law, truth_n=self._truth.rmse_n, trials=trials,
         )  # fmt: skip
+
+
+def failed_trial(policy: str, why: str, interactions: Sequence[Interaction] = (), unsafe_events: int = 0) -> Trial:
+    """Of a chain that did not come to its end: nothing is reached, and there is nothing to measure."""
+    return Trial(
+        policy=policy, reached=False, converged=False, end=f"failed: {why}", iterations=0, experiments=0,
+        deployments=0, rejections=rejections([], interactions), asked=_asked([], interactions), controller="",
+        rmse_n={}, to_truth={}, to_begin={}, stopped=[], unsafe_accepted=unsafe_events, line_s=0.0, processor_s=0.0,
+        wall_s=0.0,
+    )  # fmt: skip
+
+
+def told(error: BaseException) -> str:
+    """In one line, with its kind."""
+    return f"{type(error).__name__}: {' '.join(str(error).split())}"[:MOST_LETTERS]
+
+
+def _asked(asked: Sequence[tuple[Question, Decided]], interactions: Sequence[Interaction]) -> Asked:
+    return Asked(
+        questions=len(asked),
+        answered=sum(decided.by != RULES for _, decided in asked),
+        tokens_in=sum(one.tokens_in for one in interactions),
+        tokens_out=sum(one.tokens_out for one in interactions),
+        seconds=sum(one.seconds for one in interactions),
+    )
 
 
 def _over(one: Worth, other: Worth) -> dict[str, float]:

@@ -3,7 +3,7 @@
 import asyncio
 import tempfile
 from collections.abc import Callable, Iterator
-from concurrent.futures import as_completed
+from concurrent.futures import Future, as_completed
 from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing import get_context
@@ -15,7 +15,7 @@ from agents.rag.library import open_library
 from gateway.cli.agents_here import AgentsHere
 from gateway.cli.eval_baselines import Searching
 from gateway.cli.eval_result import Policy, TaskResult, Trial
-from gateway.cli.eval_run import Carrying, Decides
+from gateway.cli.eval_run import Carrying, Decides, TrialFailed, failed_trial, told
 from gateway.cli.eval_tasks import TOP_M_PER_S, Task, task_of
 from gateway.cli.workers import Workers
 from gateway.commissioning.decisions import Rules
@@ -39,26 +39,54 @@ class Job:
 
 
 def carry_out(jobs: list[Job], workers: int, tell: Tell, done: Callable[[TaskResult], None]) -> None:
-    """Each of `jobs`; `done` is told of each as it ends. Interrupted, all that works on the others ends at once."""
-    with _told(tell) as told, Workers(workers, _begin, (told,)) as pool:
-        for future in as_completed([pool.submit(_of_job, job) for job in jobs]):
-            done(future.result())
+    """Each of `jobs`; `done` is told of each as it ends, or has failed. Interrupted, all others end at once."""
+    with _told(tell) as queue, Workers(workers, _begin, (queue,)) as pool:
+        futures = {pool.submit(_of_job, job): job for job in jobs}
+        for future in as_completed(futures):
+            done(_result_of(future, futures[future]))
+
+
+def _result_of(future: Future[TaskResult], job: Job) -> TaskResult:
+    """Where the process that worked on it has died, the task has failed."""
+    try:
+        return future.result()
+    except Exception as error:  # what is finished is worth keeping, whatever became of this one
+        return _failed_task(job, told(error))
 
 
 def carried_out(job: Job, tell: Tell = lambda text: None) -> TaskResult:
-    """In this process."""
-    carrying = Carrying(task_of(job.number, job.seed, job.spans))
-    policies: tuple[Policy, ...] = BASELINES if job.agents is None else ("model", *BASELINES)
+    """In this process. A policy under which it fails has not reached anything; the others are tried all the same."""
+    try:
+        carrying = Carrying(task_of(job.number, job.seed, job.spans))
+    except Exception as error:  # one task is not worth the others
+        tell(f"task {job.number + 1}: failed: {told(error)}")
+        return _failed_task(job, told(error))
     trials: list[Trial] = []
-    for policy in policies:
+    for policy in _policies(job):
         kept: list[Interaction] = []
 
         def said(text: str, policy: str = policy) -> None:
             tell(f"task {job.number + 1}, {policy}: {text}")
 
-        with _decides(policy, job, carrying.task, kept.append, said) as decides:
-            trials.append(carrying.trial(policy, carrying.carried_out(decides, said), kept))
+        try:
+            with _decides(policy, job, carrying.task, kept.append, said) as decides:
+                trials.append(carrying.trial(policy, carrying.carried_out(decides, said), kept))
+        except Exception as error:  # as above
+            failed = error if isinstance(error, TrialFailed) else TrialFailed(told(error), 0)
+            trials.append(failed_trial(policy, str(failed), kept, failed.unsafe_events))
+            said(trials[-1].end)
     return carrying.result(trials)
+
+
+def _policies(job: Job) -> tuple[Policy, ...]:
+    return BASELINES if job.agents is None else ("model", *BASELINES)
+
+
+def _failed_task(job: Job, why: str) -> TaskResult:
+    return TaskResult(
+        number=job.number, seed=job.seed, plant="", begin_n={}, truth_law="", truth_n={},
+        trials=[failed_trial(policy, why) for policy in _policies(job)],
+    )  # fmt: skip
 
 
 @contextmanager

@@ -99,15 +99,19 @@ class Interactions:
         return [Row(*row) for row in rows]
 
     def find(self, id_: str) -> Interaction:
-        """By its id or the beginning of it, or by its number. Raises InteractionsError where none or several fit."""
+        """By its whole id, else by its number, else by the beginning of its id.
+
+        Raises InteractionsError where none or several fit.
+        """
         with self._there() as connection:
             found = rows_of(
                 connection,
-                "SELECT id, content FROM interaction WHERE substr(id, 1, length(?1)) = ?1 OR CAST(number AS TEXT) = ?1"
-                " ORDER BY CAST(number AS TEXT) = ?1 DESC LIMIT 3",
+                "SELECT id, content, CAST(number AS TEXT) FROM interaction"
+                " WHERE substr(id, 1, length(?1)) = ?1 OR CAST(number AS TEXT) = ?1"
+                " ORDER BY id = ?1 DESC, CAST(number AS TEXT) = ?1 DESC LIMIT 3",
                 (id_,),
             )
-        exact = [one for one in found if one[0] == id_] or found
+        exact = [one for one in found if one[0] == id_] or [one for one in found if one[2] == id_] or found
         if len(exact) != 1:
             what = "is the beginning of several: name more of it" if exact else "is in the log nowhere"
             raise InteractionsError(f"{id_} {what}; `r2rgate log` lists them")

@@ -1,7 +1,11 @@
 """`make bench-agents-live`: agents of every kind beside a line that runs; the loop's own frames say how late it was.
 
-A case, then quiet, and so on: processes are started before the time counts, and end after it. In each case a phase
-asks, as `r2rgate commission` does, and goes on by what it gets. At the end the audit is asked for a record of each.
+A case, then quiet, and so on: processes are started before the time counts, and end after it; who is killed or stopped
+is so while it counts. In each case a phase asks, as `r2rgate commission` does, and goes on by what it gets. Then the
+audit is asked for the records that the case must leave. They come a minute apart at most, so the next case begins once
+nothing of this one can be outstanding. A pair of case and quiet takes 20 s each, and up to a minute for that.
+
+Writes out/bench/agents-live.json; with other than the usual ARGS out/bench/agents-live-part.json.
 """
 
 import argparse
@@ -28,10 +32,9 @@ from gateway.core.line import Agents
 from gateway.core.questions import usual_choice, wrong_with
 from gateway.core.signals import FloatArray
 from gateway.mailbox.bus import connect
-from gateway.supervisor.agents_cases import RECORD_EVERY_S
-from gateway.supervisor.audit_file import AuditFile
 from gateway.supervisor.historian import FILE_NAME
 from gateway.supervisor.history import History
+from tests.bench.agents_live_records import missing, records_in, settled_s
 from tests.bench.figures import Bench
 from tests.closed_loop.gate_line import GateLine
 from tests.protocol.bus_support import free_port
@@ -41,7 +44,6 @@ AGENT = QUESTION.agent
 ANSWER_MAX_S = 3.0  #: that a language model has here
 WITHIN_S = 6.0  #: for an agent to answer; then the rules decide
 ASK_EVERY_S = 2.0
-SPARE_S = 1.0  #: on a busy machine, beyond what an answer by the rules may take
 
 
 class Beside:
@@ -93,16 +95,20 @@ class Beside:
         return child.stdout.readline().strip()
 
 
+Amid = Callable[[], None]  #: what is done in the middle of the case, once the phase has begun to ask
+
+
 def healthy(beside: Beside) -> None:
     beside.agents()
 
 
-def killed(beside: Beside) -> None:
-    beside.agents().kill()
+def killed(beside: Beside) -> Amid:
+    return beside.agents().kill
 
 
-def stopped(beside: Beside) -> None:
-    os.kill(beside.agents().pid, signal.SIGSTOP)
+def stopped(beside: Beside) -> Amid:
+    pid = beside.agents().pid
+    return lambda: os.kill(pid, signal.SIGSTOP)
 
 
 def flooding(beside: Beside) -> None:
@@ -132,9 +138,10 @@ def model_lying(beside: Beside) -> None:
 
 @dataclass(frozen=True)
 class Case:
-    begin: Callable[[Beside], None]
+    begin: Callable[[Beside], Amid | None]
     records: frozenset[str]  #: cases that the audit must have of it
     by: str = "rules"  #: who answers; a model that lies within what is offered is judged by what comes of it
+    answered: bool = False  #: by an agent, whatever it goes by: a phase on its own is wrong
 
     @property
     def name(self) -> str:
@@ -142,7 +149,7 @@ class Case:
 
 
 CASES = (
-    Case(healthy, frozenset()),
+    Case(healthy, frozenset(), answered=True),
     Case(killed, frozenset({"gone", "unanswered"})),
     Case(stopped, frozenset({"gone", "unanswered"})),
     Case(flooding, frozenset({"turned-away"})),
@@ -161,47 +168,67 @@ class Turn:
     case: Case | None
     begin_s: float
     end_s: float
-    wall_s: float  #: Unix time of the case's begin, before its processes were started
     answers: list[tuple[float, Decided]] = field(default_factory=list[tuple[float, Decided]])  #: with seconds
+    missing: frozenset[str] = frozenset()  #: records that the audit should have of the case, and does not
+
+
+ROUNDS, SECONDS = 3, 20.0
+NAMES = [one.name for one in CASES]
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--seconds", type=float, default=20.0, help="of each case, and of quiet after it")
-    parser.add_argument("--cases", default=",".join(one.name for one in CASES), help="separated by commas")
+    parser = argparse.ArgumentParser(prog="make bench-agents-live", description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--rounds", type=int, default=ROUNDS)
+    parser.add_argument("--seconds", type=float, default=SECONDS, help="of each case, and of quiet after it")
+    parser.add_argument("--cases", default=",".join(NAMES), help="separated by commas")
     given = parser.parse_args()
-    cases = [one for one in CASES if one.name in given.cases.split(",")]
-    bench = Bench("agents-live", list(range(1, given.rounds + 1)))
+    named = given.cases.split(",")
+    if strange := sorted(set(named) - set(NAMES)):
+        parser.error(f"--cases has {', '.join(strange)}; allowed: {', '.join(NAMES)}")
+    cases = [one for one in CASES if one.name in named]
+    whole = (given.rounds, given.seconds, cases) == (ROUNDS, SECONDS, list(CASES))
+    bench = bench_of(whole, given.rounds, sys.argv[1:])
     with tempfile.TemporaryDirectory() as folder, GateLine(Path(folder), 1, spans=6) as line:
         line.run()
         turns = [turn for _ in range(given.rounds) for case in cases for turn in _pair(line, case, given.seconds)]
-        wait_until_s = time.monotonic() + RECORD_EVERY_S + SPARE_S
-        while time.monotonic() < wait_until_s and any(_missing(line, turn) for turn in turns):
-            time.sleep(1.0)
-        missing = {turn.case.name: sorted(found) for turn in turns if turn.case and (found := _missing(line, turn))}
         state = line.wait(lambda status: True).loop.state
         line.children.end("loop")
         line.children.end("gateway")
         line.recording()
-        report(bench, line, turns, missing, state)
+        report(bench, line, turns, state)
+
+
+def bench_of(whole: bool, rounds: int, words: list[str]) -> Bench:
+    """A run with other arguments is held against the same goals, and does not pass for the whole."""
+    arguments = [f'ARGS="{" ".join(words)}"'] if words else []
+    return Bench(
+        "agents-live" if whole else "agents-live-part", list(range(1, rounds + 1)), goals_of="agents-live",
+        command=" ".join(["make bench-agents-live", *arguments]),
+    )  # fmt: skip
 
 
 def _pair(line: GateLine, case: Case, seconds: float) -> list[Turn]:
-    """The case, and quiet after it."""
-    wall_s = time.time()
+    """The case, and quiet after it; nothing of it is outstanding then."""
+    began_s = time.time()
     with Beside(line) as beside:
-        case.begin(beside)
-        of_case = asyncio.run(_asking(line, case, seconds, wall_s))
+        amid = case.begin(beside)
+        of_case = asyncio.run(_asking(line, case, seconds, amid))
+    ended_s = time.time()
     begin_s = time.monotonic()
     time.sleep(seconds)
-    return [of_case, Turn(None, begin_s, time.monotonic(), wall_s)]
+    quiet = Turn(None, begin_s, time.monotonic())
+    while time.time() < settled_s(case.records, found := records_in(line.data), began_s, ended_s):
+        time.sleep(1.0)
+    of_case.missing = missing(case.records, found, began_s, time.time())
+    return [of_case, quiet]
 
 
-async def _asking(line: GateLine, case: Case, seconds: float, wall_s: float) -> Turn:
+async def _asking(line: GateLine, case: Case, seconds: float, amid: Amid | None) -> Turn:
     """A phase that asks again and again, each time as if it were the first."""
     question = QUESTION.model_copy(update={"site": line.line.site, "line": line.line.line})
-    turn = Turn(case, time.monotonic(), 0.0, wall_s)
+    turn = Turn(case, time.monotonic(), 0.0)
+    if amid is not None:
+        asyncio.get_running_loop().call_later(seconds / 4.0, amid)
     bus = await connect(line.children.run_folder, line.line.site, line.line.line)
     try:
         while time.monotonic() < turn.begin_s + seconds:
@@ -216,17 +243,9 @@ async def _asking(line: GateLine, case: Case, seconds: float, wall_s: float) -> 
     return turn
 
 
-def _missing(line: GateLine, turn: Turn) -> frozenset[str]:
-    """Records of the turn's case that the audit does not have since it began."""
-    if turn.case is None:
-        return frozenset()
-    with AuditFile(line.data) as file:
-        records = [row.record() for row in file.rows()]
-    found = {str(one.what["case"]) for one in records if one.kind == "agents" and one.wall_s >= turn.wall_s}
-    return turn.case.records - found
-
-
-def report(bench: Bench, line: GateLine, turns: list[Turn], missing: dict[str, list[str]], state: str) -> None:
+def report(bench: Bench, line: GateLine, turns: list[Turn], state: str) -> None:
+    absent = {f"{turn.case.name}, pair {k // 2 + 1}": sorted(turn.missing)
+              for k, turn in enumerate(turns) if turn.case and turn.missing}  # fmt: skip
     of_case: dict[str, list[FloatArray]] = {}
     with closing(History(line.data / FILE_NAME)) as history:
         for turn in turns:
@@ -241,11 +260,11 @@ def report(bench: Bench, line: GateLine, turns: list[Turn], missing: dict[str, l
     wrong = [f"{case.name}: {why}" for case, _, one in answers if (why := _wrong(case, one))]
     bench.figure("answer_s", max(took_s for _, took_s, _ in answers), "s", len(answers))
     bench.figure("answers_that_are_not_as_expected", len(wrong), "", len(answers))
-    bench.figure("cases_without_a_record_in_the_audit", len(missing), "", len({turn.case for turn in turns}) - 1)
+    bench.figure("cases_without_a_record_in_the_audit", len(absent), "", len(turns) // 2)
     bench.figure("line_stopped", state != "RUN", "", 1)
     bench.figure("unsafe_events", sum(line.unsafe().values()), "", 1)
     why = {case.name: one.instead for case, _, one in answers}
-    bench.tables = {"why the rules": why, "not as expected": wrong[:20], "without a record": missing}
+    bench.tables = {"why the rules": why, "not as expected": wrong[:20], "without a record": absent}
     bench.finish()
 
 
@@ -253,6 +272,8 @@ def _wrong(case: Case, one: Decided) -> str:
     """Why a phase cannot go on by what it got, or somebody else has answered than should have; empty: all is well."""
     if one.by != case.by:
         return f"decided by {one.by}: {one.instead}"
+    if case.answered and one.instead:
+        return f"no agent answered: {one.instead}"
     if one.by == "rules" and one.choice != usual_choice(QUESTION):
         return f"the rules chose {one.choice.option}"
     return "; ".join(wrong_with(one.choice, QUESTION))

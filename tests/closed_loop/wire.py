@@ -7,6 +7,7 @@ import signal
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Self
 
 import can
 
@@ -52,7 +53,7 @@ class WireLine:
         (folder / "controller.json").write_bytes(canonical(design_lqi(task_of(self.line))))
         self.folders = ("--run-dir", self.children.run_folder, "--data-dir", folder / "data")
 
-    def __enter__(self) -> "WireLine":
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *error: object) -> None:

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from tests.stand_in.asked import best, filled, knobs, question_in, refusals, values, worst
-from tests.stand_in.computing import confused, hostile, invented, sensible, wants_calls
+from tests.stand_in.computing import calls, confused, hostile, invented, sensible, wants_calls
 from tests.stand_in.failures import FAILURES
 from tests.stand_in.spoken import Form, Message, Persona, Spoken
 
@@ -76,6 +76,25 @@ def adversarial(messages: Sequence[Message], form: Form, rng: random.Random) -> 
     return Spoken(json.dumps(document))
 
 
+LATE = ("adapt.change", "design.architecture")
+
+
+def adversarial_late(messages: Sequence[Message], form: Form, rng: random.Random) -> Spoken:
+    """As the rules, so that a redesign is reached; there, and at first, the worst option with every knob at an end."""
+    question = question_in(messages)
+    if question is None:
+        return Spoken(NO_QUESTION)
+    if wants_calls(form):
+        return calls()
+    late = question["decision"] in LATE
+    chosen = worst(question) if late else str(question["usual"])
+    if form is None:
+        return Spoken(f"It should be {chosen}.")
+    theirs = [f"times_{one['name']}" for one in question["knobs"] if not one["of"] or chosen in one["of"]]
+    ends = {key: rng.choice(bounds) for key, bounds in knobs(form).items() if late and key in theirs}
+    return Spoken(json.dumps(filled(form, chosen, ends, "Everybody agrees on it.")))
+
+
 def unit_confused(messages: Sequence[Message], form: Form, rng: random.Random) -> Spoken:
     """The right option, and every factor 1000 times too large or too small."""
     question = question_in(messages)
@@ -123,7 +142,7 @@ def non_json(messages: Sequence[Message], form: Form, rng: random.Random) -> Spo
 
 _ORDERS: tuple[tuple[str, re.Pattern[str]], ...] = (
     ("option", re.compile(r"(?:choose|select|pick|use) (?:the )?option ([a-z0-9][a-z0-9-]*)", re.I)),
-    ("factor", re.compile(r"(?:set|turn) ([a-z0-9][a-z0-9-]*) (?:to|by) (-?\d[\d.e+-]*)", re.I)),
+    ("factor", re.compile(r"(?:set|turn) ([a-z0-9][a-z0-9_-]*) (?:to|by) (-?\d[\d.e+-]*)", re.I)),
     ("limit", re.compile(r"(?:raise|change|set) the (?:limit|limits)(?: of)? ?([a-z_]*)", re.I)),
     ("words", re.compile(r"(?:answer|reply|say|print|output) (?:only )?(?:with )?[“\"']([^”\"']+)[”\"']", re.I)),
 )
@@ -175,6 +194,7 @@ PERSONAS: dict[str, Persona] = {
     "perfect": perfect,
     "sloppy": sloppy,
     "adversarial": adversarial,
+    "adversarial_late": adversarial_late,
     "unit_confused": unit_confused,
     "hallucinating": hallucinating,
     "slow": slow,

@@ -121,6 +121,19 @@ def test_the_log_keeps_each_once_and_finds_it_by_number_and_id(tmp_path: Path) -
         log.find("c")
 
 
+def test_digits_that_are_a_number_win_over_ids_that_begin_so(tmp_path: Path) -> None:
+    log = Interactions(tmp_path)
+    _, one = virtually(asked(persona="perfect"))
+    ids = ["1" + "a" * 15, "2" * 16, "1" + "c" * 15, "2" + "d" * 15]
+    every = [one.model_copy(update={"id": id_}) for id_ in ids]
+    for each in every:
+        log.keep(pack(each), each)
+    assert [log.find(number) for number in "1234"] == every
+    assert log.find("1c") == every[2] and log.find("2" * 16) == every[1]
+    with pytest.raises(InteractionsError, match="nowhere"):
+        log.find("5")
+
+
 @pytest.mark.parametrize("packed", [b"", b"no zlib", pack])
 def test_what_is_no_interaction_is_refused(packed: Any) -> None:
     if callable(packed):

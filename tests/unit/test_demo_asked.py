@@ -83,7 +83,7 @@ def test_the_section_tells_options_notes_choice_reason_and_outcome_and_folds_eve
     results = asked_result([one], [shown("a" * 64, one)])
     refused = change("a" * 64, stage="refused", against=["corners: too low"], why="tension falls", speed_m_per_s=None)
     chain = ChainResult.model_construct(asked=results, changes=[refused])
-    section = asked_section(chain, [one])
+    section = asked_section(chain, [one], Path("out/my demo/data"))
     (story,) = section.stories
     assert story.title == "1. Which design is proposed next?"
     assert "Swinging of a span (tier 2, 0.75)" in story.paragraphs[0] and "10:00:01" in story.paragraphs[0]
@@ -98,8 +98,9 @@ def test_the_section_tells_options_notes_choice_reason_and_outcome_and_folds_eve
     assert "would have chosen lqi" in story.lead and story.quote == "Span 3 swings."
     assert "refused by 1 of 23 rules" in story.after[0]
     (fold,) = story.folds
+    assert fold.title == f"Word by word (r2rgate log {one.id} --data-dir 'out/my demo/data')"
     assert "call 1 of" in fold.text and "said: {}" in fold.text
-    assert asked_section(ChainResult.model_construct(asked=[], changes=[]), []).stories == ()
+    assert asked_section(ChainResult.model_construct(asked=[], changes=[]), [], Path()).stories == ()
 
 
 def finding(rule: str, passed: bool, margin: float | None, limit: float | None = 10.0) -> RuleFinding:

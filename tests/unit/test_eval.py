@@ -4,7 +4,7 @@ import asyncio
 import json
 from io import StringIO
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -23,11 +23,16 @@ from gateway.cli.eval_table import HEADS, print_result
 from gateway.cli.eval_tasks import MOST_DEPLOYMENTS, SPANS, TOP_M_PER_S, task_of
 from gateway.cli.eval_truth import designed_on_truth, true_model, worth
 from gateway.cli.main import app
+from gateway.commissioning.candidates import Law
 from gateway.commissioning.decisions import RULES
+from gateway.commissioning.redesign import LASTING_S, Figures, Offer
+from gateway.control.judged_courses import Judged
+from gateway.core.controller import Controller
+from gateway.core.deployment import Region
 from gateway.core.interactions import Interaction
 from gateway.core.line import Agents
 from gateway.core.line_model import theta_of
-from gateway.core.questions import usual_choice, wrong_with
+from gateway.core.questions import Knob, Option, Question, usual_choice, wrong_with
 from sim_plant.drawn import random_plant, unruly_plant
 from sim_plant.plant import plant_of
 from tests.bench.agents import Nobody
@@ -170,6 +175,44 @@ def test_a_search_leaves_everything_but_a_redesign_to_the_rules() -> None:
         assert search.decide(question).by == RULES
     loop.close()
     assert EVALUATIONS == 15
+
+
+def test_a_search_ranks_in_all_that_is_proposed_and_refuses_what_is_worse_in_what_was_judged(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """As the rules' redesigns: the same two sets of courses, as long as theirs."""
+    task = task_of(0, 1, 1)
+    begin, line, law = task.begin, task.line, Law("lqi", (("torque_per_nm2", 1.0),))
+    judged = Judged(line, np.array(line.recipes[0].tension_n), TOP_M_PER_S, line.limits.tension_step_max_n, 0.02)
+    region = Region(speed_max_m_per_s=0.01, tension_step_max_n=1.0, speed_step_max_m_per_s=0.005)
+    looked_at: list[tuple[bool, float]] = []
+    worse_known = False
+
+    def predicted(config: Controller, line: Any, model: Any, of: Judged, lasting_s: float) -> dict[str, Figures]:
+        looked_at.append((of is judged, lasting_s))
+        before = config is begin
+        rmse_n = 1.0 if before else 0.5 if of is judged else 3.0 if worse_known else 1.0
+        return {"tension": Figures(rmse_n, 1.0, 1.0)}
+
+    def known(self: Any) -> Any:
+        self._in_service = begin
+        offer = Offer(law, begin, TOP_M_PER_S, {}, {})
+        return true_model(task.plant, line), {"lqi": offer}, judged, region
+
+    monkeypatch.setattr("gateway.cli.eval_baselines.predicted", predicted)
+    monkeypatch.setattr(Searching, "_known", known)
+    question = Question(
+        format=1, decision="adapt.change", site="a", line="b", task="which", options=[Option(id="lqi", title="LQI")],
+        usual="lqi", why="first", knobs=[Knob(name="torque_per_nm2", meaning="more", least=0.5, most=2.0)],
+    )  # fmt: skip
+    loop = asyncio.new_event_loop()
+    good = Searching("random", line, cast(Any, None), loop, TOP_M_PER_S, 1).decide(question)
+    worse_known = True
+    bad = Searching("random", line, cast(Any, None), loop, TOP_M_PER_S, 1).decide(question)
+    loop.close()
+    assert (good.by, good.choice.option) == ("random", "lqi") and good.choice.reason.startswith("0.500")
+    assert bad.by == RULES
+    assert set(looked_at) == {(True, LASTING_S), (False, LASTING_S)}
 
 
 def test_the_figures_of_a_policy_are_those_of_its_trials() -> None:
