@@ -47,7 +47,9 @@ class LineDesk:
         self._folder = folder
         self._experiments = experiments
         self._knowledge = LineKnowledge(line, folder)
-        self._held: Recording | None = None  #: whose parts were asked for last
+        self._listed: dict[
+            str, Recording
+        ] = {}  #: by digest, of the last list: some few, and only of them parts are told
         self._reading, self._gathering = asyncio.Lock(), asyncio.Lock()
 
     def serve_on(self, bus: Mailbox) -> None:
@@ -80,12 +82,16 @@ class LineDesk:
         async with self._reading:
             found = await asyncio.to_thread(self._experiments, self._line.gate.data_max_age_s)
             listed = await asyncio.to_thread(lambda: [_line_of(one, end_s) for one, end_s in found])
+            self._listed = {line.digest: one for line, (one, _) in zip(listed, found, strict=True)}
         return RecordingList(recordings=listed).model_dump_json().encode()
 
     async def _recording(self, payload: bytes) -> bytes:
         asked = parse_ask(payload, OfRecording)
+        one = self._listed.get(asked.digest)
+        if one is None:
+            raise AskRefused([f"there is no recording {asked.digest[:12]} in the last list: ask for the list"])
         async with self._reading:
-            return await asyncio.to_thread(self._part, asked)
+            return await asyncio.to_thread(_part, one, asked.part)
 
     async def _known(self, payload: bytes) -> bytes:
         asked = parse_ask(payload, OfKnowledge)
@@ -125,20 +131,6 @@ class LineDesk:
             raise AskRefused([f"configuration {id_[:12]}: {found.damage}"])
         return ControllerTold(hash=id_, controller=found.controller).model_dump_json().encode()
 
-    def _part(self, asked: OfRecording) -> bytes:
-        one = self._held
-        if one is None or one.digest() != asked.digest:
-            found = [recording for recording, _ in self._experiments(self._line.gate.data_max_age_s)]
-            one = next((recording for recording in found if recording.digest() == asked.digest), None)
-            if one is None:
-                raise AskRefused([f"there is no recording {asked.digest[:12]} (any more): ask for the list"])
-            self._held = one
-        parts = _parts(one)
-        if asked.part >= parts:
-            raise AskRefused([f"part is {asked.part}; allowed: 0 to {parts - 1}"])
-        size = most_samples(one.n, MAX_PAYLOAD)
-        return packed(one.part(asked.part * size, (asked.part + 1) * size))
-
 
 async def _answer(answer: Callable[[bytes], Awaitable[bytes]], payload: bytes) -> bytes:
     try:
@@ -148,6 +140,14 @@ async def _answer(answer: Callable[[bytes], Awaitable[bytes]], payload: bytes) -
     if len(said) > MAX_PAYLOAD:
         return _bytes(refused("it is not told", [f"it has {len(said)} bytes; a message carries {MAX_PAYLOAD}"]))
     return said
+
+
+def _part(one: Recording, part: int) -> bytes:
+    parts = _parts(one)
+    if part >= parts:
+        raise AskRefused([f"part is {part}; allowed: 0 to {parts - 1}"])
+    size = most_samples(one.n, MAX_PAYLOAD)
+    return packed(one.part(part * size, (part + 1) * size))
 
 
 def _parts(one: Recording) -> int:
