@@ -27,6 +27,7 @@ from gateway.core.topics import (
 from gateway.mailbox.inprocess import Hub, InProcessMailbox
 from gateway.mailbox.port import MAX_PAYLOAD
 from gateway.supervisor import configurations, line_desk, models
+from gateway.supervisor.agents_cases import AgentsCases
 from gateway.supervisor.configurations import Origin, begin_configurations
 from gateway.supervisor.gate import Gate
 from gateway.supervisor.line_desk import LineDesk
@@ -63,7 +64,8 @@ class Desk:
             lambda configurations, models: FakeSurroundings(FakeLoop(Death())), lambda *_, **__: None, lambda: 1.0,
             lambda: NOW_S,
         )  # fmt: skip
-        LineDesk(LINE, self.gate, folder, self._experiments).serve_on(InProcessMailbox(self.hub))
+        cases = AgentsCases(self.gate.audit.append)
+        LineDesk(LINE, self.gate, folder, self._experiments, cases).serve_on(InProcessMailbox(self.hub))
         self.line = LineOnBus(self.bus, "sysid", no_pause)
 
     def _experiments(self, _: float) -> list[tuple[Recording, float]]:
