@@ -4,8 +4,8 @@ The index that is there serves until the next one is whole. Where anything fails
 """
 
 import asyncio
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Awaitable, Callable, Sequence
+from contextlib import AbstractAsyncContextManager, AsyncExitStack, suppress
 from pathlib import Path
 from typing import Protocol, Self
 
@@ -20,6 +20,8 @@ from gateway.core.line_queries import Generated
 LOOK_S = 10.0  #: from one look at the line to the next
 FIRST_S = 5.0  #: for the line to tell, before agents answer without it
 _Failed = (IndexRefused, EmbedderFailed, OSError)
+#: The embedder that is wanted; None: none is. Raises EmbedderFailed while it is not there.
+Find = Callable[[], Awaitable[Embedder | None]]
 
 
 class LineSide(Protocol):
@@ -31,10 +33,13 @@ class LineSide(Protocol):
 class Knowledge:
     """`begin` it, then `keep_up` beside all else; `search` at any time. An asynchronous context manager."""
 
-    def __init__(self, folder: Path, line: LineSide, embedder: Embedder | None, tell: Callable[[str], None]) -> None:
+    def __init__(self, folder: Path, line: LineSide, find: Find, tell: Callable[[str], None]) -> None:
         self._folder = folder
         self._line = line
-        self._embedder = embedder  #: None: by words alone
+        self._find = find
+        self._away = True  #: the embedder that is wanted has not been found yet
+        self._embedder: Embedder | None = None  #: None: by words alone
+        self._held = AsyncExitStack()
         self._tell = tell
         self._index: Index | None = None
         self._of_line: LineKnown | None = None  #: None: nobody has told; what was known of the line before stays
@@ -46,13 +51,15 @@ class Knowledge:
     async def __aexit__(self, *_: object) -> None:
         if self._index is not None:
             self._index.close()
+        await self._held.aclose()
 
     async def begin(self) -> None:
         """Until something can be looked up: by an embedder only where that costs no vectors."""
         with suppress(TimeoutError):
             async with asyncio.timeout(FIRST_S):
                 await self.hear()
-        if self._embedder is None:
+        await self._find_embedder()
+        if self._embedder is None and not self._away:
             await self.look()
             return
         try:
@@ -73,6 +80,7 @@ class Knowledge:
 
     async def look(self) -> None:
         """At what it is made of: another index where that has changed."""
+        await self._find_embedder()
         await self._make(self._embedder)
 
     async def search(self, asked: Asked) -> Retrieval:
@@ -95,6 +103,20 @@ class Knowledge:
             for text in known.left_out:
                 self._tell(f"left out of what is known: {text}")
 
+    async def _find_embedder(self) -> None:
+        """Tried until it is there; from then on it is kept."""
+        if not self._away:
+            return
+        try:
+            found = await self._find()
+        except EmbedderFailed as error:
+            self._say("embedder", f"things are looked up by words: {error}")
+            return
+        if isinstance(found, AbstractAsyncContextManager):
+            await self._held.enter_async_context(found)
+        self._embedder, self._away = found, False
+        self._say("embedder", "")
+
     async def _make(self, embedder: Embedder | None) -> None:
         generated = None if self._of_line is None else self._of_line.documents
         try:
@@ -110,10 +132,13 @@ class Knowledge:
             before.close()
 
     async def _opened(self, embedder: Embedder | None, generated: Sequence[Generated] | None) -> Index:
-        """Anew where the one that is there was made by another embedder: what they made is never mixed."""
+        """Anew where the one that is there was made by another embedder: what they made is never mixed. While the one
+        that is wanted is away, an index with vectors stays as it is: to make them again may take long."""
         try:
             return (await open_library(self._folder, 3, embedder, generated)).index
         except IndexRefused:
+            if self._away:
+                return await asyncio.to_thread(Index, self._folder / INDEX)
             return (await open_library(self._folder, 3, embedder, generated, reindex=True)).index
 
     async def _vectors(self, question: str) -> Vectors | None:

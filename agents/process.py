@@ -9,7 +9,8 @@ import signal
 import sys
 import time
 from collections.abc import Awaitable, Callable
-from contextlib import AbstractAsyncContextManager, AsyncExitStack
+from contextlib import AsyncExitStack
+from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
@@ -23,7 +24,6 @@ from agents.language_model.budget import Budget
 from agents.language_model.client import LanguageModel
 from agents.language_model.no_answer import NoAnswer
 from agents.line_on_bus import LineOnBus
-from agents.rag.embedder import Embedder, EmbedderFailed
 from agents.rag.embedders import embedder_named
 from agents.roles import ROLES
 from gateway.core.computations import ComputeReply, ComputeRequest
@@ -69,8 +69,8 @@ async def serve(line: Line, where: Path | TlsEndpoint, folder: Path, tell: Tell)
         bus = await connect(where, line.site, line.line)
         held.push_async_callback(bus.close)
         model = await _model(line, held, tell)
-        embedder = await _embedder(line, held, tell)
-        known = await held.enter_async_context(Knowledge(folder, LineOnBus(bus, LOOKS), embedder, tell))
+        find = partial(embedder_named, line.agents.embedder, line.agents.url)
+        known = await held.enter_async_context(Knowledge(folder, LineOnBus(bus, LOOKS), find, tell))
         await known.begin()
         begin(bus, line, known.search, model, tell, LineOnBus(bus, CODE))
         held.push_async_callback(_stopped, asyncio.create_task(known.keep_up()))
@@ -164,18 +164,6 @@ async def _model(line: Line, held: AsyncExitStack, tell: Tell) -> LanguageModel 
     except NoAnswer as error:
         tell(f"{error.text}; the rules decide until it answers")
     return model
-
-
-async def _embedder(line: Line, held: AsyncExitStack, tell: Tell) -> Embedder | None:
-    """None: things are looked up by words alone."""
-    try:
-        found = await embedder_named(line.agents.embedder, line.agents.url)
-    except EmbedderFailed as error:
-        tell(f"things are looked up by words: {error}")
-        return None
-    if isinstance(found, AbstractAsyncContextManager):
-        await held.enter_async_context(found)
-    return found
 
 
 async def _stopped(task: asyncio.Task[None]) -> None:

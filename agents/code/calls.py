@@ -53,7 +53,9 @@ def _named(pattern: str, allowed: str, words: Sequence[str]) -> AfterValidator:
 ModelRef = Annotated[
     str,
     Field(json_schema_extra={"pattern": _MODEL}),
-    _named(_MODEL, f"{IN_SERVICE}, {NOMINAL} (of the line's file), or the model's hash", (IN_SERVICE, NOMINAL)),
+    _named(
+        _MODEL, f"{IN_SERVICE}, {NOMINAL} (of the line's file), or the accepted model's hash", (IN_SERVICE, NOMINAL)
+    ),
 ]
 ControllerRef = Annotated[
     str,

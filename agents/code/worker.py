@@ -1,7 +1,7 @@
 """A process for each computation, confined (agents/code/confine.py), at low priority, and gone when its time is up.
 
-It is given a job when it is started, and says what came of it over a pipe, as JSON. It has no socket, and what it says
-is read like anything from outside.
+It is given a job when it is started, and says over a pipe, in a line each, that it is ready, and what came of it, as
+JSON. It has no socket, and what it says is read like anything from outside: never for longer than there is time.
 """
 
 import asyncio
@@ -30,6 +30,8 @@ NICER = 15  #: than the process that starts it
 MOST_ANSWER_BYTES = 8_388_608  #: a schedule of gains for sixty spans has some
 END_S = 5.0  #: for a process that has closed its pipe to be gone
 _READY = b"ready"
+_LINE = b"\n"  #: at the end of what it says; JSON has none in it
+_PIECE_BYTES = 65_536
 
 
 @dataclass(frozen=True)
@@ -76,6 +78,7 @@ class _Child:
         self._limits = limits
         self._until_s = time.monotonic() + within_s
         self._stopped, self._stop = Pipe(duplex=False)
+        self._came = bytearray()  #: of what it says, and is not read yet
 
     def stop(self) -> None:
         self._stop.send_bytes(b"stop")
@@ -104,14 +107,24 @@ class _Child:
             ours.close()
 
     def _heard(self, pipe: Connection, most_s: float, otherwise: str) -> bytes:
-        """Raises _NoOutcome, EOFError, OSError."""
-        left_s = max(min(most_s, self._until_s - time.monotonic()), 0.0)
-        ready = wait([pipe, self._stopped], left_s)
-        if self._stopped in ready:
-            raise _NoOutcome("nobody waits for it any more")
-        if not ready:
-            raise _NoOutcome(f"it {otherwise} within {left_s:.3g} s")
-        return pipe.recv_bytes(MOST_ANSWER_BYTES)
+        """Its next line, as far as it comes in time. Raises _NoOutcome, EOFError, OSError."""
+        within_s = max(min(most_s, self._until_s - time.monotonic()), 0.0)
+        until_s, looked = time.monotonic() + within_s, 0
+        while (end := self._came.find(_LINE, looked)) < 0:
+            looked = len(self._came)
+            if looked > MOST_ANSWER_BYTES:
+                raise _NoOutcome(f"its process has said more than {MOST_ANSWER_BYTES} bytes")
+            ready = wait([pipe, self._stopped], max(until_s - time.monotonic(), 0.0))
+            if self._stopped in ready:
+                raise _NoOutcome("nobody waits for it any more")
+            if not ready or time.monotonic() > until_s:
+                raise _NoOutcome(f"it {otherwise} within {within_s:.3g} s")
+            if not (piece := os.read(pipe.fileno(), _PIECE_BYTES)):
+                raise EOFError
+            self._came += piece
+        line = bytes(self._came[:end])
+        del self._came[: end + 1]
+        return line
 
 
 def _on_linux(end: Any) -> Connection:
@@ -132,10 +145,16 @@ def _live(pipe: Connection, prepare: Prepare, work: Work, job: Job, limits: Limi
     end_with_parent()
     os.nice(NICER)
     failed = _tried(lambda: _confined(prepare, job, limits), limits)
-    pipe.send_bytes(_READY)
+    _say(pipe, _READY)
     outcome = failed or _tried(lambda: work(job), limits)
     assert outcome is not None
-    pipe.send_bytes(outcome.model_dump_json().encode())
+    _say(pipe, outcome.model_dump_json().encode())
+
+
+def _say(pipe: Connection, line: bytes) -> None:
+    left = memoryview(line + _LINE)
+    while left:
+        left = left[os.write(pipe.fileno(), left) :]
 
 
 def _confined(prepare: Prepare, job: Job, limits: Limits) -> None:

@@ -28,11 +28,13 @@ from gateway.core.line import NonNegative, Strict
 from gateway.core.questions import Choice, ChoiceRefused, Question
 
 MOST_TRIES = 3  #: of an answer in the form
-COMPUTING_SHARE = 0.5  #: of the time that is left: the answer needs some, too
+COMPUTING_SHARE = 0.5  #: of the time that is left, for asking what to compute and for doing it: the answer needs some
 #: Calls, unread, and the seconds that there are; one result for each. Raises nothing.
 Compute = Callable[[Sequence[Any], float], Awaitable[list[Computed]]]
 #: Another try may go better: what came was cut off, torn or nothing.
 WORTH_ANOTHER_TRY: frozenset[Kind] = frozenset({"length", "broken", "empty"})
+#: After which the model is not asked anything more.
+GONE: frozenset[Kind] = frozenset({"absent", "no-model"})
 
 
 class Exchange(Strict):
@@ -126,41 +128,48 @@ class _Conversation:
     async def answer_with(self, compute: Compute | None, told: list[Said], question: Question) -> Choice:
         """After what it wants computed; without it where it does not fit into the context. Raises NoAnswer."""
         form = form_message(question)
-        if compute is not None:
-            try:
-                more = await self.computations(told, compute)
-                return await self.answer([*more, form], question)
-            except NoAnswer as error:
-                if error.kind != "too-long":
-                    raise
+        more = told if compute is None else await self.computations(told, compute)
+        try:
+            return await self.answer([*more, form], question)
+        except NoAnswer as error:
+            if error.kind != "too-long" or more is told:
+                raise
         return await self.answer([*told, form], question)
 
     async def computations(self, messages: list[Said], compute: Compute) -> list[Said]:
         """`messages`, with what the model has had computed. Each call costs one of those that it may ask for, as does a
-        list that is none; what is wrong is told, and it may ask again while there are some left. Raises NoAnswer."""
+        list that is none; what is wrong is told, and it may ask again while there are some left. What fails here ends
+        the computations, not the answer. Raises NoAnswer where the model is not there any more."""
         left, number = self._model.settings.computations_max, 0
+        now_s = self._model.now_s()
+        until_s = now_s + COMPUTING_SHARE * (self._until_s - now_s)
         while left > 0:
             number += 1
             asked = [*messages, calls_message(left, first=number == 1)]
-            said = await self._call("compute", number, asked, calls_format(left), _refused_calls)
+            try:
+                said = await self._call("compute", number, asked, calls_format(left), _refused_calls, until_s=until_s)
+            except NoAnswer as error:
+                if error.kind in GONE:
+                    raise
+                return messages
             calls = [] if said.failure or said.refused else read_calls(said.raw)
             if said.failure or not (calls or said.refused):
                 return messages
             refused = list(said.refused)
             if len(calls) > left:
                 refused.append(f"{len(calls)} calls were asked for; allowed: {left}")
-            results = await self._computed(calls[:left], compute)
+            results = await self._computed(calls[:left], compute, until_s)
             messages = [*asked, Said("assistant", said.raw[:MOST_REPEATED]), results_message(results, refused)]
             left -= max(len(calls), 1)
             if not refused and all(one.done for one in results):
                 break
         return messages
 
-    async def _computed(self, calls: Sequence[Any], compute: Compute) -> list[Computed]:
+    async def _computed(self, calls: Sequence[Any], compute: Compute, until_s: float) -> list[Computed]:
         """Kept beside the exchange that has asked for it."""
         if not calls:
             return []
-        results = await compute(calls, COMPUTING_SHARE * (self._until_s - self._model.now_s()))
+        results = await compute(calls, max(until_s - self._model.now_s(), 0.0))
         self.exchanges[-1] = self.exchanges[-1].model_copy(update={"computed": results})
         return results
 
@@ -186,12 +195,13 @@ class _Conversation:
         form: dict[str, Any] | None = None,
         read: Callable[[str], dict[str, Any]] = lambda text: {},
         think: bool | None = False,
+        until_s: float | None = None,
     ) -> Exchange:
         """One exchange, kept, with what `read` finds in the answer. Raises NoAnswer where no other try helps."""
         began_s = self._model.now_s()
         failed: NoAnswer | None = None
         try:
-            left_s = self._until_s - began_s
+            left_s = (self._until_s if until_s is None else until_s) - began_s
             reply = await self._model.chat(messages, left_s, self._budget, form, think, self._heard)
             came: dict[str, Any] = {"raw": reply.text, "thinking": reply.thinking}
             came |= {"tokens_in": reply.tokens_in, "tokens_out": reply.tokens_out}

@@ -10,6 +10,7 @@ from ipaddress import ip_address
 from typing import Literal
 
 from cryptography import x509
+from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.asymmetric.types import PrivateKeyTypes
@@ -99,6 +100,26 @@ def certificates_of(pem: bytes) -> list[x509.Certificate]:
 def belongs(pair: Pair) -> bool:
     """Whether the key is that of the certificate. Raises NoCertificate."""
     return certificate_of(pair.certificate).public_key() == _key_of(pair.private_key).public_key()
+
+
+def issued(certificate: bytes, authority: bytes) -> bool:
+    """Whether one of the authorities has signed the certificate, by way of those that stand behind it in its file.
+
+    Raises NoCertificate.
+    """
+    own, *between = certificates_of(certificate)
+    for above in between:
+        if _signed(own, above):
+            own = above
+    return any(own == one or _signed(own, one) for one in certificates_of(authority))
+
+
+def _signed(certificate: x509.Certificate, issuer: x509.Certificate) -> bool:
+    try:
+        certificate.verify_directly_issued_by(issuer)
+    except (ValueError, TypeError, InvalidSignature):  # another name; a key that signs nothing; another key
+        return False
+    return True
 
 
 def _key_of(pem: bytes) -> PrivateKeyTypes:

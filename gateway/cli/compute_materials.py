@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from agents.code.materials import Given
-from gateway.cli.model_place import chosen, reasons_against_line
+from gateway.cli.model_place import chosen, chosen_of, reasons_against_line
 from gateway.cli.process_commands import default_data_folder
 from gateway.cli.recordings import read_recording
 from gateway.cli.recordings_table import RecordingRefused
@@ -12,6 +12,7 @@ from gateway.core.controller import Controller, ControllerRefused, parse_control
 from gateway.core.line import Line
 from gateway.core.line_model import LineModel
 from gateway.supervisor.model_store import ModelsError
+from gateway.supervisor.models import FILE_NAME, open_repository
 
 
 class MaterialsRefused(Exception):
@@ -23,11 +24,12 @@ def given(
     data_dir: Path | None,
 ) -> Given:  # fmt: skip
     """Raises MaterialsRefused."""
-    kept = (data_dir or default_data_folder(line)) / "controller.json"
+    folder = data_dir or default_data_folder(line)
+    kept = folder / "controller.json"
     path = controller or (kept if kept.exists() else None)
     try:
         return Given(
-            _model(model, line, file, data_dir) if model else None,
+            _named(model, line, file, data_dir) if model else _accepted(line, folder / FILE_NAME),
             None if path is None else _controller(path),
             [read_recording(one, line.control.period_s) for one in recordings],
         )
@@ -35,11 +37,26 @@ def given(
         raise MaterialsRefused(str(error)) from error
 
 
-def _model(wanted: str, line: Line, file: Path, data_dir: Path | None) -> LineModel:
-    found = chosen(wanted, file, data_dir).model
-    if reasons := reasons_against_line(found, line):
-        raise MaterialsRefused("\n".join(f"--model {wanted} is not used: {reason}" for reason in reasons))
-    return found
+def _named(wanted: str, line: Line, file: Path, data_dir: Path | None) -> LineModel:
+    return _of_line(chosen(wanted, file, data_dir).model, line, f"--model {wanted}")
+
+
+def _accepted(line: Line, path: Path) -> LineModel | None:
+    """None: none is accepted yet."""
+    if not path.exists():
+        return None
+    with open_repository(path) as models:
+        accepted = [one for one in models.entries(line.site, line.line) if one.state == "accepted"]
+    if not accepted:
+        return None
+    found = chosen_of(accepted[-1], path)
+    return _of_line(found.model, line, f"the accepted model, {found.name},")
+
+
+def _of_line(model: LineModel, line: Line, name: str) -> LineModel:
+    if reasons := reasons_against_line(model, line):
+        raise MaterialsRefused("\n".join(f"{name} is not used: {reason}" for reason in reasons))
+    return model
 
 
 def _controller(path: Path) -> Controller:

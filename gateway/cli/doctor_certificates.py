@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from datetime import datetime, timedelta
 from pathlib import Path
 
-from gateway.cli.certificates import NoCertificate, Pair, belongs, certificates_of
+from gateway.cli.certificates import NoCertificate, Pair, belongs, certificates_of, issued
 from gateway.cli.doctor_check import Check
 from gateway.core.line import Network
 
@@ -21,6 +21,7 @@ def certificates(network: Network | None, now: datetime) -> Iterator[Check]:
         return
     for name in ("certificate", "authority"):
         yield _certificate(name, Path(getattr(network, name)), now)
+    yield from _issuer(Path(network.certificate), Path(network.authority))
     yield _private_key(Path(network.certificate), Path(network.private_key))
 
 
@@ -45,6 +46,20 @@ def _certificate(name: str, path: Path, now: datetime) -> Check:
         return Check(GROUP, name, "", "OK", measured, wanted)
     todo = "move it and its key away and run `r2rgate pki init` again; then start the gateway again"
     return Check(GROUP, name, "", "warning", measured, wanted, todo)
+
+
+def _issuer(certificate: Path, authority: Path) -> Iterator[Check]:
+    """Nothing where one of them cannot be read: that is told already."""
+    wanted = "the authority has signed the certificate"
+    try:
+        fits = issued(certificate.read_bytes(), authority.read_bytes())
+    except (OSError, NoCertificate):
+        return
+    if fits:
+        yield Check(GROUP, "issuer", "", "OK", f"{authority} has signed {certificate}", wanted)
+        return
+    measured = f"{certificate} is not signed by {authority}: no agent of another machine is let in"
+    yield Check(GROUP, "issuer", "", "warning", measured, wanted, "name files of one `r2rgate pki init`")
 
 
 def _private_key(certificate: Path, path: Path) -> Check:

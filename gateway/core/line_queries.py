@@ -27,6 +27,10 @@ class AskRefused(Exception):
         self.reasons = reasons
 
 
+class AskMalformed(AskRefused):
+    """It is no ask of its kind at all."""
+
+
 class Generated(Strict):
     """A document that the program makes of the line's own state: its configuration, a model, a deployment ..."""
 
@@ -107,13 +111,13 @@ Ask = TypeVar("Ask", bound=Strict)
 
 
 def parse_ask(payload: bytes, kind: type[Ask]) -> Ask:
-    """The ask in `payload` (JSON). Raises AskRefused with every reason."""
+    """The ask in `payload` (JSON). Raises AskMalformed with every reason."""
     if len(payload) > MOST_BYTES:
-        raise AskRefused([f"it has {len(payload)} bytes; allowed: {MOST_BYTES}"])
+        raise AskMalformed([f"it has {len(payload)} bytes; allowed: {MOST_BYTES}"])
     try:
         document: dict[str, Any] = document_of(payload)
         return kind.model_validate(document)
     except NotJson as error:
-        raise AskRefused([str(error)]) from error
+        raise AskMalformed([str(error)]) from error
     except ValidationError as error:
-        raise AskRefused(problems(error, kind)) from error
+        raise AskMalformed(problems(error, kind)) from error

@@ -11,6 +11,7 @@ from functools import partial
 from pydantic import ValidationError
 
 from gateway.core.audit_record import Who
+from gateway.core.decisions import QUERY
 from gateway.core.dry_run import DryRun
 from gateway.core.interactions import InteractionRefused, Unanswered, unpack
 from gateway.core.json_problems import NotJson, document_of, problems
@@ -63,7 +64,7 @@ class AgentsDesk:
         for agent in AGENT_NAMES:
             bus.serve(ASK_PROPOSE.of(agent), partial(self._propose, agent))
             bus.serve(ASK_STATUS.of(agent), self._tell_status)
-            bus.serve(ASK_PROPOSALS.of(agent), self._gate.answer_query)
+            bus.serve(ASK_PROPOSALS.of(agent), partial(self._query, agent))
             bus.serve(ASK_JUDGE.of(agent), partial(self._judge, agent))
             bus.serve(ASK_LOG.of(agent), partial(self._keep, agent))
             bus.serve(ASK_UNANSWERED.of(agent), partial(self._hear, agent))
@@ -81,6 +82,13 @@ class AgentsDesk:
 
     async def _tell_status(self, _: bytes) -> bytes:
         return self._status().model_dump_json().encode()
+
+    async def _query(self, agent: AgentName, payload: bytes) -> bytes:
+        try:
+            QUERY.validate_json(payload)
+        except ValidationError as error:
+            self._cases.note("refused", f"no query of proposals: {error.errors()[0]['msg']}", agent)
+        return await self._gate.answer_query(payload)
 
     async def _judge(self, agent: AgentName, payload: bytes) -> bytes:
         """What is no proposal costs the judge nothing."""

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from gateway.core.line import Line
 from gateway.core.line_queries import (
+    AskMalformed,
     AskRefused,
     ControllerTold,
     KnowledgePart,
@@ -24,9 +25,18 @@ from gateway.core.line_queries import (
 from gateway.core.messages import Reply
 from gateway.core.packed_recording import most_samples, packed
 from gateway.core.recording import Recording
-from gateway.core.topics import AGENT_NAMES, ASK_CONTROLLER, ASK_KNOWLEDGE, ASK_MODEL, ASK_RECORDING, ASK_RECORDINGS
+from gateway.core.topics import (
+    AGENT_NAMES,
+    ASK_CONTROLLER,
+    ASK_KNOWLEDGE,
+    ASK_MODEL,
+    ASK_RECORDING,
+    ASK_RECORDINGS,
+    AgentName,
+)
 from gateway.mailbox.port import MAX_PAYLOAD, Mailbox
 from gateway.supervisor import configurations, models
+from gateway.supervisor.agents_cases import AgentsCases
 from gateway.supervisor.configurations import ConfigurationsError, open_configurations
 from gateway.supervisor.gate import Gate
 from gateway.supervisor.knowledge.gathered import Known, LineKnowledge, now_of
@@ -40,14 +50,17 @@ _HEAD_BYTES = 1024  #: of a part of the knowledge, beside what it tells
 
 
 class LineDesk:
-    def __init__(self, line: Line, gate: Gate, folder: Path, experiments: Experiments) -> None:
-        """`folder`: of the line's data."""
+    def __init__(self, line: Line, gate: Gate, folder: Path, experiments: Experiments, cases: AgentsCases) -> None:
+        """`folder`: of the line's data. Asks that are none go into `cases`."""
         self._line = line
         self._gate = gate
         self._folder = folder
         self._experiments = experiments
+        self._cases = cases
         self._knowledge = LineKnowledge(line, folder)
-        self._held: Recording | None = None  #: whose parts were asked for last
+        self._listed: dict[
+            str, Recording
+        ] = {}  #: by digest, of the last list: some few, and only of them parts are told
         self._reading, self._gathering = asyncio.Lock(), asyncio.Lock()
 
     def serve_on(self, bus: Mailbox) -> None:
@@ -60,7 +73,20 @@ class LineDesk:
         }
         for agent in AGENT_NAMES:
             for row in (ASK_MODEL, ASK_CONTROLLER, ASK_RECORDINGS, ASK_RECORDING, ASK_KNOWLEDGE):
-                bus.serve(row.of(agent), partial(_answer, served[row]))
+                bus.serve(row.of(agent), partial(self._answer, agent, served[row]))
+
+    async def _answer(
+        self, agent: AgentName, answer: Callable[[bytes], Awaitable[bytes]], payload: bytes
+    ) -> bytes:  # fmt: skip
+        try:
+            said = await answer(payload)
+        except AskRefused as error:
+            if isinstance(error, AskMalformed):
+                self._cases.note("refused", f"it is not told: {error}", agent)
+            return _bytes(refused("it is not told", error.reasons))
+        if len(said) > MAX_PAYLOAD:
+            return _bytes(refused("it is not told", [f"it has {len(said)} bytes; a message carries {MAX_PAYLOAD}"]))
+        return said
 
     async def _model(self, payload: bytes) -> bytes:
         wanted = parse_ask(payload, OfHash).hash
@@ -80,12 +106,16 @@ class LineDesk:
         async with self._reading:
             found = await asyncio.to_thread(self._experiments, self._line.gate.data_max_age_s)
             listed = await asyncio.to_thread(lambda: [_line_of(one, end_s) for one, end_s in found])
+            self._listed = {line.digest: one for line, (one, _) in zip(listed, found, strict=True)}
         return RecordingList(recordings=listed).model_dump_json().encode()
 
     async def _recording(self, payload: bytes) -> bytes:
         asked = parse_ask(payload, OfRecording)
+        one = self._listed.get(asked.digest)
+        if one is None:
+            raise AskRefused([f"there is no recording {asked.digest[:12]} in the last list: ask for the list"])
         async with self._reading:
-            return await asyncio.to_thread(self._part, asked)
+            return await asyncio.to_thread(_part, one, asked.part)
 
     async def _known(self, payload: bytes) -> bytes:
         asked = parse_ask(payload, OfKnowledge)
@@ -125,29 +155,13 @@ class LineDesk:
             raise AskRefused([f"configuration {id_[:12]}: {found.damage}"])
         return ControllerTold(hash=id_, controller=found.controller).model_dump_json().encode()
 
-    def _part(self, asked: OfRecording) -> bytes:
-        one = self._held
-        if one is None or one.digest() != asked.digest:
-            found = [recording for recording, _ in self._experiments(self._line.gate.data_max_age_s)]
-            one = next((recording for recording in found if recording.digest() == asked.digest), None)
-            if one is None:
-                raise AskRefused([f"there is no recording {asked.digest[:12]} (any more): ask for the list"])
-            self._held = one
-        parts = _parts(one)
-        if asked.part >= parts:
-            raise AskRefused([f"part is {asked.part}; allowed: 0 to {parts - 1}"])
-        size = most_samples(one.n, MAX_PAYLOAD)
-        return packed(one.part(asked.part * size, (asked.part + 1) * size))
 
-
-async def _answer(answer: Callable[[bytes], Awaitable[bytes]], payload: bytes) -> bytes:
-    try:
-        said = await answer(payload)
-    except AskRefused as malformed:
-        return _bytes(refused("it is not told", malformed.reasons))
-    if len(said) > MAX_PAYLOAD:
-        return _bytes(refused("it is not told", [f"it has {len(said)} bytes; a message carries {MAX_PAYLOAD}"]))
-    return said
+def _part(one: Recording, part: int) -> bytes:
+    parts = _parts(one)
+    if part >= parts:
+        raise AskRefused([f"part is {part}; allowed: 0 to {parts - 1}"])
+    size = most_samples(one.n, MAX_PAYLOAD)
+    return packed(one.part(part * size, (part + 1) * size))
 
 
 def _parts(one: Recording) -> int:

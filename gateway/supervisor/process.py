@@ -99,7 +99,7 @@ async def serve(
     dry_runs = DryRuns(line, JudgeWorkers(line, nicer=NICEST))
     cases = AgentsCases(gate.audit.append, clock)
     desk = AgentsDesk(gateway.status, gate, dry_runs, Interactions(data_folder), gateway.note, cases)
-    line_desk = LineDesk(line, gate, data_folder, experiments)
+    line_desk = LineDesk(line, gate, data_folder, experiments, cases)
     bus = AgentsBus(line, run_folder, (desk, line_desk), gateway.note, cases, clock)
     gateway.agents_bus = bus.status
     opening = asyncio.create_task(bus.open())

@@ -19,6 +19,7 @@ from gateway.control.design import design_lqi, task_of
 from gateway.core.controller import config_hash
 from gateway.core.line_model import model_hash
 from gateway.mailbox.bus import connect, open_router
+from gateway.supervisor.agents_cases import AgentsCases
 from gateway.supervisor.experiments import MOST_EXPERIMENTS
 from gateway.supervisor.knowledge.stored import known_in
 from gateway.supervisor.line_desk import LineDesk
@@ -47,7 +48,7 @@ def test_a_commissioned_line_tells_what_it_has_become(tmp_path):
                 return list(reversed(side.experiments))[:MOST_EXPERIMENTS]
 
             bus = await open_router(LINE, sockets)
-            LineDesk(LINE, side.gate, tmp_path, newest).serve_on(bus)
+            LineDesk(LINE, side.gate, tmp_path, newest, AgentsCases(side.gate.audit.append)).serve_on(bus)
             agents = await connect(sockets, LINE.site, LINE.line)
             try:
                 line = LineOnBus(agents, "sysid")

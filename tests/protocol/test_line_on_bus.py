@@ -13,6 +13,7 @@ from gateway.core.line_queries import OfHash
 from gateway.core.topics import AGENT_TOPICS, ASK_KNOWLEDGE, ASK_MODEL, ASK_UNANSWERED
 from gateway.mailbox.inprocess import Hub, InProcessMailbox
 from gateway.mailbox.zenoh_mailbox import ZenohMailbox
+from gateway.supervisor.agents_cases import AgentsCases
 from gateway.supervisor.gate import Gate
 from gateway.supervisor.line_desk import LineDesk
 from tests.protocol.bus_support import client, raw_answers, router, run
@@ -35,7 +36,8 @@ async def served(bus: ZenohMailbox, data: Path):
     try:
         while gate.deployer is None:
             await gate.look()
-        LineDesk(LINE, gate, data, lambda most_s: [(recording(2500, 1), 1.0), (recording(20, 2), 0.0)]).serve_on(bus)
+        found = [(recording(2500, 1), 1.0), (recording(20, 2), 0.0)]
+        LineDesk(LINE, gate, data, lambda most_s: found, AgentsCases(gate.audit.append)).serve_on(bus)
         yield gate.deployer
     finally:
         await gate.close()

@@ -10,7 +10,15 @@ import pytest
 from cryptography import x509
 from typer.testing import CliRunner
 
-from gateway.cli.certificates import AUTHORITY_DAYS, CERTIFICATE_DAYS, Authority, NoCertificate, Pair, certificate_of
+from gateway.cli.certificates import (
+    AUTHORITY_DAYS,
+    CERTIFICATE_DAYS,
+    Authority,
+    NoCertificate,
+    Pair,
+    certificate_of,
+    issued,
+)
 from gateway.cli.doctor_certificates import certificates
 from gateway.cli.main import app
 from gateway.cli.pki_bus import PkiRefused, keep_bus_pki
@@ -89,10 +97,10 @@ def test_the_agents_process_meets_a_gateway_elsewhere_by_its_certificate() -> No
             )  # fmt: skip
             assert child.stdout is not None
             try:
-                said: list[bytes] = []
-                while not said or not said[-1].startswith(b"agents of "):
+                said = [await child.stdout.readline()]
+                while said[-1] and not said[-1].startswith(b"agents of "):
                     said.append(await child.stdout.readline())
-                    assert said[-1], said  # it has ended
+                assert said[-1], said
             finally:
                 child.terminate()
             assert await child.wait() == 0
@@ -217,7 +225,7 @@ def test_doctor_tells_a_month_before_a_certificate_ends(tmp_path: Path) -> None:
     (none,) = certificates(None, NOW)
     assert none.verdict == "OK" and "stays on this machine" in none.measured
     good = looked_at(tmp_path / "a", CERTIFICATE_DAYS - 31)
-    assert {verdict for verdict, _ in good.values()} == {"OK"} and len(good) == 3
+    assert {verdict for verdict, _ in good.values()} == {"OK"} and len(good) == 4
     soon = looked_at(tmp_path / "b", CERTIFICATE_DAYS - 29)
     assert soon["certificate"][0] == "warning" and "ends in 29 days" in soon["certificate"][1]
     assert soon["authority"][0] == soon["private key"][0] == "OK"
@@ -225,6 +233,15 @@ def test_doctor_tells_a_month_before_a_certificate_ends(tmp_path: Path) -> None:
     assert over["certificate"][0] == "warning" and "ended 2 days ago" in over["certificate"][1]
     early = looked_at(tmp_path / "d", -1)
     assert early["certificate"][0] == "warning" and "only from" in early["certificate"][1]
+
+
+def test_doctor_tells_a_certificate_that_another_authority_has_signed(tmp_path: Path) -> None:
+    keep_bus_pki(tmp_path / "other", "plant/line", ["127.0.0.1"], ["agents"], NOW)  # of the same names
+    mixed = looked_at(tmp_path / "own", 0, authority=str(tmp_path / "other" / "authority.pem"))
+    assert mixed["issuer"][0] == "warning" and "is not signed by" in mixed["issuer"][1]
+    assert mixed["certificate"][0] == mixed["authority"][0] == mixed["private key"][0] == "OK"
+    both = (tmp_path / "own" / "authority.pem").read_bytes() + (tmp_path / "other" / "authority.pem").read_bytes()
+    assert issued((tmp_path / "own" / "gateway.pem").read_bytes(), both), "one of several is enough"
 
 
 def test_doctor_tells_what_cannot_be_read_and_what_does_not_fit(tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """What tests of the Code agent share: a line, jobs on it, and works for its worker that go wrong in every way."""
 
+import inspect
 import os
 import socket
 import subprocess
@@ -117,6 +118,33 @@ def raises(_: Job) -> Outcome:
 
 def stands(_: Job) -> Outcome:
     return told(nice=os.getpriority(os.PRIO_PROCESS, 0), pid=os.getpid())
+
+
+BEGINNING = b"\x00\x00\x10\x00{"  #: of an answer, whichever way its length is told
+
+
+def stalls(_: Job) -> Outcome:
+    """In the middle of its answer."""
+    os.write(_own_pipe(), BEGINNING)
+    while True:
+        time.sleep(1.0)
+
+
+def trickles(_: Job) -> Outcome:
+    """An answer that has no end."""
+    pipe = _own_pipe()
+    os.write(pipe, BEGINNING)
+    while True:
+        os.write(pipe, b" ")
+        time.sleep(0.001)
+
+
+def _own_pipe() -> int:
+    frame = inspect.currentframe()
+    while frame is not None and "pipe" not in frame.f_locals:
+        frame = frame.f_back
+    assert frame is not None
+    return frame.f_locals["pipe"].fileno()
 
 
 def says_too_much(_: Job) -> Outcome:

@@ -93,14 +93,15 @@ class Records:
         self._record("experiment-ends", proposal=proposal_hash(one), because=because)
         return one
 
-    def model(self, stiffness_n: float = 2400.0) -> LineModel:
+    def model(self, stiffness_n: float = 2400.0, method: str = "test", source: str = "test") -> LineModel:
         """Accepted, without a proposal."""
         self.now_s += DAY_S
         example = parse_model(Path("docs/examples/line-model.json").read_bytes())
         parameters = example.parameters.model_copy(update={"stiffness_n": stiffness_n})
         made = example.model_copy(
-            update={"site": LINE.site, "line": LINE.line, "parameters": parameters, "intervals": {}, "posterior": None}
-        )
+            update={"site": LINE.site, "line": LINE.line, "parameters": parameters, "intervals": {}, "posterior": None,
+                    "method": method, "data": example.data.model_copy(update={"source": source})}
+        )  # fmt: skip
         with begin_repository(self.folder / models.FILE_NAME) as store:
             for one in store.entries(*SITE):
                 if one.state == "accepted":

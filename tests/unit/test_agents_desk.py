@@ -17,9 +17,14 @@ from gateway.core.messages import Reply
 from gateway.core.proposal import Evidence, Proposal, canonical, proposal_hash
 from gateway.core.topics import (
     AGENT_NAMES,
+    AGENT_TOPICS,
+    ASK_CONTROLLER,
     ASK_JUDGE,
+    ASK_KNOWLEDGE,
+    ASK_MODEL,
     ASK_PROPOSALS,
     ASK_PROPOSE,
+    ASK_RECORDINGS,
     ASK_STATUS,
     ASK_UNANSWERED,
     AgentName,
@@ -36,6 +41,7 @@ from gateway.supervisor.dry_runs import LONGER, MOST, DryRuns
 from gateway.supervisor.gate import Gate
 from gateway.supervisor.interactions import Interactions
 from gateway.supervisor.lifecycle import Stage
+from gateway.supervisor.line_desk import LineDesk
 from gateway.supervisor.status import GatewayStatus
 from tests.unit.deployer_support import FIRST, LINE, Death, FakeJudge, FakeLoop, FakeSurroundings, proposal
 from tests.unit.supervisor_support import until
@@ -90,6 +96,7 @@ class Desk:
             lambda: STATUS, self.gate, self.dry_runs, self.log, self.note, self.cases, lambda: self.now_s
         )  # fmt: skip
         desk.serve_on(InProcessMailbox(self.hub))
+        LineDesk(LINE, self.gate, folder, lambda most_s: [], self.cases).serve_on(InProcessMailbox(self.hub))
 
     def note(self, kind: str, text: str, **data: Any) -> None:
         self.events.append((kind, text))
@@ -391,6 +398,36 @@ def test_what_is_no_word_of_a_phase_is_refused_and_on_record(tmp_path, payload):
         await desk.cases.look()
         (found,) = desk.recorded()
         assert found["case"] == "refused" and len(found["newest"]) <= 400
+
+    at_desk(story, tmp_path)
+
+
+TAKES_NOTHING = (ASK_STATUS, ASK_RECORDINGS)  #: what comes with them is not read
+
+
+@pytest.mark.parametrize(
+    "row",
+    [row for row in AGENT_TOPICS if row.answers == "gateway" and row not in TAKES_NOTHING],
+    ids=lambda row: row.name,
+)
+def test_nonsense_is_on_record_with_who_sent_it_wherever_it_came(tmp_path, row):
+    async def story(desk: Desk) -> None:
+        await desk.opened()
+        reply = Reply.model_validate_json(await desk.ask(row, b'{"nonsense": [1, 2, 3]}', "code"))
+        assert not reply.ok and reply.reasons
+        await desk.cases.look()
+        assert [(one["case"], one["agents"]) for one in desk.recorded()] == [("refused", ["code"])]
+
+    at_desk(story, tmp_path)
+
+
+def test_what_is_asked_well_and_cannot_be_told_is_no_case(tmp_path):
+    async def story(desk: Desk) -> None:
+        for row in (ASK_MODEL, ASK_CONTROLLER, ASK_KNOWLEDGE):
+            assert not Reply.model_validate_json(await desk.ask(row, b"{}")).ok, "the gate is shut"
+        await desk.opened()
+        await desk.cases.look()
+        assert desk.recorded() == []
 
     at_desk(story, tmp_path)
 

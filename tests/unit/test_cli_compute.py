@@ -10,7 +10,11 @@ from gateway.cli.main import app
 from gateway.control.design import design_lqi, margins, task_of
 from gateway.core.controller import canonical
 from gateway.core.line_file import load_line
+from gateway.core.line_model import canonical as canonical_model
+from gateway.core.line_model import model_hash
 from gateway.core.line_template import line_template
+from gateway.supervisor.models import FILE_NAME, begin_repository
+from tests.unit.model_support import model
 
 TEXT = line_template(3, "line.toml")
 LINE = load_line(TEXT, "line.toml")
@@ -44,6 +48,32 @@ def test_calls_are_computed_with_the_controller_that_is_kept_and_with_one_anothe
     made, kept, named = json.loads(said)
     assert code == 0 and made["figures"] and kept["figures"] == named["figures"]
     assert kept["figures"][0]["value"] == pytest.approx(1e3 * margins(config, task_of(LINE)).delay_margin_s)
+
+
+def test_without_a_model_the_one_that_was_accepted_last_is_in_service() -> None:
+    folder = Path("data") / f"{LINE.site}-{LINE.line}"
+    folder.mkdir(parents=True)
+    call = {"call": "design", "architecture": "lqi"}
+
+    def named(*options: object) -> str:
+        code, said, error = compute(call, "--json", *options)
+        assert code == 0, error
+        return str(json.loads(said)[0]["words"])
+
+    assert "as none is accepted yet" in named()
+    of_line, other = {"site": LINE.site, "line": LINE.line}, model(3, 1.2, line="another")
+    first, second, third = (model(3, scale, **of_line) for scale in (1.0, 1.05, 1.1))
+    with begin_repository(folder / FILE_NAME) as store:
+        for one in (first, second, third, other):
+            store.store(one, 1.0)
+        store.mark(model_hash(other), "accepted", 2.0, "by a test")
+        assert "as none is accepted yet" in named(), "stored is not accepted"
+        store.mark(model_hash(first), "accepted", 2.0, "by a test")
+        store.mark(model_hash(first), "superseded", 3.0, "by a test")
+        store.mark(model_hash(second), "accepted", 3.0, "by a test")
+    assert f"the accepted model {model_hash(second)[:12]}" in named()
+    Path("third.json").write_bytes(canonical_model(third))
+    assert f"the accepted model {model_hash(third)[:12]}" in named("--model", "third.json")
 
 
 def test_a_call_that_is_refused_says_why_and_the_exit_code_says_so() -> None:

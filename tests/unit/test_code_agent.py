@@ -331,6 +331,51 @@ def test_where_the_results_do_not_fit_it_answers_without_them() -> None:
     assert kept.exchanges[2]["failure"] == "too-long" and kept.exchanges[1]["computed"]
 
 
+def only_calls(failing: Spoken) -> Persona:
+    """Fails when it is asked what to compute, and only then."""
+
+    def persona(messages: Sequence[Message], form: Form, rng: Any) -> Spoken:
+        asks_calls = form is not None and "calls" in form["properties"]
+        return failing if asks_calls else PERSONAS["perfect"](messages, form, rng)
+
+    return persona
+
+
+@pytest.mark.parametrize(
+    ("failing", "kind"),
+    [
+        (Spoken("it thinks", end="hang"), "late"),
+        (Spoken("it broke", status=500), "refused"),
+        (Spoken('{"calls": []}', read_share=0.1), "cut"),
+        (Spoken('{"calls": []}', end="hang-up", after_tokens=1), "broken"),
+    ],
+)
+def test_what_fails_in_computing_costs_the_computations_and_not_the_answer(failing: Spoken, kind: str) -> None:
+    answer, kept, of_code, _ = virtually(asked(only_calls(failing)))
+    assert (answer.choice.option, answer.by) == ("mpc", "adaptation") and not of_code
+    assert purposes(kept) == ["reason", "compute", "answer"]
+    assert kept.exchanges[1]["failure"] == kind and kept.exchanges[1]["refused"]
+    assert kept.exchanges[1]["seconds"] <= 0.5 * SETTINGS.answer_max_s + 1.0
+
+
+def computed_in(messages: Sequence[Message]) -> bool:
+    return any("What was computed" in one["content"] for one in messages)
+
+
+def test_what_was_computed_before_a_failure_is_still_answered_with() -> None:
+    first, heard = json.dumps({"calls": [DESIGN, {"call": "marginz"}]}), list[Sequence[Message]]()
+
+    def persona(messages: Sequence[Message], form: Form, rng: Any) -> Spoken:
+        if form is not None and "calls" in form["properties"]:
+            return Spoken("", status=500) if computed_in(messages) else Spoken(first)
+        heard.append(messages)
+        return PERSONAS["perfect"](messages, form, rng)
+
+    answer, kept, _, _ = virtually(asked(persona))
+    assert answer.by == "adaptation" and purposes(kept) == ["reason", "compute", "compute", "answer"]
+    assert computed_in(heard[-1]) and not computed_in(heard[0])
+
+
 ODD = st.recursive(
     st.none() | st.integers() | st.floats() | st.text(st.characters(), max_size=8),
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(st.characters()), inner),

@@ -166,8 +166,9 @@ def test_of_two_models_the_true_one_is_ahead(recording: Recording) -> None:
     errors = [value(found, f"model {k}: of tension: mean absolute error a second ahead") for k in (1, 2)]
     assert errors[0] < 0.5 * errors[1] and "a second ahead model 1 has the lesser error" in found.words
     assert 0.8 < value(found, "model 1: normalised innovation squared") < 1.2
-    same = replace(both, models=(both.models[1], both.models[1]))
-    assert "two that differ" in refusals(same)
+    again = Believed("by its hash", true.model and true.model.model_copy(deep=True))
+    for one, other in ((both.models[1], both.models[1]), (true, again)):
+        assert "two that differ" in refusals(replace(both, models=(one, other)))
 
 
 # spectrum

@@ -87,7 +87,7 @@ def test_one_thing_more_or_another_is_a_call_or_refused(document: dict[str, Any]
         ([{"call": "margins"}], "it is no object"),
         ({"call": "margins", "modell": "nominal"}, "did you mean model"),
         ({"call": "margins", "model": "nominl"}, "the nearest is nominal"),
-        ({"call": "margins", "model": "../../etc"}, "or the model's hash"),
+        ({"call": "margins", "model": "../../etc"}, "or the accepted model's hash"),
         ({"call": "margins", "controller": "call 0"}, 'an earlier call such as "call 1"'),
         ({"call": "margins", "controller": {"kind": "lqr"}}, "controller"),
         ({"call": "design", "architecture": "lqj"}, "did you mean lqr"),

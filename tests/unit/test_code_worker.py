@@ -4,6 +4,7 @@ import asyncio
 import multiprocessing
 import os
 import socket
+import threading
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -67,7 +68,7 @@ def test_processor_time_is_bounded() -> None:
     assert found.failed == "it used more than 1 s of processor time"
 
 
-@pytest.mark.parametrize("work", [works.waits, works.spins])
+@pytest.mark.parametrize("work", [works.waits, works.spins, works.stalls, works.trickles])
 def test_what_hangs_is_ended(work: Callable[[Job], Outcome]) -> None:
     assert run(work, limits=replace(LIMITS, wall_s=0.2)).failed == "it was not done within 0.2 s"
     assert not multiprocessing.active_children()
@@ -81,7 +82,7 @@ def test_one_that_dies_or_stumbles_or_says_nonsense_is_told() -> None:
     assert run(works.dies).failed == "its process ended before it was done, with exit code 7"
     assert run(works.raises).failed == "RuntimeError: the algorithm has stumbled"
     assert run(works.says_nonsense).failed == "its process has said what is no outcome"
-    assert run(works.says_too_much).failed
+    assert run(works.says_too_much).failed == "its process has said more than 8388608 bytes"
 
 
 def test_it_gives_way_to_the_others() -> None:
@@ -91,6 +92,28 @@ def test_it_gives_way_to_the_others() -> None:
 def begun() -> None:
     while not multiprocessing.active_children():
         pass
+
+
+def test_one_that_stalls_in_its_answer_is_ended_when_nobody_waits_for_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    answering, read = threading.Event(), os.read
+
+    def seen(descriptor: int, most: int) -> bytes:
+        piece = read(descriptor, most)
+        if works.BEGINNING in piece:
+            answering.set()
+        return piece
+
+    monkeypatch.setattr("agents.code.worker.os.read", seen)
+
+    async def story() -> None:
+        task = asyncio.create_task(run_work(nothing, works.stalls, named(""), LONG_S, LIMITS))
+        assert await asyncio.to_thread(answering.wait, LONG_S)
+        task.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await task
+        assert not multiprocessing.active_children()
+
+    asyncio.run(story())
 
 
 def test_what_nobody_waits_for_any_more_is_ended_with_its_process() -> None:

@@ -66,7 +66,14 @@ class Story:
         self.folder = folder
         self.line = Line(*documents)
         self.told: list[str] = []
-        self.known = Knowledge(folder, self.line, embedder, self.told.append)
+        self.embedder = embedder
+        self.away = False
+        self.known = Knowledge(folder, self.line, self._find, self.told.append)
+
+    async def _find(self) -> WordCounter | None:
+        if self.away:
+            raise EmbedderFailed("nobody answers there")
+        return self.embedder
 
     async def look(self) -> None:
         """As `keep_up` does each time."""
@@ -201,6 +208,46 @@ def test_an_embedder_that_fails_is_told_once_and_things_are_looked_up_by_words(t
             embedder.fails = False
             await one.look()
             assert await one.names("timbuktu") == ["line:model-1"]
+
+    run(story)
+
+
+def test_an_embedder_that_is_away_at_the_beginning_costs_no_vectors_and_is_used_once_it_is_there(tmp_path):
+    embedder = WordCounter()
+
+    async def story() -> None:
+        async with begun(Story(tmp_path, made("zanzibar"), embedder=embedder)) as one:
+            await one.look()
+        whole, before = (tmp_path / INDEX).read_bytes(), list(embedder.embedded)
+        later = Story(tmp_path, made("timbuktu"), embedder=embedder)
+        later.away = True
+        async with begun(later):
+            for _ in range(2):
+                assert await later.names("zanzibar") == ["line:model-1"]
+                await later.look()
+            assert (tmp_path / INDEX).read_bytes() == whole and embedder.embedded == before
+            assert later.told.count("things are looked up by words: nobody answers there") == 1
+            later.away = False
+            await later.look()
+            new = embedder.embedded[len(before) :]
+            assert new and all("timbuktu" in text for text in new), "the vectors of before are taken over"
+            assert await later.names("timbuktu") == ["line:model-1"] and embedder.embedded[-1] == "timbuktu"
+
+    run(story)
+
+
+def test_without_an_index_things_are_looked_up_by_words_until_the_embedder_is_there(tmp_path):
+    async def story() -> None:
+        one = Story(tmp_path, made("zanzibar"), embedder=WordCounter())
+        one.away = True
+        async with begun(one):
+            one.line.documents = [made("timbuktu")]
+            await one.look()
+            assert await one.names("timbuktu") == ["line:model-1"]
+            one.away = False
+            await one.look()
+            with Index(tmp_path / INDEX) as index:
+                assert index.embedder == WordCounter().identity
 
     run(story)
 

@@ -27,6 +27,7 @@ from gateway.core.topics import (
 from gateway.mailbox.inprocess import Hub, InProcessMailbox
 from gateway.mailbox.port import MAX_PAYLOAD
 from gateway.supervisor import configurations, line_desk, models
+from gateway.supervisor.agents_cases import AgentsCases
 from gateway.supervisor.configurations import Origin, begin_configurations
 from gateway.supervisor.gate import Gate
 from gateway.supervisor.line_desk import LineDesk
@@ -63,7 +64,8 @@ class Desk:
             lambda configurations, models: FakeSurroundings(FakeLoop(Death())), lambda *_, **__: None, lambda: 1.0,
             lambda: NOW_S,
         )  # fmt: skip
-        LineDesk(LINE, self.gate, folder, self._experiments).serve_on(InProcessMailbox(self.hub))
+        cases = AgentsCases(self.gate.audit.append)
+        LineDesk(LINE, self.gate, folder, self._experiments, cases).serve_on(InProcessMailbox(self.hub))
         self.line = LineOnBus(self.bus, "sysid", no_pause)
 
     def _experiments(self, _: float) -> list[tuple[Recording, float]]:
@@ -139,15 +141,34 @@ def test_recordings_come_in_parts_that_fit_and_are_what_they_were(tmp_path):
         found = await desk.line.recordings()
         assert [one.digest() for one in found] == [short.digest(), long.digest()]
         assert [one.source for one in found] == ["noise 2", "noise 1"]
-        assert desk.read == 3  # once for the list, once for each: not for each part
+        assert desk.read == 1, "the list; the parts are of what was read for it"
         ask = OfRecording(digest=long.digest(), part=99)
         reply = Reply.model_validate_json(await desk.ask(ASK_RECORDING, ask.model_dump_json().encode()))
         assert not reply.ok and "allowed: 0 to" in reply.reasons[0]
-        desk.recordings = []
-        reply = Reply.model_validate_json(
-            await desk.ask(ASK_RECORDING, OfRecording(digest="0" * 64, part=0).model_dump_json().encode())
-        )
-        assert not reply.ok and "ask for the list" in reply.reasons[0]
+        for digest in ("0" * 64, recording(4000, 3).digest()):
+            unknown = OfRecording(digest=digest, part=0).model_dump_json().encode()
+            reply = Reply.model_validate_json(await desk.ask(ASK_RECORDING, unknown))
+            assert not reply.ok and "ask for the list" in reply.reasons[0]
+        assert desk.read == 1, "who guesses has nothing read"
+
+    at_desk(story, tmp_path)
+
+
+def test_two_who_read_other_recordings_at_a_time_have_nothing_read_again(tmp_path):
+    async def story(desk: Desk) -> None:
+        found = [recording(4000, 1), recording(4000, 2)]
+        desk.recordings = [(one, NOW_S) for one in found]
+        await desk.ask(ASK_RECORDINGS, b"")
+        for part in range(2):
+            for one in found:
+                ask = OfRecording(digest=one.digest(), part=part).model_dump_json().encode()
+                size = most_samples(LINE.n, MAX_PAYLOAD)
+                assert await desk.ask(ASK_RECORDING, ask) == packed(one.part(part * size, (part + 1) * size))
+        desk.recordings = desk.recordings[:1]
+        await desk.ask(ASK_RECORDINGS, b"")
+        gone = OfRecording(digest=found[1].digest(), part=0).model_dump_json().encode()
+        assert not Reply.model_validate_json(await desk.ask(ASK_RECORDING, gone)).ok
+        assert desk.read == 2, "once for each list"
 
     at_desk(story, tmp_path)
 

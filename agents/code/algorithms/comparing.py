@@ -31,7 +31,7 @@ def _controllers(call: Compare, job: Job) -> Outcome:
 
 def _models(job: Job) -> Outcome:
     """Raises CallRefused, Unpredictable."""
-    if job.models[0].model is job.models[1].model:
+    if job.models[0].model == job.models[1].model:
         raise CallRefused([f"both models are {job.models[1].name}; allowed: two that differ"])
     stretches = stretches_of(job.recordings)
     figures: list[Figure] = []

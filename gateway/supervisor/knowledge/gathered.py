@@ -14,6 +14,7 @@ from pydantic import ValidationError
 
 from gateway.core.controller import Controller
 from gateway.core.line import Line
+from gateway.core.line_problem import printable
 from gateway.core.line_queries import Generated
 from gateway.core.proposal import Proposal
 from gateway.core.verdict import Verdict
@@ -32,10 +33,11 @@ from gateway.supervisor.models import open_repository
 #: Of each kind; further ones are left out, the oldest first.
 MOST_MODELS, MOST_DEPLOYMENTS, MOST_REFUSALS, MOST_EXPERIMENTS, MOST_MEASUREMENTS = 20, 40, 40, 20, 40
 MOST_ARCHIVED = 40
-MOST_LETTERS = 20_000  #: of a document of what happened
+MOST_WHY = 300  #: letters of why something is left out
 _FILES = (audit_file.FILE_NAME, baselines.FILE_NAME, configurations.FILE_NAME, models.FILE_NAME)
 _ERRORS = (AuditUnavailable, BaselinesError, ConfigurationsError, ModelsError)
 _T = TypeVar("_T")
+_M = TypeVar("_M")
 
 
 @dataclass(frozen=True)
@@ -84,20 +86,24 @@ class LineKnowledge:
         measured = self._from("measurements", self._measurements, [], left_out)
         archived = self._from("archived configurations", self._archives, [], left_out)
         control = self._from("what is in service", lambda: self._control(now), of_control(_bare(now)), left_out)
+        measured = _newest(measured, MOST_MEASUREMENTS, "measurements", left_out)
+        archives = _newest(archived, MOST_ARCHIVED, "archived configurations", left_out)
         happened = [
             *self._from("models", lambda: self._models(now, left_out), [], left_out),
             *self._from("proposals", lambda: self._changes(now, measured, archived, left_out), [], left_out),
-            *map(of_measurement, _newest(measured, MOST_MEASUREMENTS, "measurements", left_out)),
-            *(of_archive(*one) for one in _newest(archived, MOST_ARCHIVED, "archived configurations", left_out)),
+            *_each("measurement", measured, lambda one: str(one.number), of_measurement, left_out),
+            *_each("archived configuration", archives, lambda one: one[1].name, lambda one: of_archive(*one), left_out),
         ]
-        bounded = [_bounded(one) for one in (*of_line(self._line), control, of_recent(happened), *happened)]
-        return Known(bounded, left_out, _revision(bounded, left_out))
+        of_file = self._from("the line's file", lambda: of_line(self._line), [], left_out)
+        recent = self._from("what happened last", lambda: [of_recent(happened)], [], left_out)
+        told = [*of_file, control, *recent, *happened]
+        return Known(told, left_out, _revision(told, left_out))
 
     def _from(self, what: str, read: Callable[[], _T], otherwise: _T, left_out: list[str]) -> _T:
         try:
             return read()
-        except _ERRORS as error:
-            left_out.append(f"{what}: {error}")
+        except Exception as error:  # of a store, or of what is in it: the rest is told
+            left_out.append(f"{what}: {_why(error)}")
             return otherwise
 
     def _measurements(self) -> list[Measurement]:
@@ -137,11 +143,11 @@ class LineKnowledge:
         left_out += [f"model version {one.version}: {one.damage}" for one in accepted if one.model is None]
         sound = [(one, one.model) for one in accepted if one.model is not None]
         befores = [None, *(model for _, model in sound)]
-        told = [
-            of_model(one, model, before, one.id == now.model)
-            for (one, model), before in zip(sound, befores, strict=False)
-        ]
-        return _newest(told, MOST_MODELS, "models", left_out)
+        pairs = _newest(list(zip(sound, befores, strict=False)), MOST_MODELS, "models", left_out)
+        return _each(
+            "model version", pairs, lambda pair: str(pair[0][0].version),
+            lambda pair: of_model(*pair[0], pair[1], pair[0][0].id == now.model), left_out,
+        )  # fmt: skip
 
     def _changes(
         self, now: BookNow, measured: Sequence[Measurement], archived: Sequence[tuple[str, Archived]],
@@ -176,7 +182,8 @@ class LineKnowledge:
                     left_out.append(f"proposal {entry.proposal[:12]}: the audit has lost it")
                     continue
                 change = Change(entry, proposal, verdict or None, befores.get(entry.base), of.get(entry.changes, ()))
-                self._made[keys[entry]] = of_change(change)
+                for made in _each("proposal", [change], lambda one: one.entry.proposal[:12], of_change, left_out):
+                    self._made[keys[entry]] = made
 
     def _controllers(self, ids: Iterable[str]) -> dict[str, Controller]:
         """Those that are stored and sound."""
@@ -210,10 +217,22 @@ def _newest(given: Sequence[_T], most: int, what: str, left_out: list[str]) -> l
     return list(given[-most:])
 
 
-def _bounded(one: Generated) -> Generated:
-    if len(one.text) <= MOST_LETTERS or one.name.startswith("line"):  # of the file, which is bounded itself
-        return one
-    return one.model_copy(update={"text": f"{one.text[:MOST_LETTERS]}\n\n(cut here: it goes on in the line's records)"})
+def _each(
+    what: str, given: Iterable[_T], name: Callable[[_T], str], make: Callable[[_T], _M], left_out: list[str]
+) -> list[_M]:  # fmt: skip
+    """A document of each. One that cannot be made is left out, and the rest is told."""
+    told: list[_M] = []
+    for one in given:
+        try:
+            told.append(make(one))
+        except Exception as error:  # whatever stands in a record that others have written
+            left_out.append(f"{what} {name(one)}: {_why(error)}")
+    return told
+
+
+def _why(error: Exception) -> str:
+    said = str(error) if isinstance(error, _ERRORS) else f"{type(error).__name__}: {error}"
+    return printable(said)[:MOST_WHY]
 
 
 def _bare(now: BookNow) -> ControlNow:

@@ -12,6 +12,7 @@ from gateway.core.line_queries import Generated
 from gateway.core.line_words import name_and_unit
 from gateway.supervisor.knowledge.words import listed, number, quoted, section, whole
 
+MOST_LETTERS = 90_000  #: of a document here: a file of sixty spans is told whole
 _TABLES = {"limits": "Limits", "moves": "Moves", "control": "Control", "gate": "Gate", "priorities": "Priorities"}
 _KEYWORDS = {
     "limits": ["torque limit", "tension limit", "speed limit", "largest step", "watchdog"],
@@ -46,7 +47,7 @@ def _equipment(line: Line) -> Generated:
                 f"Roller {i} ({roller.name}) {_drive(drives.get(i))}." for i, roller in enumerate(line.rollers, 1)
             )),
             listed("Buses", (f"Bus {bus.name} speaks {bus.protocol}." for bus in line.buses)),
-        ]),
+        ], MOST_LETTERS),
         date="",
         keywords=["equipment", "layout", "how many spans", "load cells", "drives", "fieldbus", "unwinder"],
     )  # fmt: skip
@@ -66,7 +67,7 @@ def _believed(line: Line) -> Generated:
                 f"{_parameter('viscous friction', one.friction_nms_per_rad, 'Nm s/rad')}."
                 for i, one in enumerate(line.rollers, 1)
             )),
-        ]),
+        ], MOST_LETTERS),
         date="",
         keywords=["nominal values", "tolerances", "line.toml"],
     )  # fmt: skip
@@ -78,10 +79,10 @@ def _table(line: Line, key: str, model: str) -> Generated:
     return Generated(
         name=f"line-{key}",
         title=f"The {key} of this line",
-        text=f"As the line's file has it: {HELP['Line'][key].partition(';')[0]}.\n\n" + listed(key.capitalize(), (
+        text=whole([f"As the line's file has it: {HELP['Line'][key].partition(';')[0]}.", listed(key.capitalize(), (
             f"{_named(key, name)} is {_value('' if key == 'priorities' else name, value)}: {HELP[model][name]}."
             for name, value in fields.items() if value is not None
-        )),
+        ))], MOST_LETTERS),
         date="",
         keywords=_KEYWORDS[key],
     )  # fmt: skip
@@ -91,10 +92,10 @@ def _recipes(line: Line) -> Generated:
     return Generated(
         name="line-recipes",
         title="The recipes of this line: set-points of tension and speed of each grade",
-        text=listed("Recipes", (
+        text=whole([listed("Recipes", (
             f"Recipe {one.name}: {', '.join(map(number, one.tension_n))} N in spans 1 to {line.n}, at "
             f"{number(one.speed_m_per_s, 'm/s')}." for one in line.recipes
-        )),
+        ))], MOST_LETTERS),
         date="",
         keywords=["grades", "set-points", "recipes", "production speed"],
     )  # fmt: skip

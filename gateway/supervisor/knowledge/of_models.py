@@ -52,6 +52,8 @@ def of_model(entry: Entry, model: LineModel, before: LineModel | None, in_servic
                 "How it was found",
                 f"Against the model before: {'; '.join(differences(before, model))}.",
                 _made_from(model), _validated(model),
+                "Method, in the words of whoever made it:", quoted(model.method),
+                "Source of the data, in the same:", quoted(model.data.source), *_late(model),
                 *(["It was proposed because:", quoted(accepted[-1].reason)] if accepted else []),
             ),
         ]),
@@ -102,12 +104,16 @@ def _made_from(model: LineModel) -> str:
     has = [name.replace("_", " ") for name, there in model.structure.model_dump().items() if there]
     tensions = [one for one in (*region.tension_from_n, *region.tension_to_n) if one is not None]
     return " ".join([
-        f"Method: {model.method}. Beside the usual parameters it has: {', '.join(has) or 'nothing'}.",
-        f"Data: {data.samples} samples at {number(1e3 * data.period_s, 'ms')} ({data.digest[:12]}, {data.source}).",
+        f"Beside the usual parameters it has: {', '.join(has) or 'nothing'}.",
+        f"Data: {data.samples} samples at {number(1e3 * data.period_s, 'ms')} ({data.digest[:12]}).",
         f"The unwinder ran from {number(region.speed_from_m_per_s)} to {number(region.speed_to_m_per_s, 'm/s')} in them"
         + (f", tensions went from {number(min(tensions))} to {number(max(tensions), 'N')}." if tensions else "."),
-        *(f"Channel {one.channel} tells {number(1e3 * one.late_s, 'ms')} late." for one in model.alignment),
     ])  # fmt: skip
+
+
+def _late(model: LineModel) -> list[str]:
+    told = "; ".join(f"{one.channel} by {number(1e3 * one.late_s, 'ms')}" for one in model.alignment)
+    return ["Channels that tell late:", quoted(told)] if told else []
 
 
 def _validated(model: LineModel) -> str:

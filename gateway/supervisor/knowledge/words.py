@@ -5,6 +5,7 @@ from datetime import UTC, datetime
 
 from gateway.core.line_problem import printable
 
+MOST_LETTERS = 20_000  #: of a document of what happened
 MOST_QUOTED = 1000  #: letters of what somebody has written
 
 
@@ -42,6 +43,7 @@ def section(head: str, *paragraphs: str) -> str:
     return "\n\n".join([f"## {head}", *filter(None, paragraphs)])
 
 
-def whole(parts: Sequence[str]) -> str:
-    """A document of its parts, without the empty ones."""
-    return "\n\n".join(part for part in parts if part)
+def whole(parts: Sequence[str], most: int = MOST_LETTERS) -> str:
+    """A document of its parts, without the empty ones, and not longer than `most` letters and a word."""
+    text = "\n\n".join(part for part in parts if part)
+    return text if len(text) <= most else f"{text[:most]}\n\n(cut here: it goes on in the line's records)"
