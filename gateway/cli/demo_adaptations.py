@@ -40,7 +40,10 @@ def adaptations_section(result: DemoResult, chain: ChainResult) -> Section:
         if change.step == Step.REDESIGN and change.stage == "kept":
             stories.append(_adaptation(result, chain, chain.changes[begin:end], change))
             begin = end + 1
-    said = "Each begins with what the line showed, and ends with what was measured on it."
+    said = (
+        "Each begins with what the line showed, and ends with what was measured on it. Two are asked for, as the paper "
+        "has them: the second follows whatever was concluded before it."
+    )
     if not stories:
         said = "No redesign came to be kept: what the gate found against each stands below, under Through the gate."
     return Section("Adaptations: diagnosis, change, verdict, result", (said,), stories=tuple(stories))
