@@ -17,7 +17,7 @@ from gateway.supervisor.agents_cases import AgentsCases
 from gateway.supervisor.gate import Gate
 from gateway.supervisor.line_desk import LineDesk
 from tests.protocol.bus_support import client, raw_answers, router, run
-from tests.protocol.test_agents import decided, process, serve_log
+from tests.protocol.test_agents import answered, process, serve_log
 from tests.unit.deployer_support import LINE, Death, FakeJudge, FakeLoop, FakeSurroundings, controller
 from tests.unit.knowledge_support import Records
 from tests.unit.language_model_support import QUESTION
@@ -100,7 +100,7 @@ def test_the_agents_process_answers_with_what_is_known_of_the_line() -> None:
             task = "What does the last measurement of span 3 say?"
             question = QUESTION.model_copy(update={"task": task, "facts": []})
             async with process(folder):
-                await decided(phases, question)
+                await answered(phases, question)
             assert log[0].notes[0].key in ("line:measurement-1", "line:recent")
             assert log[0].notes[0].tier == 3
 
