@@ -37,8 +37,9 @@ async def decided(bus: ZenohMailbox, question: Question = QUESTION, line: Line =
 
 async def answered(bus: ZenohMailbox, question: Question = QUESTION) -> Decided:
     """Once it is known here that somebody answers: that travels by itself."""
-    while "nobody answers" in (found := await decided(bus, question)).instead:
-        await asyncio.sleep(0.01)
+    found = await decided(bus, question)
+    while "nobody answers" in found.instead:
+        found = await decided(bus, question)
     return found
 
 
