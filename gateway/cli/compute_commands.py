@@ -36,7 +36,7 @@ def compute(
 
     Exit code: 0 computed, 1 a call came to no end, 2 refused.
 
-    Example: echo '{"call": "margins"}' > call.json; r2rgate compute line.toml call.json --controller controller.json
+    Example: echo '{"call": "design", "architecture": "lqi"}' > call.json; r2rgate compute line.toml call.json
 
     Example, an earlier call's controller: '\\[{"call": "design", "architecture": "lqg"}, {"call": "simulate",
     "controller": "call 1"}]'

@@ -57,7 +57,7 @@ def init(
 ) -> None:
     """Certificates for the agents' bus beyond this machine: an authority, the gateway's, one for each agents' process.
 
-    Private files (PEM), and the table [network] to put into the line's file. Nothing is overwritten: what is there
+    Private files (PEM), and the table \\[network] to put into the line's file. Nothing is overwritten: what is there
     stays, and what is missing is made, so that the same command adds an agent or renews what was moved away.
 
     Exit code: 0 made, 2 refused.
