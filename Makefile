@@ -50,7 +50,7 @@ check: setup ## lint, types, import contracts
 	@$(MAKE) --no-print-directory --jobs=2 --output-sync types lint
 
 types: setup
-	@$(PY) -m basedpyright
+	@$(PY) -m basedpyright --threads 2
 
 lint: setup
 	@$(PY) -m ruff check .

@@ -11,7 +11,7 @@ from gateway.core.line import Network
 
 GROUP = "certificates"
 SOON = timedelta(days=30)
-_TODO = "make them with `r2rgate pki init`; until then the bus stays on this machine, and the rest runs"
+_MEND = "make them with `r2rgate pki init`; until then the bus stays on this machine, and the rest runs"
 
 
 def certificates(network: Network | None, now: datetime) -> Iterator[Check]:
@@ -31,9 +31,9 @@ def _certificate(name: str, path: Path, now: datetime) -> Check:
     try:
         found = certificates_of(path.read_bytes())
     except OSError as error:
-        return Check(GROUP, name, "", "warning", f"{path} cannot be read: {error.strerror}", wanted, _TODO)
+        return Check(GROUP, name, "", "warning", f"{path} cannot be read: {error.strerror}", wanted, _MEND)
     except NoCertificate as error:
-        return Check(GROUP, name, "", "warning", f"{path}: {error}", wanted, _TODO)
+        return Check(GROUP, name, "", "warning", f"{path}: {error}", wanted, _MEND)
     until = min(one.not_valid_after_utc for one in found)
     begins = max(one.not_valid_before_utc for one in found)
     days = (until - now) / timedelta(days=1)
@@ -70,11 +70,11 @@ def _private_key(certificate: Path, path: Path) -> Check:
         fits = belongs(Pair(certificate.read_bytes(), path.read_bytes()))
     except OSError as error:
         measured = f"{error.filename} cannot be read: {error.strerror}"
-        return Check(GROUP, "private key", "", "warning", measured, wanted, _TODO)
+        return Check(GROUP, "private key", "", "warning", measured, wanted, _MEND)
     except NoCertificate as error:
-        return Check(GROUP, "private key", "", "warning", f"{path}: {error}", wanted, _TODO)
+        return Check(GROUP, "private key", "", "warning", f"{path}: {error}", wanted, _MEND)
     if not fits:
-        return Check(GROUP, "private key", "", "warning", f"{path} is another certificate's", wanted, _TODO)
+        return Check(GROUP, "private key", "", "warning", f"{path} is another certificate's", wanted, _MEND)
     if mode & (stat.S_IRWXG | stat.S_IRWXO):
         return Check(GROUP, "private key", "", "warning", f"{path} has mode {mode:o}", wanted, f"`chmod 600 {path}`")
     return Check(GROUP, "private key", "", "OK", f"{path}, mode {mode:o}", wanted)
