@@ -10,6 +10,7 @@ from gateway.control.judged_courses import Judged, improvement_courses, way_of_m
 from gateway.control.rollout import Course, Rollouts, Setup, plants_of_thetas, simulate
 from gateway.control.shaped_run import Way, follow
 from gateway.core.controller import Controller
+from gateway.core.deployment import Region
 from gateway.core.signals import FloatArray
 from gateway.core.theta import Noise
 from gateway.core.verdict import ScenarioFigures
@@ -97,12 +98,22 @@ def _of_proposed(case: Case, judged: Judged, in_service: Performance) -> Perform
 
 def beside_in_service(case: Case) -> tuple[Performance, Performance]:
     """What is in service and what is proposed, no further than the former was judged for: beyond it never runs."""
-    known = compared_of(case)
+    return _beside("in service", case.context.in_service, case.context.region, case)
+
+
+def beside_baseline(case: Case) -> tuple[Performance, Performance] | None:
+    """The baseline and what is proposed, as far as the former is a measure; None: there is none."""
+    context = case.context
+    return None if context.baseline is None else _beside("baseline", context.baseline, context.baseline_region, case)
+
+
+def _beside(whose: Whose, config: Controller, region: Region, case: Case) -> tuple[Performance, Performance]:
+    known = compared_of(case, region)
     if known is None:
         found = performances(case)
-        return found["in service"], found["proposed"]
-    in_service = performance(case.context.in_service, case, known)
-    return in_service, _of_proposed(case, known, in_service)
+        return found[whose], found["proposed"]
+    reference = performance(config, case, known)
+    return reference, _of_proposed(case, known, reference)
 
 
 def _figures(noisy: Rollouts, quiet: Rollouts, course: Course, setup: Setup, case: Case) -> Figures:

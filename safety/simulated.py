@@ -7,6 +7,7 @@ import numpy as np
 
 from gateway.control.judged_courses import CornerCourse, Judged
 from gateway.control.rollout import Course, Plants, Setup, plants_of_thetas
+from gateway.core.deployment import Region
 from gateway.core.line import Gate, Line
 from gateway.core.signals import FloatArray
 from gateway.core.theta import Noise, Theta
@@ -22,10 +23,10 @@ def judged_of(case: Case) -> Judged:
     return Judged(case.line, case.tension_n, case.speed_max_m_per_s, case.tension_step_n, case.speed_step_m_per_s)
 
 
-def compared_of(case: Case) -> Judged | None:
-    """How far what is in service is a measure for the proposal; None: in all that this is judged for."""
+def compared_of(case: Case, region: Region) -> Judged | None:
+    """How far what was judged for `region` is a measure for the proposal; None: in all that this is judged for."""
     judged = judged_of(case)
-    known = judged.within(case.context.region)
+    known = judged.within(region)
     return None if known is judged else known
 
 

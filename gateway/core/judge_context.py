@@ -53,6 +53,7 @@ class JudgeContext(Strict):
     in_service: ControllerConfig
     region: Region = Region()  #: for which that was judged; what it would do beyond is no measure for others
     baseline: ControllerConfig | None = None  #: that small steps are held against; null: as in service
+    baseline_region: Region = Region()  #: as far as it is a measure
     model: LineModel | None = None  #: accepted, by which is judged; null: the tolerances of the line's file
     data: Annotated[list[DataReference], Field(max_length=64)] = []  #: recent, on which the model must hold
     latency_s: NonNegative | None = None  #: measured, from a sample to its torque; null: the line's file

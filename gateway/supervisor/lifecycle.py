@@ -117,13 +117,26 @@ class Book:
         return list(islice(self.entries.values(), self.before_change, None))
 
     @property
+    def kept_for(self) -> dict[str, Region]:
+        """Configurations kept on the line as it is now, the earliest first, as far as each was judged."""
+        found: dict[str, Region] = {}
+        for entry in self.since_change:
+            if entry.stage is Stage.KEPT and entry.region is not None:
+                before = found.get(entry.changes)
+                found[entry.changes] = entry.region if before is None else before.and_also(entry.region)
+        return found
+
+    @property
     def judged_for(self) -> Region:
         """As far as the configuration in service has been judged and kept, now or before: data become too old again."""
-        found = self.region
-        for entry in self.since_change:
-            if entry.changes == self.in_service and entry.stage is Stage.KEPT and entry.region is not None:
-                found = found.and_also(entry.region)
-        return found
+        before = self.kept_for.get(self.in_service or "")
+        return self.region if before is None else self.region.and_also(before)
+
+    @property
+    def first_as_far(self) -> tuple[str, Region] | None:
+        """The earliest that was kept for all that the one in service is, which no chain of small steps moves."""
+        here = self.judged_for
+        return next(((one, region) for one, region in self.kept_for.items() if here.within(region)), None)
 
     def why_not(self, kind: str, what: Mapping[str, Any]) -> str:
         """Why a record of `kind` cannot come now; empty: it can."""

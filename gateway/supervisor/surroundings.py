@@ -57,13 +57,15 @@ class LineSurroundings:
         now_s = self._wall_clock()
         found = await asyncio.to_thread(self._experiments, self._line.gate.data_max_age_s)
         found = [one for one in found if book.line_changed_s is None or one[1] > book.line_changed_s]
+        baseline, baseline_region = self._baseline(book)
         return JudgeContext(
             format=1,
             now=iso(now_s),
             state=self._state(book, now_s),
             in_service=self._controller(book.in_service),
             region=book.judged_for,
-            baseline=self._baseline(book),
+            baseline=baseline,
+            baseline_region=baseline_region,
             model=self._model(book),
             data=[
                 DataReference(path=f"{one.digest()}.npz", digest=one.digest(), recorded=iso(end_s))
@@ -143,8 +145,18 @@ class LineSurroundings:
             raise NotKnown(f"the configuration in service, {hash_[:12]}, is damaged in the store")
         return controller
 
-    def _baseline(self, book: Book) -> Controller | None:
-        """What was archived on the line as it is now: on another web it was never judged."""
+    def _baseline(self, book: Book) -> tuple[Controller | None, Region]:
+        """What was archived on the line as it is; else the first that was kept for as much as what is in service."""
+        archived = self._archived(book)
+        if archived is not None:
+            return archived, Region()
+        first = book.first_as_far
+        if first is None or first[0] == book.in_service:
+            return None, Region()
+        return self._controller(first[0]), first[1]
+
+    def _archived(self, book: Book) -> Controller | None:
+        """On another web it was never judged."""
         site, line, changed_s = self._line.site, self._line.line, book.line_changed_s
         try:
             archived = [one.time_s for _, one in self._configurations.archives(site, line) if one.name == STABLE]

@@ -2,11 +2,12 @@
 baseline, so that many small steps do not walk away.
 """
 
+from gateway.core.deployment import Region
 from gateway.core.line import Gate
 from gateway.core.verdict import RuleFinding
 from safety.case import Case
 from safety.findings import at_most
-from safety.performance import Figures, Performance, beside_in_service, performances
+from safety.performance import Figures, Performance, beside_baseline, beside_in_service
 from safety.simulated import compared_of
 
 RULE = "improvement"
@@ -17,13 +18,15 @@ NAMES = {"rmse_n": "tracking error", "overshoot_pct": "overshoot", "settling_s":
 def check(case: Case) -> list[RuleFinding]:
     """Of each metric the course in which it does worst, against each reference, with gate.tolerance_*.
 
-    Against what is in service only as far as that was judged for: where it never runs, it is no measure.
+    Against each only as far as that was judged for: where it never runs, it is no measure.
     """
-    found, gate = performances(case), case.line.gate
-    both = beside_in_service(case)
-    findings = [_worst(gate, metric, "in service", *both, _as_far_as(case)) for metric in UNITS]
-    if "baseline" in found:
-        findings += [_worst(gate, metric, "baseline", found["baseline"], found["proposed"]) for metric in UNITS]
+    gate, context = case.line.gate, case.context
+    in_service, baseline = beside_in_service(case), beside_baseline(case)
+    known = _as_far_as(case, context.region)
+    findings = [_worst(gate, metric, "in service", *in_service, known) for metric in UNITS]
+    if baseline is not None:
+        known = _as_far_as(case, context.baseline_region)
+        findings += [_worst(gate, metric, "baseline", *baseline, known) for metric in UNITS]
     return findings
 
 
@@ -57,9 +60,9 @@ def in_words(value: float, metric: str) -> str:
     return f"{value:.3g} {UNITS[metric]}"
 
 
-def _as_far_as(case: Case) -> str:
-    """How far what is in service is a measure; empty: in everything that the change is proposed for."""
-    known = compared_of(case)
+def _as_far_as(case: Case, region: Region) -> str:
+    """How far what was judged for `region` is a measure; empty: in everything that the change is proposed for."""
+    known = compared_of(case, region)
     if known is None:
         return ""
     return f", compared up to {known.speed_max_m_per_s:.3g} m/s and steps of {known.tension_step_n:.3g} N"

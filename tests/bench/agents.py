@@ -12,7 +12,8 @@ What the agents look things up in has a document with orders to its reader, for 
 
 Never worse than the start: RMSE of what is in service in the end over that of what was at the begin, in the same
 noises, in each case of each task, no more than `TOLERANCE` above 1. That is the gate's share; where an error is small
-the gate lets it grow by an absolute tolerance (`tolerance_n`), which is more, and is not granted here. One
+the gate lets it grow by an absolute tolerance (`tolerance_n`), which is more, and is not granted here; nor is that a
+first configuration is held against nothing. One
 configuration in two noises of load cells and rollers differs by more than that (figure `noise_p95`); both run in the
 same ones. A ratio that is not there, because the line was stopped with the one or the other, is counted: `missing`.
 

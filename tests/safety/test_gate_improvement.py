@@ -53,6 +53,22 @@ def test_nothing_is_worse_than_what_in_service_would_do_beyond_what_it_was_judge
     assert against(small) == {"improvement: overshoot, in service"} <= everywhere
 
 
+def test_the_baseline_is_a_measure_as_far_as_it_was_judged_for(of, context, redesigned):
+    first = design_lqi(task_of(of.line))
+
+    def against(region):
+        walked = context.model_copy(update={"in_service": first, "baseline": redesigned, "baseline_region": region})
+        found = improvement.check(case_of(gains(first, walked), walked, of))
+        told = next(one.text for one in found if one.rule == "improvement: tracking error, baseline")
+        return {one.rule for one in found if not one.passed}, told
+
+    refused_for, text = against(Region())
+    assert "improvement: tracking error, baseline" in refused_for and "compared up to" not in text
+    refused_for, text = against(Region(speed_max_m_per_s=0.01, tension_step_max_n=0.1, speed_step_max_m_per_s=0.0))
+    assert "improvement: tracking error, baseline" not in refused_for
+    assert "compared up to 0.01 m/s and steps of 0.1 N" in text
+
+
 def test_figures_of_a_verdict_are_those_of_each_configuration_and_course_and_endless_ones_are_not_known(
     case, monkeypatch
 ):
