@@ -11,7 +11,15 @@ from pydantic import ValidationError
 from gateway.cli.commission_changes import LineNow
 from gateway.cli.commission_side import CannotGoOn
 from gateway.commissioning.past import OPEN_STAGES, Outcome, past_of
-from gateway.core.decisions import Archive, LineChanged, ListProposals, ProposalList, ProposalShown, ShowProposal
+from gateway.core.decisions import (
+    MOST_LISTED,
+    Archive,
+    LineChanged,
+    ListProposals,
+    ProposalList,
+    ProposalShown,
+    ShowProposal,
+)
 from gateway.core.line import Line
 from gateway.core.messages import Reply
 from gateway.core.recording import Recording
@@ -31,7 +39,6 @@ ANSWER_S = 20.0
 POLL_S = 0.5
 READY_WITHIN_S = 600.0
 STORED_WITHIN_S = 5.0
-MOST_SHOWN = 200
 
 
 class LiveGate:
@@ -54,8 +61,15 @@ class LiveGate:
         self._settled: dict[str, ProposalShown] = {}  #: proposals to which nothing happens any more
 
     async def proposals(self) -> list[ProposalShown]:
-        listed = await self._listed()
-        return [await self._shown(one.proposal) for one in reversed(listed.proposals[: listed.since_change])]
+        """Page by page: what others propose meanwhile moves older ones to the next page, and hides none."""
+        found: dict[str, None] = {}
+        wanted = skip = 0
+        while not skip or skip < wanted:
+            listed = await self._listed(skip)
+            wanted = listed.since_change
+            found |= dict.fromkeys(one.proposal for one in listed.proposals[: min(MOST_LISTED, wanted - skip)])
+            skip += MOST_LISTED
+        return [await self._shown(proposal) for proposal in reversed(found)]
 
     async def now(self) -> LineNow:
         listed, status = await self._listed(), await self._status()
@@ -145,8 +159,9 @@ class LiveGate:
             self._tell(f"  the gate lets it through; a person decides: r2rgate approve {proposal[:12]}")
         await self._pause(POLL_S)
 
-    async def _listed(self) -> ProposalList:
-        answer = await self._ask(GATEWAY_PROPOSALS, ListProposals(most=MOST_SHOWN).model_dump_json().encode())
+    async def _listed(self, skip: int = 0) -> ProposalList:
+        query = ListProposals(most=MOST_LISTED, skip=skip)
+        answer = await self._ask(GATEWAY_PROPOSALS, query.model_dump_json().encode())
         try:
             return ProposalList.model_validate_json(answer)
         except ValidationError:

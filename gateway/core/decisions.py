@@ -59,11 +59,15 @@ Decision = Annotated[Decide | RollBackNow | Archive | LineChanged, Field(discrim
 DECISION: TypeAdapter[Decide | RollBackNow | Archive | LineChanged] = TypeAdapter(Decision)
 
 
+MOST_LISTED = 200
+
+
 class ListProposals(Strict):
-    """The newest first."""
+    """The newest first. The first page has those that wait or are on the line, too, however old they are."""
 
     command: Literal["list"] = "list"
-    most: Annotated[int, Field(ge=1, le=200)] = 50
+    most: Annotated[int, Field(ge=1, le=MOST_LISTED)] = 50
+    skip: Annotated[int, Field(ge=0)] = 0  #: so many of the newest: for what is older
 
 
 class ShowProposal(Strict):

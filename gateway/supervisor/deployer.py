@@ -8,7 +8,7 @@ proposals judged, `on_the_line` carries out what is approved.
 from collections.abc import Callable
 
 from gateway.core.audit_record import Who
-from gateway.core.decisions import Decide, ProposalLine, ProposalList, ProposalShown, shown_hash
+from gateway.core.decisions import MOST_LISTED, Decide, ProposalLine, ProposalList, ProposalShown, shown_hash
 from gateway.core.judge_context import JudgeContext
 from gateway.core.line import Line
 from gateway.core.messages import Reply
@@ -18,7 +18,18 @@ from gateway.core.small_change import beyond_small
 from gateway.mailbox.port import Unreachable
 from gateway.supervisor.audit_file import AuditUnavailable
 from gateway.supervisor.deployer_sides import AuditSide, JudgeSide, LoopSide, NotKnown, NotTakenUp, Surroundings
-from gateway.supervisor.lifecycle import LINE_CHANGED, PERSON, SCRIPT, VERDICT, Book, Entry, Impossible, Stage
+from gateway.supervisor.lifecycle import (
+    LINE_CHANGED,
+    ON_THE_LINE,
+    PERSON,
+    SCRIPT,
+    UNDECIDED,
+    VERDICT,
+    Book,
+    Entry,
+    Impossible,
+    Stage,
+)
 from gateway.supervisor.on_the_line import OnTheLine
 from gateway.supervisor.proposal_inbox import Inbox
 from gateway.supervisor.proposal_records import GATEWAY, ProposalRecords, done, refused
@@ -155,9 +166,12 @@ class Deployer:
     async def close(self) -> None:
         await self._inbox.close()
 
-    def listed(self, most: int) -> ProposalList:
-        """The newest first."""
-        newest = list(reversed(self.book.entries.values()))[:most]
+    def listed(self, most: int, skip: int = 0) -> ProposalList:
+        """The newest first, but for the first `skip`; with those that are not done with, where none are left out."""
+        entries = list(reversed(self.book.entries.values()))
+        newest, older = entries[skip : skip + most], entries[skip + most :]
+        if not skip:  # whoever proposes much must not hide what waits
+            newest += [entry for entry in older if entry.stage in (*UNDECIDED, *ON_THE_LINE)][:MOST_LISTED]
         return ProposalList(
             format=1,
             site=self._line.site,

@@ -227,7 +227,7 @@ class Gate:
         if self.deployer is None:
             return self.shut_reply().model_dump_json().encode()
         if isinstance(query, ListProposals):
-            return self.deployer.listed(query.most).model_dump_json().encode()
+            return self.deployer.listed(query.most, query.skip).model_dump_json().encode()
         found = self.deployer.shown(query.proposal)
         if isinstance(found, str):
             return Reply(ok=False, state="", text=found, reasons=[found]).model_dump_json().encode()

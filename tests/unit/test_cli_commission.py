@@ -112,7 +112,7 @@ class OneProcess:
                 proposal=one.proposal_hash, kind=one.proposal.kind, author=one.proposal.author, stage=one.stage,
                 why=one.why, created=one.proposal.created, expires=one.proposal.expires, epoch=None,
             )
-            for one in reversed(self.shown.values())
+            for one in list(reversed(self.shown.values()))[query.skip : query.skip + query.most]
         ]  # fmt: skip
         return ProposalList(
             since_change=len(self.shown),
@@ -132,6 +132,16 @@ def test_each_candidate_is_proposed_once_and_the_end_says_why(tmp_path):
     again = OneProcess(tmp_path)
     again.shown = gateway.shown  # the command started anew
     assert asyncio.run(commission(LINE, again.side)).text == found.text and len(again.shown) == len(found.tried)
+
+
+def test_everything_since_the_line_has_changed_is_looked_at_however_much_others_propose(tmp_path):
+    gateway = OneProcess(tmp_path)
+    asyncio.run(commission(LINE, gateway.side, gateway.told.append))
+    own, one = dict(gateway.shown), next(iter(gateway.shown.values()))
+    for number in range(450):  # by somebody else, afterwards
+        gateway.shown[f"{number:064x}"] = one.model_copy(update={"proposal_hash": f"{number:064x}"})
+    found = asyncio.run(LiveGate(LINE, gateway.mailbox, gateway.told.append, gateway.pause).proposals())
+    assert [each.proposal_hash for each in found] == [*own, *(f"{number:064x}" for number in range(450))]
 
 
 class Picky:
