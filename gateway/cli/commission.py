@@ -29,7 +29,7 @@ from gateway.commissioning.ladder import MOST_OWN, OWN, Ended, Next
 from gateway.commissioning.past import KINDS, Follows, Outcome, Past, Step, asked, named, past_of
 from gateway.core.decisions import ProposalShown
 from gateway.core.line import Line
-from gateway.core.line_problem import printable
+from gateway.core.line_problem import printable, quoted
 from gateway.core.questions import Choice, Question, factors_that_turn
 from gateway.identification.identify import Identified
 from gateway.supervisor.baselines import BaselinesError
@@ -207,8 +207,7 @@ class _Chain:
 
 def _reason(made: str, decided: Decided) -> str:
     """With the words of whoever chose, as a quotation."""
-    said = printable(decided.choice.reason)[:MOST_QUOTED]
-    return made if decided.by == RULES else f'{made}. {decided.by} says: "{said}"'
+    return made if decided.by == RULES else f"{made}. {decided.by} says: {quoted(decided.choice.reason, MOST_QUOTED)}"
 
 
 def _require_slow(line: Line, step: Next, now: LineNow) -> None:

@@ -25,7 +25,7 @@ from gateway.commissioning.selection import Candidate, candidate, explanation, r
 from gateway.core.controller import config_hash
 from gateway.core.line import Line, Priorities
 from gateway.core.line_model import LineModel, model_hash
-from gateway.core.line_problem import printable
+from gateway.core.line_problem import quoted
 from gateway.core.questions import Choice, Question, factors_that_turn, usual_choice
 from gateway.core.scenario import Scenario
 
@@ -120,7 +120,7 @@ def _explained(candidates: Sequence[Candidate], chosen: str, decisions: Sequence
     if not chosen or decisions[-1].by == RULES:
         return explanation(candidates)
     last = decisions[-1]
-    return [*explanation(candidates, chosen, last.by), f'{last.by} says: "{printable(last.reason)}"']
+    return [*explanation(candidates, chosen, last.by), f"{last.by} says: {quoted(last.reason)}"]
 
 
 def _candidate(one: Finished, ground: Ground, line: Line, otherwise: Priorities | None) -> Candidate:

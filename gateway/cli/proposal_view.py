@@ -6,7 +6,7 @@ from rich.table import Table
 from rich.text import Text
 
 from gateway.core.decisions import ProposalList, ProposalShown
-from gateway.core.line_problem import printable
+from gateway.core.line_problem import printable, quoted
 from gateway.core.verdict import RuleFinding, Verdict
 
 SHORT = 12  #: letters of a hash
@@ -41,7 +41,7 @@ def print_shown(found: ProposalShown, console: Console) -> None:
     for text in found.difference:
         console.print(f"  - {printable(text)}", markup=False)
     console.print("reason, in the author's words:")
-    console.print(f'  "{printable(proposal.reason)}"', markup=False)
+    console.print(f"  {quoted(proposal.reason)}", markup=False)
     if found.verdict is not None:
         _print_verdict(found.verdict, console)
 

@@ -9,6 +9,7 @@ from gateway.core.toml_places import Path
 
 _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
 _VALUE_LENGTH = 60
+_OWN_MARKS = str.maketrans(dict.fromkeys('"\u201c\u201d\u201e\u201f\u00ab\u00bb\uff02', "'"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,6 +85,11 @@ def value_in_words(value: Any) -> str:
         words = str(value)  # float, date or time
     words = printable(words)
     return words if len(words) <= _VALUE_LENGTH else words[: _VALUE_LENGTH - 3] + "..."
+
+
+def quoted(text: str, most: int | None = None) -> str:
+    """What somebody has said, between quotation marks that its own cannot close."""
+    return f'"{printable(text)[:most].translate(_OWN_MARKS)}"'
 
 
 def printable(text: str) -> str:
