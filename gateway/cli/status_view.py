@@ -9,7 +9,7 @@ from rich.text import Text
 
 from gateway.core.line_problem import printable
 from gateway.core.messages import BusReport
-from gateway.supervisor.status import ChangeStatus, GatewayStatus, LimitsStatus, SpanStatus, Spread
+from gateway.core.status import ChangeStatus, GatewayStatus, LimitsStatus, SpanStatus, Spread
 
 STATE_STYLE = {
     "SILENT": "bold",

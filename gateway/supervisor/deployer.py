@@ -15,14 +15,15 @@ from gateway.core.messages import Reply
 from gateway.core.proposal import GainsChange, Proposal
 from gateway.core.recording import Recording
 from gateway.core.small_change import beyond_small
+from gateway.core.status import ChangeStatus
 from gateway.mailbox.port import Unreachable
 from gateway.supervisor.audit_file import AuditUnavailable
 from gateway.supervisor.deployer_sides import AuditSide, JudgeSide, LoopSide, NotKnown, NotTakenUp, Surroundings
 from gateway.supervisor.lifecycle import LINE_CHANGED, PERSON, SCRIPT, VERDICT, Book, Entry, Impossible, Stage
 from gateway.supervisor.on_the_line import OnTheLine
+from gateway.supervisor.peers import GATEWAY
 from gateway.supervisor.proposal_inbox import Inbox
-from gateway.supervisor.proposal_records import GATEWAY, ProposalRecords, done, refused
-from gateway.supervisor.status import ChangeStatus
+from gateway.supervisor.proposal_records import ProposalRecords, done, refused
 
 
 class Deployer:

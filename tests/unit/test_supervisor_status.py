@@ -12,12 +12,13 @@ from pydantic import ValidationError
 from gateway.core.messages import Arm, Event, Reply
 from gateway.core.signals import DriveState, Quality
 from gateway.core.states import LoopState
+from gateway.core.status import BusStatus, GatewayStatus
 from gateway.core.topics import GATEWAY_COMMAND, GATEWAY_STATUS, LOOP_COMMAND, LOOP_EVENT, LOOP_TELEMETRY
 from gateway.mailbox.inprocess import Hub, InProcessMailbox
 from gateway.mailbox.port import MAX_PAYLOAD, PEER, Counters, Peer
 from gateway.supervisor.historian import Health, Historian
 from gateway.supervisor.service import EVENTS_SHOWN, TEXT_SHOWN, Gateway
-from gateway.supervisor.status import LOST_S, WORDS, BusStatus, GatewayStatus
+from gateway.supervisor.status import LOST_S, WORDS
 from tests.unit.supervisor_support import frame_of, line_of
 
 DOCS = Path(__file__).parents[2] / "docs"

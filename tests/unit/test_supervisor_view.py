@@ -19,9 +19,9 @@ from typer.testing import CliRunner
 from gateway.cli import status_commands
 from gateway.cli.status_commands import export_csv, status
 from gateway.cli.status_view import render
+from gateway.core.status import BusStatus, ChangeStatus, GatewayStatus
 from gateway.core.topics import GATEWAY_STATUS
 from gateway.mailbox.unix import UnixMailbox
-from gateway.supervisor.status import BusStatus, ChangeStatus, GatewayStatus
 from tests.unit.supervisor_support import frame_of, short_folder
 from tests.unit.test_historian import writer_of
 from tests.unit.test_supervisor_status import Bench
