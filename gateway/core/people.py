@@ -8,6 +8,7 @@ from typing import Annotated, Literal, get_args
 
 from pydantic import Field, TypeAdapter
 
+from gateway.core.alarms import AcknowledgeAlarm, ShelveAlarm
 from gateway.core.audit_record import Digest
 from gateway.core.decisions import Archive, Decide, LineChanged, RollBackNow
 from gateway.core.line import Strict
@@ -29,7 +30,7 @@ UserName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9._-]{0,31}$")]
 
 Said = (
     Arm | Start | Hold | Stop | SetTension | SetSpeed | SelectRecipe | RunExperiment | AbortExperiment
-    | Decide | RollBackNow | Archive | LineChanged
+    | Decide | RollBackNow | Archive | LineChanged | AcknowledgeAlarm | ShelveAlarm
 )  # fmt: skip
 
 #: By command the least role that may say it. What is no row here nobody may say through OPC UA or the page.
@@ -44,6 +45,8 @@ LEAST: dict[str, Role] = {
     "experiment-abort": "operator",
     "decide": "operator",
     "roll-back": "operator",
+    "acknowledge": "operator",
+    "shelve": "operator",
     "experiment": "engineer",
     "archive": "engineer",
     "line-changed": "engineer",
