@@ -34,6 +34,7 @@ from gateway.cli import (
     rehearse_commands,
     scan_commands,
     status_commands,
+    users_commands,
 )
 from gateway.cli.lifetime import follow_parent
 from gateway.cli.process_commands import REFUSED
@@ -55,6 +56,7 @@ app.command(rich_help_panel=ENGINEER)(line_commands.check)
 app.add_typer(scan_commands.app, rich_help_panel=ENGINEER)
 app.command(rich_help_panel=ENGINEER)(doctor_commands.doctor)
 app.add_typer(pki_commands.app, rich_help_panel=ENGINEER)
+app.add_typer(users_commands.app, rich_help_panel=ENGINEER)
 app.command(rich_help_panel=ENGINEER)(identify_commands.identify)
 app.command(rich_help_panel=ENGINEER)(design_commands.design)
 app.add_typer(models_commands.app, rich_help_panel=ENGINEER)
