@@ -31,6 +31,7 @@ from gateway.supervisor.interactions import Interactions
 from gateway.supervisor.judging import NICEST, JudgeWorkers
 from gateway.supervisor.line_desk import LineDesk
 from gateway.supervisor.models import Models
+from gateway.supervisor.past import Past
 from gateway.supervisor.persons_desk import PersonsDesk
 from gateway.supervisor.retention import retention_of
 from gateway.supervisor.service import Gateway
@@ -98,6 +99,7 @@ async def serve(
     gate = Gate(line, mailbox, data_folder, judge, around, gateway.note, clock, wall_clock)
     gateway.on_event, gateway.change = gate.hear, gate.change
     PersonsDesk(mailbox, gateway.command, gate.decide, gate.audit.append)
+    past = Past(line, mailbox, data_folder, lambda: historian.path)
     dry_runs = DryRuns(line, JudgeWorkers(line, nicer=NICEST))
     cases = AgentsCases(gate.audit.append, clock)
     desk = AgentsDesk(gateway.status, gate, dry_runs, Interactions(data_folder), gateway.note, cases)
@@ -119,6 +121,7 @@ async def serve(
         await opening
         await bus.close()
         await dry_runs.close()
+        await past.close()
         await gate.close()
         await judge.close()
         await mailbox.close()
