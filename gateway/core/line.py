@@ -173,6 +173,9 @@ class Gate(Strict):
     """What a change must show before it may reach a drive, and who decides. Changed only here, by an engineer."""
 
     autonomy: Literal["approve-all", "approve-first", "closed"] = "approve-all"
+    approvals: Annotated[int, Field(ge=1, le=2)] = (
+        1  #: people that a change takes, where it takes a person; 2: different ones
+    )
     small_share: Fraction = 0.1  #: approve-first: from what a person approved to what needs none
     authors: Annotated[list[Name], Field(max_length=32)] = ["rules", "agents", "engineer"]  #: who may propose
     proposal_max_bytes: Annotated[int, Field(ge=1024, le=16_777_216)] = 65_536

@@ -144,6 +144,7 @@ HELP: dict[str, dict[str, str]] = {
     },
     "Gate": {
         "autonomy": '"approve-all": a person decides each change; "approve-first": the first of a kind; "closed": none',
+        "approvals": "people that approve a change, where it takes a person; 2: two different ones",
         "small_share": "approve-first: what differs by no more from what a person approved last needs no person",
         "authors": "who may propose a change",
         "proposal_max_bytes": "largest proposal",

@@ -244,8 +244,6 @@ class Gate:
         if self.deployer is None:
             reply = self.shut_reply()
         elif isinstance(decision, Decide):
-            if decision.script:
-                who = who.model_copy(update={"name": f"{decision.script}, run by {who.name}"})
             reply = await self.deployer.decide(decision, who)
         elif isinstance(decision, Archive):
             assert self._stores is not None  # they are open before the gate is

@@ -56,7 +56,8 @@ def _proposed(_: str, what: What) -> str:
 def _approved(who: str, what: What) -> str:
     if what.get("by") == "verdict":
         return f"proposal {_hash(what)} passes by its verdict alone: it is like {_hash(what, 'like')}"
-    return f"{who} approves proposal {_hash(what)}{quoted(what.get('comment'))}"
+    second = f" as the second, after {_of(what, 'first')}" if "first" in what else ""
+    return f"{who} approves proposal {_hash(what)}{second}{quoted(what.get('comment'))}"
 
 
 def _approved_once(who: str, what: What) -> str:
