@@ -23,6 +23,7 @@ from gateway.core.decisions import (
 from gateway.core.line import Line
 from gateway.core.messages import Reply
 from gateway.core.recording import Recording
+from gateway.core.status import GatewayStatus
 from gateway.core.topics import GATEWAY_DECISION, GATEWAY_PROPOSALS, GATEWAY_PROPOSE, GATEWAY_STATUS, Topic
 from gateway.mailbox.port import Mailbox, Unreachable
 from gateway.supervisor import configurations as configurations_store
@@ -32,7 +33,6 @@ from gateway.supervisor.experiments import MOST_EXPERIMENTS, newest_experiments
 from gateway.supervisor.history import HistoryError
 from gateway.supervisor.model_store import ModelsError
 from gateway.supervisor.models import open_repository
-from gateway.supervisor.status import GatewayStatus
 
 TOPICS = (GATEWAY_PROPOSE, GATEWAY_PROPOSALS, GATEWAY_STATUS, GATEWAY_DECISION)  #: that are asked for
 ANSWER_S = 20.0

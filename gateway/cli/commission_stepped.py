@@ -42,7 +42,7 @@ ANSWER_S = 5.0  #: within this process
 READY_WITHIN_S = 300.0
 LEAST_S = 5.0  #: for which the line must have stood anyway before a change, and before one is kept
 MOST_DECISIONS = 3  #: on one proposal, where carrying it out is refused for the moment
-ENGINEER, RULES = Who(name="engineer"), Who(name="rules")
+ENGINEERS, RULES = (Who(name="engineer"), Who(name="second engineer")), Who(name="rules")
 
 Approves = Callable[[ProposalShown], bool]
 
@@ -212,7 +212,10 @@ class SteppedGate:
         tries = self._refused.get(shown.proposal_hash, 0)
         approve = self._approves(shown) and tries < MOST_DECISIONS
         decision = Decide(proposal=shown.proposal_hash, shown=hash_, approve=approve)
-        reply = await self.deployer.decide(decision, ENGINEER)
+        for who in ENGINEERS[: self.line.gate.approvals if approve else 1]:
+            reply = await self.deployer.decide(decision, who)
+            if not reply.ok:
+                break
         self.approvals += approve
         if not reply.ok:
             self._refused[shown.proposal_hash] = tries + 1

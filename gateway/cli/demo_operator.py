@@ -11,11 +11,11 @@ from gateway.cli.demo_progress import Progress
 from gateway.cli.operate_commands import request
 from gateway.cli.status_commands import parse_status
 from gateway.core.messages import Arm, Command, Start, Stop
+from gateway.core.status import GatewayStatus
 from gateway.core.topics import GATEWAY_STATUS
 from gateway.mailbox.paths import GATEWAY_SOCKET
 from gateway.mailbox.port import Unreachable
 from gateway.mailbox.unix import UnixMailbox
-from gateway.supervisor.status import GatewayStatus
 
 LOOK_S = 0.1
 SETTLE_TIME_S = 30.0

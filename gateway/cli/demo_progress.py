@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
-from gateway.supervisor.status import GatewayStatus
+from gateway.core.status import GatewayStatus
 
 PLAIN_EVERY_S = 5.0
 

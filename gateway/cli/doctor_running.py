@@ -6,9 +6,9 @@ from pathlib import Path
 from gateway.cli.doctor_check import Check, Verdict
 from gateway.cli.doctor_jitter import lateness_check
 from gateway.cli.status_commands import ask_status
+from gateway.core.status import GatewayStatus
 from gateway.mailbox.listener import PathTooLong
 from gateway.mailbox.port import Unreachable
-from gateway.supervisor.status import GatewayStatus
 
 GROUP = "the loop's word"
 

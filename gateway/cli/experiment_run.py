@@ -8,8 +8,8 @@ from typing import Protocol
 
 from gateway.core.experiment import Experiment
 from gateway.core.messages import Command, Reply, RunExperiment
+from gateway.core.status import GatewayStatus
 from gateway.mailbox.port import Unreachable
-from gateway.supervisor.status import GatewayStatus
 
 LOOK_EVERY_S = 0.25
 SLACK_S = 10.0  #: beyond its duration, until a run counts as lost

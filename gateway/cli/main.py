@@ -8,6 +8,7 @@ from pydantic import ValidationError
 
 from gateway.cli import (
     agents_commands,
+    alarms_commands,
     ask_commands,
     audit_commands,
     audit_replay,
@@ -34,6 +35,7 @@ from gateway.cli import (
     rehearse_commands,
     scan_commands,
     status_commands,
+    users_commands,
 )
 from gateway.cli.lifetime import follow_parent
 from gateway.cli.process_commands import REFUSED
@@ -55,6 +57,7 @@ app.command(rich_help_panel=ENGINEER)(line_commands.check)
 app.add_typer(scan_commands.app, rich_help_panel=ENGINEER)
 app.command(rich_help_panel=ENGINEER)(doctor_commands.doctor)
 app.add_typer(pki_commands.app, rich_help_panel=ENGINEER)
+app.add_typer(users_commands.app, rich_help_panel=ENGINEER)
 app.command(rich_help_panel=ENGINEER)(identify_commands.identify)
 app.command(rich_help_panel=ENGINEER)(design_commands.design)
 app.add_typer(models_commands.app, rich_help_panel=ENGINEER)
@@ -83,6 +86,7 @@ app.command(rich_help_panel=OVERSIGHT)(proposal_commands.proposals)
 app.command(rich_help_panel=OVERSIGHT)(proposal_commands.approve)
 app.command(rich_help_panel=OVERSIGHT)(proposal_commands.reject)
 app.command(rich_help_panel=OVERSIGHT)(proposal_commands.rollback)
+app.add_typer(alarms_commands.app, rich_help_panel=OVERSIGHT)
 app.command(rich_help_panel=EVIDENCE)(agents_commands.log)
 app.command("export", rich_help_panel=EVIDENCE)(recordings_export.export)
 audit_commands.app.command()(audit_replay.replay)

@@ -19,13 +19,13 @@ from rich.live import Live
 from rich.text import Text
 
 from gateway.cli.status_view import render
+from gateway.core.status import GatewayStatus
 from gateway.core.topics import GATEWAY_STATUS
 from gateway.mailbox.listener import PathTooLong
 from gateway.mailbox.paths import GATEWAY_SOCKET, running_lines
 from gateway.mailbox.port import Unreachable
 from gateway.mailbox.unix import UnixMailbox
 from gateway.supervisor.history import History, HistoryError
-from gateway.supervisor.status import GatewayStatus
 
 EXIT_RUNNING, EXIT_USAGE, EXIT_NO_GATEWAY, EXIT_NO_LOOP = 0, 2, 3, 4
 REFRESH_S = 0.2

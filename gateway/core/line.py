@@ -173,6 +173,9 @@ class Gate(Strict):
     """What a change must show before it may reach a drive, and who decides. Changed only here, by an engineer."""
 
     autonomy: Literal["approve-all", "approve-first", "closed"] = "approve-all"
+    approvals: Annotated[int, Field(ge=1, le=2)] = (
+        1  #: people that a change takes, where it takes a person; 2: different ones
+    )
     small_share: Fraction = 0.1  #: approve-first: from what a person approved to what needs none
     authors: Annotated[list[Name], Field(max_length=32)] = ["rules", "agents", "engineer"]  #: who may propose
     proposal_max_bytes: Annotated[int, Field(ge=1024, le=16_777_216)] = 65_536
@@ -249,6 +252,16 @@ class Network(Strict):
     names: Annotated[list[Name], Field(min_length=1, max_length=32)]  #: common names of certificates of agents
 
 
+class Operator(Strict):
+    """Where people reach the line: an OPC UA server and a web page, both of `r2rgate operator`."""
+
+    opc_ua: str = "opc.tcp://127.0.0.1:4840"
+    page: str = "http://127.0.0.1:8480"
+    anonymous: Literal["none", "read"] = "none"  #: whether somebody without a name may look
+    pki: str | None = None  #: folder of certificates; null: `pki` in the line's data folder
+    sessions_max: Annotated[int, Field(ge=1, le=100)] = 20  #: of OPC UA clients
+
+
 class Line(Strict):
     format: Annotated[int, Field(ge=1, le=1)]  #: not Literal: that takes `true` and 1.0 for 1
     site: Name
@@ -269,6 +282,7 @@ class Line(Strict):
     gate: Gate = Gate()
     agents: Agents = Agents()
     network: Network | None = None
+    operator: Operator = Operator()
     recipes: Annotated[list[Recipe], Field(min_length=1)]  #: the first is the one a line starts with
 
     @property

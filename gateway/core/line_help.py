@@ -35,6 +35,7 @@ HELP: dict[str, dict[str, str]] = {
         "gate": "what a change must show before it may reach a drive, and who decides",
         "agents": "who is asked where a phase leaves something to judgement; every change is judged all the same",
         "network": "lets agents on other machines in, by certificate (r2rgate pki init); without this table none is",
+        "operator": "where people reach the line: an OPC UA server and a page (r2rgate operator)",
         "recipes": "set-points for a grade; the line starts with the first",
     },
     "Control": {
@@ -143,6 +144,7 @@ HELP: dict[str, dict[str, str]] = {
     },
     "Gate": {
         "autonomy": '"approve-all": a person decides each change; "approve-first": the first of a kind; "closed": none',
+        "approvals": "people that approve a change, where it takes a person; 2: two different ones",
         "small_share": "approve-first: what differs by no more from what a person approved last needs no person",
         "authors": "who may propose a change",
         "proposal_max_bytes": "largest proposal",
@@ -195,6 +197,13 @@ HELP: dict[str, dict[str, str]] = {
         "private_key": "file with its private key, .pem",
         "authority": "file with the certificate of who signs the agents' certificates, .pem",
         "names": "common names of the certificates that may be agents; all others are refused",
+    },
+    "Operator": {
+        "opc_ua": "where OPC UA clients reach the line, signed and encrypted only",
+        "page": "where browsers do; beyond this machine https:// only",
+        "anonymous": '"read": whoever has no name may look; "none": nobody',
+        "pki": "folder with the certificates and the trusted ones; without this key: pki in the line's data folder",
+        "sessions_max": "OPC UA clients at once",
     },
     "Recipe": {
         "name": "name of the grade",

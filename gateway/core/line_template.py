@@ -2,7 +2,7 @@
 
 import json
 
-from gateway.core.line import Agents, Gate
+from gateway.core.line import Agents, Gate, Operator
 from gateway.core.line_template_tables import entries, parameter, table, tables
 from gateway.core.line_template_wiring import DEMONSTRATION, Wiring, wired_tables
 
@@ -30,7 +30,7 @@ def line_template(spans: int = 6, out: str = "line.toml", wiring: Wiring = DEMON
     more = {1: "", 2: " ~~span 2~~ roller 2"}.get(spans, f" ~~span 2~~ ... ~~span {spans}~~ roller {spans}")
     parts = [_HEAD.format(more=more, out=out), _line(spans), _process(spans), _web()]
     parts += [_rollers(spans), _spans(spans), *wired_tables(wiring, spans)]
-    return "\n".join([*parts, _history(), _priorities(), _gate(), _agents(), _network(), _recipes(spans)])
+    return "\n".join([*parts, _history(), _priorities(), _gate(), _agents(), _network(), _operator(), _recipes(spans)])
 
 
 def _line(spans: int) -> str:
@@ -145,6 +145,11 @@ def _network() -> str:
         "names": '#["agents"]',
     }
     return "# " + table("network", "Network", settings)
+
+
+def _operator() -> str:
+    settings = Operator(pki="/etc/r2rgate/pki").model_dump(mode="json")
+    return table("operator", "Operator", {key: f"#{json.dumps(value)}" for key, value in settings.items()})
 
 
 def _recipes(spans: int) -> str:

@@ -6,13 +6,13 @@ from pathlib import Path
 from typing import Protocol
 
 from gateway.core.line import Line
+from gateway.core.status import BusStatus
 from gateway.core.topics import AGENT_DECIDE, AGENT_NAMES, AgentName
 from gateway.mailbox.allowance import Allowance
 from gateway.mailbox.bus import BusUnavailable, open_router
 from gateway.mailbox.port import Mailbox
 from gateway.mailbox.zenoh_mailbox import ZenohMailbox
 from gateway.supervisor.agents_cases import AgentsCases
-from gateway.supervisor.status import BusStatus
 
 MOST_EVENTS_PER_S = 0.1  #: of each kind: whoever comes and goes all the time, or floods, does not flood the history
 

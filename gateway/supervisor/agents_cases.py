@@ -12,7 +12,7 @@ from typing import Any, Literal
 from gateway.core.audit_record import Who
 from gateway.core.topics import AgentName
 from gateway.supervisor.audit_file import AuditUnavailable
-from gateway.supervisor.proposal_records import GATEWAY
+from gateway.supervisor.peers import GATEWAY
 
 Case = Literal["gone", "turned-away", "refused", "unanswered", "rules-instead"]
 RECORD_EVERY_S = 60.0  #: of each case

@@ -17,6 +17,7 @@ from gateway.core.interactions import InteractionRefused, Unanswered, unpack
 from gateway.core.json_problems import NotJson, document_of, problems
 from gateway.core.messages import Reply
 from gateway.core.proposal import ProposalRefused, parse_proposal
+from gateway.core.status import GatewayStatus
 from gateway.core.topics import (
     AGENT_NAMES,
     ASK_JUDGE,
@@ -35,7 +36,6 @@ from gateway.supervisor.dry_runs import DryRuns, TooMany
 from gateway.supervisor.gate import Gate
 from gateway.supervisor.interactions import Interactions, InteractionsError
 from gateway.supervisor.proposal_records import refused
-from gateway.supervisor.status import GatewayStatus
 
 AUTHOR = "agents"  #: of all their proposals
 MOST_TEXT = 400  #: letters of an event

@@ -6,6 +6,7 @@ proposals judged, `on_the_line` carries out what is approved.
 """
 
 from collections.abc import Callable
+from typing import Any
 
 from gateway.core.audit_record import Who
 from gateway.core.decisions import MOST_LISTED, Decide, ProposalLine, ProposalList, ProposalShown, shown_hash
@@ -15,9 +16,11 @@ from gateway.core.messages import Reply
 from gateway.core.proposal import GainsChange, Proposal
 from gateway.core.recording import Recording
 from gateway.core.small_change import beyond_small
+from gateway.core.status import ChangeStatus
 from gateway.mailbox.port import Unreachable
 from gateway.supervisor.audit_file import AuditUnavailable
 from gateway.supervisor.deployer_sides import AuditSide, JudgeSide, LoopSide, NotKnown, NotTakenUp, Surroundings
+from gateway.supervisor.four_eyes import APPROVED_ONCE, FirstApproval, approver_of, why_not_second
 from gateway.supervisor.lifecycle import (
     LINE_CHANGED,
     ON_THE_LINE,
@@ -31,9 +34,9 @@ from gateway.supervisor.lifecycle import (
     Stage,
 )
 from gateway.supervisor.on_the_line import OnTheLine
+from gateway.supervisor.peers import GATEWAY
 from gateway.supervisor.proposal_inbox import Inbox
-from gateway.supervisor.proposal_records import GATEWAY, ProposalRecords, done, refused
-from gateway.supervisor.status import ChangeStatus
+from gateway.supervisor.proposal_records import ProposalRecords, done, refused
 
 
 class Deployer:
@@ -71,10 +74,13 @@ class Deployer:
         return await self._inbox.propose(payload, who)
 
     async def decide(self, decision: Decide, who: Who) -> Reply:
-        """A person's word. The approval is of what was shown, and good once."""
+        """A person's word, straight from the mailbox. The approval is of what was shown, and good once."""
+        approver = approver_of(who)
+        if decision.script:
+            who = who.model_copy(update={"name": f"{decision.script}, run by {who.name}"})
         async with self._records.one_step:
             entry = self.book.entries.get(decision.proposal)
-            if reasons := self._why_not_decide(entry, decision):
+            if reasons := self._why_not_decide(entry, decision, approver):
                 return refused("nothing was decided", reasons)
             assert entry is not None  # _why_not_decide says so
             by = SCRIPT if decision.script else PERSON
@@ -84,8 +90,15 @@ class Deployer:
                     await self._records.step("rejected", {**what, "because": decision.comment or f"by {who.name}"}, who)
                     return done(f"proposal {entry.proposal[:12]} is rejected")
                 found = await self._on_the_line.settle()
-                if reasons := self._why_not_decide(self.book.entries[entry.proposal], decision):
+                entry = self.book.entries[entry.proposal]
+                if reasons := self._why_not_decide(entry, decision, approver):
                     return refused("the line has changed since it was shown", reasons)
+                if self._line.gate.approvals > 1:
+                    if (first := self._first(entry)) is None:
+                        return await self._approve_once(
+                            entry, {**what, "approver": list(approver), "name": who.name}, who
+                        )
+                    what |= {"by": SCRIPT if SCRIPT in (by, first.by) else PERSON, "first": first.name}
                 await self._records.step("approved", what, who)
                 return await self._on_the_line.carry_out(self.book.entries[entry.proposal], found, who)
             except (AuditUnavailable, Unreachable, Impossible, NotTakenUp, NotKnown) as error:
@@ -212,16 +225,32 @@ class Deployer:
         """What there is to say of its stage."""
         if entry.stage is Stage.PROBATION:
             return f"not kept yet: {self._on_the_line.unseen() or 'about to be'}"
-        if entry.stage is Stage.WAITING and self._line.gate.autonomy == "approve-first":
-            return "; ".join(self._why_a_person(entry))
-        return entry.why
+        if entry.stage is not Stage.WAITING:
+            return entry.why
+        reasons = self._why_a_person(entry) if self._line.gate.autonomy == "approve-first" else [entry.why]
+        if self._line.gate.approvals > 1:
+            first = self._first(entry)
+            two = "it takes two people" if first is None else f"{first.name} has approved it, it takes another person"
+            reasons = [two, *reasons]
+        return "; ".join(reason for reason in reasons if reason)
 
     def _shown_hash(self, entry: Entry) -> str | None:
         if entry.stage is not Stage.WAITING or entry.verdict is None or self.book.in_service is None:
             return None
         return shown_hash(entry.proposal, entry.verdict, self.book.in_service, self.book.epoch)
 
-    def _why_not_decide(self, entry: Entry | None, decision: Decide) -> list[str]:
+    def _first(self, entry: Entry) -> FirstApproval | None:
+        """The first approval of what would be approved now; None: there is none."""
+        return entry.first if entry.first is not None and entry.first.shown == self._shown_hash(entry) else None
+
+    async def _approve_once(self, entry: Entry, what: dict[str, Any], who: Who) -> Reply:
+        await self._records.step(APPROVED_ONCE, what, who)
+        return done(
+            f"your approval of {entry.proposal[:12]} is on record, as the first of two: it is carried out once another "
+            f"person has approved it, too, before {entry.expires}"
+        )
+
+    def _why_not_decide(self, entry: Entry | None, decision: Decide, approver: tuple[str, ...]) -> list[str]:
         if entry is None:
             return [f"there is no proposal {decision.proposal[:12]}: `r2rgate proposals` lists them"]
         if entry.stage is not Stage.WAITING:
@@ -230,7 +259,9 @@ class Deployer:
             return [f"it has expired at {entry.expires}"]
         if decision.shown != self._shown_hash(entry):
             return ["what was shown is no longer what would be done: look at it again, then decide"]
-        return []
+        first = self._first(entry) if decision.approve and self._line.gate.approvals > 1 else None
+        same = "" if first is None else why_not_second(first, approver)
+        return [same] if same else []
 
     async def _tidy(self) -> None:
         """What is left over: of time, of a gateway that ended before it could go on, of an audit that was not there."""

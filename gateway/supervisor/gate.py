@@ -2,7 +2,6 @@
 
 import asyncio
 import json
-import pwd
 from collections.abc import Callable, Mapping
 from importlib.metadata import version
 from pathlib import Path
@@ -12,12 +11,13 @@ from pydantic import ValidationError
 
 from gateway.core.audit_record import Who
 from gateway.core.controller import Controller, ControllerRefused, config_hash, parse_controller
-from gateway.core.decisions import DECISION, QUERY, Archive, Decide, LineChanged, ListProposals
+from gateway.core.decisions import DECISION, QUERY, Archive, Decide, LineChanged, ListProposals, RollBackNow
 from gateway.core.line import Line
 from gateway.core.messages import Command, Deploy, Event, Keep, Reply, WatchGood, command_bytes
 from gateway.core.proposal import GainsChange, ModelChange, Proposal
+from gateway.core.status import ChangeStatus
 from gateway.core.topics import GATEWAY_DECISION, GATEWAY_PROPOSALS, GATEWAY_PROPOSE, LOOP_COMMAND
-from gateway.mailbox.port import PEER, Mailbox, Peer, RemoteError
+from gateway.mailbox.port import PEER, Mailbox, RemoteError
 from gateway.supervisor import configurations as configurations_store
 from gateway.supervisor import models as models_store
 from gateway.supervisor.archiving import archive
@@ -30,8 +30,7 @@ from gateway.supervisor.deployer_sides import JudgeSide, NotTakenUp
 from gateway.supervisor.experiments import ENDS as EXPERIMENT_ENDS
 from gateway.supervisor.model_store import ModelsError
 from gateway.supervisor.models import Models, begin_repository
-from gateway.supervisor.proposal_records import GATEWAY
-from gateway.supervisor.status import ChangeStatus
+from gateway.supervisor.peers import GATEWAY, who_of
 from gateway.supervisor.surroundings import LineSurroundings
 
 LOOP_TIME_S = 2.5
@@ -216,7 +215,7 @@ class Gate:
         return reply
 
     async def _answer_propose(self, payload: bytes) -> bytes:
-        return (await self.propose(payload, _who(PEER.get()))).model_dump_json().encode()
+        return (await self.propose(payload, who_of(PEER.get()))).model_dump_json().encode()
 
     async def answer_query(self, payload: bytes) -> bytes:
         """What is asked of proposals, and changes nothing."""
@@ -238,12 +237,13 @@ class Gate:
             decision = DECISION.validate_json(payload)
         except ValidationError as error:
             return _not_understood(error)
-        who = _who(PEER.get())
+        return (await self.decide(decision, who_of(PEER.get()))).model_dump_json().encode()
+
+    async def decide(self, decision: Decide | RollBackNow | Archive | LineChanged, who: Who) -> Reply:
+        """What a person, or a program in a person's place, says."""
         if self.deployer is None:
             reply = self.shut_reply()
         elif isinstance(decision, Decide):
-            if decision.script:
-                who = who.model_copy(update={"name": f"{decision.script}, run by {who.name}"})
             reply = await self.deployer.decide(decision, who)
         elif isinstance(decision, Archive):
             assert self._stores is not None  # they are open before the gate is
@@ -254,7 +254,7 @@ class Gate:
         else:
             reply = await self.deployer.roll_back(decision.comment, who)
         self._note("decision", f"{who.name}: {reply.text}", ok=reply.ok, reasons=reply.reasons)
-        return reply.model_dump_json().encode()
+        return reply
 
     async def _line_changed(self, deployer: Deployer, said: LineChanged, who: Who) -> Reply:
         reply = await deployer.line_changed(said.because, who)
@@ -275,16 +275,6 @@ def _supersede(models: Models, line: Line, but: str | None, now_s: float, why: s
     for other in models.entries(line.site, line.line):
         if other.state == "accepted" and other.id != but:
             models.mark(other.id, "superseded", now_s, why)
-
-
-def _who(peer: Peer | None) -> Who:
-    if peer is None:
-        return GATEWAY
-    try:
-        name = pwd.getpwuid(peer.uid).pw_name
-    except KeyError:
-        name = f"user {peer.uid}"
-    return Who(name=name, uid=peer.uid, pid=peer.pid)
 
 
 def _not_understood(error: ValidationError) -> bytes:

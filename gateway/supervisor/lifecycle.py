@@ -12,6 +12,7 @@ from typing import Any
 
 from gateway.core.deployment import InService, Region
 from gateway.core.proposal import Kind
+from gateway.supervisor.four_eyes import APPROVED_ONCE, FirstApproval, first_of
 
 
 class Stage(StrEnum):
@@ -39,6 +40,7 @@ ON_THE_LINE = (Stage.DEPLOYING, Stage.PROBATION, Stage.KEEPING, Stage.RUNNING)  
 STEPS: dict[str, tuple[tuple[Stage, ...], Stage]] = {
     "accepted": ((Stage.RECEIVED,), Stage.WAITING),
     "refused": ((Stage.RECEIVED,), Stage.REFUSED),
+    APPROVED_ONCE: ((Stage.WAITING,), Stage.WAITING),
     "approved": ((Stage.WAITING,), Stage.APPROVED),
     "approval-lapsed": ((Stage.APPROVED,), Stage.WAITING),
     "rejected": ((Stage.WAITING,), Stage.REJECTED),
@@ -82,6 +84,7 @@ class Entry:
     verdict: str | None = None  #: hash
     epoch: int | None = None
     by_person: bool = False  #: approved by one, not by its verdict alone
+    first: FirstApproval | None = None  #: while it waits for a second one
     since_s: float | None = None  #: Unix time at which it came to its stage
     region: Region | None = None  #: of a configuration that has been deployed: for what it was judged
 
@@ -189,14 +192,15 @@ class Book:
             )
             return
         entry = self.entries[proposal]
-        more = {key: what[key] for key in ("verdict", "epoch") if key in what}
+        more: dict[str, Any] = {key: what[key] for key in ("verdict", "epoch") if key in what}
         if kind == "deploying":
             more["region"] = _region(what)
         if kind == "approved":
             more["by_person"] = what.get("by", PERSON) == PERSON
         self.entries[proposal] = entry = replace(
-            entry, stage=STEPS[kind][1], why=str(what.get("because", entry.why)), since_s=_at(what), **more
-        )
+            entry, stage=STEPS[kind][1], why=str(what.get("because", entry.why)), since_s=_at(what),
+            first=first_of(what) if kind == APPROVED_ONCE else None, **more,
+        )  # fmt: skip
         self._in_service(kind, entry, what)
         self._trust(kind, entry)
 

@@ -24,7 +24,8 @@ from gateway.mailbox.port import RemoteError, Unreachable
 from gateway.supervisor.audit_file import AuditUnavailable
 from gateway.supervisor.deployer_sides import LoopSide, NotKnown, Surroundings
 from gateway.supervisor.lifecycle import Entry, Impossible, Stage, reconciled
-from gateway.supervisor.proposal_records import GATEWAY, ProposalRecords, done, refused
+from gateway.supervisor.peers import GATEWAY
+from gateway.supervisor.proposal_records import ProposalRecords, done, refused
 
 LEASE_S = 5.0  #: of a deployment on probation; renewed every third of it
 UNHEARD_S = 10.0  #: after an experiment should be over

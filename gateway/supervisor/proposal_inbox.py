@@ -28,7 +28,8 @@ from gateway.core.verdict import canonical as canonical_verdict
 from gateway.supervisor.audit_file import AuditUnavailable
 from gateway.supervisor.deployer_sides import JudgeSide, Surroundings
 from gateway.supervisor.lifecycle import PROPOSED, Impossible, Stage
-from gateway.supervisor.proposal_records import GATEWAY, ProposalRecords, done, refused
+from gateway.supervisor.peers import GATEWAY
+from gateway.supervisor.proposal_records import ProposalRecords, done, refused
 
 
 class Inbox:

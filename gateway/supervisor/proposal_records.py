@@ -13,8 +13,6 @@ from gateway.supervisor.audit_file import AuditUnavailable
 from gateway.supervisor.deployer_sides import AuditSide
 from gateway.supervisor.lifecycle import Book, Entry, Impossible
 
-GATEWAY = Who(name="gateway")
-
 
 class ProposalRecords:
     """`book` is what the audit says."""

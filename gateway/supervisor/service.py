@@ -2,7 +2,6 @@
 commands on to the loop, with who gave them, into the events.
 """
 
-import pwd
 import time
 from collections import deque
 from collections.abc import Callable
@@ -11,6 +10,8 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from gateway.core.alarms import AlarmStatus
+from gateway.core.audit_record import Who
 from gateway.core.line import Line
 from gateway.core.messages import (
     BUS_REPORTS,
@@ -24,12 +25,7 @@ from gateway.core.messages import (
     in_words,
     parse_command,
 )
-from gateway.core.telemetry import Frame
-from gateway.core.topics import GATEWAY_COMMAND, GATEWAY_STATUS, LOOP_BUSES, LOOP_COMMAND, LOOP_EVENT, LOOP_TELEMETRY
-from gateway.mailbox.port import PEER, Counters, Mailbox, Peer, Unreachable
-from gateway.supervisor.historian import Historian
-from gateway.supervisor.recent import Recent
-from gateway.supervisor.status import (
+from gateway.core.status import (
     BusStatus,
     ChangeStatus,
     EventStatus,
@@ -37,11 +33,14 @@ from gateway.supervisor.status import (
     HistorianStatus,
     LimitsStatus,
     LinkStatus,
-    known,
-    loop_status,
-    span_statuses,
-    timing_status,
 )
+from gateway.core.telemetry import Frame
+from gateway.core.topics import GATEWAY_COMMAND, GATEWAY_STATUS, LOOP_BUSES, LOOP_COMMAND, LOOP_EVENT, LOOP_TELEMETRY
+from gateway.mailbox.port import PEER, Counters, Mailbox, Unreachable
+from gateway.supervisor.historian import Historian
+from gateway.supervisor.peers import who_of
+from gateway.supervisor.recent import Recent
+from gateway.supervisor.status import known, loop_status, span_statuses, timing_status
 from gateway.supervisor.telemetry_sink import TelemetrySink
 
 LOOP_TIME_S = 2.5  #: for the loop to answer a command
@@ -77,6 +76,7 @@ class Gateway:
         self.on_event: Callable[[Event], None] | None = None  #: who else wants to know what the loop tells
         self.change: Callable[[], ChangeStatus | None] = lambda: None  #: what the gate does to the line now
         self.agents_bus: Callable[[], BusStatus] = lambda: NO_BUS
+        self.alarms: Callable[[], list[AlarmStatus]] = list
         self._events: deque[EventStatus] = deque(maxlen=EVENTS_SHOWN)
         self._buses: list[BusReport] = []
         self._malformed_events = 0
@@ -152,6 +152,7 @@ class Gateway:
             agents_bus=self.agents_bus(),
             historian=self._historian_status(now_s),
             events=list(self._events),
+            alarms=self.alarms(),
         )
 
     def _historian_status(self, now_s: float) -> HistorianStatus:
@@ -197,19 +198,22 @@ class Gateway:
         return self.status().model_dump_json().encode()
 
     async def _answer_command(self, payload: bytes) -> bytes:
-        peer = PEER.get()
+        return (await self.command(payload, who_of(PEER.get()))).model_dump_json().encode()
+
+    async def command(self, payload: bytes, who: Who) -> Reply:
+        """Hand a command on to the loop, and note who gave it."""
         reply = await self._pass_on(payload)
         said = payload[:1000].decode("utf-8", "replace")
         answered = "done" if reply.ok else "refused"
         self.note(
             "command",
-            f"{_who(peer)}: {_in_words(payload)}: {answered}: {reply.text}",
+            f"{who.name}: {_in_words(payload)}: {answered}: {reply.text}",
             command=said,
             reply=reply.model_dump(),
-            uid=None if peer is None else peer.uid,
-            pid=None if peer is None else peer.pid,
+            uid=who.uid,
+            pid=who.pid,
         )
-        return reply.model_dump_json().encode()
+        return reply
 
     async def _pass_on(self, payload: bytes) -> Reply:
         state = loop_status(self._line, self._sink, self._clock()).state
@@ -235,12 +239,3 @@ def _in_words(payload: bytes) -> str:
         return in_words(parse_command(payload))
     except MalformedMessage:
         return payload[:80].decode("utf-8", "replace")
-
-
-def _who(peer: Peer | None) -> str:
-    if peer is None:
-        return "this process"
-    try:
-        return pwd.getpwuid(peer.uid).pw_name
-    except KeyError:
-        return f"user {peer.uid}"

@@ -19,13 +19,13 @@ from gateway.core.controller import canonical
 from gateway.core.line import Line
 from gateway.core.line_file import load_line
 from gateway.core.messages import Arm, Command, Reply, Start, Stop
+from gateway.core.status import GatewayStatus
 from gateway.core.topics import GATEWAY_STATUS
 from gateway.mailbox.paths import GATEWAY_SOCKET
 from gateway.mailbox.port import Unreachable
 from gateway.mailbox.unix import UnixMailbox
 from gateway.supervisor.historian import FILE_NAME
 from gateway.supervisor.history import History
-from gateway.supervisor.status import GatewayStatus
 from sim_plant.recorder import read_recording
 from sim_plant.recording import Recording
 from tests.bench.lines import UDP_MULTICAST, CanWire, Ports, Wiring, line_text, plant_text

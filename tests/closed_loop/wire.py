@@ -18,11 +18,11 @@ from gateway.core.controller import canonical
 from gateway.core.line_file import load_line
 from gateway.core.line_template import line_template
 from gateway.core.messages import Arm, Command, Reply, Start
+from gateway.core.status import GatewayStatus
 from gateway.core.topics import GATEWAY_STATUS
 from gateway.mailbox.paths import GATEWAY_SOCKET
 from gateway.mailbox.port import Unreachable
 from gateway.mailbox.unix import UnixMailbox
-from gateway.supervisor.status import GatewayStatus
 from sim_plant.recorder import read_recording
 from sim_plant.recording import Recording
 

@@ -12,13 +12,13 @@ from gateway.core.audit_record import Who
 from gateway.core.decisions import ProposalList
 from gateway.core.messages import Reply
 from gateway.core.proposal import Proposal, canonical
+from gateway.core.status import GatewayStatus
 from gateway.core.topics import AGENT_DECIDE, ASK_JUDGE, ASK_LOG, ASK_PROPOSALS, ASK_PROPOSE, ASK_STATUS, GATEWAY_STATUS
 from gateway.mailbox.paths import BUS_SOCKET, GATEWAY_SOCKET
 from gateway.mailbox.unix import UnixMailbox
 from gateway.mailbox.zenoh_mailbox import ZenohMailbox
 from gateway.supervisor.audit_file import AuditFile
 from gateway.supervisor.proposal_records import iso
-from gateway.supervisor.status import GatewayStatus
 from tests.protocol.bus_support import AGENT, LINE, LONG_S, client, run
 from tests.unit.language_model_support import QUESTION
 from tests.unit.supervisor_support import child, until

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from gateway.core.states import LoopState
-from gateway.supervisor.status import GatewayStatus
+from gateway.core.status import GatewayStatus
 from tests.bench.lines import WIRINGS, CanWire, Ports, line_text
 from tests.bench.live import LiveLine, at_rest
 

@@ -21,11 +21,14 @@ from tests.unit.deployer_support import (
 )
 
 ANNA = Who(name="anna", uid=1000, pid=1)
+BERT = Who(name="bert", uid=1001, pid=2)
 PROBATION_S = LINE.gate.probation_s
 #: From controller 1 to 2 is a quarter of a number, from 1 to 3 two fifths.
 TRUSTING = LINE.model_copy(
     update={"gate": LINE.gate.model_copy(update={"autonomy": "approve-first", "small_share": 0.3})}
 )
+#: A change takes two people.
+FOUR_EYES = LINE.model_copy(update={"gate": LINE.gate.model_copy(update={"approvals": 2})})
 
 
 class Gateway:
@@ -60,11 +63,11 @@ class Gateway:
         await self.deployer.judged()
         return reply
 
-    async def decide(self, one, approve=True, shown=None, script=""):
+    async def decide(self, one, approve=True, shown=None, script="", who=ANNA):
         view = self.deployer.shown(hash_of(one))
         hash_ = shown or (view.shown if not isinstance(view, str) else None) or "0" * 64
         decision = Decide(proposal=hash_of(one), shown=hash_, approve=approve, script=script)
-        return await self.deployer.decide(decision, ANNA)
+        return await self.deployer.decide(decision, who)
 
     def stage(self, one) -> Stage:
         return self.deployer.book.entries[hash_of(one)].stage

@@ -15,6 +15,7 @@ from gateway.core.decisions import ProposalList, ProposalShown
 from gateway.core.dry_run import DryRun
 from gateway.core.messages import Reply
 from gateway.core.proposal import Evidence, Proposal, canonical, proposal_hash
+from gateway.core.status import GatewayStatus
 from gateway.core.topics import (
     AGENT_NAMES,
     AGENT_TOPICS,
@@ -42,7 +43,6 @@ from gateway.supervisor.gate import Gate
 from gateway.supervisor.interactions import Interactions
 from gateway.supervisor.lifecycle import Stage
 from gateway.supervisor.line_desk import LineDesk
-from gateway.supervisor.status import GatewayStatus
 from tests.unit.deployer_support import FIRST, LINE, Death, FakeJudge, FakeLoop, FakeSurroundings, proposal
 from tests.unit.supervisor_support import until
 

@@ -22,9 +22,9 @@ from gateway.cli.main import app
 from gateway.core.line import Line
 from gateway.core.line_template import line_template
 from gateway.core.messages import BusReport
+from gateway.core.status import GatewayStatus
 from gateway.mailbox.listener import Listener
 from gateway.mailbox.paths import LOOP_SOCKET
-from gateway.supervisor.status import GatewayStatus
 from tests.protocol.driver_support import line
 
 

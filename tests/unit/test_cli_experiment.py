@@ -13,10 +13,10 @@ from gateway.cli.main import app
 from gateway.core.experiment import Abort, Experiment, Leg, parse_experiment
 from gateway.core.line_template import line_template
 from gateway.core.messages import AbortExperiment
+from gateway.core.status import EventStatus, GatewayStatus
 from gateway.loop.pacer import Tick
 from gateway.loop.runner import Runner
 from gateway.mailbox.port import Unreachable
-from gateway.supervisor.status import EventStatus, GatewayStatus
 from tests.closed_loop.conftest import stepped
 from tests.closed_loop.test_experiment import producing
 

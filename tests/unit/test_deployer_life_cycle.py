@@ -7,10 +7,11 @@ from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
+from gateway.core.audit_record import Who
 from gateway.core.controller import config_hash
 from gateway.supervisor.lifecycle import Stage, book_of
 from gateway.supervisor.on_the_line import LEASE_S
-from tests.unit.deployer_gateway import ANNA, PROBATION_S, TRUSTING, Gateway
+from tests.unit.deployer_gateway import ANNA, BERT, FOUR_EYES, PROBATION_S, TRUSTING, Gateway
 from tests.unit.deployer_support import FIRST, LIFETIME_S, LINE, Killed, controller, hash_of, proposal
 
 
@@ -18,6 +19,7 @@ class LifeCycle(RuleBasedStateMachine):
     """Any order of everything, and death between any two effects."""
 
     line = LINE
+    people = st.just(ANNA)
 
     def __init__(self) -> None:
         super().__init__()
@@ -49,16 +51,30 @@ class LifeCycle(RuleBasedStateMachine):
             self.gateway.judge.refuses.add(hash_of(one))
         self._run(self.gateway.propose(one))
 
-    @rule(data=st.data(), approve=st.booleans())
-    def decide(self, data, approve):
+    @rule(data=st.data(), approve=st.booleans(), script=st.sampled_from(["", "a script"]))
+    def decide(self, data, approve, script):
         if (one := self._any(data)) is not None:
-            self._run(self.gateway.decide(one, approve))
+            self._run(self.gateway.decide(one, approve, script=script, who=data.draw(self.people)))
 
     @rule(data=st.data())
     def approve_the_newest(self, data):
         waiting = [e for e in self.gateway.deployer.book.entries.values() if e.stage is Stage.WAITING]
         if waiting:
-            self._run(self.gateway.decide(self.gateway.proposals[waiting[-1].proposal]))
+            one = self.gateway.proposals[waiting[-1].proposal]
+            self._run(self.gateway.decide(one, who=data.draw(self.people)))
+
+    @rule(data=st.data(), number=st.integers(1, 4), effects=st.integers(0, 8), after=st.booleans())
+    def a_change_is_made_while_all_is_well(self, data, number, effects, after):
+        """Most of the rest is trouble, through which few changes would come."""
+        self.the_wire(True, True)
+        self.the_disk(True)
+        self.something_shows(False)
+        self.death_is_near(0, after)
+        self._run(self._begin())
+        self.propose(number, True, 1)
+        self.death_is_near(effects, after)
+        for _ in range(3):
+            self.approve_the_newest(data)
 
     @rule(seconds=st.sampled_from([0.5, 2.0, LEASE_S, PROBATION_S, PROBATION_S + 1.0, LIFETIME_S]))
     def time_passes(self, seconds):
@@ -181,3 +197,41 @@ class TrustingLifeCycle(LifeCycle):
 
 TestTrustingLifeCycle = TrustingLifeCycle.TestCase
 TestTrustingLifeCycle.settings = LifeCycle.TestCase.settings
+
+
+#: Anna at a terminal, on the page and through OPC UA, and two others.
+PEOPLE = (
+    ANNA, Who(name="anna (operator, page)", uid=900, pid=3), Who(name="anna (engineer, opc-ua)", uid=900, pid=3), BERT,
+    Who(name="carla (engineer, page)", uid=900, pid=3),
+)  # fmt: skip
+
+
+def person_of(name: str) -> str:
+    return name.removeprefix("a script, run by ").partition(" ")[0]
+
+
+class FourEyesLifeCycle(LifeCycle):
+    """The same where a change takes two people."""
+
+    line = FOUR_EYES
+    people = st.sampled_from(PEOPLE)
+
+    @invariant()
+    def what_goes_on_the_line_two_different_people_have_approved_as_it_was_shown(self):
+        first: dict[str, tuple[str, str]] = {}
+        approved: set[str] = set()
+        for (kind, what), who in zip(self.gateway.audit.records, self.gateway.audit.whos, strict=True):
+            if kind == "approved-once":
+                first[what["proposal"]] = person_of(who), what["shown"]
+            elif kind == "approved":
+                person, shown = first.pop(what["proposal"])
+                assert person != person_of(who) and shown == what["shown"]
+                approved.add(what["proposal"])
+            elif kind in ("approval-lapsed", "rejected", "line-changed"):
+                approved.discard(what.get("proposal", ""))
+            elif kind == "deploying":
+                assert what["proposal"] in approved
+
+
+TestFourEyesLifeCycle = FourEyesLifeCycle.TestCase
+TestFourEyesLifeCycle.settings = LifeCycle.TestCase.settings

@@ -13,11 +13,11 @@ from typing import Any
 import pytest
 
 from gateway.core.messages import Event, Reply
+from gateway.core.status import GatewayStatus
 from gateway.core.topics import GATEWAY_COMMAND, GATEWAY_STATUS, LOOP_COMMAND, LOOP_EVENT, LOOP_TELEMETRY
 from gateway.mailbox.port import RemoteError, Unreachable
 from gateway.mailbox.unix import UnixMailbox
 from gateway.supervisor.history import History
-from gateway.supervisor.status import GatewayStatus
 from tests.unit.supervisor_support import child, frame_of, short_folder, until
 
 GATEWAY = """

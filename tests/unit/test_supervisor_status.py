@@ -9,15 +9,17 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from gateway.core.alarms import BY_NAME, AlarmStatus
 from gateway.core.messages import Arm, Event, Reply
 from gateway.core.signals import DriveState, Quality
 from gateway.core.states import LoopState
+from gateway.core.status import BusStatus, GatewayStatus
 from gateway.core.topics import GATEWAY_COMMAND, GATEWAY_STATUS, LOOP_COMMAND, LOOP_EVENT, LOOP_TELEMETRY
 from gateway.mailbox.inprocess import Hub, InProcessMailbox
 from gateway.mailbox.port import MAX_PAYLOAD, PEER, Counters, Peer
 from gateway.supervisor.historian import Health, Historian
 from gateway.supervisor.service import EVENTS_SHOWN, TEXT_SHOWN, Gateway
-from gateway.supervisor.status import LOST_S, WORDS, BusStatus, GatewayStatus
+from gateway.supervisor.status import LOST_S, WORDS
 from tests.unit.supervisor_support import frame_of, line_of
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -296,6 +298,15 @@ def example() -> GatewayStatus:
     bench.run_loop(100)
     bench.gateway.watch()
     bench.gateway.agents_bus = lambda: BusStatus(open=True, text="", agents=["sysid"], refused=0)
+    row = BY_NAME["load-cell"]
+    bench.gateway.alarms = lambda: [
+        AlarmStatus(
+            name=row.name, priority=row.priority, means=row.means, text="span 3 nip: STALE", cause=row.cause,
+            consequence=row.consequence, action=row.action, active=True, acknowledged=True, first_out=False,
+            since_wall_s=WALL_AHEAD_S + 98.0, ended_wall_s=None, acknowledged_by="anna (operator, page)",
+            shelved_until_wall_s=None,
+        )
+    ]  # fmt: skip
     return bench.gateway.status()
 
 

@@ -1,0 +1,196 @@
+"""Who may come in through OPC UA and the page: names, roles, and what proves a password without telling it.
+
+One file in the line's data folder, for its owner's eyes only; `r2rgate users` writes it. Passwords are salted and
+hashed with scrypt, which takes 32 MB and some 50 ms for a guess, and as long for a name that nobody has.
+"""
+
+import hashlib
+import hmac
+import os
+import secrets
+import stat
+import tomllib
+import unicodedata
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, NamedTuple
+
+from pydantic import Field, ValidationError
+
+from gateway.core.line import Strict
+from gateway.core.people import Role, UserName
+
+FILE_NAME = "users.toml"
+MOST_USERS = 200
+MOST_BYTES = 65_536  #: of the file
+LEAST_LETTERS, MOST_LETTERS, LEAST_DIFFERENT = 10, 128, 5
+#: What everybody tries first: no password has one of these as half of it or more.
+TRIED_FIRST = (
+    "password", "passwort", "kennwort", "geheim", "secret", "123456", "abcdef", "qwert", "asdf", "letmein", "welcome",
+    "willkommen", "admin", "operator", "engineer", "viewer", "r2rgate",
+)  # fmt: skip
+
+_LOG2_N, _R, _P, _SALT_BYTES, _HASH_BYTES = 15, 8, 1, 16, 32
+_HEX = r"^[0-9a-f]*$"
+
+
+class UsersRefused(Exception):
+    """The file cannot be used, or what was asked for cannot be; the text says why and what is allowed."""
+
+
+class _Entry(Strict):
+    name: UserName
+    role: Role
+    salt: Annotated[str, Field(pattern=_HEX, min_length=2 * _SALT_BYTES, max_length=2 * _SALT_BYTES)]
+    scrypt: Annotated[str, Field(pattern=_HEX, min_length=2 * _HASH_BYTES, max_length=2 * _HASH_BYTES)]
+
+
+class _File(Strict):
+    format: Annotated[int, Field(ge=1, le=1)]
+    users: Annotated[list[_Entry], Field(max_length=MOST_USERS)] = []
+
+
+class User(NamedTuple):
+    name: str
+    role: Role
+
+
+@dataclass(frozen=True)
+class Users:
+    """Never changed: `with_user` and `without` give others."""
+
+    _by_name: Mapping[str, _Entry]
+
+    @classmethod
+    def nobody(cls) -> "Users":
+        return cls({})
+
+    @classmethod
+    def read(cls, path: Path) -> "Users":
+        """Raises UsersRefused, also where others than its owner may read or write it."""
+        try:
+            with path.open("rb") as stream:
+                others = stat.S_IMODE(os.fstat(stream.fileno()).st_mode) & 0o077
+                content = stream.read(MOST_BYTES + 1)
+        except OSError as error:
+            raise UsersRefused(f"{path} cannot be read: {error.strerror}") from error
+        if others:
+            raise UsersRefused(f"{path} is open to others than its owner: `chmod 600 {path}` mends it")
+        if len(content) > MOST_BYTES:
+            raise UsersRefused(f"{path} has more than {MOST_BYTES} bytes")
+        try:
+            found = _File.model_validate(tomllib.loads(content.decode()))
+        except ValidationError as error:
+            reasons = "; ".join(f"{'.'.join(map(str, one['loc']))}: {one['msg']}" for one in error.errors()[:5])
+            raise UsersRefused(f"{path}: {reasons}") from None  # the cause has what was entered
+        except ValueError as error:
+            raise UsersRefused(f"{path} is no TOML: {error}") from error
+        by_name = {one.name: one for one in found.users}
+        if len(by_name) < len(found.users):
+            raise UsersRefused(f"{path} has a name twice; allowed: each once")
+        return cls(by_name)
+
+    def check(self, name: str, password: str) -> Role | None:
+        """The role of who proves so to be `name`; None: nobody does. Takes some 50 ms: call it in a thread."""
+        entry = self._by_name.get(name)
+        salt = _NOBODYS_SALT if entry is None else entry.salt
+        found = _hashed(password[:MOST_LETTERS], bytes.fromhex(salt)).hex()
+        same = hmac.compare_digest(found, "" if entry is None else entry.scrypt)
+        return entry.role if entry is not None and same and len(password) <= MOST_LETTERS else None
+
+    def entries(self) -> list[User]:
+        """By name."""
+        return [User(one.name, one.role) for one in sorted(self._by_name.values(), key=lambda one: one.name)]
+
+    def with_user(self, name: str, password: str, role: Role) -> "Users":
+        """With this one more, or with another password or role. Raises UsersRefused."""
+        if reason := why_weak(name, password):
+            raise UsersRefused(reason)
+        salt = secrets.token_bytes(_SALT_BYTES)
+        try:
+            entry = _Entry(name=name, role=role, salt=salt.hex(), scrypt=_hashed(password, salt).hex())
+        except ValidationError:
+            raise UsersRefused(
+                f"{name!r} with role {role!r}: allowed are names of 1 to 32 of a-z, 0-9, dot, underscore and hyphen "
+                "that begin with a letter, and the roles viewer, operator, engineer"
+            ) from None
+        if len(self._by_name) >= MOST_USERS and name not in self._by_name:
+            raise UsersRefused(f"there are {MOST_USERS} users, which is all that is allowed: remove one first")
+        return Users({**self._by_name, name: entry})
+
+    def without(self, name: str) -> "Users":
+        """Raises UsersRefused where there is no such user."""
+        if name not in self._by_name:
+            raise UsersRefused(f"there is no user {name}; users are: {', '.join(sorted(self._by_name)) or 'none'}")
+        return Users({one: entry for one, entry in self._by_name.items() if one != name})
+
+    def write(self, path: Path) -> None:
+        """All of it or nothing, for its owner only. Raises OSError."""
+        lines = ["# Written by `r2rgate users`. No password is in here, only what proves one.", "format = 1"]
+        for name, entry in sorted(self._by_name.items()):
+            values = {"name": name, "role": entry.role, "salt": entry.salt, "scrypt": entry.scrypt}
+            lines += ["", "[[users]]", *(f'{key} = "{value}"' for key, value in values.items())]
+        part = path.with_name(f"{path.name}.{secrets.token_hex(4)}.part")
+        descriptor = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+        try:
+            with os.fdopen(descriptor, "w", encoding="ascii") as stream:
+                stream.write("\n".join(lines) + "\n")
+                stream.flush()
+                os.fsync(stream.fileno())
+            part.replace(path)
+        except BaseException:
+            part.unlink(missing_ok=True)
+            raise
+
+
+class UsersFile:
+    """The users of a file as they are now: a change counts from the next question on."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._seen: tuple[int, int, int] | None = None
+        self._users = Users.nobody()
+
+    def current(self) -> Users:
+        """Nobody, where there is no file. Raises UsersRefused."""
+        try:
+            found = self._path.stat()
+        except FileNotFoundError:
+            self._seen, self._users = None, Users.nobody()
+            return self._users
+        except OSError as error:
+            raise UsersRefused(f"{self._path} cannot be read: {error.strerror}") from error
+        seen = found.st_ino, found.st_mtime_ns, found.st_ctime_ns
+        if seen != self._seen:
+            self._users = Users.read(self._path)
+            self._seen = seen
+        return self._users
+
+
+def why_weak(name: str, password: str) -> str:
+    """What is wrong with a new password, and what is allowed; empty: nothing. It never tells the password."""
+    plain = password.casefold()
+    allowed = f"{LEAST_LETTERS} to {MOST_LETTERS} characters; a few words in a row are good"
+    if len(password) < LEAST_LETTERS:
+        return f"the password has {len(password)} characters; allowed: {allowed}"
+    if len(password) > MOST_LETTERS:
+        return f"the password has more than {MOST_LETTERS} characters; allowed: {allowed}"
+    if any(unicodedata.category(letter) == "Cc" for letter in password):
+        return f"the password has control characters; allowed: {allowed}"
+    if len(set(plain)) < LEAST_DIFFERENT:
+        return f"the password has fewer than {LEAST_DIFFERENT} different characters; allowed: {allowed}"
+    common = next((one for one in (name.casefold(), *TRIED_FIRST) if one in plain and 2 * len(one) >= len(plain)), "")
+    if common:
+        return f"half of the password or more is what is tried first ({common}); allowed: {allowed}"
+    return ""
+
+
+def _hashed(password: str, salt: bytes) -> bytes:
+    """The same whether letters were typed as one character or composed of two."""
+    same = unicodedata.normalize("NFC", password).encode("utf-8", "replace")
+    memory = 2 * 128 * _R * 2**_LOG2_N
+    return hashlib.scrypt(same, salt=salt, n=2**_LOG2_N, r=_R, p=_P, maxmem=memory, dklen=_HASH_BYTES)
+
+
+_NOBODYS_SALT = bytes(_SALT_BYTES).hex()

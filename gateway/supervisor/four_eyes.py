@@ -1,0 +1,43 @@
+"""Who approved first, where a change takes two: another person than the first. Pure.
+
+People who came in through OPC UA or the page are told apart by name, local users by the number that the kernel tells.
+A script is the user that runs it. A person and a local user of the same name are taken to be the same.
+"""
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from gateway.core.audit_record import Who
+
+APPROVED_ONCE = "approved-once"  #: the kind of its record
+_PERSON = re.compile(r"([a-z][a-z0-9._-]{0,31}) \([a-z]+, [a-z-]+\)")  # as `who_is` writes it
+
+
+@dataclass(frozen=True)
+class FirstApproval:
+    name: str
+    approver: tuple[str, ...]  #: as `approver_of`
+    shown: str  #: what they have seen: another one is not approved by it
+    by: str  #: person or script
+
+
+def approver_of(who: Who) -> tuple[str, ...]:
+    """All by which somebody is told apart from others; of whoever came straight from the mailbox, not of a script."""
+    if (person := _PERSON.fullmatch(who.name)) is not None:  # user and process are those of the operator's process
+        return (person[1],)
+    return (who.name.casefold(),) if who.uid is None else (who.name.casefold(), f"uid {who.uid}")
+
+
+def first_of(what: Mapping[str, Any]) -> FirstApproval:
+    """Out of its record."""
+    approver = tuple(map(str, what["approver"]))
+    return FirstApproval(str(what["name"]), approver, str(what["shown"]), str(what["by"]))
+
+
+def why_not_second(first: FirstApproval, approver: tuple[str, ...]) -> str:
+    """Empty: it is somebody else."""
+    if not set(first.approver) & set(approver):
+        return ""
+    return f"{first.name} has approved it already: this line takes two different people, and you are the same one"

@@ -1,0 +1,73 @@
+"""What people say through OPC UA and the page: held against their role once more, recorded, and handed on."""
+
+from collections.abc import Awaitable, Callable, Mapping
+from typing import Any
+
+from pydantic import ValidationError
+
+from gateway.core.alarms import AlarmSaid
+from gateway.core.audit_record import Who
+from gateway.core.decisions import Archive, Decide, LineChanged, RollBackNow
+from gateway.core.messages import Command, Reply, command_bytes, in_words
+from gateway.core.people import FOR_PERSON, why_may_not
+from gateway.core.topics import GATEWAY_FOR_PERSON
+from gateway.mailbox.port import PEER, Mailbox
+from gateway.supervisor.audit_file import AuditUnavailable
+from gateway.supervisor.peers import who_is
+
+Decision = Decide | RollBackNow | Archive | LineChanged
+
+
+class PersonsDesk:
+    """A handler on a mailbox."""
+
+    def __init__(
+        self,
+        mailbox: Mailbox,
+        command: Callable[[bytes, Who], Awaitable[Reply]],
+        decide: Callable[[Decision, Who], Awaitable[Reply]],
+        alarm: Callable[[AlarmSaid, Who], Awaitable[Reply]],
+        note: Callable[[str, Who, Mapping[str, Any]], Awaitable[object]],
+    ) -> None:
+        """`note` appends a record to the audit; raises AuditUnavailable."""
+        self._command = command
+        self._decide = decide
+        self._alarm = alarm
+        self._note = note
+        mailbox.serve(GATEWAY_FOR_PERSON, self._answer)
+
+    async def _answer(self, payload: bytes) -> bytes:
+        try:
+            asked = FOR_PERSON.validate_json(payload)
+        except ValidationError as error:
+            reasons = [f"{'.'.join(map(str, one['loc']))}: {one['msg']}" for one in error.errors()]
+            return _reply(Reply(ok=False, state="", text="not understood", reasons=reasons[:20]))
+        person, said = asked.person, asked.said
+        who = who_is(person, PEER.get())
+        if reason := why_may_not(person, said.command):
+            await self._kept("refused-person", who, {"command": said.command, "because": reason})
+            return _reply(Reply(ok=False, state="", text=reason, reasons=[reason]))
+        if isinstance(said, Decision):
+            return _reply(await self._decide(said, who))
+        if isinstance(said, AlarmSaid):
+            return _reply(await self._alarm(said, who))
+        return _reply(await self._operate(said, who))
+
+    async def _operate(self, said: Command, who: Who) -> Reply:
+        """First the line, then the record: a stop never waits for a disk."""
+        reply = await self._command(command_bytes(said), who)
+        what = {"command": in_words(said), "done": reply.ok, "answer": reply.text}
+        unkept = await self._kept("operated", who, what)
+        return reply.model_copy(update={"text": f"{reply.text}{unkept}"}) if unkept else reply
+
+    async def _kept(self, kind: str, who: Who, what: Mapping[str, Any]) -> str:
+        """Empty where it is; else that it is not, to be told."""
+        try:
+            await self._note(kind, who, what)
+        except AuditUnavailable as error:
+            return f"; it could not be recorded: {error}"
+        return ""
+
+
+def _reply(reply: Reply) -> bytes:
+    return reply.model_dump_json().encode()
