@@ -16,8 +16,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from gateway.cli.certificates import CERTIFICATE_DAYS, EARLIER, Pair
 from gateway.cli.pki_bus import keep_pair, pair_there
-from gateway.operator.opcua.server import CERTIFICATE
-from gateway.operator.opcua.trust import REJECTED, TRUSTED, file_of, from_file
+from gateway.operator.opcua.trust import CERTIFICATE, REJECTED, TRUSTED, file_of, from_file
 
 KEY_BITS = 2048  #: what both security policies take, and every client
 SERVER = CERTIFICATE.removesuffix(".pem")  #: name of the files
@@ -100,4 +99,3 @@ def _general(host: str) -> x509.GeneralName:
         return x509.IPAddress(ip_address(host))
     except ValueError:
         return x509.DNSName(host)
-

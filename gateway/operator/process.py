@@ -15,14 +15,10 @@ from gateway.mailbox.unix import UnixMailbox
 from gateway.operator.line_side import TOPICS, LineSide
 from gateway.operator.opcua.server import CannotServe
 from gateway.operator.opcua.service import OpcUa
+from gateway.operator.opcua.trust import pki_folder
 from gateway.operator.users import FILE_NAME, UsersFile, UsersRefused
 
 EXIT_OK, EXIT_CANNOT_SERVE = 0, 2
-
-
-def pki_folder(line: Line, data_folder: Path) -> Path:
-    """Where the certificates of OPC UA lie."""
-    return data_folder / "pki" if line.operator.pki is None else Path(line.operator.pki)
 
 
 def run_operator(line: Line, run_folder: Path, data_folder: Path) -> int:

@@ -16,7 +16,7 @@ from cryptography import x509
 from cryptography.hazmat.primitives.serialization import Encoding
 
 from gateway.cli.certificates import Pair
-from gateway.cli.pki_opcua import keep_opcua_pki, self_signed, trust
+from gateway.cli.pki_opcua import self_signed, trust
 from gateway.core.decisions import QUERY, ListProposals, ProposalLine, ProposalList, ProposalShown
 from gateway.core.line import Line
 from gateway.core.line_past import PAST_QUERY, RecordsAfter, RecordsTold, RecordTold, TensionsTold
@@ -44,6 +44,7 @@ from tests.unit.supervisor_support import line_of, short_folder
 
 EXAMPLES = Path(__file__).parents[2] / "docs" / "examples"
 SHOWN = "5" * 64
+NUMBER = 2  #: of the namespace of the line's nodes
 USERS = {"vera": "viewer", "otto": "operator", "emma": "engineer"}
 PASSWORD = "three old rollers"
 logging.getLogger("asyncua").setLevel(logging.CRITICAL)
@@ -60,8 +61,7 @@ class FakeGateway:
         self.waiting: list[ProposalShown] = []
         self.epoch = 3
         self.records: list[RecordTold] = []
-        self.answers_after: Callable[[], Any] = asyncio.Event().is_set
-        self.hold: asyncio.Event | None = None
+        self.hold: asyncio.Event | None = None  #: until then nothing that people say is answered
         self.asked_past: list[Any] = []
         mailbox.serve(GATEWAY_STATUS, self._status)
         mailbox.serve(GATEWAY_PROPOSALS, self._proposals)
@@ -144,7 +144,8 @@ def shown(epoch: int = 3, reason: str = "span 2 swings") -> ProposalShown:
         format=1, proposal=proposal_hash(proposal), payload="c" * 64, context="d" * 64, line="e" * 64, kind="gains",
         seed=1, accepted=True, judged="2026-01-01T00:00:00Z", program_version="1",
         findings=[
-            RuleFinding(rule="delay margin", passed=True, text="6 ms", value=0.006, limit=0.004, margin=0.002, unit="s"),
+            RuleFinding(rule="delay margin", passed=True, text="6 ms", value=0.006, limit=0.004, margin=0.002,
+                        unit="s"),
             RuleFinding(rule="shape", passed=True, text="it fits the line"),
         ],
         figures=[
@@ -196,9 +197,7 @@ class Bench:
         return f"opc.tcp://127.0.0.1:{self.opcua.server.port}"
 
     def id(self, path: str) -> Any:
-        return ua.NodeId(path, self.opcua.server.iserver and self._namespace)
-
-    _namespace = 2
+        return ua.NodeId(path, NUMBER)
 
     async def client(
         self,
@@ -227,7 +226,7 @@ class Bench:
     async def connected(self, *words: Any, **named: Any) -> AsyncIterator[Client]:
         client = await self.client(*words, **named)
         async with client:
-            assert (await client.get_namespace_array())[self._namespace] == NAMESPACE
+            assert (await client.get_namespace_array())[NUMBER] == NAMESPACE
             yield client
 
     async def read(self, client: Client, path: str) -> Any:
@@ -238,9 +237,12 @@ class Bench:
 
     async def until(self, client: Client, path: str, right: Callable[[Any], bool]) -> Any:
         """Read until it is so; the test's time limit ends what never comes."""
-        while not right(found := await self.read(client, path)):
+        while not right(found := await self.read(client, path)):  # noqa: ASYNC110 (it is on the wire)
             await asyncio.sleep(0.02)
         return found
+
+    def sessions(self) -> int:
+        return len(self.opcua.server.iserver._external_sessions)  # noqa: SLF001 (there is no other way to count)
 
     async def call(self, client: Client, method: str, *arguments: Any) -> tuple[int, list[Any]]:
         """Status code and output arguments of a method of the line."""
@@ -276,7 +278,3 @@ async def bench(spans: int = 2, gateway: bool = True, **operator: Any) -> AsyncI
 def _write(folder: Path, name: str, of: Pair) -> None:
     (folder / f"{name}.pem").write_bytes(of.certificate)
     (folder / f"{name}.key.pem").write_bytes(of.private_key)
-
-
-def pki_made(folder: Path) -> None:
-    keep_opcua_pki(folder, "plant", "line", ["localhost"], [], datetime.now(UTC))

@@ -38,12 +38,13 @@ class Logins:
     async def person(self, server: InternalServer, session: Any, token: Any, certificate: str) -> Person:
         """Raises ServiceError."""
         if isinstance(token, ua.UserNameIdentityToken):
-            return await self._by_password(*_plain(server, session, token), certificate)
+            return await self.by_password(*_plain(server, session, token), certificate)
         if _is_nobody(token) and self._anonymous_may_read:
             return Person(name=ANONYMOUS, role="viewer", through="opc-ua", certificate=certificate)
         raise ServiceError(ua.StatusCodes.BadIdentityTokenRejected)
 
-    async def _by_password(self, name: str, password: str, certificate: str) -> Person:
+    async def by_password(self, name: str, password: str, certificate: str) -> Person:
+        """Raises ServiceError, after a while. A client's guesses wait for each other."""
         guessing = self._guessing.setdefault(certificate, asyncio.Lock())
         try:
             async with guessing:

@@ -24,9 +24,8 @@ from gateway.operator.opcua.login import Logins
 from gateway.operator.opcua.processor import OnlyProven, Processor
 from gateway.operator.opcua.session import Session
 from gateway.operator.opcua.sockets import Sockets
-from gateway.operator.opcua.trust import NotUsable, TrustList, application_uri, first_of
+from gateway.operator.opcua.trust import CERTIFICATE, PRIVATE_KEY, NotUsable, TrustList, application_uri, first_of
 
-CERTIFICATE, PRIVATE_KEY = "opcua-server.pem", "opcua-server.key.pem"  #: in the folder of certificates
 PRODUCT = "urn:r2rgate"
 
 ua: Any = asyncua_ua  #: what it declares of its values and what they are differ

@@ -14,6 +14,9 @@ from cryptography import x509
 from cryptography.hazmat.primitives.asymmetric.rsa import RSAPublicKey
 from cryptography.hazmat.primitives.serialization import Encoding
 
+from gateway.core.line import Line
+
+CERTIFICATE, PRIVATE_KEY = "opcua-server.pem", "opcua-server.key.pem"  #: files
 TRUSTED, REJECTED = "trusted", "rejected"  #: folders
 MOST_TRUSTED, MOST_REJECTED = 500, 20  #: files
 MOST_BYTES = 8192  #: of a certificate
@@ -23,6 +26,10 @@ LEAST_BITS, MOST_BITS = 2048, 4096  #: of its key; what the offered security pol
 
 class NotUsable(Exception):
     """Bytes that are no certificate of an OPC UA application; the text says why."""
+
+
+def pki_folder(line: Line, data_folder: Path) -> Path:
+    return data_folder / "pki" if line.operator.pki is None else Path(line.operator.pki)
 
 
 def fingerprint(der: bytes) -> str:
