@@ -8,6 +8,7 @@ from pydantic import ValidationError
 
 from gateway.cli import (
     agents_commands,
+    alarms_commands,
     ask_commands,
     audit_commands,
     audit_replay,
@@ -87,6 +88,7 @@ app.command(rich_help_panel=OVERSIGHT)(proposal_commands.proposals)
 app.command(rich_help_panel=OVERSIGHT)(proposal_commands.approve)
 app.command(rich_help_panel=OVERSIGHT)(proposal_commands.reject)
 app.command(rich_help_panel=OVERSIGHT)(proposal_commands.rollback)
+app.add_typer(alarms_commands.app, rich_help_panel=OVERSIGHT)
 app.command(rich_help_panel=EVIDENCE)(agents_commands.log)
 app.command("export", rich_help_panel=EVIDENCE)(recordings_export.export)
 audit_commands.app.command()(audit_replay.replay)

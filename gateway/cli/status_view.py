@@ -31,7 +31,7 @@ def render(status: GatewayStatus, width: int, height: int | None = None) -> Rend
     """With a `height` (lines), spans that need no attention and old events give way so that it fits."""
     spans, events = status.spans, len(status.events)
     if height is not None:
-        height -= (status.change is not None) + bool(_agents(status))
+        height -= (status.change is not None) + bool(_agents(status)) + bool(status.alarms)
         room = max(1, height - FIXED_LINES - LEAST_EVENTS)
         if len(spans) > room:
             spans = _urgent(spans, max(1, room - 1), status.limits)
@@ -56,6 +56,8 @@ def _head(status: GatewayStatus) -> RenderableType:
     if loop.saturated:
         title.append("  torque at its limit", style="bold yellow")
     head.add_row(title, _clock_time(status.wall_s))
+    if status.alarms:
+        head.add_row(_alarms(status), "")
     for doubt in loop.doubts:
         head.add_row(Text(f"Proposals are blocked: {doubt}", "bold yellow"), "")
     if status.change is not None:
@@ -64,6 +66,17 @@ def _head(status: GatewayStatus) -> RenderableType:
     speed, setpoint = (_number(value, ".4f") for value in (status.unwind_speed_m_per_s, status.speed_setpoint_m_per_s))
     head.add_row(Text(f"Web {speed} m/s, set-point {setpoint} m/s", "" if loop.running else "dim"), "")
     return head
+
+
+def _alarms(status: GatewayStatus) -> Text:
+    """One line: `r2rgate alarms` has the rest."""
+    shown = [one for one in status.alarms if one.shelved_until_wall_s is None]
+    words = [f"{one.means}{'' if one.acknowledged else ' (!)'}" for one in shown]
+    if shelved := len(status.alarms) - len(shown):
+        words.append(f"{shelved} shelved")
+    high = any(one.priority == "high" and one.active for one in shown)
+    style = "bold red" if high else "bold yellow" if shown else "dim"
+    return Text(f"Alarms: {'; '.join(words)}", style, no_wrap=True, overflow="ellipsis")
 
 
 def _change(change: ChangeStatus, now_s: float) -> str:

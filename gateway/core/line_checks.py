@@ -10,6 +10,7 @@ from functools import partial
 
 from gateway.core import line_rules_agents as agents
 from gateway.core import line_rules_network as network
+from gateway.core import line_rules_operator as operator
 from gateway.core import line_rules_process as process
 from gateway.core import line_rules_wiring as wiring
 from gateway.core.line import Line
@@ -49,6 +50,10 @@ RULES: tuple[Rule, ...] = (
     _rule("network", network.listens_with_tls),
     _rule("network", network.files_are_named),
     _rule("network", network.names_differ),
+    _rule("operator", operator.opc_ua_is_an_endpoint),
+    _rule("operator", operator.page_is_an_address),
+    _rule("operator", operator.ports_differ),
+    _rule("operator", operator.pki_is_a_folder),
     _rule("limits", process.tension_limits_ordered),
     _rule("limits web", process.web_bears_the_tension),
     _rule("limits", process.steps_within_limits),

@@ -20,7 +20,7 @@ def opcua_endpoint(bus: OpcUaBus, path: Path) -> Iterator[Finding]:
         known = _split(right)
         like = f'"{right}"' if known is not None and is_host(known.hostname or "") else ""
         yield Finding((*path, "endpoint"), "is no endpoint", '"opc.tcp://HOST:PORT", with a path or without', like)
-    elif bus.security == "none" and not _is_this_machine(parts.hostname or ""):
+    elif bus.security == "none" and not is_this_machine(parts.hostname or ""):
         without = "is reached without security: anybody on that network can command its devices"
         yield odd((*path, "endpoint"), without, 'security = "Basic256Sha256"')
 
@@ -60,7 +60,8 @@ def is_host(host: str) -> bool:
     return bool(host) and all(c.isalnum() or c in ".-_:" for c in host)
 
 
-def _is_this_machine(host: str) -> bool:
+def is_this_machine(host: str) -> bool:
+    """Whether nobody else can reach it there."""
     try:
         return ip_address(host).is_loopback
     except ValueError:

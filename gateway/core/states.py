@@ -38,3 +38,5 @@ STATE_OF: dict[Phase, LoopState] = {
     Phase.UNLOADING: LoopState.STOP,
     Phase.OFF: LoopState.STOP,
 }
+
+OPERATORS_STOP = "operator's stop"  #: the reason of a stop that a person wanted

@@ -4,6 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
+from gateway.core.alarms import AlarmStatus
 from gateway.core.line import Strict
 from gateway.core.messages import BusReport
 from gateway.core.proposal import Kind
@@ -123,3 +124,4 @@ class GatewayStatus(Strict):
     agents_bus: BusStatus
     historian: HistorianStatus
     events: list[EventStatus]  #: the last ones, the newest at the end
+    alarms: list[AlarmStatus] = []  #: what needs a look first stands first

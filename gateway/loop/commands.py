@@ -22,7 +22,7 @@ from gateway.core.messages import (
 )
 from gateway.core.nearest import nearest
 from gateway.core.signals import Channel, Quality
-from gateway.core.states import LoopState, Phase
+from gateway.core.states import OPERATORS_STOP, LoopState, Phase
 from gateway.loop import machine as machines
 from gateway.loop.cycle import Cycle
 from gateway.loop.deploy import configure
@@ -216,7 +216,7 @@ def _hold(cycle: Cycle, now_s: float) -> str:
 
 def _stop(cycle: Cycle, now_s: float) -> str:
     before = cycle.machine
-    cycle.change(machines.stop(before, now_s, "operator's stop"))
+    cycle.change(machines.stop(before, now_s, OPERATORS_STOP))
     if cycle.machine is before:
         return "nothing is sent to the drives" if before.state is LoopState.SILENT else "stopping or stopped already"
     if cycle.machine.phase is Phase.OFF:

@@ -2,7 +2,8 @@
 
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
+from contextlib import closing
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,6 +16,7 @@ from gateway.supervisor.blobs import DamagedBlob, unpack_column, unpack_times
 from gateway.supervisor.store import PER_SPAN, SCHEMA, STORED_FIELDS
 
 FIELDS = ("time_s", "wall_s", *STORED_FIELDS)
+_BETWEEN_WALL = "end_s + blob.wall_ahead_s >= ? AND start_s + blob.wall_ahead_s <= ?"
 
 
 class HistoryError(Exception):
@@ -82,8 +84,13 @@ class History:
 
     def read_wall(self, start_s: float, end_s: float, fields: Sequence[str]) -> dict[str, NDArray[Any]]:
         """As `read`, over all boots, between two instants of Unix time."""
-        where = "end_s + blob.wall_ahead_s >= ? AND start_s + blob.wall_ahead_s <= ?"
-        return self._read(where, (), "wall_s", start_s, end_s, fields)
+        return self._read(_BETWEEN_WALL, (), "wall_s", start_s, end_s, fields)
+
+    def walk_wall(
+        self, start_s: float, end_s: float, fields: Sequence[str]
+    ) -> Generator[dict[str, NDArray[Any]], None, None]:
+        """As `read_wall`, in parts of some seconds, the oldest first: never more than one of them in memory."""
+        return self._walk(_BETWEEN_WALL, (), "wall_s", start_s, end_s, fields)
 
     def events(self, start_s: float, end_s: float) -> list[StoredEvent]:
         """Events between two instants of Unix time, in order."""
@@ -100,22 +107,29 @@ class History:
     def _read(
         self, where: str, values: tuple[Any, ...], by: str, start_s: float, end_s: float, fields: Sequence[str]
     ) -> dict[str, NDArray[Any]]:
+        with closing(self._walk(where, values, by, start_s, end_s, fields)) as walk:
+            parts = list(walk)
+        return {name: np.concatenate([part[name] for part in parts]) for name in dict.fromkeys(("time_s", *fields))}
+
+    def _walk(
+        self, where: str, values: tuple[Any, ...], by: str, start_s: float, end_s: float, fields: Sequence[str]
+    ) -> Generator[dict[str, NDArray[Any]], None, None]:
+        """The first part is empty, with the shapes of what follows."""
         _check_fields(fields)
         wanted = dict.fromkeys(("time_s", *fields))
         self._connection.execute("BEGIN")  # one snapshot, whatever the writer gathers meanwhile
         try:
             blobs = self._blobs(where, (*values, start_s, end_s))
-            parts = [_nothing(wanted, blobs[0].spans if blobs else 0)]
+            yield _nothing(wanted, blobs[0].spans if blobs else 0)
             for blob in blobs:
                 columns = self._unpack(blob, [*wanted, by])
                 if columns:
                     inside = (columns[by] >= start_s) & (columns[by] <= end_s)
-                    parts.append({name: columns[name][inside] for name in wanted})
+                    yield {name: columns[name][inside] for name in wanted}
         except apsw.Error as error:
             raise HistoryError(f"the history cannot be read: {error}") from error
         finally:
             self._connection.execute("ROLLBACK")
-        return {name: np.concatenate([part[name] for part in parts]) for name in wanted}
 
     def _blobs(self, where: str, values: tuple[Any, ...]) -> list[_Blob]:
         sql = (

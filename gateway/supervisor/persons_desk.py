@@ -5,6 +5,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from gateway.core.alarms import AlarmSaid
 from gateway.core.audit_record import Who
 from gateway.core.decisions import Archive, Decide, LineChanged, RollBackNow
 from gateway.core.messages import Command, Reply, command_bytes, in_words
@@ -25,11 +26,13 @@ class PersonsDesk:
         mailbox: Mailbox,
         command: Callable[[bytes, Who], Awaitable[Reply]],
         decide: Callable[[Decision, Who], Awaitable[Reply]],
+        alarm: Callable[[AlarmSaid, Who], Awaitable[Reply]],
         note: Callable[[str, Who, Mapping[str, Any]], Awaitable[object]],
     ) -> None:
         """`note` appends a record to the audit; raises AuditUnavailable."""
         self._command = command
         self._decide = decide
+        self._alarm = alarm
         self._note = note
         mailbox.serve(GATEWAY_FOR_PERSON, self._answer)
 
@@ -46,6 +49,8 @@ class PersonsDesk:
             return _reply(Reply(ok=False, state="", text=reason, reasons=[reason]))
         if isinstance(said, Decision):
             return _reply(await self._decide(said, who))
+        if isinstance(said, AlarmSaid):
+            return _reply(await self._alarm(said, who))
         return _reply(await self._operate(said, who))
 
     async def _operate(self, said: Command, who: Who) -> Reply:

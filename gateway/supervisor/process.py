@@ -20,6 +20,7 @@ from gateway.mailbox.unix import UnixMailbox
 from gateway.supervisor.agents_bus import AgentsBus
 from gateway.supervisor.agents_cases import AgentsCases
 from gateway.supervisor.agents_desk import AgentsDesk
+from gateway.supervisor.alarms import Alarms
 from gateway.supervisor.configurations import Configurations
 from gateway.supervisor.deployer_sides import JudgeSide
 from gateway.supervisor.dry_runs import DryRuns
@@ -31,6 +32,7 @@ from gateway.supervisor.interactions import Interactions
 from gateway.supervisor.judging import NICEST, JudgeWorkers
 from gateway.supervisor.line_desk import LineDesk
 from gateway.supervisor.models import Models
+from gateway.supervisor.past import Past
 from gateway.supervisor.persons_desk import PersonsDesk
 from gateway.supervisor.retention import retention_of
 from gateway.supervisor.service import Gateway
@@ -97,7 +99,10 @@ async def serve(
     judge.begin()
     gate = Gate(line, mailbox, data_folder, judge, around, gateway.note, clock, wall_clock)
     gateway.on_event, gateway.change = gate.hear, gate.change
-    PersonsDesk(mailbox, gateway.command, gate.decide, gate.audit.append)
+    alarms = Alarms(mailbox, data_folder, gate.audit.append, gateway.note, clock, wall_clock)
+    gateway.alarms = alarms.status
+    PersonsDesk(mailbox, gateway.command, gate.decide, alarms.say, gate.audit.append)
+    past = Past(line, mailbox, data_folder, lambda: historian.path)
     dry_runs = DryRuns(line, JudgeWorkers(line, nicer=NICEST))
     cases = AgentsCases(gate.audit.append, clock)
     desk = AgentsDesk(gateway.status, gate, dry_runs, Interactions(data_folder), gateway.note, cases)
@@ -105,20 +110,23 @@ async def serve(
     bus = AgentsBus(line, run_folder, (desk, line_desk), gateway.note, cases, clock)
     gateway.agents_bus = bus.status
     opening = asyncio.create_task(bus.open())
-    looking = [asyncio.create_task(_look(look, stop, watch_s)) for look in (gate.look, cases.look)]
+    looking = [asyncio.create_task(_look(look, stop, watch_s)) for look in (gate.look, cases.look, alarms.keep)]
     gateway.note("gateway-up", "the gateway has started")
     print(f"gateway of {line.site}/{line.line}: {run_folder / GATEWAY_SOCKET}, history {historian.path}", flush=True)
     try:
         while not stop.is_set():
             gateway.watch()
+            alarms.look(gateway.status(), gate.audit.state())
             bus.watch()
             await _wait(stop, watch_s)
     finally:
         stop.set()
         await asyncio.gather(*looking)
+        await alarms.keep()
         await opening
         await bus.close()
         await dry_runs.close()
+        await past.close()
         await gate.close()
         await judge.close()
         await mailbox.close()

@@ -10,6 +10,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from gateway.core.alarms import AlarmStatus
 from gateway.core.audit_record import Who
 from gateway.core.line import Line
 from gateway.core.messages import (
@@ -75,6 +76,7 @@ class Gateway:
         self.on_event: Callable[[Event], None] | None = None  #: who else wants to know what the loop tells
         self.change: Callable[[], ChangeStatus | None] = lambda: None  #: what the gate does to the line now
         self.agents_bus: Callable[[], BusStatus] = lambda: NO_BUS
+        self.alarms: Callable[[], list[AlarmStatus]] = list
         self._events: deque[EventStatus] = deque(maxlen=EVENTS_SHOWN)
         self._buses: list[BusReport] = []
         self._malformed_events = 0
@@ -150,6 +152,7 @@ class Gateway:
             agents_bus=self.agents_bus(),
             historian=self._historian_status(now_s),
             events=list(self._events),
+            alarms=self.alarms(),
         )
 
     def _historian_status(self, now_s: float) -> HistorianStatus:

@@ -4,6 +4,7 @@ import asyncio
 
 import pytest
 
+from gateway.core.alarms import AcknowledgeAlarm, ShelveAlarm
 from gateway.core.decisions import Archive, Decide, LineChanged, RollBackNow
 from gateway.core.messages import (
     AbortExperiment,
@@ -28,7 +29,10 @@ COMMANDS = [
     Arm(), Start(), Hold(), Stop(), SetTension(span=1, tension_n=20.0), SetSpeed(speed_m_per_s=0.05),
     SelectRecipe(name="a"), AbortExperiment(),
 ]  # fmt: skip
-DECISIONS = [Decide(proposal=HASH, shown=HASH, approve=True), RollBackNow(comment="it squeals")]
+DECISIONS = [
+    Decide(proposal=HASH, shown=HASH, approve=True), RollBackNow(comment="it squeals"),
+    AcknowledgeAlarm(alarm="load-cell"), ShelveAlarm(alarm="load-cell", for_s=60.0, because="being mended"),
+]  # fmt: skip
 FOR_ENGINEERS = [
     Archive(configuration="1", name="phi_stable", because="it held"), LineChanged(because="a thinner web"),
 ]  # fmt: skip
@@ -42,7 +46,7 @@ class Desk:
         self.mailbox, self.asking = InProcessMailbox(hub), InProcessMailbox(hub)
         self.commands, self.decisions, self.records = [], [], []
         self.audit_open = True
-        PersonsDesk(self.mailbox, self.command, self.decide, self.note)
+        PersonsDesk(self.mailbox, self.command, self.decide, self.decide, self.note)
 
     async def command(self, payload, who):
         self.commands.append((parse_command(payload), who))

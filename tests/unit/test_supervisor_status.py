@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from gateway.core.alarms import BY_NAME, AlarmStatus
 from gateway.core.messages import Arm, Event, Reply
 from gateway.core.signals import DriveState, Quality
 from gateway.core.states import LoopState
@@ -297,6 +298,15 @@ def example() -> GatewayStatus:
     bench.run_loop(100)
     bench.gateway.watch()
     bench.gateway.agents_bus = lambda: BusStatus(open=True, text="", agents=["sysid"], refused=0)
+    row = BY_NAME["load-cell"]
+    bench.gateway.alarms = lambda: [
+        AlarmStatus(
+            name=row.name, priority=row.priority, means=row.means, text="span 3 nip: STALE", cause=row.cause,
+            consequence=row.consequence, action=row.action, active=True, acknowledged=True, first_out=False,
+            since_wall_s=WALL_AHEAD_S + 98.0, ended_wall_s=None, acknowledged_by="anna (operator, page)",
+            shelved_until_wall_s=None,
+        )
+    ]  # fmt: skip
     return bench.gateway.status()
 
 

@@ -24,7 +24,7 @@ from gateway.core.topics import GATEWAY_STATUS
 from gateway.mailbox.unix import UnixMailbox
 from tests.unit.supervisor_support import frame_of, short_folder
 from tests.unit.test_historian import writer_of
-from tests.unit.test_supervisor_status import Bench
+from tests.unit.test_supervisor_status import Bench, example
 
 app = typer.Typer()
 app.command("status")(status)
@@ -227,3 +227,14 @@ def test_history_becomes_csv(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     result = CliRunner().invoke(app, [*arguments, "--fields", "tensions"])
     assert result.exit_code == 2
     assert "nearest is" in result.stderr
+
+
+def test_alarms_stand_in_one_line_and_the_screen_still_fits() -> None:
+    shown = example().alarms[0]
+    alarms = [shown.model_copy(update={"acknowledged": False}), shown, shown]
+    alarms.append(shown.model_copy(update={"shelved_until_wall_s": 1.0}))
+    lines = text_of(running(20).model_copy(update={"alarms": alarms}), 120, 24)
+    assert len(lines) <= 24 and max(map(len, lines)) <= 120
+    (line,) = [line for line in lines if line.startswith("Alarms: ")]
+    assert line.startswith("Alarms: a load cell cannot be trusted (!); a load cell cannot be trusted; ")
+    assert "Alarms" not in "".join(text_of(running(20), 120, 24))

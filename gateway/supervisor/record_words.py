@@ -1,0 +1,145 @@
+"""A record of the audit as a sentence for people. Pure: made here out of its fields, never by a language model.
+
+What people and agents wrote themselves is told as a quotation, shortened, and without what plays with a screen.
+"""
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from gateway.core.line_problem import printable
+
+LONGEST_QUOTE = 200  #: characters
+LONGEST_TOLD = 400  #: of what this program has found itself
+SHORT = 12  #: letters of a hash
+
+What = Mapping[str, Any]
+
+
+def in_a_sentence(kind: str, who: str, what: What, reason: str = "") -> str:
+    """`reason`: of a proposal, by whoever made it. A kind that is not known here is told as it is called."""
+    tell = SENTENCES.get(kind)
+    if tell is None:
+        return _clean(f"{kind}, by {who}", LONGEST_TOLD)
+    return tell(_clean(who, 200), {**what, "reason": reason} if kind == "proposed" else what)
+
+
+def quoted(text: object) -> str:
+    """With what leads to it; empty where nothing was said."""
+    said = _clean(str(text or ""), LONGEST_QUOTE)
+    return f": \u201c{said}\u201d" if said else ""
+
+
+def _clean(text: str, most: int) -> str:
+    plain = printable(" ".join(text.split())).replace("\u201c", '"').replace("\u201d", '"')
+    return plain if len(plain) <= most else f"{plain[: most - 1]}\u2026"
+
+
+def _of(what: What, key: str) -> str:
+    """A field as it may be shown; ? where a record of another version lacks it."""
+    return _clean(str(what.get(key, "?")), 80)
+
+
+def _hash(what: What, key: str = "proposal") -> str:
+    return _of(what, key)[:SHORT]
+
+
+def _because(what: What) -> str:
+    """What this program has found."""
+    said = _clean(str(what.get("because") or ""), LONGEST_TOLD)
+    return f": {said}" if said else ""
+
+
+def _proposed(_: str, what: What) -> str:
+    return f"{_of(what, 'author')} proposes {_of(what, 'change')} {_hash(what)}{quoted(what['reason'])}"
+
+
+def _approved(who: str, what: What) -> str:
+    if what.get("by") == "verdict":
+        return f"proposal {_hash(what)} passes by its verdict alone: it is like {_hash(what, 'like')}"
+    return f"{who} approves proposal {_hash(what)}{quoted(what.get('comment'))}"
+
+
+def _approved_once(who: str, what: What) -> str:
+    return f"{who} approves proposal {_hash(what)} as the first of two{quoted(what.get('comment'))}"
+
+
+def _deployed(_: str, what: What) -> str:
+    return f"proposal {_hash(what)} controls the line as epoch {_of(what, 'epoch')}, on probation"
+
+
+def _rolled_back(_: str, what: What) -> str:
+    return f"proposal {_hash(what)} is taken back, {_hash(what, 'to')} controls the line{_because(what)}"
+
+
+def _experiment_ends(_: str, what: What) -> str:
+    return (
+        f"the experiment of proposal {_hash(what)} {'has ended' if what.get('because') else 'is done'}{_because(what)}"
+    )
+
+
+def _found(_: str, what: What) -> str:
+    odd = "" if what.get("explained", True) else "; the records do not explain how it came to that"
+    epoch = _of(what, "epoch")
+    return f"the loop says that it runs {_hash(what, 'configuration')}, epoch {epoch}{_because(what)}{odd}"
+
+
+def _operated(who: str, what: What) -> str:
+    done = "done" if what.get("done") else "refused"
+    return f"{who}: {_of(what, 'command')}: {done}: {_clean(str(what.get('answer', '')), LONGEST_TOLD)}"
+
+
+def _archived(who: str, what: What) -> str:
+    kept = f"configuration {_hash(what, 'configuration')} (version {_of(what, 'version')}) as {_of(what, 'name')}"
+    return f"{who} keeps {kept}{quoted(what.get('because'))}"
+
+
+def _not_archived(_: str, what: What) -> str:
+    return f"configuration {_hash(what, 'configuration')} could not be kept as {_of(what, 'name')}{_because(what)}"
+
+
+def _shelved(who: str, what: What) -> str:
+    alarm, for_s = _of(what, "alarm"), what.get("for_s", 0.0)
+    if not for_s:
+        return f"{who} takes alarm {alarm} off the shelf{quoted(what.get('because'))}"
+    return f"{who} shelves alarm {alarm} for {for_s / 60.0:.0f} min{quoted(what.get('because'))}"
+
+
+def _of_proposal(text: str) -> Callable[[str, What], str]:
+    return lambda who, what: f"proposal {_hash(what)} {text}{_because(what)}"
+
+
+#: By kind. What is written down of a person's own words is quoted.
+SENTENCES: dict[str, Callable[[str, What], str]] = {
+    "proposed": _proposed,
+    "accepted": _of_proposal("is accepted by the gate"),
+    "refused": _of_proposal("is refused by the gate"),
+    "approved-once": _approved_once,
+    "approved": _approved,
+    "approval-lapsed": _of_proposal("waits again"),
+    "rejected": lambda who, what: f"{who} rejects proposal {_hash(what)}{quoted(what.get('comment'))}",
+    "expired": _of_proposal("has expired"),
+    "superseded": _of_proposal("is superseded"),
+    "deploying": lambda who, what: f"proposal {_hash(what)} goes to the loop as epoch {_of(what, 'epoch')}",
+    "not-deployed": _of_proposal("was not taken by the loop"),
+    "deployed": _deployed,
+    "keeping": _of_proposal("is about to be kept"),
+    "kept": _of_proposal("is kept"),
+    "rolled-back": _rolled_back,
+    "experiment-begins": _of_proposal("begins: an experiment runs"),
+    "experiment-ends": _experiment_ends,
+    "model-in-service": lambda who, what: f"proposals are judged by model {_hash(what, 'model')} from now on",
+    "found-in-service": _found,
+    "rollback-asked": lambda who, what: f"{who} asks for what was before{quoted(what.get('comment'))}",
+    "line-changed": lambda who, what: f"{who} says that the line has changed{quoted(what.get('because'))}",
+    "archived": _archived,
+    "not-archived": _not_archived,
+    "operated": _operated,
+    "refused-person": lambda who, what: f"{who} was refused {_of(what, 'command')}{_because(what)}",
+    "acknowledged": lambda who, what: f"{who} has seen alarm {_of(what, 'alarm')}{quoted(what.get('comment'))}",
+    "shelved": _shelved,
+    "malformed-proposal": lambda who, what: f"{who} sent what is no proposal",
+    "agents": lambda who, what: f"agents, {_of(what, 'times')} times {_of(what, 'case')}{quoted(what.get('newest'))}",
+    "gateway-start": lambda who, what: f"the gateway has started, version {_of(what, 'version')}",
+    "begun": lambda who, what: "the audit has begun",
+    "not-done": lambda who, what: f"records {_of(what, 'sequences')} were stored, and nothing came of them",
+}
