@@ -17,6 +17,7 @@ from cryptography.hazmat.primitives.serialization import Encoding
 
 from gateway.cli.certificates import Pair
 from gateway.cli.pki_opcua import self_signed, trust
+from gateway.core.alarms import BY_NAME, AlarmStatus
 from gateway.core.decisions import QUERY, ListProposals, ProposalLine, ProposalList, ProposalShown
 from gateway.core.line import Line
 from gateway.core.line_past import PAST_QUERY, RecordsAfter, RecordsTold, RecordTold, TensionsTold
@@ -60,6 +61,7 @@ class FakeGateway:
         self.running, self.quality, self.tension_n = True, "GOOD", 20.0
         self.waiting: list[ProposalShown] = []
         self.epoch = 3
+        self.alarms: list[AlarmStatus] = []
         self.records: list[RecordTold] = []
         self.hold: asyncio.Event | None = None  #: until then nothing that people say is answered
         self.asked_past: list[Any] = []
@@ -93,7 +95,7 @@ class FakeGateway:
             agents_bus=BusStatus(open=True, text="", agents=[], refused=0),
             historian=HistorianStatus(storing=True, text="", path="", frames_stored=0, frames_lost=0, events_lost=0,
                                       last_stored_age_s=None, moved_aside=""),
-            events=[EventStatus(wall_s=1.0, kind="state", text="RUN")],
+            alarms=self.alarms, events=[EventStatus(wall_s=1.0, kind="state", text="RUN")],
         )  # fmt: skip
 
     async def _proposals(self, payload: bytes) -> bytes:
@@ -135,6 +137,16 @@ class FakeGateway:
             await self.hold.wait()
         self.heard.append(FOR_PERSON.validate_json(payload))
         return self.reply.model_dump_json().encode()
+
+
+def alarm(name: str, acknowledged_by: str = "", shelved: bool = False) -> AlarmStatus:
+    row = BY_NAME[name]
+    return AlarmStatus(
+        name=name, priority=row.priority, means=row.means, text="span 1 has 3 N", cause=row.cause,
+        consequence=row.consequence, action=row.action, active=True, acknowledged=bool(acknowledged_by),
+        first_out=True, since_wall_s=1.7e9, ended_wall_s=None, acknowledged_by=acknowledged_by,
+        shelved_until_wall_s=1.8e9 if shelved else None,
+    )  # fmt: skip
 
 
 def shown(epoch: int = 3, reason: str = "span 2 swings") -> ProposalShown:

@@ -8,7 +8,7 @@ from asyncua import Client, ua
 
 from gateway.core.line_past import RecordTold, TensionsBetween
 from gateway.operator.opcua.space import NAMESPACE
-from tests.protocol.operator_support import SHOWN, bench, shown
+from tests.protocol.operator_support import SHOWN, alarm, bench, shown
 
 CODES = ua.StatusCodes
 
@@ -188,6 +188,29 @@ def test_a_proposal_that_waits_is_there_as_variables_and_goes_when_it_is_decided
             assert (await b.read(client, f"{own}.Id")).StatusCode.value == CODES.BadNodeIdUnknown
             there = await client.get_node(b.id("Line.Proposals")).get_children()
             assert [child.nodeid for child in there] == [b.id(newest)]
+
+    run(story)
+
+
+def test_every_alarm_of_the_table_has_its_variables_whether_it_is_active_or_not():
+    async def story():
+        async with bench(spans=1) as b, b.connected("vera") as client:
+            path, quiet = "Line.Alarms.tension-out-of-band", "Line.Alarms.loop-lost"
+            await b.until(client, f"{path}.Active", lambda found: found.Value.Value is False)
+            assert "web" in await b.value(client, f"{path}.Action")
+            b.gateway.alarms = [alarm("tension-out-of-band"), alarm("load-cell", shelved=True)]
+            await b.until(client, f"{path}.Active", lambda found: found.Value.Value is True)
+            assert await b.value(client, f"{path}.Text") == "span 1 has 3 N"
+            assert await b.value(client, f"{path}.Since") == "2023-11-14T22:13:20Z"
+            assert await b.value(client, "Line.Alarms.Active") == 1  # the other is out of the way
+            assert await b.value(client, "Line.Alarms.First") == "tension-out-of-band"
+            assert await b.value(client, "Line.Alarms.load-cell.Shelved") is True
+            b.gateway.alarms = [alarm("tension-out-of-band", acknowledged_by="otto")]
+            await b.until(client, f"{path}.AcknowledgedBy", lambda found: found.Value.Value == "otto")
+            assert await b.value(client, "Line.Alarms.Unacknowledged") == 0
+            assert await b.value(client, f"{quiet}.Acknowledged") is True
+            await b.gateway_mailbox.close()
+            await b.until(client, f"{quiet}.Active", has(CODES.BadNoCommunication))
 
     run(story)
 

@@ -149,7 +149,6 @@ def test_a_wrong_name_or_password_is_refused_also_that_of_asyncuas_own_admin():
         ("admin", PASSWORD),
         ("Admin", PASSWORD),
         ("otto", ""),
-        ("", ""),
     ]
 
     async def story():

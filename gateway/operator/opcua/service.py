@@ -8,6 +8,7 @@ from pathlib import Path
 from gateway.core.decisions import ProposalList, ProposalShown
 from gateway.core.line import Line
 from gateway.operator.line_side import LineSide, NotTold
+from gateway.operator.opcua.alarm_nodes import alarms_of, live_alarm_paths, make_alarms
 from gateway.operator.opcua.events import Events
 from gateway.operator.opcua.history import History
 from gateway.operator.opcua.line_nodes import ROOT, Told, live_paths, make_line, of_proposals, of_status
@@ -45,6 +46,7 @@ class OpcUa:
         await server.init()
         self._space = Space(server, await server.register_namespace(NAMESPACE))
         await make_line(self._space, self._line)
+        await make_alarms(self._space)
         self._proposals = ProposalNodes(self._space)
         await self._proposals.make()
         await make_methods(server, self._space, self._side)
@@ -72,11 +74,11 @@ class OpcUa:
         fresh = age_s is not None and age_s <= STALE_S
         await self._tell((Told(f"{ROOT}.Connection.Fresh", fresh), Told(f"{ROOT}.Connection.Trouble", side.trouble)))
         if side.status is not None and fresh:
-            await self._tell(of_status(side.status), side.status.wall_s)
+            await self._tell((*of_status(side.status), *alarms_of(side.status)), side.status.wall_s)
             if side.proposals is not None:
                 await self._tell(of_proposals(side.proposals))
         else:
-            for path in live_paths(self._line):
+            for path in (*live_paths(self._line), *live_alarm_paths()):
                 await space.tell(path, None, None, WAITING if age_s is None else NO_COMMUNICATION)
 
     async def _show_proposals(self) -> None:

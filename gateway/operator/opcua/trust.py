@@ -20,7 +20,7 @@ CERTIFICATE, PRIVATE_KEY = "opcua-server.pem", "opcua-server.key.pem"  #: files
 TRUSTED, REJECTED = "trusted", "rejected"  #: folders
 MOST_TRUSTED, MOST_REJECTED = 500, 20  #: files
 MOST_BYTES = 8192  #: of a certificate
-KEEP_S = 1.0  #: at most one of the rejected is written in this time: they are made in no time
+KEEP_S = 1.0  #: at most one certificate is kept, and told of, in this time: they are made in no time
 LEAST_BITS, MOST_BITS = 2048, 4096  #: of its key; what the offered security policies allow
 
 
@@ -106,9 +106,19 @@ class TrustList:
             return "it is not trusted"
         now = self._now()
         if not certificate.not_valid_before_utc <= now <= certificate.not_valid_after_utc:
-            self._tell(f"the trusted certificate {_told(der, certificate)} is out of date: its client is turned away")
+            if self._may_say():  # anybody can show somebody's certificate, though only they can use it
+                self._tell(
+                    f"the trusted certificate {_told(der, certificate)} is out of date: its client stays outside"
+                )
             return "it is out of date"
         return ""
+
+    def _may_say(self) -> bool:
+        """Now and then: neither the disk nor the log is for strangers to fill."""
+        if time.monotonic() < self._next_s:
+            return False
+        self._next_s = time.monotonic() + KEEP_S
+        return True
 
     def _is_trusted(self, der: bytes) -> bool:
         """By content: a file's name proves nothing."""
@@ -117,9 +127,8 @@ class TrustList:
     def _keep(self, der: bytes, certificate: x509.Certificate) -> None:
         """Beside the newest others; told once as long as it lies there."""
         path = file_of(self._rejected, der)
-        if path.exists() or time.monotonic() < self._next_s:
+        if path.exists() or not self._may_say():
             return
-        self._next_s = time.monotonic() + KEEP_S
         self._rejected.mkdir(mode=0o700, parents=True, exist_ok=True)
         older = sorted(self._rejected.glob("*.der"), key=lambda one: one.stat().st_mtime)
         for one in older[: max(0, len(older) + 1 - MOST_REJECTED)]:
