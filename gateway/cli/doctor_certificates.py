@@ -1,13 +1,16 @@
-"""Whether the certificates of the agents' bus can be read, fit together, and are good for a while."""
+"""Whether the certificates of the agents' bus and of OPC UA can be read, fit together, and are good for a while."""
 
 import stat
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from datetime import datetime, timedelta
 from pathlib import Path
+
+from cryptography import x509
 
 from gateway.cli.certificates import NoCertificate, Pair, belongs, certificates_of, issued
 from gateway.cli.doctor_check import Check
 from gateway.core.line import Network
+from gateway.operator.opcua.trust import CERTIFICATE, PRIVATE_KEY, TRUSTED, NotUsable, certificate_of
 
 GROUP = "certificates"
 SOON = timedelta(days=30)
@@ -25,11 +28,34 @@ def certificates(network: Network | None, now: datetime) -> Iterator[Check]:
     yield _private_key(Path(network.certificate), Path(network.private_key))
 
 
-def _certificate(name: str, path: Path, now: datetime) -> Check:
+def opcua_certificates(pki: Path, now: datetime) -> Iterator[Check]:
+    """Of the operator's OPC UA server and its clients. Warnings at most: a line runs without."""
+    own = pki / CERTIFICATE
+    if not own.exists():
+        todo = "`r2rgate pki init` makes it; until then `r2rgate operator` does not start, and the rest runs"
+        yield Check(GROUP, "OPC UA server", "", "warning", f"there is no {own}", "one", todo)
+        return
+    yield _certificate("OPC UA server", own, now)
+    yield _private_key(own, pki / PRIVATE_KEY)
+    for path in sorted((pki / TRUSTED).glob("*.der")):
+        yield _certificate("OPC UA client", path, now, _of_client)
+
+
+def _of_client(content: bytes) -> list[x509.Certificate]:
+    """Raises NoCertificate."""
+    try:
+        return [certificate_of(content)]
+    except NotUsable as error:
+        raise NoCertificate(str(error)) from error
+
+
+def _certificate(
+    name: str, path: Path, now: datetime, read: Callable[[bytes], list[x509.Certificate]] = certificates_of
+) -> Check:
     """The one of a file that ends first."""
     wanted = f"good for {SOON.days} days or longer"
     try:
-        found = certificates_of(path.read_bytes())
+        found = read(path.read_bytes())
     except OSError as error:
         return Check(GROUP, name, "", "warning", f"{path} cannot be read: {error.strerror}", wanted, _MEND)
     except NoCertificate as error:
@@ -44,7 +70,9 @@ def _certificate(name: str, path: Path, now: datetime) -> Check:
     measured = f"{path} {ends}, on {until:%Y-%m-%d}"
     if until - now >= SOON:
         return Check(GROUP, name, "", "OK", measured, wanted)
-    todo = "move it and its key away and run `r2rgate pki init` again; then start the gateway again"
+    todo = "move it and its key away and run `r2rgate pki init` again; then start what uses it again"
+    if read is _of_client:
+        todo = "make its client a new one, then `r2rgate pki trust FILE`, and remove this one"
     return Check(GROUP, name, "", "warning", measured, wanted, todo)
 
 

@@ -67,16 +67,19 @@ def doctor(
 
 async def examine(line: Line, run_folder: Path, data_folder: Path, seconds: float, tell: Progress) -> list[Check]:
     """Every check but that of the file."""
-    from gateway.cli.doctor_certificates import certificates
+    from gateway.cli.doctor_certificates import certificates, opcua_certificates
     from gateway.cli.doctor_clocks import clocks
     from gateway.cli.doctor_language_model import language_model
     from gateway.cli.doctor_machine import machine
     from gateway.cli.doctor_permissions import permissions
     from gateway.cli.doctor_software import software
+    from gateway.operator.opcua.trust import pki_folder
 
     tell("software, permissions, computer, certificates, language model")
     checks = [*software(), *permissions(line, run_folder, data_folder), *machine(line, data_folder), *clocks()]
-    checks += [*certificates(line.network, datetime.now(UTC)), *await language_model(line.agents)]
+    now = datetime.now(UTC)
+    checks += [*certificates(line.network, now), *opcua_certificates(pki_folder(line, data_folder), now)]
+    checks += await language_model(line.agents)
     if living(run_folder / LOOP_SOCKET):
         why = f"the line's loop runs ({run_folder / LOOP_SOCKET})"
         checks.append(Check("real time", "lateness", "", "skipped", f"{why}: the measurement would take its processor"))

@@ -27,6 +27,7 @@ from gateway.cli import (
     line_commands,
     models_commands,
     operate_commands,
+    operator_commands,
     pki_commands,
     process_commands,
     proposal_commands,
@@ -70,6 +71,7 @@ app.command(rich_help_panel=PROCESSES)(process_commands.run)
 app.command(rich_help_panel=PROCESSES)(process_commands.loop)
 app.command(rich_help_panel=PROCESSES)(process_commands.gateway)
 app.command(rich_help_panel=PROCESSES)(agents_commands.agents)
+app.command(rich_help_panel=PROCESSES)(operator_commands.operator)
 app.command(rich_help_panel=PROCESSES)(process_commands.sim)
 app.command(rich_help_panel=PROCESSES)(demo_commands.demo)
 app.add_typer(fault_commands.app, rich_help_panel=PROCESSES)

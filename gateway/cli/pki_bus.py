@@ -37,7 +37,7 @@ def keep_bus_pki(
     wanted: list[tuple[str, Purpose, Sequence[str]]] = [(GATEWAY, "server", hosts)]
     for name in agents:
         wanted.append((name, "client", ()))
-    there = {name: _there(folder, name) for name in (AUTHORITY, *(name for name, _, _ in wanted))}
+    there = {name: pair_there(folder, name) for name in (AUTHORITY, *(name for name, _, _ in wanted))}
     if all(there.values()):
         names = ", ".join(f"{name}.pem" for name in there)
         raise PkiRefused(f"{folder} has {names} already, which were left as they are: {how_to_renew()}")
@@ -54,8 +54,7 @@ def keep_bus_pki(
     folder.mkdir(parents=True, exist_ok=True, mode=0o700)
     for one in found:
         if one.made:
-            _write(folder / f"{one.name}.key.pem", one.pair.private_key)
-            _write(folder / f"{one.name}.pem", one.pair.certificate)
+            keep_pair(folder, one.name, one.pair)
     return found
 
 
@@ -66,7 +65,13 @@ def how_to_renew() -> str:
     )
 
 
-def _there(folder: Path, name: str) -> Pair | None:
+def keep_pair(folder: Path, name: str, pair: Pair) -> None:
+    """Raises OSError, also where one of the files is there."""
+    _write(folder / f"{name}.key.pem", pair.private_key)
+    _write(folder / f"{name}.pem", pair.certificate)
+
+
+def pair_there(folder: Path, name: str) -> Pair | None:
     """None: neither file is there. Raises PkiRefused where only one is, or what is there is no pair."""
     certificate, key = folder / f"{name}.pem", folder / f"{name}.key.pem"
     found = [path for path in (certificate, key) if path.exists()]

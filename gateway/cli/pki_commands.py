@@ -13,11 +13,13 @@ from urllib.parse import urlsplit
 
 import typer
 
-from gateway.cli.process_commands import REFUSED, read_line
+from gateway.cli.process_commands import REFUSED, DataFolder, default_data_folder, read_line
+from gateway.core.line_problem import printable
 from gateway.core.line_rules_opcua import is_host
 
 if TYPE_CHECKING:
     from gateway.cli.pki_bus import Kept
+    from gateway.cli.pki_opcua import KeptOpcUa
     from gateway.core.line import Line
 
 PORT = 7447  #: where nothing else is said
@@ -29,11 +31,6 @@ app = typer.Typer(
     help="Certificates for the machines of a line: made here, signed by an authority of the line's own.",
     no_args_is_help=True,
 )
-
-
-@app.callback()
-def pki() -> None:
-    """A group, also while it has one command."""
 
 
 @app.command()
@@ -51,39 +48,92 @@ def init(
     host: Annotated[
         list[str] | None,
         typer.Option(
-            "--host", help="Name or address by which agents reach the gateway; repeatable. This machine's too."
+            "--host", help="Name or address by which this machine is reached; repeatable. Those it has itself, too."
         ),
     ] = None,
+    clients: Annotated[
+        list[str] | None,
+        typer.Option("--client", help="Name of an OPC UA client to make a certificate for, and trust; repeatable."),
+    ] = None,
+    data_dir: DataFolder = None,
 ) -> None:
-    """Certificates for the agents' bus beyond this machine: an authority, the gateway's, one for each agents' process.
+    """Certificates for the agents' bus beyond this machine, and for the OPC UA server of `r2rgate operator`.
 
-    Private files (PEM), and the table \\[network] to put into the line's file. Nothing is overwritten: what is there
-    stays, and what is missing is made, so that the same command adds an agent or renews what was moved away.
+    For the bus: an authority, the gateway's, one for each agents' process, and the table \\[network] to put into the
+    line's file. For OPC UA: the server's, and one for each client that cannot make its own. Private files (PEM).
+    Nothing is overwritten: what is there stays, and what is missing is made, so that the same command adds an agent or
+    a client, or renews what was moved away.
 
     Exit code: 0 made, 2 refused.
 
-    Example: r2rgate pki init --line line.toml --host gateway.plant.example --agents agents
+    Example: r2rgate pki init --line line.toml --host gateway.plant.example --agents agents --client panel-1
     """
     from gateway.cli.pki_bus import PkiRefused, keep_bus_pki
+    from gateway.cli.pki_opcua import keep_opcua_pki
+    from gateway.operator.opcua.trust import pki_folder
 
     line = read_line(line_file)
     folder = (out or line_file.absolute().parent / "pki").absolute()
     names = agents or (line.network.names if line.network is not None else [AGENTS])
     own = list(host or [])
-    _check(names, own)
+    of_opcua = pki_folder(line, data_dir or default_data_folder(line)).absolute()
+    _check(names, clients or (), own)
     hosts = list(dict.fromkeys([*own, *_listened_on(line), *_this_machine()]))
+    now = datetime.now(UTC)
+    opcua: list[KeptOpcUa] = []
     try:
-        kept = keep_bus_pki(folder, f"{line.site}/{line.line}", hosts, names, datetime.now(UTC))
+        opcua = keep_opcua_pki(of_opcua, line.site, line.line, hosts, clients or (), now)
+        kept = keep_bus_pki(folder, f"{line.site}/{line.line}", hosts, names, now)
     except PkiRefused as refused:
-        _refuse(str(refused))
+        if not any(one.made for one in opcua):
+            _refuse(str(refused))
+        typer.echo("\n".join([*_told_opcua(of_opcua, opcua), "", str(refused)]))
+        return
     except OSError as error:
-        _refuse(f"{error.filename or folder}: {error.strerror}; name a folder that you may write with --out")
-    typer.echo("\n".join(_told(line, folder, kept, hosts, names)))
+        _refuse(
+            f"{error.filename or folder}: {error.strerror}; name folders that you may write with --out and --data-dir"
+        )
+    typer.echo("\n".join([*_told(line, folder, kept, hosts, names), "", *_told_opcua(of_opcua, opcua)]))
 
 
-def _check(names: Sequence[str], hosts: Sequence[str]) -> None:
+@app.command()
+def trust(
+    file: Annotated[Path, typer.Argument(help="A client's certificate: DER or PEM.")],
+    line_file: Annotated[Path, typer.Option("--line", help="The line's file.")],
+    data_dir: DataFolder = None,
+) -> None:
+    """Let an OPC UA client in. Compare the fingerprint with the one that the client itself shows.
+
+    An unknown client's certificate lies in pki/rejected of the line's data folder once it has tried. To let one out
+    again, remove its file from pki/trusted. Both count from the next connection on.
+
+    Exit code: 0 trusted, 2 refused.
+
+    Example: r2rgate pki trust panel.der --line line.toml
+    """
+    from cryptography import x509
+
+    from gateway.cli.pki_opcua import trust as trusted
+    from gateway.operator.opcua.trust import NotUsable, application_uri, fingerprint, pki_folder
+
+    line = read_line(line_file)
+    try:
+        path = trusted(pki_folder(line, data_dir or default_data_folder(line)), file.read_bytes())
+    except NotUsable as error:
+        _refuse(f"{file} is not trusted: {error}")
+    except OSError as error:
+        _refuse(f"{error.filename}: {error.strerror}")
+    found = x509.load_der_x509_certificate(path.read_bytes())
+    typer.echo(f"trusted: {printable(application_uri(found))}, good until {found.not_valid_after_utc:%Y-%m-%d}")
+    typer.echo(f"SHA-256 {fingerprint(path.read_bytes())}\n{path}")
+
+
+def _check(names: Sequence[str], clients: Sequence[str], hosts: Sequence[str]) -> None:
     from gateway.cli.pki_bus import AUTHORITY, GATEWAY
 
+    for name in clients:
+        if not _NAME.fullmatch(name):
+            _refuse(f"--client is {name}; allowed: small letters, digits and dashes, at most 32")
     for name in names:
         if not _NAME.fullmatch(name) or name in (AUTHORITY, GATEWAY) or names.count(name) > 1:
             _refuse(
@@ -148,6 +198,15 @@ def _told(line: "Line", folder: Path, kept: "Sequence[Kept]", hosts: Sequence[st
         "On the agents' machine: r2rgate agents LINE.toml --gateway HOST:PORT --certificate FOLDER/NAME.pem",
         f"`r2rgate doctor` tells when one is about to end; {how_to_renew()}.",
     ]  # fmt: skip
+
+
+def _told_opcua(folder: Path, kept: "Sequence[KeptOpcUa]") -> list[str]:
+    rows = [f"{folder}, for OPC UA:"]
+    for one in kept:
+        how = f"{'made' if one.made else 'was there'}, good until {one.pair.until:%Y-%m-%d}"
+        rows.append(f"  {one.name}.pem, {one.name}.key.pem ({how}): {one.uri}")
+    rows.append("Clients need the server's certificate, and are let in one by one: `r2rgate pki trust FILE`.")
+    return rows
 
 
 def _outside(hosts: Sequence[str]) -> str:

@@ -33,18 +33,27 @@ NOW = datetime.now(UTC)
 STATUS = ASK_STATUS.of("sysid")
 
 
+def invoke(folder: Path, *words: str):
+    where = ["--line", str(folder / "line.toml"), "--data-dir", str(folder / "data")]
+    return CliRunner().invoke(app, ["pki", "init", *where, *words])
+
+
 def init(folder: Path, *words: str) -> str:
     """What the command says; it must succeed."""
     if not (folder / "line.toml").exists():
         (folder / "line.toml").write_text(line_template(1), encoding="utf-8")
-    done = CliRunner().invoke(app, ["pki", "init", "--line", str(folder / "line.toml"), *words])
+    done = CliRunner().invoke(
+        app, ["pki", "init", "--line", str(folder / "line.toml"), "--data-dir", str(folder / "data"), *words]
+    )
     assert done.exit_code == 0, done.output
     return done.stdout
 
 
 def refusal(folder: Path, *words: str) -> str:
     (folder / "line.toml").write_text(line_template(1), encoding="utf-8")
-    done = CliRunner().invoke(app, ["pki", "init", "--line", str(folder / "line.toml"), *words])
+    done = CliRunner().invoke(
+        app, ["pki", "init", "--line", str(folder / "line.toml"), "--data-dir", str(folder / "data"), *words]
+    )
     assert done.exit_code == 2 and not done.stdout
     return done.stderr
 

@@ -1,0 +1,87 @@
+"""Who a client's user is: by name and password, or nobody in particular where the line's file lets such look."""
+
+import asyncio
+from collections import OrderedDict
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+from asyncua import ua as asyncua_ua
+from asyncua.common.utils import ServiceError
+from asyncua.server.internal_server import InternalServer
+from pydantic import ValidationError
+
+from gateway.core.people import Person, Role
+
+Check = Callable[[str, str], Awaitable[Role | None]]
+
+ANONYMOUS = "anonymous"  #: as the audit names whoever has no name
+FIRST_DELAY_S, LAST_DELAY_S = 0.25, 3.0  #: after the first wrong password of a client, and after many
+MOST_CLIENTS = 500  #: whose wrong passwords are counted
+LONGEST = 1024  #: bytes of a password as it comes
+#: How a password may be encrypted inside the channel, which is encrypted. Not with RSA 1.5, which can be made to tell.
+ENCRYPTIONS = (
+    None, "", "http://www.w3.org/2001/04/xmlenc#rsa-oaep", "http://opcfoundation.org/UA/security/rsa-oaep-sha2-256",
+)  # fmt: skip
+
+ua: Any = asyncua_ua  #: what it declares of its values and what they are differ
+
+
+class Logins:
+    """Each client, known by its certificate, guesses one password after the other, and ever more slowly."""
+
+    def __init__(self, check: Check, anonymous_may_read: bool) -> None:
+        self._check = check
+        self._anonymous_may_read = anonymous_may_read
+        self._wrong: OrderedDict[str, int] = OrderedDict()  #: passwords in a row, by certificate
+        self._guessing: dict[str, asyncio.Lock] = {}
+
+    async def person(self, server: InternalServer, session: Any, token: Any, certificate: str) -> Person:
+        """Raises ServiceError."""
+        if isinstance(token, ua.UserNameIdentityToken):
+            return await self.by_password(*_plain(server, session, token), certificate)
+        if _is_nobody(token) and self._anonymous_may_read:
+            return Person(name=ANONYMOUS, role="viewer", through="opc-ua", certificate=certificate)
+        raise ServiceError(ua.StatusCodes.BadIdentityTokenRejected)
+
+    async def by_password(self, name: str, password: str, certificate: str) -> Person:
+        """Raises ServiceError, after a while. A client's guesses wait for each other."""
+        guessing = self._guessing.setdefault(certificate, asyncio.Lock())
+        try:
+            async with guessing:
+                role = await self._check(name, password)
+                if role is not None:
+                    self._wrong.pop(certificate, None)
+                    return Person(name=name, role=role, through="opc-ua", certificate=certificate)
+                await asyncio.sleep(self._delay_s(certificate))
+        except ValidationError:  # a name that no user can have
+            pass
+        finally:
+            if not guessing.locked():
+                self._guessing.pop(certificate, None)
+        raise ServiceError(ua.StatusCodes.BadUserAccessDenied)
+
+    def _delay_s(self, certificate: str) -> float:
+        """After one more wrong password."""
+        wrong = self._wrong[certificate] = self._wrong.pop(certificate, 0) + 1
+        while len(self._wrong) > MOST_CLIENTS:
+            self._wrong.popitem(last=False)
+        return min(FIRST_DELAY_S * 2.0 ** min(wrong - 1, 16), LAST_DELAY_S)
+
+
+def _plain(server: InternalServer, session: Any, token: Any) -> tuple[str, str]:
+    """Name and password of a token. Raises ServiceError."""
+    password = token.Password or b""
+    if token.EncryptionAlgorithm not in ENCRYPTIONS or len(password) > LONGEST or len(token.UserName or "") > LONGEST:
+        raise ServiceError(ua.StatusCodes.BadIdentityTokenInvalid)
+    token.Password = password
+    try:
+        name, plain = server.decrypt_user_token(session, token)
+    except Exception as error:  # whatever asyncua and its cryptography make of bytes that are no password
+        raise ServiceError(ua.StatusCodes.BadIdentityTokenInvalid) from error
+    return name or "", plain
+
+
+def _is_nobody(token: Any) -> bool:
+    """A token that is left out stands for no name, too (OPC 10000-4, 5.7.3)."""
+    left_out = isinstance(token, ua.ExtensionObject) and token.TypeId == ua.NodeId(ua.ObjectIds.Null)
+    return token is None or left_out or isinstance(token, ua.AnonymousIdentityToken)

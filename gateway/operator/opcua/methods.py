@@ -1,0 +1,168 @@
+"""What people may have done: methods of the line. Each asks who calls, and says it to the gateway in their name.
+
+The gateway holds it against the same table of roles again. What is refused for what it says is an answer (`ok` is
+false, and a sentence); who may not call at all gets BadUserAccessDenied.
+"""
+
+from collections.abc import Awaitable, Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from asyncua import ua as asyncua_ua
+from asyncua.server.server import Server
+from pydantic import ValidationError
+
+from gateway.core.alarms import AcknowledgeAlarm
+from gateway.core.decisions import Decide, RollBackNow
+from gateway.core.messages import Arm, Hold, Reply, SelectRecipe, SetSpeed, SetTension, Start, Stop
+from gateway.core.people import Person, Said, why_may_not
+from gateway.operator.line_side import LineSide, NotTold
+from gateway.operator.opcua.line_nodes import ROOT
+from gateway.operator.opcua.session import CALLER
+from gateway.operator.opcua.space import BOOLEAN, DOUBLE, STRING, UINT32, Space
+
+ua: Any = asyncua_ua  #: what it declares of its values and what they are differ
+
+
+class NotSent(Exception):
+    """Refused here, before anything is sent; the text is for the caller."""
+
+
+@dataclass(frozen=True)
+class Input:
+    name: str
+    kind: Any  #: of the variant
+    tells: str
+
+
+@dataclass(frozen=True)
+class Method:
+    name: str
+    command: str  #: by which the table of roles knows it
+    tells: str
+    inputs: tuple[Input, ...]
+    make: Callable[..., Awaitable[Said]]  #: of the line's side, then of the arguments. Raises NotSent.
+
+
+async def _decide(line: LineSide, id: str, hash: str, base_revision: int, approve: bool, comment: str) -> Said:
+    try:
+        shown = await line.shown(id)
+    except (NotTold, ValidationError) as error:
+        raise NotSent(f"the proposal cannot be looked up: {_first(error)}") from error
+    if shown.epoch != base_revision:
+        raise NotSent(
+            f"what was shown was of revision {base_revision}, in service is revision {shown.epoch}: look at it again"
+        )
+    return Decide(proposal=shown.proposal_hash, shown=hash, approve=approve, comment=comment)
+
+
+def _plain(make: Callable[..., Said]) -> Callable[..., Awaitable[Said]]:
+    async def made(_line: LineSide, *arguments: Any) -> Said:
+        return make(*arguments)
+
+    return made
+
+
+_COMMENT = Input("comment", STRING, "For the audit; may be empty")
+METHODS = (
+    Method("Decide", "decide", "Approve or reject a proposal, as it was shown", (
+        Input("id", STRING, "Of the proposal"), Input("hash", STRING, "ShownHash of what was looked at"),
+        Input("base_revision", UINT32, "BaseRevision of what was looked at"),
+        Input("approve", BOOLEAN, "False: reject"), _COMMENT), _decide),
+    Method("Rollback", "roll-back", "Back to the last known good configuration, at once", (_COMMENT,),
+           _plain(lambda comment: RollBackNow(comment=comment))),
+    Method("Arm", "arm", "Prove limits, PLC and watchdogs; zero torque", (), _plain(Arm)),
+    Method("Start", "start", "Tension the web and run; from HOLD: go on", (), _plain(Start)),
+    Method("Hold", "hold", "Speed to standstill, tension stays on", (), _plain(Hold)),
+    Method("Stop", "stop", "Controlled stop, then torque off", (), _plain(Stop)),
+    Method("SetTension", "set", "A tension set-point, ramped", (
+        Input("span", UINT32, "Number"), Input("newton", DOUBLE, "N")),
+           _plain(lambda span, newton: SetTension(span=span, tension_n=newton))),
+    Method("SetSpeed", "speed", "The line's speed set-point, ramped", (Input("speed", DOUBLE, "m/s"),),
+           _plain(lambda speed: SetSpeed(speed_m_per_s=speed))),
+    Method("SelectRecipe", "recipe", "All set-points of a recipe, ramped", (Input("name", STRING, "As in Recipes"),),
+           _plain(lambda name: SelectRecipe(name=name))),
+    Method("AcknowledgeAlarm", "acknowledge", "A person has seen it", (Input("name", STRING, "Of the alarm"), _COMMENT),
+           _plain(lambda name, comment: AcknowledgeAlarm(alarm=name, comment=comment))),
+)  # fmt: skip
+
+
+async def make_methods(server: Server, space: Space, line: LineSide) -> None:
+    root = server.get_node(space.id(ROOT))
+    answers = [_argument("ok", BOOLEAN, "It was done"), _argument("sentence", STRING, "What was done, or why not")]
+    for method in METHODS:
+        inputs = [_argument(one.name, one.kind, one.tells) for one in method.inputs]
+        name = ua.QualifiedName(method.name, space.namespace)
+        node_id = space.id(f"{ROOT}.{method.name}")
+        node = await root.add_method(node_id, name, _callback(method, line), inputs, answers)
+        described = ua.DataValue(ua.Variant(ua.LocalizedText(method.tells), ua.VariantType.LocalizedText))
+        await server.write_attribute_value(node.nodeid, described, ua.AttributeIds.Description)
+
+
+def _callback(method: Method, line: LineSide) -> Callable[..., Awaitable[Any]]:
+    async def called(parent: Any, *arguments: Any) -> Any:
+        person = CALLER.get()
+        if person is None or why_may_not(person, method.command):
+            return _result(ua.StatusCodes.BadUserAccessDenied)
+        if wrong := _wrong(method.inputs, arguments):
+            return wrong
+        reply = await _said(method, line, person, [_value(one) for one in arguments])
+        return [ua.Variant(reply.ok, BOOLEAN), ua.Variant(_sentence(reply), STRING)]
+
+    return called
+
+
+async def _said(method: Method, line: LineSide, person: Person, values: Sequence[Any]) -> Reply:
+    try:
+        said = await method.make(line, *values)
+    except (NotSent, ValidationError) as error:
+        return Reply(ok=False, state="", text=_first(error))
+    return await line.say(person, said)
+
+
+def _first(error: Exception) -> str:
+    """In a sentence."""
+    if not isinstance(error, ValidationError):
+        return str(error)
+    reasons = (f"{'.'.join(map(str, one['loc']))}: {one['msg']}" for one in error.errors()[:3])
+    return f"nothing was sent: {'; '.join(reasons)}"
+
+
+def _sentence(reply: Reply) -> str:
+    return "; ".join([reply.text, *(reason for reason in reply.reasons if reason not in reply.text)])
+
+
+def _wrong(inputs: Sequence[Input], arguments: Sequence[Any]) -> Any:
+    """The result of a call that cannot be one; None: it can."""
+    if len(arguments) < len(inputs):
+        return _result(ua.StatusCodes.BadArgumentsMissing)
+    if len(arguments) > len(inputs):
+        return _result(ua.StatusCodes.BadTooManyArguments)
+    codes = [_code(one, argument) for one, argument in zip(inputs, arguments, strict=True)]
+    if all(code == ua.StatusCodes.Good for code in codes):
+        return None
+    result = _result(ua.StatusCodes.BadInvalidArgument)
+    result.InputArgumentResults = [ua.StatusCode(code) for code in codes]
+    return result
+
+
+def _code(wanted: Input, argument: Any) -> int:
+    no_text = wanted.kind is STRING and argument.Value is None  #: which stands for an empty one
+    if argument.VariantType is not wanted.kind or argument.is_array or (argument.Value is None and not no_text):
+        return ua.StatusCodes.BadTypeMismatch
+    return ua.StatusCodes.Good
+
+
+def _value(argument: Any) -> Any:
+    return "" if argument.Value is None else argument.Value
+
+
+def _result(code: int) -> Any:
+    return ua.CallMethodResult(StatusCode=ua.StatusCode(code))
+
+
+def _argument(name: str, kind: Any, tells: str) -> Any:
+    return ua.Argument(
+        Name=name, DataType=ua.NodeId(kind.value), ValueRank=-1, ArrayDimensions=[],
+        Description=ua.LocalizedText(tells),
+    )  # fmt: skip

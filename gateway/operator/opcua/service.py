@@ -1,0 +1,120 @@
+"""The OPC UA server of a line: the nodes, and the tasks that keep them true."""
+
+import asyncio
+from collections.abc import Awaitable, Callable, Iterable
+from datetime import UTC, datetime
+from pathlib import Path
+
+from gateway.core.decisions import ProposalList, ProposalShown
+from gateway.core.line import Line
+from gateway.operator.line_side import LineSide, NotTold
+from gateway.operator.opcua.alarm_nodes import alarms_of, live_alarm_paths, make_alarms
+from gateway.operator.opcua.events import Events
+from gateway.operator.opcua.history import History
+from gateway.operator.opcua.line_nodes import ROOT, Told, live_paths, make_line, of_proposals, of_status
+from gateway.operator.opcua.login import Check, Logins
+from gateway.operator.opcua.methods import make_methods
+from gateway.operator.opcua.proposal_nodes import MOST_WAITING, ProposalNodes
+from gateway.operator.opcua.server import OperatorServer, make_server
+from gateway.operator.opcua.space import NAMESPACE, NO_COMMUNICATION, WAITING, Space
+from gateway.operator.opcua.trust import TrustList
+
+STALE_S = 2.0  #: older than this nothing counts as known
+LOOK_S = 0.5  #: between two looks at the audit and at the age of what is known
+WAITS = "waiting"  #: the stage of a proposal that waits for a person
+
+
+class OpcUa:
+    """`start`, then `run` as a task, then `stop`."""
+
+    def __init__(self, line: Line, side: LineSide, pki: Path, check: Check, tell: Callable[[str], None]) -> None:
+        """Raises CannotServe."""
+        anonymous = line.operator.anonymous == "read"
+        trust = TrustList(pki, tell, lambda: datetime.now(UTC))
+        self.server: OperatorServer = make_server(
+            line.operator.opc_ua, line.operator.sessions_max, Logins(check, anonymous), anonymous, trust, pki
+        )
+        self._line = line
+        self._side = side
+        self._new_status, self._new_proposals = asyncio.Event(), asyncio.Event()
+        self._shown: list[ProposalShown] = []  #: those that wait
+        self._shown_of: ProposalList | None = None  #: of which list
+
+    async def start(self) -> None:
+        """Raises CannotServe; `stop` is needed all the same."""
+        server = self.server
+        await server.init()
+        self._space = Space(server, await server.register_namespace(NAMESPACE))
+        await make_line(self._space, self._line)
+        await make_alarms(self._space)
+        self._proposals = ProposalNodes(self._space)
+        await self._proposals.make()
+        await make_methods(server, self._space, self._side)
+        self._events = Events(server, self._space, self._side)
+        await self._events.make()
+        server.iserver.history_manager = History(self._space, self._line, self._side)  # type: ignore[assignment]
+        self._side.on_status.append(lambda _: self._new_status.set())
+        self._side.on_proposals.append(lambda _: self._new_proposals.set())
+        self._new_proposals.set()
+        await server.start()
+
+    async def run(self) -> None:
+        """Until it is cancelled."""
+        async with asyncio.TaskGroup() as group:
+            for show, event in ((self._show_line, self._new_status), (self._show_proposals, self._new_proposals)):
+                group.create_task(_again(show, event))
+            group.create_task(_again(lambda: self._events.look(), asyncio.Event()))
+
+    async def stop(self) -> None:
+        await self.server.stop()
+
+    async def _show_line(self) -> None:
+        side, space = self._side, self._space
+        age_s = side.age_s
+        fresh = age_s is not None and age_s <= STALE_S
+        await self._tell((Told(f"{ROOT}.Connection.Fresh", fresh), Told(f"{ROOT}.Connection.Trouble", side.trouble)))
+        if side.status is not None and fresh:
+            await self._tell((*of_status(side.status), *alarms_of(side.status)), side.status.wall_s)
+            if side.proposals is not None:
+                await self._tell(of_proposals(side.proposals))
+        else:
+            for path in (*live_paths(self._line), *live_alarm_paths()):
+                await space.tell(path, None, None, WAITING if age_s is None else NO_COMMUNICATION)
+
+    async def _show_proposals(self) -> None:
+        """What is shown must be of the moment: where the gateway does not tell, nothing is."""
+        found = self._side.proposals
+        age_s = self._side.age_s
+        if found is None or age_s is None or age_s > STALE_S:
+            await self._proposals.unsure(WAITING if found is None else NO_COMMUNICATION)
+            return
+        if found is not self._shown_of:
+            try:
+                self._shown, self._shown_of = await self._waiting(found), found
+            except NotTold:
+                await self._proposals.unsure(NO_COMMUNICATION)
+                return
+        await self._proposals.show(self._shown)
+        await self._events.waiting(self._shown)
+
+    async def _waiting(self, found: ProposalList) -> list[ProposalShown]:
+        """Raises NotTold. One that is decided in between is left out."""
+        waiting = [one.proposal for one in found.proposals if one.stage == WAITS][:MOST_WAITING]
+        shown = [await self._side.shown(one) for one in waiting]
+        return [one for one in shown if one.stage == WAITS and one.shown is not None]
+
+    async def _tell(self, values: Iterable[Told], wall_s: float | None = None) -> None:
+        for one in values:
+            await self._space.tell(one.path, one.value, wall_s, one.code)
+
+
+async def _again(do: Callable[[], Awaitable[None]], event: asyncio.Event) -> None:
+    """Whenever the event comes, and without it every `LOOK_S`."""
+    while True:
+        event.clear()
+        await do()
+        try:
+            async with asyncio.timeout(LOOK_S):
+                await event.wait()
+        except TimeoutError:
+            pass

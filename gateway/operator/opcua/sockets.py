@@ -1,0 +1,89 @@
+"""The sockets of asyncua's server, bounded. Bytes that cannot be OPC UA close the connection they came on, and no
+other.
+"""
+
+import asyncio
+from collections.abc import Callable
+from typing import Any, cast
+
+from asyncua import ua as asyncua_ua
+from asyncua.common.connection import TransportLimits
+from asyncua.common.utils import Buffer, ServiceError
+from asyncua.server.binary_server_asyncio import BinaryServer, OPCUAProtocol
+from asyncua.server.internal_server import InternalServer
+from asyncua.ua.ua_binary import uatcp_to_binary
+from asyncua.ua.uaerrors import UaStatusCodeError
+
+from gateway.operator.opcua.limits import MAX_CHUNK, MAX_CHUNKS, MAX_MESSAGE
+from gateway.operator.opcua.processor import Processor
+
+ua: Any = asyncua_ua  #: what it declares of its values and what they are differ
+
+MakeProcessor = Callable[[asyncio.Transport, TransportLimits], Processor]
+
+
+class Sockets(BinaryServer):
+    """The listening socket and its connections."""
+
+    def __init__(self, server: InternalServer, make: MakeProcessor, host: str, port: int) -> None:
+        super().__init__(server, host, port, TransportLimits(MAX_CHUNK, MAX_CHUNK, MAX_CHUNKS, MAX_MESSAGE))
+        self._make = make
+
+    async def stop(self) -> None:
+        if self._server is None:
+            return
+        cast(asyncio.Server, self._server).close()
+        for client in self.clients:
+            cast(asyncio.Transport, client.transport).abort()
+        while self.clients:  # noqa: ASYNC110 (asyncua has no event for it)
+            await asyncio.sleep(0)  # they are told of their end in the next turn of the loop
+        await super().stop()
+
+    def _make_protocol(self) -> OPCUAProtocol:
+        connection = _Connection(self.iserver, self._policies, self.clients, self.closing_tasks, self.limits)
+        connection.make = self._make
+        return connection
+
+
+class _Connection(OPCUAProtocol):
+    """One client. Refuses a message that says it is too large before it has come."""
+
+    make: MakeProcessor
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        super().connection_made(transport)
+        if self.transport is not None:  # otherwise there are too many already
+            self.processor = self.make(self.transport, self.limits)
+            self.processor.set_policies(self.policies)
+
+    def data_received(self, data: bytes) -> None:
+        transport = self.transport
+        if transport is None or transport.is_closing():
+            return
+        super().data_received(data)
+        if len(self._buffer) >= 8 and int.from_bytes(self._buffer[4:8], "little") > MAX_CHUNK:
+            self._refuse(ua.StatusCodes.BadTcpMessageTooLarge)  # announced; its end has not come yet
+
+    def pause_writing(self) -> None:
+        # A client that asks without reading its answers is not heard until it has read them.
+        if self.transport is not None:
+            self.transport.pause_reading()
+
+    def resume_writing(self) -> None:
+        if self.transport is not None:
+            self.transport.resume_reading()
+
+    async def _process_one_msg(self, header: Any, buf: Buffer) -> bool:
+        try:
+            return await super()._process_one_msg(header, buf)
+        except (ServiceError, UaStatusCodeError) as error:
+            self._refuse(error.code)
+        except Exception:  # a broken chunk or header: nothing that follows can be understood
+            self._refuse(ua.StatusCodes.BadSecurityChecksFailed)
+        return False
+
+    def _refuse(self, code: int) -> None:
+        """Say why, and end it."""
+        if self.transport is not None and not self.transport.is_closing():
+            self.transport.write(uatcp_to_binary(ua.MessageType.Error, ua.ErrorMessage(ua.StatusCode(code))))
+            self.transport.close()

@@ -1,0 +1,185 @@
+"""What people have done through OPC UA: by role, in their name, bound to what they were shown; and wrong calls."""
+
+import asyncio
+
+import pytest
+from asyncua import ua
+
+from gateway.core.messages import Reply
+from gateway.operator.opcua.methods import METHODS
+from gateway.operator.opcua.trust import fingerprint
+from tests.protocol.operator_support import SHOWN, bench, der, pair, shown
+
+CODES = ua.StatusCodes
+TEXT, NUMBER, REAL, YES = ua.VariantType.String, ua.VariantType.UInt32, ua.VariantType.Double, ua.VariantType.Boolean
+
+
+def run(story):
+    asyncio.run(asyncio.wait_for(story(), 60.0))
+
+
+def text(value):
+    return ua.Variant(value, TEXT)
+
+
+def number(value):
+    return ua.Variant(value, NUMBER)
+
+
+def real(value):
+    return ua.Variant(value, REAL)
+
+
+def decide(one, shown_hash=SHOWN, revision=3, approve=True):
+    return [text(one.proposal_hash), text(shown_hash), number(revision), ua.Variant(approve, YES), text("looks right")]
+
+
+ARGUMENTS = {
+    "SetTension": lambda _: [number(1), real(22.0)], "SetSpeed": lambda _: [real(0.05)],
+    "SelectRecipe": lambda _: [text("web-a")], "Rollback": lambda _: [text("it squeals")],
+    "AcknowledgeAlarm": lambda _: [text("tension-low"), text(None)], "Decide": decide,
+}  # fmt: skip
+
+
+def test_every_method_is_said_in_the_name_of_who_calls_and_refused_to_viewers():
+    async def story():
+        async with bench(spans=1) as b, b.connected("otto") as otto, b.connected("vera") as vera:
+            one = shown()
+            b.gateway.waiting = [one]
+            for method in METHODS:
+                arguments = ARGUMENTS.get(method.name, lambda _: [])(one)
+                assert await b.call(vera, method.name, *arguments) == (CODES.BadUserAccessDenied, [])
+                assert await b.call(otto, method.name, *arguments) == (CODES.Good, [True, "done"]), method.name
+            assert [one.said.command for one in b.gateway.heard] == [method.command for method in METHODS]
+            for heard in b.gateway.heard:
+                assert (heard.person.name, heard.person.role, heard.person.through) == ("otto", "operator", "opc-ua")
+                assert heard.person.certificate == fingerprint(der(pair("client")))
+            tension = next(one.said for one in b.gateway.heard if one.said.command == "set")
+            assert (tension.span, tension.tension_n, tension.step) == (1, 22.0, False)
+            decided = b.gateway.heard[0].said
+            assert (decided.proposal, decided.shown, decided.approve, decided.script) == (
+                one.proposal_hash, SHOWN, True, "",
+            )  # fmt: skip
+
+    run(story)
+
+
+def test_two_people_who_call_at_the_same_time_are_not_taken_for_each_other():
+    async def story():
+        async with bench(spans=1) as b, b.connected("otto") as otto, b.connected("emma") as emma:
+            b.gateway.hold = asyncio.Event()
+            calls = [asyncio.create_task(b.call(client, "SelectRecipe", text(name)))
+                     for client, name in ((otto, "of-otto"), (emma, "of-emma"), (otto, "of-otto"))]  # fmt: skip
+            await asyncio.sleep(0)
+            b.gateway.hold.set()
+            await asyncio.gather(*calls)
+            assert sorted((one.person.name, one.said.name) for one in b.gateway.heard) == [
+                ("emma", "of-emma"), ("otto", "of-otto"), ("otto", "of-otto"),
+            ]  # fmt: skip
+
+    run(story)
+
+
+def test_what_was_shown_of_another_revision_is_refused_before_anything_is_sent():
+    async def story():
+        async with bench(spans=1) as b, b.connected("otto") as client:
+            one = shown(epoch=4)
+            b.gateway.waiting = [one]
+            code, (ok, sentence) = await b.call(client, "Decide", *decide(one, revision=3))
+            assert (code, ok) == (CODES.Good, False)
+            assert "revision 3" in sentence and "revision 4" in sentence
+            code, (ok, sentence) = await b.call(client, "Decide", text("f" * 64), *decide(one)[1:])
+            assert not ok and "there is no such proposal" in sentence
+            code, (ok, sentence) = await b.call(client, "Decide", *decide(one, shown_hash="5", revision=4))
+            assert not ok and "shown" in sentence
+            code, (ok, sentence) = await b.call(client, "Decide", text("no hash"), *decide(one)[1:])
+            assert not ok
+            assert b.gateway.heard == []
+
+    run(story)
+
+
+def test_what_the_gateway_refuses_is_told_with_every_reason():
+    async def story():
+        async with bench(spans=1) as b, b.connected("otto") as client:
+            one = shown()
+            b.gateway.waiting = [one]
+            b.gateway.reply = Reply(ok=False, state="", text="not decided", reasons=["it was decided already"])
+            told = await b.call(client, "Decide", *decide(one))
+            assert told == (CODES.Good, [False, "not decided; it was decided already"])
+            await b.gateway_mailbox.close()
+            code, (ok, sentence) = await b.call(client, "Stop")
+            assert (code, ok) == (CODES.Good, False) and "gateway not running" in sentence
+
+    run(story)
+
+
+WRONG = [
+    ("SetTension", [number(1)], CODES.BadArgumentsMissing, []),
+    ("SetTension", [], CODES.BadArgumentsMissing, []),
+    ("SetTension", [number(1), real(1.0), real(1.0)], CODES.BadTooManyArguments, []),
+    ("Arm", [number(1)], CODES.BadTooManyArguments, []),
+    ("SetTension", [real(1.0), real(1.0)], CODES.BadInvalidArgument, [CODES.BadTypeMismatch, CODES.Good]),
+    ("SetTension", [number(1), text("22")], CODES.BadInvalidArgument, [CODES.Good, CODES.BadTypeMismatch]),
+    ("SetSpeed", [ua.Variant([0.1], REAL)], CODES.BadInvalidArgument, [CODES.BadTypeMismatch]),
+    ("SetSpeed", [ua.Variant(None)], CODES.BadInvalidArgument, [CODES.BadTypeMismatch]),
+]
+
+
+def test_a_call_that_cannot_be_one_gets_its_code_and_the_session_lives():
+    async def story():
+        async with bench(spans=1) as b, b.connected("otto") as client:
+            for method, arguments, code, each in WRONG:
+                request = ua.CallMethodRequest(b.id("Line"), b.id(f"Line.{method}"), arguments)
+                (result,) = await client.uaclient.call([request])
+                assert result.StatusCode.value == code, (method, arguments)
+                assert [one.value for one in result.InputArgumentResults or ()][: len(each)] == each
+            assert await b.call(client, "Hold") == (CODES.Good, [True, "done"])
+            assert [one.said.command for one in b.gateway.heard] == ["hold"]
+
+    run(story)
+
+
+def test_numbers_that_are_none_are_refused_in_words():
+    async def story():
+        async with bench(spans=1) as b, b.connected("otto") as client:
+            for method, arguments in (
+                ("SetTension", [number(1), real(float("nan"))]), ("SetSpeed", [real(float("inf"))]),
+                ("SetTension", [number(0), real(20.0)]), ("Rollback", [text("x" * 1001)]),
+                ("AcknowledgeAlarm", [text("No Such"), text("")]),
+            ):  # fmt: skip
+                code, (ok, sentence) = await b.call(client, method, *arguments)
+                assert (code, ok) == (CODES.Good, False) and sentence.startswith("nothing was sent: "), method
+            assert b.gateway.heard == []
+
+    run(story)
+
+
+def test_a_method_that_takes_its_time_keeps_nothing_else_of_its_client_waiting():
+    async def story():
+        async with bench(spans=1) as b, b.connected("otto") as client:
+            b.gateway.hold = asyncio.Event()
+            calling = asyncio.create_task(b.call(client, "Arm"))
+            await asyncio.sleep(0)
+            await b.until(client, "Line.Operation.State", lambda found: found.Value.Value == "RUN")
+            assert not calling.done()
+            others = [asyncio.create_task(b.call(client, "Stop")) for _ in range(5)]  # more than may be at once
+            refused, _ = await asyncio.wait(others, return_when=asyncio.FIRST_COMPLETED)
+            with pytest.raises(ua.uaerrors.BadTooManyOperations):
+                await refused.pop()
+            b.gateway.hold.set()
+            assert await calling == (CODES.Good, [True, "done"])
+            await asyncio.gather(*others, return_exceptions=True)
+
+    run(story)
+
+
+def test_methods_say_what_they_take_and_return():
+    async def story():
+        async with bench(spans=1) as b, b.connected("vera") as client:
+            inputs = await (await client.get_node(b.id("Line.Decide")).get_child("0:InputArguments")).read_value()
+            assert [one.Name for one in inputs] == ["id", "hash", "base_revision", "approve", "comment"]
+            outputs = await (await client.get_node(b.id("Line.Decide")).get_child("0:OutputArguments")).read_value()
+            assert [one.Name for one in outputs] == ["ok", "sentence"]
+
+    run(story)
