@@ -1,0 +1,103 @@
+"""What the page shows ten times a second, made once for all who look: the status, compact, and what is abnormal in it.
+
+What counts as abnormal is said here, in one place; the page only paints it.
+"""
+
+from typing import Any
+
+from gateway.core.decisions import ProposalList
+from gateway.core.line import Line
+from gateway.core.status import GatewayStatus, LimitsStatus, SpanStatus
+
+DRIVES_THAT_FAIL = frozenset({"ABSENT", "STOPPING", "FAULT", "STO"})
+IN_MOTION = frozenset({"RUN", "HOLD"})  #: states in which tensions are controlled
+ENDED = frozenset(
+    {"refused", "rejected", "expired", "superseded", "not-deployed", "kept", "rolled-back", "done"}
+)  #: stages after which nothing comes
+
+
+def line_told(line: Line) -> dict[str, Any]:
+    """What never changes while the process runs."""
+    return {
+        "site": line.site,
+        "line": line.line,
+        "description": line.description,
+        "n": line.n,
+        "period_s": line.control.period_s,
+        "tension_n": [line.limits.tension_min_n, line.limits.tension_max_n],
+        "setpoint_n": [
+            line.limits.tension_min_n + line.limits.tension_margin_n,
+            line.limits.tension_max_n - line.limits.tension_margin_n,
+        ],
+        "torque_nm": line.limits.torque_nm,
+        "speed_max_m_per_s": line.limits.speed_max_m_per_s,
+        "spans": [{"name": span.name, "control": span.control} for span in line.spans],
+        "rollers": [roller.name for roller in line.rollers],
+        "recipes": [recipe.model_dump() for recipe in line.recipes],
+    }
+
+
+def tick_of(status: GatewayStatus, proposals: ProposalList | None, line: Line) -> dict[str, Any]:
+    """Of a status, as a JSON object."""
+    loop, moving = status.loop, status.loop.state in IN_MOTION
+    off_n = line.gate.tail_error_max_n
+    return {
+        "wall_s": status.wall_s,
+        "loop": loop.model_dump(exclude={"next"}),
+        "speed": _short(status.unwind_speed_m_per_s),
+        "speed_setpoint": _short(status.speed_setpoint_m_per_s),
+        "stands": status.stands,
+        "change": None if status.change is None else status.change.model_dump(),
+        "spans": [
+            [
+                _short(span.tension_n, 2),
+                _short(span.setpoint_n, 2),
+                _short(span.speed_m_per_s),
+                _short(span.torque_nm, 2),
+                *abnormal(span, status.limits, off_n, moving),
+            ]
+            for span in status.spans
+        ],
+        "timing": status.timing.model_dump(),
+        "link": status.link.model_dump(),
+        "buses": [bus.model_dump() for bus in status.buses],
+        "agents": status.agents_bus.model_dump(),
+        "historian": status.historian.model_dump(include={"storing", "text", "frames_lost", "events_lost"}),
+        "events": [event.model_dump() for event in status.events[-20:]],
+        "alarms": [alarm.model_dump() for alarm in status.alarms],
+        "proposals": None if proposals is None else _proposals(proposals),
+    }
+
+
+def abnormal(span: SpanStatus, limits: LimitsStatus, off_n: float, moving: bool) -> tuple[str, str]:
+    """(how bad: "", "attention" or "alarm"; which: a word of the catalogue). The worst comes first.
+
+    `off_n`: how far a tension may be from its set-point. Where the line does not move, tensions may be anything.
+    """
+    if span.drive in DRIVES_THAT_FAIL:
+        return "alarm", f"drive.{span.drive}"
+    if span.quality != "GOOD" and span.control == "tension":
+        return "alarm", f"quality.{span.quality}"
+    if span.tension_n is None or not moving:
+        return "", ""
+    if span.tension_n < limits.tension_min_n or span.tension_n > limits.tension_max_n:
+        return "alarm", "span.outside"
+    if span.error_n is not None and abs(span.error_n) > off_n:
+        return "attention", "span.off"
+    return "", ""
+
+
+def _proposals(proposals: ProposalList) -> dict[str, Any]:
+    """What changes when there is anything new to ask for, and what waits for a person."""
+    waiting = [one for one in proposals.proposals if one.stage == "waiting"]
+    return {
+        "state": [[one.proposal[:12], one.stage] for one in proposals.proposals if one.stage not in ENDED],
+        "made": len(proposals.proposals),
+        "newest": proposals.proposals[0].proposal if proposals.proposals else None,
+        "epoch": proposals.epoch,
+        "waiting": [one.proposal for one in waiting],
+    }
+
+
+def _short(value: float | None, digits: int = 4) -> float | None:
+    return None if value is None else round(value, digits)
