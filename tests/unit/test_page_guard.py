@@ -58,7 +58,7 @@ def test_the_cookie_alone_says_nothing(token: str):
         async with page() as there:
             await there.log_in()
             answer = await there.browser.post(
-                "/api/say", json={"command": "stop"}, headers={TOKEN_HEADER: token.encode()}
+                "/api/say", json={"command": "stop"}, headers=[(TOKEN_HEADER.encode(), token.encode())]
             )
             assert answer.status_code == 403 and there.gateway.said == []
 

@@ -17,7 +17,7 @@ from gateway.operator.page.sessions import (
 from tests.operator.fake_line import PASSWORD
 from tests.unit.page_support import page
 
-ASKED = ("/api/me", "/api/line", "/api/proposals", "/api/proposals/abcdef", "/api/records", "/api/tensions", "/events")
+ASKED = ("/api/line", "/api/proposals", "/api/proposals/abcdef", "/api/records", "/api/tensions", "/events")
 
 
 class Clock:
@@ -158,7 +158,8 @@ def test_after_logging_out_the_cookie_is_worth_nothing():
             kept = dict(there.browser.cookies)
             assert (await there.browser.post("/api/logout", json={})).status_code == 200
             there.browser.cookies.update(kept)
-            assert (await there.browser.get("/api/me")).status_code == 401
+            assert (await there.browser.get("/api/me")).json()["role"] is None
+            assert (await there.browser.get("/api/line")).status_code == 401
 
     asyncio.run(story())
 

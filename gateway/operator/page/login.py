@@ -15,7 +15,7 @@ from starlette.routing import Route
 from gateway.core.line import Strict
 from gateway.core.people import Person, Role
 from gateway.operator.page.guard import body_of
-from gateway.operator.page.sessions import LONGEST_S, Sessions, Tries
+from gateway.operator.page.sessions import LONGEST_S, Session, Sessions, Tries
 
 Check = Callable[[str, str], Awaitable[Role | None]]
 
@@ -58,12 +58,10 @@ class Door:
 
     def visitor(self, request: Request) -> Visitor:
         """Raises HTTPException 401: log in."""
-        session = self._sessions.use(self._key(request))
-        if session is not None:
-            return Visitor(session.name, session.role, session.token)
-        if self._anonymous:
-            return Visitor(None, "viewer", None)
-        raise HTTPException(401, "log in")
+        visitor = self._known(self._sessions.find(self._key(request)))
+        if visitor is None:
+            raise HTTPException(401, "log in")
+        return visitor
 
     def may_look(self, request: Request) -> bool:
         """Still; this is no request of the person."""
@@ -76,6 +74,7 @@ class Door:
             raise HTTPException(401, "log in")
         if not secrets.compare_digest(request.headers.get(TOKEN_HEADER, "").encode(), visitor.token.encode()):
             raise HTTPException(403, "the request does not carry this session's token; load the page anew")
+        self._sessions.use(self._key(request))
         return Person(name=visitor.name, role=visitor.role, through="page")
 
     async def _login(self, request: Request) -> JSONResponse:
@@ -122,7 +121,13 @@ class Door:
         return answer
 
     async def _me(self, request: Request) -> JSONResponse:
-        return JSONResponse(_told(self.visitor(request)))
+        visitor = self._known(self._sessions.use(self._key(request)))
+        return JSONResponse(_told(visitor) if visitor else {"name": None, "role": None, "token": None})
+
+    def _known(self, session: Session | None) -> Visitor | None:
+        if session is not None:
+            return Visitor(session.name, session.role, session.token)
+        return Visitor(None, "viewer", None) if self._anonymous else None
 
     def _key(self, request: Request) -> str:
         return request.cookies.get(self._cookie, "")

@@ -69,6 +69,7 @@ async def serve_on(
     try:
         config.load()
     except OSError as error:  # ssl.SSLError is one
+        listener.close()
         raise CannotServe(f"the page's certificate {certificate} and key {key} cannot be used: {error}") from error
     server = _Server(config)
     serving = asyncio.ensure_future(server.serve(sockets=[listener]))

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from gateway.core.people import Role
 
-IDLE_S = 3600.0  #: without a request; looking on is none
+IDLE_S = 3600.0  #: nothing said, and the page not loaded anew; looking on alone is nothing
 LONGEST_S = 12.0 * 3600.0  #: a shift, and the way there
 MOST_SESSIONS = 64  #: the one that has been idle for longest goes first
 

@@ -46,8 +46,10 @@ def used(finding: RuleFinding) -> float | None:
     value, limit, margin = finding.value, finding.limit, finding.margin
     if value is None or limit is None or margin is None:
         return None
+    if margin < 0.0:
+        return 1.0
     at_least = math.isclose(margin, value - limit, rel_tol=1e-6, abs_tol=1e-12)
     part, whole = (limit, value) if at_least else (abs(value), abs(limit))
     if whole <= 0.0:
         return None
-    return min(1.0, max(0.0, part / whole))
+    return min(1.0, part / whole)

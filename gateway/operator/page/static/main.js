@@ -10,28 +10,27 @@ import { Picture } from "./picture.js";
 import { Trends } from "./trends.js";
 import { number, preferred, speak, time, word } from "./words.js";
 
-const STALE_MS = 1000, VIEWS = ["line", "change", "history", "health"];
-let parts = null, tick = null, heard_ms = 0, skew_s = 0, source = null, list = null, records = [];
+const STALE_MS = 1000, AGAIN_MS = 3000, VIEWS = ["line", "change", "history", "health"];
+let parts = null, tick = null, heard_ms = 0, skew_s = 0, list = null, records = [];
 
 async function begin() {
   await speak(preferred());
   try {
-    await enter(await ask("api/me"));
+    const me = await ask("api/me");
+    await (me.role === null ? askName() : enter(me));
   } catch (error) {
     if (!(error instanceof Refused)) throw error;
-    if (error.status === 401) askName();
-    else setTimeout(begin, 2000), reply(error);
+    reply(error);
+    setTimeout(begin, AGAIN_MS);
   }
 }
 
+// The session has ended: everything anew.
+const out = () => location.reload();
+
 function askName() {
-  source?.close();
-  [source, parts, tick] = [null, null, null];
-  keepToken(null);
-  for (const id of ["now", "views", "stop", "logout", "stale"]) show($(id), false);
+  for (const id of ["now", "views", "logout"]) show($(id), false);
   for (const view of VIEWS) show($(`view-${view}`), false);
-  document.body.classList.remove("stale");
-  setText($("me"), "");
   show($("login"), true);
   $("login").elements.name.focus();
 }
@@ -52,18 +51,34 @@ async function enter(me) {
   document.title = `${line.site} / ${line.line}`;
   route();
   parts = { line, picture: new Picture(line), trends: new Trends(line), alarms: new Alarms(say, may), change: new Change(say, may), operate: new Operate(line, say, may) };
-  source?.close();
   heard_ms = performance.now();
-  source = listen(hear, () => setTimeout(begin, 2000));
+  follow();
+}
+
+const follow = () => listen(hear, () => setTimeout(again, AGAIN_MS));
+
+// The stream has been refused: there is no session any more, or too many look.
+async function again() {
+  try {
+    (await ask("api/me")).role === null ? out() : follow();
+  } catch (error) {
+    if (!(error instanceof Refused)) throw error;
+    setTimeout(again, AGAIN_MS);
+  }
 }
 
 async function logOut() {
-  await ask("api/logout", {}).catch(reply);
-  askName();
+  try {
+    await ask("api/logout", {});
+    out();
+  } catch (error) {
+    if (!(error instanceof Refused)) throw error;
+    reply(error);
+  }
 }
 
 function hear(kind, data) {
-  if (kind === "logged-out") return askName();
+  if (kind === "logged-out") return out();
   if (kind === "away") return;
   const first = !tick, before = tick;
   [tick, heard_ms, skew_s] = [data, performance.now(), data.wall_s - Date.now() / 1000];
@@ -98,7 +113,7 @@ function look() {
   const age_ms = performance.now() - heard_ms, stale = age_ms > STALE_MS;
   show($("stale"), stale);
   document.body.classList.toggle("stale", stale);
-  if (stale) setText($("stale"), tick ? word("stale.old", { seconds: Math.floor(age_ms / 1000) }) : word("stale.none"));
+  if (stale) setText($("stale"), tick ? word("stale.old") : word("stale.none"));
   setText($("clock"), tick ? (stale ? word("stale.at", { time: time(tick.wall_s) }) : time(tick.wall_s)) : "");
   parts.change.paint(Date.now() / 1000 + skew_s);
 }
@@ -111,7 +126,7 @@ async function news() {
     parts?.trends.told(records);
   } catch (error) {
     if (!(error instanceof Refused)) throw error;
-    if (error.status === 401) return askName();
+    if (error.status === 401) return out();
   }
   route();
 }
@@ -140,7 +155,7 @@ async function say(said) {
     reply(await ask("api/say", said));
   } catch (error) {
     if (!(error instanceof Refused)) throw error;
-    if (error.status === 401) askName();
+    if (error.status === 401) return out();
     reply(error);
   }
   await news();
@@ -164,10 +179,8 @@ $("login").addEventListener("submit", async (event) => {
   const { name, password } = $("login").elements;
   setText($("login-refused"), "");
   try {
-    const me = await ask("api/login", { name: name.value, password: password.value });
-    password.value = "";
-    await enter(me);
-    $("content").focus();
+    await ask("api/login", { name: name.value, password: password.value });
+    location.reload();
   } catch (error) {
     if (!(error instanceof Refused)) throw error;
     setText($("login-refused"), error.message);
@@ -178,6 +191,9 @@ $("language").addEventListener("change", () => {
   localStorage.setItem("language", $("language").value);
   location.reload();
 });
-addEventListener("hashchange", route);
+addEventListener("hashchange", () => {
+  route();
+  news();
+});
 setInterval(look, 250);
 begin();

@@ -2,7 +2,7 @@
 import { $, h, setText, svg } from "./dom.js";
 import { number, word } from "./words.js";
 
-const LEAST = 104, MOST = 190, LEAD = 64, TALL = 316, R = 21, BAR = { top: 158, bottom: 268, wide: 42 };
+const LEAST = 104, MOST = 190, LEAD = 64, TALL = 334, R = 21, BAR = { top: 158, bottom: 268, wide: 42 };
 
 export class Picture {
   constructor(line) {
@@ -53,13 +53,13 @@ export class Picture {
   }
 
   cell(i, x, wide) {
-    const middle = x + wide / 2 - 8, left = middle - BAR.wide / 2;
+    const left = x + (wide - BAR.wide - 58) / 2, middle = left + BAR.wide / 2; // the set-point's number stands beside it
     const parts = {
       value: svg("text", { x: middle, y: 140, class: "tension" }),
       fill: svg("rect", { x: left, width: BAR.wide, y: BAR.bottom, height: 0, class: "fill" }),
       mark: svg("path", { class: "mark" }),
       setpoint: svg("text", { x: left + BAR.wide + 13, class: "setpoint" }),
-      note: svg("text", { x: middle, y: BAR.bottom + 40, class: "note" }),
+      note: svg("text", { class: "note" }, svg("tspan", { x: middle, y: BAR.bottom + 40 }), svg("tspan", { x: middle, y: BAR.bottom + 59 })),
       frame: svg("rect", { x: left, width: BAR.wide, y: BAR.top, height: BAR.bottom - BAR.top, class: "frame" }),
       left,
     };
@@ -76,7 +76,9 @@ export class Picture {
       const parts = this.cells[i];
       if (!parts) return;
       setText(parts.value, number(tension));
-      setText(parts.note, bad ? `▲ ${word(why)}` : "");
+      const [, first, rest] = bad ? /^(\S+) ?(.*)$/.exec(word(why)) : ["", "", ""];
+      setText(parts.note.firstChild, bad ? `▲ ${first}` : "");
+      setText(parts.note.lastChild, rest);
       for (const name of ["value", "fill", "note", "frame"]) parts[name].setAttribute("data-bad", bad);
       const top = tension == null ? BAR.bottom : y(tension);
       parts.fill.setAttribute("y", top);

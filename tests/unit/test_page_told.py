@@ -1,0 +1,98 @@
+"""What the page is told: what counts as abnormal, how much of a limit is used, and that a tick is small."""
+
+import asyncio
+import json
+
+import pytest
+
+from gateway.core.signals import DriveState, Quality
+from gateway.core.status import GatewayStatus
+from gateway.core.verdict import RuleFinding
+from gateway.operator.page.tick import DRIVES_THAT_FAIL, abnormal, line_told, tick_of
+from gateway.operator.page.told import used
+from tests.unit.page_support import page
+from tests.unit.supervisor_support import line_of
+
+
+def status_of(**span: object) -> GatewayStatus:
+    with open("docs/examples/status.json") as file:
+        found = json.load(file)
+    found["spans"][0] |= span
+    return GatewayStatus.model_validate(found)
+
+
+@pytest.mark.parametrize(
+    "span, expected",
+    [
+        ({}, ("", "")),
+        ({"error_n": 3.0, "tension_n": 23.0}, ("", "")),
+        ({"error_n": 3.01, "tension_n": 23.01}, ("attention", "span.off")),
+        ({"error_n": -3.01, "tension_n": 16.99}, ("attention", "span.off")),
+        ({"tension_n": 60.0, "error_n": 0.0}, ("", "")),
+        ({"tension_n": 60.1, "error_n": 40.1}, ("alarm", "span.outside")),
+        ({"tension_n": 1.9, "error_n": 0.0}, ("alarm", "span.outside")),
+        ({"quality": "STALE"}, ("alarm", "quality.STALE")),
+        ({"tension_n": None, "error_n": None, "quality": "MISSING"}, ("alarm", "quality.MISSING")),
+        ({"tension_n": None, "error_n": None, "quality": "MISSING", "control": "draw"}, ("", "")),
+        ({"drive": "FAULT", "quality": "STALE", "tension_n": 1.0}, ("alarm", "drive.FAULT")),
+        ({"drive": "READY"}, ("", "")),
+    ],
+)
+def test_what_is_abnormal_of_a_span(span: dict[str, object], expected: tuple[str, str]):
+    status = status_of(**span)
+    assert abnormal(status.spans[0], status.limits, 3.0, moving=True) == expected
+
+
+def test_at_rest_a_tension_may_be_anything_but_a_failed_drive_is_told():
+    status = status_of(tension_n=0.0, error_n=-20.0)
+    assert abnormal(status.spans[0], status.limits, 3.0, moving=False) == ("", "")
+    status = status_of(tension_n=0.0, drive="STO")
+    assert abnormal(status.spans[0], status.limits, 3.0, moving=False)[0] == "alarm"
+
+
+def test_what_fails_are_names_of_drive_states():
+    assert {state.name for state in DriveState} >= DRIVES_THAT_FAIL
+    assert {quality.name for quality in Quality} == {"GOOD", "STALE", "BAD", "MISSING"}
+
+
+@pytest.mark.parametrize(
+    "value, limit, margin, expected",
+    [
+        (30.0, 60.0, 30.0, 0.5),  # at most
+        (4.0, 2.0, 2.0, 0.5),  # at least
+        (0.0, 0.002, 0.002, 0.0),
+        (70.0, 60.0, -10.0, 1.0),
+        (1.0, 2.0, -1.0, 1.0),  # at least, and not reached
+        (0.0, 0.0, 0.0, None),
+        (None, 2.0, 1.0, None),
+        (1.0, None, None, None),
+        (-1.0, 0.5, -1.5, 1.0),  # decay that is growth
+    ],
+)
+def test_how_much_of_a_limit_is_used(value: float | None, limit: float | None, margin: float | None, expected: object):
+    finding = RuleFinding(rule="r", passed=True, text="t", value=value, limit=limit, margin=margin)
+    assert used(finding) == expected
+
+
+def test_a_tick_of_the_longest_line_is_small():
+    async def story() -> None:
+        async with page(spans=60) as there:
+            assert there.side.status is not None
+            tick = tick_of(there.side.status, there.side.proposals, there.line)
+            assert len(tick["spans"]) == 60 and tick["proposals"]["waiting"] == [there.gateway.hash]
+            assert len(json.dumps(tick)) < 8000
+
+    asyncio.run(story())
+
+
+def test_before_the_first_list_of_proposals_none_is_told():
+    assert tick_of(status_of(), None, line_of(6))["proposals"] is None
+
+
+def test_set_points_are_offered_as_far_as_the_loop_takes_them():
+    line = line_of(6)
+    told, limits = line_told(line), line.limits
+    assert told["setpoint_n"] == [
+        limits.tension_min_n + limits.tension_margin_n,
+        limits.tension_max_n - limits.tension_margin_n,
+    ]
