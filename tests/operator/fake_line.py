@@ -12,7 +12,7 @@ import time
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
-from gateway.core.alarms import AcknowledgeAlarm, AlarmStatus, ShelveAlarm
+from gateway.core.alarms import ALARMS, AcknowledgeAlarm, AlarmStatus, ShelveAlarm
 from gateway.core.decisions import (
     QUERY,
     Decide,
@@ -48,26 +48,21 @@ async def check(name: str, password: str) -> Role | None:
     return next((role for role in ROLES if role == name and password == PASSWORD), None)
 
 
-def alarm(name: str = "drive-away", **changes: object) -> AlarmStatus:
-    return AlarmStatus.model_validate(
-        {
-            "name": name,
-            "priority": "high",
-            "means": "a drive does not answer",
-            "text": "drive of roller-3 has not answered for 1.2 s",
-            "cause": "its supply is off, or its cable is loose",
-            "consequence": "the line has stopped and cannot be armed",
-            "action": "look at the drive's display, then at its plug; then arm",
-            "active": True,
-            "acknowledged": False,
-            "first_out": True,
-            "since_wall_s": time.time() - 30.0,
-            "ended_wall_s": None,
-            "acknowledged_by": "",
-            "shelved_until_wall_s": None,
-        }
-        | changes
-    )
+def alarm(name: str = "device-absent", **changes: object) -> AlarmStatus:
+    """A row of the table that has just come; `changes` are of its status."""
+    row = next(one for one in ALARMS if one.name == name)
+    told = {key: getattr(row, key) for key in ("name", "priority", "means", "cause", "consequence", "action")}
+    state = {
+        "text": "drive of roller-3 has not answered for 1.2 s",
+        "active": True,
+        "acknowledged": False,
+        "first_out": True,
+        "since_wall_s": time.time() - 30.0,
+        "ended_wall_s": None,
+        "acknowledged_by": "",
+        "shelved_until_wall_s": None,
+    }
+    return AlarmStatus.model_validate(told | state | changes)
 
 
 class FakeGateway:
@@ -233,8 +228,8 @@ async def show(spans: int) -> None:
         served, asked = UnixMailbox(), UnixMailbox()
         gateway = FakeGateway(line, served)
         if spans > 1:
-            gateway.alarms = [alarm(priority="medium", means="a tension is away from its set-point")]
-            gateway.off_n[1] = 4.0
+            gateway.alarms = [alarm("tension-off", text="tension of span 2 is 8.0 N above its set-point of 36.0 N")]
+            gateway.off_n[1] = 8.0
         await served.listen(folder / "gateway.sock")
         asked.connect(TOPICS, folder / "gateway.sock")
         side = LineSide(asked)

@@ -105,12 +105,12 @@ def test_a_tick_tells_what_the_gateway_tells():
     async def story() -> None:
         async with served() as at:
             at.there.gateway.alarms = [alarm()]
-            at.there.gateway.off_n[1] = 5.0
+            at.there.gateway.off_n[1] = 9.0
             stream = await at.look()
             tick = await stream.until("tick")
             while not tick["alarms"]:
                 tick = await stream.until("tick")
-            assert tick["loop"]["state"] == "RUN" and tick["alarms"][0]["name"] == "drive-away"
+            assert tick["loop"]["state"] == "RUN" and tick["alarms"][0]["name"] == "device-absent"
             assert [span[4] for span in tick["spans"]] == ["", "attention", ""]
             assert tick["proposals"]["waiting"] == [at.there.gateway.hash]
 

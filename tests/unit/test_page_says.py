@@ -22,8 +22,8 @@ SAID: dict[str, dict[str, object]] = {
     "experiment-abort": {},
     "decide": {"proposal": HASH, "shown": HASH, "approve": False},
     "roll-back": {"comment": "it hums"},
-    "acknowledge": {"alarm": "drive-away"},
-    "shelve": {"alarm": "drive-away", "for_s": 60.0, "because": "fitter is there"},
+    "acknowledge": {"alarm": "device-absent"},
+    "shelve": {"alarm": "device-absent", "for_s": 60.0, "because": "fitter is there"},
     "archive": {"configuration": "abc", "name": "spring", "because": "it was good"},
     "line-changed": {"because": "new web"},
 }
@@ -154,8 +154,8 @@ def test_an_alarm_is_acknowledged_and_shelved_in_a_persons_name():
         async with page() as there:
             there.gateway.alarms = [alarm()]
             await there.log_in()
-            await there.say("acknowledge", alarm="drive-away")
-            await there.say("shelve", alarm="drive-away", for_s=60.0, because="fitter is there")
+            await there.say("acknowledge", alarm="device-absent")
+            await there.say("shelve", alarm="device-absent", for_s=60.0, because="fitter is there")
             (one,) = there.gateway.alarms
             assert one.acknowledged_by == "operator" and one.shelved_until_wall_s is not None
 

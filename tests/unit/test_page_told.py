@@ -8,8 +8,9 @@ import pytest
 from gateway.core.signals import DriveState, Quality
 from gateway.core.status import GatewayStatus
 from gateway.core.verdict import RuleFinding
-from gateway.operator.page.tick import DRIVES_THAT_FAIL, abnormal, line_told, tick_of
+from gateway.operator.page.tick import DRIVES_THAT_FAIL, IN_MOTION, OFF_SHARE, abnormal, line_told, tick_of
 from gateway.operator.page.told import used
+from gateway.supervisor import alarm_conditions
 from tests.unit.page_support import page
 from tests.unit.supervisor_support import line_of
 
@@ -25,12 +26,14 @@ def status_of(**span: object) -> GatewayStatus:
     "span, expected",
     [
         ({}, ("", "")),
-        ({"error_n": 3.0, "tension_n": 23.0}, ("", "")),
-        ({"error_n": 3.01, "tension_n": 23.01}, ("attention", "span.off")),
-        ({"error_n": -3.01, "tension_n": 16.99}, ("attention", "span.off")),
-        ({"tension_n": 60.0, "error_n": 0.0}, ("", "")),
-        ({"tension_n": 60.1, "error_n": 40.1}, ("alarm", "span.outside")),
-        ({"tension_n": 1.9, "error_n": 0.0}, ("alarm", "span.outside")),
+        ({"tension_n": 24.0}, ("", "")),
+        ({"tension_n": 24.01}, ("attention", "span.off")),
+        ({"tension_n": 15.99}, ("attention", "span.off")),
+        ({"tension_n": 60.0, "setpoint_n": 55.0}, ("", "")),
+        ({"tension_n": 60.1, "setpoint_n": 55.0}, ("alarm", "span.outside")),
+        ({"tension_n": 1.9, "setpoint_n": 2.0}, ("alarm", "span.outside")),
+        ({"tension_n": 0.9, "setpoint_n": 1.0}, ("", "")),
+        ({"tension_n": 24.01, "control": "draw"}, ("", "")),
         ({"quality": "STALE"}, ("alarm", "quality.STALE")),
         ({"tension_n": None, "error_n": None, "quality": "MISSING"}, ("alarm", "quality.MISSING")),
         ({"tension_n": None, "error_n": None, "quality": "MISSING", "control": "draw"}, ("", "")),
@@ -40,14 +43,20 @@ def status_of(**span: object) -> GatewayStatus:
 )
 def test_what_is_abnormal_of_a_span(span: dict[str, object], expected: tuple[str, str]):
     status = status_of(**span)
-    assert abnormal(status.spans[0], status.limits, 3.0, moving=True) == expected
+    assert abnormal(status.spans[0], status.limits, moving=True) == expected
 
 
 def test_at_rest_a_tension_may_be_anything_but_a_failed_drive_is_told():
-    status = status_of(tension_n=0.0, error_n=-20.0)
-    assert abnormal(status.spans[0], status.limits, 3.0, moving=False) == ("", "")
-    status = status_of(tension_n=0.0, drive="STO")
-    assert abnormal(status.spans[0], status.limits, 3.0, moving=False)[0] == "alarm"
+    status = status_of(tension_n=0.0)
+    assert abnormal(status.spans[0], status.limits, moving=False) == ("", "")
+    status = status_of(tension_n=0.0, drive="STO", quality="STALE")
+    assert abnormal(status.spans[0], status.limits, moving=False) == ("", "")
+    status = status_of(tension_n=0.0, drive="FAULT")
+    assert abnormal(status.spans[0], status.limits, moving=False)[0] == "alarm"
+
+
+def test_what_is_off_is_off_as_the_alarm_has_it():
+    assert (OFF_SHARE, IN_MOTION) == (alarm_conditions.OFF_SHARE, set(alarm_conditions.MOVING))
 
 
 def test_what_fails_are_names_of_drive_states():
@@ -78,7 +87,7 @@ def test_a_tick_of_the_longest_line_is_small():
     async def story() -> None:
         async with page(spans=60) as there:
             assert there.side.status is not None
-            tick = tick_of(there.side.status, there.side.proposals, there.line)
+            tick = tick_of(there.side.status, there.side.proposals)
             assert len(tick["spans"]) == 60 and tick["proposals"]["waiting"] == [there.gateway.hash]
             assert len(json.dumps(tick)) < 8000
 
@@ -86,7 +95,7 @@ def test_a_tick_of_the_longest_line_is_small():
 
 
 def test_before_the_first_list_of_proposals_none_is_told():
-    assert tick_of(status_of(), None, line_of(6))["proposals"] is None
+    assert tick_of(status_of(), None)["proposals"] is None
 
 
 def test_set_points_are_offered_as_far_as_the_loop_takes_them():

@@ -31,7 +31,7 @@ def page_app(line: Line, side: LineSide, check: Check, clock: Callable[[], float
     """
     address = urlsplit(line.operator.page)
     door = Door(check, clock, line.operator.anonymous == "read", address.scheme == "https")
-    asks, ticks = Asks(line, side, door), Ticks(line, side)
+    asks, ticks = Asks(line, side, door), Ticks(side)
     return Starlette(
         routes=[
             *door.routes(),

@@ -14,7 +14,6 @@ from starlette.requests import Request
 from starlette.responses import StreamingResponse
 from starlette.types import Receive, Scope, Send
 
-from gateway.core.line import Line
 from gateway.core.status import GatewayStatus
 from gateway.operator.line_side import LineSide
 from gateway.operator.page.tick import tick_of
@@ -26,9 +25,8 @@ HEARTBEAT_S = 0.5
 class Ticks:
     """Made of every status that comes, as long as somebody looks."""
 
-    def __init__(self, line: Line, side: LineSide) -> None:
+    def __init__(self, side: LineSide) -> None:
         self.looking = 0
-        self._line = line
         self._side = side
         self._text = ""
         self._number = 0
@@ -47,7 +45,7 @@ class Ticks:
     def _take(self, status: GatewayStatus) -> None:
         if not self.looking:
             return
-        self._text = _event("tick", tick_of(status, self._side.proposals, self._line))
+        self._text = _event("tick", tick_of(status, self._side.proposals))
         self._number += 1
         self._news.set()
         self._news = asyncio.Event()  # those who waited have the old one

@@ -11,6 +11,7 @@ from gateway.core.status import GatewayStatus, LimitsStatus, SpanStatus
 
 DRIVES_THAT_FAIL = frozenset({"ABSENT", "STOPPING", "FAULT", "STO"})
 IN_MOTION = frozenset({"RUN", "HOLD"})  #: states in which tensions are controlled
+OFF_SHARE = 0.2  #: of the set-point: a tension farther off is told. As the alarm has it, without its delay
 ENDED = frozenset(
     {"refused", "rejected", "expired", "superseded", "not-deployed", "kept", "rolled-back", "done"}
 )  #: stages after which nothing comes
@@ -37,10 +38,9 @@ def line_told(line: Line) -> dict[str, Any]:
     }
 
 
-def tick_of(status: GatewayStatus, proposals: ProposalList | None, line: Line) -> dict[str, Any]:
+def tick_of(status: GatewayStatus, proposals: ProposalList | None) -> dict[str, Any]:
     """Of a status, as a JSON object."""
     loop, moving = status.loop, status.loop.state in IN_MOTION
-    off_n = line.gate.tail_error_max_n
     return {
         "wall_s": status.wall_s,
         "loop": loop.model_dump(exclude={"next"}),
@@ -54,7 +54,7 @@ def tick_of(status: GatewayStatus, proposals: ProposalList | None, line: Line) -
                 _short(span.setpoint_n, 2),
                 _short(span.speed_m_per_s),
                 _short(span.torque_nm, 2),
-                *abnormal(span, status.limits, off_n, moving),
+                *abnormal(span, status.limits, moving),
             ]
             for span in status.spans
         ],
@@ -69,20 +69,27 @@ def tick_of(status: GatewayStatus, proposals: ProposalList | None, line: Line) -
     }
 
 
-def abnormal(span: SpanStatus, limits: LimitsStatus, off_n: float, moving: bool) -> tuple[str, str]:
+def abnormal(span: SpanStatus, limits: LimitsStatus, moving: bool) -> tuple[str, str]:
     """(how bad: "", "attention" or "alarm"; which: a word of the catalogue). The worst comes first.
 
-    `off_n`: how far a tension may be from its set-point. Where the line does not move, tensions may be anything.
+    Where the line does not move, drives may be off and tensions anything; and they may be outside the limits on the way from a slack web.
     """
-    if span.drive in DRIVES_THAT_FAIL:
+    if span.drive == "FAULT" or (moving and span.drive in DRIVES_THAT_FAIL):
         return "alarm", f"drive.{span.drive}"
-    if span.quality != "GOOD" and span.control == "tension":
-        return "alarm", f"quality.{span.quality}"
-    if span.tension_n is None or not moving:
+    if span.control != "tension" or not moving:
         return "", ""
-    if span.tension_n < limits.tension_min_n or span.tension_n > limits.tension_max_n:
+    if span.quality != "GOOD":
+        return "alarm", f"quality.{span.quality}"
+    return (
+        ("", "") if span.tension_n is None or span.setpoint_n is None else _off(span.tension_n, span.setpoint_n, limits)
+    )
+
+
+def _off(tension_n: float, setpoint_n: float, limits: LimitsStatus) -> tuple[str, str]:
+    least, most = limits.tension_min_n, limits.tension_max_n
+    if least <= setpoint_n <= most and not least <= tension_n <= most:
         return "alarm", "span.outside"
-    if span.error_n is not None and abs(span.error_n) > off_n:
+    if abs(tension_n - setpoint_n) > OFF_SHARE * setpoint_n > 0.0:
         return "attention", "span.off"
     return "", ""
 

@@ -84,6 +84,7 @@ export class Change {
       yes: word(approve ? "change.yes-approve" : "change.yes-reject"), comment: true,
     });
     if (answer === null) return;
+    location.hash = `#change/${shown.proposal_hash}`; // what becomes of it stays in sight
     await this.say({ command: "decide", proposal: shown.proposal_hash, shown: shown.shown, approve, comment: answer });
   }
 

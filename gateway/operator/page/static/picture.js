@@ -31,17 +31,17 @@ export class Picture {
     const wide = LEAD + (end - first) * cell;
     const root = svg("svg", { width: wide, height: TALL, viewBox: `0 0 ${wide} ${TALL}`, role: "img",
       "aria-label": word("picture.label", { first: first + 1, last: end }) });
-    const points = [first === 0 ? [34, 62] : [0, 62]];
+    const exit = (i) => (i % 2 === 0 ? 50 - R : 74 + R); // over the odd rollers, under the even ones
+    const points = [first === 0 ? [34, 32] : [0, exit(first - 1)]];
     const rollers = [];
     if (first === 0) rollers.push(svg("circle", { cx: 34, cy: 62, r: 30, class: "unwinder" }), svg("circle", { cx: 34, cy: 62, r: 5, class: "hub" }));
-    if (first === 0) points[0] = [34, 32];
     for (let i = first; i < end; i++) {
-      const x = LEAD + (i - first) * cell, up = i % 2 === 0, cx = x + cell - R - 4, cy = up ? 50 : 74;
-      points.push([cx - 6, up ? cy - R : cy + R], [cx + 6, up ? cy - R : cy + R]);
+      const x = LEAD + (i - first) * cell, cx = x + cell - R - 4, cy = i % 2 === 0 ? 50 : 74;
+      points.push([cx - 6, exit(i)], [cx + 6, exit(i)]);
       rollers.push(svg("circle", { cx, cy, r: R, class: "roller" }), svg("text", { x: cx, y: cy + 6, class: "roller-name" }, String(i + 1)));
       root.append(this.cell(i, x, cell));
     }
-    if (end < this.line.n) points.push([wide, 62]);
+    if (end < this.line.n) points.push([wide, exit(end - 1)]);
     root.prepend(...rollers, svg("polyline", { points: points.map((p) => p.join()).join(" "), class: "web" }));
     const [least, most] = this.line.tension_n;
     root.append(
