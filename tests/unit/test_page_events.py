@@ -8,6 +8,7 @@ from contextlib import asynccontextmanager
 from typing import Any
 
 import httpx
+import pytest
 
 from gateway.operator.page.events import MOST_BROWSERS
 from gateway.operator.page.login import TOKEN_HEADER
@@ -53,9 +54,10 @@ class Stream:
 class Served:
     """A page on a port of its own."""
 
-    def __init__(self, there: Page, port: int) -> None:
+    def __init__(self, there: Page, listener: socket.socket) -> None:
         self.there = there
-        self.port = port
+        self.port = listener.getsockname()[1]
+        self.serving = asyncio.create_task(serve_on(there.app, listener))
         self.cookie = ""
         self.streams: list[Stream] = []
 
@@ -89,16 +91,15 @@ class Served:
 async def served(spans: int = 3, watched: bool = True) -> AsyncIterator[Served]:
     async with page(spans, watched=watched) as there:
         listener = socket.create_server(("127.0.0.1", 0))
-        found = Served(there, listener.getsockname()[1])
-        serving = asyncio.create_task(serve_on(there.app, listener))
+        found = Served(there, listener)
         try:
             await found.log_in()
             yield found
         finally:
             for stream in found.streams:
                 await stream.close()
-            serving.cancel()
-            await asyncio.gather(serving, return_exceptions=True)
+            found.serving.cancel()
+            await asyncio.gather(found.serving, return_exceptions=True)
 
 
 def test_a_tick_tells_what_the_gateway_tells():
@@ -112,7 +113,22 @@ def test_a_tick_tells_what_the_gateway_tells():
                 tick = await stream.until("tick")
             assert tick["loop"]["state"] == "RUN" and tick["alarms"][0]["name"] == "device-absent"
             assert [span[4] for span in tick["spans"]] == ["", "attention", ""]
-            assert tick["proposals"]["waiting"] == [at.there.gateway.hash]
+            assert tick["waiting"] == [at.there.gateway.hash]
+
+    asyncio.run(story())
+
+
+def test_a_tick_tells_when_proposals_are_others_than_before():
+    async def story() -> None:
+        async with served() as at:
+            stream = await at.look()
+            before = await stream.until("tick")
+            at.there.gateway.stage = "expired"
+            after = await stream.until("tick")
+            while after["revision"] == before["revision"]:
+                assert after["waiting"] == before["waiting"]
+                after = await stream.until("tick")
+            assert after["waiting"] == []
 
     asyncio.run(story())
 
@@ -193,6 +209,20 @@ def test_the_stream_ends_with_the_session():
             await at.log_out(token)
             await stream.until("logged-out")
             assert (await at.look()).status == 401
+
+    asyncio.run(story())
+
+
+def test_streams_end_with_the_process():
+    async def story() -> None:
+        async with served() as at:
+            stream = await at.look()
+            await stream.until("tick")
+            at.serving.cancel()
+            with pytest.raises(asyncio.IncompleteReadError):
+                while True:
+                    assert (await stream.next())[0] == "tick"
+            await asyncio.gather(at.serving, return_exceptions=True)
 
     asyncio.run(story())
 

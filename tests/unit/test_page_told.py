@@ -87,15 +87,15 @@ def test_a_tick_of_the_longest_line_is_small():
     async def story() -> None:
         async with page(spans=60) as there:
             assert there.side.status is not None
-            tick = tick_of(there.side.status, there.side.proposals)
-            assert len(tick["spans"]) == 60 and tick["proposals"]["waiting"] == [there.gateway.hash]
+            tick = tick_of(there.side.status, there.side.proposals, 1)
+            assert len(tick["spans"]) == 60 and tick["waiting"] == [there.gateway.hash]
             assert len(json.dumps(tick)) < 8000
 
     asyncio.run(story())
 
 
-def test_before_the_first_list_of_proposals_none_is_told():
-    assert tick_of(status_of(), None)["proposals"] is None
+def test_before_the_first_list_of_proposals_none_waits():
+    assert tick_of(status_of(), None, 0)["waiting"] == []
 
 
 def test_set_points_are_offered_as_far_as_the_loop_takes_them():

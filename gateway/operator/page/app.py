@@ -32,7 +32,7 @@ def page_app(line: Line, side: LineSide, check: Check, clock: Callable[[], float
     address = urlsplit(line.operator.page)
     door = Door(check, clock, line.operator.anonymous == "read", address.scheme == "https")
     asks, ticks = Asks(line, side, door), Ticks(side)
-    return Starlette(
+    app = Starlette(
         routes=[
             *door.routes(),
             *asks.routes(),
@@ -43,6 +43,8 @@ def page_app(line: Line, side: LineSide, check: Check, clock: Callable[[], float
         middleware=[Middleware(Guarded, loopback=address.hostname in LOOPBACK)],
         exception_handlers={HTTPException: _refused},
     )
+    app.state.end = ticks.end  # `serve_on` calls it: a stream has no end of its own
+    return app
 
 
 async def _refused(_: Request, error: Exception) -> JSONResponse:

@@ -14,6 +14,7 @@ from starlette.requests import Request
 from starlette.responses import StreamingResponse
 from starlette.types import Receive, Scope, Send
 
+from gateway.core.decisions import ProposalList
 from gateway.core.status import GatewayStatus
 from gateway.operator.line_side import LineSide
 from gateway.operator.page.tick import tick_of
@@ -27,11 +28,19 @@ class Ticks:
 
     def __init__(self, side: LineSide) -> None:
         self.looking = 0
+        self.ended = False
         self._side = side
         self._text = ""
         self._number = 0
         self._news = asyncio.Event()
+        self._revision = 0  # of the proposals
         side.on_status.append(self._take)
+        side.on_proposals.append(self._take_proposals)
+
+    def end(self) -> None:
+        """The process ends: all streams do."""
+        self.ended = True
+        self._news.set()
 
     async def after(self, number: int) -> tuple[int, str]:
         """The newest event, once there is one that is not `number`; after a while that there is none."""
@@ -45,10 +54,13 @@ class Ticks:
     def _take(self, status: GatewayStatus) -> None:
         if not self.looking:
             return
-        self._text = _event("tick", tick_of(status, self._side.proposals))
+        self._text = _event("tick", tick_of(status, self._side.proposals, self._revision))
         self._number += 1
         self._news.set()
         self._news = asyncio.Event()  # those who waited have the old one
+
+    def _take_proposals(self, _: ProposalList) -> None:
+        self._revision += 1
 
 
 class _Stream(StreamingResponse):
@@ -69,10 +81,12 @@ class _Stream(StreamingResponse):
 async def _events(ticks: Ticks, may_look: Callable[[], bool]) -> AsyncIterator[str]:
     yield "retry: 1000\n\n"
     number = 0
-    while may_look():
+    while not ticks.ended:
+        if not may_look():
+            yield _event("logged-out", {})
+            return
         number, text = await ticks.after(number)
         yield text
-    yield _event("logged-out", {})
 
 
 def stream(

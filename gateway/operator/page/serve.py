@@ -11,7 +11,7 @@ import uvicorn
 from starlette.applications import Starlette
 
 MOST_CONNECTIONS = 100
-CLOSING_S = 1  #: streams have no end of their own
+CLOSING_S = 1  #: for answers that are on their way
 
 
 class CannotServe(Exception):
@@ -48,7 +48,7 @@ def listening(address: str) -> socket.socket:
 async def serve_on(
     app: Starlette, listener: socket.socket, certificate: Path | None = None, key: Path | None = None
 ) -> None:
-    """Until it is cancelled. Raises CannotServe."""
+    """Until it is cancelled. `app` is one of `page_app`. Raises CannotServe."""
     config = uvicorn.Config(
         app,
         ssl_certfile=certificate,
@@ -76,6 +76,7 @@ async def serve_on(
     try:
         await asyncio.shield(serving)
     except asyncio.CancelledError:
+        app.state.end()
         server.should_exit = True
         await serving
         raise

@@ -12,9 +12,6 @@ from gateway.core.status import GatewayStatus, LimitsStatus, SpanStatus
 DRIVES_THAT_FAIL = frozenset({"ABSENT", "STOPPING", "FAULT", "STO"})
 IN_MOTION = frozenset({"RUN", "HOLD"})  #: states in which tensions are controlled
 OFF_SHARE = 0.2  #: of the set-point: a tension farther off is told. As the alarm has it, without its delay
-ENDED = frozenset(
-    {"refused", "rejected", "expired", "superseded", "not-deployed", "kept", "rolled-back", "done"}
-)  #: stages after which nothing comes
 
 
 def line_told(line: Line) -> dict[str, Any]:
@@ -38,8 +35,8 @@ def line_told(line: Line) -> dict[str, Any]:
     }
 
 
-def tick_of(status: GatewayStatus, proposals: ProposalList | None) -> dict[str, Any]:
-    """Of a status, as a JSON object."""
+def tick_of(status: GatewayStatus, proposals: ProposalList | None, revision: int) -> dict[str, Any]:
+    """Of a status, as a JSON object. `revision` is another where the proposals are others than before."""
     loop, moving = status.loop, status.loop.state in IN_MOTION
     return {
         "wall_s": status.wall_s,
@@ -65,14 +62,15 @@ def tick_of(status: GatewayStatus, proposals: ProposalList | None) -> dict[str, 
         "historian": status.historian.model_dump(include={"storing", "text", "frames_lost", "events_lost"}),
         "events": [event.model_dump() for event in status.events[-20:]],
         "alarms": [alarm.model_dump() for alarm in status.alarms],
-        "proposals": None if proposals is None else _proposals(proposals),
+        "revision": revision,
+        "waiting": [one.proposal for one in proposals.proposals if one.stage == "waiting"] if proposals else [],
     }
 
 
 def abnormal(span: SpanStatus, limits: LimitsStatus, moving: bool) -> tuple[str, str]:
     """(how bad: "", "attention" or "alarm"; which: a word of the catalogue). The worst comes first.
 
-    Where the line does not move, drives may be off and tensions anything; and they may be outside the limits on the way from a slack web.
+    Where the line does not move, drives may be off and tensions anything; on the way from a slack web, too.
     """
     if span.drive == "FAULT" or (moving and span.drive in DRIVES_THAT_FAIL):
         return "alarm", f"drive.{span.drive}"
@@ -92,18 +90,6 @@ def _off(tension_n: float, setpoint_n: float, limits: LimitsStatus) -> tuple[str
     if abs(tension_n - setpoint_n) > OFF_SHARE * setpoint_n > 0.0:
         return "attention", "span.off"
     return "", ""
-
-
-def _proposals(proposals: ProposalList) -> dict[str, Any]:
-    """What changes when there is anything new to ask for, and what waits for a person."""
-    waiting = [one for one in proposals.proposals if one.stage == "waiting"]
-    return {
-        "state": [[one.proposal[:12], one.stage] for one in proposals.proposals if one.stage not in ENDED],
-        "made": len(proposals.proposals),
-        "newest": proposals.proposals[0].proposal if proposals.proposals else None,
-        "epoch": proposals.epoch,
-        "waiting": [one.proposal for one in waiting],
-    }
 
 
 def _short(value: float | None, digits: int = 4) -> float | None:

@@ -10,7 +10,7 @@ import { Picture } from "./picture.js";
 import { Trends } from "./trends.js";
 import { number, preferred, speak, time, word } from "./words.js";
 
-const STALE_MS = 1000, AGAIN_MS = 3000, VIEWS = ["line", "change", "history", "health"];
+const STALE_MS = 1000, AGAIN_MS = 3000, LONG = 22, VIEWS = ["line", "change", "history", "health"];
 let parts = null, tick = null, heard_ms = 0, skew_s = 0, list = null, records = [];
 
 async function begin() {
@@ -47,6 +47,7 @@ async function enter(me) {
   setText($("logout"), word(me.name ? "logout" : "login.enter"));
   $("logout").onclick = me.name ? logOut : askName;
   setText($("me"), me.name ? `${me.name}, ${word(`role.${me.role}`)}` : word("role.anonymous"));
+  $("view-line").classList.toggle("long", line.n > LONG);
   setText($("line-name"), `${line.site} / ${line.line}`);
   document.title = `${line.site} / ${line.line}`;
   route();
@@ -83,7 +84,7 @@ function hear(kind, data) {
   const first = !tick, before = tick;
   [tick, heard_ms, skew_s] = [data, performance.now(), data.wall_s - Date.now() / 1000];
   if (first) parts.trends.load(tick.wall_s);
-  if (first || JSON.stringify(before.proposals) !== JSON.stringify(tick.proposals)) news();
+  if (first || before.revision !== tick.revision) news();
   if (!first && before.loop.state !== tick.loop.state) setText($("announce"), word(`state.${tick.loop.state}`));
   paint();
 }
@@ -100,7 +101,7 @@ function paint() {
     parts.operate.paint(tick);
   }
   if (open() === "health") paintHealth(tick, parts.line);
-  const waiting = tick.proposals?.waiting ?? [];
+  const { waiting } = tick;
   show($("waiting"), waiting.length > 0);
   setText($("waiting"), String(waiting.length));
   show($("prompt"), waiting.length > 0);
@@ -145,7 +146,7 @@ function route() {
     view === name ? link.setAttribute("aria-current", "page") : link.removeAttribute("aria-current");
   }
   if (!parts) return;
-  if (name === "change") parts.change.open(location.hash.split("/")[1] ?? "", tick?.proposals?.waiting ?? []);
+  if (name === "change") parts.change.open(location.hash.split("/")[1] ?? "", tick?.waiting ?? []);
   if (name === "history") paintHistory(list, records);
   paint();
 }
