@@ -13,6 +13,7 @@ from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 
+from gateway.operator.page import guard, serve
 from gateway.operator.page.serve import CannotServe, listening, serve_on
 from tests.unit.page_support import page
 
@@ -74,6 +75,36 @@ def test_a_certificate_that_is_none_is_told_and_the_address_is_free_again(tmp_pa
             with pytest.raises(CannotServe, match=r"page\.pem"):
                 await serve_on(there.app, listener, nothing, nothing)
             assert listener.fileno() == -1
+
+    asyncio.run(story())
+
+
+@pytest.mark.parametrize(
+    "sent",
+    [
+        b"",
+        b"GET /api/me HT",
+        b"GET /api/me HTTP/1.1\r\nhost: 127.0.0.1\r\n",
+        b"GET /api/me HTTP/1.1\r\nhost: 127.0.0.1\r\n\r\nGET /api",
+        b"POST /api/login HTTP/1.1\r\nhost: 127.0.0.1\r\norigin: http://127.0.0.1\r\ncontent-length: 9\r\n"
+        b"content-type: application/json\r\n\r\n{",
+        b"\x16\x03\x01\x02\x00\x01\x00",
+    ],
+)
+def test_who_says_nothing_whole_takes_no_place(sent: bytes, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(serve, "IDLE_S", 0.05)
+    monkeypatch.setattr(guard, "BODY_S", 0.05)
+
+    async def story() -> None:
+        async with page() as there:
+            listener = socket.create_server(("127.0.0.1", 0))
+            serving = asyncio.create_task(serve_on(there.app, listener))
+            reader, writer = await asyncio.open_connection("127.0.0.1", listener.getsockname()[1])
+            writer.write(sent)
+            await reader.read()  # to its end: the page closes
+            writer.close()
+            serving.cancel()
+            await asyncio.gather(serving, return_exceptions=True)
 
     asyncio.run(story())
 

@@ -2,6 +2,7 @@
 answer tells the browser to refuse.
 """
 
+import asyncio
 from collections.abc import Mapping
 from urllib.parse import urlsplit
 
@@ -12,6 +13,7 @@ from starlette.responses import PlainTextResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 MOST_BYTES = 16_384  #: of a request's body
+BODY_S = 10.0  #: for it to come
 LOOPBACK = frozenset({"127.0.0.1", "localhost", "::1"})
 
 POLICY = "; ".join(
@@ -93,12 +95,16 @@ class Guarded:
 
 
 async def body_of(request: Request) -> bytes:
-    """Raises HTTPException where it is longer than MOST_BYTES, whatever its header says, or is said to be no JSON."""
+    """Raises HTTPException where it is said to be no JSON, longer than MOST_BYTES whatever its header says, or slow."""
     if request.headers.get("content-type", "").partition(";")[0].strip() != "application/json":
         raise HTTPException(415, "the request is not application/json")
     body = bytearray()
-    async for part in request.stream():
-        body += part
-        if len(body) > MOST_BYTES:
-            raise HTTPException(413, f"the request is longer than {MOST_BYTES} bytes")
+    try:
+        async with asyncio.timeout(BODY_S):
+            async for part in request.stream():
+                body += part
+                if len(body) > MOST_BYTES:
+                    raise HTTPException(413, f"the request is longer than {MOST_BYTES} bytes", {"connection": "close"})
+    except TimeoutError:
+        raise HTTPException(408, "the request does not come to its end", {"connection": "close"}) from None
     return bytes(body)

@@ -9,13 +9,32 @@ from urllib.parse import urlsplit
 
 import uvicorn
 from starlette.applications import Starlette
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
 MOST_CONNECTIONS = 100
+IDLE_S = 10.0  #: of a connection without a whole request
 CLOSING_S = 1  #: for answers that are on their way
 
 
 class CannotServe(Exception):
     """The address cannot be listened on, or its certificate cannot be read; the text says why."""
+
+
+class _Connection(H11Protocol):
+    """Is closed when it brings no whole request: whoever opens many and says nothing takes no place from others."""
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
+        super().connection_made(transport)
+        self.loop.call_later(IDLE_S, self._look, self.cycle)
+
+    def _look(self, before: object) -> None:
+        """`before`: the request that was the newest when it was looked at last."""
+        if self.transport.is_closing():
+            return
+        if self.cycle is before and (self.cycle is None or self.cycle.response_complete):
+            self.transport.close()
+        else:
+            self.loop.call_later(IDLE_S, self._look, self.cycle)
 
 
 class _Server(uvicorn.Server):
@@ -56,7 +75,7 @@ async def serve_on(
         lifespan="off",
         ws="none",
         loop="none",
-        http="h11",
+        http=_Connection,
         log_config=None,
         access_log=False,
         server_header=False,

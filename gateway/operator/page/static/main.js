@@ -187,6 +187,10 @@ $("login").addEventListener("submit", async (event) => {
     setText($("login-refused"), error.message);
   }
 });
+document.querySelector(".skip").addEventListener("click", (event) => {
+  event.preventDefault(); // the part that is open stands behind the #
+  $("content").focus();
+});
 $("stop").addEventListener("click", () => say({ command: "stop" }));
 $("language").addEventListener("change", () => {
   localStorage.setItem("language", $("language").value);
