@@ -133,6 +133,24 @@ def test_a_session_ends_when_idle_and_at_the_end_of_a_shift(step_s: float, steps
     assert found is None
 
 
+def test_who_only_looks_has_to_log_in_again_who_says_something_has_not():
+    clock = Clock()
+
+    async def story(*says: str) -> int:
+        async with page(clock=clock) as there:
+            await there.log_in()
+            for _ in range(2):
+                clock.now_s += 0.6 * IDLE_S
+                for command in says:
+                    await there.say(command)
+                answer = await there.browser.get("/api/line")
+                assert answer.status_code == 200 or clock.now_s > 1000.0 + IDLE_S
+            return (await there.browser.get("/api/line")).status_code
+
+    assert asyncio.run(story()) == 401
+    assert asyncio.run(story("hold")) == 200
+
+
 def test_looking_on_does_not_keep_a_session_alive():
     clock = Clock()
     sessions = Sessions(clock)

@@ -4,6 +4,7 @@ import { confirmed } from "./dialog.js";
 import { time, word } from "./words.js";
 
 const SHELF_S = 1800, ORDER = ["high", "medium", "low"];
+const shelved = (one) => one.shelved_until_wall_s !== null;
 
 export class Alarms {
   constructor(say, may) {
@@ -11,7 +12,7 @@ export class Alarms {
     this.known = new Set();
   }
 
-  paint({ alarms }, shelved = (one) => one.shelved_until_wall_s !== null) {
+  paint({ alarms }) {
     const rank = (one) => (shelved(one) ? 20 : 0) + (one.active ? 0 : 10) + ORDER.indexOf(one.priority);
     const sorted = [...alarms].sort((a, b) => rank(a) - rank(b) || a.since_wall_s - b.since_wall_s);
     const open = sorted.filter((one) => one.active && !shelved(one));
@@ -23,12 +24,12 @@ export class Alarms {
     replaced($("now-alarms"), `${document.documentElement.lang} ${open.length} ${open[0]?.name}`, () =>
       open.length ? h("span", { class: `alarm-count ${open[0].priority}` }, `▲ ${open.length}`) : word("alarms.none-short"));
     replaced($("alarm-list"), JSON.stringify([sorted, document.documentElement.lang]), () =>
-      sorted.length ? h("ul", { class: "plain" }, sorted.map((one) => this.item(one, shelved(one)))) : h("p", {}, word("alarms.none")));
+      sorted.length ? h("ul", { class: "plain" }, sorted.map((one) => this.item(one))) : h("p", {}, word("alarms.none")));
   }
 
-  item(one, shelved) {
-    const bad = one.active && !shelved;
-    const state = shelved ? word("alarms.shelved", { until: time(one.shelved_until_wall_s) }) : word(one.active ? "alarms.active" : "alarms.ended");
+  item(one) {
+    const bad = one.active && !shelved(one);
+    const state = shelved(one) ? word("alarms.shelved", { until: time(one.shelved_until_wall_s) }) : word(one.active ? "alarms.active" : "alarms.ended");
     const seen = one.acknowledged ? word("alarms.seen-by", { name: one.acknowledged_by }) : word("alarms.unseen");
     return h("li", { class: `alarm ${bad ? one.priority : "over"}` },
       h("p", {}, h("b", { class: bad ? "tag" : "tag over" }, `${bad ? "▲ " : ""}${word(`priority.${one.priority}`)}`), " ", english("b", one.means)),
@@ -40,11 +41,11 @@ export class Alarms {
         h("p", {}, h("b", {}, word("alarms.consequence")), " ", english("span", one.consequence))),
       this.may("acknowledge") && h("div", { class: "buttons" },
         !one.acknowledged && h("button", { type: "button", "data-focus": `ack-${one.name}`, onclick: () => this.say({ command: "acknowledge", alarm: one.name }) }, word("alarms.acknowledge")),
-        h("button", { type: "button", "data-focus": `shelve-${one.name}`, onclick: () => this.shelve(one, shelved) }, word(shelved ? "alarms.unshelve" : "alarms.shelve"))));
+        h("button", { type: "button", "data-focus": `shelve-${one.name}`, onclick: () => this.shelve(one) }, word(shelved(one) ? "alarms.unshelve" : "alarms.shelve"))));
   }
 
-  async shelve(one, shelved) {
-    if (shelved) return this.say({ command: "shelve", alarm: one.name, for_s: 0, because: word("alarms.unshelve") });
+  async shelve(one) {
+    if (shelved(one)) return this.say({ command: "shelve", alarm: one.name, for_s: 0, because: word("alarms.unshelve") });
     const because = await confirmed({ title: word("alarms.sure-shelve"), lines: [{ english: one.means }, word("alarms.then-shelve")], yes: word("alarms.shelve"), comment: true, needed: true });
     if (because) await this.say({ command: "shelve", alarm: one.name, for_s: SHELF_S, because });
   }

@@ -111,10 +111,10 @@ function paint() {
 // Four times a second, whether anything comes or not: how old it is, and how long there is to decide.
 function look() {
   if (!parts) return;
-  const age_ms = performance.now() - heard_ms, stale = age_ms > STALE_MS;
+  const old = performance.now() - heard_ms > STALE_MS, stale = old || tick?.loop.running === false;
   show($("stale"), stale);
   document.body.classList.toggle("stale", stale);
-  if (stale) setText($("stale"), tick ? word("stale.old") : word("stale.none"));
+  if (stale) setText($("stale"), word(!tick ? "stale.none" : old ? "stale.old" : "stale.loop"));
   setText($("clock"), tick ? (stale ? word("stale.at", { time: time(tick.wall_s) }) : time(tick.wall_s)) : "");
   parts.change.paint(Date.now() / 1000 + skew_s);
 }

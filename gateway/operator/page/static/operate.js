@@ -48,13 +48,13 @@ export class Operate {
     const max = this.line.speed_max_m_per_s;
     const value = this.fields.speed = h("input", { type: "number", min: 0, max, step: "0.001", required: true, inputmode: "decimal" });
     return this.form("speed", () => this.say({ command: "speed", speed_m_per_s: Number(value.value) }),
-      h("label", { class: "grow" }, h("span", {}, `${word("operate.speed")}, m/s, 0 ${word("operate.to")} ${number(max, 2)}`), value));
+      h("label", {}, h("span", {}, `${word("operate.speed")}, m/s, 0 ${word("operate.to")} ${number(max, 2)}`), value));
   }
 
   recipe() {
     const name = h("select", {}, this.line.recipes.map((recipe) => h("option", { value: recipe.name },
       `${recipe.name} (${number(Math.min(...recipe.tension_n), 0)}–${number(Math.max(...recipe.tension_n), 0)} N, ${number(recipe.speed_m_per_s, 2)} m/s)`)));
-    return this.form("recipe", () => this.say({ command: "recipe", name: name.value }), h("label", { class: "grow" }, h("span", {}, word("operate.recipe")), name));
+    return this.form("recipe", () => this.say({ command: "recipe", name: name.value }), h("label", {}, h("span", {}, word("operate.recipe")), name));
   }
 
   async back() {

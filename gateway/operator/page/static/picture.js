@@ -8,7 +8,6 @@ export class Picture {
   constructor(line) {
     this.line = line;
     this.cells = [];
-    this.rows = line.spans.map(() => null);
     new ResizeObserver(() => this.build()).observe($("picture"));
     this.build();
     this.table();
