@@ -5,7 +5,8 @@ import gc
 import logging
 import signal
 import sys
-from collections.abc import Awaitable, Callable
+import time
+from collections.abc import Awaitable, Callable, Coroutine
 from pathlib import Path
 
 from gateway.core.line import Line
@@ -13,9 +14,13 @@ from gateway.core.people import Role
 from gateway.mailbox.paths import GATEWAY_SOCKET
 from gateway.mailbox.unix import UnixMailbox
 from gateway.operator.line_side import TOPICS, LineSide
-from gateway.operator.opcua.server import CannotServe
+from gateway.operator.opcua.login import Check
+from gateway.operator.opcua.server import CannotServe, NotSetUp
 from gateway.operator.opcua.service import OpcUa
-from gateway.operator.opcua.trust import pki_folder
+from gateway.operator.opcua.trust import CERTIFICATE, PRIVATE_KEY, pki_folder
+from gateway.operator.page.app import page_app
+from gateway.operator.page.serve import CannotServe as PageCannotServe
+from gateway.operator.page.serve import listening, serve_on
 from gateway.operator.users import FILE_NAME, UsersFile, UsersRefused
 
 EXIT_OK, EXIT_CANNOT_SERVE = 0, 2
@@ -26,27 +31,38 @@ def run_operator(line: Line, run_folder: Path, data_folder: Path) -> int:
     logging.getLogger("asyncua").setLevel(logging.CRITICAL)  # whatever strangers send would be written down
     try:
         asyncio.run(serve(line, run_folder, data_folder))
-    except CannotServe as error:
+    except (CannotServe, PageCannotServe) as error:
         print(f"the operator's process cannot start: {error}", file=sys.stderr)
         return EXIT_CANNOT_SERVE
     return EXIT_OK
 
 
 async def serve(line: Line, run_folder: Path, data_folder: Path) -> None:
-    """All of it, in one event loop. Raises CannotServe."""
+    """All of it, in one event loop. Raises CannotServe of either."""
     stop = asyncio.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
     mailbox = UnixMailbox()
     mailbox.connect(TOPICS, run_folder / GATEWAY_SOCKET)
-    side = LineSide(mailbox)
-    opcua = OpcUa(line, side, pki_folder(line, data_folder), checked_by(data_folder / FILE_NAME, _tell), _tell)
+    side, users = LineSide(mailbox), data_folder / FILE_NAME
+    check, pki = checked_by(users, _tell), pki_folder(line, data_folder)
+    opcua = _opcua(line, side, pki, check)
+    page = page_app(line, side, check, time.monotonic)
+    tls = (pki / CERTIFICATE, pki / PRIVATE_KEY) if line.operator.page.startswith("https:") else (None, None)
     try:
-        await opcua.start()
-        print(f"operator of {line.site}/{line.line}: OPC UA on {line.operator.opc_ua}", flush=True)
+        listener = listening(line.operator.page)
+        works: list[Coroutine[object, object, object]] = [side.watch(), serve_on(page, listener, *tls), stop.wait()]
+        served = [f"page at {line.operator.page}"]
+        if opcua is not None:
+            await opcua.start()
+            works.append(opcua.run())
+            served.append(f"OPC UA at {line.operator.opc_ua}")
+        print(f"operator of {line.site}/{line.line}: {', '.join(served)}", flush=True)
+        if not users.exists() and line.operator.anonymous == "none":
+            _tell("nobody can come in yet: `r2rgate users add NAME --role ROLE LINE.toml` lets somebody")
         gc.collect()
         gc.freeze()  # half a million nodes and references that stay: to look through them takes 0.15 s each time
-        tasks = [asyncio.create_task(work) for work in (side.watch(), opcua.run(), stop.wait())]
+        tasks = [asyncio.create_task(work) for work in works]
         done, others = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
         for task in others:
             task.cancel()
@@ -54,8 +70,18 @@ async def serve(line: Line, run_folder: Path, data_folder: Path) -> None:
         for task in done:
             task.result()  # what has failed is told, and the process started again
     finally:
-        await opcua.stop()
+        if opcua is not None:
+            await opcua.stop()
         await mailbox.close()
+
+
+def _opcua(line: Line, side: LineSide, pki: Path, check: Check) -> OpcUa | None:
+    """None where it has no certificate yet: the page needs none. Raises CannotServe."""
+    try:
+        return OpcUa(line, side, pki, check, _tell)
+    except NotSetUp as error:
+        _tell(f"OPC UA clients are not served: {error}")
+        return None
 
 
 def checked_by(path: Path, tell: Callable[[str], None]) -> Callable[[str, str], Awaitable[Role | None]]:

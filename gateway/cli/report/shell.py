@@ -19,14 +19,14 @@ def html_page(title: str, header: str, main: str, data: str, script: str) -> str
     It holds script, style and data, and works from a file. Its content security policy forbids every request, and every
     script but the two of its own.
     """
-    licence = f"/*\n{_asset('uplot.LICENSE.txt')}\n*/\n"
-    scripts = {"uplot": licence + _asset("uplot.iife.min.js"), "script": _asset("charts.js") + _asset(script)}
+    licence = f"/*\n{_uplot('uplot.LICENSE.txt')}\n*/\n"
+    scripts = {"uplot": licence + _uplot("uplot.iife.min.js"), "script": _asset("charts.js") + _asset(script)}
     hashes = " ".join(f"'sha256-{_sha256(text)}'" for text in scripts.values())
     return Template(_asset("page.html")).substitute(
         scripts,
         policy=f"default-src 'none'; style-src 'unsafe-inline'; script-src {hashes}",
         title=escape(title),
-        style=_asset("uplot.min.css") + _asset("report.css"),
+        style=_uplot("uplot.min.css") + _asset("report.css"),
         header=header,
         main=main,
         data=data,
@@ -70,3 +70,8 @@ def _asset(name: str) -> str:
 
 def _sha256(text: str) -> str:
     return base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
+
+
+def _uplot(name: str) -> str:
+    """Of the one copy, which the operator's page serves as it is."""
+    return (files("gateway.operator.page") / "static" / name).read_text(encoding="utf-8")

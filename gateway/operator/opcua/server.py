@@ -41,6 +41,10 @@ class CannotServe(Exception):
     """The text says why, and what to do."""
 
 
+class NotSetUp(CannotServe):
+    """It has no certificate yet."""
+
+
 class _Trusted(SecurityPolicyFactory):
     """A security policy for clients whose certificate is trusted, before anything they say is looked at."""
 
@@ -145,7 +149,7 @@ def _load(stack: Stack, pki: Path) -> str:
             raise CannotServe(f"{pki / PRIVATE_KEY} is not the key of {pki / CERTIFICATE}: move both away; {way_out}")
         return application_uri(stack.certificate)
     except FileNotFoundError as error:
-        raise CannotServe(f"there is no {error.filename}: {way_out}") from error
+        raise NotSetUp(f"there is no {error.filename}: {way_out}") from error
     except OSError as error:
         raise CannotServe(f"{error.filename} cannot be read: {error.strerror}") from error
     except (NotUsable, ValueError, TypeError) as error:

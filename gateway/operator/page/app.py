@@ -1,0 +1,52 @@
+"""The page as a web application: its files, what it asks for, what it is told ten times a second, and the way in."""
+
+from collections.abc import Callable
+from importlib.resources import files
+from pathlib import Path
+from urllib.parse import urlsplit
+
+from starlette.applications import Starlette
+from starlette.exceptions import HTTPException
+from starlette.middleware import Middleware
+from starlette.requests import Request
+from starlette.responses import JSONResponse
+from starlette.routing import Mount, Route
+from starlette.staticfiles import StaticFiles
+
+from gateway.core.line import Line
+from gateway.operator.line_side import LineSide
+from gateway.operator.page.asks import Asks
+from gateway.operator.page.events import Ticks, stream
+from gateway.operator.page.guard import LOOPBACK, Guarded
+from gateway.operator.page.login import Check, Door
+from gateway.operator.page.words import words_routes
+
+STATIC = Path(str(files("gateway.operator.page"))) / "static"
+
+
+def page_app(line: Line, side: LineSide, check: Check, clock: Callable[[], float]) -> Starlette:
+    """`check`: the role of whoever has this name and password, None: nobody has. `clock`: monotonic, s.
+
+    The page speaks TLS where the address in the line's file says https; then its cookie is sent over TLS alone.
+    """
+    address = urlsplit(line.operator.page)
+    door = Door(check, clock, line.operator.anonymous == "read", address.scheme == "https")
+    asks, ticks = Asks(line, side, door), Ticks(side)
+    app = Starlette(
+        routes=[
+            *door.routes(),
+            *asks.routes(),
+            *words_routes(),
+            Route("/events", stream(ticks, door.visitor, door.may_look)),
+            Mount("/", StaticFiles(directory=STATIC, html=True)),
+        ],
+        middleware=[Middleware(Guarded, loopback=address.hostname in LOOPBACK)],
+        exception_handlers={HTTPException: _refused},
+    )
+    app.state.end = ticks.end  # `serve_on` calls it: a stream has no end of its own
+    return app
+
+
+async def _refused(_: Request, error: Exception) -> JSONResponse:
+    assert isinstance(error, HTTPException)
+    return JSONResponse({"ok": False, "text": error.detail}, error.status_code, error.headers)

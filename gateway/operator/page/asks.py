@@ -1,0 +1,110 @@
+"""What the page asks for: the line, proposals, records, tensions of the past; and what people say."""
+
+import json
+from typing import Annotated, Any
+
+from pydantic import Field, TypeAdapter, ValidationError
+from starlette.exceptions import HTTPException
+from starlette.requests import Request
+from starlette.responses import JSONResponse
+from starlette.routing import Route
+
+from gateway.core.line import Line
+from gateway.core.line_past import TensionsBetween
+from gateway.core.people import LEAST, Said, may, why_may_not
+from gateway.operator.line_side import LineSide, NotTold
+from gateway.operator.page.guard import body_of
+from gateway.operator.page.login import Door
+from gateway.operator.page.tick import line_told
+from gateway.operator.page.told import proposal_told
+
+_SAID: TypeAdapter[Said] = TypeAdapter(Annotated[Said, Field(discriminator="command")])
+
+
+class Asks:
+    """Hands on what the gateway tells, to whoever may look; and what a person says, in their name."""
+
+    def __init__(self, line: Line, side: LineSide, door: Door) -> None:
+        self._line = line_told(line)
+        self._side = side
+        self._door = door
+
+    def routes(self) -> list[Route]:
+        return [
+            Route("/api/line", self._of_line),
+            Route("/api/proposals", self._proposals),
+            Route("/api/proposals/{proposal}", self._proposal),
+            Route("/api/records", self._records),
+            Route("/api/tensions", self._tensions),
+            Route("/api/say", self._say, methods=["POST"]),
+        ]
+
+    async def _of_line(self, request: Request) -> JSONResponse:
+        visitor = self._door.visitor(request)
+        return JSONResponse({**self._line, "may": [command for command in LEAST if may(visitor.role, command)]})
+
+    async def _proposals(self, request: Request) -> JSONResponse:
+        self._door.visitor(request)
+        if self._side.proposals is None:
+            raise HTTPException(503, self._side.trouble or "the gateway has not told yet")
+        return JSONResponse(self._side.proposals.model_dump())
+
+    async def _proposal(self, request: Request) -> JSONResponse:
+        self._door.visitor(request)
+        try:
+            return JSONResponse(proposal_told(await self._side.shown(request.path_params["proposal"])))
+        except ValidationError as error:
+            raise HTTPException(400, _in_words(error)) from None
+        except NotTold as error:
+            raise HTTPException(503, str(error)) from error
+
+    async def _records(self, request: Request) -> JSONResponse:
+        self._door.visitor(request)
+        after = request.query_params.get("after")
+        if after is not None and not (after.isdecimal() and len(after) < 18):
+            raise HTTPException(400, f"after is {after[:20]!r}; allowed: the number of a record")
+        try:
+            told = await self._side.records(None if after is None else int(after))
+        except NotTold as error:
+            raise HTTPException(503, str(error)) from error
+        # What a record holds in full stays in the audit: the page has its sentence.
+        return JSONResponse(told.model_dump(exclude={"records": {"__all__": {"what"}}}))
+
+    async def _tensions(self, request: Request) -> JSONResponse:
+        self._door.visitor(request)
+        try:
+            asked = TensionsBetween.model_validate_strings(dict(request.query_params))
+        except ValidationError as error:
+            raise HTTPException(400, _in_words(error)) from None
+        try:
+            return JSONResponse((await self._side.tensions(asked)).model_dump())
+        except NotTold as error:
+            raise HTTPException(503, str(error)) from error
+
+    async def _say(self, request: Request) -> JSONResponse:
+        person = self._door.person(request)
+        try:
+            said = _SAID.validate_python(_object(await body_of(request)))
+        except ValidationError as error:
+            raise HTTPException(400, _in_words(error)) from None
+        if reason := why_may_not(person, said.command):
+            # The gateway refuses it as well, and its audit has to know that it was tried.
+            reply = await self._side.say(person, said)
+            return JSONResponse({**reply.model_dump(exclude={"in_service"}), "ok": False, "text": reason}, 403)
+        reply = await self._side.say(person, said)
+        return JSONResponse(reply.model_dump(exclude={"in_service"}), 200 if reply.ok else 409)
+
+
+def _object(body: bytes) -> dict[str, Any]:
+    """Raises HTTPException."""
+    try:
+        found = json.loads(body)
+    except (ValueError, RecursionError):
+        found = None
+    if not isinstance(found, dict):
+        raise HTTPException(400, "what is said is no JSON object")
+    return found
+
+
+def _in_words(error: ValidationError) -> str:
+    return "; ".join(f"{'.'.join(map(str, one['loc'])) or 'it'}: {one['msg']}" for one in error.errors()[:20])

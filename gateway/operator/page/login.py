@@ -1,0 +1,137 @@
+"""The way in: names and passwords, the cookie of a session, and who a request comes from."""
+
+import math
+import secrets
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+from typing import Annotated
+
+from pydantic import Field, ValidationError
+from starlette.exceptions import HTTPException
+from starlette.requests import Request
+from starlette.responses import JSONResponse
+from starlette.routing import Route
+
+from gateway.core.line import Strict
+from gateway.core.people import Person, Role
+from gateway.operator.page.guard import body_of
+from gateway.operator.page.sessions import LONGEST_S, Session, Sessions, Tries
+
+Check = Callable[[str, str], Awaitable[Role | None]]
+
+MOST_CHECKS = 4  #: passwords that wait to be checked: each takes memory and time
+TOKEN_HEADER = "x-r2rgate-token"
+
+
+class _Login(Strict):
+    name: Annotated[str, Field(max_length=64)]
+    password: Annotated[str, Field(max_length=1000)]
+
+
+@dataclass(frozen=True)
+class Visitor:
+    """Whoever looks at the page."""
+
+    name: str | None  #: None: nobody has logged in, and anybody may look
+    role: Role
+    token: str | None
+
+
+class Door:
+    """Lets people in, and says who they are. `anonymous`: whoever has no name may look."""
+
+    def __init__(self, check: Check, clock: Callable[[], float], anonymous: bool, secure: bool) -> None:
+        self._check = check
+        self._anonymous = anonymous
+        self._secure = secure
+        self._cookie = "__Host-r2rgate" if secure else "r2rgate"
+        self._sessions = Sessions(clock)
+        self._tries = Tries(clock)
+        self._checking = 0
+
+    def routes(self) -> list[Route]:
+        return [
+            Route("/api/login", self._login, methods=["POST"]),
+            Route("/api/logout", self._logout, methods=["POST"]),
+            Route("/api/me", self._me),
+        ]
+
+    def visitor(self, request: Request) -> Visitor:
+        """Raises HTTPException 401: log in."""
+        visitor = self._known(self._sessions.find(self._key(request)))
+        if visitor is None:
+            raise HTTPException(401, "log in")
+        return visitor
+
+    def may_look(self, request: Request) -> bool:
+        """Still; this is no request of the person."""
+        return self._anonymous or self._sessions.find(self._key(request)) is not None
+
+    def person(self, request: Request) -> Person:
+        """Who says something. Raises HTTPException where nobody has logged in, or another site's page asks."""
+        visitor = self.visitor(request)
+        if visitor.name is None or visitor.token is None:
+            raise HTTPException(401, "log in")
+        if not secrets.compare_digest(request.headers.get(TOKEN_HEADER, "").encode(), visitor.token.encode()):
+            raise HTTPException(403, "the request does not carry this session's token; load the page anew")
+        self._sessions.use(self._key(request))
+        return Person(name=visitor.name, role=visitor.role, through="page")
+
+    async def _login(self, request: Request) -> JSONResponse:
+        try:
+            login = _Login.model_validate_json(await body_of(request))
+        except ValidationError:
+            raise HTTPException(400, "a login is a name and a password") from None
+        place = request.client.host if request.client else ""
+        if wait_s := self._tries.wait_s(place):
+            whole_s = math.ceil(wait_s)
+            raise HTTPException(429, f"too many tries; wait {whole_s} s", {"retry-after": str(whole_s)})
+        if self._checking >= MOST_CHECKS:
+            raise HTTPException(503, "too many people are logging in; try again", {"retry-after": "1"})
+        role = await self._role(login)
+        if role is None:
+            self._tries.failed(place)
+            raise HTTPException(403, "name or password is wrong")
+        self._tries.went_well(place)
+        self._sessions.end(self._key(request))
+        return self._let_in(login.name, role)
+
+    async def _role(self, login: _Login) -> Role | None:
+        self._checking += 1
+        try:
+            return await self._check(login.name, login.password)
+        finally:
+            self._checking -= 1
+
+    def _let_in(self, name: str, role: Role) -> JSONResponse:
+        key = self._sessions.begin(name, role)
+        session = self._sessions.find(key)
+        assert session is not None
+        answer = JSONResponse(_told(Visitor(name, role, session.token)))
+        answer.set_cookie(
+            self._cookie, key, max_age=int(LONGEST_S), path="/", secure=self._secure, httponly=True, samesite="strict"
+        )
+        return answer
+
+    async def _logout(self, request: Request) -> JSONResponse:
+        self.person(request)
+        self._sessions.end(self._key(request))
+        answer = JSONResponse({})
+        answer.delete_cookie(self._cookie, path="/", secure=self._secure, httponly=True, samesite="strict")
+        return answer
+
+    async def _me(self, request: Request) -> JSONResponse:
+        visitor = self._known(self._sessions.use(self._key(request)))
+        return JSONResponse(_told(visitor) if visitor else {"name": None, "role": None, "token": None})
+
+    def _known(self, session: Session | None) -> Visitor | None:
+        if session is not None:
+            return Visitor(session.name, session.role, session.token)
+        return Visitor(None, "viewer", None) if self._anonymous else None
+
+    def _key(self, request: Request) -> str:
+        return request.cookies.get(self._cookie, "")
+
+
+def _told(visitor: Visitor) -> dict[str, str | None]:
+    return {"name": visitor.name, "role": visitor.role, "token": visitor.token}

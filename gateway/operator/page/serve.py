@@ -1,0 +1,103 @@
+"""The page on its address: plain on loopback, TLS elsewhere. It shares the event loop of the operator's process."""
+
+import asyncio
+import contextlib
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import uvicorn
+from starlette.applications import Starlette
+from uvicorn.protocols.http.h11_impl import H11Protocol
+
+MOST_CONNECTIONS = 100
+IDLE_S = 10.0  #: of a connection without a whole request
+CLOSING_S = 1  #: for answers that are on their way
+
+
+class CannotServe(Exception):
+    """The address cannot be listened on, or its certificate cannot be read; the text says why."""
+
+
+class _Connection(H11Protocol):
+    """Is closed when it brings no whole request: whoever opens many and says nothing takes no place from others."""
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
+        super().connection_made(transport)
+        self.loop.call_later(IDLE_S, self._look, self.cycle)
+
+    def _look(self, before: object) -> None:
+        """`before`: the request that was the newest when it was looked at last."""
+        if self.transport.is_closing():
+            return
+        if self.cycle is before and (self.cycle is None or self.cycle.response_complete):
+            self.transport.close()
+        else:
+            self.loop.call_later(IDLE_S, self._look, self.cycle)
+
+
+class _Server(uvicorn.Server):
+    @contextlib.contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        """Signals belong to the process, which is more than a page."""
+        yield
+
+
+async def serve_page(app: Starlette, address: str, certificate: Path | None = None, key: Path | None = None) -> None:
+    """Until it is cancelled. `address` as in the line's file; with https `certificate` and `key` are PEM files.
+
+    Raises CannotServe.
+    """
+    await serve_on(app, listening(address), certificate, key)
+
+
+def listening(address: str) -> socket.socket:
+    """Raises CannotServe."""
+    parts = urlsplit(address)
+    host, port = parts.hostname or "", parts.port
+    port = (443 if parts.scheme == "https" else 80) if port is None else port
+    try:
+        family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
+        return socket.create_server((host, port), family=family, backlog=64)
+    except OSError as error:
+        raise CannotServe(f"the page cannot be at {address}: {error}") from error
+
+
+async def serve_on(
+    app: Starlette, listener: socket.socket, certificate: Path | None = None, key: Path | None = None
+) -> None:
+    """Until it is cancelled. `app` is one of `page_app`. Raises CannotServe."""
+    config = uvicorn.Config(
+        app,
+        ssl_certfile=certificate,
+        ssl_keyfile=key,
+        lifespan="off",
+        ws="none",
+        loop="none",
+        http=_Connection,
+        log_config=None,
+        access_log=False,
+        server_header=False,
+        proxy_headers=False,
+        limit_concurrency=MOST_CONNECTIONS,
+        timeout_keep_alive=5,
+        timeout_graceful_shutdown=CLOSING_S,
+        h11_max_incomplete_event_size=16_384,
+    )
+    try:
+        config.load()
+    except OSError as error:  # ssl.SSLError is one
+        listener.close()
+        raise CannotServe(f"the page's certificate {certificate} and key {key} cannot be used: {error}") from error
+    server = _Server(config)
+    serving = asyncio.ensure_future(server.serve(sockets=[listener]))
+    try:
+        await asyncio.shield(serving)
+    except asyncio.CancelledError:
+        app.state.end()
+        server.should_exit = True
+        await serving
+        raise
+    finally:
+        listener.close()

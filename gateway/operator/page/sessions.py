@@ -1,0 +1,96 @@
+"""Who is logged in at the page, for how long, and how fast names and passwords may be tried. Pure: time is given."""
+
+import secrets
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from gateway.core.people import Role
+
+IDLE_S = 3600.0  #: nothing said, and the page not loaded anew; looking on alone is nothing
+LONGEST_S = 12.0 * 3600.0  #: a shift, and the way there
+MOST_SESSIONS = 64  #: the one that has been idle for longest goes first
+
+FREE_TRIES = 3  #: that fail, before the next has to wait
+LONGEST_WAIT_S = 60.0
+FORGOTTEN_S = 900.0  #: after the last one that failed
+MOST_PLACES = 1000  #: from which tries are remembered
+
+
+@dataclass
+class Session:
+    name: str
+    role: Role
+    token: str  #: in a header of every request that changes something: no other site's page can know it
+    began_s: float
+    seen_s: float
+
+
+class Sessions:
+    """By the random key that the browser keeps in a cookie."""
+
+    def __init__(self, clock: Callable[[], float]) -> None:
+        self._clock = clock
+        self._by_key: OrderedDict[str, Session] = OrderedDict()  # the one used last at the end
+
+    def begin(self, name: str, role: Role) -> str:
+        """The key, 256 random bits."""
+        key, now_s = secrets.token_urlsafe(32), self._clock()
+        self._by_key[key] = Session(name, role, secrets.token_urlsafe(32), now_s, now_s)
+        while len(self._by_key) > MOST_SESSIONS:
+            self._by_key.popitem(last=False)
+        return key
+
+    def find(self, key: str) -> Session | None:
+        """None: there is none, or no longer."""
+        session = self._by_key.get(key)
+        if session is None:
+            return None
+        now_s = self._clock()
+        if now_s - session.seen_s > IDLE_S or now_s - session.began_s > LONGEST_S:
+            del self._by_key[key]
+            return None
+        return session
+
+    def use(self, key: str) -> Session | None:
+        """As `find`, and it is not idle."""
+        session = self.find(key)
+        if session is not None:
+            session.seen_s = self._clock()
+            self._by_key.move_to_end(key)
+        return session
+
+    def end(self, key: str) -> None:
+        self._by_key.pop(key, None)
+
+
+@dataclass
+class _Failures:
+    count: int
+    last_s: float
+
+
+class Tries:
+    """Of names and passwords, by where they come from. Who fails waits, each time twice as long."""
+
+    def __init__(self, clock: Callable[[], float]) -> None:
+        self._clock = clock
+        self._failed: OrderedDict[str, _Failures] = OrderedDict()
+
+    def wait_s(self, place: str) -> float:
+        """0: the next may be made now."""
+        failures = self._failed.get(place)
+        if failures is None or failures.count < FREE_TRIES:
+            return 0.0
+        wait_s = min(LONGEST_WAIT_S, 2.0 ** (failures.count - FREE_TRIES))
+        return max(0.0, failures.last_s + wait_s - self._clock())
+
+    def failed(self, place: str) -> None:
+        before, now_s = self._failed.pop(place, None), self._clock()
+        count = 0 if before is None or now_s - before.last_s > FORGOTTEN_S else before.count
+        self._failed[place] = _Failures(min(count + 1, 30), now_s)
+        while len(self._failed) > MOST_PLACES:
+            self._failed.popitem(last=False)
+
+    def went_well(self, place: str) -> None:
+        self._failed.pop(place, None)

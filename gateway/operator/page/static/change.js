@@ -1,0 +1,107 @@
+// A proposal, and the way to a decision on it. What is decided on is exactly what is shown, by its hash.
+import { $, english, h, replaced, setText } from "./dom.js";
+import { confirmed } from "./dialog.js";
+import { beforeAfter, margins } from "./figures.js";
+import { Refused, ask } from "./net.js";
+import { duration, figure, instant, word } from "./words.js";
+
+export class Change {
+  constructor(say, may) {
+    this.say = say;
+    this.may = may;
+    this.asked = 0;
+  }
+
+  // `hash`: empty for the one that waits.
+  async open(hash, waiting) {
+    const wanted = hash || waiting[0];
+    this.wanted = wanted;
+    const number = ++this.asked;
+    if (!wanted) return this.empty();
+    try {
+      const shown = await ask(`api/proposals/${wanted}`);
+      if (number === this.asked) this.fill(shown);
+    } catch (error) {
+      if (!(error instanceof Refused)) throw error;
+      if (number === this.asked) this.put(error.message, () => h("section", { class: "panel" }, h("h2", {}, word("change.title")), english("p", error.message)));
+    }
+  }
+
+  put(key, make) {
+    replaced($("view-change"), `${document.documentElement.lang} ${key}`, make);
+  }
+
+  empty() {
+    this.shown = null;
+    this.put("none", () => h("section", { class: "panel" }, h("h2", {}, word("change.title")), h("p", {}, word("change.none")),
+      h("p", {}, h("a", { class: "button", href: "#history" }, word("view.history")))));
+  }
+
+  fill(shown) {
+    this.shown = shown;
+    this.put(JSON.stringify(shown), () => [this.what(shown), this.figures(shown), this.rules(shown), this.bar(shown)]);
+  }
+
+  what(shown) {
+    const quoted = h("figure", { class: "quote" }, english("blockquote", shown.reason), h("figcaption", {}, word("change.said-by", { author: shown.author, when: instant(shown.created) })));
+    return h("section", { class: "panel" },
+      h("h2", {}, word(`kind.${shown.kind}`), " ", h("code", {}, shown.proposal_hash.slice(0, 12))),
+      h("p", {}, word(`stage.${shown.stage}`), shown.why && [": ", english("span", shown.why)]),
+      h("h3", {}, word("change.difference")), h("ul", {}, shown.difference.map((line) => english("li", line))),
+      h("h3", {}, word("change.reason")), quoted,
+      shown.evidence.length > 0 && [h("h3", {}, word("change.evidence")), h("ul", {}, shown.evidence.map(evidence))],
+      shown.predicted.length > 0 && [h("h3", {}, word("change.promised")), h("ul", {}, shown.predicted.map(promise))]);
+  }
+
+  figures(shown) {
+    if (!shown.verdict?.figures.length) return null;
+    return h("section", { class: "panel" }, h("h2", {}, word("change.figures")), h("p", { class: "muted" }, word("change.figures-how")), beforeAfter(shown.verdict.figures));
+  }
+
+  rules(shown) {
+    if (!shown.verdict) return null;
+    const { findings, reported, accepted } = shown.verdict;
+    return h("section", { class: "panel wide" }, h("h2", {}, word("change.rules")),
+      h("p", {}, word(accepted ? "change.accepted" : "change.refused", { rules: findings.length }), " ", word("change.rules-how")),
+      margins(findings),
+      reported.length > 0 && h("details", {}, h("summary", {}, word("change.reported")), margins(reported)));
+  }
+
+  bar(shown) {
+    const until = h("span", { id: "expiry" });
+    const decides = shown.shown && this.may("decide");
+    return h("div", { class: "decide" }, shown.stage === "waiting" && until,
+      shown.shown && !this.may("decide") && h("span", {}, word("change.may-not")),
+      decides && h("button", { type: "button", "data-focus": "reject", onclick: () => this.decide(shown, false) }, word("change.reject")),
+      decides && h("button", { type: "button", class: "main", "data-focus": "approve", onclick: () => this.decide(shown, true) }, word("change.approve")));
+  }
+
+  async decide(shown, approve) {
+    const what = shown.difference.slice(0, 4).map((line) => ({ english: line }));
+    const answer = await confirmed({
+      title: word(approve ? "change.sure-approve" : "change.sure-reject"),
+      lines: [...what, word(approve ? "change.then-approve" : "change.then-reject"), word("change.hash", { hash: shown.shown.slice(0, 12) })],
+      yes: word(approve ? "change.yes-approve" : "change.yes-reject"), comment: true,
+    });
+    if (answer === null) return;
+    location.hash = `#change/${shown.proposal_hash}`; // what becomes of it stays in sight
+    await this.say({ command: "decide", proposal: shown.proposal_hash, shown: shown.shown, approve, comment: answer });
+  }
+
+  paint(now_s) {
+    const element = $("expiry");
+    if (!element || !this.shown) return;
+    const left_s = Date.parse(this.shown.expires) / 1000 - now_s;
+    setText(element, left_s > 0 ? word("change.expires", { left: duration(left_s) }) : word("change.expired"));
+  }
+}
+
+function evidence(one) {
+  const value = one.value == null ? "" : `: ${figure(one.value)} ${one.unit}`;
+  return h("li", {}, english("span", one.what), value, one.digest && [" ", h("code", {}, one.digest.slice(0, 12))]);
+}
+
+function promise(one) {
+  const parts = [["rmse_n", "N"], ["overshoot_pct", "%"], ["settling_s", "s"]].filter(([name]) => one[name] != null);
+  return h("li", {}, english("span", one.scenario), ": ", parts.map(([name, unit]) => `${word(`measure.${name}`)} ${figure(one[name])} ${unit}`).join(", "));
+}

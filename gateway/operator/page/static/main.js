@@ -1,0 +1,204 @@
+// The page: who is there, which part is open, and what every tick changes.
+import { Alarms } from "./alarms.js";
+import { Change } from "./change.js";
+import { $, english, h, replaced, setText, show } from "./dom.js";
+import { paintHealth } from "./health.js";
+import { Refused, ask, keepToken, listen } from "./net.js";
+import { Operate } from "./operate.js";
+import { paintHistory } from "./past.js";
+import { Picture } from "./picture.js";
+import { Trends } from "./trends.js";
+import { number, preferred, speak, time, word } from "./words.js";
+
+const STALE_MS = 1000, AGAIN_MS = 3000, LONG = 22, VIEWS = ["line", "change", "history", "health"];
+let parts = null, tick = null, heard_ms = 0, skew_s = 0, list = null, records = [];
+
+async function begin() {
+  await speak(preferred());
+  try {
+    const me = await ask("api/me");
+    await (me.role === null ? askName() : enter(me));
+  } catch (error) {
+    if (!(error instanceof Refused)) throw error;
+    reply(error);
+    setTimeout(begin, AGAIN_MS);
+  }
+}
+
+// The session has ended: everything anew.
+const out = () => location.reload();
+
+function askName() {
+  for (const id of ["now", "views", "logout"]) show($(id), false);
+  for (const view of VIEWS) show($(`view-${view}`), false);
+  show($("login"), true);
+  $("login").elements.name.focus();
+}
+
+async function enter(me) {
+  keepToken(me.token);
+  const line = await ask("api/line");
+  show($("login"), false);
+  show($("views"), true);
+  show($("now"), true);
+  const may = (command) => me.name !== null && line.may.includes(command);
+  show($("stop"), may("stop"));
+  show($("logout"), true);
+  setText($("logout"), word(me.name ? "logout" : "login.enter"));
+  $("logout").onclick = me.name ? logOut : askName;
+  setText($("me"), me.name ? `${me.name}, ${word(`role.${me.role}`)}` : word("role.anonymous"));
+  $("view-line").classList.toggle("long", line.n > LONG);
+  setText($("line-name"), `${line.site} / ${line.line}`);
+  document.title = `${line.site} / ${line.line}`;
+  route();
+  parts = { line, picture: new Picture(line), trends: new Trends(line), alarms: new Alarms(say, may), change: new Change(say, may), operate: new Operate(line, say, may) };
+  heard_ms = performance.now();
+  follow();
+}
+
+const follow = () => listen(hear, () => setTimeout(again, AGAIN_MS));
+
+// The stream has been refused: there is no session any more, or too many look.
+async function again() {
+  try {
+    (await ask("api/me")).role === null ? out() : follow();
+  } catch (error) {
+    if (!(error instanceof Refused)) throw error;
+    setTimeout(again, AGAIN_MS);
+  }
+}
+
+async function logOut() {
+  try {
+    await ask("api/logout", {});
+    out();
+  } catch (error) {
+    if (!(error instanceof Refused)) throw error;
+    reply(error);
+  }
+}
+
+function hear(kind, data) {
+  if (kind === "logged-out") return out();
+  if (kind === "away") return;
+  const first = !tick, before = tick;
+  [tick, heard_ms, skew_s] = [data, performance.now(), data.wall_s - Date.now() / 1000];
+  if (first) parts.trends.load(tick.wall_s);
+  if (first || before.revision !== tick.revision) news();
+  if (!first && before.loop.state !== tick.loop.state) setText($("announce"), word(`state.${tick.loop.state}`));
+  paint();
+}
+
+function paint() {
+  if (!tick || !parts) return;
+  const { loop } = tick;
+  setText($("now-state"), loop.running ? word(`state.${loop.state}`) : word("state.UNKNOWN"));
+  setText($("now-speed"), number(tick.speed, 3));
+  parts.alarms.paint(tick);
+  parts.trends.paint(tick);
+  if (open() === "line") {
+    parts.picture.paint(tick);
+    parts.operate.paint(tick);
+  }
+  if (open() === "health") paintHealth(tick, parts.line);
+  const { waiting } = tick;
+  show($("waiting"), waiting.length > 0);
+  setText($("waiting"), String(waiting.length));
+  show($("prompt"), waiting.length > 0);
+  setText($("prompt-text"), word(waiting.length === 1 ? "prompt.one" : "prompt.more", { count: waiting.length }));
+}
+
+// Four times a second, whether anything comes or not: how old it is, and how long there is to decide.
+function look() {
+  if (!parts) return;
+  const old = performance.now() - heard_ms > STALE_MS, stale = old || tick?.loop.running === false;
+  show($("stale"), stale);
+  document.body.classList.toggle("stale", stale);
+  if (stale) setText($("stale"), word(!tick ? "stale.none" : old ? "stale.old" : "stale.loop"));
+  setText($("clock"), tick ? (stale ? word("stale.at", { time: time(tick.wall_s) }) : time(tick.wall_s)) : "");
+  parts.change.paint(Date.now() / 1000 + skew_s);
+}
+
+// Proposals or records may be others now.
+async function news() {
+  try {
+    list = await ask("api/proposals");
+    records = (await ask("api/records")).records;
+    parts?.trends.told(records);
+  } catch (error) {
+    if (!(error instanceof Refused)) throw error;
+    if (error.status === 401) return out();
+  }
+  route();
+}
+
+const open = () => {
+  const name = location.hash.slice(1).split("/")[0];
+  return VIEWS.includes(name) ? name : "line";
+};
+
+function route() {
+  if (!$("login").hidden) return;
+  const name = open();
+  for (const view of VIEWS) {
+    show($(`view-${view}`), view === name);
+    const link = document.querySelector(`#views a[href="#${view}"]`);
+    view === name ? link.setAttribute("aria-current", "page") : link.removeAttribute("aria-current");
+  }
+  if (!parts) return;
+  if (name === "change") parts.change.open(location.hash.split("/")[1] ?? "", tick?.waiting ?? []);
+  if (name === "history") paintHistory(list, records);
+  paint();
+}
+
+async function say(said) {
+  try {
+    reply(await ask("api/say", said));
+  } catch (error) {
+    if (!(error instanceof Refused)) throw error;
+    if (error.status === 401) return out();
+    reply(error);
+  }
+  await news();
+}
+
+// What came of what was said, in the gateway's words; it stays until the next, or until it is closed.
+function reply(answer) {
+  const refused = answer instanceof Refused;
+  const text = refused ? answer.message : answer.text;
+  const reasons = (answer.reasons ?? []).filter((reason) => reason !== text);
+  replaced($("reply"), `${performance.now()}`, () => [
+    h("p", {}, h("b", {}, word(refused ? "reply.refused" : "reply.done")), " ", english("span", text)),
+    reasons.length > 0 && h("ul", {}, reasons.map((reason) => english("li", reason))),
+    h("button", { type: "button", onclick: () => show($("reply"), false) }, word("reply.close"))]);
+  $("reply").classList.toggle("refused", refused);
+  show($("reply"), true);
+}
+
+$("login").addEventListener("submit", async (event) => {
+  event.preventDefault();
+  const { name, password } = $("login").elements;
+  setText($("login-refused"), "");
+  try {
+    await ask("api/login", { name: name.value, password: password.value });
+    location.reload();
+  } catch (error) {
+    if (!(error instanceof Refused)) throw error;
+    setText($("login-refused"), error.message);
+  }
+});
+document.querySelector(".skip").addEventListener("click", (event) => {
+  event.preventDefault(); // the part that is open stands behind the #
+  $("content").focus();
+});
+$("stop").addEventListener("click", () => say({ command: "stop" }));
+$("language").addEventListener("change", () => {
+  localStorage.setItem("language", $("language").value);
+  location.reload();
+});
+addEventListener("hashchange", () => {
+  route();
+  news();
+});
+setInterval(look, 250);
+begin();

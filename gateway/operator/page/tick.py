@@ -1,0 +1,96 @@
+"""What the page shows ten times a second, made once for all who look: the status, compact, and what is abnormal in it.
+
+What counts as abnormal is said here, in one place; the page only paints it.
+"""
+
+from typing import Any
+
+from gateway.core.decisions import ProposalList
+from gateway.core.line import Line
+from gateway.core.status import GatewayStatus, LimitsStatus, SpanStatus
+
+DRIVES_THAT_FAIL = frozenset({"ABSENT", "STOPPING", "FAULT", "STO"})
+IN_MOTION = frozenset({"RUN", "HOLD"})  #: states in which tensions are controlled
+OFF_SHARE = 0.2  #: of the set-point: a tension farther off is told. As the alarm has it, without its delay
+
+
+def line_told(line: Line) -> dict[str, Any]:
+    """What never changes while the process runs."""
+    return {
+        "site": line.site,
+        "line": line.line,
+        "description": line.description,
+        "n": line.n,
+        "period_s": line.control.period_s,
+        "tension_n": [line.limits.tension_min_n, line.limits.tension_max_n],
+        "setpoint_n": [
+            line.limits.tension_min_n + line.limits.tension_margin_n,
+            line.limits.tension_max_n - line.limits.tension_margin_n,
+        ],
+        "torque_nm": line.limits.torque_nm,
+        "speed_max_m_per_s": line.limits.speed_max_m_per_s,
+        "spans": [{"name": span.name, "control": span.control} for span in line.spans],
+        "rollers": [roller.name for roller in line.rollers],
+        "recipes": [recipe.model_dump() for recipe in line.recipes],
+    }
+
+
+def tick_of(status: GatewayStatus, proposals: ProposalList | None, revision: int) -> dict[str, Any]:
+    """Of a status, as a JSON object. `revision` is another where the proposals are others than before."""
+    loop, moving = status.loop, status.loop.state in IN_MOTION
+    return {
+        "wall_s": status.wall_s,
+        "loop": loop.model_dump(exclude={"next"}),
+        "speed": _short(status.unwind_speed_m_per_s),
+        "speed_setpoint": _short(status.speed_setpoint_m_per_s),
+        "stands": status.stands,
+        "change": None if status.change is None else status.change.model_dump(),
+        "spans": [
+            [
+                _short(span.tension_n, 2),
+                _short(span.setpoint_n, 2),
+                _short(span.speed_m_per_s),
+                _short(span.torque_nm, 2),
+                *abnormal(span, status.limits, moving),
+            ]
+            for span in status.spans
+        ],
+        "timing": status.timing.model_dump(),
+        "link": status.link.model_dump(),
+        "buses": [bus.model_dump() for bus in status.buses],
+        "agents": status.agents_bus.model_dump(),
+        "historian": status.historian.model_dump(include={"storing", "text", "frames_lost", "events_lost"}),
+        "events": [event.model_dump() for event in status.events[-20:]],
+        "alarms": [alarm.model_dump() for alarm in status.alarms],
+        "revision": revision,
+        "waiting": [one.proposal for one in proposals.proposals if one.stage == "waiting"] if proposals else [],
+    }
+
+
+def abnormal(span: SpanStatus, limits: LimitsStatus, moving: bool) -> tuple[str, str]:
+    """(how bad: "", "attention" or "alarm"; which: a word of the catalogue). The worst comes first.
+
+    Where the line does not move, drives may be off and tensions anything; on the way from a slack web, too.
+    """
+    if span.drive == "FAULT" or (moving and span.drive in DRIVES_THAT_FAIL):
+        return "alarm", f"drive.{span.drive}"
+    if span.control != "tension" or not moving:
+        return "", ""
+    if span.quality != "GOOD":
+        return "alarm", f"quality.{span.quality}"
+    return (
+        ("", "") if span.tension_n is None or span.setpoint_n is None else _off(span.tension_n, span.setpoint_n, limits)
+    )
+
+
+def _off(tension_n: float, setpoint_n: float, limits: LimitsStatus) -> tuple[str, str]:
+    least, most = limits.tension_min_n, limits.tension_max_n
+    if least <= setpoint_n <= most and not least <= tension_n <= most:
+        return "alarm", "span.outside"
+    if abs(tension_n - setpoint_n) > OFF_SHARE * setpoint_n > 0.0:
+        return "attention", "span.off"
+    return "", ""
+
+
+def _short(value: float | None, digits: int = 4) -> float | None:
+    return None if value is None else round(value, digits)

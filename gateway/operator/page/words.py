@@ -1,0 +1,39 @@
+"""The page's own words, in every language that it speaks: one catalogue, words.toml.
+
+What the gateway says stays as it says it, in English, and the page marks it as that.
+"""
+
+import json
+import tomllib
+from functools import cache
+from importlib.resources import files
+
+from starlette.requests import Request
+from starlette.responses import Response
+from starlette.routing import Route
+
+LANGUAGES = ("en", "de")
+
+
+@cache
+def catalogue() -> dict[str, dict[str, str]]:
+    """By key, then by language."""
+    return tomllib.loads((files("gateway.operator.page") / "words.toml").read_text(encoding="utf-8"))
+
+
+def words_of(language: str) -> dict[str, str]:
+    return {key: said[language] for key, said in catalogue().items()}
+
+
+def words_routes() -> list[Route]:
+    """Anybody may read them: whoever logs in needs them, too."""
+    return [Route(f"/words/{language}.json", _answer(language)) for language in LANGUAGES]
+
+
+def _answer(language: str):
+    text = json.dumps(words_of(language), ensure_ascii=False, separators=(",", ":"))
+
+    async def answer(_: Request) -> Response:
+        return Response(text, media_type="application/json", headers={"cache-control": "no-cache"})
+
+    return answer

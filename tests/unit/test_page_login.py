@@ -1,0 +1,193 @@
+"""Who gets into the page, for how long, and who does not."""
+
+import asyncio
+
+import pytest
+
+from gateway.operator.page.sessions import (
+    FREE_TRIES,
+    IDLE_S,
+    LONGEST_S,
+    LONGEST_WAIT_S,
+    MOST_PLACES,
+    MOST_SESSIONS,
+    Sessions,
+    Tries,
+)
+from tests.operator.fake_line import PASSWORD
+from tests.unit.page_support import page
+
+ASKED = ("/api/line", "/api/proposals", "/api/proposals/abcdef", "/api/records", "/api/tensions", "/events")
+
+
+class Clock:
+    def __init__(self) -> None:
+        self.now_s = 1000.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
+@pytest.mark.parametrize("path", ASKED)
+def test_without_a_login_nothing_is_told(path: str):
+    async def story() -> None:
+        async with page() as there:
+            assert (await there.browser.get(path)).status_code == 401
+
+    asyncio.run(story())
+
+
+def test_a_login_is_a_cookie_that_no_script_and_no_other_site_gets():
+    async def story() -> None:
+        async with page() as there:
+            answer = await there.log_in("engineer")
+            assert answer.json()["name"] == answer.json()["role"] == "engineer"
+            kept = answer.headers["set-cookie"].lower()
+            assert kept.startswith("r2rgate=") and "httponly" in kept and "samesite=strict" in kept
+            assert "secure" not in kept  # loopback without TLS: the browser would not send it
+            assert len(kept.split("=")[1].split(";")[0]) >= 43  # 256 bits in base 64
+            assert (await there.browser.get("/api/me")).json() == answer.json()
+
+    asyncio.run(story())
+
+
+def test_with_tls_the_cookie_is_sent_over_tls_alone():
+    async def story() -> None:
+        async with page(page="https://127.0.0.1:8480") as there:
+            kept = (await there.log_in()).headers["set-cookie"]
+            assert kept.startswith("__Host-r2rgate=") and "Secure" in kept and "Path=/" in kept
+            assert (await there.browser.get("/api/me")).json()["name"] == "operator"
+
+    asyncio.run(story())
+
+
+@pytest.mark.parametrize("name, password", [("operator", "wrong"), ("nobody", PASSWORD), ("", "")])
+def test_a_wrong_name_and_a_wrong_password_are_told_alike(name: str, password: str):
+    async def story() -> None:
+        async with page() as there:
+            answer = await there.browser.post("/api/login", json={"name": name, "password": password})
+            assert answer.status_code == 403 and answer.json()["text"] == "name or password is wrong"
+            assert "set-cookie" not in answer.headers
+
+    asyncio.run(story())
+
+
+@pytest.mark.parametrize("body", [b"", b"[]", b"{}", b'{"name": "a", "password": 1}', b"\xff", b"[" * 9000])
+def test_what_is_no_login_is_refused(body: bytes):
+    async def story() -> None:
+        async with page() as there:
+            sent = await there.browser.post("/api/login", content=body, headers={"content-type": "application/json"})
+            assert sent.status_code == 400
+
+    asyncio.run(story())
+
+
+def test_who_fails_waits_each_time_longer_even_with_the_right_password():
+    clock = Clock()
+
+    async def story() -> None:
+        async with page(clock=clock) as there:
+            for _ in range(FREE_TRIES):
+                wrong = await there.browser.post("/api/login", json={"name": "operator", "password": "x"})
+                assert wrong.status_code == 403
+            right = {"name": "operator", "password": PASSWORD}
+            waits = await there.browser.post("/api/login", json=right)
+            assert waits.status_code == 429 and waits.headers["retry-after"] == "1"
+            clock.now_s += 1.0
+            assert (await there.browser.post("/api/login", json=right)).status_code == 200
+
+    asyncio.run(story())
+
+
+def test_the_wait_doubles_has_an_end_and_is_forgotten():
+    clock = Clock()
+    tries = Tries(clock)
+    waits: list[float] = []
+    for _ in range(FREE_TRIES + 9):
+        tries.failed("there")
+        waits.append(tries.wait_s("there"))
+    assert waits[: FREE_TRIES + 2] == [0.0] * (FREE_TRIES - 1) + [1.0, 2.0, 4.0]
+    assert waits[-1] == LONGEST_WAIT_S and tries.wait_s("elsewhere") == 0.0
+    tries.went_well("there")
+    assert tries.wait_s("there") == 0.0
+
+
+def test_tries_from_ever_new_places_take_no_more_memory():
+    tries = Tries(Clock())
+    for place in range(MOST_PLACES + FREE_TRIES):
+        for _ in range(FREE_TRIES):
+            tries.failed(str(place))
+    assert tries.wait_s("0") == 0.0 and tries.wait_s(str(MOST_PLACES)) > 0.0
+
+
+@pytest.mark.parametrize("step_s, steps", [(IDLE_S + 1.0, 1), (IDLE_S - 1.0, int(LONGEST_S // (IDLE_S - 1.0)) + 1)])
+def test_a_session_ends_when_idle_and_at_the_end_of_a_shift(step_s: float, steps: int):
+    clock = Clock()
+    sessions = Sessions(clock)
+    key = sessions.begin("anna", "operator")
+    found = sessions.use(key)
+    for _ in range(steps):
+        assert found is not None
+        clock.now_s += step_s
+        found = sessions.use(key)
+    assert found is None
+
+
+def test_who_only_looks_has_to_log_in_again_who_says_something_has_not():
+    clock = Clock()
+
+    async def story(*says: str) -> int:
+        async with page(clock=clock) as there:
+            await there.log_in()
+            for _ in range(2):
+                clock.now_s += 0.6 * IDLE_S
+                for command in says:
+                    await there.say(command)
+                answer = await there.browser.get("/api/line")
+                assert answer.status_code == 200 or clock.now_s > 1000.0 + IDLE_S
+            return (await there.browser.get("/api/line")).status_code
+
+    assert asyncio.run(story()) == 401
+    assert asyncio.run(story("hold")) == 200
+
+
+def test_looking_on_does_not_keep_a_session_alive():
+    clock = Clock()
+    sessions = Sessions(clock)
+    key = sessions.begin("anna", "operator")
+    clock.now_s += IDLE_S
+    assert sessions.find(key) is not None
+    clock.now_s += 1.0
+    assert sessions.find(key) is None
+
+
+def test_of_too_many_sessions_the_longest_unused_goes():
+    sessions = Sessions(Clock())
+    keys = [sessions.begin("anna", "operator") for _ in range(MOST_SESSIONS)]
+    sessions.use(keys[0])
+    sessions.begin("bert", "viewer")
+    assert sessions.find(keys[0]) is not None and sessions.find(keys[1]) is None
+
+
+def test_after_logging_out_the_cookie_is_worth_nothing():
+    async def story() -> None:
+        async with page() as there:
+            await there.log_in()
+            kept = dict(there.browser.cookies)
+            assert (await there.browser.post("/api/logout", json={})).status_code == 200
+            there.browser.cookies.update(kept)
+            assert (await there.browser.get("/api/me")).json()["role"] is None
+            assert (await there.browser.get("/api/line")).status_code == 401
+
+    asyncio.run(story())
+
+
+def test_whoever_has_no_name_looks_where_the_line_lets_them_and_says_nothing():
+    async def story() -> None:
+        async with page(anonymous="read") as there:
+            assert (await there.browser.get("/api/me")).json() == {"name": None, "role": "viewer", "token": None}
+            assert (await there.browser.get("/api/proposals")).status_code == 200
+            assert (await there.say("stop")).status_code == 401
+            assert there.gateway.said == []
+
+    asyncio.run(story())

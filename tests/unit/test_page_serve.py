@@ -1,0 +1,125 @@
+"""The page on its address: TLS, an address that is taken, a certificate that is none, and its end."""
+
+import asyncio
+import socket
+import ssl
+from datetime import UTC, datetime, timedelta
+from ipaddress import ip_address
+from pathlib import Path
+
+import httpx
+import pytest
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+
+from gateway.operator.page import guard, serve
+from gateway.operator.page.serve import CannotServe, listening, serve_on
+from tests.unit.page_support import page
+
+
+def certificate_in(folder: Path) -> tuple[Path, Path]:
+    """Of 127.0.0.1, signed by itself."""
+    key, name = ec.generate_private_key(ec.SECP256R1()), x509.Name([])
+    now = datetime.now(UTC)
+    names = x509.SubjectAlternativeName([x509.IPAddress(ip_address("127.0.0.1"))])
+    signed = (
+        x509.CertificateBuilder(name, name, key.public_key(), 1, now - timedelta(hours=1), now + timedelta(hours=1))
+        .add_extension(names, critical=True)
+        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+        .sign(key, hashes.SHA256())
+    )
+    at, key_at = folder / "page.pem", folder / "page.key.pem"
+    at.write_bytes(signed.public_bytes(serialization.Encoding.PEM))
+    key_at.write_bytes(
+        key.private_bytes(serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption())
+    )
+    return at, key_at
+
+
+def test_beyond_loopback_the_page_speaks_tls(tmp_path: Path):
+    certificate, key = certificate_in(tmp_path)
+
+    async def story() -> None:
+        async with page(page="https://127.0.0.1:8480") as there:
+            listener = socket.create_server(("127.0.0.1", 0))
+            port = listener.getsockname()[1]
+            serving = asyncio.create_task(serve_on(there.app, listener, certificate, key))
+            trusted = await asyncio.to_thread(ssl.create_default_context, cafile=str(certificate))
+            base = f"https://127.0.0.1:{port}"
+            async with httpx.AsyncClient(base_url=base, verify=trusted) as browser:
+                assert (await browser.get("/")).status_code == 200
+            async with httpx.AsyncClient() as browser:
+                with pytest.raises(httpx.HTTPError):
+                    await browser.get(f"http://127.0.0.1:{port}/")
+            serving.cancel()
+            await asyncio.gather(serving, return_exceptions=True)
+
+    asyncio.run(story())
+
+
+def test_an_address_that_is_taken_is_told():
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        address = f"http://127.0.0.1:{taken.getsockname()[1]}"
+        with pytest.raises(CannotServe, match=address):
+            listening(address)
+
+
+def test_a_certificate_that_is_none_is_told_and_the_address_is_free_again(tmp_path: Path):
+    nothing = tmp_path / "page.pem"
+    nothing.write_text("nothing")
+
+    async def story() -> None:
+        async with page() as there:
+            listener = socket.create_server(("127.0.0.1", 0))
+            with pytest.raises(CannotServe, match=r"page\.pem"):
+                await serve_on(there.app, listener, nothing, nothing)
+            assert listener.fileno() == -1
+
+    asyncio.run(story())
+
+
+@pytest.mark.parametrize(
+    "sent",
+    [
+        b"",
+        b"GET /api/me HT",
+        b"GET /api/me HTTP/1.1\r\nhost: 127.0.0.1\r\n",
+        b"GET /api/me HTTP/1.1\r\nhost: 127.0.0.1\r\n\r\nGET /api",
+        b"POST /api/login HTTP/1.1\r\nhost: 127.0.0.1\r\norigin: http://127.0.0.1\r\ncontent-length: 9\r\n"
+        b"content-type: application/json\r\n\r\n{",
+        b"\x16\x03\x01\x02\x00\x01\x00",
+    ],
+)
+def test_who_says_nothing_whole_takes_no_place(sent: bytes, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(serve, "IDLE_S", 0.05)
+    monkeypatch.setattr(guard, "BODY_S", 0.05)
+
+    async def story() -> None:
+        async with page() as there:
+            listener = socket.create_server(("127.0.0.1", 0))
+            serving = asyncio.create_task(serve_on(there.app, listener))
+            reader, writer = await asyncio.open_connection("127.0.0.1", listener.getsockname()[1])
+            writer.write(sent)
+            await reader.read()  # to its end: the page closes
+            writer.close()
+            serving.cancel()
+            await asyncio.gather(serving, return_exceptions=True)
+
+    asyncio.run(story())
+
+
+def test_when_it_ends_the_address_is_free_again():
+    async def story() -> None:
+        async with page() as there:
+            listener = socket.create_server(("127.0.0.1", 0))
+            port = listener.getsockname()[1]
+            serving = asyncio.create_task(serve_on(there.app, listener))
+            async with httpx.AsyncClient() as browser:
+                assert (await browser.get(f"http://127.0.0.1:{port}/")).status_code == 200
+            serving.cancel()
+            await asyncio.gather(serving, return_exceptions=True)
+            assert serving.cancelled()
+            listening(f"http://127.0.0.1:{port}").close()
+
+    asyncio.run(story())

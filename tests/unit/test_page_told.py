@@ -1,0 +1,107 @@
+"""What the page is told: what counts as abnormal, how much of a limit is used, and that a tick is small."""
+
+import asyncio
+import json
+
+import pytest
+
+from gateway.core.signals import DriveState, Quality
+from gateway.core.status import GatewayStatus
+from gateway.core.verdict import RuleFinding
+from gateway.operator.page.tick import DRIVES_THAT_FAIL, IN_MOTION, OFF_SHARE, abnormal, line_told, tick_of
+from gateway.operator.page.told import used
+from gateway.supervisor import alarm_conditions
+from tests.unit.page_support import page
+from tests.unit.supervisor_support import line_of
+
+
+def status_of(**span: object) -> GatewayStatus:
+    with open("docs/examples/status.json") as file:
+        found = json.load(file)
+    found["spans"][0] |= span
+    return GatewayStatus.model_validate(found)
+
+
+@pytest.mark.parametrize(
+    "span, expected",
+    [
+        ({}, ("", "")),
+        ({"tension_n": 24.0}, ("", "")),
+        ({"tension_n": 24.01}, ("attention", "span.off")),
+        ({"tension_n": 15.99}, ("attention", "span.off")),
+        ({"tension_n": 60.0, "setpoint_n": 55.0}, ("", "")),
+        ({"tension_n": 60.1, "setpoint_n": 55.0}, ("alarm", "span.outside")),
+        ({"tension_n": 1.9, "setpoint_n": 2.0}, ("alarm", "span.outside")),
+        ({"tension_n": 0.9, "setpoint_n": 1.0}, ("", "")),
+        ({"tension_n": 24.01, "control": "draw"}, ("", "")),
+        ({"quality": "STALE"}, ("alarm", "quality.STALE")),
+        ({"tension_n": None, "error_n": None, "quality": "MISSING"}, ("alarm", "quality.MISSING")),
+        ({"tension_n": None, "error_n": None, "quality": "MISSING", "control": "draw"}, ("", "")),
+        ({"drive": "FAULT", "quality": "STALE", "tension_n": 1.0}, ("alarm", "drive.FAULT")),
+        ({"drive": "READY"}, ("", "")),
+    ],
+)
+def test_what_is_abnormal_of_a_span(span: dict[str, object], expected: tuple[str, str]):
+    status = status_of(**span)
+    assert abnormal(status.spans[0], status.limits, moving=True) == expected
+
+
+def test_at_rest_a_tension_may_be_anything_but_a_failed_drive_is_told():
+    status = status_of(tension_n=0.0)
+    assert abnormal(status.spans[0], status.limits, moving=False) == ("", "")
+    status = status_of(tension_n=0.0, drive="STO", quality="STALE")
+    assert abnormal(status.spans[0], status.limits, moving=False) == ("", "")
+    status = status_of(tension_n=0.0, drive="FAULT")
+    assert abnormal(status.spans[0], status.limits, moving=False)[0] == "alarm"
+
+
+def test_what_is_off_is_off_as_the_alarm_has_it():
+    assert (OFF_SHARE, IN_MOTION) == (alarm_conditions.OFF_SHARE, set(alarm_conditions.MOVING))
+
+
+def test_what_fails_are_names_of_drive_states():
+    assert {state.name for state in DriveState} >= DRIVES_THAT_FAIL
+    assert {quality.name for quality in Quality} == {"GOOD", "STALE", "BAD", "MISSING"}
+
+
+@pytest.mark.parametrize(
+    "value, limit, margin, expected",
+    [
+        (30.0, 60.0, 30.0, 0.5),  # at most
+        (4.0, 2.0, 2.0, 0.5),  # at least
+        (0.0, 0.002, 0.002, 0.0),
+        (70.0, 60.0, -10.0, 1.0),
+        (1.0, 2.0, -1.0, 1.0),  # at least, and not reached
+        (0.0, 0.0, 0.0, None),
+        (None, 2.0, 1.0, None),
+        (1.0, None, None, None),
+        (-1.0, 0.5, -1.5, 1.0),  # decay that is growth
+    ],
+)
+def test_how_much_of_a_limit_is_used(value: float | None, limit: float | None, margin: float | None, expected: object):
+    finding = RuleFinding(rule="r", passed=True, text="t", value=value, limit=limit, margin=margin)
+    assert used(finding) == expected
+
+
+def test_a_tick_of_the_longest_line_is_small():
+    async def story() -> None:
+        async with page(spans=60) as there:
+            assert there.side.status is not None
+            tick = tick_of(there.side.status, there.side.proposals, 1)
+            assert len(tick["spans"]) == 60 and tick["waiting"] == [there.gateway.hash]
+            assert len(json.dumps(tick)) < 8000
+
+    asyncio.run(story())
+
+
+def test_before_the_first_list_of_proposals_none_waits():
+    assert tick_of(status_of(), None, 0)["waiting"] == []
+
+
+def test_set_points_are_offered_as_far_as_the_loop_takes_them():
+    line = line_of(6)
+    told, limits = line_told(line), line.limits
+    assert told["setpoint_n"] == [
+        limits.tension_min_n + limits.tension_margin_n,
+        limits.tension_max_n - limits.tension_margin_n,
+    ]
