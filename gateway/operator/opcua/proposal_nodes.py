@@ -94,7 +94,8 @@ def _values(shown: ProposalShown | None) -> Iterator[tuple[str, Value]]:
     figures = [] if verdict is None else verdict.figures
     yield from {
         "Id": shown.proposal_hash, "ShownHash": shown.shown or "", "BaseRevision": shown.epoch, "Kind": proposal.kind,
-        "Author": proposal.author, "Stage": shown.stage, "Why": shown.why, "Created": proposal.created, "Expires": proposal.expires,
+        "Author": proposal.author, "Stage": shown.stage, "Why": shown.why,
+        "Created": proposal.created, "Expires": proposal.expires,
         "Reason": quoted(proposal.reason), "Difference": shown.difference,
         "Promised": [_promise(one.scenario, one.rmse_n, one.overshoot_pct, one.settling_s)
                      for one in proposal.predicted],
