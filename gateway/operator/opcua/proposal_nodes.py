@@ -21,6 +21,7 @@ ROWS = (
     Row("Kind", STRING, "gains, experiment or model"),
     Row("Author", STRING, "Who proposes"),
     Row("Stage", STRING, "waiting"),
+    Row("Why", STRING, "What the gateway says of that stage, as who has approved already where two must"),
     Row("Created", STRING, "RFC 3339"),
     Row("Expires", STRING, "RFC 3339; later it cannot be approved"),
     Row("Reason", STRING, "Quoted: the words of its author, possibly a language model, which nobody has checked"),
@@ -93,7 +94,8 @@ def _values(shown: ProposalShown | None) -> Iterator[tuple[str, Value]]:
     figures = [] if verdict is None else verdict.figures
     yield from {
         "Id": shown.proposal_hash, "ShownHash": shown.shown or "", "BaseRevision": shown.epoch, "Kind": proposal.kind,
-        "Author": proposal.author, "Stage": shown.stage, "Created": proposal.created, "Expires": proposal.expires,
+        "Author": proposal.author, "Stage": shown.stage, "Why": shown.why,
+        "Created": proposal.created, "Expires": proposal.expires,
         "Reason": quoted(proposal.reason), "Difference": shown.difference,
         "Promised": [_promise(one.scenario, one.rmse_n, one.overshoot_pct, one.settling_s)
                      for one in proposal.predicted],
