@@ -76,7 +76,7 @@ def normalised_by_output(found: Sequence[Foretold]) -> tuple[list[str], FloatArr
     """Names of the outputs, and the same of each."""
     counts = [one.predicted.stretch.predictions for one in found]
     each = np.average([one.predicted.normalised_squared for one in found], axis=0, weights=counts)
-    return found[0].predicted.stretch.names, np.nan_to_num(each, nan=np.inf)
+    return found[0].predicted.stretch.names, np.where(np.isfinite(each), each, np.inf)
 
 
 def by_speed(found: Sequence[Foretold]) -> list[tuple[float, list[Foretold]]]:

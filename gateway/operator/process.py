@@ -59,7 +59,7 @@ async def serve(line: Line, run_folder: Path, data_folder: Path) -> None:
             served.append(f"OPC UA at {line.operator.opc_ua}")
         print(f"operator of {line.site}/{line.line}: {', '.join(served)}", flush=True)
         if not users.exists() and line.operator.anonymous == "none":
-            _tell("nobody can come in yet: `r2rgate users add NAME --role ROLE LINE.toml` lets somebody")
+            _tell("nobody can come in yet: `r2rgate users add LINE.toml NAME --role ROLE` lets somebody")
         gc.collect()
         gc.freeze()  # half a million nodes and references that stay: to look through them takes 0.15 s each time
         tasks = [asyncio.create_task(work) for work in works]

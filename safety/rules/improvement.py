@@ -69,7 +69,7 @@ def _as_far_as(case: Case, region: Region) -> str:
 
 
 def _worst(
-    gate: Gate, metric: str, whose: str, reference: Performance, proposed: Performance, how_far: str = ""
+    gate: Gate, metric: str, whose: str, reference: Performance, proposed: Performance, how_far: str
 ) -> RuleFinding:
     pairs = [(name, value_of(proposed[name], metric), value_of(reference[name], metric)) for name in proposed]
     name, value, before = max(pairs, key=lambda pair: _excess(pair[1], no_worse(gate, metric, pair[2])))

@@ -58,13 +58,25 @@ def test_cool_down(of, context, redesigned, since_s, passes):
     assert (refused(cool_down.check(case_of(gains(redesigned, context), now, of))) == []) is passes
 
 
+def test_cool_down_tells_when_it_was(of, context, redesigned):
+    def found(since_s):
+        now = with_state(context, since_change_s=since_s)
+        (one,) = cool_down.check(case_of(gains(redesigned, context), now, of))
+        return one.text, one.value, one.limit, one.unit
+
+    assert found(None)[0] == "the line has not been changed yet"
+    text = "the last change was 12.5 s ago; allowed: gate.cool_down_s, 30 s, and more"
+    assert found(12.5) == (text, 12.5, 30.0, "s")
+
+
 def test_state_of_the_line(of, context, redesigned):
     def found(check, **state):
         return refused(check(case_of(gains(redesigned, context), with_state(context, **state), of)))
 
     for state in ("RUN", "READY", "SILENT", "HOLD"):
         assert found(line_state.check_gains, state=state) == []
-    assert "the line is in STOP" in found(line_state.check_gains, state="STOP")[0]
+    stopped = "the line is in STOP; allowed: RUN, HOLD, READY, SILENT: arm it first"
+    assert found(line_state.check_gains, state="STOP") == [stopped]
     assert "the line is in HOLD; allowed: RUN" in found(line_state.check_experiment, state="HOLD")[0]
     assert found(line_state.check_experiment) == [] == found(line_state.check_model, state="STOP", moving=True)
     everything = {"moving": True, "experiment": True, "on_probation": True, "doubts": ["cell 3"], "tension_n": [30.0]}

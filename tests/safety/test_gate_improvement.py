@@ -69,6 +69,28 @@ def test_the_baseline_is_a_measure_as_far_as_it_was_judged_for(of, context, rede
     assert "compared up to 0.01 m/s and steps of 0.1 N" in text
 
 
+def test_how_far_in_service_is_a_measure_is_said_only_where_it_is_not_everywhere(of, context, redesigned):
+    def text(region):
+        within = context.model_copy(update={"region": region})
+        return improvement.check(case_of(gains(redesigned, within), within, of))[0].text
+
+    assert text(Region()).endswith(" N")
+    small = Region(speed_max_m_per_s=0.01, tension_step_max_n=0.1, speed_step_max_m_per_s=0.0)
+    assert text(small).endswith(", compared up to 0.01 m/s and steps of 0.1 N")
+
+
+def test_what_has_no_end_in_both_hides_nothing_that_is_worse(of, context, redesigned, monkeypatch):
+    def course(rmse_n, settling_s):
+        return Figures(rmse_n, 0.0, settling_s, 0.0)
+
+    before = {"tension": course(1.0, inf), "velocity": course(1.0, 1.0)}
+    after = {"tension": course(1.0, inf), "velocity": course(1.0, 1.5)}
+    monkeypatch.setattr(improvement, "beside_in_service", lambda case: (before, after))
+    found = improvement.check(case_of(gains(redesigned, context), context, of))
+    (wrong,) = [one for one in found if not one.passed]
+    assert wrong.rule == "improvement: settling time, in service" and wrong.text.startswith("settling time in velocity")
+
+
 def test_figures_of_a_verdict_are_those_of_each_configuration_and_course_and_endless_ones_are_not_known(
     case, monkeypatch
 ):
