@@ -119,7 +119,7 @@ class ProposalShown(Strict):
     verdict: Verdict | None  #: null: not judged yet
 
 
-def shown_hash(proposal: str, verdict: str, in_service: str, epoch: int) -> str:
-    """SHA-256 over the hashes of a proposal, its verdict, the configuration in service, and its epoch."""
-    content = {"proposal": proposal, "verdict": verdict, "in_service": in_service, "epoch": epoch}
+def shown_hash(proposal: str, verdict: str, in_service: str, epoch: int, model: str | None) -> str:
+    """SHA-256 over the hashes of a proposal, its verdict, configuration and model in service, and the epoch."""
+    content = {"proposal": proposal, "verdict": verdict, "in_service": in_service, "epoch": epoch, "model": model}
     return hashlib.sha256(json.dumps(content, sort_keys=True, separators=(",", ":")).encode()).hexdigest()

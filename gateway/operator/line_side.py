@@ -5,7 +5,7 @@ The gateway is the only one that it talks to. Where that is away, what was known
 
 import asyncio
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable, Coroutine
 from typing import TypeVar
 
 from pydantic import ValidationError
@@ -28,11 +28,14 @@ from gateway.mailbox.port import Mailbox, Unreachable
 STATUS_S = 0.1  #: between two looks
 PROPOSALS_S = 0.5
 ASK_S = 2.0
+ANSWERED_S = 10.0  #: for what is read from a disk: whoever gives up earlier asks again while it is still being read
+MOST_ASKED = 3  #: of those at once
 ACT_S = 20.0  #: arming, and a deployment, take their time
 
 Model = TypeVar("Model", bound=Strict)
 
-TOPICS: tuple[Topic, ...] = (GATEWAY_STATUS, GATEWAY_PROPOSALS, GATEWAY_PAST, GATEWAY_FOR_PERSON)
+READ: tuple[Topic, ...] = (GATEWAY_STATUS, GATEWAY_PROPOSALS, GATEWAY_PAST)  #: what is looked at
+TOPICS: tuple[Topic, ...] = (*READ, GATEWAY_FOR_PERSON)
 
 
 class NotTold(Exception):
@@ -42,20 +45,36 @@ class NotTold(Exception):
 class LineSide:
     """`watch` as a task; then read `status`, `proposals`, `records`. All in one event loop."""
 
-    def __init__(self, mailbox: Mailbox, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self, mailbox: Mailbox, saying: Mailbox | None = None, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        """`saying`: a way of its own for what people say, so that no reading keeps a stop from being heard."""
         self.status: GatewayStatus | None = None
         self.status_s: float | None = None  #: of the clock, when it came
         self.proposals: ProposalList | None = None
-        self.trouble = ""  #: why the last look came to nothing; empty: it did not
+        self.proposals_s: float | None = None
         self.on_status: list[Callable[[GatewayStatus], None]] = []
         self.on_proposals: list[Callable[[ProposalList], None]] = []  #: when they are others than before
         self._mailbox = mailbox
+        self._saying = saying or mailbox
         self._clock = clock
+        self._troubles: dict[str, str] = {}  #: by what was asked for, while it is not told
+        self._asking = asyncio.Semaphore(MOST_ASKED)
 
     @property
     def age_s(self) -> float | None:
         """Of the status; None: there has been none."""
         return None if self.status_s is None else self._clock() - self.status_s
+
+    @property
+    def proposals_age_s(self) -> float | None:
+        """Of the list of proposals; None: there has been none."""
+        return None if self.proposals_s is None else self._clock() - self.proposals_s
+
+    @property
+    def trouble(self) -> str:
+        """Why the last looks came to nothing; empty: they did not."""
+        return "; ".join(dict.fromkeys(self._troubles.values()))
 
     async def watch(self) -> None:
         """Until it is cancelled."""
@@ -63,21 +82,21 @@ class LineSide:
 
     async def shown(self, proposal: str) -> ProposalShown:
         """Everything on which a person decides. Raises NotTold."""
-        return _told(ProposalShown, await self._ask(GATEWAY_PROPOSALS, ShowProposal(proposal=proposal)))
+        return _told(ProposalShown, await self._in_turn(GATEWAY_PROPOSALS, ShowProposal(proposal=proposal)))
 
     async def records(self, after: int | None = None) -> RecordsTold:
         """Raises NotTold."""
-        return _told(RecordsTold, await self._ask(GATEWAY_PAST, RecordsAfter(after=after)))
+        return _told(RecordsTold, await self._in_turn(GATEWAY_PAST, RecordsAfter(after=after)))
 
     async def tensions(self, asked: TensionsBetween) -> TensionsTold:
         """Raises NotTold."""
-        return _told(TensionsTold, await self._ask(GATEWAY_PAST, asked))
+        return _told(TensionsTold, await self._in_turn(GATEWAY_PAST, asked))
 
     async def say(self, person: Person, said: Said) -> Reply:
         """In a person's name. A gateway that is away is an answer, too."""
         try:
             payload = ForPerson(person=person, said=said).model_dump_json().encode()
-            return Reply.model_validate_json(await self._mailbox.request(GATEWAY_FOR_PERSON, payload, ACT_S))
+            return Reply.model_validate_json(await self._saying.request(GATEWAY_FOR_PERSON, payload, ACT_S))
         except (Unreachable, ValidationError) as error:
             return Reply(ok=False, state="", text=str(error), reasons=[str(error)])
 
@@ -89,26 +108,39 @@ class LineSide:
 
     async def _look_at_proposals(self) -> None:
         found = _told(ProposalList, await self._ask(GATEWAY_PROPOSALS, ListProposals()))
+        self.proposals_s = self._clock()
         if found != self.proposals:
             self.proposals = found
             for tell in self.on_proposals:
                 tell(found)
 
-    async def _again(self, look: Callable[[], Awaitable[None]], every_s: float) -> None:
+    async def _again(self, look: Callable[[], Coroutine[object, object, None]], every_s: float) -> None:
         while True:
             try:
                 await look()
-                self.trouble = ""
+                self._troubles.pop(look.__name__, None)
             except NotTold as error:
-                self.trouble = str(error)
+                self._troubles[look.__name__] = str(error)
             await asyncio.sleep(every_s)
+
+    async def _in_turn(self, topic: Topic, query: ShowProposal | RecordsAfter | TensionsBetween) -> bytes:
+        """Few at a time, so that those who look cannot fill the way to the gateway. Raises NotTold."""
+        try:
+            async with asyncio.timeout(ASK_S):
+                await self._asking.acquire()
+        except TimeoutError:
+            raise NotTold("too much is being asked at once: try again in some seconds") from None
+        try:
+            return await self._request(topic, query.model_dump_json().encode(), ANSWERED_S)
+        finally:
+            self._asking.release()
 
     async def _ask(self, topic: Topic, query: ListProposals | ShowProposal | RecordsAfter | TensionsBetween) -> bytes:
         return await self._request(topic, query.model_dump_json().encode())
 
-    async def _request(self, topic: Topic, payload: bytes) -> bytes:
+    async def _request(self, topic: Topic, payload: bytes, within_s: float = ASK_S) -> bytes:
         try:
-            return await self._mailbox.request(topic, payload, ASK_S)
+            return await self._mailbox.request(topic, payload, within_s)
         except Unreachable as error:
             raise NotTold(str(error)) from error
 

@@ -11,9 +11,10 @@ from pathlib import Path
 
 from gateway.core.line import Line
 from gateway.core.people import Role
+from gateway.core.topics import GATEWAY_FOR_PERSON
 from gateway.mailbox.paths import GATEWAY_SOCKET
 from gateway.mailbox.unix import UnixMailbox
-from gateway.operator.line_side import TOPICS, LineSide
+from gateway.operator.line_side import READ, LineSide
 from gateway.operator.opcua.login import Check
 from gateway.operator.opcua.server import CannotServe, NotSetUp
 from gateway.operator.opcua.service import OpcUa
@@ -42,9 +43,10 @@ async def serve(line: Line, run_folder: Path, data_folder: Path) -> None:
     stop = asyncio.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
-    mailbox = UnixMailbox()
-    mailbox.connect(TOPICS, run_folder / GATEWAY_SOCKET)
-    side, users = LineSide(mailbox), data_folder / FILE_NAME
+    mailbox, saying = UnixMailbox(), UnixMailbox()
+    mailbox.connect(READ, run_folder / GATEWAY_SOCKET)
+    saying.connect((GATEWAY_FOR_PERSON,), run_folder / GATEWAY_SOCKET)
+    side, users = LineSide(mailbox, saying), data_folder / FILE_NAME
     check, pki = checked_by(users, _tell), pki_folder(line, data_folder)
     opcua = _opcua(line, side, pki, check)
     page = page_app(line, side, check, time.monotonic)
@@ -73,6 +75,7 @@ async def serve(line: Line, run_folder: Path, data_folder: Path) -> None:
         if opcua is not None:
             await opcua.stop()
         await mailbox.close()
+        await saying.close()
 
 
 def _opcua(line: Line, side: LineSide, pki: Path, check: Check) -> OpcUa | None:

@@ -105,23 +105,37 @@ class Deployer:
                 return refused("it is not carried out", [str(error)])
 
     async def roll_back(self, comment: str, who: Who) -> Reply:
-        """To the last known good configuration, now. Done even where the audit is not there: it is the safe side."""
-        recorded = ""
+        """To the last known good configuration, now. Done even where the audit is not there: it is the safe side.
+
+        The line first, which waits for no disk and for no step that is under way; what is deployed in between goes back
+        as soon as its step is over.
+        """
+        reason, recorded = comment or f"asked for by {who.name}", ""
+        try:
+            reply = await self._on_the_line.back(reason)
+        except Unreachable as error:
+            return refused("not confirmed", [str(error)])
         async with self._records.one_step:
-            on_the_line = self.book.on_the_line
-            given_up = on_the_line is not None and on_the_line.stage is not Stage.RUNNING
+            given_up = self._on_watch()
             try:
                 await self._records.note("rollback-asked", who, {"comment": comment})
             except AuditUnavailable as error:
                 recorded = f"; it could not be recorded: {error}"
             try:
-                reply = await self._on_the_line.roll_back(comment or f"asked for by {who.name}")
+                await self._on_the_line.settle()
+                if self._on_watch():
+                    reply = await self._on_the_line.roll_back(reason)
             except (Unreachable, AuditUnavailable, Impossible) as error:
                 return refused("not confirmed", [f"{error}{recorded}"])
         further = ""
         if reply.in_service is not None and not given_up:
             further = "; to go further back, propose what ran before (`r2rgate configurations list`)"
         return reply.model_copy(update={"text": reply.text + further + recorded})
+
+    def _on_watch(self) -> bool:
+        """Whether the book has a change on its way to the line, or on probation."""
+        change = self.book.on_the_line
+        return change is not None and change.stage is not Stage.RUNNING
 
     async def line_changed(self, because: str, who: Who) -> Reply:
         """From now on it is another line: what was learned of it, and what was judged by that, counts no more."""
@@ -237,7 +251,7 @@ class Deployer:
     def _shown_hash(self, entry: Entry) -> str | None:
         if entry.stage is not Stage.WAITING or entry.verdict is None or self.book.in_service is None:
             return None
-        return shown_hash(entry.proposal, entry.verdict, self.book.in_service, self.book.epoch)
+        return shown_hash(entry.proposal, entry.verdict, self.book.in_service, self.book.epoch, self.book.model)
 
     def _first(self, entry: Entry) -> FirstApproval | None:
         """The first approval of what would be approved now; None: there is none."""

@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from importlib.metadata import version
 from pathlib import Path
@@ -34,6 +35,7 @@ from gateway.supervisor.peers import GATEWAY, who_of
 from gateway.supervisor.surroundings import LineSurroundings
 
 LOOP_TIME_S = 2.5
+MOST_KEPT, LARGEST_KEPT = 64, 1_000_000  #: proposals and verdicts that are being looked at, bytes of one
 CONFIGURATION_CHANGES = ("start", "rolled-back")
 BUILD_TIME_S = 15.0  #: for what the loop builds and warms before it answers
 
@@ -51,6 +53,7 @@ class KeptAudit:
     def __init__(self, folder: Path, audit: Audit) -> None:
         self._folder = folder
         self._audit = audit
+        self._blobs: OrderedDict[str, bytes] = OrderedDict()  #: the last ones that were asked for
 
     async def append(
         self, kind: str, who: Who, what: Mapping[str, Any], blobs: Mapping[str, bytes] | None = None
@@ -58,8 +61,17 @@ class KeptAudit:
         return await self._audit.append(kind, who, what, blobs)
 
     def blob(self, id_: str) -> bytes | None:
+        """A file is looked at before it is read, which takes its time: what has a hash for a name is read once."""
+        if (known := self._blobs.get(id_)) is not None:
+            self._blobs.move_to_end(id_)
+            return known
         with AuditFile(self._folder) as file:
-            return file.blob(id_)
+            found = file.blob(id_)
+        if found is not None and len(found) <= LARGEST_KEPT:
+            self._blobs[id_] = found
+            while len(self._blobs) > MOST_KEPT:
+                self._blobs.popitem(last=False)
+        return found
 
 
 class LoopOverMailbox:

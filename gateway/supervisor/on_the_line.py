@@ -93,9 +93,13 @@ class OnTheLine:
         await self._records.step("model-in-service", {"proposal": entry.proposal, "model": entry.changes}, who)
         return done(f"model {entry.changes[:12]} is what proposals are judged by from now on")
 
+    async def back(self, reason: str) -> Reply:
+        """The loop is told, and nothing is recorded. Raises Unreachable."""
+        return await self._loop.tell(Rollback(reason=reason))
+
     async def roll_back(self, reason: str) -> Reply:
         """Now. Raises as `settle`, and Impossible."""
-        reply = await self._loop.tell(Rollback(reason=reason))
+        reply = await self.back(reason)
         await self.settle()
         return reply
 

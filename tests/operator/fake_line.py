@@ -97,7 +97,7 @@ class FakeGateway:
 
     @property
     def shown(self) -> str:
-        return shown_hash(self.hash, verdict_hash(self.verdict), IN_SERVICE, self.epoch)
+        return shown_hash(self.hash, verdict_hash(self.verdict), IN_SERVICE, self.epoch, None)
 
     def status(self) -> GatewayStatus:
         status = json.loads((EXAMPLES / "status.json").read_text())

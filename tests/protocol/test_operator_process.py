@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
+import httpx
 from asyncua import Client, ua
 from asyncua.crypto.security_policies import SecurityPolicyAes256Sha256RsaPss
 from cryptography import x509
@@ -30,8 +31,10 @@ PASSWORD = "three old rollers"
 
 def set_up(folder: Path, *words: str) -> Path:
     """A line's file, and certificates of server and client."""
-    port = free_port()
-    text = line_template(1).replace('# opc_ua = "opc.tcp://127.0.0.1:4840"', f'opc_ua = "opc.tcp://127.0.0.1:{port}"')
+    text = line_template(1)
+    for key, address in (("opc_ua", "opc.tcp://127.0.0.1:4840"), ("page", "http://127.0.0.1:8480")):
+        free = f"{address.rpartition(':')[0]}:{free_port()}"
+        text = text.replace(f'# {key} = "{address}"', f'{key} = "{free}"')
     (folder / "line.toml").write_text(text, encoding="utf-8")
     done = command(folder, "init", "--client", "panel", *words)
     assert done.exit_code == 0, done.output
@@ -67,8 +70,10 @@ def test_a_panel_with_its_own_certificate_and_a_user_of_the_file_reach_the_line(
         await mailbox.listen(folder / "gateway.sock")
         with operator(folder) as process:
             said = await asyncio.to_thread(process.stdout.readline)
-            assert said.endswith(f"OPC UA on {line.operator.opc_ua}\n"), (said, process.stderr.read())
-            assert ":4840" not in said
+            served = f"page at {line.operator.page}, OPC UA at {line.operator.opc_ua}\n"
+            assert said.endswith(served), (said, process.stderr.read())
+            assert ":4840" not in said and ":8480" not in said
+            assert (await asyncio.to_thread(httpx.get, line.operator.page)).status_code == 200
             client = Client(line.operator.opc_ua)
             client.application_uri = f"urn:r2rgate:{line.site}:{line.line}:panel"
             await client.set_security(
@@ -91,20 +96,30 @@ def test_a_panel_with_its_own_certificate_and_a_user_of_the_file_reach_the_line(
         asyncio.run(story(folder))
 
 
-def test_an_operator_without_certificates_or_on_a_port_in_use_ends_with_code_2_and_says_what_to_do():
+def test_without_a_certificate_yet_there_is_the_page_and_what_to_do_is_said():
     with short_folder() as folder:
-        pki = set_up(folder)
-        (pki / "opcua-server.pem").rename(pki / "away.pem")
+        (set_up(folder) / "opcua-server.pem").unlink()
+        page = load_line((folder / "line.toml").read_text(encoding="utf-8"), "line.toml").operator.page
         with operator(folder) as process:
-            assert process.wait() == 2
-            assert "r2rgate pki init" in process.stderr.read()
-        (pki / "away.pem").rename(pki / "opcua-server.pem")
+            assert process.stdout.readline().endswith(f": page at {page}\n")
+            assert httpx.get(page).status_code == 200
+            process.send_signal(signal.SIGTERM)
+            assert process.wait() == 0
+            told = process.stderr.read()
+            assert (
+                "OPC UA clients are not served" in told and "r2rgate pki init" in told and "r2rgate users add" in told
+            )
+
+
+def test_a_port_in_use_ends_with_code_2_and_says_which():
+    with short_folder() as folder:
+        set_up(folder)
         with operator(folder) as first:
             assert first.stdout.readline()
             with operator(folder) as second:
                 assert second.wait() == 2
                 told = second.stderr.read()
-                assert "cannot listen" in told and "opc_ua" in told and "Traceback" not in told
+                assert "the page cannot be at http://127.0.0.1" in told and "Traceback" not in told
 
 
 def test_the_servers_certificate_names_its_application_and_where_it_is_reached(tmp_path):
