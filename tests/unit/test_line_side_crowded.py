@@ -8,7 +8,7 @@ from gateway.core.people import Person
 from gateway.core.topics import GATEWAY_FOR_PERSON, GATEWAY_PAST
 from gateway.mailbox.unix import UnixMailbox
 from gateway.operator.line_side import MOST_ASKED, READ, LineSide
-from tests.unit.supervisor_support import short_folder
+from tests.unit.supervisor_support import short_folder, until
 
 ANNA = Person(name="anna", role="operator", through="page")
 
@@ -34,8 +34,7 @@ def test_a_stop_is_heard_while_readers_fill_every_place_there_is():
         side = LineSide(reading, saying)
         query = TensionsBetween(from_wall_s=0.0, to_wall_s=1.0)
         readers = [asyncio.create_task(side.tensions(query)) for _ in range(60)]
-        while len(asked) < MOST_ASKED:
-            await asyncio.sleep(0)
+        await until(lambda: len(asked) >= MOST_ASKED)
         assert (await side.say(ANNA, Stop())).text == "stopping"
         assert len(asked) == MOST_ASKED
         for reader in readers:
