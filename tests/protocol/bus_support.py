@@ -16,6 +16,7 @@ from gateway.core.line import Line, Network
 from gateway.core.topics import AGENT_DECIDE, ASK_STATUS, Topic
 from gateway.mailbox.bus import TlsEndpoint, connect, open_router, open_session, router_settings
 from gateway.mailbox.paths import BUS_SOCKET
+from gateway.mailbox.port import Unreachable
 from gateway.mailbox.zenoh_mailbox import ZenohMailbox
 from tests.unit.supervisor_support import line_of, short_folder, until
 
@@ -50,6 +51,17 @@ LONG_S = 30.0  #: that a test would notice, had it to wait for it
 
 async def echo(payload: bytes) -> bytes:
     return b"echo " + payload
+
+
+async def answer_of(mailbox: ZenohMailbox, topic: Topic, payload: bytes, within_s: float) -> bytes:
+    """Once it is known on the other side that somebody answers there, which is a moment after they say so."""
+    async with asyncio.timeout(within_s):
+        while True:
+            try:
+                return await mailbox.request(topic, payload, within_s)
+            except Unreachable as error:
+                if "nobody answers" not in str(error):
+                    raise
 
 
 async def never(_: bytes) -> bytes:

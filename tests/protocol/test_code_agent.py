@@ -13,7 +13,7 @@ from gateway.core.computations import ComputeReply, ComputeRequest
 from gateway.core.interactions import Answer
 from gateway.core.line import Agents
 from gateway.core.topics import AGENT_COMPUTE, AGENT_DECIDE
-from tests.protocol.bus_support import LINE, client, router, run
+from tests.protocol.bus_support import LINE, answer_of, client, router, run
 from tests.protocol.test_agents import serve_log
 from tests.stand_in.engine import Engine
 from tests.stand_in.personas import PERSONAS
@@ -36,7 +36,7 @@ def test_a_phase_has_something_computed_over_the_bus_and_it_is_logged_as_the_cod
             calls = [{"call": "margins"}, {"call": "marginz"}]
             request = ComputeRequest(format=1, asked_by="commissioning", task="is it stable", calls=calls)
             topic = AGENT_COMPUTE.of("code")
-            answer = await phases.request(topic, request.model_dump_json().encode(), LONG_S)
+            answer = await answer_of(phases, topic, request.model_dump_json().encode(), LONG_S)
             reply = ComputeReply.model_validate_json(answer)
             done, refused = reply.results
             assert done.figures[0].value == pytest.approx(1e3 * margins(CONFIG, task_of(LINE)).delay_margin_s)
@@ -45,7 +45,7 @@ def test_a_phase_has_something_computed_over_the_bus_and_it_is_logged_as_the_cod
             assert kept[0].computations == reply.results
             for payload in (b"", b"{}", b'{"format": 1, "asked_by": "x", "task": "y", "calls": []}'):
                 with pytest.raises(Exception, match="JSON|missing|few"):
-                    await phases.request(topic, payload, LONG_S)
+                    await answer_of(phases, topic, payload, LONG_S)
 
     run(story)
 
@@ -60,7 +60,7 @@ def test_a_model_over_http_has_something_computed_before_it_answers(persona: str
                 async with LanguageModel(settings) as model:
                     begin(agents, LINE, nothing, model, lambda text: None, Given(None, CONFIG))
                     topic = AGENT_DECIDE.of("adaptation")
-                    answer = await phases.request(topic, QUESTION.model_dump_json().encode(), LONG_S)
+                    answer = await answer_of(phases, topic, QUESTION.model_dump_json().encode(), LONG_S)
             assert Answer.model_validate_json(answer).by == "adaptation"
             of_code, of_adaptation = sorted(kept, key=lambda one: one.agent != "code")
             assert of_code.asked_by == of_adaptation.agent == "adaptation" and of_code.task == QUESTION.task
