@@ -77,3 +77,20 @@ def test_the_page_offers_the_languages_there_are():
     page = (STATIC / "index.html").read_text()
     assert re.findall(r'<option value="(\w+)"', page) == list(LANGUAGES)
     assert words_of("de")["command.stop"] == "Stopp"
+
+
+@pytest.mark.parametrize("key", ["stale.old", "stale.loop", "stale.none", "next.UNKNOWN"])
+def test_old_data_never_sound_as_if_the_line_stood(key: str):
+    assert "The line may be running." in words_of("en")[key] and "läuft vielleicht" in words_of("de")[key]
+
+
+def test_a_state_in_which_rollers_may_turn_does_not_say_that_they_stand():
+    assert [words_of("en")[f"state.{name}"] for name in ("STOP", "HOLD", "SILENT", "UNKNOWN")] == [
+        "Stopping / stopped",
+        "Hold",
+        "Not armed",
+        "Unknown",
+    ]
+    for key in ("next.HOLD", "next.STOP"):
+        assert "Rollers may still turn" in words_of("en")[key].replace("rollers", "Rollers")
+        assert "Walzen können sich noch drehen" in words_of("de")[key]
