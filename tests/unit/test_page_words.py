@@ -79,7 +79,7 @@ def test_the_page_offers_the_languages_there_are():
     assert words_of("de")["command.stop"] == "Stopp"
 
 
-@pytest.mark.parametrize("key", ["stale.old", "stale.loop", "stale.none", "next.UNKNOWN"])
+@pytest.mark.parametrize("key", ["stale.old", "stale.loop", "stale.none", "stale.broken", "next.UNKNOWN"])
 def test_old_data_never_sound_as_if_the_line_stood(key: str):
     assert "The line may be running." in words_of("en")[key] and "läuft vielleicht" in words_of("de")[key]
 

@@ -100,8 +100,9 @@ export class Picture {
   }
 
   fill(tick) {
-    if (tick.wall_s - (this.filled ?? 0) < 0.9) return;
-    this.filled = tick.wall_s;
+    const now_ms = performance.now(); // the line's clock may be set back
+    if (now_ms - (this.filled_ms ?? -Infinity) < 900) return;
+    this.filled_ms = now_ms;
     tick.spans.forEach(([tension, setpoint, speed, torque, bad, why], i) => {
       const texts = [number(tension), number(setpoint), number(speed, 3), number(torque), bad ? word(why) : word("span.well")];
       texts.forEach((text, k) => setText(this.values[i][k], text));
