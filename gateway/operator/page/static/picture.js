@@ -75,8 +75,8 @@ export class Picture {
       const parts = this.cells[i];
       if (!parts) return;
       setText(parts.value, number(tension));
-      const [, first, rest] = bad ? /^(\S+) ?(.*)$/.exec(word(why)) : ["", "", ""];
-      setText(parts.note.firstChild, bad ? `▲ ${first}` : "");
+      const [, first, rest] = why ? /^(\S+) ?(.*)$/.exec(word(why)) : ["", "", ""];
+      setText(parts.note.firstChild, bad ? `▲ ${first}` : first);
       setText(parts.note.lastChild, rest);
       for (const name of ["value", "fill", "note", "frame"]) parts[name].setAttribute("data-bad", bad);
       const top = tension == null ? BAR.bottom : y(tension);
@@ -104,7 +104,7 @@ export class Picture {
     if (now_ms - (this.filled_ms ?? -Infinity) < 900) return;
     this.filled_ms = now_ms;
     tick.spans.forEach(([tension, setpoint, speed, torque, bad, why], i) => {
-      const texts = [number(tension), number(setpoint), number(speed, 3), number(torque), bad ? word(why) : word("span.well")];
+      const texts = [number(tension), number(setpoint), number(speed, 3), number(torque), why ? `${bad && "▲ "}${word(why)}` : word("span.well")];
       texts.forEach((text, k) => setText(this.values[i][k], text));
     });
   }
