@@ -28,6 +28,7 @@ FAMILIES: dict[str, list[str]] = {
     "kind.": [*get_args(Kind)],
     "stage.": [stage.value for stage in Stage],
     "configuration.": [*get_args(ScenarioFigures.model_fields["configuration"].annotation)],
+    "change.then-": [*get_args(Kind)],
     "measure.": ["rmse_n", "overshoot_pct", "settling_s", "effort_n2m2s"],
     "command.": ["arm", "start", "hold"],
     "table.": ["span", "tension", "setpoint", "speed", "torque", "condition"],
