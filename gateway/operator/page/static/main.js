@@ -12,7 +12,7 @@ import { Trends } from "./trends.js";
 import { number, preferred, speak, time, word } from "./words.js";
 
 const STALE_MS = 1000, AGAIN_MS = 3000, STOP_MS = 3000, LONG = 22, VIEWS = ["line", "change", "history", "health"];
-let parts = null, tick = null, heard_ms = 0, broken = false, followed = null, skew_s = 0, list = null, records = [];
+let parts = null, tick = null, heard_ms = 0, broken = false, followed = null, stops = 0, skew_s = 0, list = null, records = [];
 
 async function begin() {
   await speak(preferred());
@@ -161,14 +161,15 @@ function route() {
 }
 
 async function say(said) {
-  const stop = said.command === "stop";
+  const stop = said.command === "stop", mine = stop ? ++stops : stops;
+  const tell = (answer) => mine === stops && reply(answer, stop); // what comes late never covers what came of a stop
   if (stop) stopSent();
   try {
-    reply(await ask("api/say", said, stop ? STOP_MS : undefined), stop);
+    tell(await ask("api/say", said, stop ? STOP_MS : undefined));
   } catch (error) {
     if (!(error instanceof Refused)) throw error;
     if (error.status === 401) return out();
-    reply(error, stop);
+    tell(error);
   }
   await news();
 }
