@@ -237,3 +237,16 @@ def test_while_nobody_looks_nothing_is_made():
             assert (kind, data["age_s"]) == ("away", None)
 
     asyncio.run(story())
+
+
+def test_a_new_stream_does_not_begin_with_what_was_made_for_others_before():
+    async def story() -> None:
+        async with served(watched=False) as at:
+            before = await at.look()
+            assert (await before.next())[0] == "away"
+            for tell in at.there.side.on_status:
+                tell(at.there.gateway.status())
+            await before.until("tick")
+            assert (await (await at.look()).next())[0] == "away"
+
+    asyncio.run(story())

@@ -9,6 +9,7 @@ from gateway.operator.page.sessions import (
     IDLE_S,
     LONGEST_S,
     LONGEST_WAIT_S,
+    MOST_EACH,
     MOST_PLACES,
     MOST_SESSIONS,
     Sessions,
@@ -43,7 +44,7 @@ def test_a_login_is_a_cookie_that_no_script_and_no_other_site_gets():
             answer = await there.log_in("engineer")
             assert answer.json()["name"] == answer.json()["role"] == "engineer"
             kept = answer.headers["set-cookie"].lower()
-            assert kept.startswith("r2rgate=") and "httponly" in kept and "samesite=strict" in kept
+            assert kept.startswith("r2rgate-8480=") and "httponly" in kept and "samesite=strict" in kept
             assert "secure" not in kept  # loopback without TLS: the browser would not send it
             assert len(kept.split("=")[1].split(";")[0]) >= 43  # 256 bits in base 64
             assert (await there.browser.get("/api/me")).json() == answer.json()
@@ -55,7 +56,7 @@ def test_with_tls_the_cookie_is_sent_over_tls_alone():
     async def story() -> None:
         async with page(page="https://127.0.0.1:8480") as there:
             kept = (await there.log_in()).headers["set-cookie"]
-            assert kept.startswith("__Host-r2rgate=") and "Secure" in kept and "Path=/" in kept
+            assert kept.startswith("__Host-r2rgate-8480=") and "Secure" in kept and "Path=/" in kept
             assert (await there.browser.get("/api/me")).json()["name"] == "operator"
 
     asyncio.run(story())
@@ -163,10 +164,34 @@ def test_looking_on_does_not_keep_a_session_alive():
 
 def test_of_too_many_sessions_the_longest_unused_goes():
     sessions = Sessions(Clock())
-    keys = [sessions.begin("anna", "operator") for _ in range(MOST_SESSIONS)]
+    keys = [sessions.begin(f"anna{i}", "operator") for i in range(MOST_SESSIONS)]
     sessions.use(keys[0])
     sessions.begin("bert", "viewer")
     assert sessions.find(keys[0]) is not None and sessions.find(keys[1]) is None
+
+
+def test_of_too_many_sessions_of_one_name_the_oldest_ends_and_no_other():
+    clock = Clock()
+    sessions = Sessions(clock)
+    other = sessions.begin("bert", "viewer")
+    keys: list[str] = []
+    for _ in range(MOST_EACH):
+        keys.append(sessions.begin("anna", "operator"))
+        clock.now_s += 1.0
+    sessions.use(keys[0])
+    assert all(map(sessions.find, keys))
+    keys.append(sessions.begin("anna", "operator"))
+    assert [sessions.find(key) is not None for key in keys] == [False] + [True] * MOST_EACH
+    assert sessions.find(other) is not None
+
+
+def test_lines_on_one_machine_have_cookies_of_their_own():
+    async def story() -> None:
+        async with page() as one, page(page="http://127.0.0.1:8481") as other:
+            names = [(await there.log_in()).headers["set-cookie"].partition("=")[0] for there in (one, other)]
+            assert names == ["r2rgate-8480", "r2rgate-8481"]
+
+    asyncio.run(story())
 
 
 def test_after_logging_out_the_cookie_is_worth_nothing():

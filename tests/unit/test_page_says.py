@@ -136,13 +136,13 @@ def test_the_past_is_told_in_sentences_and_columns():
     asyncio.run(story())
 
 
-def test_a_gateway_that_is_away_is_an_answer_even_to_stop():
+def test_a_gateway_that_is_away_has_refused_nothing_not_even_a_stop():
     async def story() -> None:
         async with page() as there:
             await there.log_in()
             await there.gateway_mailbox.close()
             answer = await there.say("stop")
-            assert answer.status_code == 409 and not answer.json()["ok"] and answer.json()["text"]
+            assert answer.status_code == 504 and not answer.json()["ok"] and answer.json()["text"]
             await until(lambda: there.side.trouble != "")
             assert (await there.browser.get("/api/records")).status_code == 503
 

@@ -2,15 +2,19 @@
 
 import asyncio
 import json
+from pathlib import Path
 
 import pytest
 
+from gateway.core.experiment import Experiment
+from gateway.core.proposal import ExperimentChange
 from gateway.core.signals import DriveState, Quality
 from gateway.core.status import GatewayStatus
 from gateway.core.verdict import RuleFinding
 from gateway.operator.page.tick import DRIVES_THAT_FAIL, IN_MOTION, OFF_SHARE, abnormal, line_told, tick_of
-from gateway.operator.page.told import used
-from gateway.supervisor import alarm_conditions
+from gateway.operator.page.told import TWO_PEOPLE, TWO_SIDED, proposal_told, used
+from gateway.supervisor import alarm_conditions, deployer
+from safety.rules import model_residuals, validity
 from tests.unit.page_support import page
 from tests.unit.supervisor_support import line_of
 
@@ -36,7 +40,9 @@ def status_of(**span: object) -> GatewayStatus:
         ({"tension_n": 24.01, "control": "draw"}, ("", "")),
         ({"quality": "STALE"}, ("alarm", "quality.STALE")),
         ({"tension_n": None, "error_n": None, "quality": "MISSING"}, ("alarm", "quality.MISSING")),
-        ({"tension_n": None, "error_n": None, "quality": "MISSING", "control": "draw"}, ("", "")),
+        ({"tension_n": None, "error_n": None, "quality": "MISSING", "control": "draw"}, ("", "quality.MISSING")),
+        ({"tension_n": None, "error_n": None, "quality": "BAD"}, ("alarm", "quality.MISSING")),
+        ({"quality": "BAD", "control": "draw"}, ("attention", "quality.BAD")),
         ({"drive": "FAULT", "quality": "STALE", "tension_n": 1.0}, ("alarm", "drive.FAULT")),
         ({"drive": "READY"}, ("", "")),
     ],
@@ -49,10 +55,23 @@ def test_what_is_abnormal_of_a_span(span: dict[str, object], expected: tuple[str
 def test_at_rest_a_tension_may_be_anything_but_a_failed_drive_is_told():
     status = status_of(tension_n=0.0)
     assert abnormal(status.spans[0], status.limits, moving=False) == ("", "")
-    status = status_of(tension_n=0.0, drive="STO", quality="STALE")
-    assert abnormal(status.spans[0], status.limits, moving=False) == ("", "")
     status = status_of(tension_n=0.0, drive="FAULT")
     assert abnormal(status.spans[0], status.limits, moving=False)[0] == "alarm"
+
+
+@pytest.mark.parametrize("drive", ["STO", "READY"])
+@pytest.mark.parametrize(
+    "span, expected",
+    [
+        ({"quality": "STALE"}, ("attention", "quality.STALE")),
+        ({"quality": "BAD"}, ("attention", "quality.BAD")),
+        ({"tension_n": None, "error_n": None, "quality": "MISSING"}, ("attention", "quality.MISSING")),
+        ({"tension_n": None, "error_n": None, "quality": "STALE"}, ("attention", "quality.MISSING")),
+    ],
+)
+def test_at_rest_a_value_that_is_not_good_is_never_normal(span: dict[str, object], expected: object, drive: str):
+    status = status_of(drive=drive, **span)
+    assert abnormal(status.spans[0], status.limits, moving=False) == expected
 
 
 def test_what_is_off_is_off_as_the_alarm_has_it():
@@ -81,6 +100,48 @@ def test_what_fails_are_names_of_drive_states():
 def test_how_much_of_a_limit_is_used(value: float | None, limit: float | None, margin: float | None, expected: object):
     finding = RuleFinding(rule="r", passed=True, text="t", value=value, limit=limit, margin=margin)
     assert used(finding) == expected
+
+
+@pytest.mark.parametrize("rule, unit, expected", [("model validity", "", None), ("model: residuals", "", None),
+                                                  ("model validity", "m/s", 0.8), ("decay", "", 0.8)])  # fmt: skip
+def test_of_two_limits_none_is_used_up(rule: str, unit: str, expected: float | None):
+    finding = RuleFinding(rule=rule, passed=True, text="t", value=1.0, limit=0.8, margin=0.2, unit=unit)
+    assert used(finding) == expected
+
+
+def test_rules_of_two_limits_are_called_what_the_gate_calls_them():
+    assert {validity.RULE, model_residuals.RULE} == TWO_SIDED
+
+
+@pytest.mark.parametrize("why, two", [("", False), ("the line stands still", False),
+                                      *[(f"{said}; it is checked", True) for said in TWO_PEOPLE]])  # fmt: skip
+def test_a_change_that_takes_two_people_says_so(why: str, two: bool):
+    async def story() -> None:
+        async with page() as there:
+            shown = await there.side.shown(there.gateway.hash)
+            assert proposal_told(shown.model_copy(update={"why": why}))["two_people"] is two
+
+    asyncio.run(story())
+
+
+def test_the_gateway_says_so_in_these_words():
+    said = Path(deployer.__file__).read_text()
+    assert all(words in said for words in TWO_PEOPLE)
+
+
+def test_an_experiment_says_how_long_it_moves_set_points():
+    with open("docs/examples/experiment.json") as file:
+        experiment = Experiment.model_validate(json.load(file))
+
+    async def story() -> None:
+        async with page() as there:
+            shown = await there.side.shown(there.gateway.hash)
+            assert proposal_told(shown)["lasts_s"] is None
+            change = ExperimentChange(experiment=experiment)
+            tried = shown.model_copy(update={"proposal": shown.proposal.model_copy(update={"change": change})})
+            assert proposal_told(tried)["lasts_s"] == experiment.duration_s > 0.0
+
+    asyncio.run(story())
 
 
 def test_a_tick_of_the_longest_line_is_small():

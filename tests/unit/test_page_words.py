@@ -28,6 +28,7 @@ FAMILIES: dict[str, list[str]] = {
     "kind.": [*get_args(Kind)],
     "stage.": [stage.value for stage in Stage],
     "configuration.": [*get_args(ScenarioFigures.model_fields["configuration"].annotation)],
+    "change.then-": [*get_args(Kind)],
     "measure.": ["rmse_n", "overshoot_pct", "settling_s", "effort_n2m2s"],
     "command.": ["arm", "start", "hold"],
     "table.": ["span", "tension", "setpoint", "speed", "torque", "condition"],
@@ -77,3 +78,20 @@ def test_the_page_offers_the_languages_there_are():
     page = (STATIC / "index.html").read_text()
     assert re.findall(r'<option value="(\w+)"', page) == list(LANGUAGES)
     assert words_of("de")["command.stop"] == "Stopp"
+
+
+@pytest.mark.parametrize("key", ["stale.old", "stale.loop", "stale.none", "stale.broken", "next.UNKNOWN"])
+def test_old_data_never_sound_as_if_the_line_stood(key: str):
+    assert "The line may be running." in words_of("en")[key] and "läuft vielleicht" in words_of("de")[key]
+
+
+def test_a_state_in_which_rollers_may_turn_does_not_say_that_they_stand():
+    assert [words_of("en")[f"state.{name}"] for name in ("STOP", "HOLD", "SILENT", "UNKNOWN")] == [
+        "Stopping / stopped",
+        "Hold",
+        "Not armed",
+        "Unknown",
+    ]
+    for key in ("next.HOLD", "next.STOP"):
+        assert "Rollers may still turn" in words_of("en")[key].replace("rollers", "Rollers")
+        assert "Walzen können sich noch drehen" in words_of("de")[key]

@@ -19,6 +19,7 @@ from gateway.operator.page.asks import Asks
 from gateway.operator.page.events import Ticks, stream
 from gateway.operator.page.guard import LOOPBACK, Guarded
 from gateway.operator.page.login import Check, Door
+from gateway.operator.page.serve import port_of
 from gateway.operator.page.words import words_routes
 
 STATIC = Path(str(files("gateway.operator.page"))) / "static"
@@ -30,7 +31,7 @@ def page_app(line: Line, side: LineSide, check: Check, clock: Callable[[], float
     The page speaks TLS where the address in the line's file says https; then its cookie is sent over TLS alone.
     """
     address = urlsplit(line.operator.page)
-    door = Door(check, clock, line.operator.anonymous == "read", address.scheme == "https")
+    door = Door(check, clock, line.operator.anonymous == "read", address.scheme == "https", port_of(address))
     asks, ticks = Asks(line, side, door), Ticks(side)
     app = Starlette(
         routes=[

@@ -11,6 +11,7 @@ from starlette.routing import Route
 
 from gateway.core.line import Line
 from gateway.core.line_past import TensionsBetween
+from gateway.core.messages import Reply
 from gateway.core.people import LEAST, Said, may, why_may_not
 from gateway.operator.line_side import LineSide, NotTold
 from gateway.operator.page.guard import body_of
@@ -92,7 +93,18 @@ class Asks:
             reply = await self._side.say(person, said)
             return JSONResponse({**reply.model_dump(exclude={"in_service"}), "ok": False, "text": reason}, 403)
         reply = await self._side.say(person, said)
-        return JSONResponse(reply.model_dump(exclude={"in_service"}), 200 if reply.ok else 409)
+        return JSONResponse(reply.model_dump(exclude={"in_service"}), _status(reply))
+
+
+def _status(reply: Reply) -> int:
+    """409: the gateway refuses. 504: it did not answer, and nobody knows whether it was done.
+
+    The latter comes from this side, with its text as the only reason: what the gateway refuses says what was refused,
+    and why.
+    """
+    if reply.ok:
+        return 200
+    return 504 if not reply.state and reply.reasons == [reply.text] else 409
 
 
 def _object(body: bytes) -> dict[str, Any]:

@@ -37,6 +37,11 @@ class Ticks:
         side.on_status.append(self._take)
         side.on_proposals.append(self._take_proposals)
 
+    @property
+    def number(self) -> int:
+        """Of the newest."""
+        return self._number
+
     def end(self) -> None:
         """The process ends: all streams do."""
         self.ended = True
@@ -80,7 +85,7 @@ class _Stream(StreamingResponse):
 
 async def _events(ticks: Ticks, may_look: Callable[[], bool]) -> AsyncIterator[str]:
     yield "retry: 1000\n\n"
-    number = 0
+    number = ticks.number  # what was made before, for others, may be hours old
     while not ticks.ended:
         if not may_look():
             yield _event("logged-out", {})

@@ -40,11 +40,12 @@ class Visitor:
 class Door:
     """Lets people in, and says who they are. `anonymous`: whoever has no name may look."""
 
-    def __init__(self, check: Check, clock: Callable[[], float], anonymous: bool, secure: bool) -> None:
+    def __init__(self, check: Check, clock: Callable[[], float], anonymous: bool, secure: bool, port: int) -> None:
         self._check = check
         self._anonymous = anonymous
         self._secure = secure
-        self._cookie = "__Host-r2rgate" if secure else "r2rgate"
+        # Cookies do not tell ports apart: two lines on one machine would log each other out.
+        self._cookie = f"__Host-r2rgate-{port}" if secure else f"r2rgate-{port}"
         self._sessions = Sessions(clock)
         self._tries = Tries(clock)
         self._checking = 0

@@ -5,7 +5,7 @@ import contextlib
 import socket
 from collections.abc import Iterator
 from pathlib import Path
-from urllib.parse import urlsplit
+from urllib.parse import SplitResult, urlsplit
 
 import uvicorn
 from starlette.applications import Starlette
@@ -55,13 +55,17 @@ async def serve_page(app: Starlette, address: str, certificate: Path | None = No
 def listening(address: str) -> socket.socket:
     """Raises CannotServe."""
     parts = urlsplit(address)
-    host, port = parts.hostname or "", parts.port
-    port = (443 if parts.scheme == "https" else 80) if port is None else port
+    host, port = parts.hostname or "", port_of(parts)
     try:
         family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
         return socket.create_server((host, port), family=family, backlog=64)
     except OSError as error:
         raise CannotServe(f"the page cannot be at {address}: {error}") from error
+
+
+def port_of(address: SplitResult) -> int:
+    """Where none is said, the one of the scheme."""
+    return (443 if address.scheme == "https" else 80) if address.port is None else address.port
 
 
 async def serve_on(

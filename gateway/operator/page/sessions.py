@@ -10,6 +10,7 @@ from gateway.core.people import Role
 IDLE_S = 3600.0  #: nothing said, and the page not loaded anew; looking on alone is nothing
 LONGEST_S = 12.0 * 3600.0  #: a shift, and the way there
 MOST_SESSIONS = 64  #: the one that has been idle for longest goes first
+MOST_EACH = 5  #: of one name; the oldest ends
 
 FREE_TRIES = 3  #: that fail, before the next has to wait
 LONGEST_WAIT_S = 60.0
@@ -36,6 +37,9 @@ class Sessions:
     def begin(self, name: str, role: Role) -> str:
         """The key, 256 random bits."""
         key, now_s = secrets.token_urlsafe(32), self._clock()
+        own = sorted((one.began_s, old) for old, one in self._by_key.items() if one.name == name)
+        for _, old in own[: max(0, len(own) - MOST_EACH + 1)]:
+            del self._by_key[old]
         self._by_key[key] = Session(name, role, secrets.token_urlsafe(32), now_s, now_s)
         while len(self._by_key) > MOST_SESSIONS:
             self._by_key.popitem(last=False)

@@ -70,17 +70,26 @@ def tick_of(status: GatewayStatus, proposals: ProposalList | None, revision: int
 def abnormal(span: SpanStatus, limits: LimitsStatus, moving: bool) -> tuple[str, str]:
     """(how bad: "", "attention" or "alarm"; which: a word of the catalogue). The worst comes first.
 
-    Where the line does not move, drives may be off and tensions anything; on the way from a slack web, too.
+    Where the line does not move, drives may be off and tensions anything; on the way from a slack web, too. A value
+    that is not good is told everywhere: at rest somebody may rely on it to reach in. Where only the speed is
+    controlled there may be no load cell: that there is no value is said, and nothing is wrong.
     """
     if span.drive == "FAULT" or (moving and span.drive in DRIVES_THAT_FAIL):
         return "alarm", f"drive.{span.drive}"
+    if span.quality != "GOOD":
+        return _how_bad(span, moving), f"quality.{'MISSING' if span.tension_n is None else span.quality}"
     if span.control != "tension" or not moving:
         return "", ""
-    if span.quality != "GOOD":
-        return "alarm", f"quality.{span.quality}"
     return (
         ("", "") if span.tension_n is None or span.setpoint_n is None else _off(span.tension_n, span.setpoint_n, limits)
     )
+
+
+def _how_bad(span: SpanStatus, moving: bool) -> str:
+    """A value that is not good."""
+    if span.control == "tension":
+        return "alarm" if moving else "attention"
+    return "" if span.tension_n is None else "attention"
 
 
 def _off(tension_n: float, setpoint_n: float, limits: LimitsStatus) -> tuple[str, str]:

@@ -7,16 +7,24 @@ import math
 from typing import Any
 
 from gateway.core.decisions import ProposalShown
+from gateway.core.proposal import ExperimentChange
 from gateway.core.verdict import RuleFinding, Verdict
+
+#: Rules with a lower and an upper limit: how much of one of them is used says nothing.
+TWO_SIDED = frozenset({"model validity", "model: residuals"})
+#: What the gateway says of the stage where one approval is not enough.
+TWO_PEOPLE = ("it takes two people", "it takes another person")
 
 
 def proposal_told(shown: ProposalShown) -> dict[str, Any]:
     """Without the matrices: nobody decides on those."""
-    proposal = shown.proposal
+    proposal, change = shown.proposal, shown.proposal.change
     return {
         **shown.model_dump(include={"stage", "why", "proposal_hash", "shown", "epoch", "difference"}),
         **proposal.model_dump(include={"base", "model", "reason", "evidence", "predicted", "author"}),
         "kind": proposal.kind,
+        "lasts_s": change.experiment.duration_s if isinstance(change, ExperimentChange) else None,
+        "two_people": any(said in shown.why for said in TWO_PEOPLE),
         "created": proposal.created,
         "expires": proposal.expires,
         "verdict": None if shown.verdict is None else _verdict(shown.verdict),
@@ -41,10 +49,14 @@ def _finding(finding: RuleFinding) -> dict[str, Any]:
 def used(finding: RuleFinding) -> float | None:
     """How much of what is allowed is used, 0 to 1; 1 too where more is. None: the rule has no such number.
 
+    A rule of two limits has none, but its rows with a unit, such as a greatest speed, have one limit.
+
     Where at least the limit is asked for, the limit over the value; where at most, the value over the limit.
     """
     value, limit, margin = finding.value, finding.limit, finding.margin
     if value is None or limit is None or margin is None:
+        return None
+    if finding.rule in TWO_SIDED and not finding.unit:
         return None
     if margin < 0.0:
         return 1.0

@@ -10,25 +10,51 @@ export class Change {
     this.say = say;
     this.may = may;
     this.asked = 0;
+    this.others = [];
   }
 
-  // `hash`: empty for the one that waits.
+  // `hash`: empty for the one that waits; from then on it is that one, whatever else comes.
   async open(hash, waiting) {
-    const wanted = hash || waiting[0];
+    const wanted = hash || (waiting.includes(this.wanted) ? this.wanted : waiting[0]);
+    if (wanted && !hash) history.replaceState(null, "", `#change/${wanted}`);
+    const other = wanted !== this.wanted;
     this.wanted = wanted;
+    this.others = waiting.filter((one) => wanted && !one.startsWith(wanted));
     const number = ++this.asked;
     if (!wanted) return this.empty();
+    if (other) [this.shown, this.newer] = [null, null];
+    this.notes();
     try {
       const shown = await ask(`api/proposals/${wanted}`);
-      if (number === this.asked) this.fill(shown);
+      if (number === this.asked) this.take(shown);
     } catch (error) {
       if (!(error instanceof Refused)) throw error;
-      if (number === this.asked) this.put(error.message, () => h("section", { class: "panel" }, h("h2", {}, word("change.title")), english("p", error.message)));
+      if (number === this.asked && !this.shown) this.put(error.message, () => h("section", { class: "panel" }, h("h2", {}, word("change.title")), english("p", error.message)));
     }
   }
 
+  // What somebody may be about to decide on never changes while they read.
+  take(shown) {
+    if (!this.shown?.shown || !shown.shown || shown.shown === this.shown.shown) return this.fill(shown);
+    this.newer = shown;
+    for (const button of $("change-body").querySelectorAll(".decide button")) button.disabled = true;
+    this.notes();
+  }
+
+  notes() {
+    const { newer, others } = this;
+    replaced($("change-notes"), JSON.stringify([newer?.shown, others, document.documentElement.lang]), () => [
+      newer && h("section", { class: "panel prompt" }, h("p", {}, word("change.newer")),
+        h("button", { type: "button", class: "main", onclick: () => this.fill(newer) }, word("change.show-newer"))),
+      others.map((one) => h("section", { class: "panel" }, h("p", {}, word("change.another"), " ",
+        h("a", { class: "button", href: `#change/${one}` }, word("prompt.open"), " ", h("code", {}, one.slice(0, 12))))))]);
+  }
+
   put(key, make) {
-    replaced($("view-change"), `${document.documentElement.lang} ${key}`, make);
+    this.newer = null;
+    this.notes();
+    replaced($("change-body"), `${document.documentElement.lang} ${key}`, make);
+    for (const button of $("change-body").querySelectorAll(".decide button")) button.disabled = false;
   }
 
   empty() {
@@ -77,11 +103,12 @@ export class Change {
   }
 
   async decide(shown, approve) {
-    const what = shown.difference.slice(0, 4).map((line) => ({ english: line }));
+    const then = approve ? [shown.two_people && word("change.two-people"), word(`change.then-${shown.kind}`, { lasts: duration(shown.lasts_s ?? 0) })] : [word("change.then-reject")];
     const answer = await confirmed({
       title: word(approve ? "change.sure-approve" : "change.sure-reject"),
-      lines: [...what, word(approve ? "change.then-approve" : "change.then-reject"), word("change.hash", { hash: shown.shown.slice(0, 12) })],
-      yes: word(approve ? "change.yes-approve" : "change.yes-reject"), comment: true,
+      lines: [...then.filter(Boolean), ...judged(shown.verdict?.region), ...shown.difference.map((line) => ({ english: line })),
+        shown.why && { english: shown.why }, word("change.hash", { hash: shown.shown.slice(0, 12) })].filter(Boolean),
+      yes: word(approve ? "change.yes-approve" : "change.yes-reject"), comment: true, wide: true,
     });
     if (answer === null) return;
     location.hash = `#change/${shown.proposal_hash}`; // what becomes of it stays in sight
@@ -94,6 +121,14 @@ export class Change {
     const left_s = Date.parse(this.shown.expires) / 1000 - now_s;
     setText(element, left_s > 0 ? word("change.expires", { left: duration(left_s) }) : word("change.expired"));
   }
+}
+
+// How far the gate has judged it; beyond that the line does not go with it.
+function judged(region) {
+  if (!region) return [];
+  const upTo = (value, unit) => (value == null ? word("change.own-limit") : `${figure(value)} ${unit}`);
+  const [speed, tension, step] = [upTo(region.speed_max_m_per_s, "m/s"), upTo(region.tension_step_max_n, "N"), upTo(region.speed_step_max_m_per_s, "m/s")];
+  return [word("change.region", { speed, tension, step })];
 }
 
 function evidence(one) {

@@ -44,7 +44,7 @@ function compared(name, unit, of) {
   return h("div", { class: "compared" }, h("div", { class: "measure" }, word(`measure.${name}`)),
     rows.map(([configuration, value]) => h("div", { class: "pair" },
       h("span", {}, word(`configuration.${configuration}`)),
-      svg("svg", { viewBox: "0 0 100 10", preserveAspectRatio: "none", "aria-hidden": "true" },
-        svg("rect", { x: 0, y: 0, width: (100 * (value ?? 0)) / most, height: 10, class: configuration === "proposed" ? "after" : "before" })),
-      h("b", {}, value == null ? word("measure.none") : `${figure(value)} ${unit}`))));
+      value == null ? h("div", { class: "no-end", "aria-hidden": "true" }) : svg("svg", { viewBox: "0 0 100 10", preserveAspectRatio: "none", "aria-hidden": "true" },
+        svg("rect", { x: 0, y: 0, width: (100 * value) / most, height: 10, class: configuration === "proposed" ? "after" : "before" })),
+      value == null ? h("b", { class: "alarm-text" }, "▲ ", word(name === "settling_s" ? "measure.unsettled" : "measure.away")) : h("b", {}, `${figure(value)} ${unit}`))));
 }

@@ -2,11 +2,12 @@
 import { $, english, h, replaced, svg } from "./dom.js";
 import { number, time, word } from "./words.js";
 
-let painted = 0;
+let painted_ms = 0;
 
 export function paintHealth(tick, line) {
-  if (tick.wall_s - painted < 0.9 && $("view-health").dataset.key) return;
-  painted = tick.wall_s;
+  const now_ms = performance.now(); // the line's clock may be set back
+  if (now_ms - painted_ms < 900 && $("view-health").dataset.key) return;
+  painted_ms = now_ms;
   const key = JSON.stringify([tick.timing, tick.loop.doubts, tick.buses, tick.agents, tick.historian, tick.link, tick.events, document.documentElement.lang]);
   replaced($("view-health"), key, () => [diagnoses(tick), timing(tick, line), parts(tick), events(tick)]);
 }

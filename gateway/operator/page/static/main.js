@@ -1,17 +1,18 @@
 // The page: who is there, which part is open, and what every tick changes.
 import { Alarms } from "./alarms.js";
 import { Change } from "./change.js";
-import { $, english, h, replaced, setText, show } from "./dom.js";
+import { $, setText, show } from "./dom.js";
 import { paintHealth } from "./health.js";
 import { Refused, ask, keepToken, listen } from "./net.js";
 import { Operate } from "./operate.js";
 import { paintHistory } from "./past.js";
 import { Picture } from "./picture.js";
+import { reply, stopSent } from "./reply.js";
 import { Trends } from "./trends.js";
 import { number, preferred, speak, time, word } from "./words.js";
 
-const STALE_MS = 1000, AGAIN_MS = 3000, LONG = 22, VIEWS = ["line", "change", "history", "health"];
-let parts = null, tick = null, heard_ms = 0, skew_s = 0, list = null, records = [];
+const STALE_MS = 1000, AGAIN_MS = 3000, STOP_MS = 3000, LONG = 22, VIEWS = ["line", "change", "history", "health"];
+let parts = null, tick = null, heard_ms = 0, broken = false, followed = null, stops = 0, skew_s = 0, list = null, records = [];
 
 async function begin() {
   await speak(preferred());
@@ -20,7 +21,8 @@ async function begin() {
     await (me.role === null ? askName() : enter(me));
   } catch (error) {
     if (!(error instanceof Refused)) throw error;
-    reply(error);
+    setText($("stale"), error.message);
+    show($("stale"), true);
     setTimeout(begin, AGAIN_MS);
   }
 }
@@ -31,6 +33,7 @@ const out = () => location.reload();
 function askName() {
   for (const id of ["now", "views", "logout"]) show($(id), false);
   for (const view of VIEWS) show($(`view-${view}`), false);
+  show($("stale"), false);
   show($("login"), true);
   $("login").elements.name.focus();
 }
@@ -56,7 +59,7 @@ async function enter(me) {
   follow();
 }
 
-const follow = () => listen(hear, () => setTimeout(again, AGAIN_MS));
+const follow = () => (followed ? followed() : (followed = listen(hear, () => setTimeout(again, AGAIN_MS))));
 
 // The stream has been refused: there is no session any more, or too many look.
 async function again() {
@@ -81,8 +84,14 @@ async function logOut() {
 function hear(kind, data) {
   if (kind === "logged-out") return out();
   if (kind === "away") return;
+  broken = true; // until all of it is on the screen
+  take(data);
+  [broken, heard_ms] = [false, performance.now()];
+}
+
+function take(data) {
   const first = !tick, before = tick;
-  [tick, heard_ms, skew_s] = [data, performance.now(), data.wall_s - Date.now() / 1000];
+  [tick, skew_s] = [data, data.wall_s - Date.now() / 1000];
   if (first) parts.trends.load(tick.wall_s);
   if (first || before.revision !== tick.revision) news();
   if (!first && before.loop.state !== tick.loop.state) setText($("announce"), word(`state.${tick.loop.state}`));
@@ -111,10 +120,10 @@ function paint() {
 // Four times a second, whether anything comes or not: how old it is, and how long there is to decide.
 function look() {
   if (!parts) return;
-  const old = performance.now() - heard_ms > STALE_MS, stale = old || tick?.loop.running === false;
+  const old = performance.now() - heard_ms > STALE_MS, stale = old || broken || tick?.loop.running === false;
   show($("stale"), stale);
   document.body.classList.toggle("stale", stale);
-  if (stale) setText($("stale"), word(!tick ? "stale.none" : old ? "stale.old" : "stale.loop"));
+  if (stale) setText($("stale"), word(broken ? "stale.broken" : !tick ? "stale.none" : old ? "stale.old" : "stale.loop"));
   setText($("clock"), tick ? (stale ? word("stale.at", { time: time(tick.wall_s) }) : time(tick.wall_s)) : "");
   parts.change.paint(Date.now() / 1000 + skew_s);
 }
@@ -152,27 +161,17 @@ function route() {
 }
 
 async function say(said) {
+  const stop = said.command === "stop", mine = stop ? ++stops : stops;
+  const tell = (answer) => mine === stops && reply(answer, stop); // what comes late never covers what came of a stop
+  if (stop) stopSent();
   try {
-    reply(await ask("api/say", said));
+    tell(await ask("api/say", said, stop ? STOP_MS : undefined));
   } catch (error) {
     if (!(error instanceof Refused)) throw error;
     if (error.status === 401) return out();
-    reply(error);
+    tell(error);
   }
   await news();
-}
-
-// What came of what was said, in the gateway's words; it stays until the next, or until it is closed.
-function reply(answer) {
-  const refused = answer instanceof Refused;
-  const text = refused ? answer.message : answer.text;
-  const reasons = (answer.reasons ?? []).filter((reason) => reason !== text);
-  replaced($("reply"), `${performance.now()}`, () => [
-    h("p", {}, h("b", {}, word(refused ? "reply.refused" : "reply.done")), " ", english("span", text)),
-    reasons.length > 0 && h("ul", {}, reasons.map((reason) => english("li", reason))),
-    h("button", { type: "button", onclick: () => show($("reply"), false) }, word("reply.close"))]);
-  $("reply").classList.toggle("refused", refused);
-  show($("reply"), true);
 }
 
 $("login").addEventListener("submit", async (event) => {

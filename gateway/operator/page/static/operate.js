@@ -8,7 +8,7 @@ const TWO_STEPS = ["arm", "start"];
 export class Operate {
   constructor(line, say, may) {
     Object.assign(this, { line, say, may });
-    this.fields = {};
+    this.follows = []; // what puts the line's set-points into fields that nobody has touched
     $("operate").replaceChildren(...(may("arm") ? this.forms() : [h("p", {}, word("operate.look-only"))]));
   }
 
@@ -32,29 +32,74 @@ export class Operate {
       ...fields, h("button", { "aria-label": `${word("operate.set")}: ${word(`operate.${name}`)}` }, word("operate.set")));
   }
 
+  // A field for a number, with the line's own in it until somebody writes another.
+  field(min, max, now) {
+    const input = h("input", { type: "number", min, max, step: "any", required: true, inputmode: "decimal" });
+    let touched = false;
+    const put = () => {
+      const text = String((this.last && now()) ?? "");
+      if (!touched && input.value !== text) input.value = text;
+    };
+    input.addEventListener("input", () => (touched = input.value !== ""));
+    const anew = () => {
+      touched = false;
+      put();
+    };
+    input.addEventListener("blur", () => touched || put());
+    this.follows.push(() => document.activeElement !== input && put());
+    return { input, anew };
+  }
+
   tension() {
     const span = h("select", {}, this.line.spans.map((one, i) => h("option", { value: i + 1 }, `${i + 1} ${one.name}`)));
     const [min, max] = this.line.setpoint_n;
-    const value = h("input", { type: "number", min, max, step: "0.1", required: true, inputmode: "decimal" });
-    const put = () => this.last && (value.value = this.last.spans[span.value - 1][1]?.toFixed(1) ?? "");
-    span.addEventListener("change", put);
-    this.prefill = put;
-    return this.form("tension", () => this.say({ command: "set", span: Number(span.value), tension_n: Number(value.value) }),
+    const value = this.field(min, max, () => this.last.spans[span.value - 1][1]);
+    span.addEventListener("change", value.anew);
+    const submit = async () => {
+      await this.say({ command: "set", span: Number(span.value), tension_n: Number(value.input.value) });
+      value.anew();
+    };
+    return this.form("tension", submit,
       h("label", {}, h("span", {}, word("operate.tension")), span),
-      h("label", {}, h("span", {}, `N, ${number(min, 0)} ${word("operate.to")} ${number(max, 0)}`), value));
+      h("label", {}, h("span", {}, `N, ${number(min, 0)} ${word("operate.to")} ${number(max, 0)}`), value.input));
   }
 
   speed() {
     const max = this.line.speed_max_m_per_s;
-    const value = this.fields.speed = h("input", { type: "number", min: 0, max, step: "0.001", required: true, inputmode: "decimal" });
-    return this.form("speed", () => this.say({ command: "speed", speed_m_per_s: Number(value.value) }),
-      h("label", {}, h("span", {}, `${word("operate.speed")}, m/s, 0 ${word("operate.to")} ${number(max, 2)}`), value));
+    const value = this.field(0, max, () => this.last.speed_setpoint);
+    const submit = async () => {
+      const to = Number(value.input.value), from = this.last?.speed_setpoint ?? 0;
+      const lines = [changed(word("operate.speed"), from, to, "m/s", 3)];
+      if (to > from && (await confirmed({ title: word("operate.sure-speed"), lines, yes: word("operate.set") })) === null) return;
+      await this.say({ command: "speed", speed_m_per_s: to });
+      value.anew();
+    };
+    return this.form("speed", submit,
+      h("label", {}, h("span", {}, `${word("operate.speed")}, m/s, 0 ${word("operate.to")} ${number(max, 2)}`), value.input));
   }
 
   recipe() {
-    const name = h("select", {}, this.line.recipes.map((recipe) => h("option", { value: recipe.name },
-      `${recipe.name} (${number(Math.min(...recipe.tension_n), 0)}–${number(Math.max(...recipe.tension_n), 0)} N, ${number(recipe.speed_m_per_s, 2)} m/s)`)));
-    return this.form("recipe", () => this.say({ command: "recipe", name: name.value }), h("label", {}, h("span", {}, word("operate.recipe")), name));
+    const options = this.line.recipes.map((recipe) => h("option", { value: recipe.name },
+      `${recipe.name} (${number(Math.min(...recipe.tension_n), 0)}–${number(Math.max(...recipe.tension_n), 0)} N, ${number(recipe.speed_m_per_s, 2)} m/s)`));
+    const name = h("select", { required: true }, h("option", { value: "" }, word("operate.choose")), options);
+    const submit = async () => {
+      const recipe = this.line.recipes.find((one) => one.name === name.value), lines = this.byRecipe(recipe);
+      if ((await confirmed({ title: word("operate.sure-recipe", { name: recipe.name }), lines, yes: word("operate.set"), wide: true })) === null) return;
+      await this.say({ command: "recipe", name: recipe.name });
+      name.value = "";
+    };
+    return this.form("recipe", submit, h("label", {}, h("span", {}, word("operate.recipe")), name));
+  }
+
+  // Every set-point that it would move.
+  byRecipe(recipe) {
+    const from = this.last, lines = [];
+    if (from?.speed_setpoint == null || Math.abs(from.speed_setpoint - recipe.speed_m_per_s) > 1e-4) lines.push(changed(word("operate.speed"), from?.speed_setpoint, recipe.speed_m_per_s, "m/s", 3));
+    recipe.tension_n.forEach((to, i) => {
+      const was = from?.spans[i]?.[1];
+      if (was == null || Math.abs(was - to) > 0.005) lines.push(changed(`${word("operate.tension")} ${i + 1}`, was, to, "N", 1));
+    });
+    return lines.length ? lines : [word("operate.same")];
   }
 
   async back() {
@@ -63,14 +108,14 @@ export class Operate {
   }
 
   paint(tick) {
-    const first = !this.last;
     this.last = tick;
     const state = $("operate-state");
     if (!state) return;
     setText(state, word(`next.${tick.loop.state}`));
-    if (first) {
-      this.prefill();
-      this.fields.speed.value = tick.speed_setpoint ?? "";
-    }
+    for (const follow of this.follows) follow();
   }
+}
+
+function changed(what, from, to, unit, digits) {
+  return word("operate.from-to", { what, from: `${number(from, digits)} ${unit}`, to: `${number(to, digits)} ${unit}` });
 }

@@ -75,8 +75,8 @@ export class Picture {
       const parts = this.cells[i];
       if (!parts) return;
       setText(parts.value, number(tension));
-      const [, first, rest] = bad ? /^(\S+) ?(.*)$/.exec(word(why)) : ["", "", ""];
-      setText(parts.note.firstChild, bad ? `▲ ${first}` : "");
+      const [, first, rest] = why ? /^(\S+) ?(.*)$/.exec(word(why)) : ["", "", ""];
+      setText(parts.note.firstChild, bad ? `▲ ${first}` : first);
       setText(parts.note.lastChild, rest);
       for (const name of ["value", "fill", "note", "frame"]) parts[name].setAttribute("data-bad", bad);
       const top = tension == null ? BAR.bottom : y(tension);
@@ -100,10 +100,11 @@ export class Picture {
   }
 
   fill(tick) {
-    if (tick.wall_s - (this.filled ?? 0) < 0.9) return;
-    this.filled = tick.wall_s;
+    const now_ms = performance.now(); // the line's clock may be set back
+    if (now_ms - (this.filled_ms ?? -Infinity) < 900) return;
+    this.filled_ms = now_ms;
     tick.spans.forEach(([tension, setpoint, speed, torque, bad, why], i) => {
-      const texts = [number(tension), number(setpoint), number(speed, 3), number(torque), bad ? word(why) : word("span.well")];
+      const texts = [number(tension), number(setpoint), number(speed, 3), number(torque), why ? `${bad && "▲ "}${word(why)}` : word("span.well")];
       texts.forEach((text, k) => setText(this.values[i][k], text));
     });
   }

@@ -3,7 +3,7 @@ import { $, english, h, replaced } from "./dom.js";
 import { Refused, ask } from "./net.js";
 import { number, time, word } from "./words.js";
 
-const LONG_S = 600, EVERY_S = 0.5, MARKS = { deployed: "D", "rolled-back": "R" };
+const LONG_S = 600, EVERY_MS = 500, MARKS = { deployed: "D", "rolled-back": "R" };
 
 export class Trends {
   constructor(line) {
@@ -44,15 +44,22 @@ export class Trends {
   }
 
   paint(tick) {
+    const now_ms = performance.now();
+    if (now_ms - (this.painted_ms ?? -Infinity) < EVERY_MS) return;
+    this.painted_ms = now_ms;
+    if (tick.wall_s < (this.times.at(-1) ?? 0)) for (const list of this.lists()) list.length = 0; // the clock was set back
     const last = this.times.at(-1) ?? 0;
-    if (tick.wall_s - last < EVERY_S) return;
+    if (tick.wall_s === last) return;
     if (this.times.length && tick.wall_s - last > 5) this.push(last + 1, null); // a gap, not a line across it
     this.push(tick.wall_s, tick);
     this.draw();
   }
 
+  lists() {
+    return [this.times, this.speed, ...this.tension, ...this.setpoint];
+  }
+
   push(wall_s, tick) {
-    const lists = [this.times, this.speed, ...this.tension, ...this.setpoint];
     this.times.push(wall_s);
     this.speed.push(tick?.speed ?? null);
     this.line.spans.forEach((_, i) => {
@@ -60,7 +67,7 @@ export class Trends {
       this.setpoint[i].push(tick?.spans[i][1] ?? null);
     });
     const old = this.times.findIndex((t) => t >= wall_s - LONG_S);
-    if (old > 50) for (const list of lists) list.splice(0, old);
+    if (old > 50) for (const list of this.lists()) list.splice(0, old);
   }
 
   draw(anew = false) {
