@@ -161,7 +161,7 @@ def test_subscriptions_are_bounded_in_speed_number_and_length(monkeypatch):
     monkeypatch.setattr(limits, "SUBSCRIPTIONS_EACH", 2)
 
     async def story():
-        async with bench(spans=1, sessions_max=1) as b, b.connected("vera") as client:
+        async with bench(spans=1) as b, b.connected("vera") as client:
             subscription = await client.create_subscription(0, None)
             held = b.opcua.server.iserver.subscription_service.subscriptions[subscription.subscription_id]
             assert held.data.RevisedPublishingInterval == limits.PUBLISHING_MS[0]
@@ -175,9 +175,16 @@ def test_subscriptions_are_bounded_in_speed_number_and_length(monkeypatch):
             params.ItemsToCreate = [item] * limits.MAX_MONITORED
             with pytest.raises(ua.uaerrors.BadTooManyMonitoredItems):
                 await client.uaclient.create_monitored_items(params)
-            await client.create_subscription(100, None)
+            another = await client.create_subscription(100, None)
+            params.SubscriptionId = another.subscription_id  # all of a session count together
+            with pytest.raises(ua.uaerrors.BadTooManyMonitoredItems):
+                await client.uaclient.create_monitored_items(params)
             with pytest.raises(ua.uaerrors.BadTooManySubscriptions):
                 await client.create_subscription(100, None)
+            held = b.opcua.server.iserver.subscription_service.subscriptions[another.subscription_id]
+            assert held._no_acks_limit == limits.MAX_UNACKNOWLEDGED == 20  # noqa: SLF001 (nothing tells it)
+            async with b.connected("otto") as other:  # others have theirs
+                await other.create_subscription(100, None)
 
     run(story)
 

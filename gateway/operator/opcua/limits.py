@@ -7,7 +7,10 @@ from typing import Any
 from asyncua import ua as asyncua_ua
 from asyncua.common.utils import ServiceError
 from asyncua.server.address_space import ViewService
+from asyncua.server.internal_subscription import InternalSubscription
 from asyncua.server.subscription_service import SubscriptionService
+
+from gateway.operator.opcua.filters import Items
 
 MAX_CHUNK = 65_535  #: bytes
 MAX_CHUNKS = 4
@@ -15,11 +18,15 @@ MAX_MESSAGE = 262_144  #: bytes
 MAX_READ = 1000  #: nodes of one request
 MAX_BROWSE = 100
 MAX_CALLS = 4  #: methods of one request, and requests with methods that one client may have running
-MAX_HISTORIES = 60  #: nodes of one request
-MAX_MONITORED = 1000  #: items of one subscription
+MAX_URGENT = 16  #: requests with methods, those that stop the line among them
+MAX_HISTORIES = 20  #: nodes of one request
+MAX_HISTORY_READS = 2  #: requests that one client may have running
+MAX_HISTORY_POINTS = 5000  #: of one request, of all its nodes: they have to fit into an answer
+MAX_MONITORED = 1000  #: items of all subscriptions of a session
+MAX_EVENT_ITEMS = 10  #: among them: an event is made anew for each
 MAX_QUEUE = 100  #: values of one item that wait to be published
-MAX_UNACKNOWLEDGED = 100  #: messages of one subscription that are kept to be sent again
-SUBSCRIPTIONS_EACH = 4  #: of the sessions that may be, on average
+MAX_UNACKNOWLEDGED = 20  #: messages of one subscription that are kept to be sent again
+SUBSCRIPTIONS_EACH = 4  #: of a session
 MORE_CONNECTIONS = 12  #: than sessions: for clients that look for the endpoints, or have not logged in yet
 PENDING_MESSAGES = 64
 LOGIN_S = 5.0  #: from a connection to a session
@@ -46,7 +53,7 @@ def at_most(count: int, most: int) -> None:
 
 
 class Subscriptions(SubscriptionService):
-    """Subscriptions of bounded speed and number of items."""
+    """Subscriptions of bounded speed, number and number of items, none of which can harm another."""
 
     async def create_subscription(
         self,
@@ -57,14 +64,25 @@ class Subscriptions(SubscriptionService):
     ) -> Any:
         shortest, longest = PUBLISHING_MS
         if request_callback is not None:  # a client's
+            if len(self._of(session_id)) >= SUBSCRIPTIONS_EACH:
+                raise ServiceError(ua.StatusCodes.BadTooManySubscriptions)
             wanted = float(params.RequestedPublishingInterval)
             params.RequestedPublishingInterval = min(max(wanted, shortest), longest) if isfinite(wanted) else longest
-        return await super().create_subscription(params, callback, session_id, request_callback)
+        result = await super().create_subscription(params, callback, session_id, request_callback)
+        made = self.subscriptions[result.SubscriptionId]
+        made.monitored_item_srv = Items(made, self.aspace)
+        return result
 
     async def create_monitored_items(self, params: Any) -> list[Any]:
+        wanted = params.ItemsToCreate = params.ItemsToCreate or []
+        events = sum(one.ItemToMonitor.AttributeId == ua.AttributeIds.EventNotifier for one in wanted)
         held = self.subscriptions.get(params.SubscriptionId)
-        before = 0 if held is None else len(held.monitored_item_srv._monitored_items)  # noqa: SLF001
-        if before + len(params.ItemsToCreate) > MAX_MONITORED:
+        others = [one.monitored_item_srv for one in self._of(held.session_id)] if held is not None else []
+        items = [one for one in others if isinstance(one, Items)]
+        if (
+            sum(one.items() for one in items) + len(wanted) > MAX_MONITORED
+            or sum(one.event_items() for one in items) + events > MAX_EVENT_ITEMS
+        ):
             raise ServiceError(ua.StatusCodes.BadTooManyMonitoredItems)
         return await super().create_monitored_items(params)
 
@@ -73,6 +91,17 @@ class Subscriptions(SubscriptionService):
         for item in params.ItemsToModify:  # asyncua would take any length, and 0 for none at all
             item.RequestedParameters.QueueSize = min(max(item.RequestedParameters.QueueSize, 1), MAX_QUEUE)
         return super().modify_monitored_items(params)
+
+    async def trigger_event(self, event: Any, subscription_id: int | None = None) -> None:
+        """A subscription that cannot be told is ended; the others, and who tells, go on."""
+        for number in list(self.subscriptions) if subscription_id is None else [subscription_id]:
+            try:
+                await super().trigger_event(event, number)
+            except Exception:  # whatever asyncua makes of what that client has asked for
+                await self.delete_subscriptions([number])
+
+    def _of(self, session_id: Any) -> list[InternalSubscription]:
+        return [one for one in self.subscriptions.values() if one.session_id == session_id]
 
 
 class Views(ViewService):
