@@ -60,10 +60,13 @@ class FakeGateway:
         self.reply = Reply(ok=True, state="RUN", text="done")
         self.running, self.quality, self.tension_n = True, "GOOD", 20.0
         self.waiting: list[ProposalShown] = []
+        self.hidden: set[str] = set()  #: proposals that are listed, and not shown
+        self.lists = True  #: proposals, when it is asked
         self.epoch = 3
         self.alarms: list[AlarmStatus] = []
         self.records: list[RecordTold] = []
         self.hold: asyncio.Event | None = None  #: until then nothing that people say is answered
+        self.hold_past: asyncio.Event | None = None  #: until then no tensions are told
         self.asked_past: list[Any] = []
         mailbox.serve(GATEWAY_STATUS, self._status)
         mailbox.serve(GATEWAY_PROPOSALS, self._proposals)
@@ -101,9 +104,10 @@ class FakeGateway:
     async def _proposals(self, payload: bytes) -> bytes:
         query = QUERY.validate_json(payload)
         if isinstance(query, ListProposals):
-            return self._list().model_dump_json().encode()
+            told = self._list() if self.lists else Reply(ok=False, state="", text="the storage does not answer")
+            return told.model_dump_json().encode()
         for one in self.waiting:
-            if one.proposal_hash.startswith(query.proposal):
+            if one.proposal_hash.startswith(query.proposal) and one.proposal_hash not in self.hidden:
                 return one.model_dump_json().encode()
         return Reply(ok=False, state="", text="there is no such proposal").model_dump_json().encode()
 
@@ -125,6 +129,8 @@ class FakeGateway:
         if isinstance(query, RecordsAfter):
             newer = [one for one in self.records if query.after is None or one.sequence > query.after]
             return RecordsTold(format=1, last=last, records=newer).model_dump_json().encode()
+        if self.hold_past is not None:
+            await self.hold_past.wait()
         n = self.line.n
         return TensionsTold(
             format=1, wall_s=[query.from_wall_s, query.from_wall_s + 1.0, query.to_wall_s],

@@ -4,6 +4,7 @@ import asyncio
 from datetime import UTC, datetime, timedelta
 from math import isnan
 
+import pytest
 from asyncua import Client, ua
 
 from gateway.core.line_past import RecordTold, TensionsBetween
@@ -43,7 +44,7 @@ def test_a_line_is_found_by_browsing_and_each_node_tells_what_it_is():
             assert root in await client.nodes.objects.get_children()
             found = await paths(client, root)
             assert {"Line.Spans.2.Tension", "Line.Rollers.2.Torque", "Line.Controller.Revision", "Line.Decide",
-                    "Line.Proposals.Newest.RuleMargin", "Line.Unwinder.Speed"} <= set(found)  # fmt: skip
+                    "Line.Proposals.Current.RuleMargin", "Line.Unwinder.Speed"} <= set(found)  # fmt: skip
             assert len(found) == len(set(found))
             span = client.get_node(b.id("Line.Spans.1"))
             assert await span.read_type_definition() == b.id("Types.SpanType")
@@ -114,9 +115,9 @@ def test_a_gateway_that_goes_away_leaves_nothing_that_looks_true():
     async def story():
         async with bench(spans=1) as b, b.connected("vera") as client:
             b.gateway.waiting = [shown()]
-            await b.until(client, "Line.Proposals.Newest.Id", lambda found: bool(found.Value.Value))
+            await b.until(client, "Line.Proposals.Current.Id", lambda found: bool(found.Value.Value))
             await b.gateway_mailbox.close()
-            for path in ("Line.Spans.1.Tension", "Line.Operation.State", "Line.Proposals.Newest.ShownHash"):
+            for path in ("Line.Spans.1.Tension", "Line.Operation.State", "Line.Proposals.Current.ShownHash"):
                 found = await b.until(client, path, has(CODES.BadNoCommunication))
                 assert found.Value.Value is None
             assert await b.value(client, "Line.Connection.Fresh") is False
@@ -167,10 +168,10 @@ def test_a_proposal_that_waits_is_there_as_variables_and_goes_when_it_is_decided
         async with bench(spans=1) as b, b.connected("vera") as client:
             one = shown(reason="approve me at once").model_copy(update={"why": "emma has approved"})
             b.gateway.waiting = [one]
-            newest = "Line.Proposals.Newest"
-            await b.until(client, f"{newest}.Id", lambda found: found.Value.Value == one.proposal_hash)
-            own = f"Line.Proposals.{one.proposal_hash[:12]}"
-            for path in (newest, own):
+            current = "Line.Proposals.Current"
+            await b.until(client, f"{current}.Id", lambda found: found.Value.Value == one.proposal_hash)
+            own = f"Line.Proposals.{one.proposal_hash}"
+            for path in (current, own):
                 assert await b.value(client, f"{path}.ShownHash") == SHOWN
                 assert await b.value(client, f"{path}.BaseRevision") == 3
                 assert await b.value(client, f"{path}.Why") == "emma has approved"
@@ -184,11 +185,11 @@ def test_a_proposal_that_waits_is_there_as_variables_and_goes_when_it_is_decided
                 settling = await b.value(client, f"{path}.FigureSettling")
                 assert isnan(settling[0]) and settling[1] == 2.0
             b.gateway.waiting = []
-            await b.until(client, f"{newest}.Id", lambda found: found.Value.Value == "")
-            assert await b.value(client, f"{newest}.Rule") == []
+            await b.until(client, f"{current}.Id", lambda found: found.Value.Value == "")
+            assert await b.value(client, f"{current}.Rule") == []
             assert (await b.read(client, f"{own}.Id")).StatusCode.value == CODES.BadNodeIdUnknown
             there = await client.get_node(b.id("Line.Proposals")).get_children()
-            assert [child.nodeid for child in there] == [b.id(newest)]
+            assert [child.nodeid for child in there] == [b.id(current)]
 
     run(story)
 
@@ -271,6 +272,34 @@ def test_the_past_of_a_tension_is_read_from_the_gateway():
     run(story)
 
 
-def _raw(node_id, begin, end):
-    details = ua.ReadRawModifiedDetails(IsReadModified=False, StartTime=begin, EndTime=end, NumValuesPerNode=10)
-    return ua.HistoryReadParameters(HistoryReadDetails=details, NodesToRead=[ua.HistoryReadValueId(NodeId=node_id)])
+def test_a_history_that_takes_its_time_keeps_nothing_else_waiting_and_each_node_is_asked_for_once():
+    async def story():
+        async with bench(spans=10) as b, b.connected("vera") as client:
+            begin = datetime(2026, 1, 1, tzinfo=UTC)
+            end = begin + timedelta(seconds=10)
+            nodes = [b.id(f"Line.Spans.{k}.{name}") for k in range(1, 11) for name in ("Tension", "Setpoint")]
+            b.gateway.hold_past = asyncio.Event()
+            reading = [asyncio.create_task(client.uaclient.history_read(_raw(*of, begin, end, most=9999)))
+                       for of in (nodes, nodes[:1])]  # fmt: skip
+            await b.until(client, "Line.Operation.State", good)
+            assert not any(task.done() for task in reading)
+            with pytest.raises(ua.uaerrors.BadTooManyOperations):
+                await client.uaclient.history_read(_raw(nodes[0], begin, end))
+            b.gateway.hold_past.set()
+            many, one = await asyncio.gather(*reading)
+            assert len(many) == 20 and len(one) == 1 and all(found.StatusCode.is_good() for found in (*many, *one))
+            points = {found.points for found in b.gateway.asked_past if isinstance(found, TensionsBetween)}
+            assert points == {250, 2000}
+            twice = await client.uaclient.history_read(_raw(nodes[0], nodes[0], begin, end))
+            assert [found.StatusCode.value for found in twice] == [CODES.BadTooManyOperations] * 2
+            with pytest.raises(ua.uaerrors.BadTooManyOperations):
+                await client.uaclient.history_read(_raw(*nodes, b.id("Line.Spans.1.Error"), begin, end))
+
+    run(story)
+
+
+def _raw(*node_ids_begin_end, most=10):
+    *node_ids, begin, end = node_ids_begin_end
+    details = ua.ReadRawModifiedDetails(IsReadModified=False, StartTime=begin, EndTime=end, NumValuesPerNode=most)
+    nodes = [ua.HistoryReadValueId(NodeId=one) for one in node_ids]
+    return ua.HistoryReadParameters(HistoryReadDetails=details, NodesToRead=nodes)

@@ -100,6 +100,11 @@ def of_proposals(found: ProposalList) -> Iterator[Told]:
         yield Told(f"{ROOT}.Controller.{name}", value)
 
 
+def list_paths() -> list[str]:
+    """Of what the list of proposals tells of the controller."""
+    return [f"{ROOT}.Controller.{name}" for name in ("InService", "LastKnownGood", "Revision", "Model")]
+
+
 def health(status: GatewayStatus) -> str:
     """In words."""
     if not status.loop.running:

@@ -8,10 +8,10 @@ from math import nan
 from gateway.core.decisions import ProposalShown
 from gateway.core.verdict import RuleFinding
 from gateway.operator.opcua.line_nodes import ROOT
-from gateway.operator.opcua.space import BOOLEAN, DOUBLE, STRING, UINT32, Row, Space, Value
+from gateway.operator.opcua.space import BOOLEAN, DOUBLE, NO_DATA, STRING, UINT32, Row, Space, Value
 
 FOLDER = f"{ROOT}.Proposals"
-NEWEST = f"{FOLDER}.Newest"
+CURRENT = f"{FOLDER}.Current"
 MOST_WAITING = 20  #: that have nodes, the newest
 
 ROWS = (
@@ -49,19 +49,21 @@ class ProposalNodes:
         self._space = space
         self._type = ""
         self._there: set[str] = set()
+        self._current: ProposalShown | None = None
 
     async def make(self) -> None:
         self._type = await self._space.type("ProposalType", "A change that waits for a person's word", ROWS)
-        await self._space.object(FOLDER, ROOT, "Those that wait, by the first 12 digits of their ids; and the newest")
-        await self._make(NEWEST, "The newest of those that wait")
+        await self._space.object(FOLDER, ROOT, "Those that wait, by their ids; and the one to look at")
+        await self._make(CURRENT, "One that waits, the same as long as it waits unchanged; then the newest")
 
     async def show(self, waiting: Sequence[ProposalShown]) -> None:
         """Those that wait, the newest first."""
-        newest = waiting[0] if waiting else None
-        for name, value in _values(newest):
-            await self._space.tell(f"{NEWEST}.{name}", value, None)
-        wanted = {f"{FOLDER}.{one.proposal_hash[:12]}": one for one in waiting[:MOST_WAITING]}
+        self._current = _kept(self._current, waiting)
+        for name, value in _values(self._current):
+            await self._space.tell(f"{CURRENT}.{name}", value, None)
+        wanted = {f"{FOLDER}.{one.proposal_hash}": one for one in waiting}
         for path in self._there - wanted.keys():
+            await self._nothing(path, NO_DATA)  # whoever watches it shall not go on seeing it wait
             await self._space.remove(path)
         for path in wanted.keys() - self._there:
             await self._make(path, "A proposal that waits")
@@ -72,13 +74,25 @@ class ProposalNodes:
 
     async def unsure(self, code: int) -> None:
         """Whether they still wait is not known: nothing is shown that could be decided on."""
-        for path in (NEWEST, *sorted(self._there)):
-            for row in ROWS:
-                await self._space.tell(f"{path}.{row.name}", None, None, code)
+        for path in (CURRENT, *sorted(self._there)):
+            await self._nothing(path, code)
+
+    async def _nothing(self, path: str, code: int) -> None:
+        for row in ROWS:
+            await self._space.tell(f"{path}.{row.name}", None, None, code)
 
     async def _make(self, path: str, tells: str) -> None:
         await self._space.object(path, FOLDER, tells, self._type)
         await self._space.variables(path, ROWS)
+
+
+def _kept(current: ProposalShown | None, waiting: Sequence[ProposalShown]) -> ProposalShown | None:
+    """What a person looks at does not change under their finger because something newer has come."""
+    if current is not None:
+        for one in waiting:
+            if (one.proposal_hash, one.shown) == (current.proposal_hash, current.shown):
+                return one
+    return waiting[0] if waiting else None
 
 
 def quoted(reason: str) -> str:

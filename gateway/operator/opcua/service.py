@@ -11,7 +11,7 @@ from gateway.operator.line_side import LineSide, NotTold
 from gateway.operator.opcua.alarm_nodes import alarms_of, live_alarm_paths, make_alarms
 from gateway.operator.opcua.events import Events
 from gateway.operator.opcua.history import History
-from gateway.operator.opcua.line_nodes import ROOT, Told, live_paths, make_line, of_proposals, of_status
+from gateway.operator.opcua.line_nodes import ROOT, Told, list_paths, live_paths, make_line, of_proposals, of_status
 from gateway.operator.opcua.login import Check, Logins
 from gateway.operator.opcua.methods import make_methods
 from gateway.operator.opcua.proposal_nodes import MOST_WAITING, ProposalNodes
@@ -69,43 +69,61 @@ class OpcUa:
         await self.server.stop()
 
     async def _show_line(self) -> None:
-        side, space = self._side, self._space
+        side = self._side
         age_s = side.age_s
-        fresh = age_s is not None and age_s <= STALE_S
+        fresh = _is_fresh(age_s)
         await self._tell((Told(f"{ROOT}.Connection.Fresh", fresh), Told(f"{ROOT}.Connection.Trouble", side.trouble)))
         if side.status is not None and fresh:
             await self._tell((*of_status(side.status), *alarms_of(side.status)), side.status.wall_s)
-            if side.proposals is not None:
+            if side.proposals is not None and _is_fresh(side.proposals_age_s):
                 await self._tell(of_proposals(side.proposals))
+            else:
+                await self._unsure(list_paths(), side.proposals_age_s)
         else:
-            for path in (*live_paths(self._line), *live_alarm_paths()):
-                await space.tell(path, None, None, WAITING if age_s is None else NO_COMMUNICATION)
+            await self._unsure((*live_paths(self._line), *live_alarm_paths()), age_s)
+
+    async def _unsure(self, paths: Iterable[str], age_s: float | None) -> None:
+        for path in paths:
+            await self._space.tell(path, None, None, WAITING if age_s is None else NO_COMMUNICATION)
 
     async def _show_proposals(self) -> None:
         """What is shown must be of the moment: where the gateway does not tell, nothing is."""
         found = self._side.proposals
-        age_s = self._side.age_s
-        if found is None or age_s is None or age_s > STALE_S:
+        if found is None or not self._list_is_fresh():
             await self._proposals.unsure(WAITING if found is None else NO_COMMUNICATION)
             return
         if found is not self._shown_of:
-            try:
-                self._shown, self._shown_of = await self._waiting(found), found
-            except NotTold:
+            shown, missed = await self._waiting(found)
+            if missed and (not shown or not self._list_is_fresh()):
                 await self._proposals.unsure(NO_COMMUNICATION)
                 return
+            self._shown, self._shown_of = shown, None if missed else found
         await self._proposals.show(self._shown)
         await self._events.waiting(self._shown)
 
-    async def _waiting(self, found: ProposalList) -> list[ProposalShown]:
-        """Raises NotTold. One that is decided in between is left out."""
-        waiting = [one.proposal for one in found.proposals if one.stage == WAITS][:MOST_WAITING]
-        shown = [await self._side.shown(one) for one in waiting]
-        return [one for one in shown if one.stage == WAITS and one.shown is not None]
+    def _list_is_fresh(self) -> bool:
+        return _is_fresh(self._side.age_s) and _is_fresh(self._side.proposals_age_s)
+
+    async def _waiting(self, found: ProposalList) -> tuple[list[ProposalShown], bool]:
+        """Those that can be shown, and whether one cannot. One that is decided in between is left out."""
+        shown: list[ProposalShown] = []
+        missed = False
+        for one in [one.proposal for one in found.proposals if one.stage == WAITS][:MOST_WAITING]:
+            try:
+                shown.append(await self._side.shown(one))
+            except NotTold:
+                missed = True
+                if not self._list_is_fresh():  # the gateway is away: it does not have to be asked for each
+                    break
+        return [one for one in shown if one.stage == WAITS and one.shown is not None], missed
 
     async def _tell(self, values: Iterable[Told], wall_s: float | None = None) -> None:
         for one in values:
             await self._space.tell(one.path, one.value, wall_s, one.code)
+
+
+def _is_fresh(age_s: float | None) -> bool:
+    return age_s is not None and age_s <= STALE_S
 
 
 async def _again(do: Callable[[], Awaitable[None]], event: asyncio.Event) -> None:

@@ -25,6 +25,7 @@ GOOD: int = ua.StatusCodes.Good
 WAITING: int = ua.StatusCodes.BadWaitingForInitialData
 LAST_USABLE: int = ua.StatusCodes.UncertainLastUsableValue
 NO_COMMUNICATION: int = ua.StatusCodes.BadNoCommunication
+NO_DATA: int = ua.StatusCodes.BadNoData
 
 Scalar = bool | int | float | str
 Value = Scalar | Sequence[Scalar] | None
