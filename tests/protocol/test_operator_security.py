@@ -1,10 +1,10 @@
 """Who is let in at the OPC UA server, and what those cannot do who are not, or only to look."""
 
 import asyncio
+from pathlib import Path
 
 import pytest
 from asyncua import Client, ua
-from asyncua.common.utils import ServiceError
 from asyncua.crypto import security_policies as policies
 
 from gateway.operator.opcua import login
@@ -167,32 +167,29 @@ def test_somebody_without_a_name_stays_outside_unless_the_lines_file_lets_them_l
             await b.until(client, "Line.Operation.State", lambda found: found.StatusCode.is_good())
             assert await b.call(client, "Stop") == (CODES.BadUserAccessDenied, [])
             assert await refused(await b.client(None, policy=None))  # nor then without encryption
-            assert b.gateway.heard == []
+            assert [(one.person.name, one.person.role) for one in b.gateway.heard] == [("anonymous", "viewer")]
 
     run(story)
 
 
-def test_guessing_becomes_slower_and_slower_for_that_client_alone(monkeypatch):
-    slept: list[float] = []
-    mine, other = "a" * 64, "b" * 64
+def test_a_file_among_the_trusted_that_cannot_be_read_keeps_nobody_else_out(monkeypatch):
+    read = Path.read_bytes
+
+    def reads(path):
+        if path.name == "0.der":
+            raise PermissionError(13, "Permission denied")
+        return read(path)
 
     async def story():
-        async def check(name, password):
-            return "operator" if password == PASSWORD else None
-
-        async def sleep(seconds):
-            slept.append(seconds)
-
-        monkeypatch.setattr(login.asyncio, "sleep", sleep)
-        logins = login.Logins(check, anonymous_may_read=False)
-        for certificate in (mine, mine, mine, other):
-            with pytest.raises(ServiceError):
-                await logins.by_password("otto", "guess", certificate)
-        person = await logins.by_password("otto", PASSWORD, mine)
-        assert person.name == "otto"
+        async with bench(spans=1) as b:
+            (b.pki / TRUSTED / "00.der").mkdir()
+            (b.pki / TRUSTED / "0.der").write_bytes(bytes(len(der(pair("client")))))
+            monkeypatch.setattr(Path, "read_bytes", reads)
+            async with b.connected("otto"):
+                pass
+            assert any("0.der cannot be read" in said for said in b.said)
 
     run(story)
-    assert slept == [0.001, 0.002, 0.004, 0.001]
 
 
 def test_a_session_cannot_be_taken_up_by_another_connection():

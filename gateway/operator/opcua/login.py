@@ -1,7 +1,7 @@
 """Who a client's user is: by name and password, or nobody in particular where the line's file lets such look."""
 
 import asyncio
-from collections import OrderedDict
+from collections import Counter, OrderedDict
 from collections.abc import Awaitable, Callable
 from typing import Any
 
@@ -17,6 +17,8 @@ Check = Callable[[str, str], Awaitable[Role | None]]
 ANONYMOUS = "anonymous"  #: as the audit names whoever has no name
 FIRST_DELAY_S, LAST_DELAY_S = 0.25, 3.0  #: after the first wrong password of a client, and after many
 MOST_CLIENTS = 500  #: whose wrong passwords are counted
+MOST_NAMES = 50  #: of one client; those of further names are counted together
+CHECKS = 2  #: passwords that are looked at at a time, of all clients
 LONGEST = 1024  #: bytes of a password as it comes
 #: How a password may be encrypted inside the channel, which is encrypted. Not with RSA 1.5, which can be made to tell.
 ENCRYPTIONS = (
@@ -26,14 +28,23 @@ ENCRYPTIONS = (
 ua: Any = asyncua_ua  #: what it declares of its values and what they are differ
 
 
+class _Guesser:
+    """A client, known by its certificate, as long as it waits for an answer."""
+
+    def __init__(self) -> None:
+        self.turn = asyncio.Lock()
+        self.waiting = 0  #: those that hold it or wait for it
+
+
 class Logins:
-    """Each client, known by its certificate, guesses one password after the other, and ever more slowly."""
+    """Each client guesses one password after the other, and ever more slowly."""
 
     def __init__(self, check: Check, anonymous_may_read: bool) -> None:
         self._check = check
         self._anonymous_may_read = anonymous_may_read
-        self._wrong: OrderedDict[str, int] = OrderedDict()  #: passwords in a row, by certificate
-        self._guessing: dict[str, asyncio.Lock] = {}
+        self._wrong: OrderedDict[str, Counter[str]] = OrderedDict()  #: passwords by certificate, then by name
+        self._guessing: dict[str, _Guesser] = {}
+        self._checks = asyncio.Semaphore(CHECKS)
 
     async def person(self, server: InternalServer, session: Any, token: Any, certificate: str) -> Person:
         """Raises ServiceError."""
@@ -45,27 +56,39 @@ class Logins:
 
     async def by_password(self, name: str, password: str, certificate: str) -> Person:
         """Raises ServiceError, after a while. A client's guesses wait for each other."""
-        guessing = self._guessing.setdefault(certificate, asyncio.Lock())
+        guesser = self._guessing.setdefault(certificate, _Guesser())
+        guesser.waiting += 1
         try:
-            async with guessing:
-                role = await self._check(name, password)
+            async with guesser.turn:
+                async with self._checks:
+                    role = await self._check(name, password)
                 if role is not None:
-                    self._wrong.pop(certificate, None)
+                    self._forget(certificate, name)
                     return Person(name=name, role=role, through="opc-ua", certificate=certificate)
-                await asyncio.sleep(self._delay_s(certificate))
+                await asyncio.sleep(self._delay_s(certificate, name))
         except ValidationError:  # a name that no user can have
             pass
         finally:
-            if not guessing.locked():
-                self._guessing.pop(certificate, None)
+            guesser.waiting -= 1
+            if not guesser.waiting:
+                del self._guessing[certificate]
         raise ServiceError(ua.StatusCodes.BadUserAccessDenied)
 
-    def _delay_s(self, certificate: str) -> float:
-        """After one more wrong password."""
-        wrong = self._wrong[certificate] = self._wrong.pop(certificate, 0) + 1
+    def _forget(self, certificate: str, name: str) -> None:
+        """Wrong passwords of that name; those of others still count for the client."""
+        found = self._wrong.get(certificate)
+        if found is not None:
+            del found[name]
+            if not found:
+                del self._wrong[certificate]
+
+    def _delay_s(self, certificate: str, name: str) -> float:
+        """After one more wrong password: by all of this client's, for whatever names."""
+        found = self._wrong[certificate] = self._wrong.pop(certificate, Counter())
+        found[name if name in found or len(found) < MOST_NAMES else ""] += 1
         while len(self._wrong) > MOST_CLIENTS:
             self._wrong.popitem(last=False)
-        return min(FIRST_DELAY_S * 2.0 ** min(wrong - 1, 16), LAST_DELAY_S)
+        return min(FIRST_DELAY_S * 2.0 ** min(found.total() - 1, 16), LAST_DELAY_S)
 
 
 def _plain(server: InternalServer, session: Any, token: Any) -> tuple[str, str]:

@@ -122,7 +122,16 @@ class TrustList:
 
     def _is_trusted(self, der: bytes) -> bool:
         """By content: a file's name proves nothing."""
-        return any(path.read_bytes() == der for path in sorted(self._trusted.glob("*.der"))[:MOST_TRUSTED])
+        return any(self._holds(path, der) for path in sorted(self._trusted.glob("*.der"))[:MOST_TRUSTED])
+
+    def _holds(self, path: Path, der: bytes) -> bool:
+        """A file that cannot be read lets nobody in, and keeps nobody else out."""
+        try:
+            return path.is_file() and path.stat().st_size == len(der) and path.read_bytes() == der
+        except OSError as error:
+            if self._may_say():
+                self._tell(f"{path} cannot be read, and lets nobody in: {error.strerror}")
+            return False
 
     def _keep(self, der: bytes, certificate: x509.Certificate) -> None:
         """Beside the newest others; told once as long as it lies there."""

@@ -1,0 +1,90 @@
+"""Wrong passwords: who guesses is slowed down, and nobody else."""
+
+import asyncio
+
+import pytest
+from asyncua.common.utils import ServiceError
+
+from gateway.operator.opcua import login
+from tests.protocol.operator_support import PASSWORD
+from tests.protocol.test_operator_security import impatient, run
+
+__all__ = ["impatient"]  #: the fixture
+
+
+def test_guessing_becomes_slower_and_slower_for_that_client_alone(monkeypatch):
+    slept: list[float] = []
+    mine, other = "a" * 64, "b" * 64
+
+    async def story():
+        async def check(name, password):
+            return "operator" if password == PASSWORD else None
+
+        async def sleep(seconds):
+            slept.append(seconds)
+
+        monkeypatch.setattr(login.asyncio, "sleep", sleep)
+        logins = login.Logins(check, anonymous_may_read=False)
+        for certificate in (mine, mine, mine, other):
+            with pytest.raises(ServiceError):
+                await logins.by_password("otto", "guess", certificate)
+        person = await logins.by_password("otto", PASSWORD, mine)
+        assert person.name == "otto"
+
+    run(story)
+    assert slept == [0.001, 0.002, 0.004, 0.001]
+
+
+def test_who_knows_one_password_guesses_those_of_others_no_faster(monkeypatch):
+    slept: list[float] = []
+
+    async def story():
+        async def check(name, password):
+            return "operator" if (name, password) == ("otto", PASSWORD) else None
+
+        async def sleep(seconds):
+            slept.append(seconds)
+
+        monkeypatch.setattr(login.asyncio, "sleep", sleep)
+        logins = login.Logins(check, anonymous_may_read=False)
+        for _ in range(3):
+            with pytest.raises(ServiceError):
+                await logins.by_password("emma", "guess", "a" * 64)
+            await logins.by_password("otto", PASSWORD, "a" * 64)
+        with pytest.raises(ServiceError):
+            await logins.by_password("otto", "mistyped", "a" * 64)
+        await logins.by_password("otto", PASSWORD, "a" * 64)  # which clears otto's own
+        with pytest.raises(ServiceError):
+            await logins.by_password("emma", "guess", "a" * 64)
+
+    run(story)
+    assert slept == [0.001, 0.002, 0.004, 0.008, 0.008]
+
+
+def test_a_clients_guesses_wait_for_each_other_and_those_of_all_are_two_at_a_time():
+    async def story():
+        running: list[str] = []
+        most: list[list[str]] = []
+        go = asyncio.Event()
+
+        async def check(name, password):
+            running.append(name)
+            most.append(list(running))
+            await go.wait()
+            await asyncio.sleep(0)
+            running.remove(name)
+
+        logins = login.Logins(check, anonymous_may_read=False)
+        guesses = [
+            asyncio.create_task(logins.by_password(f"{of}{number}", "guess", of * 64))
+            for number in range(3) for of in "abc"
+        ]  # fmt: skip
+        while not running:  # noqa: ASYNC110 (the first of them)
+            await asyncio.sleep(0)
+        go.set()
+        answers = await asyncio.gather(*guesses, return_exceptions=True)
+        assert all(isinstance(one, ServiceError) for one in answers)
+        assert len(most) == 9 and max(map(len, most)) == 2
+        assert all(len({name[0] for name in at_once}) == len(at_once) for at_once in most)
+
+    run(story)
