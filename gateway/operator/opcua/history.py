@@ -16,6 +16,7 @@ from pydantic import ValidationError
 from gateway.core.line import Line
 from gateway.core.line_past import MOST_POINTS, TensionsBetween, TensionsTold
 from gateway.operator.line_side import LineSide, NotTold
+from gateway.operator.opcua.limits import MAX_HISTORY_POINTS
 from gateway.operator.opcua.line_nodes import ROOT
 from gateway.operator.opcua.space import DOUBLE, Space
 
@@ -49,19 +50,22 @@ class History:
         details = params.HistoryReadDetails
         if not isinstance(details, ua.ReadRawModifiedDetails) or details.IsReadModified:
             return [_refused(ua.StatusCodes.BadHistoryOperationUnsupported)] * len(params.NodesToRead)
-        known = [one.NodeId in self._columns for one in params.NodesToRead]
+        nodes = [one.NodeId for one in params.NodesToRead]
+        if len(set(nodes)) < len(nodes):
+            return [_refused(ua.StatusCodes.BadTooManyOperations)] * len(nodes)
+        known = [one in self._columns for one in nodes]
         if not any(known):
             return [_refused(ua.StatusCodes.BadHistoryOperationUnsupported)] * len(known)
         start_s, end_s = _seconds(details.StartTime), _seconds(details.EndTime)
         if start_s is None and end_s is None:
             return [_refused(ua.StatusCodes.BadInvalidTimestampArgument)] * len(known)
         backwards = start_s is None or (end_s is not None and start_s > end_s)
+        most = min(int(details.NumValuesPerNode or 0) or POINTS, MOST_POINTS, MAX_HISTORY_POINTS // sum(known))
         try:
-            told = await self._side.tensions(self._between(start_s, end_s, int(details.NumValuesPerNode or 0)))
+            told = await self._side.tensions(self._between(start_s, end_s, most))
         except (NotTold, ValidationError):
             return [_refused(ua.StatusCodes.BadNoCommunication)] * len(known)
-        return [self._values(one.NodeId, told, backwards, int(details.NumValuesPerNode or 0))
-                for one in params.NodesToRead]  # fmt: skip
+        return [self._values(one, told, backwards, most) for one in nodes]
 
     def update_history(self, params: Any) -> list[Any]:
         raise ua.UaStatusCodeError(ua.StatusCodes.BadServiceUnsupported)
@@ -70,8 +74,7 @@ class History:
         ends = [one for one in (start_s, end_s) if one is not None]
         first = min(ends) if len(ends) == 2 or start_s is not None else ends[0] - OPEN_S
         last = max(ends) if len(ends) == 2 or start_s is None else min(ends[0] + OPEN_S, self._wall_clock())
-        points = min(max(most, 2), MOST_POINTS) if most else POINTS
-        return TensionsBetween(from_wall_s=first, to_wall_s=max(first, last), points=points)
+        return TensionsBetween(from_wall_s=first, to_wall_s=max(first, last), points=max(most, 2))
 
     def _values(self, node_id: Any, told: TensionsTold, backwards: bool, most: int) -> Any:
         found = self._columns.get(node_id)
@@ -89,7 +92,7 @@ class History:
         if backwards:
             values.reverse()
         held = ua.HistoryData()
-        held.DataValues = values[:most] if most else values
+        held.DataValues = values[:most]
         return ua.HistoryReadResult(HistoryData=held)
 
 

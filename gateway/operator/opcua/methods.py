@@ -4,6 +4,7 @@ The gateway holds it against the same table of roles again. What is refused for 
 false, and a sentence); who may not call at all gets BadUserAccessDenied.
 """
 
+import time
 from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -20,6 +21,8 @@ from gateway.operator.line_side import LineSide, NotTold
 from gateway.operator.opcua.line_nodes import ROOT
 from gateway.operator.opcua.session import CALLER
 from gateway.operator.opcua.space import BOOLEAN, DOUBLE, STRING, UINT32, Space
+
+REFUSED_S = 60.0  #: between two refusals of a person's command that the gateway is told of
 
 ua: Any = asyncua_ua  #: what it declares of its values and what they are differ
 
@@ -87,22 +90,42 @@ METHODS = (
 )  # fmt: skip
 
 
+class _Refusals:
+    """What people may not do is handed on now and then: the audit is not for them to fill."""
+
+    def __init__(self) -> None:
+        self._next_s: dict[tuple[str, str], float] = {}  #: by person and command; both are few
+
+    def is_due(self, name: str, command: str) -> bool:
+        now_s = time.monotonic()
+        if now_s < self._next_s.get((name, command), now_s):
+            return False
+        self._next_s[name, command] = now_s + REFUSED_S
+        return True
+
+
 async def make_methods(server: Server, space: Space, line: LineSide) -> None:
     root = server.get_node(space.id(ROOT))
+    refusals = _Refusals()
     answers = [_argument("ok", BOOLEAN, "It was done"), _argument("sentence", STRING, "What was done, or why not")]
     for method in METHODS:
         inputs = [_argument(one.name, one.kind, one.tells) for one in method.inputs]
         name = ua.QualifiedName(method.name, space.namespace)
         node_id = space.id(f"{ROOT}.{method.name}")
-        node = await root.add_method(node_id, name, _callback(method, line), inputs, answers)
+        node = await root.add_method(node_id, name, _callback(method, line, refusals), inputs, answers)
         described = ua.DataValue(ua.Variant(ua.LocalizedText(method.tells), ua.VariantType.LocalizedText))
         await server.write_attribute_value(node.nodeid, described, ua.AttributeIds.Description)
 
 
-def _callback(method: Method, line: LineSide) -> Callable[..., Awaitable[Any]]:
+def _callback(method: Method, line: LineSide, refusals: _Refusals) -> Callable[..., Awaitable[Any]]:
     async def called(parent: Any, *arguments: Any) -> Any:
         person = CALLER.get()
-        if person is None or why_may_not(person, method.command):
+        if person is None:
+            return _result(ua.StatusCodes.BadUserAccessDenied)
+        if why_may_not(person, method.command):
+            if not _wrong(method.inputs, arguments) and refusals.is_due(person.name, method.command):
+                # The gateway refuses it as well, and its audit has to know that it was tried.
+                await _said(method, line, person, [_value(one) for one in arguments])
             return _result(ua.StatusCodes.BadUserAccessDenied)
         if wrong := _wrong(method.inputs, arguments):
             return wrong

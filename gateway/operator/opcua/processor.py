@@ -17,7 +17,8 @@ from asyncua.ua.ua_binary import struct_from_binary
 from asyncua.ua.uaerrors import UaStatusCodeError
 from cryptography import x509
 
-from gateway.operator.opcua.limits import MAX_CALLS
+from gateway.operator.opcua.limits import MAX_CALLS, MAX_HISTORY_READS, MAX_URGENT, at_most
+from gateway.operator.opcua.line_nodes import ROOT
 from gateway.operator.opcua.login import Logins
 from gateway.operator.opcua.session import Session
 from gateway.operator.opcua.trust import application_uri, fingerprint
@@ -37,6 +38,8 @@ _SERVICES = _OPEN | _numbers(
     "SetMonitoringMode", "SetPublishingMode", "Publish", "Republish",
 )  # fmt: skip
 (_CREATE,), (_ACTIVATE,), (_CALL,) = _numbers("CreateSession"), _numbers("ActivateSession"), _numbers("Call")
+(_HISTORY,) = _numbers("HistoryRead")
+URGENT = frozenset(f"{ROOT}.{name}" for name in ("Stop", "Hold"))  #: what nothing else may keep waiting
 _ANYBODY = User(role=UserRole.User)  #: what asyncua is told of whoever has logged in; roles are ours
 
 
@@ -67,7 +70,9 @@ class Processor(UaProcessor):
         super().__init__(server, transport, limits)
         self._logins = logins
         self._proving = proving
-        self._calls: set[asyncio.Task[None]] = set()
+        self._calls: set[asyncio.Task[None]] = set()  #: without those that are urgent
+        self._urgent: set[asyncio.Task[None]] = set()
+        self._histories: set[asyncio.Task[None]] = set()
 
     async def _process_message(self, typeid: Any, requesthdr: Any, seqhdr: Any, body: Buffer) -> bool:
         service = typeid.Identifier
@@ -78,7 +83,14 @@ class Processor(UaProcessor):
         if service not in _OPEN and service != _CREATE:
             self._check_token(requesthdr)
         if service == _CALL:
-            self._begin_call(typeid, requesthdr, seqhdr, body)
+            urgent = _is_urgent(body)
+            at_most(len(self._calls) + len(self._urgent) + 1 if urgent else 0, MAX_URGENT)
+            at_most(0 if urgent else len(self._calls) + 1, MAX_CALLS)
+            self._begin(self._urgent if urgent else self._calls, typeid, requesthdr, seqhdr, body)
+            return True
+        if service == _HISTORY:
+            at_most(len(self._histories) + 1, MAX_HISTORY_READS)
+            self._begin(self._histories, typeid, requesthdr, seqhdr, body)
             return True
         return await self._answer(typeid, requesthdr, seqhdr, body)
 
@@ -95,15 +107,13 @@ class Processor(UaProcessor):
         except Exception as error:
             raise ServiceError(ua.StatusCodes.BadDecodingError) from error
 
-    def _begin_call(self, typeid: Any, requesthdr: Any, seqhdr: Any, body: Buffer) -> None:
-        """Beside the rest: a method may take its time, and the client's subscriptions shall not wait for it."""
-        if len(self._calls) >= MAX_CALLS:
-            raise ServiceError(ua.StatusCodes.BadTooManyOperations)
-        task = asyncio.get_running_loop().create_task(self._call(typeid, requesthdr, seqhdr, body))
-        self._calls.add(task)
-        task.add_done_callback(self._calls.discard)
+    def _begin(self, running: set[asyncio.Task[None]], typeid: Any, requesthdr: Any, seqhdr: Any, body: Buffer) -> None:
+        """Beside the rest: it may take its time, and the client's subscriptions shall not wait for it."""
+        task = asyncio.get_running_loop().create_task(self._beside(typeid, requesthdr, seqhdr, body))
+        running.add(task)
+        task.add_done_callback(running.discard)
 
-    async def _call(self, typeid: Any, requesthdr: Any, seqhdr: Any, body: Buffer) -> None:
+    async def _beside(self, typeid: Any, requesthdr: Any, seqhdr: Any, body: Buffer) -> None:
         try:
             await self._answer(typeid, requesthdr, seqhdr, body)
         except (ServiceError, UaStatusCodeError) as error:
@@ -171,3 +181,12 @@ class Processor(UaProcessor):
             self._session_watchdog_task.cancel()
         if self.session is not None:
             await self.session.close_session(True)
+
+
+def _is_urgent(body: Buffer) -> bool:
+    """A request that does nothing but stop the line. Raises ServiceError."""
+    try:
+        calls = struct_from_binary(ua.CallParameters, body.copy()).MethodsToCall or ()
+    except Exception as error:  # whatever asyncua makes of bytes that are no request
+        raise ServiceError(ua.StatusCodes.BadDecodingError) from error
+    return bool(calls) and all(call.MethodId.Identifier in URGENT for call in calls)
