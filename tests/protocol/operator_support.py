@@ -204,11 +204,12 @@ class Bench:
         self.pki.mkdir()
         _write(self.pki, "opcua-server", pair("server", "urn:r2rgate:test:line"))
         trust(self.pki, pair("client").certificate)
-        self.opcua = OpcUa(line, self.side, self.pki, self._check, self.said.append)
+        self.users = dict(USERS)  #: as the users' file has them now
+        self.opcua = OpcUa(line, self.side, self.pki, self._check, self.users.get, self.said.append)
 
     async def _check(self, name: str, password: str):
         self.checks += 1
-        return USERS.get(name) if password == PASSWORD else None
+        return self.users.get(name) if password == PASSWORD else None
 
     @property
     def url(self) -> str:

@@ -4,6 +4,7 @@ Without encryption only the endpoints are told: that is how clients find out wha
 """
 
 import asyncio
+from functools import partial
 from typing import Any
 
 from asyncua import ua as asyncua_ua
@@ -143,7 +144,7 @@ class Processor(UaProcessor):
         certificate = fingerprint(self._certificate())
         person = await self._logins.person(self.iserver, session, params.UserIdentityToken, certificate)
         alive = await self._with_proof(typeid, requesthdr, seqhdr, body)
-        session.person = person
+        session.logged_in = partial(self._logins.now, person)
         return alive
 
     async def _with_proof(self, typeid: Any, requesthdr: Any, seqhdr: Any, body: Buffer) -> bool:
@@ -152,6 +153,13 @@ class Processor(UaProcessor):
             return await super()._process_message(typeid, requesthdr, seqhdr, body)
         finally:
             self._proving.proven = False
+
+    def is_logged_in(self) -> bool:
+        return isinstance(self.session, Session) and self.session.is_activated()
+
+    def is_nobodys(self) -> bool:
+        """Whoever has logged in is no user any more."""
+        return isinstance(self.session, Session) and self.session.is_activated() and self.session.person is None
 
     def _session(self) -> Session:
         """Raises ServiceError. A session lives and dies with its connection: nobody else can take it up."""

@@ -129,6 +129,11 @@ class OperatorServer(Server):
         """On which it listens."""
         return 0 if self.bserver is None else self.bserver.port
 
+    def end_strangers(self) -> None:
+        """To be called now and then: who was removed from the users does not go on looking."""
+        if isinstance(self.bserver, Sockets):
+            self.bserver.end_strangers()
+
     async def stop(self) -> None:
         if self.iserver.time_task is not None:
             self.iserver.time_task.cancel()  # asyncua would wait for its next second

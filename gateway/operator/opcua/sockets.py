@@ -39,6 +39,12 @@ class Sockets(BinaryServer):
             await asyncio.sleep(0)  # they are told of their end in the next turn of the loop
         await super().stop()
 
+    def end_strangers(self) -> None:
+        """Connections of those who are no users any more."""
+        for client in list(self.clients):
+            if isinstance(client.processor, Processor) and client.processor.is_nobodys():
+                cast(asyncio.Transport, client.transport).abort()
+
     def _make_protocol(self) -> OPCUAProtocol:
         connection = _Connection(self.iserver, self._policies, self.clients, self.closing_tasks, self.limits)
         connection.make = self._make
