@@ -261,6 +261,7 @@ def test_the_role_of_somebody_who_is_in_already_is_the_files_of_now(anna: Users,
     anna.with_user("anna", GOOD, "viewer").write(path)
     assert file.role_of("anna") == "viewer"
     path.write_text("nonsense")
-    assert file.role_of("anna") is None  # nobody knows what was meant
+    assert file.role_of("anna") == "viewer"  # nobody knows what was meant; who is at work must be able to stop
+    assert UsersFile(path).role_of("anna") is None
     path.unlink()
     assert file.role_of("anna") is None
