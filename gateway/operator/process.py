@@ -14,6 +14,7 @@ from gateway.core.people import Role
 from gateway.core.topics import GATEWAY_FOR_PERSON
 from gateway.mailbox.paths import GATEWAY_SOCKET
 from gateway.mailbox.unix import UnixMailbox
+from gateway.operator.access import Access
 from gateway.operator.line_side import READ, LineSide
 from gateway.operator.opcua.login import Check
 from gateway.operator.opcua.server import CannotServe, NotSetUp
@@ -48,12 +49,15 @@ async def serve(line: Line, run_folder: Path, data_folder: Path) -> None:
     saying.connect((GATEWAY_FOR_PERSON,), run_folder / GATEWAY_SOCKET)
     side, users = LineSide(mailbox, saying), UsersFile(data_folder / FILE_NAME)
     check, pki = checked_by(users, _tell), pki_folder(line, data_folder)
-    opcua = _opcua(line, side, pki, check, users)
-    page = page_app(line, side, check, time.monotonic)
+    access = Access(side, users, _tell, time.monotonic)
+    opcua = _opcua(line, side, pki, check, users, access)
+    page = page_app(line, side, check, time.monotonic, access)
     tls = (pki / CERTIFICATE, pki / PRIVATE_KEY) if line.operator.page.startswith("https:") else (None, None)
     try:
         listener = listening(line.operator.page)
-        works: list[Coroutine[object, object, object]] = [side.watch(), serve_on(page, listener, *tls), stop.wait()]
+        works: list[Coroutine[object, object, object]] = [
+            side.watch(), access.run(), serve_on(page, listener, *tls), stop.wait(),
+        ]  # fmt: skip
         served = [f"page at {line.operator.page}"]
         if opcua is not None:
             await opcua.start()
@@ -78,10 +82,10 @@ async def serve(line: Line, run_folder: Path, data_folder: Path) -> None:
         await saying.close()
 
 
-def _opcua(line: Line, side: LineSide, pki: Path, check: Check, users: UsersFile) -> OpcUa | None:
+def _opcua(line: Line, side: LineSide, pki: Path, check: Check, users: UsersFile, access: Access) -> OpcUa | None:
     """None where it has no certificate yet: the page needs none. Raises CannotServe."""
     try:
-        return OpcUa(line, side, pki, check, users.role_of, _tell)
+        return OpcUa(line, side, pki, check, users.role_of, _tell, access)
     except NotSetUp as error:
         _tell(f"OPC UA clients are not served: {error}")
         return None

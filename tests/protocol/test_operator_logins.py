@@ -6,8 +6,11 @@ import pytest
 from asyncua import ua
 from asyncua.common.utils import ServiceError
 
+from gateway.operator import access
 from gateway.operator.opcua import login
-from tests.protocol.operator_support import PASSWORD, USERS, bench
+from gateway.operator.opcua.trust import fingerprint
+from gateway.operator.users import Users
+from tests.protocol.operator_support import PASSWORD, USERS, bench, der, pair
 from tests.protocol.test_operator_security import impatient, run
 
 __all__ = ["impatient"]  #: the fixture
@@ -133,5 +136,29 @@ def test_an_anonymous_session_stays_though_no_user_is_called_so():
             await asyncio.sleep(0)
             assert (await b.read(client, "Line.Limits.TensionMax")).StatusCode.is_good()
             assert (await b.call(client, "Stop"))[0] == ua.StatusCodes.BadUserAccessDenied
+
+    run(story)
+
+
+def test_the_gateway_hears_once_of_each_session_and_of_wrong_passwords_by_where_they_came_from(monkeypatch):
+    monkeypatch.setattr(access, "REPORT_S", 0.0)
+
+    async def story():
+        async with bench(spans=1) as b:
+            async with b.connected("otto") as client:
+                await client.activate_session(username="otto", password=PASSWORD)  # the same session again
+            for name in ("otto", "three old rollers"):  # the second typed into the wrong field
+                with pytest.raises((ua.UaError, ConnectionError)):
+                    async with await b.client(name, "guess"):
+                        pass
+            Users.nobody().with_user("otto", PASSWORD, "operator").write(b.folder / "users.toml")
+            await b.access.look()
+            users, came, wrong = b.gateway.at_the_door
+            certificate = fingerprint(der(pair("client")))
+            assert users.roles == {"otto": "operator"}
+            assert (came.person.name, came.person.certificate, came.address) == ("otto", certificate, "127.0.0.1")
+            (place,) = wrong.places
+            assert (place.certificate, place.address, place.count) == (certificate, "127.0.0.1", 2)
+            assert "rollers" not in wrong.model_dump_json()
 
     run(story)

@@ -142,9 +142,13 @@ class Processor(UaProcessor):
         session = self._session()
         params = struct_from_binary(ua.ActivateSessionParameters, body.copy())
         certificate = fingerprint(self._certificate())
-        person = await self._logins.person(self.iserver, session, params.UserIdentityToken, certificate)
+        address = address_of(self._transport)
+        person = await self._logins.person(self.iserver, session, params.UserIdentityToken, certificate, address)
+        before = session.person
         alive = await self._with_proof(typeid, requesthdr, seqhdr, body)
         session.logged_in = partial(self._logins.now, person)
+        if before is None or before.name != person.name:
+            self._logins.came_in(person, address)
         return alive
 
     async def _with_proof(self, typeid: Any, requesthdr: Any, seqhdr: Any, body: Buffer) -> bool:
@@ -189,6 +193,12 @@ class Processor(UaProcessor):
             self._session_watchdog_task.cancel()
         if self.session is not None:
             await self.session.close_session(True)
+
+
+def address_of(transport: asyncio.BaseTransport) -> str:
+    """Of the other side in the network; empty where it is gone already."""
+    name: Any = transport.get_extra_info("peername")
+    return str(name[0]) if name else ""
 
 
 def _is_urgent(body: Buffer) -> bool:

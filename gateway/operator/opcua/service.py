@@ -7,6 +7,7 @@ from pathlib import Path
 
 from gateway.core.decisions import ProposalList, ProposalShown
 from gateway.core.line import Line
+from gateway.operator.access import Access
 from gateway.operator.line_side import LineSide, NotTold
 from gateway.operator.opcua.alarm_nodes import alarms_of, live_alarm_paths, make_alarms
 from gateway.operator.opcua.events import Events
@@ -29,13 +30,25 @@ class OpcUa:
     """`start`, then `run` as a task, then `stop`."""
 
     def __init__(
-        self, line: Line, side: LineSide, pki: Path, check: Check, role_of: RoleOf, tell: Callable[[str], None]
+        self,
+        line: Line,
+        side: LineSide,
+        pki: Path,
+        check: Check,
+        role_of: RoleOf,
+        tell: Callable[[str], None],
+        access: Access | None = None,
     ) -> None:
         """Raises CannotServe."""
         anonymous = line.operator.anonymous == "read"
         trust = TrustList(pki, tell, lambda: datetime.now(UTC))
         self.server: OperatorServer = make_server(
-            line.operator.opc_ua, line.operator.sessions_max, Logins(check, role_of, anonymous), anonymous, trust, pki
+            line.operator.opc_ua,
+            line.operator.sessions_max,
+            Logins(check, role_of, anonymous, access),
+            anonymous,
+            trust,
+            pki,
         )
         self._line = line
         self._side = side
