@@ -207,6 +207,7 @@ class Bench:
         self.gateway_mailbox = UnixMailbox()
         self.gateway = FakeGateway(line, self.gateway_mailbox)
         self.checks = 0
+        self.port: int | None = None  #: by which clients go, where it is not the server's own
         mailbox = UnixMailbox()
         mailbox.connect(TOPICS, folder / "gateway.sock")
         self.mailbox = mailbox
@@ -226,7 +227,7 @@ class Bench:
 
     @property
     def url(self) -> str:
-        return f"opc.tcp://127.0.0.1:{self.opcua.server.port}"
+        return f"opc.tcp://127.0.0.1:{self.port or self.opcua.server.port}"
 
     def id(self, path: str) -> Any:
         return ua.NodeId(path, NUMBER)

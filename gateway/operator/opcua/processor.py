@@ -4,6 +4,7 @@ Without encryption only the endpoints are told: that is how clients find out wha
 """
 
 import asyncio
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -65,12 +66,15 @@ class Processor(UaProcessor):
         server: InternalServer,
         logins: Logins,
         proving: OnlyProven,
+        has_its_share: Callable[[str], bool],
         transport: asyncio.Transport,
         limits: TransportLimits,
     ) -> None:
+        """`has_its_share`: of the sessions, by address."""
         super().__init__(server, transport, limits)
         self._logins = logins
         self._proving = proving
+        self._has_its_share = has_its_share
         self._calls: set[asyncio.Task[None]] = set()  #: without those that are urgent
         self._urgent: set[asyncio.Task[None]] = set()
         self._histories: set[asyncio.Task[None]] = set()
@@ -79,7 +83,7 @@ class Processor(UaProcessor):
         service = typeid.Identifier
         if typeid.NamespaceIndex or service not in _SERVICES or not self._connection.is_open():
             raise ServiceError(ua.StatusCodes.BadServiceUnsupported)
-        if service not in _OPEN and not self._is_encrypted():
+        if service not in _OPEN and not self.is_encrypted():
             raise ServiceError(ua.StatusCodes.BadSecurityModeRejected)
         if service not in _OPEN and service != _CREATE:
             self._check_token(requesthdr)
@@ -136,6 +140,9 @@ class Processor(UaProcessor):
         if params.ClientDescription.ApplicationUri != application_uri(x509.load_der_x509_certificate(own)):
             raise ServiceError(ua.StatusCodes.BadCertificateUriInvalid)
         await self._end_session()
+        self.session = None
+        if self._has_its_share(address_of(self._transport)):
+            raise ServiceError(ua.StatusCodes.BadTooManySessions)
 
     async def _activate(self, typeid: Any, requesthdr: Any, seqhdr: Any, body: Buffer) -> bool:
         """First the person is asked for proof, then asyncua, which checks the client's signature."""
@@ -176,7 +183,7 @@ class Processor(UaProcessor):
         if requesthdr.AuthenticationToken != self._session().auth_token:
             raise ServiceError(ua.StatusCodes.BadSessionIdInvalid)
 
-    def _is_encrypted(self) -> bool:
+    def is_encrypted(self) -> bool:
         return self._connection.security_policy.Mode == ua.MessageSecurityMode.SignAndEncrypt
 
     def _certificate(self) -> bytes:
