@@ -285,8 +285,8 @@ class Bench:
 
 
 @asynccontextmanager
-async def bench(spans: int = 2, gateway: bool = True, **operator: Any) -> AsyncIterator[Bench]:
-    """A running server; without `gateway` nobody answers it."""
+async def bench(spans: int = 2, gateway: bool = True, begin: bool = True, **operator: Any) -> AsyncIterator[Bench]:
+    """A running server; without `gateway` nobody answers it, without `begin` it is only made."""
     line = line_of(spans)
     settings = line.operator.model_copy(update={"opc_ua": "opc.tcp://127.0.0.1:0", **operator})
     with short_folder() as folder:
@@ -295,8 +295,10 @@ async def bench(spans: int = 2, gateway: bool = True, **operator: Any) -> AsyncI
             await found.gateway_mailbox.listen(folder / "gateway.sock")
         tasks: list[asyncio.Task[Any]] = []
         try:
-            await found.opcua.start()
-            tasks += [asyncio.create_task(found.side.watch()), asyncio.create_task(found.opcua.run())]
+            tasks.append(asyncio.create_task(found.side.watch()))
+            if begin:
+                await found.opcua.start()
+                tasks.append(asyncio.create_task(found.opcua.run()))
             yield found
             assert not any(task.done() for task in tasks), [task.exception() for task in tasks if task.done()]
         finally:

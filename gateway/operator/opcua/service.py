@@ -50,6 +50,8 @@ class OpcUa:
             trust,
             pki,
         )
+        self.page_trouble: Callable[[], str] = str  #: why there is no page; empty: there is one
+        self._made = False
         self._line = line
         self._side = side
         self._new_status, self._new_proposals = asyncio.Event(), asyncio.Event()
@@ -57,7 +59,14 @@ class OpcUa:
         self._shown_of: ProposalList | None = None  #: of which list
 
     async def start(self) -> None:
-        """Raises CannotServe; `stop` is needed all the same."""
+        """Raises CannotServe, and may be called again then; `stop` is needed all the same."""
+        if not self._made:
+            await self._make()
+            self._made = True
+        await self.server.start()
+
+    async def _make(self) -> None:
+        """All nodes."""
         server = self.server
         await server.init()
         self._space = Space(server, await server.register_namespace(NAMESPACE))
@@ -72,7 +81,6 @@ class OpcUa:
         self._side.on_status.append(lambda _: self._new_status.set())
         self._side.on_proposals.append(lambda _: self._new_proposals.set())
         self._new_proposals.set()
-        await server.start()
 
     async def run(self) -> None:
         """Until it is cancelled."""
@@ -92,7 +100,8 @@ class OpcUa:
         side = self._side
         age_s = side.age_s
         fresh = _is_fresh(age_s)
-        await self._tell((Told(f"{ROOT}.Connection.Fresh", fresh), Told(f"{ROOT}.Connection.Trouble", side.trouble)))
+        connection = {"Fresh": fresh, "Trouble": side.trouble, "PageTrouble": self.page_trouble()}
+        await self._tell(Told(f"{ROOT}.Connection.{name}", value) for name, value in connection.items())
         if side.status is not None and fresh:
             await self._tell((*of_status(side.status), *alarms_of(side.status)), side.status.wall_s)
             if side.proposals is not None and _is_fresh(side.proposals_age_s):
