@@ -279,6 +279,8 @@ class Deployer:
             return [f"proposal {entry.proposal[:12]} is {entry.stage}{f': {entry.why}' if entry.why else ''}"]
         if self._wall_clock() >= entry.expires_s:
             return [f"it has expired at {entry.expires}"]
+        if because := self.book.why_outdated(entry):
+            return [because]
         if decision.shown != self._shown_hash(entry):
             return ["what was shown is no longer what would be done: look at it again, then decide"]
         first = self._first(entry) if decision.approve and self._line.gate.approvals > 1 else None
@@ -292,6 +294,8 @@ class Deployer:
             if now_s >= entry.expires_s:
                 what = {"proposal": entry.proposal, "because": f"nobody decided until {entry.expires}"}
                 await self._records.step("expired", what, GATEWAY)
+            elif because := self.book.why_outdated(entry):
+                await self._records.step("superseded", {"proposal": entry.proposal, "because": because}, GATEWAY)
             elif entry.stage is Stage.APPROVED:
                 because = "it was approved, and not carried out: decide again"
                 await self._records.step("approval-lapsed", {"proposal": entry.proposal, "because": because}, GATEWAY)
