@@ -86,6 +86,8 @@ class FakeAudit:
         if due:
             raise Killed
 
+    async def fetch(self, ids): ...
+
     def blob(self, id_):
         return self.blobs.get(id_)
 
