@@ -14,6 +14,7 @@ from gateway.core.people import Role
 from gateway.core.topics import GATEWAY_FOR_PERSON
 from gateway.mailbox.paths import GATEWAY_SOCKET
 from gateway.mailbox.unix import UnixMailbox
+from gateway.operator.access import Access
 from gateway.operator.line_side import READ, LineSide
 from gateway.operator.opcua.login import Check
 from gateway.operator.opcua.server import CannotServe, NotSetUp
@@ -46,21 +47,24 @@ async def serve(line: Line, run_folder: Path, data_folder: Path) -> None:
     mailbox, saying = UnixMailbox(), UnixMailbox()
     mailbox.connect(READ, run_folder / GATEWAY_SOCKET)
     saying.connect((GATEWAY_FOR_PERSON,), run_folder / GATEWAY_SOCKET)
-    side, users = LineSide(mailbox, saying), data_folder / FILE_NAME
+    side, users = LineSide(mailbox, saying), UsersFile(data_folder / FILE_NAME)
     check, pki = checked_by(users, _tell), pki_folder(line, data_folder)
-    opcua = _opcua(line, side, pki, check)
-    page = page_app(line, side, check, time.monotonic)
+    access = Access(side, users, _tell, time.monotonic)
+    opcua = _opcua(line, side, pki, check, users, access)
+    page = page_app(line, side, check, time.monotonic, access)
     tls = (pki / CERTIFICATE, pki / PRIVATE_KEY) if line.operator.page.startswith("https:") else (None, None)
     try:
         listener = listening(line.operator.page)
-        works: list[Coroutine[object, object, object]] = [side.watch(), serve_on(page, listener, *tls), stop.wait()]
+        works: list[Coroutine[object, object, object]] = [
+            side.watch(), access.run(), serve_on(page, listener, *tls), stop.wait(),
+        ]  # fmt: skip
         served = [f"page at {line.operator.page}"]
         if opcua is not None:
             await opcua.start()
             works.append(opcua.run())
             served.append(f"OPC UA at {line.operator.opc_ua}")
         print(f"operator of {line.site}/{line.line}: {', '.join(served)}", flush=True)
-        if not users.exists() and line.operator.anonymous == "none":
+        if not users.path.exists() and line.operator.anonymous == "none":
             _tell("nobody can come in yet: `r2rgate users add LINE.toml NAME --role ROLE` lets somebody")
         gc.collect()
         gc.freeze()  # half a million nodes and references that stay: to look through them takes 0.15 s each time
@@ -78,18 +82,17 @@ async def serve(line: Line, run_folder: Path, data_folder: Path) -> None:
         await saying.close()
 
 
-def _opcua(line: Line, side: LineSide, pki: Path, check: Check) -> OpcUa | None:
+def _opcua(line: Line, side: LineSide, pki: Path, check: Check, users: UsersFile, access: Access) -> OpcUa | None:
     """None where it has no certificate yet: the page needs none. Raises CannotServe."""
     try:
-        return OpcUa(line, side, pki, check, _tell)
+        return OpcUa(line, side, pki, check, users.role_of, _tell, access)
     except NotSetUp as error:
         _tell(f"OPC UA clients are not served: {error}")
         return None
 
 
-def checked_by(path: Path, tell: Callable[[str], None]) -> Callable[[str, str], Awaitable[Role | None]]:
+def checked_by(users: UsersFile, tell: Callable[[str], None]) -> Callable[[str, str], Awaitable[Role | None]]:
     """Names and passwords against the users' file, off the event loop: a guess takes some 50 ms."""
-    users = UsersFile(path)
 
     def checked(name: str, password: str) -> Role | None:
         try:

@@ -2,12 +2,14 @@
 
 import asyncio
 import struct
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 
 import pytest
 from asyncua import Client, ua
 
 from gateway.operator.opcua import limits
-from tests.protocol.operator_support import bench
+from tests.protocol.operator_support import PASSWORD, bench
 
 CODES = ua.StatusCodes
 
@@ -262,6 +264,100 @@ def test_of_a_client_that_falls_silent_nothing_stays_either(monkeypatch):
                 ua.CreateSubscriptionParameters(RequestedPublishingInterval=50.0, PublishingEnabled=True), print
             )
             client.uaclient.protocol.transport.pause_reading()  # as one that was stopped
+            await nothing_left(b)
+            client.disconnect_socket()
+
+    run(story)
+
+
+@asynccontextmanager
+async def from_elsewhere(b) -> AsyncIterator[None]:
+    """Clients reach the server from another address."""
+
+    async def taken(reader, writer):
+        onward = await asyncio.open_connection("127.0.0.1", b.opcua.server.port, local_addr=("127.0.0.2", 0))
+        await asyncio.gather(passed_on(reader, onward[1]), passed_on(onward[0], writer))
+
+    async def passed_on(reader, writer):
+        try:
+            while data := await reader.read(65536):
+                writer.write(data)
+        except ConnectionError:
+            pass
+        writer.close()
+
+    server = await asyncio.start_server(taken, "127.0.0.1", 0)
+    b.port = server.sockets[0].getsockname()[1]
+    try:
+        yield
+    finally:
+        b.port = None
+        server.close()
+
+
+def test_who_floods_keeps_nobody_out_neither_from_elsewhere_nor_from_there():
+    async def story():
+        async with bench(spans=1, sessions_max=2) as b, b.connected("vera") as before:
+            flood = []
+
+            async def more():
+                flood.append(await asyncio.open_connection("127.0.0.1", b.opcua.server.port))
+
+            for _ in range(10 * limits.MORE_CONNECTIONS):
+                await more()
+            assert (await b.read(before, "Line.Limits.TensionMax")).StatusCode.is_good()
+            async with from_elsewhere(b):
+                client = await b.client("otto")
+                await client.connect()
+                for _ in range(3 * limits.MORE_CONNECTIONS):
+                    await more()
+                assert (await b.read(client, "Line.Limits.TensionMax")).StatusCode.is_good()
+                await client.disconnect()
+            client = await b.client("otto")  # the oldest that says nothing gives way to it
+            await client.connect_socket()
+            await client.send_hello()
+            await client.open_secure_channel()
+            for _ in range(3 * limits.MORE_CONNECTIONS):
+                await more()
+            await client.create_session()
+            await client.activate_session(username="otto", password=PASSWORD)
+            assert (await b.read(client, "Line.Limits.TensionMax")).StatusCode.is_good()
+            await client.disconnect()
+            for _, writer in flood:
+                writer.close()
+
+    run(story)
+
+
+def test_one_address_does_not_get_all_sessions():
+    async def story():
+        async with bench(spans=1, sessions_max=4) as b:
+            held = [await b.client("otto") for _ in range(3)]
+            for one in held:
+                await one.connect()
+            with pytest.raises(ua.uaerrors.BadTooManySessions):
+                async with await b.client("otto"):
+                    pass
+            async with from_elsewhere(b), b.connected("vera"):
+                assert b.sessions() == 4
+            for one in held:
+                await one.disconnect()
+
+    run(story)
+
+
+def test_a_session_to_which_nobody_logs_in_does_not_stay_whatever_was_there_before(monkeypatch):
+    async def story():
+        async with bench(spans=1) as b:
+            client = await b.client("otto")
+            await client.connect()
+            monkeypatch.setattr(limits, "LOGIN_S", 0.0)
+            b.opcua.server.end_strangers()
+            assert (await b.read(client, "Line.Limits.TensionMax")).StatusCode.is_good()  # who is in may stay
+            try:
+                await client.create_session()  # in place of the first, and nobody logs in to it
+            except (ConnectionError, ua.UaError):
+                pass  # out already
             await nothing_left(b)
             client.disconnect_socket()
 
