@@ -173,7 +173,7 @@ def test_a_proposal_is_announced_approved_once_and_deployed(panel: Panel) -> Non
         panel.until("otto", "Line.Controller.InService", config_hash(controller))
         (after,) = panel.values("otto", "Line.Controller.Revision")
         assert after == before + 1 == revision + 1
-        with line.unchanged():
+        with line.unchanged("refused-decision"):
             second = panel.client("call", "otto", "Decide", *shown, True, "once more")
         assert second["status"] == "Good" and not second["ok"] and second["sentence"], second
         told = until(lambda: panel.client("events", "otto"), lambda found: {"approved", "deployed"} <= _kinds(found))
@@ -233,16 +233,19 @@ def test_what_was_not_shown_is_not_decided_on(panel: Panel) -> None:
     with panel.as_("otto", **OTTO):
         shown = panel.waiting("otto", panel.other())
         proposal, shown_hash, revision = shown
-        for wrong in (
-            [proposal, shown_hash[::-1], revision], [proposal, proposal, revision], [proposal, "", revision],
-            [proposal, shown_hash, revision + 1], [shown_hash, shown_hash, revision],
-        ):  # fmt: skip
-            with panel.line.unchanged():
+        for wrong, recorded in (
+            ([proposal, shown_hash[::-1], revision], ["refused-decision"]),
+            ([proposal, proposal, revision], ["refused-decision"]),
+            ([proposal, "", revision], []),  # what is none is not even sent
+            ([proposal, shown_hash, revision + 1], []),
+            ([shown_hash, shown_hash, revision], []),
+        ):
+            with panel.line.unchanged(*recorded):
                 answer = panel.client("call", "otto", "Decide", *wrong, True, "")
             assert answer["status"] == "Good" and not answer["ok"] and answer["sentence"], (wrong, answer)
         assert panel.values("otto", f"Line.Proposals.{proposal}.Stage") == ["waiting"]
         assert panel.client("call", "otto", "Decide", *shown, False, "not now")["ok"]
-        with panel.line.unchanged():  # a rejection is a decision, too
+        with panel.line.unchanged("refused-decision"):  # a rejection is a decision, too
             assert not panel.client("call", "otto", "Decide", *shown, True, "or now")["ok"]
 
 
@@ -252,9 +255,12 @@ def test_what_has_expired_is_not_approved(panel: Panel) -> None:
         path = f"Line.Proposals.{shown[0]}.Stage"
         until(lambda: panel.client("read", "otto", [path])[path], lambda found: found["status"] != "Good")
         panel.line.look_on(lambda: panel.line.shown(shown[0]).stage, lambda stage: stage == "expired")
-        with panel.line.unchanged():
+        with panel.line.unchanged("refused-decision"):
             answer = panel.client("call", "otto", "Decide", *shown, True, "too late")
         assert answer["status"] == "Good" and not answer["ok"] and "expired" in answer["sentence"], answer
+    refusal = next(one for one in reversed(panel.line.records()) if one.kind == "refused-decision")
+    assert refusal.what["proposal"] == shown[0] and "expired" in refusal.what["because"]
+    assert "otto" in refusal.who.name and refusal.who.certificate == panel.line.fingerprint(PANEL)
 
 
 @pytest.mark.parametrize(
