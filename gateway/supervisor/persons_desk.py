@@ -15,6 +15,8 @@ from gateway.mailbox.port import PEER, Mailbox
 from gateway.supervisor.audit_file import AuditUnavailable
 from gateway.supervisor.peers import who_is
 
+A_PROGRAM = "a program"  #: that decides in a person's place, as the audit has it before its user's name
+
 Decision = Decide | RollBackNow | Archive | LineChanged
 
 
@@ -47,6 +49,8 @@ class PersonsDesk:
         if reason := why_may_not(person, said.command):
             await self._kept("refused-person", who, {"command": said.command, "because": reason})
             return _reply(Reply(ok=False, state="", text=reason, reasons=[reason]))
+        if isinstance(said, Decide) and person.is_script:
+            said = said.model_copy(update={"script": said.script or A_PROGRAM})
         if isinstance(said, Decision):
             return _reply(await self._decide(said, who))
         if isinstance(said, AlarmSaid):

@@ -16,8 +16,8 @@ from gateway.cli.demo_cases import MOST_REPEATS, Window, again_after_stops
 from gateway.cli.demo_chain import Measured, beyond, name_of
 from gateway.cli.demo_chain_page import page
 from gateway.cli.demo_chain_table import print_chain
-from gateway.cli.demo_line import Setup, line_text
-from gateway.cli.demo_operator import DemoFailed
+from gateway.cli.demo_failed import DemoFailed
+from gateway.cli.demo_line import Ports, Setup, line_text
 from gateway.cli.demo_result import DemoResult, paper_improvement_pct
 from gateway.commissioning.past import Step, named
 from gateway.control.design import design_lqi, task_of
@@ -29,7 +29,8 @@ from gateway.core.scenario import PAPER
 from sim_plant.recording import Recording
 from tests.unit.test_report import Page
 
-LINE = load_line(line_text(41000, 41001), "line.toml")
+PORTS = Ports(41000, 41001, 41002, 41003)
+LINE = load_line(line_text(PORTS), "line.toml")
 CONFIGS = [
     design_lqi(replace(task_of(LINE), unwind_speed_m_per_s=0.01 * k)).model_copy(update={"antiwindup": 0.1 * k})
     for k in (1, 2, 3)
@@ -41,10 +42,10 @@ def test_its_line_says_what_it_states_and_nothing_else_of_the_template_is_lost(m
     assert (gate.first_speed_max_m_per_s, gate.first_step_max_n, gate.probation_s) == (0.1, 24.0, 10.0)
     assert {roller.friction_nms_per_rad.tolerance for roller in LINE.rollers} == {0.6}
     assert (gate.cool_down_s, gate.first_corner_share, gate.autonomy) == (30.0, 0.4, "approve-all")
-    assert "port = 41000" in line_text(41000, 41001) and all(why in line_text(1, 2) for *_, why in demo_line.STATED)
+    assert "port = 41000" in line_text(PORTS) and all(why in line_text(PORTS) for *_, why in demo_line.STATED)
     monkeypatch.setattr(demo_line, "STATED", (("# no such key = 1", "x = 1", "because"),))
     with pytest.raises(DemoFailed, match="no such key"):
-        line_text(1, 2)
+        line_text(PORTS)
 
 
 @pytest.mark.parametrize(
@@ -181,7 +182,7 @@ def test_the_table_fits_a_terminal_and_says_who_approved():
     result = example()
     print_chain(result, console)
     text = console.export_text()
-    assert result.chain is not None and result.chain.audit.head in text and "scripted operator (demo)" in text
+    assert result.chain is not None and result.chain.audit.head in text and "script-operator (operator, opc-ua)" in text
     table = text[: text.index("on truth:")]
     assert "…" not in table and "paper" in table and max(map(len, table.splitlines())) <= 80
     assert f"{result.rmse_n(1, 'velocity'):.3f}" in table and "-39.6%" in table
@@ -210,7 +211,7 @@ def test_the_page_holds_every_figure_and_a_case_that_was_not_run(tmp_path):
         assert all(
             f"{case.rmse_n:.4f}" in shown.words and f"{case.ratio_to_stepped:.3f}" in shown.words for case in one.cases
         )
-    assert "It was not run." in shown.words and "scripted operator (demo)" in shown.words
+    assert "It was not run." in shown.words and "script-operator (operator, opc-ua)" in shown.words
     chain = result.chain
     assert chain is not None and chain.audit.head in shown.words
     refused = [text for one in chain.changes for text in one.against]
