@@ -106,10 +106,10 @@ def read_evidence(setup: Setup, windows: list[Window], world_start_s: float) -> 
         history = file.read(world_start_s, windows[-1].end_s + 60.0, FIELDS)
         if file.damaged:
             raise DemoFailed(f"the history is damaged: {'; '.join(file.damaged)}")
-    return Evidence(recording, recording.time_s + world_start_s, history, _summary(setup, recording))
+    return Evidence(recording, recording.time_s + world_start_s, history, summary_of(setup, recording))
 
 
-def _summary(setup: Setup, recording: Recording) -> dict[str, Any]:
+def summary_of(setup: Setup, recording: Recording) -> dict[str, Any]:
     """As the simulated line wrote it at its end; while that runs, the same from what it has recorded until now."""
     file = setup.out / "recording" / SUMMARY_FILE
     if file.exists():
