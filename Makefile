@@ -24,8 +24,8 @@ $(VENV)/.compiled: $(VENV)/.ready gateway/cli/compiled.py $(wildcard gateway/con
 	@$(PY) -m gateway.cli.compiled > out/compiled.txt 2>&1 || { cat out/compiled.txt; exit 1; }
 	@touch $@
 
-run: $(VENV)/.compiled ## set up, then the demonstration: a line adapted through the gate, in real time (about 5 min; ARGS="--quick")
-	@exec $(RUN) demo $(ARGS)
+run: $(VENV)/.compiled ## set up, then the demonstration: a line adapted through the gate, in real time (about 5 min; ARGS="--quick"; STAY=1 to play with)
+	@exec $(RUN) demo $(if $(STAY),--stay) $(ARGS)
 
 test: $(VENV)/.compiled ## set up, then all tests but the long ones: those about time itself alone, the others on every core
 	@$(PY) -m pytest -m "realtime and not long" $(ARGS) || [ $$? -eq 5 ]  # 5: none of them was asked for

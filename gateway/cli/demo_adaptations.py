@@ -58,7 +58,8 @@ def _adaptation(result: DemoResult, chain: ChainResult, before: Sequence[ChangeR
         *(("Tried before", f"{one.name}: {one.reason or one.why}; {verdict_words(one)}") for one in before
           if one.step == Step.REDESIGN),
         ("Change", f"{kept.reason} ({kept.proposal[:12]}, author {kept.author})"),
-        ("Verdict", f"{verdict_words(kept)}. Approved by {kept.approved_by or 'nobody'}"),
+        ("Verdict", verdict_words(kept)),
+        ("Approved", approval_words(kept)),
         ("Result", f"{result_words(kept)} {_measured(result, place)}"),
     ]  # fmt: skip
     asked = [one for one in chain.asked if one.proposal == kept.proposal and one.decision != DIAGNOSES]
@@ -69,6 +70,15 @@ def _adaptation(result: DemoResult, chain: ChainResult, before: Sequence[ChangeR
         lead="" if last is None else f"Why this one of {len(last.options)}, in the words of {_who(last)}:",
         quote="" if last is None else last.reason,
     )
+
+
+def approval_words(change: ChangeResult) -> str:
+    """Who approved, from which certificate, and over what."""
+    if not change.approved_by:
+        return "by nobody"
+    certificate = f", from certificate {change.certificate[:16]}" if change.certificate else ""
+    over = f"; over: {change.approved_over}" if change.approved_over else ""
+    return f"by {change.approved_by}{certificate}{over}"
 
 
 def _diagnosis(chain: ChainResult, changes: Sequence[ChangeResult]) -> list[str]:

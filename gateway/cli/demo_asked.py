@@ -2,8 +2,8 @@
 
 from collections.abc import Sequence
 
+from gateway.cli.demo_failed import DemoFailed
 from gateway.cli.demo_line import Setup
-from gateway.cli.demo_operator import DemoFailed
 from gateway.cli.demo_result import AskedResult, FigureResult, NoteResult, OptionResult
 from gateway.commissioning.past import interactions_of
 from gateway.core.decisions import ProposalShown

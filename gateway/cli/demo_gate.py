@@ -10,6 +10,7 @@ from gateway.cli.demo_asked import asked_result
 from gateway.cli.demo_chain import Chain
 from gateway.cli.demo_line import Setup
 from gateway.cli.demo_result import AuditResult, ChainResult, ChangeResult, RuleResult, SwapResult
+from gateway.core.audit_record import Who
 from gateway.core.controller import config_hash
 from gateway.core.decisions import ProposalShown
 from gateway.core.interactions import Interaction
@@ -36,7 +37,10 @@ def chain_result(setup: Setup, chain: Chain, evidence: Evidence, interactions: S
     return ChainResult(
         reached=found.reached,
         text=found.text,
-        changes=[_change(one, shown.get(one.proposal), approved.get(one.proposal, "")) for one in found.tried],
+        changes=[
+            _change(one, shown.get(one.proposal), approved.get(one.proposal), chain.approved_over.get(one.proposal, ""))
+            for one in found.tried
+        ],
         asked=asked_result(interactions, chain.shown),
         deployments=deployments,
         swaps=_swaps(setup, evidence, steps),
@@ -53,7 +57,7 @@ def audit_result(setup: Setup) -> AuditResult:
     return AuditResult(records=found.records, head=found.head, sound=found.sound, problems=found.problems)
 
 
-def _change(tried: Tried, shown: ProposalShown | None, approved_by: str) -> ChangeResult:
+def _change(tried: Tried, shown: ProposalShown | None, approved: Who | None, over: str) -> ChangeResult:
     findings = [] if shown is None or shown.verdict is None else shown.verdict.findings
     change = None if shown is None else shown.proposal.change
     return ChangeResult(
@@ -69,7 +73,9 @@ def _change(tried: Tried, shown: ProposalShown | None, approved_by: str) -> Chan
         against=[f"{one.rule}: {one.text}" for one in findings if not one.passed],
         closest=_closest(findings),
         measured="" if tried.shown is None else tried.shown.text,
-        approved_by=approved_by,
+        approved_by="" if approved is None else approved.name,
+        certificate="" if approved is None or approved.certificate is None else approved.certificate,
+        approved_over=over,
         speed_m_per_s=tried.speed_m_per_s,
     )
 
@@ -92,11 +98,11 @@ def _share(one: RuleFinding) -> float:
     return one.margin / abs(one.limit)
 
 
-def _decided(setup: Setup) -> tuple[dict[str, str], int]:
+def _decided(setup: Setup) -> tuple[dict[str, Who], int]:
     """By proposal who approved it, and how often anything was deployed."""
     with AuditFile(setup.data) as file:
         records = [row.record() for row in file.rows()]
-    approved = {str(one.what["proposal"]): one.who.name for one in records if one.kind == "approved"}
+    approved = {str(one.what["proposal"]): one.who for one in records if one.kind == "approved"}
     return approved, sum(one.kind == "deployed" for one in records)
 
 
