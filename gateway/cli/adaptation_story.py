@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from gateway.cli.report import Story, Table
+from gateway.cli.report import Story
 from gateway.core.verdict import Verdict
 
 
@@ -31,12 +31,6 @@ PARTS = (
 
 
 def adaptation_story(one: Adaptation) -> Story:
-    """The parts as a table, then the words of who chose it, then the verdict with every rule."""
-    rows = tuple((name, text) for name, part in PARTS for text in getattr(one, part))
-    return Story(
-        one.title,
-        tables=(Table("What led to it, and what it came to.", ("", "What"), rows),),
-        lead=one.lead,
-        quote=one.quote,
-        verdict=one.judged,
-    )
+    """The parts that there are, then the words of who chose it, then the verdict with every rule."""
+    facts = tuple((name, tuple(texts)) for name, part in PARTS if (texts := getattr(one, part)))
+    return Story(one.title, facts=facts, lead=one.lead, quote=one.quote, verdict=one.judged)

@@ -50,6 +50,7 @@ class LineRecords:
     found: Verification
     book: Book
     proposals: list[Recorded] = field(default_factory=list[Recorded])  #: the oldest first
+    others: list[AuditRecord] = field(default_factory=list[AuditRecord])  #: of no proposal
     problems: list[str] = field(default_factory=list[str])  #: what could not be told, beside what `found` has
 
 
@@ -96,6 +97,8 @@ def _fold(records: Iterable[AuditRecord], told: LineRecords) -> dict[str, list[A
         proposal = one.what.get("proposal")
         if isinstance(proposal, str) and (one.kind == PROPOSED or proposal in steps):
             steps.setdefault(proposal, []).append(one)
+        else:
+            told.others.append(one)
     return steps
 
 

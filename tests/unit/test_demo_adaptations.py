@@ -22,10 +22,11 @@ def of(step: Step, proposal: str, stage: str = "done", **changes: Any) -> Change
 
 
 def told(changes: list[ChangeResult], questions: list[AskedResult]) -> list[list[tuple[str, ...]]]:
-    """The rows of each story."""
+    """What each story says, by part."""
     result = DemoResult.model_construct(configurations=[])
     chain = ChainResult.model_construct(changes=changes, asked=questions)
-    return [list(story.tables[0].rows) for story in adaptations_section(result, chain, {}).stories]
+    stories = adaptations_section(result, chain, {}).stories
+    return [[(name, text) for name, texts in story.facts for text in texts] for story in stories]
 
 
 @pytest.mark.parametrize("newer_model", [False, True])

@@ -20,5 +20,6 @@ def components() -> str:
 
 
 def component_words() -> dict[str, str]:
-    """In English, as the rest of a report."""
-    return {key: said for key, said in words_of("en").items() if key.startswith(FAMILIES)}
+    """In English, as the rest of a report. What is in service on the page was so when it was judged."""
+    said = words_of("en") | {"configuration.in service": "before"}
+    return {key: text for key, text in said.items() if key.startswith(FAMILIES)}

@@ -54,6 +54,7 @@ class Story:
     quote: str = ""  #: somebody's own words
     after: tuple[str, ...] = ()  #: paragraphs behind them
     folds: tuple[Fold, ...] = ()
+    facts: tuple[tuple[str, tuple[str, ...]], ...] = ()  #: names, and what is said of each; before the tables
     verdict: Verdict | None = None  #: what the gate has found of it, before the folds
 
 

@@ -53,6 +53,8 @@ def _section(index: int, section: Section, judged: list[Verdict]) -> str:
 
 def _story(one: Story, judged: list[Verdict]) -> str:
     parts = [f"<h3>{escape(one.title)}</h3>", *(f"<p>{escape(text)}</p>" for text in one.paragraphs)]
+    if one.facts:
+        parts.append(shell.facts((escape(name), "".join(map(_line, texts))) for name, texts in one.facts))
     parts += [_table(each) for each in one.tables]
     if one.lead:
         parts.append(f"<p>{escape(one.lead)}</p>")
@@ -67,6 +69,10 @@ def _story(one: Story, judged: list[Verdict]) -> str:
         for fold in one.folds
     ]
     return f'<article class="story">{"".join(parts)}</article>'
+
+
+def _line(text: str) -> str:
+    return f"<p>{escape(text)}</p>"
 
 
 def _table(one: Table) -> str:
