@@ -27,11 +27,12 @@ def proposal_told(shown: ProposalShown) -> dict[str, Any]:
         "two_people": any(said in shown.why for said in TWO_PEOPLE),
         "created": proposal.created,
         "expires": proposal.expires,
-        "verdict": None if shown.verdict is None else _verdict(shown.verdict),
+        "verdict": None if shown.verdict is None else verdict_told(shown.verdict),
     }
 
 
-def _verdict(verdict: Verdict) -> dict[str, Any]:
+def verdict_told(verdict: Verdict) -> dict[str, Any]:
+    """With how much of each limit is used."""
     return {
         "accepted": verdict.accepted,
         "judged": verdict.judged,
