@@ -46,10 +46,10 @@ async def serve(line: Line, run_folder: Path, data_folder: Path) -> None:
     mailbox, saying = UnixMailbox(), UnixMailbox()
     mailbox.connect(READ, run_folder / GATEWAY_SOCKET)
     saying.connect((GATEWAY_FOR_PERSON,), run_folder / GATEWAY_SOCKET)
-    side, users = LineSide(mailbox, saying), data_folder / FILE_NAME
+    side, users = LineSide(mailbox, saying), UsersFile(data_folder / FILE_NAME)
     check, pki = checked_by(users, _tell), pki_folder(line, data_folder)
     opcua = _opcua(line, side, pki, check)
-    page = page_app(line, side, check, time.monotonic)
+    page = page_app(line, side, check, users.role_of, time.monotonic)
     tls = (pki / CERTIFICATE, pki / PRIVATE_KEY) if line.operator.page.startswith("https:") else (None, None)
     try:
         listener = listening(line.operator.page)
@@ -60,7 +60,7 @@ async def serve(line: Line, run_folder: Path, data_folder: Path) -> None:
             works.append(opcua.run())
             served.append(f"OPC UA at {line.operator.opc_ua}")
         print(f"operator of {line.site}/{line.line}: {', '.join(served)}", flush=True)
-        if not users.exists() and line.operator.anonymous == "none":
+        if not users.path.exists() and line.operator.anonymous == "none":
             _tell("nobody can come in yet: `r2rgate users add LINE.toml NAME --role ROLE` lets somebody")
         gc.collect()
         gc.freeze()  # half a million nodes and references that stay: to look through them takes 0.15 s each time
@@ -87,9 +87,8 @@ def _opcua(line: Line, side: LineSide, pki: Path, check: Check) -> OpcUa | None:
         return None
 
 
-def checked_by(path: Path, tell: Callable[[str], None]) -> Callable[[str, str], Awaitable[Role | None]]:
+def checked_by(users: UsersFile, tell: Callable[[str], None]) -> Callable[[str, str], Awaitable[Role | None]]:
     """Names and passwords against the users' file, off the event loop: a guess takes some 50 ms."""
-    users = UsersFile(path)
 
     def checked(name: str, password: str) -> Role | None:
         try:
