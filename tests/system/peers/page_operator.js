@@ -89,12 +89,13 @@ chromium.launch({ executablePath: process.argv[2], chromiumSandbox: false, args:
     see: async (selector, text = '') => {
       const found = visible(selector).filter({ hasText: text }).first()
       await found.waitFor()
-      return (await found.innerText()).trim()
+      return (await found.evaluate((one) => one.innerText ?? one.textContent)).trim()
     },
     gone: (selector) => page.locator(selector).filter({ visible: true }).first().waitFor({ state: 'detached' }),
-    texts: (selector) => visible(selector).allInnerTexts(),
+    texts: (selector) => visible(selector).evaluateAll((all) => all.map((one) => (one.innerText ?? one.textContent).trim())),
     count: (selector) => visible(selector).count(),
     part: async (name) => { await page.evaluate((hash) => { location.hash = hash }, name); await visible(`#view-${name}`).waitFor() },
+    forget_session: () => context.clearCookies(), // as the server does after a while
     violations,
     too_wide: tooWide,
     focused,
