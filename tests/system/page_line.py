@@ -9,11 +9,11 @@ import httpx
 from gateway.control.design import design_lqg, task_of
 from gateway.core.controller import Controller, config_hash
 from gateway.core.line_file import load_line
-from gateway.core.people import ROLES, Role
+from gateway.core.people import ROLES
 from gateway.operator.users import FILE_NAME, Users
 from tests.closed_loop.gate_line import GateLine
 from tests.protocol.bus_support import free_port
-from tests.system.peer import Peer
+from tests.system.peer import Spoken
 
 PASSWORD = "three old rollers"
 PARTS = ("line", "change", "history", "health")
@@ -74,7 +74,7 @@ class PageLine(GateLine):
             return False
 
 
-class AtPage(Peer):
+class AtPage(Spoken):
     """Somebody at a page, in Chromium: see the deeds of page_operator.js."""
 
     def __init__(self, log: Path) -> None:
@@ -86,13 +86,10 @@ class AtPage(Peer):
         super().__enter__()
         return self
 
-    def _become_punctual(self) -> None:
-        """A browser is no device: the line runs before it."""
-
     def open(self, page: str, language: str = "en", **window: Any) -> None:
         self("open", page, {"language": LANGUAGES[language], **window})
 
-    def log_in(self, name: Role, password: str = PASSWORD) -> None:
+    def log_in(self, name: str, password: str = PASSWORD) -> None:
         """And wait until the line is seen."""
         self.try_log_in(name, password)
         self("see", "#picture svg")

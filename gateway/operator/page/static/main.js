@@ -121,6 +121,7 @@ function paint() {
   setText($("waiting"), String(waiting.length));
   show($("prompt"), waiting.length > 0);
   setText($("prompt-text"), word(waiting.length === 1 ? "prompt.one" : "prompt.more", { count: waiting.length }));
+  $("clock").dateTime = new Date(1000 * (tick.wall_s - (loop.age_s ?? 0))).toISOString(); // when the loop measured all this
 }
 
 // Four times a second, whether anything comes or not: how old it is, and how long there is to decide.
