@@ -28,7 +28,6 @@ REFRESH_S = 0.2
 NOTES_S = 20.0  #: how long the screen shows what the loop said of its start
 MOST_NOTES = 4  #: of the operator's process
 EXIT_S = 60.0  #: how long it shows the last words of a child that has ended; then one line remains
-DONE_WITHOUT = ("agents", "operator")  #: what the line runs on without, whatever they are refused
 _REACHED = "operator of "  #: so begins the operator's word of where it is reached
 #: How the loop's ordinary words at its start begin; all others are for the person at the terminal.
 _ORDINARY = ("loop of ", "pinned to ", "real-time priority ", "memory locked")
@@ -52,8 +51,8 @@ def run_together(
     children = [
         Child("gateway", lambda: gateway, data_folder / "gateway.log"),
         Child("loop", lambda: loop, data_folder / "loop.log"),
-        Child("agents", lambda: gateway, data_folder / "agents.log"),
-        Child("operator", lambda: gateway, data_folder / "operator.log"),
+        Child("agents", lambda: gateway, data_folder / "agents.log", is_needed=False),
+        Child("operator", lambda: gateway, data_folder / "operator.log", is_needed=False),
     ]
     if plant is not None:
         loop.append("--simulated")  # it is the line that is started here
@@ -103,7 +102,7 @@ def _tend(children: Sequence[Child], notices: "Notices") -> Exit | None:
                 notices.hear_of_sim(child.said())
             elif child.name == "operator":
                 notices.hear_of_operator(child.said(), now_s)
-        elif ended.is_final and child.name not in DONE_WITHOUT:
+        elif ended.is_final:
             final = final or ended
         else:
             notices.tell(ended)

@@ -146,7 +146,7 @@ def test_what_the_line_does_without_is_told_when_it_is_refused_and_ends_nothing(
         f"again.touch(); raise SystemExit({code})"
     )
     assert run(tmp_path) == 0
-    assert f"{name} has ended with exit code {code}" in capsys.readouterr().err
+    assert f"{name} has ended with exit code {code}; it is started again\n" in capsys.readouterr().err
 
 
 def test_a_crash_is_told_and_the_child_comes_back(
