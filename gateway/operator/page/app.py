@@ -14,6 +14,7 @@ from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
 from gateway.core.line import Line
+from gateway.operator.access import Access
 from gateway.operator.line_side import LineSide
 from gateway.operator.page.asks import Asks
 from gateway.operator.page.events import Ticks, stream
@@ -25,13 +26,16 @@ from gateway.operator.page.words import words_routes
 STATIC = Path(str(files("gateway.operator.page"))) / "static"
 
 
-def page_app(line: Line, side: LineSide, check: Check, clock: Callable[[], float]) -> Starlette:
+def page_app(
+    line: Line, side: LineSide, check: Check, clock: Callable[[], float], access: Access | None = None
+) -> Starlette:
     """`check`: the role of whoever has this name and password, None: nobody has. `clock`: monotonic, s.
+    `access` is told who comes in, and who does not.
 
     The page speaks TLS where the address in the line's file says https; then its cookie is sent over TLS alone.
     """
     address = urlsplit(line.operator.page)
-    door = Door(check, clock, line.operator.anonymous == "read", address.scheme == "https", port_of(address))
+    door = Door(check, clock, line.operator.anonymous == "read", address.scheme == "https", port_of(address), access)
     asks, ticks = Asks(line, side, door), Ticks(side)
     app = Starlette(
         routes=[
