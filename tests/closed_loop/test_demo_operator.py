@@ -11,6 +11,7 @@ from gateway.cli.demo_panel import Panel
 from gateway.cli.demo_people import CLIENT, let_in
 from gateway.control.design import design_lqg, task_of
 from gateway.core.controller import config_hash
+from gateway.core.line_file import load_line
 from tests.operator.real_line import OperatorLine
 
 pytestmark = [pytest.mark.realtime, pytest.mark.timeout(240)]
@@ -56,7 +57,8 @@ def test_a_scripted_operator_approves_what_it_was_shown_and_the_audit_says_that_
 
     with OperatorLine(tmp_path, spans=3) as line:
         line.run()
-        found = let_in(line.line, line.data, people=True)
+        described = load_line((line.folder / "line.toml").read_text(encoding="utf-8"), "line.toml")
+        found = let_in(described, line.data, people=True)
         line.operate()
         better = design_lqg(task_of(line.line))
         proposal = line.propose(better)
