@@ -18,6 +18,7 @@ from gateway.cli.commission import commission
 from gateway.cli.commission_stepped import BEGIN, SteppedGate, impatient
 from gateway.cli.stepped import SteppedLoop
 from gateway.control.design import design_lqi, task_of
+from gateway.core.audit_record import Who
 from gateway.core.controller import config_hash
 from gateway.core.interactions import pack
 from gateway.core.line_file import load_line
@@ -26,10 +27,13 @@ from gateway.core.messages import Event
 from gateway.core.proposal import GainsChange
 from gateway.core.verdict import Verdict
 from gateway.operator.page.told import used
+from gateway.supervisor.audit import Audit
 from gateway.supervisor.audit_file import FILE_NAME as AUDIT
 from gateway.supervisor.audit_file import AuditFile
 from gateway.supervisor.baselines import FILE_NAME as BASELINES
 from gateway.supervisor.baselines import Measured, MeasuredRun, begin_baselines
+from gateway.supervisor.configurations import FILE_NAME as CONFIGURATIONS
+from gateway.supervisor.configurations import Origin, begin_configurations
 from gateway.supervisor.historian import FILE_NAME as HISTORY
 from gateway.supervisor.interactions import Interactions
 from sim_plant.drawn import random_plant
@@ -253,6 +257,51 @@ def test_an_audit_that_is_no_database_any_more_leaves_what_else_there_is(folder:
     assert code == 1 and "NOT SOUND" in said
     words = Page(text).words
     assert "NOT SOUND" in words and "cannot be trusted: span 2" in words and "measurement 1.234 7.5" in words
+
+
+def test_it_is_read_beside_what_writes_it_and_left_as_it_was(folder: Path) -> None:
+    data = folder / "data"
+    writing = Audit(data)
+    writing.start()
+    writer = writer_of(data / HISTORY, wall_ahead_s=BEGIN.timestamp(), spans=SPANS)
+    writer.store([], [Event(time_s=2.0, kind="alarm", text="cycles-late: just now", data={})], BEGIN.timestamp())
+    try:
+        before = stores(data)
+        code, said, text = report(folder)
+        assert stores(data) == before
+        audit = writing.append_and_wait("gateway-start", Who(name="gateway"), {"version": "1"})
+        writer.store([], [Event(time_s=3.0, kind="alarm", text="still written", data={})], BEGIN.timestamp())
+    finally:
+        writer.disconnect()
+        assert writing.close()
+    assert code == 0, said
+    assert "cycles-late: just now" in Page(text).words and audit is not None
+
+
+def stores(data: Path) -> dict[str, bytes]:
+    """Without the history: whoever opens its file here lets go of the locks of whoever writes it here."""
+    return {one.name: one.read_bytes() for one in data.iterdir() if one.is_file() and not one.name.startswith(HISTORY)}
+
+
+def test_a_line_on_which_nothing_was_ever_proposed_shows_what_controls_it(tmp_path: Path) -> None:
+    (tmp_path / "line.toml").write_text(TEXT)
+    data = tmp_path / "data"
+    data.mkdir()
+    controller = design_lqi(task_of(LINE))
+    hash_ = config_hash(controller)
+    with begin_configurations(data / CONFIGURATIONS) as storage:
+        storage.store(LINE.site, LINE.line, controller, Origin(1.0, "loop", "the line was started with it"))
+    found = {"configuration": hash_, "last_known_good": hash_, "epoch": 0, "because": "start", "explained": True}
+    audit = Audit(data)
+    audit.start()
+    audit.append_and_wait("found-in-service", Who(name="gateway"), found)
+    assert audit.close()
+    code, said, text = report(tmp_path)
+    assert code == 0, said
+    words = Page(text).words
+    assert "Nothing has been proposed on this line: how it is controlled has not changed." in words
+    assert f"Initial {hash_[:12]}, epoch 0" in words and "Initial LQI" in words
+    assert "Caution: of what the line has shown nothing is told: there is no history at" in words
 
 
 def test_a_time_without_a_change_says_so_and_shows_what_is_in_service(folder: Path) -> None:
