@@ -12,8 +12,8 @@ from gateway.commissioning.ground import course_of
 from gateway.core.scenario import Scenario
 from gateway.core.signals import FloatArray
 
-MOST_SHOWN = 6  #: as many as there are colours
-PLOT_EVERY_S = 0.02  #: at least, between the samples of a chart
+MOST_SHOWN = 5  #: with the reference as many as there are colours
+PLOT_EVERY_S = 0.01  #: at least, between the samples of a chart
 LOST = "ran away"
 
 
@@ -57,7 +57,7 @@ def _table(case: Scenario, named: Sequence[Named], found: Sequence[Simulated | s
     rows: list[tuple[str, ...]] = []
     before: Simulated | None = None
     for one, run in zip(named, found, strict=True):
-        judged = "not known" if one.region is None else beyond(case, one.region) or "yes"
+        judged = one.unjudged if one.region is None else beyond(case, one.region) or "yes"
         law = one.controller.kind.upper()
         if isinstance(run, str):
             rows.append((one.name, law, "-", "-", "-", "-", "-", f"not simulated: {run}"))
