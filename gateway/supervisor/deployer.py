@@ -239,12 +239,13 @@ class Deployer:
         if len(found) != 1:
             return f"{len(found)} proposals begin with {beginning}: `r2rgate proposals` lists them"
         (entry,) = found
-        proposal = self._records.proposal(entry)
+        proposal, first = self._records.proposal(entry), self._first(entry)
         return ProposalShown(
             format=1, stage=entry.stage, why=self._why(entry), proposal_hash=entry.proposal,
             shown=self._shown_hash(entry), epoch=self.book.epoch,
             difference=self._surroundings.difference(proposal, self.book), proposal=proposal,
-            verdict=self._records.verdict(entry),
+            verdict=self._records.verdict(entry), approvals=self._line.gate.approvals,
+            approved_by=None if first is None else first.name,
         )  # fmt: skip
 
     def change(self) -> ChangeStatus | None:

@@ -91,6 +91,49 @@ def test_bytes_that_are_no_opc_ua_end_their_connection_and_no_other():
     run(story)
 
 
+def hello(receive: int, send: int) -> bytes:
+    """`receive`, `send`: the largest chunk that the client takes and sends."""
+    return b"HELF" + struct.pack("<IIIIIIi", 32, 0, receive, send, 0, 0, -1)
+
+
+@pytest.mark.parametrize(("receive", "send"), [(0, 0), (25, 65_535), (65_535, 25), (8191, 8192)])
+def test_a_client_that_takes_or_sends_crumbs_is_refused(receive, send):
+    async def story():
+        async with bench(spans=1) as b:
+            assert await ends_with(b, hello(receive, send)) == CODES.BadTcpNotEnoughResources
+            await answered(b)
+
+    run(story)
+
+
+def test_a_client_with_the_least_buffers_that_there_may_be_is_heard():
+    async def story():
+        async with bench(spans=1) as b:
+            reader, writer = await asyncio.open_connection("127.0.0.1", b.opcua.server.port)
+            writer.write(hello(8192, 8192))
+            assert (await reader.readexactly(28))[:4] == b"ACKF"
+            writer.close()
+
+    run(story)
+
+
+def test_a_client_that_asks_much_at_once_waits_its_turn():
+    """Its forty questions are on their way before the other's one, which is answered among them."""
+
+    async def story():
+        async with bench(spans=1) as b, b.connected("vera") as greedy, b.connected("otto") as other:
+            many = ua.ReadParameters(NodesToRead=[ua.ReadValueId(ua.NodeId(2258), ua.AttributeIds.Value)] * 100)
+            asked = [asyncio.create_task(greedy.uaclient.read(many)) for _ in range(40)]
+            while not any(task.done() for task in asked):  # noqa: ASYNC110 (the other has to be heard amid them)
+                await asyncio.sleep(0)
+            await b.read(other, "Line.Limits.TensionMax")
+            left = sum(not task.done() for task in asked)
+            await asyncio.gather(*asked)
+            assert left > 20
+
+    run(story)
+
+
 def test_a_message_of_too_many_chunks_is_refused():
     async def story():
         async with bench(spans=1) as b:

@@ -12,9 +12,9 @@ from asyncua.server.subscription_service import SubscriptionService
 
 from gateway.operator.opcua.filters import Items
 
-MAX_CHUNK = 65_535  #: bytes
+LEAST_CHUNK, MAX_CHUNK = 8192, 65_535  #: bytes; the least that a client must be able to take (OPC 10000-6, 7.1.2.3)
 MAX_CHUNKS = 4
-MAX_MESSAGE = 262_144  #: bytes
+MAX_MESSAGE = MAX_CHUNKS * MAX_CHUNK  #: bytes
 MAX_READ = 1000  #: nodes of one request
 MAX_BROWSE = 100
 MAX_CALLS = 4  #: methods of one request, and requests with methods that one client may have running

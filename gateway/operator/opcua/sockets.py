@@ -17,7 +17,7 @@ from asyncua.ua.ua_binary import uatcp_to_binary
 from asyncua.ua.uaerrors import UaStatusCodeError
 
 from gateway.operator.opcua import limits
-from gateway.operator.opcua.limits import MAX_CHUNK, MAX_CHUNKS, MAX_MESSAGE
+from gateway.operator.opcua.limits import LEAST_CHUNK, MAX_CHUNK, MAX_CHUNKS, MAX_MESSAGE
 from gateway.operator.opcua.processor import Processor, address_of
 
 ua: Any = asyncua_ua  #: what it declares of its values and what they are differ
@@ -129,6 +129,10 @@ class _Connection(OPCUAProtocol):
             self.transport.resume_reading()
 
     async def _process_one_msg(self, header: Any, buf: Buffer) -> bool:
+        await asyncio.sleep(0)  # the others' turn: a client may send many at once, and each takes its time
+        if header.MessageType == ua.MessageType.Hello and _least_buffer(buf.copy()) < LEAST_CHUNK:
+            self._refuse(ua.StatusCodes.BadTcpNotEnoughResources)
+            return False
         try:
             return await super()._process_one_msg(header, buf)
         except (ServiceError, UaStatusCodeError) as error:
@@ -142,3 +146,9 @@ class _Connection(OPCUAProtocol):
         if self.transport is not None and not self.transport.is_closing():
             self.transport.write(uatcp_to_binary(ua.MessageType.Error, ua.ErrorMessage(ua.StatusCode(code))))
             self.transport.close()
+
+
+def _least_buffer(hello: Buffer) -> int:
+    """Bytes; 0 where it is cut off. Answers in pieces of a few bytes would keep the server busy for a second each."""
+    said = hello.read(min(12, len(hello)))  # the protocol's version, then what the client receives and sends at most
+    return min(int.from_bytes(said[4:8], "little"), int.from_bytes(said[8:12], "little"))
