@@ -261,7 +261,7 @@ def test_every_alarm_of_the_table_has_its_variables_whether_it_is_active_or_not(
             b.gateway.alarms = [alarm("tension-out-of-band"), alarm("load-cell", shelved=True)]
             await b.until(client, f"{path}.Active", lambda found: found.Value.Value is True)
             assert await b.value(client, f"{path}.Text") == "span 1 has 3 N"
-            assert await b.value(client, f"{path}.Since") == "2023-11-14T22:13:20Z"
+            assert await b.value(client, f"{path}.Since") == "2023-11-14T22:13:20.000Z"
             assert await b.value(client, "Line.Alarms.Active") == 1  # the other is out of the way
             assert await b.value(client, "Line.Alarms.First") == "tension-out-of-band"
             assert await b.value(client, "Line.Alarms.load-cell.Shelved") is True
