@@ -4,14 +4,15 @@ from collections.abc import Sequence
 
 from gateway.cli.commission_result import Tried, candidate_name
 from gateway.cli.demo_result import ChangeResult, RuleResult
+from gateway.core.audit_record import Who
 from gateway.core.controller import config_hash
 from gateway.core.decisions import ProposalShown
 from gateway.core.proposal import GainsChange
 from gateway.core.verdict import RuleFinding
 
 
-def change_of(tried: Tried, shown: ProposalShown | None, approved_by: str) -> ChangeResult:
-    """`approved_by`: as the audit has it."""
+def change_of(tried: Tried, shown: ProposalShown | None, approved: Who | None = None, over: str = "") -> ChangeResult:
+    """`approved`: by whom, as the audit has it; None: nobody. `over`: what they had read, where that is known."""
     findings = [] if shown is None or shown.verdict is None else shown.verdict.findings
     change = None if shown is None else shown.proposal.change
     return ChangeResult(
@@ -27,7 +28,9 @@ def change_of(tried: Tried, shown: ProposalShown | None, approved_by: str) -> Ch
         against=[f"{one.rule}: {one.text}" for one in findings if not one.passed],
         closest=closest_of(findings),
         measured="" if tried.shown is None else tried.shown.text,
-        approved_by=approved_by,
+        approved_by="" if approved is None else approved.name,
+        certificate="" if approved is None or approved.certificate is None else approved.certificate,
+        approved_over=over,
         speed_m_per_s=tried.speed_m_per_s,
     )
 

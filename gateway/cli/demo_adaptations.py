@@ -74,13 +74,22 @@ def _adaptation(
             ],
             change=[f"{kept.reason} ({kept.proposal[:12]}, author {kept.author})"],
             verdict=[verdict_words(kept)],
-            decision=[f"Approved by {kept.approved_by or 'nobody'}"],
+            decision=[f"Approved {approval_words(kept)}"],
             result=[f"{result_words(kept)} {_measured(result, place)}"],
             lead="" if last is None else f"Why this one of {len(last.options)}, in the words of {_who(last)}:",
             quote="" if last is None else last.reason,
             judged=verdicts.get(kept.proposal),
         )
     )
+
+
+def approval_words(change: ChangeResult) -> str:
+    """Who approved, from which certificate, and over what."""
+    if not change.approved_by:
+        return "by nobody"
+    certificate = f", from certificate {change.certificate[:16]}" if change.certificate else ""
+    over = f"; over: {change.approved_over}" if change.approved_over else ""
+    return f"by {change.approved_by}{certificate}{over}"
 
 
 def _diagnosis(chain: ChainResult, changes: Sequence[ChangeResult]) -> list[str]:

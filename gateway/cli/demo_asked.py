@@ -1,8 +1,8 @@
 """What was asked of the agents in the demonstration."""
 
 from gateway.cli.asked_result import interactions_in
+from gateway.cli.demo_failed import DemoFailed
 from gateway.cli.demo_line import Setup
-from gateway.cli.demo_operator import DemoFailed
 from gateway.core.interactions import Interaction
 from gateway.supervisor.interactions import InteractionsError
 

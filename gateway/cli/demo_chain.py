@@ -13,8 +13,9 @@ from gateway.cli.commission_live import TOPICS, LiveGate
 from gateway.cli.commission_result import Commissioned
 from gateway.cli.commission_side import GateSide
 from gateway.cli.demo_cases import Window, again_after_stops, run_with_repeats
+from gateway.cli.demo_failed import DemoFailed
 from gateway.cli.demo_line import Setup
-from gateway.cli.demo_operator import DemoFailed, Operator
+from gateway.cli.demo_operator import Operator
 from gateway.cli.demo_stepped import SteppedAside
 from gateway.cli.within_region import beyond
 from gateway.commissioning.past import Step, past_of
@@ -114,6 +115,7 @@ class Chain:
     left_out: list[str] = field(default_factory=list[str])  #: cases that a configuration was not judged for
     shown: list[ProposalShown] = field(default_factory=list[ProposalShown])
     commissioned: Commissioned | None = None
+    approved_over: dict[str, str] = field(default_factory=dict[str, str])  #: by proposal what was read of it
 
 
 async def carry_out(operator: Operator, setup: Setup, stepped: SteppedAside) -> Chain:
@@ -122,14 +124,15 @@ async def carry_out(operator: Operator, setup: Setup, stepped: SteppedAside) -> 
     period_s = setup.line.control.period_s
 
     async def decide(shown: ProposalShown) -> None:
-        short = shown.proposal_hash[:12]
-        operator.progress.step(f"  the gate lets it through by {_rules(shown)} rules; $ r2rgate approve {short} --yes")
-        decided[short] = decided.get(short, 0) + 1
+        proposal = shown.proposal_hash
+        operator.progress.step(f"  the gate lets it through by {_rules(shown)} rules; {proposal[:12]} waits")
+        decided[proposal] = decided.get(proposal, 0) + 1
         try:
-            await operator.approve(short, "the demonstration approves what the gate lets through")
-        except DemoFailed:
-            if decided[short] == MOST_DECISIONS:
+            chain.approved_over[proposal] = await operator.approve(proposal)
+        except DemoFailed as refused:
+            if decided[proposal] == MOST_DECISIONS:
                 raise
+            operator.progress.step(f"  {refused}")
 
     async def measure(config: Controller, shown: ProposalShown) -> None:
         name = name_of(len({config_hash(window.config) for window in chain.windows}))

@@ -10,6 +10,7 @@ from gateway.cli.demo_analysis import Evidence
 from gateway.cli.demo_chain import Chain
 from gateway.cli.demo_line import Setup
 from gateway.cli.demo_result import AuditResult, ChainResult, SwapResult
+from gateway.core.audit_record import Who
 from gateway.core.interactions import Interaction
 from gateway.core.signals import FloatArray
 from gateway.supervisor.audit_file import AuditFile
@@ -32,7 +33,12 @@ def chain_result(setup: Setup, chain: Chain, evidence: Evidence, interactions: S
     return ChainResult(
         reached=found.reached,
         text=found.text,
-        changes=[change_of(one, shown.get(one.proposal), approved.get(one.proposal, "")) for one in found.tried],
+        changes=[
+            change_of(
+                one, shown.get(one.proposal), approved.get(one.proposal), chain.approved_over.get(one.proposal, "")
+            )
+            for one in found.tried
+        ],
         asked=asked_result(interactions, chain.shown),
         deployments=deployments,
         swaps=_swaps(setup, evidence, steps),
@@ -49,11 +55,11 @@ def audit_result(setup: Setup) -> AuditResult:
     return AuditResult(records=found.records, head=found.head, sound=found.sound, problems=found.problems)
 
 
-def _decided(setup: Setup) -> tuple[dict[str, str], int]:
+def _decided(setup: Setup) -> tuple[dict[str, Who], int]:
     """By proposal who approved it, and how often anything was deployed."""
     with AuditFile(setup.data) as file:
         records = [row.record() for row in file.rows()]
-    approved = {str(one.what["proposal"]): one.who.name for one in records if one.kind == "approved"}
+    approved = {str(one.what["proposal"]): one.who for one in records if one.kind == "approved"}
     return approved, sum(one.kind == "deployed" for one in records)
 
 

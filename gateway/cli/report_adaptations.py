@@ -61,7 +61,7 @@ def changes_of(proposals: Sequence[Recorded], measured: Mapping[str, Convergence
     for one in proposals:
         past, approved = past_of(one.shown), one.step("approved")
         tried = tried_of(past, one.shown, measured.get(one.hash))
-        found.append(change_of(tried, one.shown, "" if approved is None else approved.who.name))
+        found.append(change_of(tried, one.shown, None if approved is None else approved.who))
     return found
 
 

@@ -5,6 +5,7 @@ the loop runs on. Here is what people and programs ask for, and what passes with
 proposals judged, `on_the_line` carries out what is approved.
 """
 
+import os
 from collections.abc import Callable
 from typing import Any
 
@@ -20,7 +21,7 @@ from gateway.core.status import ChangeStatus
 from gateway.mailbox.port import Unreachable
 from gateway.supervisor.audit_file import AuditUnavailable
 from gateway.supervisor.deployer_sides import AuditSide, JudgeSide, LoopSide, NotKnown, NotTakenUp, Surroundings
-from gateway.supervisor.four_eyes import APPROVED_ONCE, FirstApproval, approver_of, why_not_second
+from gateway.supervisor.four_eyes import APPROVED_ONCE, FirstApproval, approver_of, why_no_person, why_not_second
 from gateway.supervisor.lifecycle import (
     LINE_CHANGED,
     ON_THE_LINE,
@@ -38,6 +39,8 @@ from gateway.supervisor.peers import GATEWAY
 from gateway.supervisor.proposal_inbox import Inbox
 from gateway.supervisor.proposal_records import ProposalRecords, done, refused
 
+MOST_AT_HAND = 24  #: proposals that wait, the newest
+
 
 class Deployer:
     """`propose`, `decide` and `roll_back` for others; `watch` a few times a second. All in one event loop."""
@@ -53,9 +56,14 @@ class Deployer:
         take_up: Callable[[Proposal, str | None], None],
         clock: Callable[[], float],
         wall_clock: Callable[[], float],
+        own_uid: int | None = None,
     ) -> None:
-        """`take_up` puts into the stores what is about to be put into service; raises NotTakenUp."""
+        """`take_up` puts into the stores what is about to be put into service; raises NotTakenUp.
+
+        `own_uid`: the user that the gateway runs as; None: that of this process.
+        """
         self.book = book
+        self._own_uid = os.getuid() if own_uid is None else own_uid
         self._line = line
         self._surroundings = surroundings
         self._wall_clock = wall_clock
@@ -76,6 +84,8 @@ class Deployer:
     async def decide(self, decision: Decide, who: Who) -> Reply:
         """A person's word, straight from the mailbox. The approval is of what was shown, and good once."""
         approver = approver_of(who)
+        if decision.approve and self._line.gate.approvals > 1 and (reason := why_no_person(who, self._own_uid)):
+            return refused("nothing was decided", [reason])
         if decision.script:
             who = who.model_copy(update={"name": f"{decision.script}, run by {who.name}"})
         async with self._records.one_step:
@@ -193,6 +203,17 @@ class Deployer:
     async def close(self) -> None:
         await self._inbox.close()
 
+    async def at_hand(self, beginning: str | None = None) -> None:
+        """Before `watch`, `listed`, `shown` and `decide`: what they need of the disk. None: of what waits."""
+        wanted = list[Entry]()
+        if beginning is not None:
+            wanted = [one for hash_, one in self.book.entries.items() if hash_.startswith(beginning)][:1]
+        elif self._line.gate.autonomy == "approve-first":  # whether it passes by itself depends on what it is
+            wanted = [one for one in reversed(self.book.undecided) if one.stage is Stage.WAITING][:MOST_AT_HAND]
+        if self._line.gate.autonomy == "approve-first":
+            wanted += [self.book.entries[one] for one in self.book.trusted.values()]
+        await self._records.fetch(wanted)
+
     def listed(self, most: int, skip: int = 0) -> ProposalList:
         """The newest first, but for the first `skip`; with those that are not done with, where none are left out."""
         entries = list(reversed(self.book.entries.values()))
@@ -218,12 +239,13 @@ class Deployer:
         if len(found) != 1:
             return f"{len(found)} proposals begin with {beginning}: `r2rgate proposals` lists them"
         (entry,) = found
-        proposal = self._records.proposal(entry)
+        proposal, first = self._records.proposal(entry), self._first(entry)
         return ProposalShown(
             format=1, stage=entry.stage, why=self._why(entry), proposal_hash=entry.proposal,
             shown=self._shown_hash(entry), epoch=self.book.epoch,
             difference=self._surroundings.difference(proposal, self.book), proposal=proposal,
-            verdict=self._records.verdict(entry),
+            verdict=self._records.verdict(entry), approvals=self._line.gate.approvals,
+            approved_by=None if first is None else first.name,
         )  # fmt: skip
 
     def change(self) -> ChangeStatus | None:
@@ -271,6 +293,8 @@ class Deployer:
             return [f"proposal {entry.proposal[:12]} is {entry.stage}{f': {entry.why}' if entry.why else ''}"]
         if self._wall_clock() >= entry.expires_s:
             return [f"it has expired at {entry.expires}"]
+        if because := self.book.why_outdated(entry):
+            return [because]
         if decision.shown != self._shown_hash(entry):
             return ["what was shown is no longer what would be done: look at it again, then decide"]
         first = self._first(entry) if decision.approve and self._line.gate.approvals > 1 else None
@@ -284,6 +308,8 @@ class Deployer:
             if now_s >= entry.expires_s:
                 what = {"proposal": entry.proposal, "because": f"nobody decided until {entry.expires}"}
                 await self._records.step("expired", what, GATEWAY)
+            elif because := self.book.why_outdated(entry):
+                await self._records.step("superseded", {"proposal": entry.proposal, "because": because}, GATEWAY)
             elif entry.stage is Stage.APPROVED:
                 because = "it was approved, and not carried out: decide again"
                 await self._records.step("approval-lapsed", {"proposal": entry.proposal, "because": because}, GATEWAY)

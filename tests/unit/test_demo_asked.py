@@ -11,8 +11,8 @@ from gateway.cli.asked_result import asked_result
 from gateway.cli.change_result import closest_of
 from gateway.cli.demo_asked import read_interactions
 from gateway.cli.demo_asked_page import asked_section, came_of, in_short
-from gateway.cli.demo_line import LanguageModelAsked, Setup, line_text
-from gateway.cli.demo_operator import DemoFailed
+from gateway.cli.demo_failed import DemoFailed
+from gateway.cli.demo_line import LanguageModelAsked, Ports, Setup, line_text
 from gateway.cli.demo_result import ChangeResult, RuleResult
 from gateway.cli.main import app
 from gateway.commissioning.past import Step, asked, named
@@ -47,7 +47,7 @@ def change(hash_: str, **changes: Any) -> ChangeResult:
     fields = {
         "step": "redesign", "name": "candidate 1", "proposal": hash_, "configuration": "", "author": "rules",
         "reason": "MPC", "stage": "kept", "why": "", "rules": 23, "against": [], "closest": rule, "measured": "",
-        "approved_by": "anna", "speed_m_per_s": 0.1, **changes,
+        "approved_by": "anna", "certificate": "ab" * 32, "approved_over": "a gain", "speed_m_per_s": 0.1, **changes,
     }  # fmt: skip
     return ChangeResult.model_validate(fields)
 
@@ -120,9 +120,9 @@ def test_the_rule_that_decided_is_the_first_that_failed_or_the_narrowest() -> No
 
 
 def test_a_language_model_that_is_asked_stands_in_the_lines_file() -> None:
-    line = load_line(line_text(1, 2, LanguageModelAsked('http://127.0.0.1:1/"x', "a:b")), "line.toml")
+    line = load_line(line_text(Ports(1, 2, 3, 4), LanguageModelAsked('http://127.0.0.1:1/"x', "a:b")), "line.toml")
     assert (line.agents.llm, line.agents.url, line.agents.model) == ("ollama", 'http://127.0.0.1:1/"x', "a:b")
-    assert load_line(line_text(1, 2), "line.toml").agents.llm == "off"
+    assert load_line(line_text(Ports(1, 2, 3, 4)), "line.toml").agents.llm == "off"
 
 
 @pytest.mark.parametrize(
