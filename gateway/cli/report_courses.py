@@ -116,7 +116,7 @@ def simulated(
     found: dict[str, list[Simulated | str]] = {case.name: [] for case in cases}
     for case in cases:
         for one in named:
-            tell(f"simulated under identical conditions: {one.name}, {case.heading.lower()}")
+            tell(f"simulating {one.name}, {case.heading.lower()}")
             try:
                 found[case.name].append(conditions.run(one.controller, case))
             except ValueError as error:  # of another period, or another number of spans
