@@ -10,10 +10,11 @@ from typing import Any
 
 from gateway.core.audit_record import Who
 from gateway.core.decisions import MOST_LISTED, Decide, ProposalLine, ProposalList, ProposalShown, shown_hash
+from gateway.core.deployment import Region
 from gateway.core.judge_context import JudgeContext
 from gateway.core.line import Line
 from gateway.core.messages import Reply
-from gateway.core.proposal import GainsChange, Proposal
+from gateway.core.proposal import GainsChange, Proposal, canonical
 from gateway.core.recording import Recording
 from gateway.core.small_change import beyond_small
 from gateway.core.status import ChangeStatus
@@ -185,6 +186,13 @@ class Deployer:
     async def judged(self) -> None:
         """Until nothing is being judged any more."""
         await self._inbox.judged()
+
+    def judged_as(self, entry: Entry) -> tuple[bytes, JudgeContext, Region]:
+        """The bytes that were judged, in which context, and for what. Raises AuditUnavailable, NotKnown."""
+        verdict = self._records.verdict(entry)
+        if verdict is None or verdict.region is None:
+            raise NotKnown("it was not accepted")
+        return canonical(self._records.proposal(entry)), self._records.context(verdict), verdict.region
 
     async def context(self) -> tuple[JudgeContext, list[Recording]]:
         """What a proposal would be judged against now. Raises NotKnown."""
