@@ -73,7 +73,7 @@ def _drawn(
     return DrawnCourse(
         scenario=name,
         time_s=[round(k * period_s, 4) for k in range(0, len(setpoint_n), every)],
-        setpoint_n=[[round(one, 2) for one in span] for span in setpoint_n[::every].T.tolist()],
+        setpoint_n=[[round(one, 3) for one in span] for span in setpoint_n[::every].T.tolist()],
         tension_n={whose: _told(run(config)[::every]) for whose, config in configs.items()},
     )
 
