@@ -18,7 +18,8 @@ from agents.rag.stages import Asked, Retrieval
 from gateway.core.line_queries import Generated
 
 LOOK_S = 10.0  #: from one look at the line to the next
-FIRST_S = 5.0  #: for the line to tell, before agents answer without it
+FIRST_S = 5.0  #: for the line to tell, and for the embedder to be there, before agents answer without them
+QUESTION_S = 5.0  #: for the embedder to read a question: an agent has other things to do with its time
 _Failed = (IndexRefused, EmbedderFailed, OSError)
 #: The embedder that is wanted; None: none is. Raises EmbedderFailed while it is not there.
 Find = Callable[[], Awaitable[Embedder | None]]
@@ -58,7 +59,11 @@ class Knowledge:
         with suppress(TimeoutError):
             async with asyncio.timeout(FIRST_S):
                 await self.hear()
-        await self._find_embedder()
+        try:
+            async with asyncio.timeout(FIRST_S):
+                await self._find_embedder()
+        except TimeoutError:  # it is waited for beside the answers
+            self._say("embedder", f"things are looked up by words: no embedder within {FIRST_S:g} s")
         if self._embedder is None and not self._away:
             await self.look()
             return
@@ -145,7 +150,11 @@ class Knowledge:
         if self._embedder is None or not self._comparable():
             return None
         try:
-            found = await self._embedder.embed([question])
+            async with asyncio.timeout(QUESTION_S):
+                found = await self._embedder.embed([question])
+        except TimeoutError:
+            self._say("embedder", f"looked up by words: no vector within {QUESTION_S:g} s")
+            return None
         except EmbedderFailed as error:
             self._say("embedder", f"looked up by words: {error}")
             return None

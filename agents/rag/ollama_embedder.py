@@ -30,7 +30,7 @@ class OllamaEmbedder:
         try:
             digest = await _digest(client, model, url)
             vectors = await _vectors(client, model, ["dimension"])
-        except EmbedderFailed:
+        except BaseException:  # also where it is no longer waited for
             await _close(client)
             raise
         return cls(client, EmbedderId(f"ollama:{model}", vectors.shape[1], digest))

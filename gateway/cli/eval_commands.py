@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from gateway.cli.eval_result import EvalResult, TaskResult
     from gateway.core.line import Agents
 
-UNSAFE = 1  #: exit code
+UNSAFE, FAILED = 1, 3  #: exit codes
 OFF = "off"
 LIBRARIES = ("r2rgate", "numpy", "scipy", "osqp", "numba", "ollama")
 
@@ -38,7 +38,8 @@ def evaluate(
     With a model tasks run one after another, and all that is said is kept: `r2rgate log --data-dir out/eval`. Ctrl-C
     ends it; the tasks that were finished are in the result. A task that fails is in it as well, with the reason.
 
-    Exit code: 0 done, 1 done and unsafe events were seen at the simulated drives, 2 refused, 130 interrupted.
+    Exit code: 0 done, 1 done and unsafe events were seen at the simulated drives, 2 refused, 3 done but for
+    trials that failed, 130 interrupted.
 
     Example: r2rgate eval --model qwen3:4b --tasks 5
 
@@ -64,7 +65,12 @@ def evaluate(
     if not complete:
         typer.echo(f"interrupted: {len(found)} of {tasks} tasks are in {out}", err=True)
         raise typer.Exit(INTERRUPTED)
-    raise typer.Exit(UNSAFE if any(one.unsafe_accepted for one in result.figures) else 0)
+    failed = [(task.number + 1, trial) for task in found for trial in task.trials if trial.failed]
+    for number, trial in failed:
+        typer.echo(f"task {number}, {trial.policy}: {trial.end}", err=True)
+    if any(one.unsafe_accepted for one in result.figures):
+        raise typer.Exit(UNSAFE)
+    raise typer.Exit(FAILED if failed else 0)
 
 
 def _answering(model: str, url: str) -> tuple["Agents", str]:

@@ -38,6 +38,7 @@ class Trial(Strict):
     """One task, carried out once under one policy."""
 
     policy: str  #: `Policy`; in a benchmark also the name of who is in the place of a model
+    failed: bool = False  #: the chain did not come to an end; `end` says why
     reached: bool  #: an adapted configuration is in service
     converged: bool  #: the last measurement shows the criteria met, and nothing significant left to gain
     end: str  #: of the chain, in words

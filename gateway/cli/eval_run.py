@@ -143,7 +143,7 @@ class Carrying:
 def failed_trial(policy: str, why: str, interactions: Sequence[Interaction] = (), unsafe_events: int = 0) -> Trial:
     """Of a chain that did not come to its end: nothing is reached, and there is nothing to measure."""
     return Trial(
-        policy=policy, reached=False, converged=False, end=f"failed: {why}", iterations=0, experiments=0,
+        policy=policy, failed=True, reached=False, converged=False, end=f"failed: {why}", iterations=0, experiments=0,
         deployments=0, rejections=rejections([], interactions), asked=_asked([], interactions), controller="",
         rmse_n={}, to_truth={}, to_begin={}, stopped=[], unsafe_accepted=unsafe_events, line_s=0.0, processor_s=0.0,
         wall_s=0.0,

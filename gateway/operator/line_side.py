@@ -10,6 +10,7 @@ from typing import TypeVar
 
 from pydantic import ValidationError
 
+from gateway.core.access import AtTheDoor
 from gateway.core.courses import CoursesTold, ShowCourses
 from gateway.core.decisions import ListProposals, ProposalList, ProposalShown, ShowProposal
 from gateway.core.line import Strict
@@ -18,6 +19,7 @@ from gateway.core.messages import Reply
 from gateway.core.people import ForPerson, Person, Said
 from gateway.core.status import GatewayStatus
 from gateway.core.topics import (
+    GATEWAY_ACCESS,
     GATEWAY_COURSES,
     GATEWAY_FOR_PERSON,
     GATEWAY_PAST,
@@ -36,7 +38,8 @@ ACT_S = 20.0  #: arming, and a deployment, take their time
 
 Model = TypeVar("Model", bound=Strict)
 
-READ: tuple[Topic, ...] = (GATEWAY_STATUS, GATEWAY_PROPOSALS, GATEWAY_PAST, GATEWAY_COURSES)  #: what is looked at
+#: All but what people say.
+READ: tuple[Topic, ...] = (GATEWAY_STATUS, GATEWAY_PROPOSALS, GATEWAY_PAST, GATEWAY_COURSES, GATEWAY_ACCESS)
 TOPICS: tuple[Topic, ...] = (*READ, GATEWAY_FOR_PERSON)
 
 
@@ -109,6 +112,14 @@ class LineSide:
             return Reply.model_validate_json(await self._saying.request(GATEWAY_FOR_PERSON, payload, ACT_S))
         except (Unreachable, ValidationError) as error:
             return NoAnswer(ok=False, state="", text=str(error), reasons=[str(error)])
+
+    async def at_the_door(self, happened: AtTheDoor) -> bool:
+        """For the audit. False: it has to be told again later."""
+        try:
+            answer = await self._mailbox.request(GATEWAY_ACCESS, happened.model_dump_json().encode(), ACT_S)
+            return Reply.model_validate_json(answer).ok
+        except (Unreachable, ValidationError):
+            return False
 
     async def _look(self) -> None:
         status = _told(GatewayStatus, await self._request(GATEWAY_STATUS, b""))

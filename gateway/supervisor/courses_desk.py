@@ -59,11 +59,11 @@ class CoursesDesk:
         if deployer is None:
             return _refused("the gate is shut", ["ask again once it is open"])
         try:
-            return self._told(asked.proposal, deployer)
+            return await self._told(asked.proposal, deployer)
         except (NotKnown, AuditUnavailable) as error:
             return _refused("there are no courses of it", [str(error)])
 
-    def _told(self, proposal: str, deployer: Deployer) -> bytes:
+    async def _told(self, proposal: str, deployer: Deployer) -> bytes:
         """Raises NotKnown, AuditUnavailable."""
         entry = deployer.book.entries.get(proposal)
         if entry is None or entry.verdict is None:
@@ -72,8 +72,9 @@ class CoursesDesk:
             return found
         if entry.kind != "gains" or entry.stage is not Stage.WAITING:
             raise NotKnown("they are drawn of another controller alone, and while it waits for a decision")
+        judged = await deployer.judged_as(entry)
         if self._drawing is None or self._drawing.done():
-            work = self._draw(proposal, entry.verdict, *deployer.judged_as(entry))
+            work = self._draw(proposal, entry.verdict, *judged)
             self._drawing = asyncio.get_running_loop().create_task(work)
         return _of(proposal, entry.verdict, None, drawing=True)
 

@@ -5,6 +5,7 @@ the loop runs on. Here is what people and programs ask for, and what passes with
 proposals judged, `on_the_line` carries out what is approved.
 """
 
+import os
 from collections.abc import Callable
 from typing import Any
 
@@ -21,7 +22,7 @@ from gateway.core.status import ChangeStatus
 from gateway.mailbox.port import Unreachable
 from gateway.supervisor.audit_file import AuditUnavailable
 from gateway.supervisor.deployer_sides import AuditSide, JudgeSide, LoopSide, NotKnown, NotTakenUp, Surroundings
-from gateway.supervisor.four_eyes import APPROVED_ONCE, FirstApproval, approver_of, why_not_second
+from gateway.supervisor.four_eyes import APPROVED_ONCE, FirstApproval, approver_of, why_no_person, why_not_second
 from gateway.supervisor.lifecycle import (
     LINE_CHANGED,
     ON_THE_LINE,
@@ -39,6 +40,8 @@ from gateway.supervisor.peers import GATEWAY
 from gateway.supervisor.proposal_inbox import Inbox
 from gateway.supervisor.proposal_records import ProposalRecords, done, refused
 
+MOST_AT_HAND = 24  #: proposals that wait, the newest
+
 
 class Deployer:
     """`propose`, `decide` and `roll_back` for others; `watch` a few times a second. All in one event loop."""
@@ -54,9 +57,14 @@ class Deployer:
         take_up: Callable[[Proposal, str | None], None],
         clock: Callable[[], float],
         wall_clock: Callable[[], float],
+        own_uid: int | None = None,
     ) -> None:
-        """`take_up` puts into the stores what is about to be put into service; raises NotTakenUp."""
+        """`take_up` puts into the stores what is about to be put into service; raises NotTakenUp.
+
+        `own_uid`: the user that the gateway runs as; None: that of this process.
+        """
         self.book = book
+        self._own_uid = os.getuid() if own_uid is None else own_uid
         self._line = line
         self._surroundings = surroundings
         self._wall_clock = wall_clock
@@ -77,6 +85,8 @@ class Deployer:
     async def decide(self, decision: Decide, who: Who) -> Reply:
         """A person's word, straight from the mailbox. The approval is of what was shown, and good once."""
         approver = approver_of(who)
+        if decision.approve and self._line.gate.approvals > 1 and (reason := why_no_person(who, self._own_uid)):
+            return refused("nothing was decided", [reason])
         if decision.script:
             who = who.model_copy(update={"name": f"{decision.script}, run by {who.name}"})
         async with self._records.one_step:
@@ -187,12 +197,13 @@ class Deployer:
         """Until nothing is being judged any more."""
         await self._inbox.judged()
 
-    def judged_as(self, entry: Entry) -> tuple[bytes, JudgeContext, Region]:
+    async def judged_as(self, entry: Entry) -> tuple[bytes, JudgeContext, Region]:
         """The bytes that were judged, in which context, and for what. Raises AuditUnavailable, NotKnown."""
+        await self._records.fetch([entry])
         verdict = self._records.verdict(entry)
         if verdict is None or verdict.region is None:
             raise NotKnown("it was not accepted")
-        return canonical(self._records.proposal(entry)), self._records.context(verdict), verdict.region
+        return canonical(self._records.proposal(entry)), await self._records.context(verdict), verdict.region
 
     async def context(self) -> tuple[JudgeContext, list[Recording]]:
         """What a proposal would be judged against now. Raises NotKnown."""
@@ -200,6 +211,17 @@ class Deployer:
 
     async def close(self) -> None:
         await self._inbox.close()
+
+    async def at_hand(self, beginning: str | None = None) -> None:
+        """Before `watch`, `listed`, `shown` and `decide`: what they need of the disk. None: of what waits."""
+        wanted = list[Entry]()
+        if beginning is not None:
+            wanted = [one for hash_, one in self.book.entries.items() if hash_.startswith(beginning)][:1]
+        elif self._line.gate.autonomy == "approve-first":  # whether it passes by itself depends on what it is
+            wanted = [one for one in reversed(self.book.undecided) if one.stage is Stage.WAITING][:MOST_AT_HAND]
+        if self._line.gate.autonomy == "approve-first":
+            wanted += [self.book.entries[one] for one in self.book.trusted.values()]
+        await self._records.fetch(wanted)
 
     def listed(self, most: int, skip: int = 0) -> ProposalList:
         """The newest first, but for the first `skip`; with those that are not done with, where none are left out."""
@@ -280,6 +302,8 @@ class Deployer:
             return [f"proposal {entry.proposal[:12]} is {entry.stage}{f': {entry.why}' if entry.why else ''}"]
         if self._wall_clock() >= entry.expires_s:
             return [f"it has expired at {entry.expires}"]
+        if because := self.book.why_outdated(entry):
+            return [because]
         if decision.shown != self._shown_hash(entry):
             return ["what was shown is no longer what would be done: look at it again, then decide"]
         first = self._first(entry) if decision.approve and self._line.gate.approvals > 1 else None
@@ -293,6 +317,8 @@ class Deployer:
             if now_s >= entry.expires_s:
                 what = {"proposal": entry.proposal, "because": f"nobody decided until {entry.expires}"}
                 await self._records.step("expired", what, GATEWAY)
+            elif because := self.book.why_outdated(entry):
+                await self._records.step("superseded", {"proposal": entry.proposal, "because": because}, GATEWAY)
             elif entry.stage is Stage.APPROVED:
                 because = "it was approved, and not carried out: decide again"
                 await self._records.step("approval-lapsed", {"proposal": entry.proposal, "because": because}, GATEWAY)

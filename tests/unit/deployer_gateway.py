@@ -5,7 +5,8 @@ import asyncio
 from gateway.core.audit_record import Who
 from gateway.core.controller import config_hash
 from gateway.core.decisions import Decide
-from gateway.core.proposal import canonical
+from gateway.core.line_model import model_hash
+from gateway.core.proposal import ModelChange, canonical
 from gateway.supervisor.deployer import Deployer
 from gateway.supervisor.lifecycle import Stage, book_of
 from tests.unit.deployer_support import (
@@ -21,6 +22,7 @@ from tests.unit.deployer_support import (
 )
 
 ANNA = Who(name="anna", uid=1000, pid=1)
+OPERATORS_UID = 900  #: of the gateway, and of the operator's process
 BERT = Who(name="bert", uid=1001, pid=2)
 PROBATION_S = LINE.gate.probation_s
 #: From controller 1 to 2 is a quarter of a number, from 1 to 3 two fifths.
@@ -52,13 +54,15 @@ class Gateway:
     def begin(self) -> None:
         book, clock = book_of(self.audit.records), self._now_s
         args = (self.audit, self.loop, self.judge, self.surroundings, lambda proposal, verdict: None, clock, clock)
-        self.deployer = Deployer(self.line, book, *args)
+        self.deployer = Deployer(self.line, book, *args, own_uid=OPERATORS_UID)
 
     def _now_s(self) -> float:
         return self.loop.now_s
 
     async def propose(self, one):
         self.proposals[hash_of(one)] = one
+        if isinstance(one.change, ModelChange):
+            self.surroundings.models[model_hash(one.change.model)] = one.change.model
         reply = await self.deployer.propose(canonical(one), ANNA)
         await self.deployer.judged()
         return reply

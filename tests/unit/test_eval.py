@@ -18,6 +18,7 @@ from gateway.cli.commission_result import Tried
 from gateway.cli.eval_baselines import EVALUATIONS, Searching
 from gateway.cli.eval_figures import policy_figures
 from gateway.cli.eval_result import EvalResult
+from gateway.cli.eval_run import failed_trial
 from gateway.cli.eval_stages import rejections
 from gateway.cli.eval_table import HEADS, print_result
 from gateway.cli.eval_tasks import MOST_DEPLOYMENTS, SPANS, TOP_M_PER_S, task_of
@@ -271,6 +272,20 @@ def test_interrupted_it_keeps_the_tasks_that_were_finished(tmp_path: Path, monke
     assert ended.exit_code == 130 and "interrupted: 1 of 3 tasks" in ended.output
     kept = EvalResult.model_validate_json(out.read_bytes())
     assert not kept.complete and kept.tasks == [finished] and kept.figures[0].trials == 1
+
+
+def test_trials_that_failed_are_told_and_the_exit_code_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    finished = EvalResult.model_validate_json(EXAMPLE.read_bytes()).tasks[0]
+    broken = finished.model_copy(update={"trials": [*finished.trials, failed_trial("nelder-mead", "no memory left")]})
+
+    def carry_out(jobs: Any, workers: int, tell: Any, done: Any) -> None:
+        done(broken if len(jobs) == 2 else finished)
+
+    monkeypatch.setattr("gateway.cli.eval_work.carry_out", carry_out)
+    out = str(tmp_path / "eval.json")
+    failed = CliRunner().invoke(app, ["eval", "--tasks", "2", "--out", out])
+    assert failed.exit_code == 3 and "task 1, nelder-mead: failed: no memory left" in failed.output
+    assert CliRunner().invoke(app, ["eval", "--tasks", "1", "--out", out]).exit_code == 0
 
 
 def test_a_result_with_a_strange_key_is_refused() -> None:

@@ -49,10 +49,13 @@ class Failing(WordCounter):
         super().__init__()
         self.fails = False
         self.held = False
+        self.hangs = False
         self.let = asyncio.Event()
         self.let.set()
 
     async def embed(self, texts):
+        if self.hangs:
+            await asyncio.Event().wait()
         if len(texts) > 1:
             self.held = not self.let.is_set()
             await self.let.wait()
@@ -68,11 +71,14 @@ class Story:
         self.told: list[str] = []
         self.embedder = embedder
         self.away = False
+        self.hangs = False
         self.known = Knowledge(folder, self.line, self._find, self.told.append)
 
     async def _find(self) -> WordCounter | None:
         if self.away:
             raise EmbedderFailed("nobody answers there")
+        if self.hangs:
+            await asyncio.Event().wait()
         return self.embedder
 
     async def look(self) -> None:
@@ -232,6 +238,28 @@ def test_an_embedder_that_is_away_at_the_beginning_costs_no_vectors_and_is_used_
             new = embedder.embedded[len(before) :]
             assert new and all("timbuktu" in text for text in new), "the vectors of before are taken over"
             assert await later.names("timbuktu") == ["line:model-1"] and embedder.embedded[-1] == "timbuktu"
+
+    run(story)
+
+
+def test_an_embedder_that_hangs_holds_up_neither_the_start_nor_a_question(tmp_path, monkeypatch):
+    monkeypatch.setattr(known_module, "FIRST_S", 0.2)
+    monkeypatch.setattr(known_module, "QUESTION_S", 0.2)
+    embedder = Failing()
+
+    async def story() -> None:
+        one = Story(tmp_path, made("zanzibar"), embedder=embedder)
+        one.hangs = True
+        async with begun(one):
+            assert one.told.count("things are looked up by words: no embedder within 0.2 s") == 1
+            assert await one.names("zanzibar") == ["line:model-1"]
+            one.hangs = False
+            await one.look()
+            embedder.hangs = True
+            assert await one.names("zanzibar") == ["line:model-1"]
+            assert one.told[-1] == "looked up by words: no vector within 0.2 s"
+            embedder.hangs = False
+            assert await one.names("zanzibar") == ["line:model-1"] and embedder.embedded[-1] == "zanzibar"
 
     run(story)
 

@@ -94,6 +94,7 @@ def test_what_fails_are_names_of_drive_states():
         (None, 2.0, 1.0, None),
         (1.0, None, None, None),
         (-1.0, 0.5, -1.5, 1.0),  # decay that is growth
+        (0.39, -10.0, 10.39, None),  # at least something negative: no bar, rather than one of no length
     ],
 )
 def test_how_much_of_a_limit_is_used(value: float | None, limit: float | None, margin: float | None, expected: object):

@@ -14,6 +14,7 @@ from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
 from gateway.core.line import Line
+from gateway.operator.access import Access
 from gateway.operator.line_side import LineSide
 from gateway.operator.page.asks import Asks
 from gateway.operator.page.events import Ticks, stream
@@ -26,14 +27,17 @@ from gateway.operator.users import RoleOf
 STATIC = Path(str(files("gateway.operator.page"))) / "static"
 
 
-def page_app(line: Line, side: LineSide, check: Check, role_of: RoleOf, clock: Callable[[], float]) -> Starlette:
+def page_app(
+    line: Line, side: LineSide, check: Check, role_of: RoleOf, clock: Callable[[], float], access: Access | None = None
+) -> Starlette:
     """`check`: the role of whoever has this name and password, None: nobody has. `clock`: monotonic, s.
+    `access` is told who comes in, and who does not.
 
     The page speaks TLS where the address in the line's file says https; then its cookie is sent over TLS alone.
     """
     address = urlsplit(line.operator.page)
     anonymous, secure = line.operator.anonymous == "read", address.scheme == "https"
-    door = Door(check, role_of, clock, anonymous, secure, port_of(address))
+    door = Door(check, role_of, clock, anonymous, secure, port_of(address), access)
     asks, ticks = Asks(line, side, door), Ticks(side)
     app = Starlette(
         routes=[

@@ -14,6 +14,7 @@ from starlette.routing import Route
 
 from gateway.core.line import Strict
 from gateway.core.people import Person, Role
+from gateway.operator.access import Access
 from gateway.operator.page.guard import body_of
 from gateway.operator.page.sessions import LONGEST_S, Session, Sessions, Tries
 from gateway.operator.users import RoleOf
@@ -43,11 +44,20 @@ class Door:
     """Lets people in, and says who they are. `anonymous`: whoever has no name may look."""
 
     def __init__(
-        self, check: Check, role_of: RoleOf, clock: Callable[[], float], anonymous: bool, secure: bool, port: int
+        self,
+        check: Check,
+        role_of: RoleOf,
+        clock: Callable[[], float],
+        anonymous: bool,
+        secure: bool,
+        port: int,
+        access: Access | None,
     ) -> None:
+        """`access`: is told who comes in, and who does not."""
         self._check = check
         self._role_of = role_of
         self._clock = clock
+        self._access = access
         self._anonymous = anonymous
         self._secure = secure
         # Cookies do not tell ports apart: two lines on one machine would log each other out.
@@ -102,9 +112,13 @@ class Door:
         role = await self._role(login)
         if role is None:
             self._tries.failed(place, login.name)
+            if self._access is not None:
+                self._access.refused("page", place, None, login.name)
             raise HTTPException(403, "name or password is wrong")
         self._tries.went_well(place, login.name)
         self._sessions.end(self._key(request))
+        if self._access is not None:
+            self._access.came_in(Person(name=login.name, role=role, through="page"), place)
         return self._let_in(login.name, role)
 
     async def _role(self, login: _Login) -> Role | None:

@@ -26,11 +26,12 @@ def proposal_told(shown: ProposalShown) -> dict[str, Any]:
         "lasts_s": change.experiment.duration_s if isinstance(change, ExperimentChange) else None,
         "created": proposal.created,
         "expires": proposal.expires,
-        "verdict": None if shown.verdict is None else _verdict(shown.verdict),
+        "verdict": None if shown.verdict is None else verdict_told(shown.verdict),
     }
 
 
-def _verdict(verdict: Verdict) -> dict[str, Any]:
+def verdict_told(verdict: Verdict) -> dict[str, Any]:
+    """With how much of each limit is used."""
     return {
         "accepted": verdict.accepted,
         "judged": verdict.judged,
@@ -61,6 +62,6 @@ def used(finding: RuleFinding) -> float | None:
         return 1.0
     at_least = math.isclose(margin, value - limit, rel_tol=1e-6, abs_tol=1e-12)
     part, whole = (limit, value) if at_least else (abs(value), abs(limit))
-    if whole <= 0.0:
+    if whole <= 0.0 or part < 0.0:  # at least -10, say: of that nothing is used up
         return None
     return min(1.0, part / whole)

@@ -44,7 +44,7 @@ export class Alarms {
         h("p", {}, h("b", {}, word("alarms.cause")), " ", coded("span", one.cause)),
         h("p", {}, h("b", {}, word("alarms.consequence")), " ", coded("span", one.consequence))),
       this.may("acknowledge") && h("div", { class: "buttons" },
-        !one.acknowledged && h("button", { type: "button", "data-focus": `ack-${one.name}`, onclick: () => this.say({ command: "acknowledge", alarm: one.name }) }, word("alarms.acknowledge")),
+        !one.acknowledged && h("button", { type: "button", "data-focus": `ack-${one.name}`, onclick: () => this.say({ command: "acknowledge", alarm: one.name, since_wall_s: one.since_wall_s }) }, word("alarms.acknowledge")),
         h("button", { type: "button", "data-focus": `shelve-${one.name}`, onclick: () => this.shelve(one) }, word(shelved(one) ? "alarms.unshelve" : "alarms.shelve"))));
   }
 
