@@ -44,8 +44,10 @@ class Panel:
     def as_(self, name: str, **options: str) -> Iterator[None]:
         connected = self.client("connect", name, options)
         assert connected["refused"] is None, connected
-        yield
-        self.client("close", name)
+        try:
+            yield
+        finally:
+            self.client("close", name)
 
     def refused(self, **options: str) -> str:
         """By what the server has answered."""
