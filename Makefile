@@ -35,7 +35,7 @@ test-long: $(VENV)/.compiled ## the demonstration, whole chains through the gate
 	@$(PY) -m pytest -m "long and realtime" $(ARGS) || [ $$? -eq 5 ]
 	@$(PY) -m pytest -m "long and not realtime" $(PARALLEL) $(ARGS) || [ $$? -eq 5 ]
 
-system-test: setup ## a real CAN kernel and foreign protocol stacks; as root, installs Debian and npm packages (about 6 min)
+system-test: $(VENV)/.compiled ## a real CAN kernel and foreign protocol stacks; as root, installs Debian and npm packages (about 9 min)
 	@$(PY) -m tests.system.needs
 	@$(PY) -m pytest tests/system $(ARGS)
 
