@@ -24,8 +24,8 @@ $(VENV)/.compiled: $(VENV)/.ready gateway/cli/compiled.py $(wildcard gateway/con
 	@$(PY) -m gateway.cli.compiled > out/compiled.txt 2>&1 || { cat out/compiled.txt; exit 1; }
 	@touch $@
 
-run: $(VENV)/.compiled ## set up, then the demonstration: a line adapted through the gate, in real time (about 5 min; ARGS="--quick")
-	@exec $(RUN) demo $(ARGS)
+run: $(VENV)/.compiled ## set up, then the demonstration: a line adapted through the gate, in real time (about 5 min; ARGS="--quick"; STAY=1 to play with)
+	@exec $(RUN) demo $(if $(STAY),--stay) $(ARGS)
 
 test: $(VENV)/.compiled ## set up, then all tests but the long ones: those about time itself alone, the others on every core
 	@$(PY) -m pytest -m "realtime and not long" $(ARGS) || [ $$? -eq 5 ]  # 5: none of them was asked for
@@ -104,7 +104,8 @@ bench-gate-live: $(VENV)/.compiled ## the gate on a running line: rollback, swap
 bench-agents-live: $(VENV)/.compiled ## agents that die, hang, flood or lie beside a running line (about 30 min; ARGS="--rounds 1")
 	@$(PY) -m tests.bench.agents_live $(ARGS)
 
-bench-operator: $(VENV)/.compiled ## the OPC UA server flooded beside a running line, and what it costs (about 7 min; ARGS="--rounds 1 --seconds 5")
+bench-operator: $(VENV)/.compiled ## the OPC UA server flooded beside a running line, what it costs, the page in Chromium; as root (about 8 min; ARGS="--rounds 1 --seconds 5")
+	@$(PY) -m tests.system.needs
 	@$(PY) -m tests.bench.operator $(ARGS)
 
 bench-gate: setup ## proposals of every way of going wrong, judged by the gate and by the truth (ARGS="--parts a --plants 5 --proposals 200")

@@ -138,6 +138,7 @@ class AcknowledgeAlarm(Strict):
 
     command: Literal["acknowledge"] = "acknowledge"
     alarm: AlarmName
+    since_wall_s: Annotated[float, Field(allow_inf_nan=False)] | None = None  #: of what was shown; null: as it is now
     comment: Annotated[str, Field(max_length=1000)] = ""
 
 

@@ -45,6 +45,10 @@ class NotTold(Exception):
     """The gateway did not tell; the text says why."""
 
 
+class NoAnswer(Reply):
+    """None came that can be read: nobody knows whether what was said was done."""
+
+
 class LineSide:
     """`watch` as a task; then read `status`, `proposals`, `records`. All in one event loop."""
 
@@ -101,7 +105,7 @@ class LineSide:
             payload = ForPerson(person=person, said=said).model_dump_json().encode()
             return Reply.model_validate_json(await self._saying.request(GATEWAY_FOR_PERSON, payload, ACT_S))
         except (Unreachable, ValidationError) as error:
-            return Reply(ok=False, state="", text=str(error), reasons=[str(error)])
+            return NoAnswer(ok=False, state="", text=str(error), reasons=[str(error)])
 
     async def at_the_door(self, happened: AtTheDoor) -> bool:
         """For the audit. False: it has to be told again later."""

@@ -39,6 +39,8 @@ from gateway.supervisor.peers import GATEWAY
 from gateway.supervisor.proposal_inbox import Inbox
 from gateway.supervisor.proposal_records import ProposalRecords, done, refused
 
+MOST_AT_HAND = 24  #: proposals that wait, the newest
+
 
 class Deployer:
     """`propose`, `decide` and `roll_back` for others; `watch` a few times a second. All in one event loop."""
@@ -201,6 +203,17 @@ class Deployer:
     async def close(self) -> None:
         await self._inbox.close()
 
+    async def at_hand(self, beginning: str | None = None) -> None:
+        """Before `watch`, `listed`, `shown` and `decide`: what they need of the disk. None: of what waits."""
+        wanted = list[Entry]()
+        if beginning is not None:
+            wanted = [one for hash_, one in self.book.entries.items() if hash_.startswith(beginning)][:1]
+        elif self._line.gate.autonomy == "approve-first":  # whether it passes by itself depends on what it is
+            wanted = [one for one in reversed(self.book.undecided) if one.stage is Stage.WAITING][:MOST_AT_HAND]
+        if self._line.gate.autonomy == "approve-first":
+            wanted += [self.book.entries[one] for one in self.book.trusted.values()]
+        await self._records.fetch(wanted)
+
     def listed(self, most: int, skip: int = 0) -> ProposalList:
         """The newest first, but for the first `skip`; with those that are not done with, where none are left out."""
         entries = list(reversed(self.book.entries.values()))
@@ -226,12 +239,13 @@ class Deployer:
         if len(found) != 1:
             return f"{len(found)} proposals begin with {beginning}: `r2rgate proposals` lists them"
         (entry,) = found
-        proposal = self._records.proposal(entry)
+        proposal, first = self._records.proposal(entry), self._first(entry)
         return ProposalShown(
             format=1, stage=entry.stage, why=self._why(entry), proposal_hash=entry.proposal,
             shown=self._shown_hash(entry), epoch=self.book.epoch,
             difference=self._surroundings.difference(proposal, self.book), proposal=proposal,
-            verdict=self._records.verdict(entry),
+            verdict=self._records.verdict(entry), approvals=self._line.gate.approvals,
+            approved_by=None if first is None else first.name,
         )  # fmt: skip
 
     def change(self) -> ChangeStatus | None:
@@ -279,6 +293,8 @@ class Deployer:
             return [f"proposal {entry.proposal[:12]} is {entry.stage}{f': {entry.why}' if entry.why else ''}"]
         if self._wall_clock() >= entry.expires_s:
             return [f"it has expired at {entry.expires}"]
+        if because := self.book.why_outdated(entry):
+            return [because]
         if decision.shown != self._shown_hash(entry):
             return ["what was shown is no longer what would be done: look at it again, then decide"]
         first = self._first(entry) if decision.approve and self._line.gate.approvals > 1 else None
@@ -292,6 +308,8 @@ class Deployer:
             if now_s >= entry.expires_s:
                 what = {"proposal": entry.proposal, "because": f"nobody decided until {entry.expires}"}
                 await self._records.step("expired", what, GATEWAY)
+            elif because := self.book.why_outdated(entry):
+                await self._records.step("superseded", {"proposal": entry.proposal, "because": because}, GATEWAY)
             elif entry.stage is Stage.APPROVED:
                 because = "it was approved, and not carried out: decide again"
                 await self._records.step("approval-lapsed", {"proposal": entry.proposal, "because": because}, GATEWAY)

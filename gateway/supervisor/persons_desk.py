@@ -16,6 +16,8 @@ from gateway.supervisor.audit_file import AuditUnavailable
 from gateway.supervisor.bounded import Bounded, with_left_out
 from gateway.supervisor.peers import who_is
 
+A_PROGRAM = "a program"  #: that decides in a person's place, as the audit has it before its user's name
+
 Decision = Decide | RollBackNow | Archive | LineChanged
 
 
@@ -52,6 +54,8 @@ class PersonsDesk:
                 what = with_left_out({"command": said.command, "because": reason}, left_out)
                 await self._kept("refused-person", who, what)
             return _reply(Reply(ok=False, state="", text=reason, reasons=[reason]))
+        if isinstance(said, Decide) and person.is_script:
+            said = said.model_copy(update={"script": said.script or A_PROGRAM})
         if isinstance(said, Decision):
             return _reply(await self._decide(said, who))
         if isinstance(said, AlarmSaid):

@@ -1,7 +1,7 @@
 """The records of what becomes of proposals: each step is stored before it counts, with what lies beside it."""
 
 import asyncio
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from datetime import UTC, datetime
 from typing import Any
 
@@ -37,6 +37,14 @@ class ProposalRecords:
     async def note(self, kind: str, who: Who, what: Mapping[str, Any]) -> None:
         """A record that is no step of a proposal. Raises AuditUnavailable."""
         await self._audit.append(kind, who, what)
+
+    async def fetch(self, entries: Iterable[Entry]) -> None:
+        """What lies beside these, so that nobody waits for it afterwards. What cannot be read says so then."""
+        ids = [id_ for one in entries for id_ in (one.proposal, one.verdict) if id_ is not None]
+        try:
+            await self._audit.fetch(ids)
+        except AuditUnavailable:
+            pass
 
     def proposal(self, entry: Entry) -> Proposal:
         """Raises AuditUnavailable."""

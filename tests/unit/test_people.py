@@ -104,6 +104,16 @@ def test_what_an_operator_decides_is_decided_in_their_name(desk, said):
     assert decision == said and who.name == "anna (operator, opc-ua)"
 
 
+def test_nobody_takes_the_decision_of_a_program_for_a_persons(desk):
+    decide = DECISIONS[0]
+    for name, script in (("script-panel", "a program"), ("scripter", "")):
+        person = Person(name=name, role="operator", through="opc-ua", certificate=HASH)
+        assert desk.send(ForPerson(person=person, said=decide).model_dump_json().encode()).ok
+        decision, who = desk.decisions.pop()
+        assert decision == decide.model_copy(update={"script": script})
+        assert who.name == f"{name} (operator, opc-ua)" and who.certificate == HASH
+
+
 @pytest.mark.parametrize("said", FOR_ENGINEERS, ids=lambda said: said.command)
 def test_what_takes_an_engineer_takes_one(desk, said):
     assert desk.ask("operator", said).text == f"anna is an operator; {said.command} takes an engineer"

@@ -42,10 +42,6 @@ class CannotServe(Exception):
     """The text says why, and what to do."""
 
 
-class NotSetUp(CannotServe):
-    """It has no certificate yet."""
-
-
 class _Trusted(SecurityPolicyFactory):
     """A security policy for clients whose certificate is trusted, before anything they say is looked at."""
 
@@ -111,13 +107,14 @@ class OperatorServer(Server):
             await self.get_node(ua.NodeId(number)).write_value(ua.Variant(limit, ua.VariantType.UInt32))
 
     async def start(self) -> None:
-        """Raises CannotServe. `stop` is needed all the same."""
-        await self._setup_server_nodes()
-        policies = [_Trusted(policy, self._trust.why_not) for policy in self._policies]
-        await self.iserver.start()
+        """Raises CannotServe, and may be called again then. `stop` is needed all the same."""
         host, port = self.endpoint.hostname or "", self.endpoint.port or 0
-        self.bserver = Sockets(self.iserver, self._processor, host, port)
-        self.bserver.set_policies(policies)
+        if self.bserver is None:
+            await self._setup_server_nodes()
+            policies = [_Trusted(policy, self._trust.why_not) for policy in self._policies]
+            await self.iserver.start()
+            self.bserver = Sockets(self.iserver, self._processor, host, port)
+            self.bserver.set_policies(policies)
         try:
             await self.bserver.start()
         except OSError as error:
@@ -161,7 +158,7 @@ def _load(stack: Stack, pki: Path) -> str:
             raise CannotServe(f"{pki / PRIVATE_KEY} is not the key of {pki / CERTIFICATE}: move both away; {way_out}")
         return application_uri(stack.certificate)
     except FileNotFoundError as error:
-        raise NotSetUp(f"there is no {error.filename}: {way_out}") from error
+        raise CannotServe(f"there is no {error.filename}: {way_out}") from error
     except OSError as error:
         raise CannotServe(f"{error.filename} cannot be read: {error.strerror}") from error
     except (NotUsable, ValueError, TypeError) as error:
