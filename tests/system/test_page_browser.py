@@ -52,6 +52,7 @@ def test_an_operator_sees_the_line_approves_a_change_and_takes_it_back(line: Pag
     margins = at("texts", ".margins li")
     assert len(margins) >= 5 and all("passed" in one and "not passed" not in one for one in margins)
     assert any("margin" in one and "limit" in one for one in margins)
+    at("see", ".course canvas")  # before and after, over time
     at("click", APPROVE)
     assert "on probation" in at("see", "dialog[open] .lines")
     assert line.in_service() == before  # the first of two steps
