@@ -270,9 +270,11 @@ class Bench:
 
 
 @asynccontextmanager
-async def bench(spans: int = 2, gateway: bool = True, **operator: Any) -> AsyncIterator[Bench]:
-    """A running server; without `gateway` nobody answers it."""
-    line = line_of(spans)
+async def bench(
+    spans: int = 2, gateway: bool = True, line: Line | None = None, **operator: Any
+) -> AsyncIterator[Bench]:
+    """A running server of `line`, or of one with so many spans; without `gateway` nobody answers it."""
+    line = line or line_of(spans)
     settings = line.operator.model_copy(update={"opc_ua": "opc.tcp://127.0.0.1:0", **operator})
     with short_folder() as folder:
         found = Bench(line.model_copy(update={"operator": settings}), folder)

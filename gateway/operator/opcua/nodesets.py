@@ -1,6 +1,6 @@
 """Models of companion specifications in the server, from files as they are published.
 
-A model comes with all it requires or not at all. Nothing that comes can be written or called, and no code is made of it.
+A model comes with all it requires or not at all. Nothing of it can be written or called, and no code is made of it.
 """
 
 import xml.etree.ElementTree as ET
