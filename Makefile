@@ -7,7 +7,7 @@ PARALLEL := --numprocesses auto --maxprocesses 4 --dist loadfile
 export PYTHONDONTWRITEBYTECODE :=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup run test test-long coverage system-test check types lint format bench bench-stepped bench-wire bench-processes bench-cycle bench-monitor bench-control bench-identify bench-faults bench-fuzz bench-soak bench-gate bench-lifecycle bench-audit bench-kill bench-gate-live bench-agents-live bench-knowledge bench-agents minilm mutate lock clean
+.PHONY: help setup run test test-long coverage system-test check types lint format bench bench-stepped bench-wire bench-processes bench-cycle bench-monitor bench-control bench-identify bench-faults bench-fuzz bench-soak bench-gate bench-lifecycle bench-audit bench-kill bench-gate-live bench-agents-live bench-operator bench-knowledge bench-agents minilm mutate lock clean
 
 help: ## this list
 	@echo "r2rgate: make TARGET"
@@ -24,8 +24,8 @@ $(VENV)/.compiled: $(VENV)/.ready gateway/cli/compiled.py $(wildcard gateway/con
 	@$(PY) -m gateway.cli.compiled > out/compiled.txt 2>&1 || { cat out/compiled.txt; exit 1; }
 	@touch $@
 
-run: $(VENV)/.compiled ## set up, then the demonstration: a line adapted through the gate, in real time (about 5 min; ARGS="--quick")
-	@exec $(RUN) demo $(ARGS)
+run: $(VENV)/.compiled ## set up, then the demonstration: a line adapted through the gate, in real time (about 5 min; ARGS="--quick"; STAY=1 to play with)
+	@exec $(RUN) demo $(if $(STAY),--stay) $(ARGS)
 
 test: $(VENV)/.compiled ## set up, then all tests but the long ones: those about time itself alone, the others on every core
 	@$(PY) -m pytest -m "realtime and not long" $(ARGS) || [ $$? -eq 5 ]  # 5: none of them was asked for
@@ -103,6 +103,9 @@ bench-gate-live: $(VENV)/.compiled ## the gate on a running line: rollback, swap
 
 bench-agents-live: $(VENV)/.compiled ## agents that die, hang, flood or lie beside a running line (about 30 min; ARGS="--rounds 1")
 	@$(PY) -m tests.bench.agents_live $(ARGS)
+
+bench-operator: $(VENV)/.compiled ## the OPC UA server flooded beside a running line, and what it costs (about 7 min; ARGS="--rounds 1 --seconds 5")
+	@$(PY) -m tests.bench.operator $(ARGS)
 
 bench-gate: setup ## proposals of every way of going wrong, judged by the gate and by the truth (ARGS="--parts a --plants 5 --proposals 200")
 	@$(PY) -m tests.bench.gate $(ARGS)

@@ -1,16 +1,18 @@
-"""The processes of a demonstration: simulated line, gateway, loop, agents; started in order, ended in order."""
+"""The processes of a demonstration: simulated line, gateway, loop, agents, operator; started and ended in order."""
 
 import json
 import shutil
 import socket
 import subprocess
 import tempfile
+from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
 from gateway.cli.lifetime import end, start
 
+IN_ORDER = ("loop", "operator", "agents", "gateway", "sim")  #: in which they are ended
 STOP_TIME_S = 15.0  #: for the loop's controlled stop
 
 
@@ -21,10 +23,11 @@ class ChildFailed(Exception):
 class Children:
     """A context: whatever happens inside, no process and no socket folder is left behind."""
 
-    def __init__(self, logs: Path) -> None:
+    def __init__(self, logs: Path, sockets: Path | None = None) -> None:
+        """`sockets`: the folder in which that of the sockets is made; None: one where no command looks by itself."""
         self.logs = logs
         # Socket paths are limited to 107 bytes, wherever the output folder lies.
-        self.run_folder = Path(tempfile.mkdtemp(prefix="r2rgate-"))
+        self.run_folder = Path(tempfile.mkdtemp(prefix="r2rgate-", dir=sockets))
         self._running: dict[str, subprocess.Popen[str]] = {}
 
     def __enter__(self) -> Self:
@@ -33,7 +36,7 @@ class Children:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        for name in ("loop", "agents", "gateway", "sim"):
+        for name in IN_ORDER:
             self.end(name)
         shutil.rmtree(self.run_folder, ignore_errors=True)
 
@@ -78,6 +81,12 @@ class Children:
         code = child.returncode if child is not None else "unknown"
         tail = "\n".join("    " + text for text in self.log(name).read_text(errors="replace").splitlines()[-12:])
         return f"{name} has ended with exit code {code}; the end of {self.log(name)}:\n{tail}"
+
+
+def free_tcp_ports(count: int) -> list[int]:
+    """Ports of this machine's loopback on which nobody listens now."""
+    with ExitStack() as probes:
+        return [probes.enter_context(socket.create_server(("127.0.0.1", 0))).getsockname()[1] for _ in range(count)]
 
 
 def free_udp_port() -> int:

@@ -6,22 +6,28 @@ Quick: both cases on the configuration with which the loop is started.
 
 import asyncio
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rich.console import Console
 
 from gateway.cli.children import ChildFailed, Children
-from gateway.cli.demo_cases import Window, begin_with_repeats, run_with_repeats, settle_with_repeats
-from gateway.cli.demo_line import LanguageModelAsked, Setup, begin, begin_agents, clear, end_in_order
-from gateway.cli.demo_operator import DemoFailed, Operator
+from gateway.cli.demo_cases import Window, again_after_stops, begin_with_repeats, run_with_repeats, settle_with_repeats
+from gateway.cli.demo_failed import DemoFailed
+from gateway.cli.demo_line import LanguageModelAsked, Setup, begin, begin_agents, begin_operator, clear, end_in_order
+from gateway.cli.demo_operator import Operator
+from gateway.cli.demo_panel import Panel
 from gateway.cli.demo_progress import Progress
+from gateway.cli.demo_stay import stay_on
 from gateway.core.messages import Stop
 from gateway.core.scenario import PAPER
+from gateway.mailbox.paths import run_base
 from gateway.mailbox.port import Unreachable
 
 if TYPE_CHECKING:
     from gateway.cli.demo_chain import Chain
+    from gateway.cli.demo_people import LetIn
     from gateway.cli.demo_stepped import SteppedAside
 
 READY_TIME_S = 20.0
@@ -33,25 +39,44 @@ OPENING_QUICK = (
 NOT_REACHED = "the chain has ended before its aim: {}. The report says which rule refused what, and by how much"
 
 
-def run_demo(out: Path, seed: int, quick: str | None, asked: LanguageModelAsked | None = None) -> int:
+@dataclass(frozen=True)
+class Told:
+    """What there is to tell of the line while it ran."""
+
+    windows: list[Window]  #: when each case ran
+    chain: "Chain | None"
+    stops: list[str]  #: why the line stopped by itself in between
+    let_in: "LetIn | None"
+    waiting: str = ""  #: hash of a proposal that is left for a person
+
+
+def run_demo(
+    out: Path, seed: int, quick: str | None, asked: LanguageModelAsked | None = None, stay: bool = False
+) -> int:
     """Run it and write everything into `out`. `quick`: the law of the one configuration that is run.
 
-    `asked`: the language model whom the agents ask; None: the rules answer.
+    `asked`: the language model whom the agents ask; None: the rules answer. `stay`: then the line runs on until Ctrl-C,
+    for people to play with.
 
-    Returns the exit code: 0, 1 when something failed, 130 on Ctrl-C.
+    Returns the exit code: 0, 1 when something failed, 130 on Ctrl-C before the result.
     """
     console = Console(highlight=False)
     started_s = time.monotonic()
     console.print(OPENING if quick is None else OPENING_QUICK, markup=False, soft_wrap=True)
     try:
         clear(out)
-        with Children(out / "logs") as children:
+        with Children(out / "logs", _found_by_commands() if stay else None) as children:
             setup, world_start_s = begin(children, out, quick or "lqi", seed, asked)
             with _stepped_aside(setup) as stepped:
-                windows, chain, stops = asyncio.run(_story(children, setup, stepped, console, quick is None))
-                end_in_order(children)
+                told = asyncio.run(_story(children, setup, stepped, console, quick is None, stay))
+                if not stay:
+                    end_in_order(children)
                 console.print("measuring: the same cases in stepped time, then the report")
-                return _conclude(setup, stepped, windows, chain, stops, world_start_s, started_s, console)
+                code = _conclude(setup, stepped, told, world_start_s, started_s, console)
+            if stay:
+                assert told.let_in is not None
+                stay_on(children, setup, told.let_in.password, told.waiting, console)
+            return code
     except (ChildFailed, DemoFailed, Unreachable) as error:
         console.print(f"the demonstration failed: {error}", style="red", markup=False)
         console.print(
@@ -63,6 +88,13 @@ def run_demo(out: Path, seed: int, quick: str | None, asked: LanguageModelAsked 
         return 130
 
 
+def _found_by_commands() -> Path:
+    """Where the sockets lie of a line that `r2rgate status` and the others find by themselves."""
+    base = run_base()
+    base.mkdir(mode=0o700, parents=True, exist_ok=True)
+    return base
+
+
 def _stepped_aside(setup: Setup) -> "SteppedAside":
     from gateway.cli.demo_stepped import SteppedAside
 
@@ -72,9 +104,7 @@ def _stepped_aside(setup: Setup) -> "SteppedAside":
 def _conclude(
     setup: Setup,
     stepped: "SteppedAside",
-    windows: list[Window],
-    chain: "Chain | None",
-    stops: list[str],
+    told: Told,
     world_start_s: float,
     started_s: float,
     console: Console,
@@ -82,6 +112,7 @@ def _conclude(
     """Figures, `result.json`, `report.html`, tables. Returns the exit code."""
     from gateway.cli.demo_analysis import measure, read_evidence
 
+    windows, chain, stops = told.windows, told.chain, told.stops
     if not windows:
         text = "" if chain is None or chain.commissioned is None else chain.commissioned.text
         raise DemoFailed(f"no configuration came to run the cases: {text}")
@@ -116,18 +147,20 @@ def _conclude(
 
 
 async def _story(
-    children: Children, setup: Setup, stepped: "SteppedAside", console: Console, whole: bool
-) -> "tuple[list[Window], Chain | None, list[str]]":
-    """From SILENT to rest. Returns when each case ran, the chain, and why the line stopped in between, if it did."""
+    children: Children, setup: Setup, stepped: "SteppedAside", console: Console, whole: bool, stay: bool
+) -> Told:
+    """From SILENT to rest; to a line that runs on, where it shall `stay`."""
     with Progress(console) as progress:
         operator = Operator(children, progress)
         try:
             progress.step("starting the processes")
             for config in (setup.config, stepped.on_truth())[whole:]:
                 stepped.ask(config)
+            let_in = await _with_operator(children, setup, stay) if whole or stay else None
             await operator.wait(lambda status: status.loop.running, READY_TIME_S, "the loop")
-            if whole:
+            if whole and let_in is not None:
                 await _with_agents(children, setup, operator)
+                operator.panel = await Panel.begin(let_in.script, children.log("client"))
             await begin_with_repeats(operator)
             if whole:
                 windows, chain = await _whole(operator, setup, stepped)
@@ -135,16 +168,35 @@ async def _story(
                 period_s = setup.line.control.period_s
                 windows = [await run_with_repeats(operator, setup.config, case, period_s) for case in PAPER]
                 chain = None
+            if stay:
+                return Told(windows, chain, operator.stops, let_in, await _left_waiting(operator, setup, chain))
             progress.step("stopping")
             await operator.order(Stop())
             await operator.wait_at_rest()
-            return windows, chain, operator.stops
+            return Told(windows, chain, operator.stops, let_in)
         except BaseException:
             # Now rather than after a thread that still designs: until it ends, this event loop does not.
             children.end("loop")
             raise
         finally:
             await operator.close()
+
+
+async def _with_operator(children: Children, setup: Setup, people: bool) -> "LetIn":
+    """Its process, with certificates and users; keys are made while others start."""
+    from gateway.cli.demo_people import let_in
+
+    setup.data.mkdir(exist_ok=True)
+    found = await asyncio.to_thread(let_in, setup.line, setup.data, people)
+    begin_operator(children, setup)
+    return found
+
+
+async def _left_waiting(operator: Operator, setup: Setup, chain: "Chain | None") -> str:
+    from gateway.cli.demo_waiting import leave_one_waiting
+
+    shown = [] if chain is None else chain.shown
+    return await again_after_stops(operator, lambda: leave_one_waiting(operator, setup, shown), "once more")
 
 
 async def _with_agents(children: Children, setup: Setup, operator: Operator) -> None:

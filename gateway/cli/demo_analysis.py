@@ -6,6 +6,7 @@ the case's own set-points. The gateway's history gives timing, and the instant a
 
 import json
 import time
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -15,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gateway.cli.demo_cases import Window
+from gateway.cli.demo_failed import DemoFailed
 from gateway.cli.demo_line import Setup
-from gateway.cli.demo_operator import DemoFailed
 from gateway.cli.demo_result import CaseResult, ChainResult, ConfigurationResult, DemoResult, Percentiles, TimingResult
 from gateway.cli.demo_stepped import SteppedAside
 from gateway.cli.demo_words import command_line, machine_lines, now_iso
@@ -25,6 +26,8 @@ from gateway.core.metrics import rmse_n, rmse_per_span_n
 from gateway.core.scenario import PAPER
 from gateway.supervisor.historian import FILE_NAME
 from gateway.supervisor.history import History
+from sim_plant.judge import UNSAFE
+from sim_plant.process import SUMMARY_FILE
 from sim_plant.recorder import read_recording
 from sim_plant.recording import Recording
 
@@ -103,8 +106,17 @@ def read_evidence(setup: Setup, windows: list[Window], world_start_s: float) -> 
         history = file.read(world_start_s, windows[-1].end_s + 60.0, FIELDS)
         if file.damaged:
             raise DemoFailed(f"the history is damaged: {'; '.join(file.damaged)}")
-    summary = json.loads((setup.out / "recording" / "summary.json").read_text())
-    return Evidence(recording, recording.time_s + world_start_s, history, summary)
+    return Evidence(recording, recording.time_s + world_start_s, history, summary_of(setup, recording))
+
+
+def summary_of(setup: Setup, recording: Recording) -> dict[str, Any]:
+    """As the simulated line wrote it at its end; while that runs, the same from what it has recorded until now."""
+    file = setup.out / "recording" / SUMMARY_FILE
+    if file.exists():
+        return json.loads(file.read_text())
+    seen = Counter(event["what"] for event in recording.of_kind("unsafe"))
+    (header,) = recording.of_kind("recording")
+    return {"plant": header["plant"], "unsafe_events": {kind.label: seen[kind.label] for kind in UNSAFE}}
 
 
 def trace_of(window: Window, evidence: Evidence) -> CaseTrace:

@@ -5,7 +5,8 @@ from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
-from gateway.cli.demo_operator import DemoFailed, Operator
+from gateway.cli.demo_failed import DemoFailed
+from gateway.cli.demo_operator import Operator
 from gateway.core.controller import Controller
 from gateway.core.messages import SelectRecipe
 from gateway.core.scenario import Scenario

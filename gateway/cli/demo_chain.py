@@ -13,9 +13,11 @@ from gateway.cli.commission_live import TOPICS, LiveGate
 from gateway.cli.commission_result import Commissioned
 from gateway.cli.commission_side import GateSide
 from gateway.cli.demo_cases import Window, again_after_stops, run_with_repeats
+from gateway.cli.demo_failed import DemoFailed
 from gateway.cli.demo_line import Setup
-from gateway.cli.demo_operator import DemoFailed, Operator
+from gateway.cli.demo_operator import Operator
 from gateway.cli.demo_stepped import SteppedAside
+from gateway.cli.within_region import beyond
 from gateway.commissioning.past import Step, past_of
 from gateway.core.controller import Controller, config_hash
 from gateway.core.decisions import ProposalShown
@@ -23,7 +25,7 @@ from gateway.core.deployment import Region
 from gateway.core.messages import Reply, SelectRecipe
 from gateway.core.proposal import GainsChange
 from gateway.core.recording import Recording
-from gateway.core.scenario import PAPER, Scenario
+from gateway.core.scenario import PAPER
 from gateway.mailbox.bus import BusUnavailable, connect
 from gateway.mailbox.paths import GATEWAY_SOCKET
 from gateway.mailbox.unix import UnixMailbox
@@ -113,6 +115,7 @@ class Chain:
     left_out: list[str] = field(default_factory=list[str])  #: cases that a configuration was not judged for
     shown: list[ProposalShown] = field(default_factory=list[ProposalShown])
     commissioned: Commissioned | None = None
+    approved_over: dict[str, str] = field(default_factory=dict[str, str])  #: by proposal what was read of it
 
 
 async def carry_out(operator: Operator, setup: Setup, stepped: SteppedAside) -> Chain:
@@ -121,14 +124,15 @@ async def carry_out(operator: Operator, setup: Setup, stepped: SteppedAside) -> 
     period_s = setup.line.control.period_s
 
     async def decide(shown: ProposalShown) -> None:
-        short = shown.proposal_hash[:12]
-        operator.progress.step(f"  the gate lets it through by {_rules(shown)} rules; $ r2rgate approve {short} --yes")
-        decided[short] = decided.get(short, 0) + 1
+        proposal = shown.proposal_hash
+        operator.progress.step(f"  the gate lets it through by {_rules(shown)} rules; {proposal[:12]} waits")
+        decided[proposal] = decided.get(proposal, 0) + 1
         try:
-            await operator.approve(short, "the demonstration approves what the gate lets through")
-        except DemoFailed:
-            if decided[short] == MOST_DECISIONS:
+            chain.approved_over[proposal] = await operator.approve(proposal)
+        except DemoFailed as refused:
+            if decided[proposal] == MOST_DECISIONS:
                 raise
+            operator.progress.step(f"  {refused}")
 
     async def measure(config: Controller, shown: ProposalShown) -> None:
         name = name_of(len({config_hash(window.config) for window in chain.windows}))
@@ -206,20 +210,3 @@ async def _initial(operator: Operator, setup: Setup, stepped: SteppedAside) -> l
 def name_of(place: int) -> str:
     """Of a configuration, in the paper's words: `place` from 0 in the order in which they were kept."""
     return "Initial" if place == 0 else f"Adapt{place}"
-
-
-def beyond(case: Scenario, region: Region | None) -> str:
-    """Why a configuration that was judged for `region` does not run a case; empty: it does."""
-    if region is None:
-        return ""
-    speed = max(case.speed_m_per_s, case.speed_end_m_per_s)
-    wanted = (
-        ("the speed", speed, region.speed_max_m_per_s, "m/s"),
-        ("the step of tension", case.tension_step_n, region.tension_step_max_n, "N"),
-        ("the step of speed", case.speed_step_m_per_s, region.speed_step_max_m_per_s, "m/s"),
-    )
-    return "; ".join(
-        f"{what} is {value:g} {unit}, it was judged up to {most:g} {unit}"
-        for what, value, most, unit in wanted
-        if most is not None and value > most * (1.0 + 1e-9)
-    )

@@ -23,19 +23,26 @@ def demo(
         str | None, typer.Option(help="The agents ask this language model, as Ollama names it; without it the rules.")
     ] = None,
     url: Annotated[str | None, typer.Option(help="With --model: where Ollama answers, if not on this machine.")] = None,
+    stay: Annotated[
+        bool, typer.Option("--stay", help="Then the line runs on until Ctrl-C, with its page: to play with.")
+    ] = False,
 ) -> None:
     """The demonstration: from a wrong model of a line to adapted configurations, each change through the gate.
 
     A simulated six-span line, loop, gateway and agents run in processes of their own, in real time. A first
     configuration, an experiment, a model and a redesign, and once more: agents are asked over their bus which, each is
-    judged by the gate and approved by a scripted operator; both cases of the paper run on each configuration. Some four
-    minutes; Ctrl-C brings the line to rest and ends all. Exit code: 0 done, 1 failed or not adapted, 130 interrupted.
+    judged by the gate and approved by a scripted operator over OPC UA; both cases of the paper run on each
+    configuration. Some four minutes; Ctrl-C brings the line to rest and ends all.
+
+    Exit code: 0 done, 1 failed or not adapted, 130 interrupted before the report.
 
     Example: r2rgate demo --out out/demo
 
     Example, one configuration: r2rgate demo --quick --law pid
 
     Example, with a language model: r2rgate demo --model qwen3:4b
+
+    Example, a line to play with after a minute: r2rgate demo --quick --stay
     """
     from gateway.cli.demo import run_demo
     from gateway.cli.demo_line import LanguageModelAsked
@@ -49,7 +56,7 @@ def demo(
         _refuse(f"--model {model} is for the whole demonstration; with --quick nothing is asked of the agents")
     writable_folder(out, "--out")
     asked = None if model is None else LanguageModelAsked(url or Agents().url, model)
-    raise typer.Exit(run_demo(out, seed, (law or "lqi") if quick else None, asked))
+    raise typer.Exit(run_demo(out, seed, (law or "lqi") if quick else None, asked, stay))
 
 
 def _refuse(text: str) -> NoReturn:

@@ -5,12 +5,13 @@ import shutil
 from dataclasses import dataclass
 from importlib.resources import as_file, files
 from pathlib import Path
+from typing import NamedTuple
 
-from gateway.cli.children import Children, free_udp_port
-from gateway.cli.demo_operator import DemoFailed
+from gateway.cli.children import IN_ORDER, Children, free_tcp_ports, free_udp_port
+from gateway.cli.demo_failed import DemoFailed
 from gateway.cli.line_commands import known_maps
 from gateway.core.controller import Controller, canonical
-from gateway.core.line import Agents, Line
+from gateway.core.line import Agents, Line, Operator
 from gateway.core.line_file import load_line
 from gateway.core.line_template import line_template
 
@@ -33,6 +34,15 @@ STATED: tuple[tuple[str, str, str], ...] = (
     ("# first_step_max_n = 4.0", "first_step_max_n = 24.0", "and for their step; on a line of yours leave both"),
     ("# probation_s = 30.0", "probation_s = 10.0", "shorter than on a line that produces: three changes in minutes"),
 )
+
+
+class Ports(NamedTuple):
+    """Of this machine, none of which anybody else uses."""
+
+    can: int
+    modbus: int
+    opc_ua: int  #: of the operator's process
+    page: int
 
 
 @dataclass(frozen=True)
@@ -82,7 +92,7 @@ def begin(
         out / "plant.toml", "--record", out / "recording", "--seed", str(seed),
         "--can-port", str(free_udp_port()), "--modbus-port", "0", "--priority", str(SIM_PRIORITY),
     )  # fmt: skip
-    text = line_text(ready["can_port"], ready["modbus_port"], asked)
+    text = line_text(Ports(ready["can_port"], ready["modbus_port"], *free_tcp_ports(2)), asked)
     (out / "line.toml").write_text(text, encoding="utf-8")
     line = load_line(text, "line.toml", known_maps())
     config = {"lqi": design_lqi, "pid": design_pid}[law](task_of(line))
@@ -100,12 +110,23 @@ def begin_agents(children: Children, setup: Setup) -> None:
     children.start("agents", setup.out / "line.toml", *folders)
 
 
-def line_text(can_port: int, modbus_port: int, asked: LanguageModelAsked | None = None) -> str:
+def begin_operator(children: Children, setup: Setup) -> None:
+    """What people reach, once there are certificates and users."""
+    folders = ("--run-dir", children.run_folder, "--data-dir", setup.data)
+    children.start("operator", setup.out / "line.toml", *folders)
+
+
+def line_text(ports: Ports, asked: LanguageModelAsked | None = None) -> str:
     """The template's line on these ports, with what is stated. Raises DemoFailed where the template has changed."""
-    text = line_template(SPANS, "line.toml")
-    ports = (("port = 43113", f"port = {can_port}"), ("port = 5020", f"port = {modbus_port}"))
+    text, usual = line_template(SPANS, "line.toml"), Operator()
+    wires = (
+        ("port = 43113", f"port = {ports.can}"),
+        ("port = 5020", f"port = {ports.modbus}"),
+        (f'# opc_ua = "{usual.opc_ua}"', f'opc_ua = "opc.tcp://127.0.0.1:{ports.opc_ua}"'),
+        (f'# page = "{usual.page}"', f'page = "http://127.0.0.1:{ports.page}"'),
+    )
     stated = ((default, f"# {why}:\n{said}") for default, said, why in STATED)
-    for default, said in (*ports, *stated, *_agents(asked)):
+    for default, said in (*wires, *stated, *_agents(asked)):
         if default not in text:
             raise DemoFailed(f"the line template does not say {default!r}")
         text = text.replace(default, said)
@@ -125,7 +146,7 @@ def _agents(asked: LanguageModelAsked | None) -> list[tuple[str, str]]:
 
 
 def end_in_order(children: Children) -> None:
-    for name in ("loop", "agents", "gateway", "sim"):
+    for name in IN_ORDER:
         code = children.end(name)
         if code != 0:
             raise DemoFailed(f"{name} ended with exit code {code}: see {children.log(name)}")

@@ -1,12 +1,19 @@
-"""A person at the command line, scripted: looks at the status, gives commands, approves what the gate lets through."""
+"""A person at the line, scripted: looks at the status, gives commands, approves what the gate lets through.
+
+Arming, starting and approving go through OPC UA, where the demonstration has a client. A stop goes straight to the
+loop, as every stop of the command line does.
+"""
 
 import asyncio
 import contextlib
-import sys
 import time
 from collections.abc import Callable, Sequence
 
 from gateway.cli.children import Children
+from gateway.cli.demo_failed import DemoFailed
+from gateway.cli.demo_orders import Approve, Call, Told
+from gateway.cli.demo_panel import Panel
+from gateway.cli.demo_people import SCRIPT
 from gateway.cli.demo_progress import Progress
 from gateway.cli.operate_commands import request
 from gateway.cli.status_commands import parse_status
@@ -21,17 +28,13 @@ LOOK_S = 0.1
 SETTLE_TIME_S = 30.0
 SETTLED_N = 0.6  #: a measured tension this near its set-point has settled (six times the sensors' noise)
 SETTLED_FOR_S = 2.0
-COMMAND_TIME_S = 60.0  #: for a command of its own process, on a busy computer
-SCRIPT = "scripted operator (demo)"  #: as the audit has it: nobody shall take its word for a person's
-
-
-class DemoFailed(Exception):
-    """The demonstration cannot go on; the text says why."""
+COMMENT = "the demonstration approves what the gate lets through"
 
 
 class Operator:
     def __init__(self, children: Children, progress: Progress) -> None:
         self.progress = progress
+        self.panel: Panel | None = None  #: its OPC UA client
         self.stops: list[str] = []  #: why the line stopped by itself
         self.run_folder = children.run_folder
         self._children = children
@@ -41,10 +44,16 @@ class Operator:
         self._mailbox.connect({GATEWAY_STATUS}, self.run_folder / GATEWAY_SOCKET)
 
     async def close(self) -> None:
+        if self.panel is not None:
+            await self.panel.close()
         await self._mailbox.close()
 
     async def order(self, command: Command) -> None:
         self._stopping = isinstance(command, Stop)
+        if self.panel is not None and isinstance(command, Arm | Start):
+            told = await self._through_opc_ua(Call(method="Arm" if isinstance(command, Arm) else "Start"))
+            self.progress.step(f"  over OPC UA: {told.sentence}")
+            return
         reply = await request(self.run_folder, command, timeout_s=15.0)
         if not reply.ok:
             raise DemoFailed(f"{command.command}: {'; '.join([reply.text, *reply.reasons])}")
@@ -126,30 +135,19 @@ class Operator:
             await asyncio.sleep(min(LOOK_S, left_s))
             await self.look()
 
-    async def approve(self, proposal: str, comment: str) -> str:
-        """By `r2rgate approve`, as a person would; what it says. Raises DemoFailed where it is refused."""
-        words = ["approve", proposal[:12], "--yes", "--script", SCRIPT, "--comment", comment]
-        return await self._command(*words, "--run-dir", str(self.run_folder))
+    async def approve(self, proposal: str) -> str:
+        """Through OPC UA, over what the server shows of it, which is returned. Raises DemoFailed where refused."""
+        told = await self._through_opc_ua(Approve(proposal=proposal, comment=COMMENT))
+        self.progress.step(f"  {SCRIPT}, over OPC UA, reads: {told.seen}")
+        self.progress.step(f"  and approves: {told.sentence}")
+        return told.seen
 
-    async def _command(self, *words: str) -> str:
-        """A command of `r2rgate` in a process of its own, which Ctrl-C here does not reach."""
-        process = await asyncio.create_subprocess_exec(
-            sys.executable, "-m", "gateway.cli", *words,
-            stdin=asyncio.subprocess.DEVNULL, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE,
-            start_new_session=True,
-        )  # fmt: skip
-        try:
-            async with asyncio.timeout(COMMAND_TIME_S):
-                said, wrong = await process.communicate()
-        except TimeoutError:
-            raise DemoFailed(f"`r2rgate {' '.join(words)}` took longer than {COMMAND_TIME_S:g} s") from None
-        finally:
-            if process.returncode is None:
-                process.kill()
-                await process.wait()
-        if process.returncode:
-            raise DemoFailed(f"`r2rgate {' '.join(words)}`: {wrong.decode(errors='replace').strip()}")
-        return said.decode(errors="replace").strip()
+    async def _through_opc_ua(self, order: Call | Approve) -> Told:
+        assert self.panel is not None  # with a client, if with a gate
+        told = await self.panel.ask(order)
+        if not told.ok:
+            raise DemoFailed(f"refused over OPC UA: {told.sentence}")
+        return told
 
 
 def _at_rest(status: GatewayStatus) -> bool:

@@ -61,6 +61,8 @@ class ChangeResult(Strict):
     closest: RuleResult | None  #: the rule that decided: the first that failed, or the one that passed most narrowly
     measured: str  #: of a measurement: what it has shown
     approved_by: str  #: as the audit has it; empty: nobody was asked
+    certificate: str  #: SHA-256 of that of the client by which it was approved; empty: it had none
+    approved_over: str  #: what that client had read of it
     speed_m_per_s: float | None  #: up to which a configuration was let through
 
 
@@ -153,7 +155,7 @@ class TimingResult(Strict):
 
 
 class DemoResult(Strict):
-    format: Literal[3] = 3
+    format: Literal[4] = 4
     command: str
     date: str  #: ISO 8601
     seed: int

@@ -13,7 +13,7 @@ from gateway.cli.process_commands import (
 
 
 def operator(file: LineFile, run_dir: RunFolder = None, data_dir: DataFolder = None) -> None:
-    """The operator's process: an OPC UA server, as the line's file has it in \\[operator].
+    """The operator's process: an OPC UA server and a page, as the line's file has it in \\[operator].
 
     It shows the line and its proposals, and hands on what people say, with their names, to the gateway. Who may is in
     `r2rgate users`; whose clients may in `r2rgate pki trust`. The line runs on without it.

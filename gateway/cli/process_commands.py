@@ -173,7 +173,9 @@ def run(
     run_dir: RunFolder = None,
     data_dir: DataFolder = None,
 ) -> None:
-    """Loop and gateway together in this terminal, with the status on the screen. Ctrl-C stops the line, then ends.
+    """Loop, gateway, agents and operator together in this terminal, with the status on the screen.
+
+    Ctrl-C stops the line, then ends. The screen says where the page and the OPC UA server are.
 
     Without --controller one is designed on the line's nominal model, kept, and designed anew when the line changes.
     What crashes is started again. Exit code: 0 ended as asked, 2 refused, 3 the line runs already.

@@ -1,4 +1,4 @@
-"""`r2rgate run`: gateway, loop and agents (and, where asked for, the simulated line) as children of one terminal.
+"""`r2rgate run`: gateway, loop, agents and operator (where asked for, the simulated line) as children of one terminal.
 
 A child that ends is started again, with growing pauses; the loop comes back SILENT, as after a reboot. What a start
 cannot mend (a refused file, a line that runs already) ends all of it, with that child's exit code.
@@ -8,6 +8,7 @@ import json
 import signal
 import sys
 import time
+from collections import deque
 from collections.abc import Sequence
 from contextlib import nullcontext
 from pathlib import Path
@@ -25,7 +26,10 @@ from gateway.core.line import Line
 PATIENCE_S = 3.0  #: beyond the time that a stop may take
 REFRESH_S = 0.2
 NOTES_S = 20.0  #: how long the screen shows what the loop said of its start
+MOST_NOTES = 4  #: of the operator's process
 EXIT_S = 60.0  #: how long it shows the last words of a child that has ended; then one line remains
+DONE_WITHOUT = ("agents", "operator")  #: what the line runs on without, whatever they are refused
+_REACHED = "operator of "  #: so begins the operator's word of where it is reached
 #: How the loop's ordinary words at its start begin; all others are for the person at the terminal.
 _ORDINARY = ("loop of ", "pinned to ", "real-time priority ", "memory locked")
 
@@ -49,6 +53,7 @@ def run_together(
         Child("gateway", lambda: gateway, data_folder / "gateway.log"),
         Child("loop", lambda: loop, data_folder / "loop.log"),
         Child("agents", lambda: gateway, data_folder / "agents.log"),
+        Child("operator", lambda: gateway, data_folder / "operator.log"),
     ]
     if plant is not None:
         loop.append("--simulated")  # it is the line that is started here
@@ -96,7 +101,9 @@ def _tend(children: Sequence[Child], notices: "Notices") -> Exit | None:
                 notices.hear(child.said(), now_s)
             elif child.name == "sim":
                 notices.hear_of_sim(child.said())
-        elif ended.is_final and child.name != "agents":  # the line does without them
+            elif child.name == "operator":
+                notices.hear_of_operator(child.said(), now_s)
+        elif ended.is_final and child.name not in DONE_WITHOUT:
             final = final or ended
         else:
             notices.tell(ended)
@@ -118,6 +125,9 @@ class Notices:
         self._notes: list[str] = []
         self._exits: dict[str, Exit] = {}
         self._faults = ""
+        self._reached = ""  #: addresses of the page and of OPC UA, while they are served
+        self._of_operator: list[str] = []  #: all that it has said
+        self._operator_notes: deque[tuple[float, str]] = deque(maxlen=MOST_NOTES)  #: with when each was heard
 
     def hear_of_sim(self, said: list[str]) -> None:
         """What the simulated line has said since its start: where faults can be asked of it."""
@@ -137,14 +147,28 @@ class Notices:
         self._print([f"loop: {text}" for text in notes[len(self._notes) :]])
         self._notes = notes
 
+    def hear_of_operator(self, said: list[str], now_s: float) -> None:
+        """What the operator's process has said since its start: where people reach the line, and what is missing."""
+        for text in (text for text in said if text not in self._of_operator):
+            reached = text.partition(": ")[2] if text.startswith(_REACHED) else ""
+            self._reached = reached or self._reached
+            if not reached:
+                self._operator_notes.append((now_s, f"operator: {text}"))
+            self._print([reached or f"operator: {text}"])
+        self._of_operator = said
+
     def tell(self, ended: Exit) -> None:
+        if ended.name == "operator":
+            self._reached, self._of_operator = "", []
         self._exits[ended.name] = ended
         self._print(ended.lines())
 
     def lines(self, now_s: float) -> list[str]:
         """What stands above the status now."""
         notes = [*self._opening, *(f"loop: {text}" for text in self._notes), *([self._faults] if self._faults else [])]
-        shown = notes if now_s - self._start_s <= NOTES_S else []
+        shown = [self._reached] if self._reached else []
+        shown += notes if now_s - self._start_s <= NOTES_S else []
+        shown += [text for at_s, text in self._operator_notes if now_s - at_s <= NOTES_S]
         for ended in self._exits.values():
             ago_s = now_s - ended.at_s
             shown += (

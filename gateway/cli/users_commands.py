@@ -28,6 +28,8 @@ RoleOption = Annotated[str, typer.Option("--role", help="viewer looks, operator 
 def add(file: LineFile, name: Name, role: RoleOption = "viewer", data_dir: DataFolder = None) -> None:
     """One user more. Asks for the password twice, or takes a line of standard input.
 
+    A name that begins with script- is a program's: the audit takes its decisions for no person's.
+
     Exit code: 0 added, 2 refused.
 
     Example: r2rgate users add line.toml anna --role operator

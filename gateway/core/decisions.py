@@ -117,6 +117,8 @@ class ProposalShown(Strict):
     difference: list[str]  #: what would change, as the gateway computes it
     proposal: Proposal
     verdict: Verdict | None  #: null: not judged yet
+    approvals: Annotated[int, Field(ge=1)] = 1  #: that it takes, each of another person
+    approved_by: str | None = None  #: whose approval of what is shown is on record, where it takes another one's, too
 
 
 def shown_hash(proposal: str, verdict: str, in_service: str, epoch: int, model: str | None) -> str:

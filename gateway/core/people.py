@@ -27,6 +27,7 @@ from gateway.core.messages import (
 Role = Literal["viewer", "operator", "engineer"]  #: each may do all that the one before may
 ROLES: tuple[Role, ...] = get_args(Role)
 UserName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9._-]{0,31}$")]
+SCRIPTS = "script-"  #: so begin the names of programs: nobody takes their word for a person's
 
 Said = (
     Arm | Start | Hold | Stop | SetTension | SetSpeed | SelectRecipe | RunExperiment | AbortExperiment
@@ -60,6 +61,10 @@ class Person(Strict):
     role: Role
     through: Literal["opc-ua", "page"]
     certificate: Digest | None = None  #: SHA-256 of the DER bytes of the client's; null: it had none
+
+    @property
+    def is_script(self) -> bool:
+        return self.name.startswith(SCRIPTS)
 
 
 class ForPerson(Strict):

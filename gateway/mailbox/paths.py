@@ -26,9 +26,13 @@ def _usable(base: Path) -> bool:
 
 def default_run_folder(line: Line) -> Path:
     """$XDG_RUNTIME_DIR/r2rgate, else /run/r2rgate where it may be written, else /tmp/r2rgate-UID; then site-line."""
+    return run_base() / f"{line.site}-{line.line}"
+
+
+def run_base() -> Path:
+    """In which every command looks for lines that run; it need not exist."""
     *preferred, last = _bases()
-    base = next((base for base in preferred if _usable(base)), last)
-    return base / f"{line.site}-{line.line}"
+    return next((base for base in preferred if _usable(base)), last)
 
 
 def running_lines() -> list[Path]:

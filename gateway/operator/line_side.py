@@ -10,6 +10,7 @@ from typing import TypeVar
 
 from pydantic import ValidationError
 
+from gateway.core.access import AtTheDoor
 from gateway.core.decisions import ListProposals, ProposalList, ProposalShown, ShowProposal
 from gateway.core.line import Strict
 from gateway.core.line_past import RecordsAfter, RecordsTold, TensionsBetween, TensionsTold
@@ -17,6 +18,7 @@ from gateway.core.messages import Reply
 from gateway.core.people import ForPerson, Person, Said
 from gateway.core.status import GatewayStatus
 from gateway.core.topics import (
+    GATEWAY_ACCESS,
     GATEWAY_FOR_PERSON,
     GATEWAY_PAST,
     GATEWAY_PROPOSALS,
@@ -34,12 +36,17 @@ ACT_S = 20.0  #: arming, and a deployment, take their time
 
 Model = TypeVar("Model", bound=Strict)
 
-READ: tuple[Topic, ...] = (GATEWAY_STATUS, GATEWAY_PROPOSALS, GATEWAY_PAST)  #: what is looked at
+#: All but what people say.
+READ: tuple[Topic, ...] = (GATEWAY_STATUS, GATEWAY_PROPOSALS, GATEWAY_PAST, GATEWAY_ACCESS)
 TOPICS: tuple[Topic, ...] = (*READ, GATEWAY_FOR_PERSON)
 
 
 class NotTold(Exception):
     """The gateway did not tell; the text says why."""
+
+
+class NoAnswer(Reply):
+    """None came that can be read: nobody knows whether what was said was done."""
 
 
 class LineSide:
@@ -98,7 +105,15 @@ class LineSide:
             payload = ForPerson(person=person, said=said).model_dump_json().encode()
             return Reply.model_validate_json(await self._saying.request(GATEWAY_FOR_PERSON, payload, ACT_S))
         except (Unreachable, ValidationError) as error:
-            return Reply(ok=False, state="", text=str(error), reasons=[str(error)])
+            return NoAnswer(ok=False, state="", text=str(error), reasons=[str(error)])
+
+    async def at_the_door(self, happened: AtTheDoor) -> bool:
+        """For the audit. False: it has to be told again later."""
+        try:
+            answer = await self._mailbox.request(GATEWAY_ACCESS, happened.model_dump_json().encode(), ACT_S)
+            return Reply.model_validate_json(answer).ok
+        except (Unreachable, ValidationError):
+            return False
 
     async def _look(self) -> None:
         status = _told(GatewayStatus, await self._request(GATEWAY_STATUS, b""))

@@ -14,17 +14,19 @@ from gateway.core.people import Role
 from gateway.core.topics import GATEWAY_FOR_PERSON
 from gateway.mailbox.paths import GATEWAY_SOCKET
 from gateway.mailbox.unix import UnixMailbox
+from gateway.operator.access import Access
 from gateway.operator.line_side import READ, LineSide
-from gateway.operator.opcua.login import Check
-from gateway.operator.opcua.server import CannotServe, NotSetUp
 from gateway.operator.opcua.service import OpcUa
 from gateway.operator.opcua.trust import CERTIFICATE, PRIVATE_KEY, pki_folder
 from gateway.operator.page.app import page_app
-from gateway.operator.page.serve import CannotServe as PageCannotServe
-from gateway.operator.page.serve import listening, serve_on
 from gateway.operator.users import FILE_NAME, UsersFile, UsersRefused
+from gateway.operator.ways import OpcUaWay, PageWay, Way
 
 EXIT_OK, EXIT_CANNOT_SERVE = 0, 2
+
+
+class NothingServed(Exception):
+    """The text says why."""
 
 
 def run_operator(line: Line, run_folder: Path, data_folder: Path) -> int:
@@ -32,64 +34,60 @@ def run_operator(line: Line, run_folder: Path, data_folder: Path) -> int:
     logging.getLogger("asyncua").setLevel(logging.CRITICAL)  # whatever strangers send would be written down
     try:
         asyncio.run(serve(line, run_folder, data_folder))
-    except (CannotServe, PageCannotServe) as error:
+    except NothingServed as error:
         print(f"the operator's process cannot start: {error}", file=sys.stderr)
         return EXIT_CANNOT_SERVE
     return EXIT_OK
 
 
 async def serve(line: Line, run_folder: Path, data_folder: Path) -> None:
-    """All of it, in one event loop. Raises CannotServe of either."""
+    """All of it, in one event loop. Raises NothingServed where neither way in can be opened."""
     stop = asyncio.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
     mailbox, saying = UnixMailbox(), UnixMailbox()
     mailbox.connect(READ, run_folder / GATEWAY_SOCKET)
     saying.connect((GATEWAY_FOR_PERSON,), run_folder / GATEWAY_SOCKET)
-    side, users = LineSide(mailbox, saying), data_folder / FILE_NAME
+    side, users = LineSide(mailbox, saying), UsersFile(data_folder / FILE_NAME)
     check, pki = checked_by(users, _tell), pki_folder(line, data_folder)
-    opcua = _opcua(line, side, pki, check)
-    page = page_app(line, side, check, time.monotonic)
-    tls = (pki / CERTIFICATE, pki / PRIVATE_KEY) if line.operator.page.startswith("https:") else (None, None)
+    access = Access(side, users, _tell, time.monotonic)
+    page_tls = (pki / CERTIFICATE, pki / PRIVATE_KEY) if line.operator.page.startswith("https:") else (None, None)
+    served_page = PageWay(
+        page_app(line, side, check, users.role_of, time.monotonic, access), line.operator.page, *page_tls
+    )
+    page = Way(f"page at {line.operator.page}", served_page.begin, served_page.serve, _tell)
+    served_opcua = OpcUaWay(lambda: OpcUa(line, side, pki, check, users.role_of, _tell, access), lambda: page.trouble)
+    opcua = Way(f"OPC UA at {line.operator.opc_ua}", served_opcua.begin, served_opcua.serve, _tell)
     try:
-        listener = listening(line.operator.page)
-        works: list[Coroutine[object, object, object]] = [side.watch(), serve_on(page, listener, *tls), stop.wait()]
-        served = [f"page at {line.operator.page}"]
-        if opcua is not None:
-            await opcua.start()
-            works.append(opcua.run())
-            served.append(f"OPC UA at {line.operator.opc_ua}")
-        print(f"operator of {line.site}/{line.line}: {', '.join(served)}", flush=True)
-        if not users.exists() and line.operator.anonymous == "none":
+        ways = [way for way in (page, opcua) if await way.open()]
+        if not ways:
+            raise NothingServed(f"{page.trouble}; {opcua.trouble}")
+        print(f"operator of {line.site}/{line.line}: {', '.join(way.name for way in ways)}", flush=True)
+        if not users.path.exists() and line.operator.anonymous == "none":
             _tell("nobody can come in yet: `r2rgate users add LINE.toml NAME --role ROLE` lets somebody")
         gc.collect()
         gc.freeze()  # half a million nodes and references that stay: to look through them takes 0.15 s each time
-        tasks = [asyncio.create_task(work) for work in works]
-        done, others = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-        for task in others:
-            task.cancel()
-        await asyncio.gather(*others, return_exceptions=True)
-        for task in done:
-            task.result()  # what has failed is told, and the process started again
+        await _until_one_ends(side.watch(), access.run(), page.keep(), opcua.keep(), stop.wait())
     finally:
-        if opcua is not None:
-            await opcua.stop()
+        await served_page.stop()
+        await served_opcua.stop()
         await mailbox.close()
         await saying.close()
 
 
-def _opcua(line: Line, side: LineSide, pki: Path, check: Check) -> OpcUa | None:
-    """None where it has no certificate yet: the page needs none. Raises CannotServe."""
-    try:
-        return OpcUa(line, side, pki, check, _tell)
-    except NotSetUp as error:
-        _tell(f"OPC UA clients are not served: {error}")
-        return None
+async def _until_one_ends(*works: Coroutine[object, object, object]) -> None:
+    """What has failed is told, and the process started again."""
+    tasks = [asyncio.create_task(work) for work in works]
+    done, others = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+    for task in others:
+        task.cancel()
+    await asyncio.gather(*others, return_exceptions=True)
+    for task in done:
+        task.result()
 
 
-def checked_by(path: Path, tell: Callable[[str], None]) -> Callable[[str, str], Awaitable[Role | None]]:
+def checked_by(users: UsersFile, tell: Callable[[str], None]) -> Callable[[str, str], Awaitable[Role | None]]:
     """Names and passwords against the users' file, off the event loop: a guess takes some 50 ms."""
-    users = UsersFile(path)
 
     def checked(name: str, password: str) -> Role | None:
         try:

@@ -11,7 +11,7 @@ import secrets
 import stat
 import tomllib
 import unicodedata
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, NamedTuple
@@ -33,6 +33,9 @@ TRIED_FIRST = (
 
 _LOG2_N, _R, _P, _SALT_BYTES, _HASH_BYTES = 15, 8, 1, 16, 32
 _HEX = r"^[0-9a-f]*$"
+
+
+RoleOf = Callable[[str], Role | None]  #: of a name as of now; None: there is no such user, or no more
 
 
 class UsersRefused(Exception):
@@ -99,6 +102,11 @@ class Users:
         same = hmac.compare_digest(found, "" if entry is None else entry.scrypt)
         return entry.role if entry is not None and same and len(password) <= MOST_LETTERS else None
 
+    def role_of(self, name: str) -> Role | None:
+        """None: there is no such user. No proof that somebody is `name`."""
+        entry = self._by_name.get(name)
+        return None if entry is None else entry.role
+
     def entries(self) -> list[User]:
         """By name."""
         return [User(one.name, one.role) for one in sorted(self._by_name.values(), key=lambda one: one.name)]
@@ -148,24 +156,35 @@ class UsersFile:
     """The users of a file as they are now: a change counts from the next question on."""
 
     def __init__(self, path: Path) -> None:
-        self._path = path
+        self.path = path
         self._seen: tuple[int, int, int] | None = None
         self._users = Users.nobody()
 
     def current(self) -> Users:
         """Nobody, where there is no file. Raises UsersRefused."""
         try:
-            found = self._path.stat()
+            found = self.path.stat()
         except FileNotFoundError:
             self._seen, self._users = None, Users.nobody()
             return self._users
         except OSError as error:
-            raise UsersRefused(f"{self._path} cannot be read: {error.strerror}") from error
+            raise UsersRefused(f"{self.path} cannot be read: {error.strerror}") from error
         seen = found.st_ino, found.st_mtime_ns, found.st_ctime_ns
         if seen != self._seen:
-            self._users = Users.read(self._path)
+            self._users = Users.read(self.path)
             self._seen = seen
         return self._users
+
+    def role_of(self, name: str) -> Role | None:
+        """As the file has it now; None: there is no such user.
+
+        For whoever has come in before: what was taken from them since counts at once. Where the file cannot be used
+        what it said last holds: nobody new comes in then, but those at work can still stop the line.
+        """
+        try:
+            return self.current().role_of(name)
+        except UsersRefused:
+            return self._users.role_of(name)
 
 
 def why_weak(name: str, password: str) -> str:

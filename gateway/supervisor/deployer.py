@@ -5,6 +5,7 @@ the loop runs on. Here is what people and programs ask for, and what passes with
 proposals judged, `on_the_line` carries out what is approved.
 """
 
+import os
 from collections.abc import Callable
 from typing import Any
 
@@ -20,7 +21,7 @@ from gateway.core.status import ChangeStatus
 from gateway.mailbox.port import Unreachable
 from gateway.supervisor.audit_file import AuditUnavailable
 from gateway.supervisor.deployer_sides import AuditSide, JudgeSide, LoopSide, NotKnown, NotTakenUp, Surroundings
-from gateway.supervisor.four_eyes import APPROVED_ONCE, FirstApproval, approver_of, why_not_second
+from gateway.supervisor.four_eyes import APPROVED_ONCE, FirstApproval, approver_of, why_no_person, why_not_second
 from gateway.supervisor.lifecycle import (
     LINE_CHANGED,
     ON_THE_LINE,
@@ -53,9 +54,14 @@ class Deployer:
         take_up: Callable[[Proposal, str | None], None],
         clock: Callable[[], float],
         wall_clock: Callable[[], float],
+        own_uid: int | None = None,
     ) -> None:
-        """`take_up` puts into the stores what is about to be put into service; raises NotTakenUp."""
+        """`take_up` puts into the stores what is about to be put into service; raises NotTakenUp.
+
+        `own_uid`: the user that the gateway runs as; None: that of this process.
+        """
         self.book = book
+        self._own_uid = os.getuid() if own_uid is None else own_uid
         self._line = line
         self._surroundings = surroundings
         self._wall_clock = wall_clock
@@ -76,6 +82,8 @@ class Deployer:
     async def decide(self, decision: Decide, who: Who) -> Reply:
         """A person's word, straight from the mailbox. The approval is of what was shown, and good once."""
         approver = approver_of(who)
+        if decision.approve and self._line.gate.approvals > 1 and (reason := why_no_person(who, self._own_uid)):
+            return refused("nothing was decided", [reason])
         if decision.script:
             who = who.model_copy(update={"name": f"{decision.script}, run by {who.name}"})
         async with self._records.one_step:
@@ -218,12 +226,13 @@ class Deployer:
         if len(found) != 1:
             return f"{len(found)} proposals begin with {beginning}: `r2rgate proposals` lists them"
         (entry,) = found
-        proposal = self._records.proposal(entry)
+        proposal, first = self._records.proposal(entry), self._first(entry)
         return ProposalShown(
             format=1, stage=entry.stage, why=self._why(entry), proposal_hash=entry.proposal,
             shown=self._shown_hash(entry), epoch=self.book.epoch,
             difference=self._surroundings.difference(proposal, self.book), proposal=proposal,
-            verdict=self._records.verdict(entry),
+            verdict=self._records.verdict(entry), approvals=self._line.gate.approvals,
+            approved_by=None if first is None else first.name,
         )  # fmt: skip
 
     def change(self) -> ChangeStatus | None:

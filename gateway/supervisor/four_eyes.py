@@ -1,7 +1,8 @@
 """Who approved first, where a change takes two: another person than the first. Pure.
 
 People who came in through OPC UA or the page are told apart by name, local users by the number that the kernel tells.
-A script is the user that runs it. A person and a local user of the same name are taken to be the same.
+A script is the user that runs it. A person and a local user of the same name are taken to be the same. The user that
+the gateway runs as, and root, are no people: whoever may be one of these may be both.
 """
 
 import re
@@ -28,6 +29,16 @@ def approver_of(who: Who) -> tuple[str, ...]:
     if (person := _PERSON.fullmatch(who.name)) is not None:  # user and process are those of the operator's process
         return (person[1],)
     return (who.name.casefold(),) if who.uid is None else (who.name.casefold(), f"uid {who.uid}")
+
+
+def why_no_person(who: Who, own_uid: int) -> str:
+    """Empty: it is somebody in particular. `own_uid`: as which user the gateway runs."""
+    if _PERSON.fullmatch(who.name) is not None or who.uid not in (0, own_uid):
+        return ""
+    return (
+        f"{who.name} is no person, and this line takes two: approve it on the page, or through OPC UA, as a user of "
+        "`r2rgate users`"
+    )
 
 
 def first_of(what: Mapping[str, Any]) -> FirstApproval:

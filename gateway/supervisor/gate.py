@@ -2,11 +2,9 @@
 
 import asyncio
 import json
-from collections import OrderedDict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
 
 from pydantic import ValidationError
 
@@ -23,19 +21,20 @@ from gateway.supervisor import configurations as configurations_store
 from gateway.supervisor import models as models_store
 from gateway.supervisor.archiving import archive
 from gateway.supervisor.audit import Audit
-from gateway.supervisor.audit_file import AuditFile, AuditUnavailable
+from gateway.supervisor.audit_file import AuditUnavailable
 from gateway.supervisor.book_file import CannotBegin, book_in
+from gateway.supervisor.bounded import Bounded, with_left_out
 from gateway.supervisor.configurations import Configurations, ConfigurationsError, Origin, begin_configurations
 from gateway.supervisor.deployer import Deployer
 from gateway.supervisor.deployer_sides import JudgeSide, NotTakenUp
 from gateway.supervisor.experiments import ENDS as EXPERIMENT_ENDS
+from gateway.supervisor.kept_audit import KeptAudit
 from gateway.supervisor.model_store import ModelsError
 from gateway.supervisor.models import Models, begin_repository
 from gateway.supervisor.peers import GATEWAY, who_of
 from gateway.supervisor.surroundings import LineSurroundings
 
 LOOP_TIME_S = 2.5
-MOST_KEPT, LARGEST_KEPT = 64, 1_000_000  #: proposals and verdicts that are being looked at, bytes of one
 CONFIGURATION_CHANGES = ("start", "rolled-back")
 BUILD_TIME_S = 15.0  #: for what the loop builds and warms before it answers
 
@@ -45,33 +44,6 @@ STARTED_WITH: dict[str, Callable[[bytes], Controller]] = {
     "started-with.json": parse_controller,
     "configuration.json": lambda content: parse_controller(json.dumps(json.loads(content)["controller"]).encode()),
 }
-
-
-class KeptAudit:
-    """The audit of a folder: written by its own thread, read where it lies."""
-
-    def __init__(self, folder: Path, audit: Audit) -> None:
-        self._folder = folder
-        self._audit = audit
-        self._blobs: OrderedDict[str, bytes] = OrderedDict()  #: the last ones that were asked for
-
-    async def append(
-        self, kind: str, who: Who, what: Mapping[str, Any], blobs: Mapping[str, bytes] | None = None
-    ) -> object:
-        return await self._audit.append(kind, who, what, blobs)
-
-    def blob(self, id_: str) -> bytes | None:
-        """A file is looked at before it is read, which takes its time: what has a hash for a name is read once."""
-        if (known := self._blobs.get(id_)) is not None:
-            self._blobs.move_to_end(id_)
-            return known
-        with AuditFile(self._folder) as file:
-            found = file.blob(id_)
-        if found is not None and len(found) <= LARGEST_KEPT:
-            self._blobs[id_] = found
-            while len(self._blobs) > MOST_KEPT:
-                self._blobs.popitem(last=False)
-        return found
 
 
 class LoopOverMailbox:
@@ -115,6 +87,7 @@ class Gate:
         self._stores: tuple[Configurations, Models] | None = None
         self._shut = "the gate is about to open"  #: why it is, while it is
         self._told = ""
+        self._refusals = Bounded(clock)
         self._learned: str | None = None  #: what ran when `_learn` looked last
         self._telling: set[asyncio.Task[None]] = set()
         mailbox.serve(GATEWAY_PROPOSE, self._answer_propose)
@@ -266,7 +239,20 @@ class Gate:
         else:
             reply = await self.deployer.roll_back(decision.comment, who)
         self._note("decision", f"{who.name}: {reply.text}", ok=reply.ok, reasons=reply.reasons)
+        if isinstance(decision, Decide) and not reply.ok:
+            await self._record_refusal(decision, reply, who)
         return reply
+
+    async def _record_refusal(self, decision: Decide, reply: Reply, who: Who) -> None:
+        """Whoever is refused again and again is counted, and fills no disk."""
+        if (left_out := self._refusals.left_out(who.name)) is None:
+            return
+        because = "; ".join([reply.text, *reply.reasons])[:1000]
+        what = {"proposal": decision.proposal, "approve": decision.approve, "because": because}
+        try:
+            await self.audit.append("refused-decision", who, with_left_out(what, left_out))
+        except AuditUnavailable as error:
+            self._note("gate", f"a refusal could not be recorded: {error}")
 
     async def _line_changed(self, deployer: Deployer, said: LineChanged, who: Who) -> Reply:
         reply = await deployer.line_changed(said.because, who)

@@ -13,7 +13,10 @@ from gateway.core.people import FOR_PERSON, why_may_not
 from gateway.core.topics import GATEWAY_FOR_PERSON
 from gateway.mailbox.port import PEER, Mailbox
 from gateway.supervisor.audit_file import AuditUnavailable
+from gateway.supervisor.bounded import Bounded, with_left_out
 from gateway.supervisor.peers import who_is
+
+A_PROGRAM = "a program"  #: that decides in a person's place, as the audit has it before its user's name
 
 Decision = Decide | RollBackNow | Archive | LineChanged
 
@@ -28,12 +31,14 @@ class PersonsDesk:
         decide: Callable[[Decision, Who], Awaitable[Reply]],
         alarm: Callable[[AlarmSaid, Who], Awaitable[Reply]],
         note: Callable[[str, Who, Mapping[str, Any]], Awaitable[object]],
+        clock: Callable[[], float],
     ) -> None:
         """`note` appends a record to the audit; raises AuditUnavailable."""
         self._command = command
         self._decide = decide
         self._alarm = alarm
         self._note = note
+        self._refusals = Bounded(clock)
         mailbox.serve(GATEWAY_FOR_PERSON, self._answer)
 
     async def _answer(self, payload: bytes) -> bytes:
@@ -45,8 +50,12 @@ class PersonsDesk:
         person, said = asked.person, asked.said
         who = who_is(person, PEER.get())
         if reason := why_may_not(person, said.command):
-            await self._kept("refused-person", who, {"command": said.command, "because": reason})
+            if (left_out := self._refusals.left_out(who.name)) is not None:
+                what = with_left_out({"command": said.command, "because": reason}, left_out)
+                await self._kept("refused-person", who, what)
             return _reply(Reply(ok=False, state="", text=reason, reasons=[reason]))
+        if isinstance(said, Decide) and person.is_script:
+            said = said.model_copy(update={"script": said.script or A_PROGRAM})
         if isinstance(said, Decision):
             return _reply(await self._decide(said, who))
         if isinstance(said, AlarmSaid):

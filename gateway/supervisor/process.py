@@ -17,6 +17,7 @@ from gateway.core.topics import LOOP_COMMAND
 from gateway.mailbox.listener import AlreadyRunning, CannotListen, PathTooLong
 from gateway.mailbox.paths import GATEWAY_SOCKET, LOOP_SOCKET
 from gateway.mailbox.unix import UnixMailbox
+from gateway.supervisor.access_desk import AccessDesk
 from gateway.supervisor.agents_bus import AgentsBus
 from gateway.supervisor.agents_cases import AgentsCases
 from gateway.supervisor.agents_desk import AgentsDesk
@@ -101,7 +102,8 @@ async def serve(
     gateway.on_event, gateway.change = gate.hear, gate.change
     alarms = Alarms(mailbox, data_folder, gate.audit.append, gateway.note, clock, wall_clock)
     gateway.alarms = alarms.status
-    PersonsDesk(mailbox, gateway.command, gate.decide, alarms.say, gate.audit.append)
+    PersonsDesk(mailbox, gateway.command, gate.decide, alarms.say, gate.audit.append, clock)
+    AccessDesk(mailbox, gate.audit.append, clock)
     past = Past(line, mailbox, data_folder, lambda: historian.path)
     dry_runs = DryRuns(line, JudgeWorkers(line, nicer=NICEST))
     cases = AgentsCases(gate.audit.append, clock)

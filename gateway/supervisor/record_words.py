@@ -105,6 +105,45 @@ def _shelved(who: str, what: What) -> str:
     return f"{who} shelves alarm {alarm} for {for_s / 60.0:.0f} min{quoted(what.get('because'))}"
 
 
+def _left_out(what: What) -> str:
+    """Of what came too often."""
+    count = what.get("left_out", 0)
+    return f" (and {count} times before, which are not on record)" if isinstance(count, int) and count > 0 else ""
+
+
+def _refused_person(who: str, what: What) -> str:
+    return f"{who} was refused {_of(what, 'command')}{_because(what)}{_left_out(what)}"
+
+
+def _refused_decision(who: str, what: What) -> str:
+    word = "approval" if what.get("approve") else "rejection"
+    return f"{who}: {word} of proposal {_hash(what)} was refused{_because(what)}{_left_out(what)}"
+
+
+def _logged_in(who: str, what: What) -> str:
+    return f"{who} has come in from {_of(what, 'address')}{_left_out(what)}"
+
+
+def _wrong_logins(_: str, what: What) -> str:
+    places: list[Any] = what["places"] if isinstance(what.get("places"), list) else []
+    told = [
+        f"{_of(one, 'count')} from {_of(one, 'address')} ({_of(one, 'through')})"
+        for one in places if isinstance(one, Mapping)
+    ]  # fmt: skip
+    more = what.get("elsewhere", 0)
+    return _clean(f"wrong names or passwords: {', '.join([*told, *([f'{more} elsewhere'] if more else [])])}",
+                  LONGEST_TOLD)  # fmt: skip
+
+
+def _users(_: str, what: What) -> str:
+    changes: list[Any] = what["changes"] if isinstance(what.get("changes"), list) else []
+    if changes:
+        return _clean(f"users have changed: {', '.join(map(str, changes))}", LONGEST_TOLD)
+    roles = what.get("roles")
+    named = [f"{name} ({role})" for name, role in roles.items()] if isinstance(roles, Mapping) else []
+    return _clean(f"users are {', '.join(named) or 'nobody'}", LONGEST_TOLD)
+
+
 def _of_proposal(text: str) -> Callable[[str, What], str]:
     return lambda who, what: f"proposal {_hash(what)} {text}{_because(what)}"
 
@@ -135,7 +174,11 @@ SENTENCES: dict[str, Callable[[str, What], str]] = {
     "archived": _archived,
     "not-archived": _not_archived,
     "operated": _operated,
-    "refused-person": lambda who, what: f"{who} was refused {_of(what, 'command')}{_because(what)}",
+    "refused-person": _refused_person,
+    "refused-decision": _refused_decision,
+    "logged-in": _logged_in,
+    "wrong-logins": _wrong_logins,
+    "users": _users,
     "acknowledged": lambda who, what: f"{who} has seen alarm {_of(what, 'alarm')}{quoted(what.get('comment'))}",
     "shelved": _shelved,
     "malformed-proposal": lambda who, what: f"{who} sent what is no proposal",

@@ -20,7 +20,7 @@ from tests.bench.live import LineStalls, LiveLine, why
 
 Disturbance = Literal["none", "busy core", "full-speed reader"]
 FIELDS = ("sequence", "lateness_s", "cycle_s", "missed")
-_TICKS_PER_S = os.sysconf("SC_CLK_TCK")
+TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,12 +60,12 @@ def loop_slice(
 def _measure(line: LiveLine, for_s: float, disturbance: Disturbance) -> Slice:
     pid = line.children.pid("loop")
     with disturbed(disturbance, line.children.run_folder) as other:
-        begin_s, cpu_s = time.monotonic(), _cpu_s(pid)
+        begin_s, begin_cpu_s = time.monotonic(), cpu_s(pid)
         time.sleep(for_s)
-        end_s, cpu_end_s = time.monotonic(), _cpu_s(pid)
+        end_s, end_cpu_s = time.monotonic(), cpu_s(pid)
         answers = _answers(other) if other is not None and disturbance == "full-speed reader" else 0
-    memory = [_memory_mb(pid, "VmRSS"), _memory_mb(pid, "VmHWM")]
-    helpers_mb = sum(_memory_mb(child, "VmRSS") for child in _children(pid))
+    memory = [memory_mb(pid, "VmRSS"), memory_mb(pid, "VmHWM")]
+    helpers_mb = sum(memory_mb(child, "VmRSS") for child in _children(pid))
     status = line.status()
     if status is None or status.loop.state != "RUN":
         line.stops.append(f"not in RUN at the end of the slice: {'no status' if status is None else why(status)}")
@@ -84,7 +84,7 @@ def _measure(line: LiveLine, for_s: float, disturbance: Disturbance) -> Slice:
         rss_mb=memory[0],
         peak_rss_mb=memory[1],
         helpers_rss_mb=helpers_mb,
-        cpu_share=(cpu_end_s - cpu_s) / (end_s - begin_s),
+        cpu_share=(end_cpu_s - begin_cpu_s) / (end_s - begin_s),
         answers=answers,
         unsafe=line.unsafe(),
         stops=line.stops,
@@ -139,7 +139,7 @@ def _require_punctual(pid: int) -> None:
         raise SystemExit("the loop has no real-time priority and processor of its own: run as root, or with rtprio")
 
 
-def _memory_mb(pid: int, key: str) -> float:
+def memory_mb(pid: int, key: str) -> float:
     rows = Path(f"/proc/{pid}/status").read_text().splitlines()
     return next(int(row.split()[1]) for row in rows if row.startswith(f"{key}:")) / 1024
 
@@ -149,9 +149,9 @@ def _stat(pid: int | str) -> list[str]:
     return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
 
 
-def _cpu_s(pid: int) -> float:
+def cpu_s(pid: int) -> float:
     user, system = _stat(pid)[11:13]
-    return (int(user) + int(system)) / _TICKS_PER_S
+    return (int(user) + int(system)) / TICKS_PER_S
 
 
 def _children(pid: int) -> list[int]:

@@ -42,14 +42,14 @@ class GateLine(WireLine):
     def first(self) -> Controller:
         return parse_controller((self.folder / "controller.json").read_bytes())
 
-    def propose(self, controller: Controller, reason: str = "a test") -> str:
-        """What was proposed; it is being judged."""
+    def propose(self, controller: Controller, reason: str = "a test", for_s: float = 3600.0) -> str:
+        """What was proposed, to be decided within `for_s`; it is being judged."""
         found, now = self.listed(), datetime.now(UTC)
         assert found is not None and found.in_service is not None
         proposal = Proposal(
             format=1, site=found.site, line=found.line, change=GainsChange(controller=controller),
             base=found.in_service, model=found.model, reason=reason, author="engineer",
-            created=now.isoformat(), expires=(now + timedelta(hours=1)).isoformat(),
+            created=now.isoformat(), expires=(now + timedelta(seconds=for_s)).isoformat(),
         )  # fmt: skip
         reply = Reply.model_validate_json(self._ask(GATEWAY_PROPOSE, canonical(proposal)))
         assert reply.ok, reply

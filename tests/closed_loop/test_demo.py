@@ -2,24 +2,27 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
 
+import httpx
 import pytest
 
 from gateway.cli.demo_result import DemoResult
+from gateway.operator.users import FILE_NAME, UsersFile
 from sim_plant.recorder import read_recording
 from tests.bench.figures import GOALS
 
-pytestmark = [pytest.mark.realtime, pytest.mark.timeout(180)]
+pytestmark = [pytest.mark.realtime, pytest.mark.timeout(240)]
 
 
-def demo(folder: Path) -> subprocess.Popen[str]:
+def demo(folder: Path, *words: str) -> subprocess.Popen[str]:
     return subprocess.Popen(
-        [sys.executable, "-m", "gateway.cli", "demo", "--quick", "--out", str(folder)],
+        [sys.executable, "-m", "gateway.cli", "demo", "--quick", *words, "--out", str(folder)],
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
@@ -74,6 +77,36 @@ def test_the_demonstration_runs_both_cases_and_leaves_nothing_behind(tmp_path):
     page = (folder / "report.html").read_text()
     assert all(f"{case.rmse_n:.4f}" in page for case in configuration.cases)
     assert "report.html" in output and left_over(folder) == []
+
+
+@pytest.mark.long
+def test_a_line_to_play_with_has_a_report_a_page_and_a_change_and_ends_with_ctrl_c(tmp_path):
+    folder = tmp_path / "demo"
+    process = demo(folder, "--stay")
+    assert process.stdout is not None
+    told: list[str] = []
+    for line in process.stdout:
+        told.append(line)
+        if "--run-dir" in line:
+            break
+    text = "".join(told)
+    try:
+        assert (folder / "report.html").exists() and (folder / "result.json").exists(), text
+        page, password = re.search(r"^page +(\S+)$", text, re.M), re.search(r"for this run: (\S+)$", text, re.M)
+        run_folder, waiting = re.search(r"--run-dir (\S+)$", text, re.M), re.search(r"r2rgate approve (\w+)", text)
+        assert page and password and run_folder and waiting, text
+        assert httpx.get(page[1]).status_code == 200
+        assert UsersFile(folder / "data" / FILE_NAME).current().check("engineer", password[1]) == "engineer"
+        words = [sys.executable, "-m", "gateway.cli", "approve", waiting[1], "--yes", "--run-dir", run_folder[1]]
+        said = subprocess.run(words, capture_output=True, text=True, check=False)
+        assert said.returncode == 0 and "probation" in said.stdout, said
+    finally:
+        os.kill(process.pid, signal.SIGINT)
+        ended = process.stdout.read()
+        process.stdout.close()
+    assert process.wait(30) == 0, ended
+    assert left_over(folder) == [] and not Path(run_folder[1]).exists()
+    assert "unsafe events at the drives, from beginning to end: 0" in ended
 
 
 def test_ctrl_c_stops_the_line_and_ends_every_process(tmp_path):

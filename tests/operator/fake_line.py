@@ -45,7 +45,11 @@ IN_SERVICE = "c6d8cf9c18f6d8b1da935a6124c0cd14f017292be653fbbb0dbf92362e1c9e54"
 
 async def check(name: str, password: str) -> Role | None:
     """Whoever is called like a role has it."""
-    return next((role for role in ROLES if role == name and password == PASSWORD), None)
+    return role_of(name) if password == PASSWORD else None
+
+
+def role_of(name: str) -> Role | None:
+    return next((role for role in ROLES if role == name), None)
 
 
 def alarm(name: str = "device-absent", **changes: object) -> AlarmStatus:
@@ -75,6 +79,8 @@ class FakeGateway:
         self.state = "RUN"
         self.epoch = 3
         self.stage = "waiting"
+        self.approvals = 1  #: that a change takes
+        self.first = ""  #: who has approved it, where it takes two
         self.drives: dict[int, str] = {}  #: by span, those that are not ENABLED
         self.off_n: dict[int, float] = {}  #: by span, away from its set-point
         now = datetime.now(UTC).replace(microsecond=0)
@@ -136,6 +142,8 @@ class FakeGateway:
             difference=["gain_state changes by 12.4 %", "predictor.gain_state changes by 3.1 %"],
             proposal=self.proposal,
             verdict=self.verdict,
+            approvals=self.approvals,
+            approved_by=self.first or None,
         )
         return shown.model_dump_json().encode()
 
@@ -202,7 +210,7 @@ class FakeGateway:
         if reason := why_may_not(asked.person, said.command):
             return Reply(ok=False, state=self.state, text=reason, reasons=[reason])
         if isinstance(said, Decide):
-            return self._decided(said)
+            return self._decided(said, asked.person.name)
         if isinstance(said, AcknowledgeAlarm):
             seen = {"acknowledged": True, "acknowledged_by": asked.person.name}
             self.alarms = [one.model_copy(update=seen) if one.name == said.alarm else one for one in self.alarms]
@@ -214,10 +222,13 @@ class FakeGateway:
         self.state = {"stop": "STOP", "hold": "HOLD", "start": "RUN", "arm": "READY"}.get(said.command, self.state)
         return Reply(ok=True, state=self.state, text=f"{said.command}: done")
 
-    def _decided(self, said: Decide) -> Reply:
+    def _decided(self, said: Decide, name: str) -> Reply:
         if self.stage != "waiting" or said.shown != self.shown:
             reason = "what was shown is no longer what it is; look at it again"
             return Reply(ok=False, state=self.state, text="the decision does not count", reasons=[reason])
+        if said.approve and self.approvals > 1 and self.first in ("", name):
+            self.first = name
+            return Reply(ok=True, state=self.state, text="your approval is on record, as the first of two")
         self.stage = "probation" if said.approve else "rejected"
         self.epoch += said.approve
         return Reply(ok=True, state=self.state, text="approved" if said.approve else "rejected")
@@ -236,7 +247,7 @@ async def show(spans: int) -> None:
         side = LineSide(asked)
         watching = asyncio.create_task(side.watch())
         try:
-            await serve_page(page_app(line, side, check, time.monotonic), line.operator.page)
+            await serve_page(page_app(line, side, check, role_of, time.monotonic), line.operator.page)
         finally:
             watching.cancel()
             await asyncio.gather(watching, return_exceptions=True)

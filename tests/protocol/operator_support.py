@@ -3,6 +3,7 @@
 import asyncio
 import json
 import logging
+import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from datetime import UTC, datetime
@@ -17,6 +18,7 @@ from cryptography.hazmat.primitives.serialization import Encoding
 
 from gateway.cli.certificates import Pair
 from gateway.cli.pki_opcua import self_signed, trust
+from gateway.core.access import AT_THE_DOOR
 from gateway.core.alarms import BY_NAME, AlarmStatus
 from gateway.core.decisions import QUERY, ListProposals, ProposalLine, ProposalList, ProposalShown
 from gateway.core.line import Line
@@ -35,12 +37,14 @@ from gateway.core.status import (
     SpanStatus,
     TimingStatus,
 )
-from gateway.core.topics import GATEWAY_FOR_PERSON, GATEWAY_PAST, GATEWAY_PROPOSALS, GATEWAY_STATUS
+from gateway.core.topics import GATEWAY_ACCESS, GATEWAY_FOR_PERSON, GATEWAY_PAST, GATEWAY_PROPOSALS, GATEWAY_STATUS
 from gateway.core.verdict import RuleFinding, ScenarioFigures, Verdict
 from gateway.mailbox.unix import UnixMailbox
+from gateway.operator.access import Access
 from gateway.operator.line_side import TOPICS, LineSide
 from gateway.operator.opcua.service import OpcUa
 from gateway.operator.opcua.space import NAMESPACE
+from gateway.operator.users import UsersFile
 from tests.unit.supervisor_support import line_of, short_folder
 
 EXAMPLES = Path(__file__).parents[2] / "docs" / "examples"
@@ -71,7 +75,9 @@ class FakeGateway:
         mailbox.serve(GATEWAY_STATUS, self._status)
         mailbox.serve(GATEWAY_PROPOSALS, self._proposals)
         mailbox.serve(GATEWAY_PAST, self._past)
+        self.at_the_door: list[Any] = []
         mailbox.serve(GATEWAY_FOR_PERSON, self._person)
+        mailbox.serve(GATEWAY_ACCESS, self._access)
 
     async def _status(self, _: bytes) -> bytes:
         return self.status().model_dump_json().encode()
@@ -144,6 +150,10 @@ class FakeGateway:
         self.heard.append(FOR_PERSON.validate_json(payload))
         return self.reply.model_dump_json().encode()
 
+    async def _access(self, payload: bytes) -> bytes:
+        self.at_the_door.append(AT_THE_DOOR.validate_json(payload))
+        return Reply(ok=True, state="", text="recorded").model_dump_json().encode()
+
 
 def alarm(name: str, acknowledged_by: str = "", shelved: bool = False) -> AlarmStatus:
     row = BY_NAME[name]
@@ -197,6 +207,7 @@ class Bench:
         self.gateway_mailbox = UnixMailbox()
         self.gateway = FakeGateway(line, self.gateway_mailbox)
         self.checks = 0
+        self.port: int | None = None  #: by which clients go, where it is not the server's own
         mailbox = UnixMailbox()
         mailbox.connect(TOPICS, folder / "gateway.sock")
         self.mailbox = mailbox
@@ -204,15 +215,19 @@ class Bench:
         self.pki.mkdir()
         _write(self.pki, "opcua-server", pair("server", "urn:r2rgate:test:line"))
         trust(self.pki, pair("client").certificate)
-        self.opcua = OpcUa(line, self.side, self.pki, self._check, self.said.append)
+        self.users = dict(USERS)  #: as the users' file has them now
+        self.access = Access(self.side, UsersFile(folder / "users.toml"), self.said.append, time.monotonic)
+        self.opcua = OpcUa(
+            line, self.side, self.pki, self._check, self.users.get, self.said.append, self.access
+        )  # fmt: skip
 
     async def _check(self, name: str, password: str):
         self.checks += 1
-        return USERS.get(name) if password == PASSWORD else None
+        return self.users.get(name) if password == PASSWORD else None
 
     @property
     def url(self) -> str:
-        return f"opc.tcp://127.0.0.1:{self.opcua.server.port}"
+        return f"opc.tcp://127.0.0.1:{self.port or self.opcua.server.port}"
 
     def id(self, path: str) -> Any:
         return ua.NodeId(path, NUMBER)
@@ -271,9 +286,12 @@ class Bench:
 
 @asynccontextmanager
 async def bench(
-    spans: int = 2, gateway: bool = True, line: Line | None = None, **operator: Any
+    spans: int = 2, gateway: bool = True, begin: bool = True, line: Line | None = None, **operator: Any
 ) -> AsyncIterator[Bench]:
-    """A running server of `line`, or of one with so many spans; without `gateway` nobody answers it."""
+    """A running server of `line`, or of one with so many spans.
+
+    Without `gateway` nobody answers it, without `begin` it is only made.
+    """
     line = line or line_of(spans)
     settings = line.operator.model_copy(update={"opc_ua": "opc.tcp://127.0.0.1:0", **operator})
     with short_folder() as folder:
@@ -282,8 +300,10 @@ async def bench(
             await found.gateway_mailbox.listen(folder / "gateway.sock")
         tasks: list[asyncio.Task[Any]] = []
         try:
-            await found.opcua.start()
-            tasks += [asyncio.create_task(found.side.watch()), asyncio.create_task(found.opcua.run())]
+            tasks.append(asyncio.create_task(found.side.watch()))
+            if begin:
+                await found.opcua.start()
+                tasks.append(asyncio.create_task(found.opcua.run()))
             yield found
             assert not any(task.done() for task in tasks), [task.exception() for task in tasks if task.done()]
         finally:

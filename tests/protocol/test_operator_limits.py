@@ -2,12 +2,14 @@
 
 import asyncio
 import struct
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 
 import pytest
 from asyncua import Client, ua
 
 from gateway.operator.opcua import limits
-from tests.protocol.operator_support import bench
+from tests.protocol.operator_support import PASSWORD, bench
 
 CODES = ua.StatusCodes
 
@@ -85,6 +87,49 @@ def test_bytes_that_are_no_opc_ua_end_their_connection_and_no_other():
                 await ends_with(b, payload)
             assert (await b.read(client, "Line.Limits.TensionMax")).StatusCode.is_good()
             await answered(b)
+
+    run(story)
+
+
+def hello(receive: int, send: int) -> bytes:
+    """`receive`, `send`: the largest chunk that the client takes and sends."""
+    return b"HELF" + struct.pack("<IIIIIIi", 32, 0, receive, send, 0, 0, -1)
+
+
+@pytest.mark.parametrize(("receive", "send"), [(0, 0), (25, 65_535), (65_535, 25), (8191, 8192)])
+def test_a_client_that_takes_or_sends_crumbs_is_refused(receive, send):
+    async def story():
+        async with bench(spans=1) as b:
+            assert await ends_with(b, hello(receive, send)) == CODES.BadTcpNotEnoughResources
+            await answered(b)
+
+    run(story)
+
+
+def test_a_client_with_the_least_buffers_that_there_may_be_is_heard():
+    async def story():
+        async with bench(spans=1) as b:
+            reader, writer = await asyncio.open_connection("127.0.0.1", b.opcua.server.port)
+            writer.write(hello(8192, 8192))
+            assert (await reader.readexactly(28))[:4] == b"ACKF"
+            writer.close()
+
+    run(story)
+
+
+def test_a_client_that_asks_much_at_once_waits_its_turn():
+    """Its forty questions are on their way before the other's one, which is answered among them."""
+
+    async def story():
+        async with bench(spans=1) as b, b.connected("vera") as greedy, b.connected("otto") as other:
+            many = ua.ReadParameters(NodesToRead=[ua.ReadValueId(ua.NodeId(2258), ua.AttributeIds.Value)] * 100)
+            asked = [asyncio.create_task(greedy.uaclient.read(many)) for _ in range(40)]
+            while not any(task.done() for task in asked):  # noqa: ASYNC110 (the other has to be heard amid them)
+                await asyncio.sleep(0)
+            await b.read(other, "Line.Limits.TensionMax")
+            left = sum(not task.done() for task in asked)
+            await asyncio.gather(*asked)
+            assert left > 20
 
     run(story)
 
@@ -219,6 +264,100 @@ def test_of_a_client_that_falls_silent_nothing_stays_either(monkeypatch):
                 ua.CreateSubscriptionParameters(RequestedPublishingInterval=50.0, PublishingEnabled=True), print
             )
             client.uaclient.protocol.transport.pause_reading()  # as one that was stopped
+            await nothing_left(b)
+            client.disconnect_socket()
+
+    run(story)
+
+
+@asynccontextmanager
+async def from_elsewhere(b) -> AsyncIterator[None]:
+    """Clients reach the server from another address."""
+
+    async def taken(reader, writer):
+        onward = await asyncio.open_connection("127.0.0.1", b.opcua.server.port, local_addr=("127.0.0.2", 0))
+        await asyncio.gather(passed_on(reader, onward[1]), passed_on(onward[0], writer))
+
+    async def passed_on(reader, writer):
+        try:
+            while data := await reader.read(65536):
+                writer.write(data)
+        except ConnectionError:
+            pass
+        writer.close()
+
+    server = await asyncio.start_server(taken, "127.0.0.1", 0)
+    b.port = server.sockets[0].getsockname()[1]
+    try:
+        yield
+    finally:
+        b.port = None
+        server.close()
+
+
+def test_who_floods_keeps_nobody_out_neither_from_elsewhere_nor_from_there():
+    async def story():
+        async with bench(spans=1, sessions_max=2) as b, b.connected("vera") as before:
+            flood = []
+
+            async def more():
+                flood.append(await asyncio.open_connection("127.0.0.1", b.opcua.server.port))
+
+            for _ in range(10 * limits.MORE_CONNECTIONS):
+                await more()
+            assert (await b.read(before, "Line.Limits.TensionMax")).StatusCode.is_good()
+            async with from_elsewhere(b):
+                client = await b.client("otto")
+                await client.connect()
+                for _ in range(3 * limits.MORE_CONNECTIONS):
+                    await more()
+                assert (await b.read(client, "Line.Limits.TensionMax")).StatusCode.is_good()
+                await client.disconnect()
+            client = await b.client("otto")  # the oldest that says nothing gives way to it
+            await client.connect_socket()
+            await client.send_hello()
+            await client.open_secure_channel()
+            for _ in range(3 * limits.MORE_CONNECTIONS):
+                await more()
+            await client.create_session()
+            await client.activate_session(username="otto", password=PASSWORD)
+            assert (await b.read(client, "Line.Limits.TensionMax")).StatusCode.is_good()
+            await client.disconnect()
+            for _, writer in flood:
+                writer.close()
+
+    run(story)
+
+
+def test_one_address_does_not_get_all_sessions():
+    async def story():
+        async with bench(spans=1, sessions_max=4) as b:
+            held = [await b.client("otto") for _ in range(3)]
+            for one in held:
+                await one.connect()
+            with pytest.raises(ua.uaerrors.BadTooManySessions):
+                async with await b.client("otto"):
+                    pass
+            async with from_elsewhere(b), b.connected("vera"):
+                assert b.sessions() == 4
+            for one in held:
+                await one.disconnect()
+
+    run(story)
+
+
+def test_a_session_to_which_nobody_logs_in_does_not_stay_whatever_was_there_before(monkeypatch):
+    async def story():
+        async with bench(spans=1) as b:
+            client = await b.client("otto")
+            await client.connect()
+            monkeypatch.setattr(limits, "LOGIN_S", 0.0)
+            b.opcua.server.end_strangers()
+            assert (await b.read(client, "Line.Limits.TensionMax")).StatusCode.is_good()  # who is in may stay
+            try:
+                await client.create_session()  # in place of the first, and nobody logs in to it
+            except (ConnectionError, ua.UaError):
+                pass  # out already
             await nothing_left(b)
             client.disconnect_socket()
 

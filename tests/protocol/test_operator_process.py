@@ -3,13 +3,16 @@
 import asyncio
 import os
 import signal
+import socket
 import subprocess
 import sys
 from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import httpx
+import pytest
 from asyncua import Client, ua
 from asyncua.crypto.security_policies import SecurityPolicyAes256Sha256RsaPss
 from cryptography import x509
@@ -106,12 +109,10 @@ def test_without_a_certificate_yet_there_is_the_page_and_what_to_do_is_said():
             process.send_signal(signal.SIGTERM)
             assert process.wait() == 0
             told = process.stderr.read()
-            assert (
-                "OPC UA clients are not served" in told and "r2rgate pki init" in told and "r2rgate users add" in told
-            )
+            assert "no OPC UA at" in told and "r2rgate pki init" in told and "r2rgate users add" in told
 
 
-def test_a_port_in_use_ends_with_code_2_and_says_which():
+def test_where_both_ports_are_in_use_it_ends_with_code_2_and_says_which():
     with short_folder() as folder:
         set_up(folder)
         with operator(folder) as first:
@@ -120,6 +121,31 @@ def test_a_port_in_use_ends_with_code_2_and_says_which():
                 assert second.wait() == 2
                 told = second.stderr.read()
                 assert "the page cannot be at http://127.0.0.1" in told and "Traceback" not in told
+                assert "the OPC UA server cannot listen on 127.0.0.1" in told
+
+
+@pytest.mark.parametrize("taken", ["page", "opc_ua"])
+def test_of_two_ways_in_one_goes_on_where_the_others_port_is_in_use(taken):
+    with short_folder() as folder, socket.socket() as holder:
+        set_up(folder)
+        places = load_line((folder / "line.toml").read_text(encoding="utf-8"), "line.toml").operator
+        holder.bind(("127.0.0.1", urlsplit(getattr(places, taken)).port))
+        holder.listen()
+        with operator(folder) as process:
+            said = process.stdout.readline()
+            assert (f"page at {places.page}" in said, f"OPC UA at {places.opc_ua}" in said) == (
+                taken != "page", taken != "opc_ua",
+            )  # fmt: skip
+            with (
+                socket.create_connection(("127.0.0.1", urlsplit(places.page).port)),
+                socket.create_connection(("127.0.0.1", urlsplit(places.opc_ua).port)),
+            ):
+                pass
+            process.send_signal(signal.SIGTERM)
+            assert process.wait() == 0
+            told = process.stderr.read()
+            assert "Traceback" not in told and "it is tried again every 10 s" in told
+            assert f":{urlsplit(getattr(places, taken)).port}" in told
 
 
 def test_the_servers_certificate_names_its_application_and_where_it_is_reached(tmp_path):

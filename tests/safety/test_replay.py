@@ -16,7 +16,7 @@ from gateway.core.proposal import parse_proposal, proposal_hash
 from gateway.core.verdict import Verdict
 from gateway.supervisor.audit import Audit
 from gateway.supervisor.deployer import Deployer
-from gateway.supervisor.gate import KeptAudit
+from gateway.supervisor.kept_audit import KeptAudit
 from gateway.supervisor.lifecycle import Book
 from safety.judge import judge
 from tests.unit.deployer_support import Death, FakeLoop, FakeSurroundings

@@ -1,4 +1,4 @@
-"""A peer: a server in JavaScript on a foreign protocol stack, and the test's own wire into it."""
+"""Programs in JavaScript on foreign protocol stacks, and the test's own wire into them."""
 
 import json
 import os
@@ -18,8 +18,8 @@ class PeerFailed(Exception):
     """The peer has ended, or does not answer; the text holds the end of what it said."""
 
 
-class Peer:
-    """A context: `peer("state")` asks, `peer("fault", 1, "freeze")` commands. See the peer's own list of deeds."""
+class Spoken:
+    """A context: `peer("state")` asks, `peer("fault", 1, "freeze")` commands. See the script's own list of deeds."""
 
     def __init__(self, script: str, *arguments: object, log: Path) -> None:
         self._log = log
@@ -33,8 +33,7 @@ class Peer:
 
     def __enter__(self) -> Self:
         try:
-            self.ready = self._answer()
-            self._become_punctual()
+            self.begin()
         except BaseException:
             self._end()
             raise
@@ -51,10 +50,13 @@ class Peer:
         self._process.stdin.write(json.dumps([deed, *arguments]).encode() + b"\n")
         return self._answer()
 
-    def _become_punctual(self) -> None:
-        """Devices do not wait for a busy computer. Below the loop, as the simulated line."""
-        for thread in Path(f"/proc/{self._process.pid}/task").iterdir():
-            os.sched_setscheduler(int(thread.name), os.SCHED_FIFO, os.sched_param(SIM_PRIORITY))
+    def begin(self) -> None:
+        """Wait until it says that it is ready."""
+        self.ready = self._answer()
+
+    @property
+    def pid(self) -> int:
+        return self._process.pid
 
     def _answer(self) -> Any:
         assert self._process.stdout is not None
@@ -78,3 +80,13 @@ class Peer:
             self._process.kill()
             self._process.wait()
         self._process.stdout.close()
+
+
+class Peer(Spoken):
+    """A server in place of devices."""
+
+    def begin(self) -> None:
+        """Devices do not wait for a busy computer. Below the loop, as the simulated line."""
+        super().begin()
+        for thread in Path(f"/proc/{self.pid}/task").iterdir():
+            os.sched_setscheduler(int(thread.name), os.SCHED_FIFO, os.sched_param(SIM_PRIORITY))

@@ -21,6 +21,7 @@ from tests.unit.deployer_support import (
 )
 
 ANNA = Who(name="anna", uid=1000, pid=1)
+OPERATORS_UID = 900  #: of the gateway, and of the operator's process
 BERT = Who(name="bert", uid=1001, pid=2)
 PROBATION_S = LINE.gate.probation_s
 #: From controller 1 to 2 is a quarter of a number, from 1 to 3 two fifths.
@@ -52,7 +53,7 @@ class Gateway:
     def begin(self) -> None:
         book, clock = book_of(self.audit.records), self._now_s
         args = (self.audit, self.loop, self.judge, self.surroundings, lambda proposal, verdict: None, clock, clock)
-        self.deployer = Deployer(self.line, book, *args)
+        self.deployer = Deployer(self.line, book, *args, own_uid=OPERATORS_UID)
 
     def _now_s(self) -> float:
         return self.loop.now_s

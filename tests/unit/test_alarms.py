@@ -310,7 +310,7 @@ class Desk:
             self.mailbox, self.folder, self.append, lambda kind, text: self.notes.append((kind, text)),
             lambda: self.now_s, lambda: self.now_s + 1_700_000_000.0,
         )  # fmt: skip
-        PersonsDesk(self.mailbox, self._none, self._none, self.alarms.say, self.append)
+        PersonsDesk(self.mailbox, self._none, self._none, self.alarms.say, self.append, lambda: 0.0)
 
     async def _none(self, *_: object) -> Reply:
         raise AssertionError

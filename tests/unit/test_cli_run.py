@@ -36,7 +36,7 @@ WAITS = "import signal; signal.sigwait([signal.SIGTERM])"
 @pytest.fixture
 def scripts(monkeypatch: pytest.MonkeyPatch) -> Iterator[Scripts]:
     """In place of r2rgate's processes: a line of Python for each child, by its name; it finds its arguments in argv."""
-    playing: Scripts = {"agents": WAITS}
+    playing: Scripts = {"agents": WAITS, "operator": WAITS}
     begun: list[subprocess.Popen[str]] = []
 
     def start(arguments: list[str], log: Path) -> subprocess.Popen[str]:
@@ -132,20 +132,21 @@ def test_a_refused_child_ends_all_with_its_words_and_its_code(
     assert rests.exists()
 
 
+@pytest.mark.parametrize("name", ["agents", "operator"])
 @pytest.mark.parametrize("code", [2, 3])
-def test_agents_that_are_refused_are_told_and_end_nothing(
-    code: int, scripts: Scripts, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_what_the_line_does_without_is_told_when_it_is_refused_and_ends_nothing(
+    code: int, name: str, scripts: Scripts, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     scripts["gateway"] = scripts["loop"] = WAITS
     # The first start is refused, the second asks the parent to end, as Ctrl-C does.
-    scripts["agents"] = (
+    scripts[name] = (
         "import os, pathlib, signal\n"
         f"again = pathlib.Path({str(tmp_path / 'again')!r})\n"
         "if again.exists():\n    os.kill(os.getppid(), signal.SIGINT); signal.sigwait([signal.SIGTERM])\n"
         f"again.touch(); raise SystemExit({code})"
     )
     assert run(tmp_path) == 0
-    assert f"agents has ended with exit code {code}" in capsys.readouterr().err
+    assert f"{name} has ended with exit code {code}" in capsys.readouterr().err
 
 
 def test_a_crash_is_told_and_the_child_comes_back(
@@ -195,6 +196,21 @@ def test_the_screen_shows_what_was_not_granted_at_first_and_an_exit_for_longer(t
     later_s = 100.0 + NOTES_S + 1.0
     assert notices.lines(later_s) == [headline, f"  the end of {tmp_path / 'sim.log'}:", "    KeyError: 1"]
     assert notices.lines(later_s + EXIT_S) == [f"{headline} (1 min ago; {tmp_path / 'sim.log'})"]
+
+
+def test_the_screen_shows_where_people_reach_the_line_as_long_as_they_do(tmp_path: Path) -> None:
+    notices = Notices(Console(force_terminal=True), 100.0)
+    where = "page at http://127.0.0.1:8480, OPC UA at opc.tcp://127.0.0.1:4840"
+    said = [f"operator of demo/line-1: {where}", "nobody can come in yet"]
+    notices.hear_of_operator(said[:1], 101.0)
+    for now_s in (150.0, 150.2):
+        notices.hear_of_operator(said, now_s)
+    assert notices.lines(151.0) == [where, "operator: nobody can come in yet"]
+    assert notices.lines(150.1 + NOTES_S) == [where]  # what is missing is told for a while
+    notices.tell(Exit("operator", 2, 1, 200.0, tmp_path / "operator.log", ["the page cannot be at 8480"]))
+    assert notices.lines(201.0)[0] == "operator has ended with exit code 2"
+    notices.hear_of_operator(said[:1], 202.0)
+    assert notices.lines(202.0)[0] == where
 
 
 def test_without_a_terminal_each_is_printed_once(capsys: pytest.CaptureFixture[str]) -> None:

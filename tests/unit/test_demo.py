@@ -3,7 +3,9 @@
 import asyncio
 import json
 from dataclasses import replace
+from datetime import UTC, datetime
 from io import StringIO
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,25 +13,32 @@ import pytest
 from rich.console import Console
 
 from gateway.cli import demo_line
-from gateway.cli.demo_analysis import Evidence
+from gateway.cli.demo_analysis import Evidence, summary_of
 from gateway.cli.demo_cases import MOST_REPEATS, Window, again_after_stops
 from gateway.cli.demo_chain import Measured, beyond, name_of
 from gateway.cli.demo_chain_page import page
 from gateway.cli.demo_chain_table import print_chain
-from gateway.cli.demo_line import Setup, line_text
-from gateway.cli.demo_operator import DemoFailed
+from gateway.cli.demo_failed import DemoFailed
+from gateway.cli.demo_line import Ports, Setup, line_text
+from gateway.cli.demo_people import let_in
 from gateway.cli.demo_result import DemoResult, paper_improvement_pct
+from gateway.cli.demo_stay import told
 from gateway.commissioning.past import Step, named
 from gateway.control.design import design_lqi, task_of
 from gateway.core.controller import config_hash
 from gateway.core.deployment import Region
 from gateway.core.line_file import load_line
+from gateway.core.people import ROLES
 from gateway.core.proposal import GainsChange
 from gateway.core.scenario import PAPER
+from gateway.operator.opcua.trust import TrustList, from_file
+from gateway.operator.users import FILE_NAME, UsersFile
+from sim_plant.judge import UNSAFE
 from sim_plant.recording import Recording
 from tests.unit.test_report import Page
 
-LINE = load_line(line_text(41000, 41001), "line.toml")
+PORTS = Ports(41000, 41001, 41002, 41003)
+LINE = load_line(line_text(PORTS), "line.toml")
 CONFIGS = [
     design_lqi(replace(task_of(LINE), unwind_speed_m_per_s=0.01 * k)).model_copy(update={"antiwindup": 0.1 * k})
     for k in (1, 2, 3)
@@ -41,10 +50,10 @@ def test_its_line_says_what_it_states_and_nothing_else_of_the_template_is_lost(m
     assert (gate.first_speed_max_m_per_s, gate.first_step_max_n, gate.probation_s) == (0.1, 24.0, 10.0)
     assert {roller.friction_nms_per_rad.tolerance for roller in LINE.rollers} == {0.6}
     assert (gate.cool_down_s, gate.first_corner_share, gate.autonomy) == (30.0, 0.4, "approve-all")
-    assert "port = 41000" in line_text(41000, 41001) and all(why in line_text(1, 2) for *_, why in demo_line.STATED)
+    assert "port = 41000" in line_text(PORTS) and all(why in line_text(PORTS) for *_, why in demo_line.STATED)
     monkeypatch.setattr(demo_line, "STATED", (("# no such key = 1", "x = 1", "because"),))
     with pytest.raises(DemoFailed, match="no such key"):
-        line_text(1, 2)
+        line_text(PORTS)
 
 
 @pytest.mark.parametrize(
@@ -181,7 +190,7 @@ def test_the_table_fits_a_terminal_and_says_who_approved():
     result = example()
     print_chain(result, console)
     text = console.export_text()
-    assert result.chain is not None and result.chain.audit.head in text and "scripted operator (demo)" in text
+    assert result.chain is not None and result.chain.audit.head in text and "script-operator (operator, opc-ua)" in text
     table = text[: text.index("on truth:")]
     assert "…" not in table and "paper" in table and max(map(len, table.splitlines())) <= 80
     assert f"{result.rmse_n(1, 'velocity'):.3f}" in table and "-39.6%" in table
@@ -210,7 +219,7 @@ def test_the_page_holds_every_figure_and_a_case_that_was_not_run(tmp_path):
         assert all(
             f"{case.rmse_n:.4f}" in shown.words and f"{case.ratio_to_stepped:.3f}" in shown.words for case in one.cases
         )
-    assert "It was not run." in shown.words and "scripted operator (demo)" in shown.words
+    assert "It was not run." in shown.words and "script-operator (operator, opc-ua)" in shown.words
     chain = result.chain
     assert chain is not None and chain.audit.head in shown.words
     refused = [text for one in chain.changes for text in one.against]
@@ -221,3 +230,33 @@ def test_the_page_holds_every_figure_and_a_case_that_was_not_run(tmp_path):
     for k in (1, 2):
         assert f"to {result.rmse_n(k, 'tension'):.3f} N" in shown.words
     assert all(why in shown.words for *_, why in demo_line.STATED)
+
+
+def test_who_stays_is_told_where_to_go_and_that_commands_take_other_folders_in_quotes(tmp_path):
+    setup = Setup(tmp_path / "my line", LINE, CONFIGS[0], 1)
+    text = "\n".join(told(setup, "amber-fern", "ab" * 32, "/tmp/r2rgate-x"))
+    for wanted in (LINE.operator.page, LINE.operator.opc_ua, "amber-fern", "r2rgate approve abababababab", "Ctrl-C"):
+        assert wanted in text
+    assert f"--control '{tmp_path}/my line/recording'" in text and "--run-dir /tmp/r2rgate-x" in text
+    assert "r2rgate approve" not in "\n".join(told(setup, "amber-fern", "", "/tmp/r2rgate-x"))
+
+
+def test_who_is_let_in_has_a_certificate_that_is_trusted_and_a_password_that_is_a_good_one(tmp_path):
+    alone, people = (let_in(LINE, tmp_path / name, people=name == "b") for name in ("a", "b"))
+    users = [UsersFile(tmp_path / name / FILE_NAME).current() for name in ("a", "b")]
+    assert [one.name for one in users[0].entries()] == ["script-operator"] and alone.password == ""
+    assert [users[1].check(role, people.password) for role in ROLES] == list(ROLES)
+    script = people.script
+    assert users[1].check(script.user, script.password) == "operator" and alone.script.password != script.password
+    pki = tmp_path / "b" / "pki"
+    trusted = TrustList(pki, print, lambda: datetime.now(UTC))
+    assert trusted.why_not(from_file(Path(script.certificate).read_bytes())) == ""
+
+
+def test_what_the_simulated_line_has_seen_so_far_is_counted_as_at_its_end(tmp_path):
+    setup = Setup(tmp_path, LINE, CONFIGS[0], 1)
+    events = [{"kind": "recording", "plant": "s-real"}, *({"kind": "unsafe", "what": "tension-band"},) * 2]
+    empty = np.empty((0, LINE.n))
+    found = summary_of(setup, Recording(LINE.n, np.empty(0), empty, empty, empty, np.empty(0), events))
+    assert found["plant"] == "s-real" and found["unsafe_events"]["tension-band"] == 2
+    assert sum(found["unsafe_events"].values()) == 2 and len(found["unsafe_events"]) == len(UNSAFE)

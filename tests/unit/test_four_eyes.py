@@ -13,7 +13,7 @@ from gateway.supervisor.four_eyes import approver_of
 from gateway.supervisor.lifecycle import Stage, book_of
 from gateway.supervisor.peers import who_is, who_of
 from tests.unit.deployer_gateway import ANNA, BERT, FOUR_EYES, PROBATION_S, TRUSTING, Gateway, run, started
-from tests.unit.deployer_support import FIRST, LIFETIME_S, hash_of, proposal
+from tests.unit.deployer_support import FIRST, LIFETIME_S, LINE, hash_of, proposal
 
 OPERATORS_PROCESS = Peer(uid=900, pid=3)
 
@@ -102,6 +102,25 @@ async def test_a_script_is_the_user_that_runs_it_and_cannot_pass_for_another():
     assert approved["by"] == "script"  # one of them was: nothing later rests on it
     assert approved["first"] == "bert (operator, page), run by anna"
     assert not gateway.deployer.book.entries[hash_of(one)].by_person
+
+
+@pytest.mark.parametrize(
+    "nobody", [Who(name="r2rgate", uid=900, pid=9), Who(name="root", uid=0, pid=9), Who(name="carla", uid=0, pid=9)]
+)
+def test_neither_root_nor_the_gateways_own_user_is_one_of_two_people(nobody):
+    async def test():
+        gateway, one = await waiting()
+        for script in ("", "nightly"):  # neither as the first
+            reply = await gateway.decide(one, who=nobody, script=script)
+            assert not reply.ok and "is no person, and this line takes two" in reply.reasons[0]
+        await gateway.decide(one, who=person("anna"))
+        assert not (await gateway.decide(one, who=nobody)).ok  # nor as the second
+        assert gateway.stage(one) is Stage.WAITING and gateway.audit.kinds.count("approved-once") == 1
+        assert (await gateway.decide(one, approve=False, who=nobody)).ok  # to stop it anybody will do
+        gateway, one = await waiting(LINE)
+        assert (await gateway.decide(one, who=nobody)).ok  # where one is enough, whoever may is
+
+    asyncio.run(test())
 
 
 @pytest.mark.parametrize("who", [ANNA, BERT])

@@ -7,13 +7,16 @@ from pathlib import Path
 
 import pytest
 
+from gateway.core.access import CameIn
 from gateway.core.alarms import ShelveAlarm
+from gateway.core.decisions import Decide
 from gateway.core.line_past import TensionsBetween
 from gateway.core.messages import Stop
 from gateway.core.people import Person
 from gateway.core.topics import LOOP_TELEMETRY
 from gateway.mailbox.unix import UnixMailbox
 from gateway.operator.line_side import TOPICS, LineSide, NotTold
+from gateway.supervisor.bounded import AT_ONCE
 from tests.unit.supervisor_support import frame_of, until
 from tests.unit.test_supervisor_process import gateway, loop_and_client, run
 
@@ -88,5 +91,23 @@ def test_tensions_of_the_last_seconds_are_told_and_a_loop_that_is_gone_is_an_ala
                 watching.cancel()
                 await asyncio.gather(watching, return_exceptions=True)
                 await mailbox.close()
+
+    run(story)
+
+
+def test_a_refused_decision_and_who_came_in_are_on_record_and_no_more_often_than_need_be() -> None:
+    async def story(folder: Path) -> None:
+        with gateway(folder):
+            side, mailbox = side_of(folder)
+            await told(side, "gateway-start")
+            assert await side.at_the_door(CameIn(person=ANNA, address="192.0.2.7"))
+            for _ in range(3 * AT_ONCE):
+                assert not (await side.say(ANNA, Decide(proposal="a" * 64, shown="b" * 64, approve=True))).ok
+            kinds = [one.kind for one in (await side.records()).records]
+            assert kinds.count("refused-decision") == AT_ONCE and kinds.count("logged-in") == 1
+            sentence = await told(side, "refused-decision")
+            assert sentence.startswith("anna (operator, opc-ua): approval of proposal aaaaaaaaaaaa was refused: ")
+            assert await told(side, "logged-in") == "anna (operator, opc-ua) has come in from 192.0.2.7"
+            await mailbox.close()
 
     run(story)

@@ -10,10 +10,14 @@ from typing import Any
 import httpx
 import pytest
 
+from gateway.core.people import Role
+from gateway.operator.page import login
 from gateway.operator.page.events import MOST_BROWSERS
 from gateway.operator.page.login import TOKEN_HEADER
 from gateway.operator.page.serve import serve_on
+from gateway.operator.users import RoleOf
 from tests.operator.fake_line import PASSWORD, alarm
+from tests.operator.fake_line import role_of as role_of_anybody
 from tests.unit.page_support import Page, page
 
 
@@ -88,8 +92,8 @@ class Served:
 
 
 @asynccontextmanager
-async def served(spans: int = 3, watched: bool = True) -> AsyncIterator[Served]:
-    async with page(spans, watched=watched) as there:
+async def served(spans: int = 3, watched: bool = True, role_of: RoleOf = role_of_anybody) -> AsyncIterator[Served]:
+    async with page(spans, watched=watched, role_of=role_of) as there:
         listener = socket.create_server(("127.0.0.1", 0))
         found = Served(there, listener)
         try:
@@ -200,6 +204,21 @@ def test_no_more_look_than_can_and_a_place_becomes_free_again():
     asyncio.run(story())
 
 
+@pytest.mark.parametrize("role", [None, "engineer"])
+def test_whoever_has_another_role_or_none_loads_the_page_anew(role: Role | None, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(login, "LOOK_UP_S", 0.0)
+    roles: dict[str, Role | None] = {"viewer": "viewer"}
+
+    async def story() -> None:
+        async with served(role_of=roles.get) as at:
+            stream = await at.look()
+            await stream.until("tick")
+            roles["viewer"] = role
+            await stream.until("anew")
+
+    asyncio.run(story())
+
+
 def test_the_stream_ends_with_the_session():
     async def story() -> None:
         async with served() as at:
@@ -207,7 +226,7 @@ def test_the_stream_ends_with_the_session():
             stream = await at.look()
             await stream.until("tick")
             await at.log_out(token)
-            await stream.until("logged-out")
+            await stream.until("anew")
             assert (await at.look()).status == 401
 
     asyncio.run(story())

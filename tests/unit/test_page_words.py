@@ -35,6 +35,7 @@ FAMILIES: dict[str, list[str]] = {
     "history.": ["when", "kind", "author", "stage", "why", "epoch", "open"],
     "health.": ["cycle", "lateness"],
     "operate.": ["tension", "speed", "recipe"],
+    "reply.not-": ["stop", "said"],
     "operate.sure-": [*COMMANDS],
     "operate.then-": [*COMMANDS],
 }

@@ -22,6 +22,7 @@ from gateway.core.people import FOR_PERSON, LEAST, ROLES, ForPerson, Person, may
 from gateway.core.topics import GATEWAY_FOR_PERSON
 from gateway.mailbox.inprocess import Hub, InProcessMailbox
 from gateway.supervisor.audit_file import AuditUnavailable
+from gateway.supervisor.bounded import AT_ONCE, EVERY_S
 from gateway.supervisor.persons_desk import PersonsDesk
 
 HASH = "a" * 64
@@ -46,7 +47,8 @@ class Desk:
         self.mailbox, self.asking = InProcessMailbox(hub), InProcessMailbox(hub)
         self.commands, self.decisions, self.records = [], [], []
         self.audit_open = True
-        PersonsDesk(self.mailbox, self.command, self.decide, self.decide, self.note)
+        self.now_s = 0.0
+        PersonsDesk(self.mailbox, self.command, self.decide, self.decide, self.note, lambda: self.now_s)
 
     async def command(self, payload, who):
         self.commands.append((parse_command(payload), who))
@@ -102,11 +104,34 @@ def test_what_an_operator_decides_is_decided_in_their_name(desk, said):
     assert decision == said and who.name == "anna (operator, opc-ua)"
 
 
+def test_nobody_takes_the_decision_of_a_program_for_a_persons(desk):
+    decide = DECISIONS[0]
+    for name, script in (("script-panel", "a program"), ("scripter", "")):
+        person = Person(name=name, role="operator", through="opc-ua", certificate=HASH)
+        assert desk.send(ForPerson(person=person, said=decide).model_dump_json().encode()).ok
+        decision, who = desk.decisions.pop()
+        assert decision == decide.model_copy(update={"script": script})
+        assert who.name == f"{name} (operator, opc-ua)" and who.certificate == HASH
+
+
 @pytest.mark.parametrize("said", FOR_ENGINEERS, ids=lambda said: said.command)
 def test_what_takes_an_engineer_takes_one(desk, said):
     assert desk.ask("operator", said).text == f"anna is an operator; {said.command} takes an engineer"
     assert not desk.decisions
     assert desk.ask("engineer", said).ok
+
+
+def test_who_tries_again_and_again_what_they_may_not_is_counted_and_fills_no_disk(desk):
+    for _ in range(500):
+        assert not desk.ask("viewer", Stop()).ok
+    assert len(desk.records) == AT_ONCE
+    assert not desk.send(
+        ForPerson(person=Person(name="bert", role="viewer", through="page"), said=Stop()).model_dump_json().encode()
+    ).ok
+    assert len(desk.records) == AT_ONCE + 1  # others are on record as ever
+    desk.now_s += EVERY_S
+    desk.ask("viewer", Stop())
+    assert desk.records[-1][2]["left_out"] == 500 - AT_ONCE
 
 
 def test_a_stop_is_done_though_nothing_can_be_recorded(desk):

@@ -250,3 +250,18 @@ def test_at_a_terminal_it_is_asked_twice_and_not_echoed(
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == code
     assert said in seen.decode() and GOOD not in seen.decode()
     os.close(terminal)
+
+
+def test_the_role_of_somebody_who_is_in_already_is_the_files_of_now(anna: Users, tmp_path: Path) -> None:
+    path = tmp_path / "users.toml"
+    file = UsersFile(path)
+    assert file.role_of("anna") is None
+    anna.write(path)
+    assert file.role_of("anna") == "operator" and file.role_of("bert") is None
+    anna.with_user("anna", GOOD, "viewer").write(path)
+    assert file.role_of("anna") == "viewer"
+    path.write_text("nonsense")
+    assert file.role_of("anna") == "viewer"  # nobody knows what was meant; who is at work must be able to stop
+    assert UsersFile(path).role_of("anna") is None
+    path.unlink()
+    assert file.role_of("anna") is None

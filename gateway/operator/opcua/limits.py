@@ -12,9 +12,9 @@ from asyncua.server.subscription_service import SubscriptionService
 
 from gateway.operator.opcua.filters import Items
 
-MAX_CHUNK = 65_535  #: bytes
+LEAST_CHUNK, MAX_CHUNK = 8192, 65_535  #: bytes; the least that a client must be able to take (OPC 10000-6, 7.1.2.3)
 MAX_CHUNKS = 4
-MAX_MESSAGE = 262_144  #: bytes
+MAX_MESSAGE = MAX_CHUNKS * MAX_CHUNK  #: bytes
 MAX_READ = 1000  #: nodes of one request
 MAX_BROWSE = 100
 MAX_CALLS = 4  #: methods of one request, and requests with methods that one client may have running
@@ -28,6 +28,8 @@ MAX_QUEUE = 100  #: values of one item that wait to be published
 MAX_UNACKNOWLEDGED = 20  #: messages of one subscription that are kept to be sent again
 SUBSCRIPTIONS_EACH = 4  #: of a session
 MORE_CONNECTIONS = 12  #: than sessions: for clients that look for the endpoints, or have not logged in yet
+BEING_ENDED = 128  #: connections that count until the event loop has come round to their end
+SHARE = 0.75  #: of the sessions that one address may have: the others can still come in
 PENDING_MESSAGES = 64
 LOGIN_S = 5.0  #: from a connection to a session
 SESSION_TIMEOUT_MS = (5_000, 10_000)  #: a client that is killed costs so long and no longer

@@ -234,4 +234,5 @@ _CONTROLLER = (
 _CONNECTION = (
     Row("Fresh", BOOLEAN, "The gateway tells, and what is told here is no older than two seconds"),
     Row("Trouble", STRING, "Why the gateway does not tell; empty: it does"),
+    Row("PageTrouble", STRING, "Why the page is not served; empty: it is"),
 )

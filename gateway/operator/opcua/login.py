@@ -11,6 +11,8 @@ from asyncua.server.internal_server import InternalServer
 from pydantic import ValidationError
 
 from gateway.core.people import Person, Role
+from gateway.operator.access import Access
+from gateway.operator.users import RoleOf
 
 Check = Callable[[str, str], Awaitable[Role | None]]
 
@@ -39,20 +41,41 @@ class _Guesser:
 class Logins:
     """Each client guesses one password after the other, and ever more slowly."""
 
-    def __init__(self, check: Check, anonymous_may_read: bool) -> None:
+    def __init__(self, check: Check, role_of: RoleOf, anonymous_may_read: bool, access: Access | None = None) -> None:
+        """`access`: is told who comes in, and who does not."""
         self._check = check
+        self._access = access
+        self._role_of = role_of
         self._anonymous_may_read = anonymous_may_read
         self._wrong: OrderedDict[str, Counter[str]] = OrderedDict()  #: passwords by certificate, then by name
         self._guessing: dict[str, _Guesser] = {}
         self._checks = asyncio.Semaphore(CHECKS)
 
-    async def person(self, server: InternalServer, session: Any, token: Any, certificate: str) -> Person:
+    async def person(self, server: InternalServer, session: Any, token: Any, certificate: str, address: str) -> Person:
         """Raises ServiceError."""
         if isinstance(token, ua.UserNameIdentityToken):
-            return await self.by_password(*_plain(server, session, token), certificate)
+            name, password = _plain(server, session, token)
+            try:
+                return await self.by_password(name, password, certificate)
+            except ServiceError:
+                if self._access is not None:
+                    self._access.refused("opc-ua", address, certificate, name)
+                raise
         if _is_nobody(token) and self._anonymous_may_read:
             return Person(name=ANONYMOUS, role="viewer", through="opc-ua", certificate=certificate)
         raise ServiceError(ua.StatusCodes.BadIdentityTokenRejected)
+
+    def came_in(self, person: Person, address: str) -> None:
+        """A session has begun."""
+        if self._access is not None:
+            self._access.came_in(person, address)
+
+    def now(self, person: Person) -> Person | None:
+        """Somebody who has logged in, with the role that they have now; None: they are no user any more."""
+        if person.name == ANONYMOUS:
+            return person if self._anonymous_may_read else None
+        role = self._role_of(person.name)
+        return None if role is None else person.model_copy(update={"role": role})
 
     async def by_password(self, name: str, password: str, certificate: str) -> Person:
         """Raises ServiceError, after a while. A client's guesses wait for each other."""

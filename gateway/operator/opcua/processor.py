@@ -4,6 +4,8 @@ Without encryption only the endpoints are told: that is how clients find out wha
 """
 
 import asyncio
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from asyncua import ua as asyncua_ua
@@ -64,12 +66,15 @@ class Processor(UaProcessor):
         server: InternalServer,
         logins: Logins,
         proving: OnlyProven,
+        has_its_share: Callable[[str], bool],
         transport: asyncio.Transport,
         limits: TransportLimits,
     ) -> None:
+        """`has_its_share`: of the sessions, by address."""
         super().__init__(server, transport, limits)
         self._logins = logins
         self._proving = proving
+        self._has_its_share = has_its_share
         self._calls: set[asyncio.Task[None]] = set()  #: without those that are urgent
         self._urgent: set[asyncio.Task[None]] = set()
         self._histories: set[asyncio.Task[None]] = set()
@@ -78,7 +83,7 @@ class Processor(UaProcessor):
         service = typeid.Identifier
         if typeid.NamespaceIndex or service not in _SERVICES or not self._connection.is_open():
             raise ServiceError(ua.StatusCodes.BadServiceUnsupported)
-        if service not in _OPEN and not self._is_encrypted():
+        if service not in _OPEN and not self.is_encrypted():
             raise ServiceError(ua.StatusCodes.BadSecurityModeRejected)
         if service not in _OPEN and service != _CREATE:
             self._check_token(requesthdr)
@@ -135,15 +140,22 @@ class Processor(UaProcessor):
         if params.ClientDescription.ApplicationUri != application_uri(x509.load_der_x509_certificate(own)):
             raise ServiceError(ua.StatusCodes.BadCertificateUriInvalid)
         await self._end_session()
+        self.session = None
+        if self._has_its_share(address_of(self._transport)):
+            raise ServiceError(ua.StatusCodes.BadTooManySessions)
 
     async def _activate(self, typeid: Any, requesthdr: Any, seqhdr: Any, body: Buffer) -> bool:
         """First the person is asked for proof, then asyncua, which checks the client's signature."""
         session = self._session()
         params = struct_from_binary(ua.ActivateSessionParameters, body.copy())
         certificate = fingerprint(self._certificate())
-        person = await self._logins.person(self.iserver, session, params.UserIdentityToken, certificate)
+        address = address_of(self._transport)
+        person = await self._logins.person(self.iserver, session, params.UserIdentityToken, certificate, address)
+        before = session.person
         alive = await self._with_proof(typeid, requesthdr, seqhdr, body)
-        session.person = person
+        session.logged_in = partial(self._logins.now, person)
+        if before is None or before.name != person.name:
+            self._logins.came_in(person, address)
         return alive
 
     async def _with_proof(self, typeid: Any, requesthdr: Any, seqhdr: Any, body: Buffer) -> bool:
@@ -152,6 +164,13 @@ class Processor(UaProcessor):
             return await super()._process_message(typeid, requesthdr, seqhdr, body)
         finally:
             self._proving.proven = False
+
+    def is_logged_in(self) -> bool:
+        return isinstance(self.session, Session) and self.session.is_activated()
+
+    def is_nobodys(self) -> bool:
+        """Whoever has logged in is no user any more."""
+        return isinstance(self.session, Session) and self.session.is_activated() and self.session.person is None
 
     def _session(self) -> Session:
         """Raises ServiceError. A session lives and dies with its connection: nobody else can take it up."""
@@ -164,7 +183,7 @@ class Processor(UaProcessor):
         if requesthdr.AuthenticationToken != self._session().auth_token:
             raise ServiceError(ua.StatusCodes.BadSessionIdInvalid)
 
-    def _is_encrypted(self) -> bool:
+    def is_encrypted(self) -> bool:
         return self._connection.security_policy.Mode == ua.MessageSecurityMode.SignAndEncrypt
 
     def _certificate(self) -> bytes:
@@ -181,6 +200,12 @@ class Processor(UaProcessor):
             self._session_watchdog_task.cancel()
         if self.session is not None:
             await self.session.close_session(True)
+
+
+def address_of(transport: asyncio.BaseTransport) -> str:
+    """Of the other side in the network; empty where it is gone already."""
+    name: Any = transport.get_extra_info("peername")
+    return str(name[0]) if name else ""
 
 
 def _is_urgent(body: Buffer) -> bool:

@@ -3,6 +3,7 @@ people with names, no discovery of others, nothing that can be written.
 """
 
 import asyncio
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -41,10 +42,6 @@ class CannotServe(Exception):
     """The text says why, and what to do."""
 
 
-class NotSetUp(CannotServe):
-    """It has no certificate yet."""
-
-
 class _Trusted(SecurityPolicyFactory):
     """A security policy for clients whose certificate is trusted, before anything they say is looked at."""
 
@@ -67,13 +64,13 @@ class Stack(InternalServer):
 
     def __init__(self, sessions_max: int, proving: OnlyProven, anonymous: bool) -> None:
         super().__init__(user_manager=proving)
-        self._sessions_max = sessions_max
+        self.sessions_max = sessions_max
         self.allow_remote_admin = False
         self.supported_tokens = (ua.UserNameIdentityToken, *((ua.AnonymousIdentityToken,) if anonymous else ()))
         self.subscription_service = limits.Subscriptions(self.aspace, self)
         self.isession.subscription_service = self.subscription_service
         self.view_service = limits.Views(self.aspace)
-        self.max_connections = sessions_max + limits.MORE_CONNECTIONS
+        self.max_connections = sessions_max + limits.MORE_CONNECTIONS + limits.BEING_ENDED
         self.max_subscriptions = sessions_max * limits.SUBSCRIPTIONS_EACH
         self.min_session_timeout_ms, self.max_session_timeout_ms = map(float, limits.SESSION_TIMEOUT_MS)
         self.max_pending_activation_seconds = limits.LOGIN_S
@@ -82,7 +79,7 @@ class Stack(InternalServer):
         self.max_monitored_item_queue_size = limits.MAX_QUEUE
 
     def create_session(self, name: str, user: User = _NOBODY, external: bool = False) -> InternalSession:
-        if external and len(self._external_sessions) >= self._sessions_max:
+        if external and len(self._external_sessions) >= self.sessions_max:
             raise ServiceError(ua.StatusCodes.BadTooManySessions)
         return Session(self, self.aspace, self.subscription_service, name, user, external)
 
@@ -94,6 +91,7 @@ class OperatorServer(Server):
         """Raises CannotServe."""
         bound_decoder()
         super().__init__(iserver=stack)
+        self._sessions_max = stack.sessions_max
         self._trust = trust
         self._logins = logins
         self._proving = proving
@@ -109,13 +107,14 @@ class OperatorServer(Server):
             await self.get_node(ua.NodeId(number)).write_value(ua.Variant(limit, ua.VariantType.UInt32))
 
     async def start(self) -> None:
-        """Raises CannotServe. `stop` is needed all the same."""
-        await self._setup_server_nodes()
-        policies = [_Trusted(policy, self._trust.why_not) for policy in self._policies]
-        await self.iserver.start()
+        """Raises CannotServe, and may be called again then. `stop` is needed all the same."""
         host, port = self.endpoint.hostname or "", self.endpoint.port or 0
-        self.bserver = Sockets(self.iserver, self._processor, host, port)
-        self.bserver.set_policies(policies)
+        if self.bserver is None:
+            await self._setup_server_nodes()
+            policies = [_Trusted(policy, self._trust.why_not) for policy in self._policies]
+            await self.iserver.start()
+            self.bserver = Sockets(self.iserver, self._processor, host, port)
+            self.bserver.set_policies(policies)
         try:
             await self.bserver.start()
         except OSError as error:
@@ -129,6 +128,11 @@ class OperatorServer(Server):
         """On which it listens."""
         return 0 if self.bserver is None else self.bserver.port
 
+    def end_strangers(self) -> None:
+        """To be called now and then: who was removed from the users is put out, and who does not log in."""
+        if isinstance(self.bserver, Sockets):
+            self.bserver.end_strangers()
+
     async def stop(self) -> None:
         if self.iserver.time_task is not None:
             self.iserver.time_task.cancel()  # asyncua would wait for its next second
@@ -136,7 +140,12 @@ class OperatorServer(Server):
         await super().stop()
 
     def _processor(self, transport: asyncio.Transport, bounds: TransportLimits) -> Processor:
-        return Processor(self.iserver, self._logins, self._proving, transport, bounds)
+        return Processor(self.iserver, self._logins, self._proving, self._has_its_share, transport, bounds)
+
+    def _has_its_share(self, address: str) -> bool:
+        """No more sessions are for clients of this address."""
+        most = math.ceil(limits.SHARE * self._sessions_max)
+        return isinstance(self.bserver, Sockets) and self.bserver.sessions_from(address) >= most
 
 
 def _load(stack: Stack, pki: Path) -> str:
@@ -149,7 +158,7 @@ def _load(stack: Stack, pki: Path) -> str:
             raise CannotServe(f"{pki / PRIVATE_KEY} is not the key of {pki / CERTIFICATE}: move both away; {way_out}")
         return application_uri(stack.certificate)
     except FileNotFoundError as error:
-        raise NotSetUp(f"there is no {error.filename}: {way_out}") from error
+        raise CannotServe(f"there is no {error.filename}: {way_out}") from error
     except OSError as error:
         raise CannotServe(f"{error.filename} cannot be read: {error.strerror}") from error
     except (NotUsable, ValueError, TypeError) as error:

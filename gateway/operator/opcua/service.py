@@ -7,6 +7,7 @@ from pathlib import Path
 
 from gateway.core.decisions import ProposalList, ProposalShown
 from gateway.core.line import Line
+from gateway.operator.access import Access
 from gateway.operator.line_side import LineSide, NotTold
 from gateway.operator.opcua.alarm_nodes import alarms_of, live_alarm_paths, make_alarms
 from gateway.operator.opcua.companion import make_companion
@@ -19,6 +20,7 @@ from gateway.operator.opcua.proposal_nodes import MOST_WAITING, ProposalNodes
 from gateway.operator.opcua.server import OperatorServer, make_server
 from gateway.operator.opcua.space import NAMESPACE, NO_COMMUNICATION, WAITING, Space
 from gateway.operator.opcua.trust import TrustList
+from gateway.operator.users import RoleOf
 
 STALE_S = 2.0  #: older than this nothing counts as known
 LOOK_S = 0.5  #: between two looks at the audit and at the age of what is known
@@ -28,13 +30,29 @@ WAITS = "waiting"  #: the stage of a proposal that waits for a person
 class OpcUa:
     """`start`, then `run` as a task, then `stop`."""
 
-    def __init__(self, line: Line, side: LineSide, pki: Path, check: Check, tell: Callable[[str], None]) -> None:
+    def __init__(
+        self,
+        line: Line,
+        side: LineSide,
+        pki: Path,
+        check: Check,
+        role_of: RoleOf,
+        tell: Callable[[str], None],
+        access: Access | None = None,
+    ) -> None:
         """Raises CannotServe."""
         anonymous = line.operator.anonymous == "read"
         trust = TrustList(pki, tell, lambda: datetime.now(UTC))
         self.server: OperatorServer = make_server(
-            line.operator.opc_ua, line.operator.sessions_max, Logins(check, anonymous), anonymous, trust, pki
+            line.operator.opc_ua,
+            line.operator.sessions_max,
+            Logins(check, role_of, anonymous, access),
+            anonymous,
+            trust,
+            pki,
         )
+        self.page_trouble: Callable[[], str] = str  #: why there is no page; empty: there is one
+        self._made = False
         self._line = line
         self._side = side
         self._say = tell
@@ -43,7 +61,14 @@ class OpcUa:
         self._shown_of: ProposalList | None = None  #: of which list
 
     async def start(self) -> None:
-        """Raises CannotServe; `stop` is needed all the same."""
+        """Raises CannotServe, and may be called again then; `stop` is needed all the same."""
+        if not self._made:
+            await self._make()
+            self._made = True
+        await self.server.start()
+
+    async def _make(self) -> None:
+        """All nodes."""
         server = self.server
         await server.init()
         self._space = Space(server, await server.register_namespace(NAMESPACE))
@@ -59,23 +84,27 @@ class OpcUa:
         self._side.on_status.append(lambda _: self._new_status.set())
         self._side.on_proposals.append(lambda _: self._new_proposals.set())
         self._new_proposals.set()
-        await server.start()
 
     async def run(self) -> None:
         """Until it is cancelled."""
         async with asyncio.TaskGroup() as group:
             for show, event in ((self._show_line, self._new_status), (self._show_proposals, self._new_proposals)):
                 group.create_task(_again(show, event))
-            group.create_task(_again(lambda: self._events.look(), asyncio.Event()))
+            group.create_task(_again(self._events.look, asyncio.Event()))
+            group.create_task(_again(self._end_strangers, asyncio.Event()))
 
     async def stop(self) -> None:
         await self.server.stop()
+
+    async def _end_strangers(self) -> None:
+        self.server.end_strangers()
 
     async def _show_line(self) -> None:
         side = self._side
         age_s = side.age_s
         fresh = _is_fresh(age_s)
-        await self._tell((Told(f"{ROOT}.Connection.Fresh", fresh), Told(f"{ROOT}.Connection.Trouble", side.trouble)))
+        connection = {"Fresh": fresh, "Trouble": side.trouble, "PageTrouble": self.page_trouble()}
+        await self._tell(Told(f"{ROOT}.Connection.{name}", value) for name, value in connection.items())
         if side.status is not None and fresh:
             await self._tell((*of_status(side.status), *alarms_of(side.status)), side.status.wall_s)
             if side.proposals is not None and _is_fresh(side.proposals_age_s):

@@ -1,5 +1,6 @@
 """A client's session: whose it is, and what it may ask for. Nothing can be written, and each has its own alone."""
 
+from collections.abc import Callable
 from contextvars import ContextVar
 from typing import Any
 
@@ -16,8 +17,17 @@ ua: Any = asyncua_ua  #: what it declares of its values and what they are differ
 CALLER: ContextVar[Person | None] = ContextVar("caller", default=None)
 
 
+def _nobody() -> Person | None:
+    return None
+
+
 class Session(InternalSession):
-    person: Person | None = None  #: as they have logged in; None: not yet
+    logged_in: Callable[[], Person | None] = staticmethod(_nobody)  #: who has, as they are now
+
+    @property
+    def person(self) -> Person | None:
+        """None: nobody has logged in yet, or who has is no user any more."""
+        return self.logged_in()
 
     async def read(self, params: Any) -> list[Any]:
         at_most(len(params.NodesToRead), MAX_READ)

@@ -3,6 +3,8 @@ other.
 """
 
 import asyncio
+import time
+from collections import Counter
 from collections.abc import Callable
 from typing import Any, cast
 
@@ -14,8 +16,9 @@ from asyncua.server.internal_server import InternalServer
 from asyncua.ua.ua_binary import uatcp_to_binary
 from asyncua.ua.uaerrors import UaStatusCodeError
 
-from gateway.operator.opcua.limits import MAX_CHUNK, MAX_CHUNKS, MAX_MESSAGE
-from gateway.operator.opcua.processor import Processor
+from gateway.operator.opcua import limits
+from gateway.operator.opcua.limits import LEAST_CHUNK, MAX_CHUNK, MAX_CHUNKS, MAX_MESSAGE
+from gateway.operator.opcua.processor import Processor, address_of
 
 ua: Any = asyncua_ua  #: what it declares of its values and what they are differ
 
@@ -39,9 +42,44 @@ class Sockets(BinaryServer):
             await asyncio.sleep(0)  # they are told of their end in the next turn of the loop
         await super().stop()
 
+    def end_strangers(self) -> None:
+        """Connections of those who are no users any more, and those that have had no session for too long."""
+        now_s = time.monotonic()
+        for one in self._open():
+            if one.services.is_logged_in():
+                one.without_s = now_s
+            if one.services.is_nobodys() or now_s - one.without_s > limits.LOGIN_S:
+                one.end()
+
+    def sessions_from(self, address: str) -> int:
+        """Of connections that are open, also such as nobody has logged in to yet."""
+        return sum(one.address == address and one.services.session is not None for one in self._open())
+
+    def make_room(self, address: str) -> bool:
+        """For a connection from there, which has no session yet. False: there is none.
+
+        One is ended of the address that has most of them, the oldest on which nobody has shown a trusted certificate:
+        who floods takes places from nobody but themselves.
+        """
+        waiting = [one for one in self._open() if not one.services.is_logged_in()]
+        if len(waiting) < limits.MORE_CONNECTIONS:
+            return True
+        held = Counter([address, *(one.address for one in waiting)])
+        most = max(held.values())
+        theirs = [one for one in waiting if held[one.address] == most]
+        unproven = [one for one in theirs if not one.services.is_encrypted()]
+        if not unproven and held[address] == most:
+            return False
+        (unproven or theirs)[0].end()
+        return True
+
+    def _open(self) -> list["_Connection"]:
+        """In the order in which they came."""
+        return [one for one in self.clients if isinstance(one, _Connection) and one.is_open()]
+
     def _make_protocol(self) -> OPCUAProtocol:
         connection = _Connection(self.iserver, self._policies, self.clients, self.closing_tasks, self.limits)
-        connection.make = self._make
+        connection.make, connection.make_room = self._make, self.make_room
         return connection
 
 
@@ -49,12 +87,29 @@ class _Connection(OPCUAProtocol):
     """One client. Refuses a message that says it is too large before it has come."""
 
     make: MakeProcessor
+    make_room: Callable[[str], bool]
+    services: Processor  #: of an open one
+    address = ""
+    without_s = 0.0  #: since when it has had no session, as it was seen last
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        address = address_of(transport)
+        if not self.make_room(address):
+            cast(asyncio.Transport, transport).abort()
+            return
         super().connection_made(transport)
         if self.transport is not None:  # otherwise there are too many already
-            self.processor = self.make(self.transport, self.limits)
-            self.processor.set_policies(self.policies)
+            self.address, self.without_s = address, time.monotonic()
+            self.processor = self.services = self.make(self.transport, self.limits)
+            self.services.set_policies(self.policies)
+
+    def is_open(self) -> bool:
+        return self.transport is not None and not self.transport.is_closing()
+
+    def end(self) -> None:
+        """At once, also where the other side reads nothing."""
+        if self.transport is not None:
+            self.transport.abort()
 
     def data_received(self, data: bytes) -> None:
         transport = self.transport
@@ -74,6 +129,10 @@ class _Connection(OPCUAProtocol):
             self.transport.resume_reading()
 
     async def _process_one_msg(self, header: Any, buf: Buffer) -> bool:
+        await asyncio.sleep(0)  # the others' turn: a client may send many at once, and each takes its time
+        if header.MessageType == ua.MessageType.Hello and _least_buffer(buf.copy()) < LEAST_CHUNK:
+            self._refuse(ua.StatusCodes.BadTcpNotEnoughResources)
+            return False
         try:
             return await super()._process_one_msg(header, buf)
         except (ServiceError, UaStatusCodeError) as error:
@@ -87,3 +146,9 @@ class _Connection(OPCUAProtocol):
         if self.transport is not None and not self.transport.is_closing():
             self.transport.write(uatcp_to_binary(ua.MessageType.Error, ua.ErrorMessage(ua.StatusCode(code))))
             self.transport.close()
+
+
+def _least_buffer(hello: Buffer) -> int:
+    """Bytes; 0 where it is cut off. Answers in pieces of a few bytes would keep the server busy for a second each."""
+    said = hello.read(min(12, len(hello)))  # the protocol's version, then what the client receives and sends at most
+    return min(int.from_bytes(said[4:8], "little"), int.from_bytes(said[8:12], "little"))

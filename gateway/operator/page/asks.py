@@ -13,7 +13,7 @@ from gateway.core.line import Line
 from gateway.core.line_past import TensionsBetween
 from gateway.core.messages import Reply
 from gateway.core.people import LEAST, Said, may, why_may_not
-from gateway.operator.line_side import LineSide, NotTold
+from gateway.operator.line_side import LineSide, NoAnswer, NotTold
 from gateway.operator.page.guard import body_of
 from gateway.operator.page.login import Door
 from gateway.operator.page.tick import line_told
@@ -97,14 +97,10 @@ class Asks:
 
 
 def _status(reply: Reply) -> int:
-    """409: the gateway refuses. 504: it did not answer, and nobody knows whether it was done.
-
-    The latter comes from this side, with its text as the only reason: what the gateway refuses says what was refused,
-    and why.
-    """
+    """409: the gateway refuses. 504: it did not answer, and nobody knows whether it was done."""
     if reply.ok:
         return 200
-    return 504 if not reply.state and reply.reasons == [reply.text] else 409
+    return 504 if isinstance(reply, NoAnswer) else 409
 
 
 def _object(body: bytes) -> dict[str, Any]:

@@ -1,5 +1,5 @@
 // Alarms: what is wrong, why, what follows, what to do; seen, or out of the way for a while.
-import { $, english, h, replaced, setText } from "./dom.js";
+import { $, coded, english, h, replaced, setText } from "./dom.js";
 import { confirmed } from "./dialog.js";
 import { time, word } from "./words.js";
 
@@ -16,11 +16,15 @@ export class Alarms {
     const rank = (one) => (shelved(one) ? 20 : 0) + (one.active ? 0 : 10) + ORDER.indexOf(one.priority);
     const sorted = [...alarms].sort((a, b) => rank(a) - rank(b) || a.since_wall_s - b.since_wall_s);
     const open = sorted.filter((one) => one.active && !shelved(one));
-    for (const one of open) {
-      const key = `${one.name} ${one.since_wall_s}`;
-      if (!this.known.has(key)) setText($("alert"), `${word(`priority.${one.priority}`)}: ${one.means}`);
-      this.known.add(key);
-    }
+    const keys = open.map((one) => `${one.name} ${one.since_wall_s}`);
+    if (!keys.includes(this.told)) setText($("alert"), ""); // what is over is not read out to who looks around
+    open.forEach((one, i) => {
+      if (!this.known.has(keys[i])) {
+        setText($("alert"), `${word(`priority.${one.priority}`)}: ${one.means}`);
+        this.told = keys[i];
+      }
+      this.known.add(keys[i]);
+    });
     replaced($("now-alarms"), `${document.documentElement.lang} ${open.length} ${open[0]?.name}`, () =>
       open.length ? h("span", { class: `alarm-count ${open[0].priority}` }, `▲ ${open.length}`) : word("alarms.none-short"));
     replaced($("alarm-list"), JSON.stringify([sorted, document.documentElement.lang]), () =>
@@ -35,10 +39,10 @@ export class Alarms {
       h("p", {}, h("b", { class: bad ? "tag" : "tag over" }, `${bad ? "▲ " : ""}${word(`priority.${one.priority}`)}`), " ", english("b", one.means)),
       english("p", one.text),
       h("p", { class: "muted" }, `${time(one.since_wall_s, true)}, ${state}, ${seen}`, one.first_out && `, ${word("alarms.first")}`),
-      h("p", {}, h("b", {}, word("alarms.action")), " ", english("span", one.action)),
+      h("p", {}, h("b", {}, word("alarms.action")), " ", coded("span", one.action)),
       h("details", {}, h("summary", { "data-focus": `why-${one.name}` }, word("alarms.why")),
-        h("p", {}, h("b", {}, word("alarms.cause")), " ", english("span", one.cause)),
-        h("p", {}, h("b", {}, word("alarms.consequence")), " ", english("span", one.consequence))),
+        h("p", {}, h("b", {}, word("alarms.cause")), " ", coded("span", one.cause)),
+        h("p", {}, h("b", {}, word("alarms.consequence")), " ", coded("span", one.consequence))),
       this.may("acknowledge") && h("div", { class: "buttons" },
         !one.acknowledged && h("button", { type: "button", "data-focus": `ack-${one.name}`, onclick: () => this.say({ command: "acknowledge", alarm: one.name }) }, word("alarms.acknowledge")),
         h("button", { type: "button", "data-focus": `shelve-${one.name}`, onclick: () => this.shelve(one) }, word(shelved(one) ? "alarms.unshelve" : "alarms.shelve"))));

@@ -73,6 +73,7 @@ export class Change {
     return h("section", { class: "panel" },
       h("h2", {}, word(`kind.${shown.kind}`), " ", h("code", {}, shown.proposal_hash.slice(0, 12))),
       h("p", {}, word(`stage.${shown.stage}`), shown.why && [": ", english("span", shown.why)]),
+      shown.shown && twoPeople(shown) && h("p", {}, h("b", {}, twoPeople(shown))),
       h("h3", {}, word("change.difference")), h("ul", {}, shown.difference.map((line) => english("li", line))),
       h("h3", {}, word("change.reason")), quoted,
       shown.evidence.length > 0 && [h("h3", {}, word("change.evidence")), h("ul", {}, shown.evidence.map(evidence))],
@@ -103,7 +104,7 @@ export class Change {
   }
 
   async decide(shown, approve) {
-    const then = approve ? [shown.two_people && word("change.two-people"), word(`change.then-${shown.kind}`, { lasts: duration(shown.lasts_s ?? 0) })] : [word("change.then-reject")];
+    const then = approve ? [twoPeople(shown), word(`change.then-${shown.kind}`, { lasts: duration(shown.lasts_s ?? 0) })] : [word("change.then-reject")];
     const answer = await confirmed({
       title: word(approve ? "change.sure-approve" : "change.sure-reject"),
       lines: [...then.filter(Boolean), ...judged(shown.verdict?.region), ...shown.difference.map((line) => ({ english: line })),
@@ -121,6 +122,12 @@ export class Change {
     const left_s = Date.parse(this.shown.expires) / 1000 - now_s;
     setText(element, left_s > 0 ? word("change.expires", { left: duration(left_s) }) : word("change.expired"));
   }
+}
+
+// Empty: one is enough.
+function twoPeople(shown) {
+  if (shown.approvals < 2) return "";
+  return shown.approved_by ? word("change.second", { name: shown.approved_by }) : word("change.two-people");
 }
 
 // How far the gate has judged it; beyond that the line does not go with it.

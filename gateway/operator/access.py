@@ -1,0 +1,124 @@
+"""What happens at the door, told to the gateway for its audit: who came in, from where others tried, who the users are.
+
+Nothing here lets anybody in or keeps them out. What cannot be told now is told later; of wrong logins the number is.
+"""
+
+import asyncio
+import hashlib
+from collections import OrderedDict, deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Literal
+
+from gateway.core.access import MOST_NAMES, MOST_PLACES, CameIn, UsersNow, WrongLogins, WrongPlace
+from gateway.core.people import Person, Role
+from gateway.operator.line_side import LineSide
+from gateway.operator.users import MOST_BYTES, UsersFile, UsersRefused
+
+LOOK_S = 1.0  #: between two looks at the users' file, and at what there is to tell
+REPORT_S = 60.0  #: between two reports of wrong logins, and after which the users are told again
+MOST_WAITING = 100  #: who came in while the gateway was away
+LONGEST_ADDRESS = 64
+
+Through = Literal["opc-ua", "page"]
+
+
+@dataclass
+class _Wrong:
+    count: int = 0
+    users: set[str] = field(default_factory=set[str])
+
+
+class Access:
+    """`run` as a task; the others from the same event loop."""
+
+    def __init__(
+        self, side: LineSide, users: UsersFile, tell: Callable[[str], None], clock: Callable[[], float]
+    ) -> None:
+        self._side = side
+        self._users = users
+        self._tell = tell
+        self._clock = clock
+        self._came: deque[CameIn] = deque(maxlen=MOST_WAITING)
+        self._wrong: OrderedDict[tuple[Through, str, str | None], _Wrong] = OrderedDict()
+        self._elsewhere = 0
+        self._reported_s = clock()
+        self._told: UsersNow | None = None
+        self._told_s = clock()
+        self._trouble = ""  #: of the users' file, as it was told
+
+    def came_in(self, person: Person, address: str) -> None:
+        self._came.append(CameIn(person=person, address=address[:LONGEST_ADDRESS]))
+
+    def refused(self, through: Through, address: str, certificate: str | None, name: str) -> None:
+        """Name and password that let nobody in."""
+        key = through, address[:LONGEST_ADDRESS], certificate
+        if key not in self._wrong and len(self._wrong) >= MOST_PLACES:
+            self._elsewhere += 1
+            return
+        wrong = self._wrong.setdefault(key, _Wrong())
+        wrong.count += 1
+        # What is no user's name may be a password in the wrong field: it is written nowhere.
+        if len(wrong.users) < MOST_NAMES and self._users.role_of(name) is not None:
+            wrong.users.add(name)
+
+    async def run(self) -> None:
+        """Until it is cancelled."""
+        while True:
+            await self.look()
+            await asyncio.sleep(LOOK_S)
+
+    async def look(self) -> None:
+        """Tell what there is to tell."""
+        await self._tell_users()
+        while self._came and await self._side.at_the_door(first := self._came[0]):
+            if self._came and self._came[0] is first:  # so many may have come meanwhile that it is gone
+                self._came.popleft()
+        if self._wrong and self._clock() - self._reported_s >= REPORT_S:
+            await self._report()
+
+    async def _tell_users(self) -> None:
+        try:
+            now = self._users_now()
+        except UsersRefused as refused:
+            if str(refused) != self._trouble:
+                self._trouble = str(refused)
+                self._tell(f"nobody can log in: {refused}")
+            return
+        self._trouble = ""
+        if now == self._told and self._clock() - self._told_s < REPORT_S:
+            return
+        if await self._side.at_the_door(now):
+            self._told, self._told_s = now, self._clock()
+
+    def _users_now(self) -> UsersNow:
+        """Raises UsersRefused."""
+        roles: dict[str, Role] = {one.name: one.role for one in self._users.current().entries()}
+        try:
+            with self._users.path.open("rb") as stream:
+                digest = hashlib.sha256(stream.read(MOST_BYTES)).hexdigest()
+        except OSError:
+            digest = None
+        return UsersNow(roles=roles, file=digest)
+
+    async def _report(self) -> None:
+        wrong, elsewhere = self._wrong, self._elsewhere
+        places = [
+            WrongPlace(through=through, address=address, certificate=certificate, count=one.count,
+                       users=sorted(one.users))
+            for (through, address, certificate), one in wrong.items()
+        ]  # fmt: skip
+        self._wrong, self._elsewhere, self._reported_s = OrderedDict(), 0, self._clock()
+        if not await self._side.at_the_door(WrongLogins(places=places, elsewhere=elsewhere)):
+            self._take_back(wrong, elsewhere)
+
+    def _take_back(self, wrong: OrderedDict[tuple[Through, str, str | None], _Wrong], elsewhere: int) -> None:
+        """What could not be told stays, with what came meanwhile."""
+        for key, one in self._wrong.items():
+            if key in wrong or len(wrong) < MOST_PLACES:
+                before = wrong.setdefault(key, _Wrong())
+                before.count += one.count
+                before.users = set(sorted(before.users | one.users)[:MOST_NAMES])
+            else:
+                elsewhere += one.count
+        self._wrong, self._elsewhere = wrong, self._elsewhere + elsewhere
