@@ -8,9 +8,12 @@ from pathlib import Path
 
 from asyncua import Client, ua
 
+from gateway.cli.pki_opcua import trust
 from gateway.operator.opcua.companion import DI, MACHINE, MACHINERY, MACHINES, PROCESS, PROCESS_VALUES
-from tests.protocol.operator_support import bench
+from tests.operator.real_line import until
+from tests.protocol.operator_support import PASSWORD, Bench, bench, pair
 from tests.system.needs import PEERS
+from tests.system.peer import Spoken
 
 FOLDER = PEERS / "node_modules" / "node-opcua-nodesets" / "nodesets"
 SPANS = 6
@@ -95,7 +98,7 @@ async def _story() -> None:
         await _nothing_takes(b, client)
 
 
-async def _nothing_takes(b, client: Client) -> None:
+async def _nothing_takes(b: Bench, client: Client) -> None:
     numbers = [await client.get_namespace_index(uri) for uri in BROUGHT]
     called = 0
     for node_id in [one for one in b.opcua.server.iserver.aspace.keys() if one.NamespaceIndex in numbers]:
@@ -113,3 +116,39 @@ async def _nothing_takes(b, client: Client) -> None:
 
 def test_the_published_node_sets_carry_the_line() -> None:
     asyncio.run(asyncio.wait_for(_story(), 240.0))
+
+
+def test_a_client_on_another_stack_reads_process_values_and_hears_of_changes(tmp_path: Path) -> None:
+    async def story() -> None:
+        async with bench(2, nodesets=str(FOLDER)) as b:
+            panel = pair("panel")
+            trust(b.pki, panel.certificate)
+            (b.pki / "opcua-client-panel.pem").write_bytes(panel.certificate)
+            (b.pki / "opcua-client-panel.key.pem").write_bytes(panel.private_key)
+            async with b.connected("vera") as own:
+                await b.until(own, f"{PROCESS}.2.AnalogSignal", lambda found: found.StatusCode.is_good())
+            await asyncio.to_thread(_on_another_stack, b, tmp_path)
+
+    asyncio.run(asyncio.wait_for(story(), 240.0))
+
+
+def _on_another_stack(b: Bench, folder: Path) -> None:
+    signal, setpoint = f"{PROCESS}.2.AnalogSignal", f"{PROCESS}.2.ProcessValueSetpoint"
+    location = f"{MACHINE}.Identification.Location"
+    with Spoken("operator_client.js", b.url, b.pki, folder / "client", log=folder / "log") as client:
+        assert client("connect", "vera", {"user": "vera", "password": PASSWORD})["refused"] is None
+        low, high = b.line.limits.tension_min_n, b.line.limits.tension_max_n
+        for path in (signal, setpoint):
+            assert client("analog", "vera", path) == {
+                "unit": 5129559, "symbol": "N", "of": "http://www.opcfoundation.org/UA/units/un/cefact",
+                "low": low, "high": high,
+            }  # fmt: skip
+        found = client("read", "vera", [signal, setpoint, location])
+        assert [found[path]["value"] for path in (signal, setpoint, location)] == [21.0, 21.0, b.line.site]
+        assert client("watch", "vera", [signal])["refused"] == []
+        b.gateway.tension_n = 30.0
+        until(
+            lambda: client("seen", "vera").get(signal), lambda seen: seen is not None and seen["last"]["value"] == 31.0
+        )
+        assert client("write", "vera", signal, 1.0) == "BadUserAccessDenied"
+        client("close", "vera")
