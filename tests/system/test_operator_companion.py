@@ -147,8 +147,7 @@ def _on_another_stack(b: Bench, folder: Path) -> None:
         assert [found[path]["value"] for path in (signal, setpoint, location)] == [21.0, 21.0, b.line.site]
         assert client("watch", "vera", [signal])["refused"] == []
         b.gateway.tension_n = 30.0
-        until(
-            lambda: client("seen", "vera").get(signal), lambda seen: seen is not None and seen["last"]["value"] == 31.0
-        )
+        heard = until(lambda: client("seen", "vera").get(signal), lambda seen: seen and seen["last"]["value"] == 31.0)
+        assert heard["last"]["status"] == "Good"
         assert client("write", "vera", signal, 1.0) == "BadUserAccessDenied"
         client("close", "vera")
