@@ -40,7 +40,7 @@ def told(setup: Setup, password: str, waiting: str, run_folder: str) -> list[str
         "The line runs on. Ctrl-C brings it to rest and ends all. Nobody but this machine reaches it.",
         "",
         f"page    {operator.page}",
-        f"        log in as {', '.join(ROLES)}; the password of all three, for this run: {password}",
+        f"        log in as {' or '.join(ROLES)}; the password of all three, for this run: {password}",
         f"OPC UA  {operator.opc_ua}, signed and encrypted, for the same users",
         f"        your client's certificate: r2rgate pki trust FILE --line {line} --data-dir {data}",
         "",

@@ -4,7 +4,8 @@ A damaged audit is told as far as it can be read; what is wrong with it is told,
 """
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from pydantic import TypeAdapter, ValidationError
@@ -18,7 +19,7 @@ from gateway.core.verdict import Verdict
 from gateway.supervisor.audit_file import AuditFile, AuditUnavailable
 from gateway.supervisor.audit_verify import Verification, chained, verify
 from gateway.supervisor.audit_writer import NOT_DONE
-from gateway.supervisor.lifecycle import PROPOSED, Book, Impossible
+from gateway.supervisor.lifecycle import PROPOSED, STEPS, Book, Impossible
 
 FAR_S = 4e9  #: beyond any wall clock
 _SEQUENCES: TypeAdapter[set[int]] = TypeAdapter(set[int])
@@ -90,16 +91,30 @@ def _fold(records: Iterable[AuditRecord], told: LineRecords) -> dict[str, list[A
     for one in records:
         if one.sequence in not_done:
             continue
-        try:
-            told.book.apply(one.kind, one.what)
-        except (Impossible, KeyError, ValueError) as error:
-            told.problems.append(f"record {one.sequence}, {one.kind}, does not follow from those before: {error}")
+        if against := _against(told.book, one):
+            told.problems.append(f"record {one.sequence}, {one.kind}, does not follow from those before: {against}")
         proposal = one.what.get("proposal")
         if isinstance(proposal, str) and (one.kind == PROPOSED or proposal in steps):
             steps.setdefault(proposal, []).append(one)
         else:
             told.others.append(one)
     return steps
+
+
+def _against(book: Book, record: AuditRecord) -> str:
+    """Why it does not follow; empty: it does. The book has it either way, as if what is missing were there."""
+    kind, what = record.kind, record.what
+    try:
+        book.apply(kind, what)
+        return ""
+    except (Impossible, KeyError, ValueError) as error:
+        against = str(error)
+    entry = book.entries.get(str(what.get("proposal")))
+    if entry is not None and kind in STEPS:
+        book.entries[entry.proposal] = replace(entry, stage=STEPS[kind][0][0])
+        with suppress(Impossible, KeyError, ValueError):
+            book.apply(kind, what)
+    return against
 
 
 def _sequences(what: Mapping[str, object]) -> set[int]:

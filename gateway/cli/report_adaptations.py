@@ -70,7 +70,7 @@ def proposals_section(proposals: Sequence[Recorded], changes: Sequence[ChangeRes
     heads = ("Proposed, UTC", "What", "By", "Verdict", "Decided by", "Came to")
     rows = tuple(
         (
-            when(one.steps[0].wall_s), what_of(one), one.proposal.author, verdict_words(change),
+            when(one.steps[0].wall_s), what_of(one), one.proposal.author, verdict_words(change).partition(";")[0],
             _decided_by(one), _came_to(one),
         )
         for one, change in zip(proposals, changes, strict=True)

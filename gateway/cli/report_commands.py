@@ -42,6 +42,8 @@ def report(
             f"there is no audit in {folder}, so nothing to report: a gateway begins one when it starts; --data-dir "
             "FOLDER names another folder"
         )
+    if not out.parent.is_dir():  # before anything that takes its time
+        refuse(f"--out {out} cannot be written: there is no folder {out.parent}; name a file in a folder that is there")
     from gateway.cli.line_records import read_records
     from gateway.cli.report.page_render import render_page
     from gateway.cli.report_page import page_of
@@ -49,7 +51,7 @@ def report(
     def tell(text: str) -> None:
         typer.echo(printable(text), err=True)
 
-    tell(f"read: {folder}")
+    tell(f"reading {folder}; where nothing was simulated before, the first simulation compiles for some seconds")
     records = read_records(folder)
     lines = {(one.proposal.site, one.proposal.line) for one in records.proposals}
     if others := sorted(lines - {(described.site, described.line)}):

@@ -8,15 +8,16 @@ import numpy as np
 
 from gateway.commissioning.ground import course_of
 from gateway.commissioning.suite import suite_of
+from gateway.control.design import DesignRefused, design_mpc, task_on
 from gateway.control.rollout import Course, Rollouts, plants_of_thetas, simulate
-from gateway.core.controller import Controller
+from gateway.core.controller import Controller, config_hash
 from gateway.core.deployment import Region
 from gateway.core.line import Line
 from gateway.core.line_model import LineModel, noise_of, theta_of
 from gateway.core.metrics import RunMetrics, run_metrics
 from gateway.core.scenario import PAPER, Scenario
 from gateway.core.signals import FloatArray
-from gateway.core.theta import Noise, nominal_theta
+from gateway.core.theta import Noise, Theta, nominal_theta
 from safety.simulated import setup_of
 
 SEED = 1
@@ -30,7 +31,8 @@ class Named:
     name: str  #: Initial, Adapt1 ...
     hash: str
     controller: Controller
-    region: Region | None  #: for which it was judged; None: that is not known
+    region: Region | None  #: for which it was judged; None: it was not, or that is not known
+    unjudged: str = "not judged: the line was started with it"  #: what to say then
 
 
 @dataclass(frozen=True)
@@ -56,6 +58,20 @@ class Conditions:
     def noise(self) -> Noise:
         return Noise() if self.model is None else noise_of(self.model) or Noise()
 
+    @property
+    def theta(self) -> Theta:
+        """As it is believed to be."""
+        return nominal_theta(self.line) if self.model is None else theta_of(self.model)
+
+    @property
+    def reference(self) -> Named | None:
+        """The paper's other baseline: predictive control that is designed on this very model; None: there is none."""
+        try:
+            controller = design_mpc(task_on(self.line, self.theta, self.noise))
+        except DesignRefused:
+            return None
+        return Named("MPC baseline", config_hash(controller), controller, None, "never proposed: a reference")
+
     def run(self, controller: Controller, case: Scenario) -> Simulated:
         """RMSE, effort and courses under noise; overshoot and settling without, where they are no matter of luck."""
         course = course_of(case, self.line.control.period_s)
@@ -64,14 +80,13 @@ class Conditions:
             return Simulated(noisy.tension_n[0], noisy.torque_nm[0], inf, inf, inf, inf)
         of_noisy, of_quiet = (self._metrics(one, course) for one in (noisy, quiet))
         return Simulated(
-            noisy.tension_n[0], noisy.torque_nm[0], of_noisy.rmse_n, float(of_quiet.overshoot_pct.max()),
-            float(of_quiet.settling_s.max()), of_noisy.effort_n2m2s,
+            noisy.tension_n[0], noisy.torque_nm[0], of_noisy.rmse_n, float(of_quiet.overshoot_pct.max(initial=0.0)),
+            float(of_quiet.settling_s.max(initial=0.0)), of_noisy.effort_n2m2s,
         )  # fmt: skip
 
     def _rollouts(self, controller: Controller, course: Course, noise: Noise) -> Rollouts:
-        theta = nominal_theta(self.line) if self.model is None else theta_of(self.model)
-        latency_s = max(theta.latency_s, self.line.control.latency_s)
-        plants = plants_of_thetas([replace(theta, latency_s=latency_s)])
+        latency_s = max(self.theta.latency_s, self.line.control.latency_s)
+        plants = plants_of_thetas([replace(self.theta, latency_s=latency_s)])
         return simulate(controller, plants, course, setup_of(self.line, noise, SEED, 0.0), record=True)
 
     def _metrics(self, run: Rollouts, course: Course) -> RunMetrics:
@@ -101,7 +116,7 @@ def simulated(
     found: dict[str, list[Simulated | str]] = {case.name: [] for case in cases}
     for case in cases:
         for one in named:
-            tell(f"simulated under identical conditions: {one.name}, {case.heading.lower()}")
+            tell(f"simulating {one.name}, {case.heading.lower()}")
             try:
                 found[case.name].append(conditions.run(one.controller, case))
             except ValueError as error:  # of another period, or another number of spans

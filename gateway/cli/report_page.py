@@ -65,7 +65,9 @@ def page_of(line: Line, folder: Path, since_s: float, records: LineRecords, tell
     conditions, cases = Conditions(line, told.model), cases_of(line)
     shown = [_changes(told, one) for one in told.proposals if one.shown.stage == Stage.KEPT]
     chosen = chosen_of(told.named, shown)
-    found = simulated(conditions, chosen, cases, tell)
+    reference = conditions.reference if chosen else None
+    beside = chosen if reference is None else [*chosen, reference]
+    found = simulated(conditions, beside, cases, tell)
     changes = changes_of(told.proposals, told.measured.of_proposals)
     asked = asked_result(told.interactions, [one.shown for one in records.proposals])
     names = {one.hash: one.name for one in told.named}
@@ -74,8 +76,8 @@ def page_of(line: Line, folder: Path, since_s: float, records: LineRecords, tell
     if told.proposals:
         sections.append(adaptations_section(told.proposals, changes, asked, told.named, told.measured.of_proposals))
     if chosen:
-        sections.append(summary_section(conditions, chosen, cases, found))
-        sections += [case_section(case, chosen, found[case.name], line.control.period_s, spans) for case in cases]
+        sections.append(summary_section(conditions, beside, cases, found))
+        sections += [case_section(case, beside, found[case.name], line.control.period_s, spans) for case in cases]
     sections += [
         measured_section(told.measured, names),
         asked_section(asked, changes, told.interactions, folder),
@@ -196,7 +198,7 @@ def _came(chosen: list[Named], cases: tuple[Scenario, ...], found: dict[str, lis
         return []
     parts: list[str] = []
     for case in cases:
-        first, last = found[case.name][0], found[case.name][-1]
+        first, last = found[case.name][0], found[case.name][len(chosen) - 1]
         if isinstance(first, Simulated) and isinstance(last, Simulated):
             parts.append(f"{case.heading.lower()} from {first.rmse_n:.3g} to {last.rmse_n:.3g} N")
     if not parts:

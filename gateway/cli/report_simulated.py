@@ -1,7 +1,7 @@
 """The report's figures of the paper: courses of tension and torque of each configuration under identical conditions."""
 
 from collections.abc import Mapping, Sequence
-from math import isfinite
+from math import ceil, isfinite
 
 import numpy as np
 
@@ -12,8 +12,9 @@ from gateway.commissioning.ground import course_of
 from gateway.core.scenario import Scenario
 from gateway.core.signals import FloatArray
 
-MOST_SHOWN = 6  #: as many as there are colours
-PLOT_EVERY_S = 0.02  #: at least, between the samples of a chart
+MOST_SHOWN = 5  #: with the reference as many as there are colours
+PLOT_EVERY_S = 0.01  #: at least, between the samples of a chart
+MANY_SPANS = 12  #: beyond which there are fewer samples, so that the page stays within some megabytes
 LOST = "ran away"
 
 
@@ -57,7 +58,7 @@ def _table(case: Scenario, named: Sequence[Named], found: Sequence[Simulated | s
     rows: list[tuple[str, ...]] = []
     before: Simulated | None = None
     for one, run in zip(named, found, strict=True):
-        judged = "not known" if one.region is None else beyond(case, one.region) or "yes"
+        judged = one.unjudged if one.region is None else beyond(case, one.region) or "yes"
         law = one.controller.kind.upper()
         if isinstance(run, str):
             rows.append((one.name, law, "-", "-", "-", "-", "-", f"not simulated: {run}"))
@@ -94,7 +95,7 @@ def case_section(
     if not runs:
         return Section(title, (case.description, "None could be simulated."))
     course = course_of(case, period_s)
-    every = max(1, round(PLOT_EVERY_S / period_s))
+    every = max(1, round(PLOT_EVERY_S / period_s)) * ceil(len(spans) / MANY_SPANS)
     time_s: FloatArray = time_of(course, period_s)[::every]
     tension, torque = list[Chart](), list[Chart]()
     for span, span_name in enumerate(spans):

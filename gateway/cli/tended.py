@@ -26,10 +26,11 @@ class Exit:
     at_s: float  #: monotonic
     log: Path
     tail: list[str]  #: the last lines that it wrote
+    is_needed: bool = True  #: False: the line does without it, whatever it is refused
 
     @property
     def is_final(self) -> bool:
-        return self.code in FINAL
+        return self.is_needed and self.code in FINAL
 
     def lines(self) -> list[str]:
         """The headline and the last words, one line each."""
@@ -50,6 +51,7 @@ class Child:
     name: str
     arguments: Callable[[], list[str]]  #: asked for at every start
     log: Path
+    is_needed: bool = True
     ended: int = 0
     _process: subprocess.Popen[str] | None = None
     _pause_s: float = FIRST_PAUSE_S
@@ -68,7 +70,7 @@ class Child:
             self._due_s = now_s + self._pause_s
             self._pause_s = min(2.0 * self._pause_s, LONGEST_PAUSE_S)
             self.ended += 1
-            return Exit(self.name, code, self.ended, now_s, self.log, self.said()[-LAST_LINES:])
+            return Exit(self.name, code, self.ended, now_s, self.log, self.said()[-LAST_LINES:], self.is_needed)
         if now_s >= self._due_s:
             self._due_s = now_s
             self._log_start = self.log.stat().st_size if self.log.exists() else 0

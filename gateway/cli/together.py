@@ -28,8 +28,8 @@ REFRESH_S = 0.2
 NOTES_S = 20.0  #: how long the screen shows what the loop said of its start
 MOST_NOTES = 4  #: of the operator's process
 EXIT_S = 60.0  #: how long it shows the last words of a child that has ended; then one line remains
-DONE_WITHOUT = ("agents", "operator")  #: what the line runs on without, whatever they are refused
-_REACHED = "operator of "  #: so begins the operator's word of where it is reached
+#: How the operator's process says where it is reached, where not, and where it is again.
+_REACHED, _SHUT, _TRIED, _OPEN = "operator of ", "no ", ", it is tried again", " now"
 #: How the loop's ordinary words at its start begin; all others are for the person at the terminal.
 _ORDINARY = ("loop of ", "pinned to ", "real-time priority ", "memory locked")
 
@@ -52,8 +52,8 @@ def run_together(
     children = [
         Child("gateway", lambda: gateway, data_folder / "gateway.log"),
         Child("loop", lambda: loop, data_folder / "loop.log"),
-        Child("agents", lambda: gateway, data_folder / "agents.log"),
-        Child("operator", lambda: gateway, data_folder / "operator.log"),
+        Child("agents", lambda: gateway, data_folder / "agents.log", is_needed=False),
+        Child("operator", lambda: gateway, data_folder / "operator.log", is_needed=False),
     ]
     if plant is not None:
         loop.append("--simulated")  # it is the line that is started here
@@ -103,7 +103,7 @@ def _tend(children: Sequence[Child], notices: "Notices") -> Exit | None:
                 notices.hear_of_sim(child.said())
             elif child.name == "operator":
                 notices.hear_of_operator(child.said(), now_s)
-        elif ended.is_final and child.name not in DONE_WITHOUT:
+        elif ended.is_final:
             final = final or ended
         else:
             notices.tell(ended)
@@ -125,7 +125,7 @@ class Notices:
         self._notes: list[str] = []
         self._exits: dict[str, Exit] = {}
         self._faults = ""
-        self._reached = ""  #: addresses of the page and of OPC UA, while they are served
+        self._ways: dict[str, str] = {}  #: page and OPC UA with their addresses; with "no " what is not served
         self._of_operator: list[str] = []  #: all that it has said
         self._operator_notes: deque[tuple[float, str]] = deque(maxlen=MOST_NOTES)  #: with when each was heard
 
@@ -149,24 +149,28 @@ class Notices:
 
     def hear_of_operator(self, said: list[str], now_s: float) -> None:
         """What the operator's process has said since its start: where people reach the line, and what is missing."""
-        for text in (text for text in said if text not in self._of_operator):
-            reached = text.partition(": ")[2] if text.startswith(_REACHED) else ""
-            self._reached = reached or self._reached
-            if not reached:
+        before, self._of_operator = self._of_operator, said
+        for text in said[len(before) :] if said[: len(before)] == before else said:
+            if text.startswith(_REACHED):
+                self._ways |= dict.fromkeys(text.partition(": ")[2].split(", "), "")
+            elif text.endswith(_OPEN):
+                self._ways[text.removesuffix(_OPEN)] = ""
+            else:
+                if text.startswith(_SHUT) and _TRIED in text:
+                    self._ways[text.removeprefix(_SHUT).partition(_TRIED)[0]] = _SHUT
                 self._operator_notes.append((now_s, f"operator: {text}"))
-            self._print([reached or f"operator: {text}"])
-        self._of_operator = said
+            self._print([f"operator: {text}"])
 
     def tell(self, ended: Exit) -> None:
         if ended.name == "operator":
-            self._reached, self._of_operator = "", []
+            self._ways, self._of_operator = {}, []
         self._exits[ended.name] = ended
         self._print(ended.lines())
 
     def lines(self, now_s: float) -> list[str]:
         """What stands above the status now."""
         notes = [*self._opening, *(f"loop: {text}" for text in self._notes), *([self._faults] if self._faults else [])]
-        shown = [self._reached] if self._reached else []
+        shown = [", ".join(f"{shut}{way}" for way, shut in self._ways.items())] if self._ways else []
         shown += notes if now_s - self._start_s <= NOTES_S else []
         shown += [text for at_s, text in self._operator_notes if now_s - at_s <= NOTES_S]
         for ended in self._exits.values():

@@ -99,6 +99,7 @@ class Gate:
         if self.deployer is None:
             await self._open()
         if self.deployer is not None:
+            await self.deployer.at_hand()
             await self.deployer.watch()
             self._learn_again(self.deployer)
         trouble = self._shut if self.deployer is None else self.deployer.trouble
@@ -210,6 +211,7 @@ class Gate:
             return _not_understood(error)
         if self.deployer is None:
             return self.shut_reply().model_dump_json().encode()
+        await self.deployer.at_hand(None if isinstance(query, ListProposals) else query.proposal)
         if isinstance(query, ListProposals):
             return self.deployer.listed(query.most, query.skip).model_dump_json().encode()
         found = self.deployer.shown(query.proposal)
@@ -229,6 +231,7 @@ class Gate:
         if self.deployer is None:
             reply = self.shut_reply()
         elif isinstance(decision, Decide):
+            await self.deployer.at_hand(decision.proposal)
             reply = await self.deployer.decide(decision, who)
         elif isinstance(decision, Archive):
             assert self._stores is not None  # they are open before the gate is

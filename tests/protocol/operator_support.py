@@ -72,6 +72,7 @@ class FakeGateway:
         self.hold: asyncio.Event | None = None  #: until then nothing that people say is answered
         self.hold_past: asyncio.Event | None = None  #: until then no tensions are told
         self.asked_past: list[Any] = []
+        self.past_quality: list[list[int]] = []
         mailbox.serve(GATEWAY_STATUS, self._status)
         mailbox.serve(GATEWAY_PROPOSALS, self._proposals)
         mailbox.serve(GATEWAY_PAST, self._past)
@@ -135,13 +136,19 @@ class FakeGateway:
         if isinstance(query, RecordsAfter):
             newer = [one for one in self.records if query.after is None or one.sequence > query.after]
             return RecordsTold(format=1, last=last, records=newer).model_dump_json().encode()
+        if query.from_wall_s < 1.0e9:  # before there was a line
+            return (
+                TensionsTold(format=1, wall_s=[], tension_n=[], setpoint_n=[], speed_m_per_s=[])
+                .model_dump_json()
+                .encode()
+            )
         if self.hold_past is not None:
             await self.hold_past.wait()
         n = self.line.n
         return TensionsTold(
             format=1, wall_s=[query.from_wall_s, query.from_wall_s + 1.0, query.to_wall_s],
             tension_n=[[19.0 + k, None, 21.0 + k] for k in range(n)], setpoint_n=[[20.0, 20.0, 20.0]] * n,
-            speed_m_per_s=[0.1, 0.1, 0.1],
+            speed_m_per_s=[0.1, 0.1, 0.1], quality=self.past_quality,
         ).model_dump_json().encode()  # fmt: skip
 
     async def _person(self, payload: bytes) -> bytes:

@@ -8,6 +8,7 @@ import pytest
 from asyncua import Client, ua
 
 from gateway.core.line_past import RecordTold, TensionsBetween
+from gateway.core.signals import Quality
 from gateway.operator.opcua.space import NAMESPACE
 from tests.protocol.operator_support import SHOWN, alarm, bench, shown
 
@@ -246,6 +247,33 @@ def test_records_of_the_audit_and_waiting_proposals_are_events_of_the_server():
             waits = await heard.values.get()
             assert (waits.ProposalId, waits.ShownHash, waits.BaseRevision) == (one.proposal_hash, SHOWN, 3)
             assert heard.values.empty()
+
+    run(story)
+
+
+def test_a_time_of_which_nothing_is_kept_has_no_values():
+    async def story():
+        async with bench(spans=2) as b, b.connected("vera") as client:
+            begin = datetime(1999, 1, 1, tzinfo=UTC)
+            node = client.get_node(b.id("Line.Spans.2.Tension"))
+            assert await node.read_raw_history(begin, begin + timedelta(seconds=10), 100) == []
+
+    run(story)
+
+
+def test_past_values_say_how_good_they_were_as_live_ones_do():
+    async def story():
+        async with bench(spans=2) as b, b.connected("vera") as client:
+            begin = datetime(2026, 1, 1, tzinfo=UTC)
+            end = begin + timedelta(seconds=10)
+            b.gateway.past_quality = [[0, 0, 0], [Quality.STALE, Quality.MISSING, Quality.BAD]]
+            node = client.get_node(b.id("Line.Spans.2.Tension"))
+            last, bad = await node.read_raw_history(begin, end, 100)
+            assert (last.Value.Value, last.StatusCode.value) == (20.0, CODES.UncertainLastUsableValue)
+            assert (bad.Value.Value, bad.StatusCode.value) == (None, CODES.BadSensorFailure)
+            for path in ("Line.Spans.1.Tension", "Line.Spans.2.Setpoint"):
+                values = await client.get_node(b.id(path)).read_raw_history(begin, end, 100)
+                assert values and all(one.StatusCode.is_good() for one in values)
 
     run(story)
 

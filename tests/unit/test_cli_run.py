@@ -146,7 +146,7 @@ def test_what_the_line_does_without_is_told_when_it_is_refused_and_ends_nothing(
         f"again.touch(); raise SystemExit({code})"
     )
     assert run(tmp_path) == 0
-    assert f"{name} has ended with exit code {code}" in capsys.readouterr().err
+    assert f"{name} has ended with exit code {code}; it is started again\n" in capsys.readouterr().err
 
 
 def test_a_crash_is_told_and_the_child_comes_back(
@@ -198,19 +198,23 @@ def test_the_screen_shows_what_was_not_granted_at_first_and_an_exit_for_longer(t
     assert notices.lines(later_s + EXIT_S) == [f"{headline} (1 min ago; {tmp_path / 'sim.log'})"]
 
 
-def test_the_screen_shows_where_people_reach_the_line_as_long_as_they_do(tmp_path: Path) -> None:
+def test_the_screen_shows_where_people_reach_the_line_and_where_they_do_not(tmp_path: Path) -> None:
     notices = Notices(Console(force_terminal=True), 100.0)
-    where = "page at http://127.0.0.1:8480, OPC UA at opc.tcp://127.0.0.1:4840"
-    said = [f"operator of demo/line-1: {where}", "nobody can come in yet"]
-    notices.hear_of_operator(said[:1], 101.0)
-    for now_s in (150.0, 150.2):
-        notices.hear_of_operator(said, now_s)
-    assert notices.lines(151.0) == [where, "operator: nobody can come in yet"]
-    assert notices.lines(150.1 + NOTES_S) == [where]  # what is missing is told for a while
-    notices.tell(Exit("operator", 2, 1, 200.0, tmp_path / "operator.log", ["the page cannot be at 8480"]))
-    assert notices.lines(201.0)[0] == "operator has ended with exit code 2"
-    notices.hear_of_operator(said[:1], 202.0)
-    assert notices.lines(202.0)[0] == where
+    page, opcua = "page at http://127.0.0.1:8480", "OPC UA at opc.tcp://127.0.0.1:4840"
+    said = [f"no {opcua}, it is tried again every 10 s: Address already in use", f"operator of demo/line-1: {page}"]
+    notices.hear_of_operator(said, 150.0)
+    notices.hear_of_operator(said, 150.2)
+    assert notices.lines(151.0) == [f"no {opcua}, {page}", f"operator: {said[0]}"]
+    assert notices.lines(150.1 + NOTES_S) == [f"no {opcua}, {page}"]  # why is told for a while
+    said = [*said, f"{opcua} now"]
+    notices.hear_of_operator(said, 180.0)
+    assert notices.lines(180.1) == [f"{opcua}, {page}"]
+    notices.hear_of_operator([*said, said[0]], 190.0)
+    assert notices.lines(190.1)[0] == f"no {opcua}, {page}"
+    notices.tell(Exit("operator", 2, 1, 220.0, tmp_path / "operator.log", ["there is neither"], is_needed=False))
+    assert notices.lines(221.0)[0] == "operator has ended with exit code 2; it is started again"
+    notices.hear_of_operator([f"operator of demo/line-1: {page}, {opcua}"], 222.0)
+    assert notices.lines(222.0)[0] == f"{page}, {opcua}"
 
 
 def test_without_a_terminal_each_is_printed_once(capsys: pytest.CaptureFixture[str]) -> None:

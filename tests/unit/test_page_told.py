@@ -94,6 +94,7 @@ def test_what_fails_are_names_of_drive_states():
         (None, 2.0, 1.0, None),
         (1.0, None, None, None),
         (-1.0, 0.5, -1.5, 1.0),  # decay that is growth
+        (0.39, -10.0, 10.39, None),  # at least something negative: no bar, rather than one of no length
     ],
 )
 def test_how_much_of_a_limit_is_used(value: float | None, limit: float | None, margin: float | None, expected: object):
@@ -162,3 +163,15 @@ def test_set_points_are_offered_as_far_as_the_loop_takes_them():
         limits.tension_min_n + limits.tension_margin_n,
         limits.tension_max_n - limits.tension_margin_n,
     ]
+
+
+def test_courses_come_once_they_are_drawn():
+    async def story() -> None:
+        async with page() as there:
+            await there.log_in("viewer")
+            assert (await there.browser.get(f"/api/courses/{there.gateway.hash}")).json()["drawing"]
+            told = (await there.browser.get(f"/api/courses/{there.gateway.hash}")).json()
+            assert not told["drawing"] and len(told["courses"][0]["setpoint_n"]) == there.line.n
+            assert (await there.browser.get("/api/courses/abcdef")).status_code == 400
+
+    asyncio.run(story())

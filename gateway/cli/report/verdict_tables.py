@@ -11,12 +11,12 @@ LOST = {"settling_s": "does not settle"}
 
 
 def verdict_tables(index: int, verdict: Verdict) -> str:
-    """Figures in sight, the rules folded away; `index`: of the verdict in the page's data."""
+    """Figures in sight, the rules folded away unless one of them failed; `index`: of the verdict in the page's data."""
     count = len(verdict.findings)
     rules = (
         f"All {count} rules with their margins" if verdict.accepted else f"All {count} rules, with what failed first"
     )
-    parts = [_fold(rules, _place(index, "findings", _rules(verdict.findings)))]
+    parts = [_fold(rules, _place(index, "findings", _rules(verdict.findings)), "" if verdict.accepted else " open")]
     if verdict.figures:
         told = '<p class="muted">Before and after, as the gate has simulated them on the model of the time.</p>'
         parts.insert(0, told + _place(index, "figures", _figures(verdict.figures)))
@@ -29,8 +29,8 @@ def _place(index: int, part: str, content: str) -> str:
     return f'<div data-verdict="{index}" data-part="{part}">{content}</div>'
 
 
-def _fold(title: str, content: str) -> str:
-    return f"<details><summary>{title}</summary>{content}</details>"
+def _fold(title: str, content: str, state: str = "") -> str:
+    return f"<details{state}><summary>{title}</summary>{content}</details>"
 
 
 def _rules(findings: list[RuleFinding]) -> str:

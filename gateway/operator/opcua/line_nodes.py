@@ -23,7 +23,7 @@ from gateway.operator.opcua.units import METRE, METRE_PER_SECOND, NEWTON, NEWTON
 ROOT = "Line"
 SENSOR_FAILURE: int = 0x808C0000  #: BadSensorFailure
 NOT_CONNECTED: int = 0x808A0000  #: BadNotConnected
-_OF_QUALITY = {"GOOD": GOOD, "STALE": LAST_USABLE, "BAD": SENSOR_FAILURE, "MISSING": NOT_CONNECTED}
+CODES = {"GOOD": GOOD, "STALE": LAST_USABLE, "BAD": SENSOR_FAILURE, "MISSING": NOT_CONNECTED}  #: by quality
 
 
 @dataclass(frozen=True)
@@ -130,7 +130,7 @@ def live_paths(line: Line) -> list[str]:
 
 def _of_span(span: SpanStatus, running: bool) -> Iterator[Told]:
     path, roller = f"{ROOT}.Spans.{span.number}", f"{ROOT}.Rollers.{span.number}"
-    code = _OF_QUALITY.get(span.quality, SENSOR_FAILURE)
+    code = CODES.get(span.quality, SENSOR_FAILURE)
     for name, value in (("Tension", span.tension_n), ("Error", span.error_n)):
         held = value if code in (GOOD, LAST_USABLE) else None
         yield Told(f"{path}.{name}", held, NO_COMMUNICATION if value is None and code in (GOOD, LAST_USABLE) else code)

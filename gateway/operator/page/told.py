@@ -62,6 +62,6 @@ def used(finding: RuleFinding) -> float | None:
         return 1.0
     at_least = math.isclose(margin, value - limit, rel_tol=1e-6, abs_tol=1e-12)
     part, whole = (limit, value) if at_least else (abs(value), abs(limit))
-    if whole <= 0.0:
+    if whole <= 0.0 or part < 0.0:  # at least -10, say: of that nothing is used up
         return None
     return min(1.0, part / whole)

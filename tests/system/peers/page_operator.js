@@ -88,6 +88,7 @@ chromium.launch({ executablePath: process.argv[2], chromiumSandbox: false, args:
     texts: (selector) => visible(selector).evaluateAll((all) => all.map((one) => (one.innerText ?? one.textContent).trim())),
     count: (selector) => visible(selector).count(),
     part: async (name) => { await page.evaluate((hash) => { location.hash = hash }, name); await visible(`#view-${name}`).waitFor() },
+    size: (width, height) => page.setViewportSize({ width, height }),
     forget_session: () => context.clearCookies(), // as the server does after a while
     violations,
     too_wide: tooWide,
