@@ -66,15 +66,15 @@ class NodeSets:
             await self._need(one.uri, (*for_whom, uri))
         for lack in too_old(node_set, self._dates):
             raise NotUsable(f"{node_set.path} requires {lack}")
-        self._types[uri] = await _imported(self._server, node_set)
+        self._types[uri] = await _imported(self._server, node_set, self._taken)
         self._dates[uri] = node_set.model.published
 
 
-async def _imported(server: Server, node_set: NodeSet) -> Mapping[str, Any]:
+async def _imported(server: Server, node_set: NodeSet, taken: frozenset[str]) -> Mapping[str, Any]:
     """Raises NotUsable, and leaves nothing of it then."""
     data = node_set.read()
     try:
-        _check_namespaces(data, node_set)
+        _check_namespaces(data, node_set, taken)
         # Of definitions asyncua would make Python code, and run it.
         nodes = await server.import_xml(xmlstring=data, auto_load_definitions=False)  # type: ignore[arg-type]
         return await _harmless(server, nodes)
@@ -85,13 +85,15 @@ async def _imported(server: Server, node_set: NodeSet) -> Mapping[str, Any]:
         raise NotUsable(f"{node_set.path} cannot be brought in: {type(error).__name__}: {error!s:.200}") from error
 
 
-def _check_namespaces(data: bytes, node_set: NodeSet) -> None:
-    """All nodes are the model's own. Raises NotUsable, and what the parser raises."""
+def _check_namespaces(data: bytes, node_set: NodeSet, taken: frozenset[str]) -> None:
+    """All nodes are the model's own, and none is about this server's. Raises NotUsable, and what the parser raises."""
     root = ET.fromstring(data)
     uris = [one.text for one in root.iterfind(f"{_NODE_SET}NamespaceUris/{_NODE_SET}Uri")]
     known = uris[1:] if uris[:1] == [CORE] else uris
     if node_set.model.uri not in known:
         raise NotUsable(f"{node_set.path} does not list its own namespace, {node_set.model.uri}")
+    if others := taken & set(known):
+        raise NotUsable(f"{node_set.path} is about {', '.join(others)}, which is this server's own")
     own = f"ns={known.index(node_set.model.uri) + 1};"
     for node in root:
         node_id = node.get("NodeId", own)
