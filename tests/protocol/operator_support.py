@@ -293,9 +293,14 @@ class Bench:
 
 
 @asynccontextmanager
-async def bench(spans: int = 2, gateway: bool = True, begin: bool = True, **operator: Any) -> AsyncIterator[Bench]:
-    """A running server; without `gateway` nobody answers it, without `begin` it is only made."""
-    line = line_of(spans)
+async def bench(
+    spans: int = 2, gateway: bool = True, begin: bool = True, line: Line | None = None, **operator: Any
+) -> AsyncIterator[Bench]:
+    """A running server of `line`, or of one with so many spans.
+
+    Without `gateway` nobody answers it, without `begin` it is only made.
+    """
+    line = line or line_of(spans)
     settings = line.operator.model_copy(update={"opc_ua": "opc.tcp://127.0.0.1:0", **operator})
     with short_folder() as folder:
         found = Bench(line.model_copy(update={"operator": settings}), folder)
