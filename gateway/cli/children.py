@@ -10,7 +10,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from gateway.cli.lifetime import end, start
+from gateway.cli.lifetime import end, start, uninterrupted
 
 IN_ORDER = ("loop", "operator", "agents", "gateway", "sim")  #: in which they are ended
 STOP_TIME_S = 15.0  #: for the loop's controlled stop
@@ -36,8 +36,9 @@ class Children:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        for name in IN_ORDER:
-            self.end(name)
+        with uninterrupted():
+            for name in IN_ORDER:
+                self.end(name)
         shutil.rmtree(self.run_folder, ignore_errors=True)
 
     def start(self, name: str, *arguments: str | Path) -> None:
@@ -62,10 +63,11 @@ class Children:
 
     def end(self, name: str) -> int:
         """End it in order: the loop stops the line first. Returns its exit code; 0 when it was never started."""
-        child = self._running.pop(name, None)
+        child = self._running.get(name)
         if child is None:
             return 0
         code = end(child, STOP_TIME_S)
+        del self._running[name]  # now: an end that was interrupted is made up for
         if child.stdout is not None:
             child.stdout.close()
         return code

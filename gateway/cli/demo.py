@@ -14,12 +14,22 @@ from rich.console import Console
 
 from gateway.cli.children import ChildFailed, Children
 from gateway.cli.demo_cases import Window, again_after_stops, begin_with_repeats, run_with_repeats, settle_with_repeats
-from gateway.cli.demo_failed import DemoFailed
-from gateway.cli.demo_line import LanguageModelAsked, Setup, begin, begin_agents, begin_operator, clear, end_in_order
+from gateway.cli.demo_failed import DemoFailed, FolderInUse
+from gateway.cli.demo_line import (
+    LanguageModelAsked,
+    Setup,
+    alone_in,
+    begin,
+    begin_agents,
+    begin_operator,
+    clear,
+    end_in_order,
+)
 from gateway.cli.demo_operator import Operator
 from gateway.cli.demo_panel import Panel
 from gateway.cli.demo_progress import Progress
 from gateway.cli.demo_stay import stay_on
+from gateway.cli.line_commands import REFUSED
 from gateway.core.messages import Stop
 from gateway.core.scenario import PAPER
 from gateway.mailbox.paths import run_base
@@ -58,14 +68,15 @@ def run_demo(
     `asked`: the language model whom the agents ask; None: the rules answer. `stay`: then the line runs on until Ctrl-C,
     for people to play with.
 
-    Returns the exit code: 0, 1 when something failed, 130 on Ctrl-C before the result.
+    Returns the exit code: 0, 1 when something failed, 2 where another one uses the folder, 130 on Ctrl-C before the
+    result.
     """
     console = Console(highlight=False)
     started_s = time.monotonic()
+    out = out.resolve()  # what is told of it is good in every terminal
     console.print(OPENING if quick is None else OPENING_QUICK, markup=False, soft_wrap=True)
     try:
-        clear(out)
-        with Children(out / "logs", _found_by_commands() if stay else None) as children:
+        with alone_in(out), _children(out, stay) as children:
             setup, world_start_s = begin(children, out, quick or "lqi", seed, asked)
             with _stepped_aside(setup) as stepped:
                 told = asyncio.run(_story(children, setup, stepped, console, quick is None, stay))
@@ -77,6 +88,9 @@ def run_demo(
                 assert told.let_in is not None
                 stay_on(children, setup, told.let_in.password, told.waiting, console)
             return code
+    except FolderInUse as error:
+        console.print(str(error), markup=False, soft_wrap=True)
+        return REFUSED
     except (ChildFailed, DemoFailed, Unreachable) as error:
         console.print(f"the demonstration failed: {error}", style="red", markup=False)
         console.print(
@@ -88,11 +102,12 @@ def run_demo(
         return 130
 
 
-def _found_by_commands() -> Path:
-    """Where the sockets lie of a line that `r2rgate status` and the others find by themselves."""
-    base = run_base()
-    base.mkdir(mode=0o700, parents=True, exist_ok=True)
-    return base
+def _children(out: Path, stay: bool) -> Children:
+    """In a folder without an earlier demonstration. A line that stays is found by `r2rgate status` and the others."""
+    clear(out)
+    if stay:
+        run_base().mkdir(mode=0o700, parents=True, exist_ok=True)
+    return Children(out / "logs", run_base() if stay else None)
 
 
 def _stepped_aside(setup: Setup) -> "SteppedAside":
@@ -196,7 +211,11 @@ async def _left_waiting(operator: Operator, setup: Setup, chain: "Chain | None")
     from gateway.cli.demo_waiting import leave_one_waiting
 
     shown = [] if chain is None else chain.shown
-    return await again_after_stops(operator, lambda: leave_one_waiting(operator, setup, shown), "once more")
+    try:
+        return await again_after_stops(operator, lambda: leave_one_waiting(operator, setup, shown), "once more")
+    except DemoFailed as failed:  # what was measured is there all the same
+        operator.progress.step(f"  none is left waiting: {failed}")
+        return ""
 
 
 async def _with_agents(children: Children, setup: Setup, operator: Operator) -> None:

@@ -32,7 +32,7 @@ def demo(
     A simulated six-span line, loop, gateway and agents run in processes of their own, in real time. A first
     configuration, an experiment, a model and a redesign, and once more: agents are asked over their bus which, each is
     judged by the gate and approved by a scripted operator over OPC UA; both cases of the paper run on each
-    configuration. Some four minutes; Ctrl-C brings the line to rest and ends all.
+    configuration. Some five minutes; Ctrl-C brings the line to rest and ends all.
 
     Exit code: 0 done, 1 failed or not adapted, 130 interrupted before the report.
 
@@ -46,6 +46,7 @@ def demo(
     """
     from gateway.cli.demo import run_demo
     from gateway.cli.demo_line import LanguageModelAsked
+    from gateway.cli.lifetime import end_as_by_ctrl_c
     from gateway.core.line import Agents
 
     if law is not None and not quick:
@@ -56,6 +57,7 @@ def demo(
         _refuse(f"--model {model} is for the whole demonstration; with --quick nothing is asked of the agents")
     writable_folder(out, "--out")
     asked = None if model is None else LanguageModelAsked(url or Agents().url, model)
+    end_as_by_ctrl_c()
     raise typer.Exit(run_demo(out, seed, (law or "lqi") if quick else None, asked, stay))
 
 

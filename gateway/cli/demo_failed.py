@@ -3,3 +3,7 @@
 
 class DemoFailed(Exception):
     """The text says why."""
+
+
+class FolderInUse(Exception):
+    """Another demonstration writes there; the text says what to do."""

@@ -1,14 +1,18 @@
 """The line of the demonstration: the simulated one, its file, and the processes."""
 
+import fcntl
 import json
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.resources import as_file, files
 from pathlib import Path
 from typing import NamedTuple
 
 from gateway.cli.children import IN_ORDER, Children, free_tcp_ports, free_udp_port
-from gateway.cli.demo_failed import DemoFailed
+from gateway.cli.demo_failed import DemoFailed, FolderInUse
+from gateway.cli.lifetime import uninterrupted
 from gateway.cli.line_commands import known_maps
 from gateway.core.controller import Controller, canonical
 from gateway.core.line import Agents, Line, Operator
@@ -68,9 +72,22 @@ class Setup:
         return self.out / "data"
 
 
+@contextmanager
+def alone_in(out: Path) -> Iterator[None]:
+    """So that no other demonstration clears the folder away from under this one. Raises FolderInUse."""
+    out.mkdir(parents=True, exist_ok=True)
+    with (out / ".lock").open("a") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise FolderInUse(
+                f"another demonstration uses {out}: end that one, or name another folder with --out"
+            ) from None
+        yield
+
+
 def clear(out: Path) -> None:
     """Remove what an earlier demonstration left; nothing else of the folder is touched."""
-    out.mkdir(parents=True, exist_ok=True)
     for name in OWN_FILES:
         path = out / name
         if path.is_dir():
@@ -146,7 +163,9 @@ def _agents(asked: LanguageModelAsked | None) -> list[tuple[str, str]]:
 
 
 def end_in_order(children: Children) -> None:
-    for name in IN_ORDER:
-        code = children.end(name)
-        if code != 0:
-            raise DemoFailed(f"{name} ended with exit code {code}: see {children.log(name)}")
+    """Raises DemoFailed where one ends badly."""
+    with uninterrupted():
+        for name in IN_ORDER:
+            code = children.end(name)
+            if code != 0:
+                raise DemoFailed(f"{name} ended with exit code {code}: see {children.log(name)}")

@@ -1,7 +1,10 @@
 """The demonstration's line runs on, for people to play with: where they come in, what there is to try, the end."""
 
 import json
+import shutil
+import sys
 import time
+from pathlib import Path
 from shlex import quote
 
 from rich.console import Console
@@ -38,13 +41,15 @@ def told(setup: Setup, password: str, waiting: str, run_folder: str) -> list[str
     return [
         "",
         "The line runs on. Ctrl-C brings it to rest and ends all. Nobody but this machine reaches it.",
+        "What happens is recorded, about 1 GB an hour: end it when you have played enough.",
         "",
         f"page    {operator.page}",
         f"        log in as {' or '.join(ROLES)}; the password of all three, for this run: {password}",
         f"OPC UA  {operator.opc_ua}, signed and encrypted, for the same users",
         f"        your client's certificate: r2rgate pki trust FILE --line {line} --data-dir {data}",
         "",
-        "To try, on the page or in a second terminal:",
+        "To try, on the page or in a second terminal, as the same user:",
+        *_on_path(),
         *_waits(waiting),
         "  after an approval, back to the last good controller:  r2rgate rollback",
         "  another tension of span 3, a grade change:  r2rgate set 3 30   r2rgate recipe velocity",
@@ -53,6 +58,13 @@ def told(setup: Setup, password: str, waiting: str, run_folder: str) -> list[str
         "  what it does:  r2rgate status --watch   r2rgate proposals   r2rgate audit show --data-dir " + data,
         f"Where other lines run here, too, the commands take --run-dir {quote(run_folder)}",
     ]
+
+
+def _on_path() -> list[str]:
+    """What `r2rgate` needs to be found there."""
+    if shutil.which("r2rgate") is not None:
+        return []
+    return [f'  once in it:  export PATH="{Path(sys.executable).parent}:$PATH"']
 
 
 def _waits(proposal: str) -> list[str]:

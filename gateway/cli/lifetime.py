@@ -5,10 +5,13 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 _PARENT = "R2RGATE_PARENT"
 _PR_SET_PDEATHSIG = 1
+_ENDS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 def start(arguments: list[str], log: Path, *, stdout: int | None = None) -> subprocess.Popen[str]:
@@ -53,3 +56,20 @@ def end(child: subprocess.Popen[str], patience_s: float) -> int:
             child.kill()
             child.wait()
     return child.returncode
+
+
+@contextmanager
+def uninterrupted() -> Iterator[None]:
+    """Neither Ctrl-C nor a terminal that is closed ends what is being ended in order. In the main thread."""
+    before = {number: signal.signal(number, signal.SIG_IGN) for number in _ENDS}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def end_as_by_ctrl_c() -> None:
+    """SIGTERM, and SIGHUP of a terminal that is closed, raise KeyboardInterrupt from now on. In the main thread."""
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.default_int_handler)

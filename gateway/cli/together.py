@@ -211,11 +211,11 @@ def _screen(console: Console, notices: Notices, run_folder: Path, data_folder: P
 
 
 class _Ending:
-    """Ctrl-C and SIGTERM ask for the end; nothing is interrupted half-way."""
+    """Ctrl-C, SIGTERM and a terminal that is closed ask for the end; nothing is interrupted half-way."""
 
     def __init__(self) -> None:
         self.asked = False
-        for number in (signal.SIGINT, signal.SIGTERM):
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             signal.signal(number, self._ask)
 
     def _ask(self, number: int, frame: FrameType | None) -> None:

@@ -2,6 +2,8 @@
 
 import asyncio
 import json
+import os
+import signal
 from dataclasses import replace
 from datetime import UTC, datetime
 from io import StringIO
@@ -13,6 +15,7 @@ import pytest
 from rich.console import Console
 
 from gateway.cli import demo_line
+from gateway.cli.demo import run_demo
 from gateway.cli.demo_analysis import Evidence, summary_of
 from gateway.cli.demo_cases import MOST_REPEATS, Window, again_after_stops
 from gateway.cli.demo_chain import Measured, beyond, name_of
@@ -23,6 +26,7 @@ from gateway.cli.demo_line import Ports, Setup, line_text
 from gateway.cli.demo_people import let_in
 from gateway.cli.demo_result import DemoResult, paper_improvement_pct
 from gateway.cli.demo_stay import told
+from gateway.cli.lifetime import uninterrupted
 from gateway.commissioning.past import Step, named
 from gateway.control.design import design_lqi, task_of
 from gateway.core.controller import config_hash
@@ -241,6 +245,21 @@ def test_who_stays_is_told_where_to_go_and_that_commands_take_other_folders_in_q
         assert wanted in text
     assert f"--control '{tmp_path}/my line/recording'" in text and "--run-dir /tmp/r2rgate-x" in text
     assert "r2rgate approve" not in "\n".join(told(setup, "amber-fern", "", "/tmp/r2rgate-x"))
+
+
+def test_a_folder_that_another_demonstration_uses_is_left_alone(tmp_path, capsys):
+    (tmp_path / "data").mkdir()
+    with demo_line.alone_in(tmp_path):
+        assert run_demo(tmp_path, 1, "lqi") == 2
+    assert (tmp_path / "data").is_dir() and "another demonstration uses" in capsys.readouterr().out
+
+
+def test_what_is_ended_in_order_is_not_interrupted():
+    with uninterrupted():
+        os.kill(os.getpid(), signal.SIGINT)
+        os.kill(os.getpid(), signal.SIGTERM)
+    with pytest.raises(KeyboardInterrupt):
+        os.kill(os.getpid(), signal.SIGINT)
 
 
 def test_who_is_let_in_has_a_certificate_that_is_trusted_and_a_password_that_is_a_good_one(tmp_path):
