@@ -35,7 +35,7 @@ test-long: $(VENV)/.compiled ## the demonstration, whole chains through the gate
 	@$(PY) -m pytest -m "long and realtime" $(ARGS) || [ $$? -eq 5 ]
 	@$(PY) -m pytest -m "long and not realtime" $(PARALLEL) $(ARGS) || [ $$? -eq 5 ]
 
-system-test: setup ## a real CAN kernel and foreign protocol stacks; as root, installs Debian and npm packages (about 6 min)
+system-test: $(VENV)/.compiled ## a real CAN kernel and foreign protocol stacks; as root, installs Debian and npm packages (about 9 min)
 	@$(PY) -m tests.system.needs
 	@$(PY) -m pytest tests/system $(ARGS)
 
@@ -104,7 +104,8 @@ bench-gate-live: $(VENV)/.compiled ## the gate on a running line: rollback, swap
 bench-agents-live: $(VENV)/.compiled ## agents that die, hang, flood or lie beside a running line (about 30 min; ARGS="--rounds 1")
 	@$(PY) -m tests.bench.agents_live $(ARGS)
 
-bench-operator: $(VENV)/.compiled ## the OPC UA server flooded beside a running line, and what it costs (about 7 min; ARGS="--rounds 1 --seconds 5")
+bench-operator: $(VENV)/.compiled ## the OPC UA server flooded beside a running line, what it costs, the page in Chromium; as root (about 8 min; ARGS="--rounds 1 --seconds 5")
+	@$(PY) -m tests.system.needs
 	@$(PY) -m tests.bench.operator $(ARGS)
 
 bench-gate: setup ## proposals of every way of going wrong, judged by the gate and by the truth (ARGS="--parts a --plants 5 --proposals 200")

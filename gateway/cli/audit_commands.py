@@ -100,7 +100,7 @@ def show(
     Example: r2rgate audit show --id 08067a72 --json
     """
     folder = audit_folder(line, data_dir)
-    since_s = None if since is None else _instant(since)
+    since_s = None if since is None else instant_of(since)
     try:
         with AuditFile(folder) as file:
             records = list(chained(file.rows(), 0, BEFORE_FIRST))
@@ -241,8 +241,8 @@ def _require_kind(kind: str, records: list[Chained]) -> None:
         refuse(f"--kind {kind}: there is no such record; kinds here: {', '.join(known)}{hint}")
 
 
-def _instant(text: str) -> float:
-    """Unix time."""
+def instant_of(text: str) -> float:
+    """Unix time of what was given as --since."""
     ago = re.fullmatch(r"(\d+(?:\.\d+)?)(s|min|h|d)", text)
     if ago is not None:
         return time.time() - float(ago[1]) * _UNITS_S[ago[2]]

@@ -46,11 +46,12 @@ def commissioned(
     ended: Ended, past: Sequence[Past], shown: Sequence[ProposalShown], measured: Mapping[str, Convergence]
 ) -> Commissioned:
     by_hash = {one.proposal_hash: one for one in shown}
-    tried = [_tried(one, by_hash.get(one.proposal), measured.get(one.proposal)) for one in past]
+    tried = [tried_of(one, by_hash.get(one.proposal), measured.get(one.proposal)) for one in past]
     return Commissioned(ended.reached, ended.text, tried, region_speed(past), ended.converged)
 
 
-def _tried(one: Past, shown: ProposalShown | None, measured: Convergence | None) -> Tried:
+def tried_of(one: Past, shown: ProposalShown | None, measured: Convergence | None) -> Tried:
+    """A candidate, and the proposal that was made of it where one was; `measured`: what a measurement has shown."""
     step = one.step or ""
     if shown is None:
         return Tried(one.kind, step, one.rung, "", "not made", one.why)

@@ -1,12 +1,14 @@
 """The report's account of selection, and of each adaptation with diagnosis, change, verdict and result."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
+from gateway.cli.adaptation_story import Adaptation, adaptation_story
 from gateway.cli.demo_asked_page import result_words, story_of, verdict_words
 from gateway.cli.demo_result import PAPER_RMSE_N, AskedResult, ChainResult, ChangeResult, DemoResult
 from gateway.cli.report import Section, Story, Table
 from gateway.commissioning.past import Step
 from gateway.core.scenario import PAPER
+from gateway.core.verdict import Verdict
 
 SELECTS = "design."
 DIAGNOSES = "adapt.diagnosis"
@@ -32,13 +34,13 @@ def selection_section(chain: ChainResult) -> Section:
     return Section("Selection, with its justification", (said,), (table,), stories=stories)
 
 
-def adaptations_section(result: DemoResult, chain: ChainResult) -> Section:
-    """One story for each redesign that was kept."""
+def adaptations_section(result: DemoResult, chain: ChainResult, verdicts: Mapping[str, Verdict]) -> Section:
+    """One story for each redesign that was kept. `verdicts`: by proposal, those that are at hand."""
     stories: list[Story] = []
     begin = 0
     for end, change in enumerate(chain.changes):
         if change.step == Step.REDESIGN and change.stage == "kept":
-            stories.append(_adaptation(result, chain, chain.changes[begin:end], change))
+            stories.append(_adaptation(result, chain, chain.changes[begin:end], change, verdicts))
             begin = end + 1
     said = (
         "Each begins with what the line showed, and ends with what was measured on it. Two are asked for, as the paper "
@@ -49,26 +51,35 @@ def adaptations_section(result: DemoResult, chain: ChainResult) -> Section:
     return Section("Adaptations: diagnosis, change, verdict, result", (said,), stories=tuple(stories))
 
 
-def _adaptation(result: DemoResult, chain: ChainResult, before: Sequence[ChangeResult], kept: ChangeResult) -> Story:
+def _adaptation(
+    result: DemoResult,
+    chain: ChainResult,
+    before: Sequence[ChangeResult],
+    kept: ChangeResult,
+    verdicts: Mapping[str, Verdict],
+) -> Story:
     place = next((k for k, one in enumerate(result.configurations) if one.controller == kept.configuration), None)
     name = "a redesign that was not measured" if place is None else result.configurations[place].name
     earlier = result.configurations[place - 1].name if place else "what ran before"
-    rows = [
-        *(("Diagnosis", text) for text in _diagnosis(chain, [*before, kept])),
-        *(("Tried before", f"{one.name}: {one.reason or one.why}; {verdict_words(one)}") for one in before
-          if one.step == Step.REDESIGN),
-        ("Change", f"{kept.reason} ({kept.proposal[:12]}, author {kept.author})"),
-        ("Verdict", verdict_words(kept)),
-        ("Approved", approval_words(kept)),
-        ("Result", f"{result_words(kept)} {_measured(result, place)}"),
-    ]  # fmt: skip
     asked = [one for one in chain.asked if one.proposal == kept.proposal and one.decision != DIAGNOSES]
     last = asked[-1] if asked else None
-    return Story(
-        f"{earlier} \u2192 {name}",
-        tables=(Table("What led to it, and what it came to.", ("", "What"), tuple(rows)),),
-        lead="" if last is None else f"Why this one of {len(last.options)}, in the words of {_who(last)}:",
-        quote="" if last is None else last.reason,
+    return adaptation_story(
+        Adaptation(
+            f"{earlier} \u2192 {name}",
+            diagnosis=_diagnosis(chain, [*before, kept]),
+            tried=[
+                f"{one.name}: {one.reason or one.why}; {verdict_words(one)}"
+                for one in before
+                if one.step == Step.REDESIGN
+            ],
+            change=[f"{kept.reason} ({kept.proposal[:12]}, author {kept.author})"],
+            verdict=[verdict_words(kept)],
+            decision=[f"Approved {approval_words(kept)}"],
+            result=[f"{result_words(kept)} {_measured(result, place)}"],
+            lead="" if last is None else f"Why this one of {len(last.options)}, in the words of {_who(last)}:",
+            quote="" if last is None else last.reason,
+            judged=verdicts.get(kept.proposal),
+        )
     )
 
 
@@ -87,7 +98,7 @@ def _diagnosis(chain: ChainResult, changes: Sequence[ChangeResult]) -> list[str]
     for place, one in enumerate(changes):
         if one.step == Step.MEASUREMENT:
             said.append(f"Measured on the line: {one.measured or one.why or one.stage}")
-            said += [_concluded(asked) for asked in _diagnoses(chain, changes[place + 1 :])]
+            said += [concluded(asked) for asked in _diagnoses(chain, changes[place + 1 :])]
         elif one.step in (Step.EXPERIMENT, Step.MODEL) and one.stage in ("done", "kept"):
             said.append(f"{one.step.capitalize()}: {one.reason}; {verdict_words(one)}")
     return said
@@ -103,7 +114,8 @@ def _diagnoses(chain: ChainResult, later: Sequence[ChangeResult]) -> list[AskedR
     return [one for one in chain.asked if one.decision == DIAGNOSES and one.proposal in named]
 
 
-def _concluded(one: AskedResult) -> str:
+def concluded(one: AskedResult) -> str:
+    """By whom, what, and the reason in their own words."""
     option = next((option.title for option in one.options if option.id == one.chosen), one.chosen)
     return f"{_who(one).capitalize()} concluded: {option}. \u201c{one.reason}\u201d"
 

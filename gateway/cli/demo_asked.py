@@ -1,52 +1,15 @@
-"""What was asked of the agents in the demonstration, as their log and the proposals that followed tell it."""
+"""What was asked of the agents in the demonstration."""
 
-from collections.abc import Sequence
-
+from gateway.cli.asked_result import interactions_in
 from gateway.cli.demo_failed import DemoFailed
 from gateway.cli.demo_line import Setup
-from gateway.cli.demo_result import AskedResult, FigureResult, NoteResult, OptionResult
-from gateway.commissioning.past import interactions_of
-from gateway.core.decisions import ProposalShown
-from gateway.core.interactions import Answer, Interaction
-from gateway.core.questions import Option, Question
-from gateway.supervisor.interactions import FILE_NAME, Interactions, InteractionsError
-
-MOST = 1000
+from gateway.core.interactions import Interaction
+from gateway.supervisor.interactions import InteractionsError
 
 
 def read_interactions(setup: Setup) -> list[Interaction]:
     """The oldest first. Raises DemoFailed where the log cannot be read; without one nothing was asked."""
-    log = Interactions(setup.data)
-    if not (setup.data / FILE_NAME).exists():
-        return []
     try:
-        return [log.find(row.id) for row in reversed(log.newest(MOST))]
+        return interactions_in(setup.data)
     except InteractionsError as error:
         raise DemoFailed(str(error)) from error
-
-
-def asked_result(interactions: Sequence[Interaction], shown: Sequence[ProposalShown]) -> list[AskedResult]:
-    followed = {
-        interaction: one.proposal_hash for one in shown for interaction in interactions_of(one.proposal.evidence)
-    }
-    return [
-        _asked(one, one.question, one.answer, followed.get(one.id, ""))
-        for one in interactions
-        if one.question is not None and one.answer is not None  # what was computed stands with the question it was for
-    ]
-
-
-def _asked(one: Interaction, question: Question, answer: Answer, proposal: str) -> AskedResult:
-    return AskedResult(
-        interaction=one.id, at=one.at, agent=one.agent, decision=question.decision, task=question.task,
-        options=[_option(option) for option in question.options], usual=question.usual,
-        notes=[NoteResult(title=note.title, tier=note.tier, score=note.score) for note in one.notes],
-        chosen=answer.choice.option, factors=answer.choice.factors, by=answer.by, instead=answer.instead,
-        reason=answer.choice.reason, model=one.model, tokens=one.tokens_in + one.tokens_out, seconds=one.seconds,
-        proposal=proposal,
-    )  # fmt: skip
-
-
-def _option(one: Option) -> OptionResult:
-    figures = [FigureResult(name=figure.name, value=figure.value, unit=figure.unit) for figure in one.figures]
-    return OptionResult(id=one.id, title=one.title, figures=figures)

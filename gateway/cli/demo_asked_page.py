@@ -7,7 +7,7 @@ from pathlib import Path
 from shlex import quote
 
 from gateway.cli.agents_view import as_story
-from gateway.cli.demo_result import AskedResult, ChainResult, ChangeResult, FigureResult, OptionResult, RuleResult
+from gateway.cli.demo_result import AskedResult, ChangeResult, FigureResult, OptionResult, RuleResult
 from gateway.cli.report import Fold, Section, Story, Table
 from gateway.core.interactions import Interaction
 
@@ -16,17 +16,19 @@ MOST_OPTIONS = 6  #: in a table; all stand in the details
 MOST_FIGURES = 4
 
 
-def asked_section(chain: ChainResult, interactions: Sequence[Interaction], data: Path) -> Section:
-    """`data`: the folder in which the agents' log is."""
+def asked_section(
+    asked: Sequence[AskedResult], changes: Sequence[ChangeResult], interactions: Sequence[Interaction], data: Path
+) -> Section:
+    """`changes`: what followed from it; `data`: the folder in which the agents' log is."""
     title = "What was asked of the agents"
-    if not chain.asked:
+    if not asked:
         return Section(title, ("Nothing: every step had one candidate.",))
     whole = {one.id: one for one in interactions}
-    changes = {one.proposal: one for one in chain.changes if one.proposal}
+    followed = {one.proposal: one for one in changes if one.proposal}
     stories = tuple(
-        _story(number, one, changes, whole.get(one.interaction), data) for number, one in enumerate(chain.asked, 1)
+        _story(number, one, followed, whole.get(one.interaction), data) for number, one in enumerate(asked, 1)
     )
-    return Section(title, (f"{in_short(chain.asked)}.",), stories=stories)
+    return Section(title, (f"{in_short(asked)}.",), stories=stories)
 
 
 def in_short(asked: Sequence[AskedResult]) -> str:

@@ -17,6 +17,7 @@ from gateway.cli.demo_failed import DemoFailed
 from gateway.cli.demo_line import Setup
 from gateway.cli.demo_operator import Operator
 from gateway.cli.demo_stepped import SteppedAside
+from gateway.cli.within_region import beyond
 from gateway.commissioning.past import Step, past_of
 from gateway.core.controller import Controller, config_hash
 from gateway.core.decisions import ProposalShown
@@ -24,7 +25,7 @@ from gateway.core.deployment import Region
 from gateway.core.messages import Reply, SelectRecipe
 from gateway.core.proposal import GainsChange
 from gateway.core.recording import Recording
-from gateway.core.scenario import PAPER, Scenario
+from gateway.core.scenario import PAPER
 from gateway.mailbox.bus import BusUnavailable, connect
 from gateway.mailbox.paths import GATEWAY_SOCKET
 from gateway.mailbox.unix import UnixMailbox
@@ -209,20 +210,3 @@ async def _initial(operator: Operator, setup: Setup, stepped: SteppedAside) -> l
 def name_of(place: int) -> str:
     """Of a configuration, in the paper's words: `place` from 0 in the order in which they were kept."""
     return "Initial" if place == 0 else f"Adapt{place}"
-
-
-def beyond(case: Scenario, region: Region | None) -> str:
-    """Why a configuration that was judged for `region` does not run a case; empty: it does."""
-    if region is None:
-        return ""
-    speed = max(case.speed_m_per_s, case.speed_end_m_per_s)
-    wanted = (
-        ("the speed", speed, region.speed_max_m_per_s, "m/s"),
-        ("the step of tension", case.tension_step_n, region.tension_step_max_n, "N"),
-        ("the step of speed", case.speed_step_m_per_s, region.speed_step_max_m_per_s, "m/s"),
-    )
-    return "; ".join(
-        f"{what} is {value:g} {unit}, it was judged up to {most:g} {unit}"
-        for what, value, most, unit in wanted
-        if most is not None and value > most * (1.0 + 1e-9)
-    )

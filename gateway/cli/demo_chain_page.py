@@ -12,6 +12,7 @@ from gateway.cli.demo_cases import Window
 from gateway.cli.demo_line import STATED, Setup
 from gateway.cli.demo_result import PAPER_RMSE_N, ChainResult, ChangeResult, DemoResult, paper_improvement_pct
 from gateway.cli.demo_stepped import SEEDS
+from gateway.cli.line_records import verdicts_in
 from gateway.cli.report import Chart, Page, Section, Series, Table, render_page
 from gateway.core.controller import config_hash
 from gateway.core.interactions import Interaction
@@ -33,11 +34,15 @@ def page(
     chain = result.chain
     assert chain is not None
     traces = [trace_of(window, evidence) for window in windows]
-    sections = [_beside_the_paper(result), selection_section(chain), adaptations_section(result, chain)]
+    sections = [
+        _beside_the_paper(result),
+        selection_section(chain),
+        adaptations_section(result, chain, verdicts_in(setup.data)),
+    ]
     sections += [_against_stepped(result)]
     sections += [_case(case, result, [one for one in traces if one.window.case == case], evidence) for case in PAPER]
     sections += [
-        asked_section(chain, interactions, setup.data),
+        asked_section(chain.asked, chain.changes, interactions, setup.data),
         _through_the_gate(chain),
         _whole_run(evidence),
         _safety(result, chain),

@@ -4,19 +4,15 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from gateway.cli.commission_result import Tried, candidate_name
+from gateway.cli.asked_result import asked_result
+from gateway.cli.change_result import change_of
 from gateway.cli.demo_analysis import Evidence
-from gateway.cli.demo_asked import asked_result
 from gateway.cli.demo_chain import Chain
 from gateway.cli.demo_line import Setup
-from gateway.cli.demo_result import AuditResult, ChainResult, ChangeResult, RuleResult, SwapResult
+from gateway.cli.demo_result import AuditResult, ChainResult, SwapResult
 from gateway.core.audit_record import Who
-from gateway.core.controller import config_hash
-from gateway.core.decisions import ProposalShown
 from gateway.core.interactions import Interaction
-from gateway.core.proposal import GainsChange
 from gateway.core.signals import FloatArray
-from gateway.core.verdict import RuleFinding
 from gateway.supervisor.audit_file import AuditFile
 from gateway.supervisor.audit_verify import verify
 from gateway.supervisor.historian import FILE_NAME
@@ -38,7 +34,9 @@ def chain_result(setup: Setup, chain: Chain, evidence: Evidence, interactions: S
         reached=found.reached,
         text=found.text,
         changes=[
-            _change(one, shown.get(one.proposal), approved.get(one.proposal), chain.approved_over.get(one.proposal, ""))
+            change_of(
+                one, shown.get(one.proposal), approved.get(one.proposal), chain.approved_over.get(one.proposal, "")
+            )
             for one in found.tried
         ],
         asked=asked_result(interactions, chain.shown),
@@ -55,47 +53,6 @@ def audit_result(setup: Setup) -> AuditResult:
     """As `r2rgate audit verify` finds it."""
     found = verify(setup.data)
     return AuditResult(records=found.records, head=found.head, sound=found.sound, problems=found.problems)
-
-
-def _change(tried: Tried, shown: ProposalShown | None, approved: Who | None, over: str) -> ChangeResult:
-    findings = [] if shown is None or shown.verdict is None else shown.verdict.findings
-    change = None if shown is None else shown.proposal.change
-    return ChangeResult(
-        step=tried.step or tried.kind,
-        name=candidate_name(tried.rung),
-        proposal=tried.proposal,
-        configuration=config_hash(change.controller) if isinstance(change, GainsChange) else "",
-        author="" if shown is None else shown.proposal.author,
-        reason="" if shown is None else shown.proposal.reason,
-        stage=tried.stage,
-        why=tried.why,
-        rules=len(findings),
-        against=[f"{one.rule}: {one.text}" for one in findings if not one.passed],
-        closest=_closest(findings),
-        measured="" if tried.shown is None else tried.shown.text,
-        approved_by="" if approved is None else approved.name,
-        certificate="" if approved is None or approved.certificate is None else approved.certificate,
-        approved_over=over,
-        speed_m_per_s=tried.speed_m_per_s,
-    )
-
-
-def _closest(findings: Sequence[RuleFinding]) -> RuleResult | None:
-    """The first rule that failed; of rules that all passed the one whose margin is the smallest share of its limit."""
-    failed = [one for one in findings if not one.passed]
-    narrow = sorted((one for one in findings if one.margin is not None and one.limit), key=_share)
-    found = next(iter(failed or narrow), None)
-    if found is None:
-        return None
-    return RuleResult(
-        rule=found.rule, passed=found.passed, value=found.value, limit=found.limit, margin=found.margin,
-        unit=found.unit,
-    )  # fmt: skip
-
-
-def _share(one: RuleFinding) -> float:
-    assert one.margin is not None and one.limit
-    return one.margin / abs(one.limit)
 
 
 def _decided(setup: Setup) -> tuple[dict[str, Who], int]:

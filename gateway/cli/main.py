@@ -34,6 +34,7 @@ from gateway.cli import (
     recordings_export,
     refine_commands,
     rehearse_commands,
+    report_commands,
     scan_commands,
     status_commands,
     users_commands,
@@ -89,6 +90,7 @@ app.command(rich_help_panel=OVERSIGHT)(proposal_commands.approve)
 app.command(rich_help_panel=OVERSIGHT)(proposal_commands.reject)
 app.command(rich_help_panel=OVERSIGHT)(proposal_commands.rollback)
 app.add_typer(alarms_commands.app, rich_help_panel=OVERSIGHT)
+app.command(rich_help_panel=EVIDENCE)(report_commands.report)
 app.command(rich_help_panel=EVIDENCE)(agents_commands.log)
 app.command("export", rich_help_panel=EVIDENCE)(recordings_export.export)
 audit_commands.app.command()(audit_replay.replay)

@@ -3,6 +3,7 @@
 import getpass
 import json
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, NoReturn, cast
 
@@ -12,7 +13,7 @@ from gateway.cli.process_commands import REFUSED, DataFolder, LineFile, default_
 from gateway.core.line_problem import printable
 from gateway.core.nearest import nearest
 from gateway.core.people import ROLES, Role
-from gateway.operator.users import FILE_NAME, Users, UsersFile, UsersRefused, why_weak
+from gateway.operator.users import FILE_NAME, Users, UsersFile, UsersRefused, change, why_weak
 
 app = typer.Typer(
     name="users",
@@ -34,11 +35,22 @@ def add(file: LineFile, name: Name, role: RoleOption = "viewer", data_dir: DataF
 
     Example: r2rgate users add line.toml anna --role operator
     """
-    path = _path(file, data_dir)
-    users, checked = _users(path), _role(role)
-    if any(one.name == name for one in users.entries()):
-        _refuse(f"{name} is there already: `r2rgate users password {file} {name}` changes the password, remove ends it")
-    _write(_with(users, name, checked), path)
+    path, checked = _path(file, data_dir), _role(role)
+
+    def new(users: Users) -> None:
+        if users.role_of(name) is not None:
+            _refuse(
+                f"{name} is there already: `r2rgate users password {file} {name}` changes the password, remove ends it"
+            )
+
+    new(_users(path))  # before anything is asked for
+
+    def added(users: Users) -> Users:
+        new(users)
+        return users.with_user(name, secret, checked)
+
+    secret = _password(name)
+    _change(path, added)
     typer.echo(f"{name} may come in as {checked}: {path}")
 
 
@@ -49,8 +61,9 @@ def password(file: LineFile, name: Name, data_dir: DataFolder = None) -> None:
     Example: r2rgate users password line.toml anna
     """
     path = _path(file, data_dir)
-    users = _users(path)
-    _write(_with(users, name, _there(users, name)), path)
+    _there(_users(path), name)  # before anything is asked for
+    secret = _password(name)
+    _change(path, lambda users: users.with_user(name, secret, _there(users, name)))
     typer.echo(f"{name} has another password: {path}")
 
 
@@ -82,9 +95,12 @@ def remove(file: LineFile, name: Name, data_dir: DataFolder = None) -> None:
     Example: r2rgate users remove line.toml anna
     """
     path = _path(file, data_dir)
-    users = _users(path)
-    _there(users, name)
-    _write(users.without(name), path)
+
+    def removed(users: Users) -> Users:
+        _there(users, name)
+        return users.without(name)
+
+    _change(path, removed)
     typer.echo(f"{name} may not come in any more: {path}")
 
 
@@ -117,13 +133,6 @@ def _role(text: str) -> Role:
     return cast(Role, text)
 
 
-def _with(users: Users, name: str, role: Role) -> Users:
-    try:
-        return users.with_user(name, _password(name), role)
-    except UsersRefused as refused:
-        _refuse(str(refused))
-
-
 def _password(name: str) -> str:
     """Asked for without echo, twice; for scripts the first line of standard input."""
     if not sys.stdin.isatty():
@@ -136,10 +145,11 @@ def _password(name: str) -> str:
     return first
 
 
-def _write(users: Users, path: Path) -> None:
+def _change(path: Path, how: Callable[[Users], Users]) -> None:
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        users.write(path)
+        change(path, how)
+    except UsersRefused as refused:
+        _refuse(str(refused))
     except OSError as error:
         _refuse(f"{path} cannot be written: {error.strerror}; run this as the user whom the line's data belong to")
 

@@ -53,3 +53,4 @@ class TensionsTold(Strict):
     tension_n: list[list[float | None]]  #: by span
     setpoint_n: list[list[float | None]]
     speed_m_per_s: list[float | None]  #: of the unwinder
+    quality: list[list[Annotated[int, Field(ge=0, le=3)]]] = []  #: of `tension_n`, by span: numbers of Quality

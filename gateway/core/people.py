@@ -62,7 +62,6 @@ class Person(Strict):
     through: Literal["opc-ua", "page"]
     certificate: Digest | None = None  #: SHA-256 of the DER bytes of the client's; null: it had none
 
-
     @property
     def is_script(self) -> bool:
         return self.name.startswith(SCRIPTS)

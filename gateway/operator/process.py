@@ -52,7 +52,9 @@ async def serve(line: Line, run_folder: Path, data_folder: Path) -> None:
     check, pki = checked_by(users, _tell), pki_folder(line, data_folder)
     access = Access(side, users, _tell, time.monotonic)
     page_tls = (pki / CERTIFICATE, pki / PRIVATE_KEY) if line.operator.page.startswith("https:") else (None, None)
-    served_page = PageWay(page_app(line, side, check, time.monotonic, access), line.operator.page, *page_tls)
+    served_page = PageWay(
+        page_app(line, side, check, users.role_of, time.monotonic, access), line.operator.page, *page_tls
+    )
     page = Way(f"page at {line.operator.page}", served_page.begin, served_page.serve, _tell)
     served_opcua = OpcUaWay(lambda: OpcUa(line, side, pki, check, users.role_of, _tell, access), lambda: page.trouble)
     opcua = Way(f"OPC UA at {line.operator.opc_ua}", served_opcua.begin, served_opcua.serve, _tell)

@@ -4,6 +4,7 @@ One file in the line's data folder, for its owner's eyes only; `r2rgate users` w
 hashed with scrypt, which takes 32 MB and some 50 ms for a guess, and as long for a name that nobody has.
 """
 
+import fcntl
 import hashlib
 import hmac
 import os
@@ -20,8 +21,11 @@ from pydantic import Field, ValidationError
 
 from gateway.core.line import Strict
 from gateway.core.people import Role, UserName
+from gateway.core.topics import AGENT_NAMES
 
-FILE_NAME = "users.toml"
+FILE_NAME, LOCK = "users.toml", "users.lock"
+#: Names by which the audit calls what is no person.
+RESERVED = frozenset(("anonymous", "gateway", "r2rgate", "rules", "agents", "root", "system", "nobody", *AGENT_NAMES))
 MOST_USERS = 200
 MOST_BYTES = 65_536  #: of the file
 LEAST_LETTERS, MOST_LETTERS, LEAST_DIFFERENT = 10, 128, 5
@@ -113,6 +117,9 @@ class Users:
 
     def with_user(self, name: str, password: str, role: Role) -> "Users":
         """With this one more, or with another password or role. Raises UsersRefused."""
+        if name in RESERVED and name not in self._by_name:
+            raise UsersRefused(f"{name} is what the audit calls something else; allowed: any name but "
+                               f"{', '.join(sorted(RESERVED))}")  # fmt: skip
         if reason := why_weak(name, password):
             raise UsersRefused(reason)
         salt = secrets.token_bytes(_SALT_BYTES)
@@ -150,6 +157,20 @@ class Users:
         except BaseException:
             part.unlink(missing_ok=True)
             raise
+
+
+def change(path: Path, how: Callable[[Users], Users]) -> None:
+    """Write what `how` makes of the users as they are now. Nobody else changes them in between.
+
+    Raises UsersRefused, OSError, and what `how` raises; then nothing is changed.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    lock = os.open(path.with_name(LOCK), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        how(UsersFile(path).current()).write(path)
+    finally:
+        os.close(lock)
 
 
 class UsersFile:

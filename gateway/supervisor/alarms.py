@@ -35,10 +35,11 @@ from gateway.supervisor.alarm_states import AlarmStates, Kept
 from gateway.supervisor.audit import AuditState
 from gateway.supervisor.audit_file import AuditUnavailable
 from gateway.supervisor.peers import who_of
-from gateway.supervisor.proposal_records import done, refused
+from gateway.supervisor.proposal_records import done, iso, refused
 
 FILE_NAME = "alarms.json"
 MOST_BYTES = 65_536
+SAME_S = 0.1  #: between two tellings of one beginning: the wall clock is being disciplined
 _URGENCY = {"high": 0, "medium": 1, "low": 2}
 
 
@@ -107,6 +108,8 @@ class Alarms:
 
     async def _acknowledge(self, said: AcknowledgeAlarm, who: Who) -> Reply:
         """Also where it cannot be recorded: that may be the alarm."""
+        if reason := self._why_another(said):
+            return refused("nothing is acknowledged", [reason])
         if reason := self._states.acknowledge(said.alarm, who.name):
             return refused("nothing is acknowledged", [reason])
         try:
@@ -114,6 +117,16 @@ class Alarms:
         except AuditUnavailable as error:
             return done(f"{said.alarm} is acknowledged; it could not be recorded: {error}")
         return done(f"{said.alarm} is acknowledged")
+
+    def _why_another(self, said: AcknowledgeAlarm) -> str:
+        """Empty: what was shown is what there is. An alarm that came again nobody has seen yet."""
+        live = self._states.live.get(said.alarm)
+        if live is None or said.since_wall_s is None:
+            return ""
+        since_wall_s = live.since_s + self._wall_clock() - self._clock()
+        if abs(since_wall_s - said.since_wall_s) <= SAME_S:
+            return ""
+        return f"{said.alarm} is another than the one that was shown: it came at {iso(since_wall_s)}; look at it again"
 
     async def _shelve(self, said: ShelveAlarm, who: Who) -> Reply:
         """Only on record: whoever comes next must be able to see why an alarm is silent."""

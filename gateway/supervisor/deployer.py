@@ -11,10 +11,11 @@ from typing import Any
 
 from gateway.core.audit_record import Who
 from gateway.core.decisions import MOST_LISTED, Decide, ProposalLine, ProposalList, ProposalShown, shown_hash
+from gateway.core.deployment import Region
 from gateway.core.judge_context import JudgeContext
 from gateway.core.line import Line
 from gateway.core.messages import Reply
-from gateway.core.proposal import GainsChange, Proposal
+from gateway.core.proposal import GainsChange, Proposal, canonical
 from gateway.core.recording import Recording
 from gateway.core.small_change import beyond_small
 from gateway.core.status import ChangeStatus
@@ -38,6 +39,8 @@ from gateway.supervisor.on_the_line import OnTheLine
 from gateway.supervisor.peers import GATEWAY
 from gateway.supervisor.proposal_inbox import Inbox
 from gateway.supervisor.proposal_records import ProposalRecords, done, refused
+
+MOST_AT_HAND = 24  #: proposals that wait, the newest
 
 
 class Deployer:
@@ -194,12 +197,31 @@ class Deployer:
         """Until nothing is being judged any more."""
         await self._inbox.judged()
 
+    async def judged_as(self, entry: Entry) -> tuple[bytes, JudgeContext, Region]:
+        """The bytes that were judged, in which context, and for what. Raises AuditUnavailable, NotKnown."""
+        await self._records.fetch([entry])
+        verdict = self._records.verdict(entry)
+        if verdict is None or verdict.region is None:
+            raise NotKnown("it was not accepted")
+        return canonical(self._records.proposal(entry)), await self._records.context(verdict), verdict.region
+
     async def context(self) -> tuple[JudgeContext, list[Recording]]:
         """What a proposal would be judged against now. Raises NotKnown."""
         return await self._surroundings.context(self.book)
 
     async def close(self) -> None:
         await self._inbox.close()
+
+    async def at_hand(self, beginning: str | None = None) -> None:
+        """Before `watch`, `listed`, `shown` and `decide`: what they need of the disk. None: of what waits."""
+        wanted = list[Entry]()
+        if beginning is not None:
+            wanted = [one for hash_, one in self.book.entries.items() if hash_.startswith(beginning)][:1]
+        elif self._line.gate.autonomy == "approve-first":  # whether it passes by itself depends on what it is
+            wanted = [one for one in reversed(self.book.undecided) if one.stage is Stage.WAITING][:MOST_AT_HAND]
+        if self._line.gate.autonomy == "approve-first":
+            wanted += [self.book.entries[one] for one in self.book.trusted.values()]
+        await self._records.fetch(wanted)
 
     def listed(self, most: int, skip: int = 0) -> ProposalList:
         """The newest first, but for the first `skip`; with those that are not done with, where none are left out."""
@@ -226,12 +248,13 @@ class Deployer:
         if len(found) != 1:
             return f"{len(found)} proposals begin with {beginning}: `r2rgate proposals` lists them"
         (entry,) = found
-        proposal = self._records.proposal(entry)
+        proposal, first = self._records.proposal(entry), self._first(entry)
         return ProposalShown(
             format=1, stage=entry.stage, why=self._why(entry), proposal_hash=entry.proposal,
             shown=self._shown_hash(entry), epoch=self.book.epoch,
             difference=self._surroundings.difference(proposal, self.book), proposal=proposal,
-            verdict=self._records.verdict(entry),
+            verdict=self._records.verdict(entry), approvals=self._line.gate.approvals,
+            approved_by=None if first is None else first.name,
         )  # fmt: skip
 
     def change(self) -> ChangeStatus | None:
@@ -279,6 +302,8 @@ class Deployer:
             return [f"proposal {entry.proposal[:12]} is {entry.stage}{f': {entry.why}' if entry.why else ''}"]
         if self._wall_clock() >= entry.expires_s:
             return [f"it has expired at {entry.expires}"]
+        if because := self.book.why_outdated(entry):
+            return [because]
         if decision.shown != self._shown_hash(entry):
             return ["what was shown is no longer what would be done: look at it again, then decide"]
         first = self._first(entry) if decision.approve and self._line.gate.approvals > 1 else None
@@ -292,6 +317,8 @@ class Deployer:
             if now_s >= entry.expires_s:
                 what = {"proposal": entry.proposal, "because": f"nobody decided until {entry.expires}"}
                 await self._records.step("expired", what, GATEWAY)
+            elif because := self.book.why_outdated(entry):
+                await self._records.step("superseded", {"proposal": entry.proposal, "because": because}, GATEWAY)
             elif entry.stage is Stage.APPROVED:
                 because = "it was approved, and not carried out: decide again"
                 await self._records.step("approval-lapsed", {"proposal": entry.proposal, "because": because}, GATEWAY)

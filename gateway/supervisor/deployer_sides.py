@@ -1,6 +1,6 @@
 """What the deployer works with: an audit, a loop, a judge, and what the line is like."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, Protocol
 
 from gateway.core.audit_record import Who
@@ -26,6 +26,10 @@ class AuditSide(Protocol):
         self, kind: str, who: Who, what: Mapping[str, Any], blobs: Mapping[str, bytes] | None = None
     ) -> object:
         """Stored for good when it returns. Raises AuditUnavailable."""
+        ...
+
+    async def fetch(self, ids: Iterable[str]) -> None:
+        """So that `blob` of these does not wait. Raises AuditUnavailable."""
         ...
 
     def blob(self, id_: str) -> bytes | None:

@@ -28,6 +28,7 @@ from gateway.supervisor.configurations import Configurations, ConfigurationsErro
 from gateway.supervisor.deployer import Deployer
 from gateway.supervisor.deployer_sides import JudgeSide, NotTakenUp
 from gateway.supervisor.experiments import ENDS as EXPERIMENT_ENDS
+from gateway.supervisor.in_service import InServiceView
 from gateway.supervisor.kept_audit import KeptAudit
 from gateway.supervisor.model_store import ModelsError
 from gateway.supervisor.models import Models, begin_repository
@@ -86,6 +87,7 @@ class Gate:
         self.audit.start()
         self._stores: tuple[Configurations, Models] | None = None
         self._shut = "the gate is about to open"  #: why it is, while it is
+        self._in_service = InServiceView(line, folder)
         self._told = ""
         self._refusals = Bounded(clock)
         self._learned: str | None = None  #: what ran when `_learn` looked last
@@ -99,6 +101,7 @@ class Gate:
         if self.deployer is None:
             await self._open()
         if self.deployer is not None:
+            await self.deployer.at_hand()
             await self.deployer.watch()
             self._learn_again(self.deployer)
         trouble = self._shut if self.deployer is None else self.deployer.trouble
@@ -210,8 +213,11 @@ class Gate:
             return _not_understood(error)
         if self.deployer is None:
             return self.shut_reply().model_dump_json().encode()
+        await self.deployer.at_hand(None if isinstance(query, ListProposals) else query.proposal)
         if isinstance(query, ListProposals):
-            return self.deployer.listed(query.most, query.skip).model_dump_json().encode()
+            found = self.deployer.listed(query.most, query.skip)
+            told = found.model_copy(update={"controller": await self._in_service.told(self.deployer.book)})
+            return told.model_dump_json().encode()
         found = self.deployer.shown(query.proposal)
         if isinstance(found, str):
             return Reply(ok=False, state="", text=found, reasons=[found]).model_dump_json().encode()
@@ -229,6 +235,7 @@ class Gate:
         if self.deployer is None:
             reply = self.shut_reply()
         elif isinstance(decision, Decide):
+            await self.deployer.at_hand(decision.proposal)
             reply = await self.deployer.decide(decision, who)
         elif isinstance(decision, Archive):
             assert self._stores is not None  # they are open before the gate is

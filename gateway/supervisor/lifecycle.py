@@ -82,6 +82,7 @@ class Entry:
     stage: Stage = Stage.RECEIVED
     why: str = ""
     verdict: str | None = None  #: hash
+    judged_by: str | None = None  #: hash of the model, once there is a verdict; None: by the line's file
     epoch: int | None = None
     by_person: bool = False  #: approved by one, not by its verdict alone
     first: FirstApproval | None = None  #: while it waits for a second one
@@ -141,6 +142,14 @@ class Book:
         here = self.judged_for
         return next(((one, region) for one, region in self.kept_for.items() if here.within(region)), None)
 
+    def why_outdated(self, entry: Entry) -> str:
+        """Why its verdict counts no more, while it waits; empty: it counts."""
+        if entry.stage not in (Stage.WAITING, Stage.APPROVED) or entry.judged_by == self.model:
+            return ""
+        by = "the line's file" if entry.judged_by is None else f"model {entry.judged_by[:12]}"
+        now = "the line's file" if self.model is None else f"model {self.model[:12]}"
+        return f"it was judged by {by}, and proposals are judged by {now} now: propose it again"
+
     def why_not(self, kind: str, what: Mapping[str, Any]) -> str:
         """Why a record of `kind` cannot come now; empty: it can."""
         proposal = str(what.get("proposal", ""))
@@ -193,6 +202,8 @@ class Book:
             return
         entry = self.entries[proposal]
         more: dict[str, Any] = {key: what[key] for key in ("verdict", "epoch") if key in what}
+        if kind == "accepted":  # records of an earlier version do not say by which model
+            more["judged_by"] = what.get("model", self.model)
         if kind == "deploying":
             more["region"] = _region(what)
         if kind == "approved":

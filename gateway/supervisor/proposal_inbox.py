@@ -118,6 +118,7 @@ class Inbox:
             "proposal": hash_,
             "verdict": verdict_hash(verdict),
             "context": context_hash(context),
+            "model": None if context.model is None else model_hash(context.model),
             "seed": verdict.seed,
             "because": _first_reason(verdict),
         }

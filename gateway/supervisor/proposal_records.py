@@ -1,11 +1,12 @@
 """The records of what becomes of proposals: each step is stored before it counts, with what lies beside it."""
 
 import asyncio
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from datetime import UTC, datetime
 from typing import Any
 
 from gateway.core.audit_record import Who
+from gateway.core.judge_context import JudgeContext
 from gateway.core.messages import Reply
 from gateway.core.proposal import Proposal
 from gateway.core.verdict import Verdict
@@ -38,6 +39,14 @@ class ProposalRecords:
         """A record that is no step of a proposal. Raises AuditUnavailable."""
         await self._audit.append(kind, who, what)
 
+    async def fetch(self, entries: Iterable[Entry]) -> None:
+        """What lies beside these, so that nobody waits for it afterwards. What cannot be read says so then."""
+        ids = [id_ for one in entries for id_ in (one.proposal, one.verdict) if id_ is not None]
+        try:
+            await self._audit.fetch(ids)
+        except AuditUnavailable:
+            pass
+
     def proposal(self, entry: Entry) -> Proposal:
         """Raises AuditUnavailable."""
         return Proposal.model_validate_json(self._kept(entry.proposal))
@@ -45,6 +54,11 @@ class ProposalRecords:
     def verdict(self, entry: Entry) -> Verdict | None:
         """None: there is none yet. Raises AuditUnavailable."""
         return None if entry.verdict is None else Verdict.model_validate_json(self._kept(entry.verdict))
+
+    async def context(self, verdict: Verdict) -> JudgeContext:
+        """In which it was judged. Raises AuditUnavailable."""
+        await self._audit.fetch([verdict.context])
+        return JudgeContext.model_validate_json(self._kept(verdict.context))
 
     def _kept(self, id_: str) -> bytes:
         """Raises AuditUnavailable where it is no longer what was stored."""

@@ -11,8 +11,8 @@ is in the table `cases` (in processors, so 1.5 of 2 means that little is left); 
 process did in the flood beyond quiet and the attackers together, and asks nothing of anybody. A ratio like that of
 `busy` is that of a busy computer; what is beyond it comes from what was asked.
 
-Before that the operator's process alone: its share of a processor without anybody, and with two clients that have fifty
-variables told every 100 ms and a page open.
+Before that, with nothing wrong, the operator's process: its share of a processor without anybody, and with two clients
+that have fifty variables told every 100 ms and a page open; and the page in Chromium (tests/bench/operator_page.py).
 
 Writes out/bench/operator.json; with other than the usual ARGS out/bench/operator-part.json.
 """
@@ -34,8 +34,10 @@ from gateway.core.signals import FloatArray
 from gateway.supervisor.historian import FILE_NAME
 from gateway.supervisor.history import History
 from tests.bench.figures import Bench
+from tests.bench.operator_page import page_figures
 from tests.bench.operator_windows import Beside, Found, Turn, memory_watched
 from tests.bench.slices import cpu_s, memory_mb
+from tests.operator.names import PASSWORD
 from tests.operator.real_line import OperatorLine
 
 ROUNDS, SECONDS = 3, 10.0
@@ -63,6 +65,7 @@ def main() -> None:
         line.run()
         line.operate()
         cost(bench, line, COST_S * given.seconds / SECONDS)
+        page(bench, line, COST_S * given.seconds / SECONDS)
         found = flooded(line, given.rounds, given.seconds)
         ended = _ended(line)
         for name in ("operator", "loop", "gateway"):
@@ -96,6 +99,15 @@ def cost(bench: Bench, line: OperatorLine, seconds: float) -> None:
         bench.figure("memory_two_clients_and_a_page_mb", memory_mb(pid, "VmRSS"), "MB", 1)
     finally:
         bench.tables["told in that time"] = beside.end()
+
+
+def page(bench: Bench, line: OperatorLine, seconds: float) -> None:
+    """In a real browser, when nothing is wrong."""
+    found = page_figures(line.page, "vera", PASSWORD, line.folder / "browser.log", seconds)
+    bench.figure("telemetry_to_page_p95_s", found.latency_p95_s, "s", found.shown)
+    bench.figure("telemetry_to_page_s", found.latency_max_s, "s", found.shown)
+    bench.figure("first_paint_s", found.first_paint_s, "s", found.paints)
+    bench.figure("page_weight_kb", found.bytes / 1e3, "kB", 1)
 
 
 def flooded(line: OperatorLine, rounds: int, seconds: float) -> Found:

@@ -22,7 +22,8 @@ from contextlib import suppress
 FROM = "127.0.0.2"  #: the honest client's is 127.0.0.1
 CONNECTIONS = 100
 WORKERS = 8  #: connections with malformed messages at a time
-REFUSED_S = 0.2  #: for the server to end one; otherwise this side does
+SAID_S = 10.0  #: for the server to take what is said
+ENDED_S = 0.05  #: for it to end the connection; otherwise this side does
 CHUNK = 65_535
 RESPONSE_HEADER = 24  #: bytes: time, handle, result, no diagnostics, no texts, nothing additional
 
@@ -150,21 +151,22 @@ async def malformed(address: tuple[str, int], ended: asyncio.Event) -> dict[str,
     async def say() -> None:
         while not ended.is_set():
             name = next(wrong)
-            counts[name] += await deliver(name, address, REFUSED_S)
+            counts[name] += await deliver(name, address)
 
     await _until(ended, *(say() for _ in range(WORKERS)))
     return counts
 
 
-async def deliver(name: str, address: tuple[str, int], within_s: float) -> bool:
+async def deliver(name: str, address: tuple[str, int]) -> bool:
     """Say it on a connection of its own, and wait for the server to end that. False: it came to nothing."""
     said = False
     with suppress(OSError, TimeoutError, EOFError):
         stream, writer = await asyncio.open_connection(*address, local_addr=(FROM, 0))
         try:
-            async with asyncio.timeout(within_s):
+            async with asyncio.timeout(SAID_S):
                 await _say(name, stream, writer)
-                said = True
+            said = True
+            async with asyncio.timeout(ENDED_S):
                 while await stream.read(65_536):
                     pass
         finally:

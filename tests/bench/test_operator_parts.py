@@ -4,7 +4,7 @@ import asyncio
 
 from tests.bench.figures import GOALS
 from tests.bench.operator import BUSY, CASES, ROUNDS, bench_of
-from tests.bench.operator_attacks import BEFORE, INSIDE, REFUSED_S, deliver
+from tests.bench.operator_attacks import BEFORE, INSIDE, deliver
 from tests.bench.operator_windows import Found, Turn
 from tests.protocol.operator_support import bench
 
@@ -36,7 +36,7 @@ def test_the_server_outlives_all_that_is_hostile_and_serves_others():
         async with bench(spans=1) as b, b.connected("vera") as client:
             for name in (*BEFORE, *INSIDE):
                 async with asyncio.timeout(30.0):
-                    assert await deliver(name, ("127.0.0.1", b.opcua.server.port), REFUSED_S), name
+                    assert await deliver(name, ("127.0.0.1", b.opcua.server.port)), name
                     assert (await b.read(client, "Line.Limits.TensionMax")).StatusCode.is_good(), name
             async with b.connected("otto"):
                 pass

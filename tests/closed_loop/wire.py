@@ -72,6 +72,10 @@ class WireLine:
         self.start_gateway()
         self.start_loop()
         self.wait(lambda status: status.loop.running)
+        self.arm_and_start()
+
+    def arm_and_start(self) -> None:
+        """From rest to RUN, settled."""
         for _ in range(3):
             assert self.order(Arm()).ok
             assert self.order(Start()).ok

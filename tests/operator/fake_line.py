@@ -13,6 +13,7 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 from gateway.core.alarms import ALARMS, AcknowledgeAlarm, AlarmStatus, ShelveAlarm
+from gateway.core.courses import CoursesTold, DrawnCourse, ShowCourses
 from gateway.core.decisions import (
     QUERY,
     Decide,
@@ -29,7 +30,7 @@ from gateway.core.messages import Reply
 from gateway.core.people import FOR_PERSON, ROLES, ForPerson, Role, why_may_not
 from gateway.core.proposal import Proposal, proposal_hash
 from gateway.core.status import GatewayStatus
-from gateway.core.topics import GATEWAY_FOR_PERSON, GATEWAY_PAST, GATEWAY_PROPOSALS, GATEWAY_STATUS
+from gateway.core.topics import GATEWAY_COURSES, GATEWAY_FOR_PERSON, GATEWAY_PAST, GATEWAY_PROPOSALS, GATEWAY_STATUS
 from gateway.core.verdict import Verdict, verdict_hash
 from gateway.mailbox.port import Mailbox
 from gateway.mailbox.unix import UnixMailbox
@@ -45,7 +46,11 @@ IN_SERVICE = "c6d8cf9c18f6d8b1da935a6124c0cd14f017292be653fbbb0dbf92362e1c9e54"
 
 async def check(name: str, password: str) -> Role | None:
     """Whoever is called like a role has it."""
-    return next((role for role in ROLES if role == name and password == PASSWORD), None)
+    return role_of(name) if password == PASSWORD else None
+
+
+def role_of(name: str) -> Role | None:
+    return next((role for role in ROLES if role == name), None)
 
 
 def alarm(name: str = "device-absent", **changes: object) -> AlarmStatus:
@@ -75,6 +80,10 @@ class FakeGateway:
         self.state = "RUN"
         self.epoch = 3
         self.stage = "waiting"
+        self.absent: list[str] = []  #: from the first bus
+        self.drawn = False  #: courses were asked for
+        self.approvals = 1  #: that a change takes
+        self.first = ""  #: who has approved it, where it takes two
         self.drives: dict[int, str] = {}  #: by span, those that are not ENABLED
         self.off_n: dict[int, float] = {}  #: by span, away from its set-point
         now = datetime.now(UTC).replace(microsecond=0)
@@ -87,6 +96,7 @@ class FakeGateway:
             (GATEWAY_STATUS, self._status),
             (GATEWAY_PROPOSALS, self._proposals),
             (GATEWAY_PAST, self._past),
+            (GATEWAY_COURSES, self._courses),
             (GATEWAY_FOR_PERSON, self._for_person),
         ):
             mailbox.serve(topic, handler)
@@ -103,6 +113,11 @@ class FakeGateway:
         status = json.loads((EXAMPLES / "status.json").read_text())
         now_s = time.time()
         status |= {"wall_s": now_s, "unwind_speed_m_per_s": 0.01 + 1e-4 * math.sin(now_s)}
+        status |= {"speed_setpoint_m_per_s": 0.01}
+        status["events"] = [one | {"wall_s": now_s - 400.0 + i} for i, one in enumerate(status["events"])]
+        ways = {"timeouts": 0, "malformed": 0, "reconnects": 0, "last_error": ""}
+        status["buses"] = [ways | {"name": bus.name, "absent": []} for bus in self.line.buses]
+        status["buses"][0]["absent"] = self.absent
         status["loop"]["state"] = self.state
         status["spans"] = [self._span(status["spans"][0], i, now_s) for i in range(self.line.n)]
         status["alarms"] = [one.model_dump() for one in self.alarms]
@@ -136,8 +151,39 @@ class FakeGateway:
             difference=["gain_state changes by 12.4 %", "predictor.gain_state changes by 3.1 %"],
             proposal=self.proposal,
             verdict=self.verdict,
+            approvals=self.approvals,
+            approved_by=self.first or None,
         )
         return shown.model_dump_json().encode()
+
+    async def _courses(self, payload: bytes) -> bytes:
+        """The first answer is that they are being drawn, as the gateway's is."""
+        asked, drawing = ShowCourses.model_validate_json(payload), not self.drawn
+        self.drawn = True
+        courses = [] if drawing else [self._course("tension", 1.0, 12.0), self._course("velocity", 1.4, 0.0)]
+        return CoursesTold(
+            format=1, proposal=asked.proposal, verdict=verdict_hash(self.verdict), model=None, drawing=drawing,
+            courses=courses,
+        ).model_dump_json().encode()  # fmt: skip
+
+    def _course(self, scenario: str, swing_n: float, step_n: float) -> DrawnCourse:
+        """After 0.3 s a step or a push, and what two laws make of it."""
+        times = [0.04 * k for k in range(130)]
+        since = [max(0.0, t - 0.3) for t in times]
+        asked = [[setpoint + (step_n if t > 0.3 else 0.0) for t in times] for setpoint in self.setpoints]
+
+        def ends(setpoint: float, damping: float, push_n: float) -> list[float | None]:
+            swings = [step_n * math.cos(7.0 * t) + push_n * math.sin(7.0 * t) for t in since]
+            left = [math.exp(-damping * t) * one for t, one in zip(since, swings, strict=True)]
+            return [setpoint + (step_n - one if t > 0.3 else 0.0) for t, one in zip(times, left, strict=True)]
+
+        return DrawnCourse(
+            scenario=scenario, time_s=times, setpoint_n=asked,
+            tension_n={
+                "in service": [ends(one, 1.6, 3.0 * swing_n) for one in self.setpoints],
+                "proposed": [ends(one, 4.0, swing_n) for one in self.setpoints],
+            },
+        )  # fmt: skip
 
     def _list(self) -> ProposalList:
         line = ProposalLine(
@@ -202,7 +248,7 @@ class FakeGateway:
         if reason := why_may_not(asked.person, said.command):
             return Reply(ok=False, state=self.state, text=reason, reasons=[reason])
         if isinstance(said, Decide):
-            return self._decided(said)
+            return self._decided(said, asked.person.name)
         if isinstance(said, AcknowledgeAlarm):
             seen = {"acknowledged": True, "acknowledged_by": asked.person.name}
             self.alarms = [one.model_copy(update=seen) if one.name == said.alarm else one for one in self.alarms]
@@ -214,10 +260,13 @@ class FakeGateway:
         self.state = {"stop": "STOP", "hold": "HOLD", "start": "RUN", "arm": "READY"}.get(said.command, self.state)
         return Reply(ok=True, state=self.state, text=f"{said.command}: done")
 
-    def _decided(self, said: Decide) -> Reply:
+    def _decided(self, said: Decide, name: str) -> Reply:
         if self.stage != "waiting" or said.shown != self.shown:
             reason = "what was shown is no longer what it is; look at it again"
             return Reply(ok=False, state=self.state, text="the decision does not count", reasons=[reason])
+        if said.approve and self.approvals > 1 and self.first in ("", name):
+            self.first = name
+            return Reply(ok=True, state=self.state, text="your approval is on record, as the first of two")
         self.stage = "probation" if said.approve else "rejected"
         self.epoch += said.approve
         return Reply(ok=True, state=self.state, text="approved" if said.approve else "rejected")
@@ -236,7 +285,7 @@ async def show(spans: int) -> None:
         side = LineSide(asked)
         watching = asyncio.create_task(side.watch())
         try:
-            await serve_page(page_app(line, side, check, time.monotonic), line.operator.page)
+            await serve_page(page_app(line, side, check, role_of, time.monotonic), line.operator.page)
         finally:
             watching.cancel()
             await asyncio.gather(watching, return_exceptions=True)

@@ -95,9 +95,9 @@ class OperatorLine(GateLine):
         """Nothing happens to the line within, and of what people have asked for the audit gets `kinds` alone."""
         before, records = self._as_it_is(), len(self.records())
         yield
-        assert self._as_it_is() == before
+        assert (now := self._as_it_is()) == before, (before, now)
         told = [one.kind for one in self.records()[records:] if one.who.name != GATEWAY.name and one.kind not in DOOR]
-        assert sorted(told) == sorted(kinds)
+        assert sorted(told) == sorted(kinds), told
 
     def _as_it_is(self) -> tuple[object, ...]:
         status, runs = self.status(), self.configuration()

@@ -9,7 +9,7 @@ from gateway.core.messages import Reply
 from gateway.operator.opcua import limits
 from gateway.operator.opcua.methods import METHODS
 from gateway.operator.opcua.trust import fingerprint
-from tests.protocol.operator_support import SHOWN, bench, der, pair, shown
+from tests.protocol.operator_support import SHOWN, alarm, bench, der, pair, shown
 
 CODES = ua.StatusCodes
 TEXT, NUMBER, REAL, YES = ua.VariantType.String, ua.VariantType.UInt32, ua.VariantType.Double, ua.VariantType.Boolean
@@ -35,23 +35,27 @@ def decide(one, shown_hash=SHOWN, revision=3, approve=True):
     return [text(one.proposal_hash), text(shown_hash), number(revision), ua.Variant(approve, YES), text("looks right")]
 
 
+SINCE = "2026-11-23T15:00:00.250Z"
 ARGUMENTS = {
     "SetTension": lambda _: [number(1), real(22.0)], "SetSpeed": lambda _: [real(0.05)],
     "SelectRecipe": lambda _: [text("web-a")], "Rollback": lambda _: [text("it squeals")],
-    "AcknowledgeAlarm": lambda _: [text("tension-low"), text(None)], "Decide": decide,
+    "AcknowledgeAlarm": lambda _: [text("tension-low"), text(SINCE), text(None)], "Decide": decide,
+    "ShelveAlarm": lambda _: [text("tension-low"), real(30.0), text("being mended")],
+    "Archive": lambda _: [text("12"), text("phi_stable"), text("it held all week")],
+    "LineChanged": lambda _: [text("a thinner web")],
 }  # fmt: skip
 
 
 def test_every_method_is_said_in_the_name_of_who_calls_and_refused_to_viewers():
     async def story():
-        async with bench(spans=1) as b, b.connected("otto") as otto, b.connected("vera") as vera:
+        async with bench(spans=1) as b, b.connected("emma") as emma, b.connected("vera") as vera:
             one = shown()
             b.gateway.waiting = [one]
             for method in METHODS:
                 arguments = ARGUMENTS.get(method.name, lambda _: [])(one)
                 for _ in range(2):
                     assert await b.call(vera, method.name, *arguments) == (CODES.BadUserAccessDenied, [])
-                assert await b.call(otto, method.name, *arguments) == (CODES.Good, [True, "done"]), method.name
+                assert await b.call(emma, method.name, *arguments) == (CODES.Good, [True, "done"]), method.name
             tried = [one for one in b.gateway.heard if one.person.name == "vera"]  # once each, for the audit
             assert [(one.said.command, one.person.role) for one in tried] == [
                 (method.command, "viewer") for method in METHODS
@@ -59,7 +63,7 @@ def test_every_method_is_said_in_the_name_of_who_calls_and_refused_to_viewers():
             done = [one for one in b.gateway.heard if one.person.name != "vera"]
             assert [one.said.command for one in done] == [method.command for method in METHODS]
             for heard in done:
-                assert (heard.person.name, heard.person.role, heard.person.through) == ("otto", "operator", "opc-ua")
+                assert (heard.person.name, heard.person.role, heard.person.through) == ("emma", "engineer", "opc-ua")
                 assert heard.person.certificate == fingerprint(der(pair("client")))
             tension = next(one.said for one in done if one.said.command == "set")
             assert (tension.span, tension.tension_n, tension.step) == (1, 22.0, False)
@@ -149,11 +153,14 @@ def test_a_call_that_cannot_be_one_gets_its_code_and_the_session_lives():
 
 def test_numbers_that_are_none_are_refused_in_words():
     async def story():
-        async with bench(spans=1) as b, b.connected("otto") as client:
+        async with bench(spans=1) as b, b.connected("emma") as client:
             for method, arguments in (
                 ("SetTension", [number(1), real(float("nan"))]), ("SetSpeed", [real(float("inf"))]),
                 ("SetTension", [number(0), real(20.0)]), ("Rollback", [text("x" * 1001)]),
-                ("AcknowledgeAlarm", [text("No Such"), text("")]),
+                ("AcknowledgeAlarm", [text("No Such"), text(SINCE), text("")]),
+                ("ShelveAlarm", [text("load-cell"), real(float("nan")), text("why")]),
+                ("ShelveAlarm", [text("load-cell"), real(1e9), text("why")]),
+                ("ShelveAlarm", [text("load-cell"), real(30.0), text("")]), ("LineChanged", [text("")]),
             ):  # fmt: skip
                 code, (ok, sentence) = await b.call(client, method, *arguments)
                 assert (code, ok) == (CODES.Good, False) and sentence.startswith("nothing was sent: "), method
@@ -208,5 +215,30 @@ def test_methods_say_what_they_take_and_return():
             assert [one.Name for one in inputs] == ["id", "hash", "base_revision", "approve", "comment"]
             outputs = await (await client.get_node(b.id("Line.Decide")).get_child("0:OutputArguments")).read_value()
             assert [one.Name for one in outputs] == ["ok", "sentence"]
+
+    run(story)
+
+
+def test_what_takes_an_engineer_is_refused_to_an_operator():
+    async def story():
+        async with bench(spans=1) as b, b.connected("otto") as otto:
+            for name in ("Archive", "LineChanged"):
+                assert await b.call(otto, name, *ARGUMENTS[name](None)) == (CODES.BadUserAccessDenied, [])
+
+    run(story)
+
+
+def test_an_alarm_is_acknowledged_as_it_was_shown():
+    async def story():
+        async with bench(spans=1) as b, b.connected("otto") as client:
+            b.gateway.alarms = [alarm("load-cell").model_copy(update={"since_wall_s": 1.7e9 + 0.125})]
+            path = "Line.Alarms.load-cell.Since"
+            since = (await b.until(client, path, lambda found: bool(found.Value.Value))).Value.Value
+            assert (await b.call(client, "AcknowledgeAlarm", text("load-cell"), text(since), text("")))[1][0]
+            for wrong in ("", "yesterday", "2026-11-23T15:00:00", "9" * 5000):
+                _, (ok, sentence) = await b.call(client, "AcknowledgeAlarm", text("load-cell"), text(wrong), text(""))
+                assert not ok and "allowed: Since of the alarm" in sentence and len(sentence) < 200
+            (heard,) = b.gateway.heard
+            assert (heard.said.alarm, heard.said.since_wall_s) == ("load-cell", 1.7e9 + 0.125)
 
     run(story)

@@ -7,10 +7,12 @@ import pytest
 from asyncua import Client
 
 from gateway.operator import ways
+from gateway.operator.opcua import service
 from gateway.operator.opcua.server import CannotServe
 from gateway.operator.page.serve import CannotServe as PageCannotServe
 from gateway.operator.ways import Way
-from tests.protocol.operator_support import bench
+from tests.protocol.operator_support import bench, shown
+from tests.protocol.test_operator_nodes import record
 from tests.protocol.test_operator_security import run
 
 
@@ -91,5 +93,35 @@ def test_the_server_listens_once_its_port_is_free_and_tells_of_a_page_that_is_no
                         await b.until(client, path, lambda one, trouble=trouble: one.Value.Value == trouble)
                 running.cancel()
                 await asyncio.gather(running, return_exceptions=True)
+
+    run(story)
+
+
+def test_a_fault_of_this_program_ends_nothing_is_told_once_and_what_it_hides_does_not_look_true(monkeypatch):
+    async def story():
+        async with bench(spans=1) as b, b.connected("vera") as client:
+
+            def good(found):
+                return found.StatusCode.is_good()
+
+            def bad(found):
+                return found.StatusCode.is_bad()
+
+            b.gateway.waiting = [shown()]
+            await b.until(client, "Line.Proposals.Current.Id", lambda one: good(one) and one.Value.Value)
+            await b.until(client, "Line.Spans.1.Tension", good)
+            with monkeypatch.context() as broken:
+                broken.setattr(service, "of_status", lambda _: 1 / 0)
+                broken.setattr(b.opcua._proposals, "show", lambda _: 1 / 0)  # noqa: SLF001
+                broken.setattr(b.opcua._events, "_tell", lambda _: 1 / 0)  # noqa: SLF001
+                b.gateway.records = [record(1), record(2)]
+                await b.until(client, "Line.Spans.1.Tension", bad)
+                await b.until(client, "Line.Proposals.Current.Id", bad)
+                while b.opcua._events._after != 2:  # noqa: ASYNC110, SLF001
+                    await asyncio.sleep(0.01)
+            await b.until(client, "Line.Spans.1.Tension", good)
+            await b.until(client, "Line.Proposals.Current.Id", lambda one: good(one) and one.Value.Value)
+            assert set(b.said) == {"OPC UA does not tell all: ZeroDivisionError: division by zero"}
+            assert len(b.said) <= 3 + 1  # by each task once, and again after it had gone well in between
 
     run(story)

@@ -20,6 +20,7 @@ PACKAGES = {
     "cc": "gcc libc6-dev",
     "node": "nodejs",
     "npm": "npm",
+    "chromium": "chromium",
 }
 OLDEST_NODE = 18
 

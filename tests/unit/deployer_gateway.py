@@ -5,7 +5,8 @@ import asyncio
 from gateway.core.audit_record import Who
 from gateway.core.controller import config_hash
 from gateway.core.decisions import Decide
-from gateway.core.proposal import canonical
+from gateway.core.line_model import model_hash
+from gateway.core.proposal import ModelChange, canonical
 from gateway.supervisor.deployer import Deployer
 from gateway.supervisor.lifecycle import Stage, book_of
 from tests.unit.deployer_support import (
@@ -60,6 +61,8 @@ class Gateway:
 
     async def propose(self, one):
         self.proposals[hash_of(one)] = one
+        if isinstance(one.change, ModelChange):
+            self.surroundings.models[model_hash(one.change.model)] = one.change.model
         reply = await self.deployer.propose(canonical(one), ANNA)
         await self.deployer.judged()
         return reply

@@ -8,13 +8,15 @@ from gateway.control.design import design_lqi, task_of
 from gateway.core.controller import config_hash
 from gateway.core.deployment import Deployment, InService, RecoveryNode, RecoveryPrediction, Region
 from gateway.core.judge_context import JudgeContext, LineState, context_hash
+from gateway.core.line_model import LineModel
 from gateway.core.messages import Command, Deploy, Keep, Narrow, Renew, Reply, Rollback, RunExperiment, WatchGood
-from gateway.core.proposal import GainsChange, Proposal, proposal_hash
+from gateway.core.proposal import GainsChange, ModelChange, Proposal, proposal_hash
 from gateway.core.verdict import RuleFinding, Verdict
 from gateway.mailbox.port import Unreachable
 from gateway.supervisor.audit_file import AuditUnavailable
 from gateway.supervisor.deployer_sides import NotKnown
 from gateway.supervisor.proposal_records import iso
+from tests.unit.model_support import model as fitted
 from tests.unit.supervisor_support import line_of
 
 LINE = line_of(2)
@@ -32,6 +34,12 @@ def proposal(number: int, base: str, now_s: float, nonce: int = 0, lifetime_s: f
         format=1, site=LINE.site, line=LINE.line, change=GainsChange(controller=controller(number)), base=base,
         model=None, reason=f"trial {nonce}", author="rules", created=iso(now_s), expires=iso(now_s + lifetime_s),
     )  # fmt: skip
+
+
+def model_proposal(number: int, base: str, now_s: float, nonce: int = 0) -> Proposal:
+    """That proposals be judged by another model than all others with another number."""
+    model = fitted(LINE.n, 1.0 + 0.01 * number, site=LINE.site, line=LINE.line)
+    return proposal(number, base, now_s, nonce).model_copy(update={"change": ModelChange(model=model)})
 
 
 class Killed(BaseException):
@@ -77,6 +85,8 @@ class FakeAudit:
         self.blobs |= {hashlib.sha256(blob).hexdigest(): blob for blob in (blobs or {}).values()}
         if due:
             raise Killed
+
+    async def fetch(self, ids): ...
 
     def blob(self, id_):
         return self.blobs.get(id_)
@@ -198,10 +208,12 @@ class FakeSurroundings:
     against: str = ""
     hidden: str = ""  #: what it has not shown yet
     unknown: str = ""  #: why no recovery can be predicted
+    models: dict[str, LineModel] = field(default_factory=dict)  #: that were proposed, by hash
 
     async def context(self, book):
         state = LineState(state="READY", tension_n=[30.0] * LINE.n, speed_m_per_s=0.0)
-        return JudgeContext(format=1, now=iso(self.loop.now_s), state=state, in_service=FIRST), []
+        model = None if book.model is None else self.models[book.model]
+        return JudgeContext(format=1, now=iso(self.loop.now_s), state=state, in_service=FIRST, model=model), []
 
     def difference(self, one, book) -> list[str]:
         return ["a test"]

@@ -14,7 +14,9 @@ from gateway.mailbox.unix import UnixMailbox
 from gateway.operator.line_side import TOPICS, LineSide
 from gateway.operator.page.app import page_app
 from gateway.operator.page.login import TOKEN_HEADER
+from gateway.operator.users import RoleOf
 from tests.operator.fake_line import PASSWORD, FakeGateway, check
+from tests.operator.fake_line import role_of as role_of_anybody
 from tests.unit.supervisor_support import line_of, short_folder, until
 
 HERE = "http://127.0.0.1:8480"
@@ -42,7 +44,11 @@ class Page:
 
 @asynccontextmanager
 async def page(
-    spans: int = 3, clock: Callable[[], float] = time.monotonic, watched: bool = True, **operator: str
+    spans: int = 3,
+    clock: Callable[[], float] = time.monotonic,
+    watched: bool = True,
+    role_of: RoleOf = role_of_anybody,
+    **operator: str,
 ) -> AsyncIterator[Page]:
     """`operator`: keys of that table of the line's file."""
     line = line_of(spans)
@@ -54,7 +60,7 @@ async def page(
         await served.listen(folder / "gateway.sock")
         asked.connect(TOPICS, folder / "gateway.sock")
         side = LineSide(asked)
-        app = page_app(line, side, check, clock)
+        app = page_app(line, side, check, role_of, clock)
         watching = asyncio.create_task(side.watch()) if watched else None
         try:
             if watched:

@@ -176,7 +176,7 @@ def test_the_page_tells_who_has_logged_in_and_from_where_others_tried(both):
         return "operator" if password == SECRET else None
 
     async def story():
-        app = page_app(line_of(1), both.side, check, lambda: both.now_s, both.access)
+        app = page_app(line_of(1), both.side, check, lambda _: "operator", lambda: both.now_s, both.access)
         transport = httpx.ASGITransport(app, client=("127.0.0.9", 1))
         base = "http://127.0.0.1:8480"
         async with httpx.AsyncClient(transport=transport, base_url=base, headers={"origin": base}) as browser:

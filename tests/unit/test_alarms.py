@@ -490,3 +490,18 @@ def test_where_the_file_cannot_be_written_it_is_told(desk: Desk) -> None:
     reply = desk.ask(AcknowledgeAlarm(alarm="device-absent"))
     assert reply.ok and "the next start of the gateway will not know" in reply.text
     assert desk.listed()[0].acknowledged
+
+
+def test_an_alarm_that_came_again_is_not_acknowledged_by_whoever_saw_the_first(desk: Desk) -> None:
+    desk.look(ABSENT)
+    first = desk.listed()[0].since_wall_s
+    desk.ask(AcknowledgeAlarm(alarm="device-absent", since_wall_s=first))
+    desk.look(status(), 30.0)
+    assert desk.listed() == []
+    desk.look(ABSENT, 1.0)
+    again = desk.listed()[0].since_wall_s
+    assert again > first
+    reply = desk.ask(AcknowledgeAlarm(alarm="device-absent", since_wall_s=first))
+    assert not reply.ok and "another than the one that was shown" in reply.reasons[0]
+    assert not desk.listed()[0].acknowledged
+    assert desk.ask(AcknowledgeAlarm(alarm="device-absent", since_wall_s=again)).ok

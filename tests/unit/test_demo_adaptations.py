@@ -4,8 +4,8 @@ from typing import Any
 
 import pytest
 
+from gateway.cli.asked_result import asked_result
 from gateway.cli.demo_adaptations import adaptations_section, selection_section
-from gateway.cli.demo_asked import asked_result
 from gateway.cli.demo_result import AskedResult, ChainResult, ChangeResult, DemoResult
 from gateway.commissioning.past import Step
 from tests.unit.test_demo_asked import change, interaction, shown
@@ -22,10 +22,11 @@ def of(step: Step, proposal: str, stage: str = "done", **changes: Any) -> Change
 
 
 def told(changes: list[ChangeResult], questions: list[AskedResult]) -> list[list[tuple[str, ...]]]:
-    """The rows of each story."""
+    """What each story says, by part."""
     result = DemoResult.model_construct(configurations=[])
     chain = ChainResult.model_construct(changes=changes, asked=questions)
-    return [list(story.tables[0].rows) for story in adaptations_section(result, chain).stories]
+    stories = adaptations_section(result, chain, {}).stories
+    return [[(name, text) for name, texts in story.facts for text in texts] for story in stories]
 
 
 @pytest.mark.parametrize("newer_model", [False, True])
@@ -65,13 +66,13 @@ def test_the_change_is_told_in_the_words_of_who_chose_it_not_of_who_diagnosed() 
     changes = [of(Step.MEASUREMENT, "m", measured="bad"), of(Step.REDESIGN, "r", "kept")]
     questions = [asked(1, "r", "adapt.change", "It is calmer."), asked(2, "r", "adapt.diagnosis", "It swings.")]
     chain = ChainResult.model_construct(changes=changes, asked=questions)
-    (story,) = adaptations_section(DemoResult.model_construct(configurations=[]), chain).stories
+    (story,) = adaptations_section(DemoResult.model_construct(configurations=[]), chain, {}).stories
     assert story.quote == "It is calmer." and "agent adaptation" in story.lead
 
 
 def test_where_no_redesign_was_kept_the_section_says_so() -> None:
     chain = ChainResult.model_construct(changes=[of(Step.REDESIGN, "r", "refused")], asked=[])
-    section = adaptations_section(DemoResult.model_construct(configurations=[]), chain)
+    section = adaptations_section(DemoResult.model_construct(configurations=[]), chain, {})
     assert section.stories == () and "No redesign" in section.paragraphs[0]
 
 

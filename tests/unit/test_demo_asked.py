@@ -7,12 +7,13 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from gateway.cli.demo_asked import asked_result, read_interactions
+from gateway.cli.asked_result import asked_result
+from gateway.cli.change_result import closest_of
+from gateway.cli.demo_asked import read_interactions
 from gateway.cli.demo_asked_page import asked_section, came_of, in_short
 from gateway.cli.demo_failed import DemoFailed
-from gateway.cli.demo_gate import _closest
 from gateway.cli.demo_line import LanguageModelAsked, Ports, Setup, line_text
-from gateway.cli.demo_result import ChainResult, ChangeResult, RuleResult
+from gateway.cli.demo_result import ChangeResult, RuleResult
 from gateway.cli.main import app
 from gateway.commissioning.past import Step, asked, named
 from gateway.core.interactions import Answer, Interaction, Note, pack
@@ -82,8 +83,7 @@ def test_the_section_tells_options_notes_choice_reason_and_outcome_and_folds_eve
     one = interaction(1, "adaptation", option="pid-calm", factors={"torque": 2.0}, reason="Span 3 swings.")
     results = asked_result([one], [shown("a" * 64, one)])
     refused = change("a" * 64, stage="refused", against=["corners: too low"], why="tension falls", speed_m_per_s=None)
-    chain = ChainResult.model_construct(asked=results, changes=[refused])
-    section = asked_section(chain, [one], Path("out/my demo/data"))
+    section = asked_section(results, [refused], [one], Path("out/my demo/data"))
     (story,) = section.stories
     assert story.title == "1. Which design is proposed next?"
     assert "Swinging of a span (tier 2, 0.75)" in story.paragraphs[0] and "10:00:01" in story.paragraphs[0]
@@ -100,7 +100,7 @@ def test_the_section_tells_options_notes_choice_reason_and_outcome_and_folds_eve
     (fold,) = story.folds
     assert fold.title == f"Word by word (r2rgate log {one.id} --data-dir 'out/my demo/data')"
     assert "call 1 of" in fold.text and "said: {}" in fold.text
-    assert asked_section(ChainResult.model_construct(asked=[], changes=[]), [], Path()).stories == ()
+    assert asked_section([], [], [], Path()).stories == ()
 
 
 def finding(rule: str, passed: bool, margin: float | None, limit: float | None = 10.0) -> RuleFinding:
@@ -114,9 +114,9 @@ def test_the_rule_that_decided_is_the_first_that_failed_or_the_narrowest() -> No
         ([wide, narrow, none, at_zero], "narrow"),
         ([narrow, failed, finding("later", False, -9.0)], "failed"),
     ):
-        found = _closest(findings)
+        found = closest_of(findings)
         assert found is not None and found.rule == rule
-    assert _closest([none]) is None and _closest([]) is None
+    assert closest_of([none]) is None and closest_of([]) is None
 
 
 def test_a_language_model_that_is_asked_stands_in_the_lines_file() -> None:

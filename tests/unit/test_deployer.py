@@ -1,9 +1,11 @@
 """The deployer: judged, approved as it was shown, audited first, deployed once."""
 
+import asyncio
+
 from gateway.core.controller import config_hash
-from gateway.supervisor.lifecycle import Stage
+from gateway.supervisor.lifecycle import Stage, book_of
 from tests.unit.deployer_gateway import ANNA, PROBATION_S, deployed, run, started
-from tests.unit.deployer_support import FIRST, LIFETIME_S, controller, hash_of, proposal
+from tests.unit.deployer_support import FIRST, LIFETIME_S, controller, hash_of, model_proposal, proposal
 
 
 @run
@@ -121,3 +123,66 @@ async def test_a_loop_that_was_started_with_something_else_is_asked_again():
     gateway.deployer.look_again()
     await gateway.deployer.watch()
     assert gateway.deployer.book.in_service == config_hash(controller(5))
+
+
+@run
+async def test_an_accepted_model_supersedes_what_waits_and_was_judged_by_the_old_one():
+    gateway = await started()
+    base = config_hash(FIRST)
+    one, other, another = proposal(1, base, 0.0), model_proposal(2, base, 0.0), model_proposal(3, base, 0.0)
+    for waits in (one, other, another):
+        await gateway.propose(waits)
+    assert (await gateway.decide(other)).ok
+    reply = await gateway.decide(one)  # as it is shown now, and before anybody has looked again
+    assert not reply.ok and "it was judged by the line's file" in reply.reasons[0]
+    await gateway.deployer.watch()
+    assert [gateway.stage(waits) for waits in (one, other, another)] == [
+        Stage.SUPERSEDED, Stage.KEPT, Stage.SUPERSEDED,
+    ]  # fmt: skip
+    assert "propose it again" in gateway.deployer.shown(hash_of(one)).why
+    again = proposal(1, base, gateway.loop.now_s, nonce=1)
+    await gateway.propose(again)
+    gateway.begin()  # what is on record is enough
+    await gateway.deployer.watch()
+    assert gateway.stage(again) is Stage.WAITING
+    assert (await gateway.decide(again)).ok and gateway.loop.epoch == 1
+
+
+@run
+async def test_a_verdict_by_the_old_model_that_comes_after_the_new_one_counts_no_more():
+    gateway = await started()
+    base = config_hash(FIRST)
+    one, other = proposal(1, base, 0.0), model_proposal(2, base, 0.0)
+    await gateway.propose(other)
+    judge, hold = gateway.judge.judge, asyncio.Event()
+
+    async def slow(*asked):
+        await hold.wait()
+        return await judge(*asked)
+
+    gateway.judge.judge = slow
+    proposing = asyncio.create_task(gateway.propose(one))
+    while hash_of(one) not in gateway.deployer.book.entries:  # noqa: ASYNC110 (in this loop)
+        await asyncio.sleep(0)
+    await asyncio.sleep(0)  # its context is made
+    assert (await gateway.decide(other)).ok
+    hold.set()
+    await proposing
+    assert not (await gateway.decide(one)).ok
+    await gateway.deployer.watch()
+    assert gateway.stage(one) is Stage.SUPERSEDED and gateway.loop.epoch == 0
+
+
+def test_records_that_do_not_say_by_which_model_was_judged_count_for_the_one_of_then():
+    times = {"created": "2026-01-05T06:00:00+00:00", "expires": "2026-01-05T14:00:00+00:00", "expires_s": 4e9}
+    named = {"author": "rules", "base": "2" * 64, **times}
+    book = book_of([
+        ("found-in-service", {"configuration": "2" * 64, "last_known_good": "2" * 64, "epoch": 0}),
+        ("proposed", {"proposal": "1" * 64, "changes": "3" * 64, "change": "model", **named}),
+        ("accepted", {"proposal": "1" * 64, "verdict": "4" * 64}),
+        ("approved", {"proposal": "1" * 64}),
+        ("model-in-service", {"proposal": "1" * 64}),
+        ("proposed", {"proposal": "5" * 64, "changes": "6" * 64, "change": "gains", **named}),
+        ("accepted", {"proposal": "5" * 64, "verdict": "7" * 64}),
+    ])  # fmt: skip
+    assert book.why_outdated(book.entries["5" * 64]) == "" and book.model == "3" * 64

@@ -9,10 +9,11 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
 from gateway.core.audit_record import Who
 from gateway.core.controller import config_hash
+from gateway.core.proposal import ModelChange
 from gateway.supervisor.lifecycle import Stage, book_of
 from gateway.supervisor.on_the_line import LEASE_S
 from tests.unit.deployer_gateway import ANNA, BERT, FOUR_EYES, PROBATION_S, TRUSTING, Gateway
-from tests.unit.deployer_support import FIRST, LIFETIME_S, LINE, Killed, controller, hash_of, proposal
+from tests.unit.deployer_support import FIRST, LIFETIME_S, LINE, Killed, controller, hash_of, model_proposal, proposal
 
 
 class LifeCycle(RuleBasedStateMachine):
@@ -51,6 +52,13 @@ class LifeCycle(RuleBasedStateMachine):
             self.gateway.judge.refuses.add(hash_of(one))
         self._run(self.gateway.propose(one))
 
+    @rule(number=st.integers(1, 3))
+    def propose_a_model(self, number):
+        self.count += 1
+        self._run(
+            self.gateway.propose(model_proposal(number, self.gateway.loop.runs, self.gateway.loop.now_s, self.count))
+        )
+
     @rule(data=st.data(), approve=st.booleans(), script=st.sampled_from(["", "a script"]))
     def decide(self, data, approve, script):
         if (one := self._any(data)) is not None:
@@ -74,6 +82,16 @@ class LifeCycle(RuleBasedStateMachine):
         self.propose(number, True, 1)
         self.death_is_near(effects, after)
         for _ in range(3):
+            self.approve_the_newest(data)
+
+    @rule(data=st.data(), number=st.integers(1, 3))
+    def another_model_is_accepted_while_all_is_well(self, data, number):
+        self.the_wire(True, True)
+        self.the_disk(True)
+        self.death_is_near(0, False)
+        self._run(self._begin())
+        self.propose_a_model(number)
+        for _ in range(2):
             self.approve_the_newest(data)
 
     @rule(seconds=st.sampled_from([0.5, 2.0, LEASE_S, PROBATION_S, PROBATION_S + 1.0, LIFETIME_S]))
@@ -157,6 +175,20 @@ class LifeCycle(RuleBasedStateMachine):
                 assert what["proposal"] in judged
 
     @invariant()
+    def nothing_goes_through_that_was_judged_by_another_model_than_the_one_in_service(self):
+        in_service, judged_by = None, {}
+        for kind, what in self.gateway.audit.records:
+            if kind == "line-changed":
+                in_service = None
+            elif kind == "accepted":
+                judged_by[what["proposal"]] = what["model"]
+            elif kind in ("approved", "deploying", "model-in-service"):
+                assert judged_by[what["proposal"]] == in_service
+            if kind == "model-in-service":
+                in_service = what["model"]
+        assert self.gateway.deployer.book.model == in_service
+
+    @invariant()
     def no_approval_is_left_lying(self):
         gateway = self.gateway
         if gateway.audit.available:
@@ -185,13 +217,17 @@ class TrustingLifeCycle(LifeCycle):
         for kind, what in self.gateway.audit.records:
             if kind == "rolled-back":
                 well.clear()
-            elif kind == "kept" and by[what["proposal"]] == "person":
+            elif kind in ("kept", "model-in-service") and by[what["proposal"]] == "person":
                 well.add(what["proposal"])
             elif kind == "approved":
                 by[what["proposal"]] = what["by"]
                 if what["by"] == "verdict":
                     assert what["like"] in well
-                    like, new = (proposals[what[name]].change.controller for name in ("like", "proposal"))
+                    changes = [proposals[what[name]].change for name in ("like", "proposal")]
+                    assert changes[0].kind == changes[1].kind
+                    if isinstance(changes[0], ModelChange):
+                        continue
+                    like, new = (change.controller for change in changes)
                     assert abs(new.antiwindup / like.antiwindup - 1.0) <= 0.3
 
 
@@ -229,7 +265,7 @@ class FourEyesLifeCycle(LifeCycle):
                 approved.add(what["proposal"])
             elif kind in ("approval-lapsed", "rejected", "line-changed"):
                 approved.discard(what.get("proposal", ""))
-            elif kind == "deploying":
+            elif kind in ("deploying", "model-in-service"):
                 assert what["proposal"] in approved
 
 

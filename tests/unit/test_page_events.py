@@ -10,11 +10,16 @@ from typing import Any
 import httpx
 import pytest
 
-from gateway.operator.page.events import MOST_BROWSERS
+from gateway.core.people import Role
+from gateway.operator.page import login, serve
+from gateway.operator.page.events import MOST_BROWSERS, Ticks
 from gateway.operator.page.login import TOKEN_HEADER
 from gateway.operator.page.serve import serve_on
+from gateway.operator.users import RoleOf
 from tests.operator.fake_line import PASSWORD, alarm
+from tests.operator.fake_line import role_of as role_of_anybody
 from tests.unit.page_support import Page, page
+from tests.unit.supervisor_support import until
 
 
 class Stream:
@@ -88,8 +93,8 @@ class Served:
 
 
 @asynccontextmanager
-async def served(spans: int = 3, watched: bool = True) -> AsyncIterator[Served]:
-    async with page(spans, watched=watched) as there:
+async def served(spans: int = 3, watched: bool = True, role_of: RoleOf = role_of_anybody) -> AsyncIterator[Served]:
+    async with page(spans, watched=watched, role_of=role_of) as there:
         listener = socket.create_server(("127.0.0.1", 0))
         found = Served(there, listener)
         try:
@@ -169,6 +174,20 @@ def test_who_does_not_read_gets_the_newest_later_and_nothing_queues_up():
     asyncio.run(story())
 
 
+def test_a_browser_that_takes_nothing_any_more_frees_its_place(monkeypatch: pytest.MonkeyPatch):
+    """It may never say that it is gone: a tablet that was switched off."""
+    monkeypatch.setattr(serve, "UNHEARD_MS", 300)
+
+    async def story() -> None:
+        async with served(spans=60) as at:
+            stream = await at.look(receive_bytes=4096)
+            ticks: Ticks = at.there.app.state.end.__self__
+            assert stream.status == 200 and ticks.looking == 1
+            await until(lambda: ticks.looking == 0)  # nobody reads the stream: it takes what fits into it, and no more
+
+    asyncio.run(story())
+
+
 def test_a_gateway_that_is_away_is_told_while_it_is():
     async def story() -> None:
         async with served() as at:
@@ -200,6 +219,21 @@ def test_no_more_look_than_can_and_a_place_becomes_free_again():
     asyncio.run(story())
 
 
+@pytest.mark.parametrize("role", [None, "engineer"])
+def test_whoever_has_another_role_or_none_loads_the_page_anew(role: Role | None, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(login, "LOOK_UP_S", 0.0)
+    roles: dict[str, Role | None] = {"viewer": "viewer"}
+
+    async def story() -> None:
+        async with served(role_of=roles.get) as at:
+            stream = await at.look()
+            await stream.until("tick")
+            roles["viewer"] = role
+            await stream.until("anew")
+
+    asyncio.run(story())
+
+
 def test_the_stream_ends_with_the_session():
     async def story() -> None:
         async with served() as at:
@@ -207,7 +241,7 @@ def test_the_stream_ends_with_the_session():
             stream = await at.look()
             await stream.until("tick")
             await at.log_out(token)
-            await stream.until("logged-out")
+            await stream.until("anew")
             assert (await at.look()).status == 401
 
     asyncio.run(story())

@@ -12,7 +12,7 @@ from gateway.operator.line_side import TOPICS, LineSide
 from gateway.operator.page.app import page_app
 from gateway.operator.page.login import TOKEN_HEADER
 from gateway.operator.page.tick import tick_of
-from tests.operator.fake_line import PASSWORD, check
+from tests.operator.fake_line import PASSWORD, check, role_of
 from tests.unit.page_support import HERE
 from tests.unit.supervisor_support import line_of, until
 from tests.unit.test_line_side import told
@@ -31,7 +31,7 @@ def test_what_is_said_through_the_page_is_recorded_and_told_there_again() -> Non
             assert side.status is not None
             tick = json.loads(json.dumps(tick_of(side.status, side.proposals, 1), allow_nan=False))
             assert tick["loop"]["running"] is False and tick["waiting"] == []
-            transport = httpx.ASGITransport(page_app(line_of(6), side, check, time.monotonic))
+            transport = httpx.ASGITransport(page_app(line_of(6), side, check, role_of, time.monotonic))
             async with httpx.AsyncClient(transport=transport, base_url=HERE, headers={"origin": HERE}) as browser:
                 entered = await browser.post("/api/login", json={"name": "operator", "password": PASSWORD})
                 browser.headers[TOKEN_HEADER] = entered.json()["token"]

@@ -6,7 +6,7 @@ from pathlib import Path
 import httpx
 import pytest
 
-from gateway.operator.page.guard import MOST_BYTES, why_not_from_here, why_not_this_host
+from gateway.operator.page.guard import MOST_BYTES, names_of, why_not_from_here, why_not_this_host
 from gateway.operator.page.login import TOKEN_HEADER
 from tests.unit.page_support import HERE, page
 
@@ -77,7 +77,19 @@ def test_a_name_that_somebody_else_points_here_gets_no_answer(host: str):
 
 @pytest.mark.parametrize("host", ["127.0.0.1:8480", "localhost:8480", "[::1]:8480"])
 def test_loopback_has_three_names(host: str):
-    assert why_not_this_host(host, loopback=True) == ""
+    for bound in ("127.0.0.1", "localhost", "::1"):
+        assert why_not_this_host(host, names_of(bound)) == ""
+
+
+@pytest.mark.parametrize("host, allowed", [("127.0.0.2:8480", True), ("localhost:8480", False),
+                                           ("127.0.0.1:8480", False), ("elsewhere.example", False)])  # fmt: skip
+def test_another_address_of_loopback_has_its_own_name_only(host: str, allowed: bool):
+    assert (why_not_this_host(host, names_of("127.0.0.2")) == "") is allowed
+
+
+def test_what_is_reached_from_other_machines_has_any_name():
+    assert why_not_this_host("line-7.plant.example", names_of("192.168.7.5")) == ""
+    assert why_not_this_host("", names_of("192.168.7.5")) == "the request names no host"
 
 
 def test_what_is_too_long_is_not_read_to_its_end():

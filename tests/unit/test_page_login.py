@@ -4,6 +4,7 @@ import asyncio
 
 import pytest
 
+from gateway.core.people import Role
 from gateway.operator.page.sessions import (
     FREE_TRIES,
     IDLE_S,
@@ -18,7 +19,15 @@ from gateway.operator.page.sessions import (
 from tests.operator.fake_line import PASSWORD
 from tests.unit.page_support import page
 
-ASKED = ("/api/line", "/api/proposals", "/api/proposals/abcdef", "/api/records", "/api/tensions", "/events")
+ASKED = (
+    "/api/line",
+    "/api/proposals",
+    "/api/proposals/abcdef",
+    "/api/courses/abcdef",
+    "/api/records",
+    "/api/tensions",
+    "/events",
+)
 
 
 class Clock:
@@ -105,11 +114,19 @@ def test_the_wait_doubles_has_an_end_and_is_forgotten():
     tries = Tries(clock)
     waits: list[float] = []
     for _ in range(FREE_TRIES + 9):
-        tries.failed("there")
+        tries.failed("there", f"name-{len(waits) % 3}")
         waits.append(tries.wait_s("there"))
     assert waits[: FREE_TRIES + 2] == [0.0] * (FREE_TRIES - 1) + [1.0, 2.0, 4.0]
     assert waits[-1] == LONGEST_WAIT_S and tries.wait_s("elsewhere") == 0.0
-    tries.went_well("there")
+
+
+def test_a_right_password_clears_the_tries_of_its_own_name_only():
+    tries = Tries(Clock())
+    for _ in range(FREE_TRIES):
+        tries.failed("there", "otto")
+        tries.went_well("there", "anna")
+    assert tries.wait_s("there") > 0.0
+    tries.went_well("there", "otto")
     assert tries.wait_s("there") == 0.0
 
 
@@ -117,7 +134,7 @@ def test_tries_from_ever_new_places_take_no_more_memory():
     tries = Tries(Clock())
     for place in range(MOST_PLACES + FREE_TRIES):
         for _ in range(FREE_TRIES):
-            tries.failed(str(place))
+            tries.failed(str(place), "otto")
     assert tries.wait_s("0") == 0.0 and tries.wait_s(str(MOST_PLACES)) > 0.0
 
 
@@ -203,6 +220,37 @@ def test_after_logging_out_the_cookie_is_worth_nothing():
             there.browser.cookies.update(kept)
             assert (await there.browser.get("/api/me")).json()["role"] is None
             assert (await there.browser.get("/api/line")).status_code == 401
+
+    asyncio.run(story())
+
+
+def test_a_user_who_is_taken_away_says_nothing_more_though_logged_in():
+    roles: dict[str, Role | None] = {"operator": "operator"}
+
+    async def story() -> None:
+        async with page(role_of=roles.get) as there:
+            await there.log_in()
+            del roles["operator"]
+            assert (await there.say("start")).status_code == 401 and there.gateway.said == []
+            assert (await there.browser.get("/api/line")).status_code == 401
+            roles["operator"] = "operator"  # who comes back logs in again
+            assert (await there.browser.get("/api/me")).json()["role"] is None
+
+    asyncio.run(story())
+
+
+def test_another_role_counts_at_once_and_the_session_goes_on():
+    roles: dict[str, Role | None] = {"operator": "operator"}
+
+    async def story() -> None:
+        async with page(role_of=roles.get) as there:
+            await there.log_in()
+            roles["operator"] = "viewer"
+            assert (await there.say("start")).status_code == 403
+            assert there.gateway.said[-1].person.role == "viewer"
+            roles["operator"] = "engineer"
+            assert "archive" in (await there.browser.get("/api/line")).json()["may"]
+            assert (await there.say("stop")).status_code == 200
 
     asyncio.run(story())
 

@@ -2,7 +2,6 @@
 
 import asyncio
 import json
-from pathlib import Path
 
 import pytest
 
@@ -12,8 +11,8 @@ from gateway.core.signals import DriveState, Quality
 from gateway.core.status import GatewayStatus
 from gateway.core.verdict import RuleFinding
 from gateway.operator.page.tick import DRIVES_THAT_FAIL, IN_MOTION, OFF_SHARE, abnormal, line_told, tick_of
-from gateway.operator.page.told import TWO_PEOPLE, TWO_SIDED, proposal_told, used
-from gateway.supervisor import alarm_conditions, deployer
+from gateway.operator.page.told import TWO_SIDED, proposal_told, used
+from gateway.supervisor import alarm_conditions
 from safety.rules import model_residuals, validity
 from tests.unit.page_support import page
 from tests.unit.supervisor_support import line_of
@@ -95,6 +94,7 @@ def test_what_fails_are_names_of_drive_states():
         (None, 2.0, 1.0, None),
         (1.0, None, None, None),
         (-1.0, 0.5, -1.5, 1.0),  # decay that is growth
+        (0.39, -10.0, 10.39, None),  # at least something negative: no bar, rather than one of no length
     ],
 )
 def test_how_much_of_a_limit_is_used(value: float | None, limit: float | None, margin: float | None, expected: object):
@@ -113,20 +113,17 @@ def test_rules_of_two_limits_are_called_what_the_gate_calls_them():
     assert {validity.RULE, model_residuals.RULE} == TWO_SIDED
 
 
-@pytest.mark.parametrize("why, two", [("", False), ("the line stands still", False),
-                                      *[(f"{said}; it is checked", True) for said in TWO_PEOPLE]])  # fmt: skip
-def test_a_change_that_takes_two_people_says_so(why: str, two: bool):
+def test_a_change_that_takes_two_people_says_so_and_who_was_the_first():
     async def story() -> None:
         async with page() as there:
-            shown = await there.side.shown(there.gateway.hash)
-            assert proposal_told(shown.model_copy(update={"why": why}))["two_people"] is two
+            there.gateway.approvals = 2
+            await there.log_in("engineer")
+            for approved_by in (None, "engineer"):
+                told = (await there.browser.get(f"/api/proposals/{there.gateway.hash}")).json()
+                assert (told["approvals"], told["approved_by"], told["stage"]) == (2, approved_by, "waiting")
+                await there.say("decide", proposal=there.gateway.hash, shown=told["shown"], approve=True)
 
     asyncio.run(story())
-
-
-def test_the_gateway_says_so_in_these_words():
-    said = Path(deployer.__file__).read_text()
-    assert all(words in said for words in TWO_PEOPLE)
 
 
 def test_an_experiment_says_how_long_it_moves_set_points():
@@ -166,3 +163,15 @@ def test_set_points_are_offered_as_far_as_the_loop_takes_them():
         limits.tension_min_n + limits.tension_margin_n,
         limits.tension_max_n - limits.tension_margin_n,
     ]
+
+
+def test_courses_come_once_they_are_drawn():
+    async def story() -> None:
+        async with page() as there:
+            await there.log_in("viewer")
+            assert (await there.browser.get(f"/api/courses/{there.gateway.hash}")).json()["drawing"]
+            told = (await there.browser.get(f"/api/courses/{there.gateway.hash}")).json()
+            assert not told["drawing"] and len(told["courses"][0]["setpoint_n"]) == there.line.n
+            assert (await there.browser.get("/api/courses/abcdef")).status_code == 400
+
+    asyncio.run(story())

@@ -14,6 +14,7 @@ from gateway.core.audit_record import Who
 from gateway.core.line_past import MOST_POINTS, MOST_RECORDS, RecordsAfter, RecordsTold, TensionsBetween, TensionsTold
 from gateway.core.messages import Reply
 from gateway.core.proposal import canonical, proposal_hash
+from gateway.core.signals import Quality
 from gateway.core.topics import GATEWAY_PAST
 from gateway.mailbox.port import MAX_PAYLOAD
 from gateway.mailbox.unix import UnixMailbox
@@ -242,12 +243,14 @@ def test_what_is_no_question_is_not_understood(folder: Path, query: bytes) -> No
 # ---- tensions
 
 
-def store(folder: Path, time_s: np.ndarray, tension_n: np.ndarray) -> None:
+def store(folder: Path, time_s: np.ndarray, tension_n: np.ndarray, quality: np.ndarray | None = None) -> None:
     """Frames of six spans, a blob of ten seconds at a time."""
     writer = writer_of(folder / HISTORY)
     for first in range(0, len(time_s), 1000):
         part = range(first, min(first + 1000, len(time_s)))
-        writer.store([frame_of(k, float(time_s[k]), tension_n=tension_n[k]) for k in part], (), WALL_AHEAD_S)
+        trust = np.zeros((len(time_s), 6), np.int8) if quality is None else quality
+        frames = [frame_of(k, float(time_s[k]), tension_n=tension_n[k], tension_quality=trust[k]) for k in part]
+        writer.store(frames, (), WALL_AHEAD_S)
     writer.disconnect()
 
 
@@ -279,10 +282,26 @@ def test_a_gap_is_a_gap_and_what_is_no_number_is_null(folder: Path) -> None:
     assert {value for value in told.tension_n[0] if value is not None} == {30.0}
 
 
+def test_how_far_each_value_may_be_trusted_is_told_with_it(folder: Path) -> None:
+    time_s = np.arange(0.0, 30.0, 0.01)
+    tension_n = 30.0 + np.tile(np.sin(time_s)[:, None], (1, 6))
+    quality = np.zeros((len(time_s), 6), np.int8)
+    quality[1000:2000, 1], quality[1000:2000, 2] = Quality.STALE, Quality.BAD
+    tension_n[2000:, 3], quality[2000:, 3] = np.nan, Quality.MISSING
+    store(folder, time_s, tension_n, quality)
+    told = tensions(folder, 0.0, 30.0, points=60)
+    assert {len(column) for column in told.quality} == {len(told.wall_s)}
+    between = [10.0 < wall_s - WALL_AHEAD_S < 20.0 for wall_s in told.wall_s]
+    for span, then in ((0, Quality.GOOD), (1, Quality.STALE), (2, Quality.BAD)):
+        assert told.quality[span] == [then if inside else Quality.GOOD for inside in between]
+    for value, trust in zip(told.tension_n[3], told.quality[3], strict=True):
+        assert (value is None) == (trust == Quality.MISSING)
+
+
 def test_an_interval_of_which_nothing_is_kept_has_no_rows(folder: Path) -> None:
     store(folder, np.arange(0.0, 1.0, 0.01), np.full((100, 6), 30.0))
     told = tensions(folder, 100.0, 200.0)
-    assert told.wall_s == [] and told.speed_m_per_s == []
+    assert told.wall_s == [] and told.speed_m_per_s == [] and told.quality == []
 
 
 def test_an_interval_of_some_periods_is_told_whole(folder: Path) -> None:

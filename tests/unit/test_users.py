@@ -4,13 +4,14 @@ import os
 import pty
 import sys
 from pathlib import Path
+from threading import Thread
 
 import pytest
 from typer.testing import CliRunner
 
 from gateway.cli.main import app
 from gateway.core.line_template import line_template
-from gateway.operator.users import Users, UsersFile, UsersRefused, why_weak
+from gateway.operator.users import Users, UsersFile, UsersRefused, change, why_weak
 
 GOOD = "vier warme Walzen"
 
@@ -265,3 +266,36 @@ def test_the_role_of_somebody_who_is_in_already_is_the_files_of_now(anna: Users,
     assert UsersFile(path).role_of("anna") is None
     path.unlink()
     assert file.role_of("anna") is None
+
+
+def test_of_two_who_change_the_users_at_once_neither_loses_what_they_did(tmp_path: Path) -> None:
+    path = tmp_path / "users.toml"
+    names = [f"user{number}" for number in range(8)]
+
+    def add(name: str) -> None:
+        change(path, lambda users: users.with_user(name, GOOD, "viewer"))
+
+    threads = [Thread(target=add, args=(name,)) for name in names]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert [one.name for one in UsersFile(path).current().entries()] == names
+
+
+def test_a_change_that_is_refused_changes_nothing_and_leaves_the_file_to_others(anna: Users, tmp_path: Path) -> None:
+    path = tmp_path / "users.toml"
+    anna.write(path)
+    before = path.read_bytes()
+    with pytest.raises(UsersRefused):
+        change(path, lambda users: users.without("bert"))
+    assert path.read_bytes() == before
+    change(path, lambda users: users.without("anna"))
+    assert UsersFile(path).current().entries() == []
+    assert (tmp_path / "users.lock").stat().st_mode & 0o077 == 0
+
+
+@pytest.mark.parametrize("name", ["anonymous", "gateway", "sysid", "root"])
+def test_nobody_is_called_as_the_audit_calls_what_is_no_person(name: str) -> None:
+    with pytest.raises(UsersRefused, match=name):
+        Users.nobody().with_user(name, GOOD, "viewer")

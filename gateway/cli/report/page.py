@@ -10,6 +10,7 @@ from datetime import datetime
 import numpy as np
 
 from gateway.cli.report.data import FloatArray
+from gateway.core.verdict import Verdict
 
 LARGEST = 3e38  #: that the page can carry
 
@@ -53,6 +54,8 @@ class Story:
     quote: str = ""  #: somebody's own words
     after: tuple[str, ...] = ()  #: paragraphs behind them
     folds: tuple[Fold, ...] = ()
+    facts: tuple[tuple[str, tuple[str, ...]], ...] = ()  #: names, and what is said of each; before the tables
+    verdict: Verdict | None = None  #: what the gate has found of it, before the folds
 
 
 @dataclass(frozen=True, slots=True, eq=False)

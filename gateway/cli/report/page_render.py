@@ -6,10 +6,14 @@ from typing import Any
 import numpy as np
 
 from gateway.cli.report import shell
+from gateway.cli.report.components import component_words, components
 from gateway.cli.report.data import FloatArray
 from gateway.cli.report.embed import packed, script_json
 from gateway.cli.report.markup import chart_place, plural, range_words, swatch, table, versions_text, zoom_bar
 from gateway.cli.report.page import Chart, Page, Section, Story, Table
+from gateway.cli.report.verdict_tables import verdict_tables
+from gateway.core.verdict import Verdict
+from gateway.operator.page.told import verdict_told
 
 HINT = """<p class="muted hint">Point at a chart to read its values above it. Drag across it to look closer,
 double-click to see all of it again. In a chart that has the focus, arrow keys move the cursor, + and − zoom, 0 shows
@@ -24,15 +28,21 @@ def render_page(page: Page) -> str:
     header = shell.header(page.origin, page.when, page.title, [*links, ("method", "How this was made")])
     answer = "".join(f'<p class="answer">{escape(sentence)}</p>' for sentence in page.answer)
     main = [f'<section id="answer" aria-label="The answer">{answer}</section>']
-    main += [_section(i, section) for i, section in enumerate(page.sections)]
-    data = script_json({"sections": [_data(section) for section in page.sections]})
-    return shell.html_page(page.title, header, "\n".join([*main, _method(page)]), data, "sections.js")
+    judged: list[Verdict] = []
+    main += [_section(i, section, judged) for i, section in enumerate(page.sections)]
+    data: dict[str, Any] = {"sections": [_data(section) for section in page.sections]}
+    scripts = [shell.asset("sections.js")]
+    if judged:
+        data |= {"verdicts": [verdict_told(one) for one in judged], "words": component_words()}
+        scripts += [components(), shell.asset("verdicts.js")]
+    return shell.html_page(page.title, header, "\n".join([*main, _method(page)]), script_json(data), *scripts)
 
 
-def _section(index: int, section: Section) -> str:
+def _section(index: int, section: Section, judged: list[Verdict]) -> str:
+    """`judged` takes up the verdicts that the section tells."""
     parts = [f"<p>{escape(paragraph)}</p>" for paragraph in section.paragraphs]
     parts += [_table(one) for one in section.tables]
-    parts += [_story(one) for one in section.stories]
+    parts += [_story(one, judged) for one in section.stories]
     if section.charts:
         parts += [HINT, f'<div class="readout">{zoom_bar("Whole range")}</div>']
         parts.append(f'<div class="charts">{"".join(_chart(i, chart) for i, chart in enumerate(section.charts))}</div>')
@@ -41,19 +51,28 @@ def _section(index: int, section: Section) -> str:
     return f'<section id="section-{index}" data-section aria-labelledby="section-{index}-title">\n{content}\n</section>'
 
 
-def _story(one: Story) -> str:
+def _story(one: Story, judged: list[Verdict]) -> str:
     parts = [f"<h3>{escape(one.title)}</h3>", *(f"<p>{escape(text)}</p>" for text in one.paragraphs)]
+    if one.facts:
+        parts.append(shell.facts((escape(name), "".join(map(_line, texts))) for name, texts in one.facts))
     parts += [_table(each) for each in one.tables]
     if one.lead:
         parts.append(f"<p>{escape(one.lead)}</p>")
     if one.quote:
         parts.append(f"<blockquote>{escape(one.quote)}</blockquote>")
     parts += [f"<p>{escape(text)}</p>" for text in one.after]
+    if one.verdict is not None:
+        parts.append(verdict_tables(len(judged), one.verdict))
+        judged.append(one.verdict)
     parts += [
         f"<details><summary>{escape(fold.title)}</summary><pre>{escape(fold.text)}</pre></details>"
         for fold in one.folds
     ]
     return f'<article class="story">{"".join(parts)}</article>'
+
+
+def _line(text: str) -> str:
+    return f"<p>{escape(text)}</p>"
 
 
 def _table(one: Table) -> str:

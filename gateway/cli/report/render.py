@@ -17,7 +17,9 @@ def render_report(report: Report) -> str:
     if report.timing is not None:
         sections.append(timing_section(report.timing))
     sections += [_events_section(report), _method_section(report)]
-    return shell.html_page(report.title, _header(report), "\n".join(sections), page_data(report), "report.js")
+    return shell.html_page(
+        report.title, _header(report), "\n".join(sections), page_data(report), shell.asset("report.js")
+    )
 
 
 def _header(report: Report) -> str:

@@ -8,25 +8,26 @@ from html import escape
 from importlib.resources import files
 from string import Template
 
+STYLES = ("uplot.min.css", "colours.css", "components.css")
 THIS_PAGE = """<h3>This page</h3>
 <p>It draws from the numbers it carries, every sample with seven digits, and loads nothing from anywhere.
 Charts by uPlot, MIT licence; the licence's text stands in the source of this page.</p>"""
 
 
-def html_page(title: str, header: str, main: str, data: str, script: str) -> str:
-    """The page's text; `header`, `main` and `data` are HTML and JSON already, `script` names the asset that draws.
+def html_page(title: str, header: str, main: str, data: str, *scripts: str) -> str:
+    """The page's text; `header`, `main` and `data` are HTML and JSON already, `scripts` what draws, in this order.
 
     It holds script, style and data, and works from a file. Its content security policy forbids every request, and every
     script but the two of its own.
     """
-    licence = f"/*\n{_uplot('uplot.LICENSE.txt')}\n*/\n"
-    scripts = {"uplot": licence + _uplot("uplot.iife.min.js"), "script": _asset("charts.js") + _asset(script)}
-    hashes = " ".join(f"'sha256-{_sha256(text)}'" for text in scripts.values())
-    return Template(_asset("page.html")).substitute(
-        scripts,
+    licence = f"/*\n{static('uplot.LICENSE.txt')}\n*/\n"
+    own = {"uplot": licence + static("uplot.iife.min.js"), "script": "".join((asset("charts.js"), *scripts))}
+    hashes = " ".join(f"'sha256-{_sha256(text)}'" for text in own.values())
+    return Template(asset("page.html")).substitute(
+        own,
         policy=f"default-src 'none'; style-src 'unsafe-inline'; script-src {hashes}",
         title=escape(title),
-        style=_uplot("uplot.min.css") + _asset("report.css"),
+        style="".join(map(static, STYLES)) + asset("report.css"),
         header=header,
         main=main,
         data=data,
@@ -64,7 +65,8 @@ def notes_list(texts: Iterable[str]) -> str:
     return f"<h3>Notes</h3>{bullets(found)}" if (found := tuple(texts)) else ""
 
 
-def _asset(name: str) -> str:
+def asset(name: str) -> str:
+    """A file of the reports' own."""
     return (files("gateway.cli.report") / "assets" / name).read_text(encoding="utf-8")
 
 
@@ -72,6 +74,6 @@ def _sha256(text: str) -> str:
     return base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
 
 
-def _uplot(name: str) -> str:
-    """Of the one copy, which the operator's page serves as it is."""
+def static(name: str) -> str:
+    """A file of the operator's page, which reports share."""
     return (files("gateway.operator.page") / "static" / name).read_text(encoding="utf-8")

@@ -24,7 +24,7 @@ _LIVE = (
     Row("Shelved", BOOLEAN, "Out of the way for a while"),
     Row("FirstOut", BOOLEAN, "The first of those that came together"),
     Row("Text", STRING, "With the measured values, as they were when it came"),
-    Row("Since", STRING, "RFC 3339; empty: there is nothing to be seen"),
+    Row("Since", STRING, "RFC 3339, for AcknowledgeAlarm; empty: there is nothing to be seen"),
 )
 _SUMMARY = (
     Row("Active", UINT32, "How many are, without those that are shelved"),
@@ -76,7 +76,7 @@ def _live(one: AlarmStatus | None) -> dict[str, Value]:
             "Active": False, "Acknowledged": True, "AcknowledgedBy": "", "Shelved": False, "FirstOut": False,
             "Text": "", "Since": "",
         }  # fmt: skip
-    since = datetime.fromtimestamp(one.since_wall_s, UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
+    since = datetime.fromtimestamp(one.since_wall_s, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
     return {
         "Active": one.active, "Acknowledged": one.acknowledged, "AcknowledgedBy": one.acknowledged_by,
         "Shelved": one.shelved_until_wall_s is not None, "FirstOut": one.first_out, "Text": one.text, "Since": since,

@@ -50,14 +50,16 @@ class Events:
             return
         if self._after is not None and told.last >= self._after:
             for record in told.records:
+                self._after = record.sequence  # also of one that cannot be told: none is told twice
                 await self._tell(record)
-        newest = max((record.sequence for record in told.records), default=told.last)
-        self._after = newest if self._after is not None else told.last
+        else:
+            self._after = told.last
 
     async def waiting(self, shown: Sequence[ProposalShown]) -> None:
         """Tell of those that wait and have not been told of, as they are shown now."""
         for one in reversed(shown):
             if one.shown not in self._waiting:
+                self._waiting.add(one.shown)
                 event = self._proposal.event
                 event.ProposalId, event.ShownHash, event.BaseRevision = one.proposal_hash, one.shown or "", one.epoch
                 event.Severity = MEDIUM

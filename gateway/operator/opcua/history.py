@@ -5,7 +5,7 @@ more of a time asks for a shorter one.
 """
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
 from math import isfinite
 from typing import Any
@@ -15,9 +15,10 @@ from pydantic import ValidationError
 
 from gateway.core.line import Line
 from gateway.core.line_past import MOST_POINTS, TensionsBetween, TensionsTold
+from gateway.core.signals import Quality
 from gateway.operator.line_side import LineSide, NotTold
 from gateway.operator.opcua.limits import MAX_HISTORY_POINTS
-from gateway.operator.opcua.line_nodes import ROOT
+from gateway.operator.opcua.line_nodes import CODES, ROOT
 from gateway.operator.opcua.space import DOUBLE, Space
 
 POINTS = 600  #: where a client leaves open how many
@@ -25,7 +26,7 @@ OPEN_S = 3600.0  #: before or behind the one end that is told
 
 ua: Any = asyncua_ua  #: what it declares of its values and what they are differ
 
-Columns = Callable[[TensionsTold], list[list[float | None]]]
+Columns = Callable[[TensionsTold], Sequence[Sequence[Any]]]  #: by span
 
 
 class History:
@@ -34,10 +35,13 @@ class History:
     def __init__(self, space: Space, line: Line, side: LineSide, wall_clock: Callable[[], float] = time.time) -> None:
         self._side = side
         self._wall_clock = wall_clock
-        self._columns: Mapping[Any, tuple[int, Columns]] = {
-            space.id(f"{ROOT}.Spans.{k + 1}.{name}"): (k, columns)
+        self._columns: Mapping[Any, tuple[int, Columns, Columns]] = {
+            space.id(f"{ROOT}.Spans.{k + 1}.{name}"): (k, values, quality)
             for k in range(line.n)
-            for name, columns in (("Tension", lambda told: told.tension_n), ("Setpoint", lambda told: told.setpoint_n))
+            for name, values, quality in (
+                ("Tension", lambda told: told.tension_n, lambda told: told.quality),
+                ("Setpoint", lambda told: told.setpoint_n, lambda _: []),
+            )
         }
 
     async def init(self) -> None:
@@ -80,20 +84,28 @@ class History:
         found = self._columns.get(node_id)
         if found is None:
             return _refused(ua.StatusCodes.BadHistoryOperationUnsupported)
-        span, columns = found
-        values = [
-            ua.DataValue(
-                ua.Variant(value, DOUBLE), SourceTimestamp=datetime.fromtimestamp(wall_s, UTC),
-                StatusCode=ua.StatusCode(ua.StatusCodes.Good),
+        span, columns, qualities = found
+        if span >= len(columns(told)):  # nothing is kept of that time, or of a line with fewer spans
+            return ua.HistoryReadResult(
+                StatusCode=ua.StatusCode(ua.StatusCodes.GoodNoData), HistoryData=ua.HistoryData()
             )
-            for wall_s, value in zip(told.wall_s, columns(told)[span], strict=True)
+        quality = qualities(told)[span] if qualities(told) else [Quality.GOOD] * len(told.wall_s)
+        values = [
+            _as_of(wall_s, value, CODES[Quality(trust).name])
+            for wall_s, value, trust in zip(told.wall_s, columns(told)[span], quality, strict=True)
             if value is not None
-        ]  # fmt: skip
+        ]
         if backwards:
             values.reverse()
         held = ua.HistoryData()
         held.DataValues = values[:most]
         return ua.HistoryReadResult(HistoryData=held)
+
+
+def _as_of(wall_s: float, value: float, code: int) -> Any:
+    """As it was told at that time: what is bad has no value."""
+    held = ua.Variant(None) if ua.StatusCode(code).is_bad() else ua.Variant(value, DOUBLE)
+    return ua.DataValue(held, SourceTimestamp=datetime.fromtimestamp(wall_s, UTC), StatusCode=ua.StatusCode(code))
 
 
 def _refused(code: int) -> Any:

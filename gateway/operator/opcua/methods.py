@@ -7,14 +7,15 @@ false, and a sentence); who may not call at all gets BadUserAccessDenied.
 import time
 from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass
+from datetime import datetime
 from typing import Any
 
 from asyncua import ua as asyncua_ua
 from asyncua.server.server import Server
 from pydantic import ValidationError
 
-from gateway.core.alarms import AcknowledgeAlarm
-from gateway.core.decisions import Decide, RollBackNow
+from gateway.core.alarms import AcknowledgeAlarm, ShelveAlarm
+from gateway.core.decisions import Archive, Decide, LineChanged, RollBackNow
 from gateway.core.messages import Arm, Hold, Reply, SelectRecipe, SetSpeed, SetTension, Start, Stop
 from gateway.core.people import Person, Said, why_may_not
 from gateway.operator.line_side import LineSide, NotTold
@@ -59,6 +60,16 @@ async def _decide(line: LineSide, id: str, hash: str, base_revision: int, approv
     return Decide(proposal=shown.proposal_hash, shown=hash, approve=approve, comment=comment)
 
 
+async def _acknowledge(_line: LineSide, name: str, since: str, comment: str) -> Said:
+    try:
+        when = datetime.fromisoformat(since)
+    except ValueError:
+        when = None
+    if when is None or when.tzinfo is None:
+        raise NotSent(f"since is {since[:40]!r}; allowed: Since of the alarm, as it was shown")
+    return AcknowledgeAlarm(alarm=name, since_wall_s=when.timestamp(), comment=comment)
+
+
 def _plain(make: Callable[..., Said]) -> Callable[..., Awaitable[Said]]:
     async def made(_line: LineSide, *arguments: Any) -> Said:
         return make(*arguments)
@@ -67,6 +78,8 @@ def _plain(make: Callable[..., Said]) -> Callable[..., Awaitable[Said]]:
 
 
 _COMMENT = Input("comment", STRING, "For the audit; may be empty")
+_WHY = Input("comment", STRING, "Why, for the audit; not empty")
+_ALARM = Input("name", STRING, "Of the alarm")
 METHODS = (
     Method("Decide", "decide", "Approve or reject a proposal, as it was shown", (
         Input("id", STRING, "Of the proposal"), Input("hash", STRING, "ShownHash of what was looked at"),
@@ -85,8 +98,17 @@ METHODS = (
            _plain(lambda speed: SetSpeed(speed_m_per_s=speed))),
     Method("SelectRecipe", "recipe", "All set-points of a recipe, ramped", (Input("name", STRING, "As in Recipes"),),
            _plain(lambda name: SelectRecipe(name=name))),
-    Method("AcknowledgeAlarm", "acknowledge", "A person has seen it", (Input("name", STRING, "Of the alarm"), _COMMENT),
-           _plain(lambda name, comment: AcknowledgeAlarm(alarm=name, comment=comment))),
+    Method("AcknowledgeAlarm", "acknowledge", "A person has seen it", (
+        _ALARM, Input("since", STRING, "Since of what was looked at: it may have come again"), _COMMENT), _acknowledge),
+    Method("ShelveAlarm", "shelve", "Out of the way for a while; it comes back by itself", (
+        _ALARM, Input("minutes", DOUBLE, "0: back at once"), _WHY),
+           _plain(lambda name, minutes, why: ShelveAlarm(alarm=name, for_s=60.0 * minutes, because=why))),
+    Method("Archive", "archive", "Keep a stored configuration under a name; puts nothing into service", (
+        Input("configuration", STRING, "Its version, its name, or its hash or the beginning of it"),
+        Input("name", STRING, "As phi_stable, by which later changes are measured"), _WHY),
+           _plain(lambda which, name, why: Archive(configuration=which, name=name, because=why))),
+    Method("LineChanged", "line-changed", "Another web, a new part: what was learned counts no more", (_WHY,),
+           _plain(lambda why: LineChanged(because=why))),
 )  # fmt: skip
 
 

@@ -10,6 +10,7 @@ from gateway.core.line import Line
 from gateway.operator.access import Access
 from gateway.operator.line_side import LineSide, NotTold
 from gateway.operator.opcua.alarm_nodes import alarms_of, live_alarm_paths, make_alarms
+from gateway.operator.opcua.companion import make_companion
 from gateway.operator.opcua.events import Events
 from gateway.operator.opcua.history import History
 from gateway.operator.opcua.line_nodes import ROOT, Told, list_paths, live_paths, make_line, of_proposals, of_status
@@ -52,8 +53,10 @@ class OpcUa:
         )
         self.page_trouble: Callable[[], str] = str  #: why there is no page; empty: there is one
         self._made = False
+        self._say = tell
         self._line = line
         self._side = side
+        self._say = tell
         self._new_status, self._new_proposals = asyncio.Event(), asyncio.Event()
         self._shown: list[ProposalShown] = []  #: those that wait
         self._shown_of: ProposalList | None = None  #: of which list
@@ -78,17 +81,20 @@ class OpcUa:
         self._events = Events(server, self._space, self._side)
         await self._events.make()
         server.iserver.history_manager = History(self._space, self._line, self._side)  # type: ignore[assignment]
+        await make_companion(self._space, self._line, self._say)
         self._side.on_status.append(lambda _: self._new_status.set())
         self._side.on_proposals.append(lambda _: self._new_proposals.set())
         self._new_proposals.set()
 
     async def run(self) -> None:
         """Until it is cancelled."""
+        works = (
+            (self._show_line, self._new_status), (self._show_proposals, self._new_proposals),
+            (self._events.look, asyncio.Event()), (self._end_strangers, asyncio.Event()),
+        )  # fmt: skip
         async with asyncio.TaskGroup() as group:
-            for show, event in ((self._show_line, self._new_status), (self._show_proposals, self._new_proposals)):
-                group.create_task(_again(show, event))
-            group.create_task(_again(self._events.look, asyncio.Event()))
-            group.create_task(_again(self._end_strangers, asyncio.Event()))
+            for do, event in works:
+                group.create_task(_again(do, event, self._say))
 
     async def stop(self) -> None:
         await self.server.stop()
@@ -97,6 +103,13 @@ class OpcUa:
         self.server.end_strangers()
 
     async def _show_line(self) -> None:
+        try:
+            await self._show_line_as_it_is()
+        except Exception:  # what is shown may be old, and must not look new
+            await self._unsure((*live_paths(self._line), *live_alarm_paths()), self._side.age_s)
+            raise
+
+    async def _show_line_as_it_is(self) -> None:
         side = self._side
         age_s = side.age_s
         fresh = _is_fresh(age_s)
@@ -116,6 +129,14 @@ class OpcUa:
             await self._space.tell(path, None, None, WAITING if age_s is None else NO_COMMUNICATION)
 
     async def _show_proposals(self) -> None:
+        try:
+            await self._show_those_that_wait()
+        except Exception:  # as above; the next look begins anew
+            self._shown_of = None
+            await self._proposals.unsure(NO_COMMUNICATION)
+            raise
+
+    async def _show_those_that_wait(self) -> None:
         """What is shown must be of the moment: where the gateway does not tell, nothing is."""
         found = self._side.proposals
         if found is None or not self._list_is_fresh():
@@ -155,11 +176,18 @@ def _is_fresh(age_s: float | None) -> bool:
     return age_s is not None and age_s <= STALE_S
 
 
-async def _again(do: Callable[[], Awaitable[None]], event: asyncio.Event) -> None:
-    """Whenever the event comes, and without it every `LOOK_S`."""
+async def _again(do: Callable[[], Awaitable[None]], event: asyncio.Event, say: Callable[[str], None]) -> None:
+    """Whenever the event comes, and without it every `LOOK_S`. A fault of this program is told, and ends nothing."""
+    told = ""
     while True:
         event.clear()
-        await do()
+        try:
+            await do()
+        except Exception as error:
+            fault = f"OPC UA does not tell all: {type(error).__name__}: {error}"
+            if fault != told:
+                told = fault
+                say(fault)
         try:
             async with asyncio.timeout(LOOK_S):
                 await event.wait()

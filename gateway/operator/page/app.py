@@ -18,16 +18,17 @@ from gateway.operator.access import Access
 from gateway.operator.line_side import LineSide
 from gateway.operator.page.asks import Asks
 from gateway.operator.page.events import Ticks, stream
-from gateway.operator.page.guard import LOOPBACK, Guarded
+from gateway.operator.page.guard import Guarded, names_of
 from gateway.operator.page.login import Check, Door
 from gateway.operator.page.serve import port_of
 from gateway.operator.page.words import words_routes
+from gateway.operator.users import RoleOf
 
 STATIC = Path(str(files("gateway.operator.page"))) / "static"
 
 
 def page_app(
-    line: Line, side: LineSide, check: Check, clock: Callable[[], float], access: Access | None = None
+    line: Line, side: LineSide, check: Check, role_of: RoleOf, clock: Callable[[], float], access: Access | None = None
 ) -> Starlette:
     """`check`: the role of whoever has this name and password, None: nobody has. `clock`: monotonic, s.
     `access` is told who comes in, and who does not.
@@ -35,17 +36,18 @@ def page_app(
     The page speaks TLS where the address in the line's file says https; then its cookie is sent over TLS alone.
     """
     address = urlsplit(line.operator.page)
-    door = Door(check, clock, line.operator.anonymous == "read", address.scheme == "https", port_of(address), access)
+    anonymous, secure = line.operator.anonymous == "read", address.scheme == "https"
+    door = Door(check, role_of, clock, anonymous, secure, port_of(address), access)
     asks, ticks = Asks(line, side, door), Ticks(side)
     app = Starlette(
         routes=[
             *door.routes(),
             *asks.routes(),
             *words_routes(),
-            Route("/events", stream(ticks, door.visitor, door.may_look)),
+            Route("/events", stream(ticks, door.visitor, door.looks)),
             Mount("/", StaticFiles(directory=STATIC, html=True)),
         ],
-        middleware=[Middleware(Guarded, loopback=address.hostname in LOOPBACK)],
+        middleware=[Middleware(Guarded, names=names_of(address.hostname or ""))],
         exception_handlers={HTTPException: _refused},
     )
     app.state.end = ticks.end  # `serve_on` calls it: a stream has no end of its own

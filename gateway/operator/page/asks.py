@@ -13,7 +13,7 @@ from gateway.core.line import Line
 from gateway.core.line_past import TensionsBetween
 from gateway.core.messages import Reply
 from gateway.core.people import LEAST, Said, may, why_may_not
-from gateway.operator.line_side import LineSide, NotTold
+from gateway.operator.line_side import LineSide, NoAnswer, NotTold
 from gateway.operator.page.guard import body_of
 from gateway.operator.page.login import Door
 from gateway.operator.page.tick import line_told
@@ -35,6 +35,7 @@ class Asks:
             Route("/api/line", self._of_line),
             Route("/api/proposals", self._proposals),
             Route("/api/proposals/{proposal}", self._proposal),
+            Route("/api/courses/{proposal}", self._courses),
             Route("/api/records", self._records),
             Route("/api/tensions", self._tensions),
             Route("/api/say", self._say, methods=["POST"]),
@@ -54,6 +55,15 @@ class Asks:
         self._door.visitor(request)
         try:
             return JSONResponse(proposal_told(await self._side.shown(request.path_params["proposal"])))
+        except ValidationError as error:
+            raise HTTPException(400, _in_words(error)) from None
+        except NotTold as error:
+            raise HTTPException(503, str(error)) from error
+
+    async def _courses(self, request: Request) -> JSONResponse:
+        self._door.visitor(request)
+        try:
+            return JSONResponse((await self._side.courses(request.path_params["proposal"])).model_dump())
         except ValidationError as error:
             raise HTTPException(400, _in_words(error)) from None
         except NotTold as error:
@@ -97,14 +107,10 @@ class Asks:
 
 
 def _status(reply: Reply) -> int:
-    """409: the gateway refuses. 504: it did not answer, and nobody knows whether it was done.
-
-    The latter comes from this side, with its text as the only reason: what the gateway refuses says what was refused,
-    and why.
-    """
+    """409: the gateway refuses. 504: it did not answer, and nobody knows whether it was done."""
     if reply.ok:
         return 200
-    return 504 if not reply.state and reply.reasons == [reply.text] else 409
+    return 504 if isinstance(reply, NoAnswer) else 409
 
 
 def _object(body: bytes) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from starlette.responses import StreamingResponse
 from starlette.types import Receive, Scope, Send
 
 from gateway.core.decisions import ProposalList
+from gateway.core.people import Role
 from gateway.core.status import GatewayStatus
 from gateway.operator.line_side import LineSide
 from gateway.operator.page.tick import tick_of
@@ -71,8 +72,8 @@ class Ticks:
 class _Stream(StreamingResponse):
     """Counts who looks for exactly as long as the answer lasts, also where it never begins."""
 
-    def __init__(self, ticks: Ticks, may_look: Callable[[], bool]) -> None:
-        super().__init__(_events(ticks, may_look), media_type="text/event-stream")
+    def __init__(self, ticks: Ticks, looks: Callable[[], Role | None]) -> None:
+        super().__init__(_events(ticks, looks), media_type="text/event-stream")
         self._ticks = ticks
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -83,27 +84,27 @@ class _Stream(StreamingResponse):
             self._ticks.looking -= 1
 
 
-async def _events(ticks: Ticks, may_look: Callable[[], bool]) -> AsyncIterator[str]:
+async def _events(ticks: Ticks, looks: Callable[[], Role | None]) -> AsyncIterator[str]:
     yield "retry: 1000\n\n"
-    number = ticks.number  # what was made before, for others, may be hours old
+    number, role = ticks.number, looks()  # what was made before, for others, may be hours old
     while not ticks.ended:
-        if not may_look():
-            yield _event("logged-out", {})
+        if (now := looks()) is None or now != role:  # the page has to be loaded anew: they may more, less, or nothing
+            yield _event("anew", {})
             return
         number, text = await ticks.after(number)
         yield text
 
 
 def stream(
-    ticks: Ticks, visitor: Callable[[Request], object], may_look: Callable[[Request], bool]
+    ticks: Ticks, visitor: Callable[[Request], object], looks: Callable[[Request], Role | None]
 ) -> Callable[[Request], Awaitable[StreamingResponse]]:
-    """The endpoint. `visitor` raises where nobody may look."""
+    """The endpoint. `visitor` raises where nobody may look; `looks`: as whom, still."""
 
     async def events(request: Request) -> StreamingResponse:
         visitor(request)
         if ticks.looking >= MOST_BROWSERS:
             raise HTTPException(503, f"{MOST_BROWSERS} pages are open already; close one", {"retry-after": "10"})
-        return _Stream(ticks, lambda: may_look(request))
+        return _Stream(ticks, lambda: looks(request))
 
     return events
 

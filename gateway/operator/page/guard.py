@@ -12,9 +12,11 @@ from starlette.requests import Request
 from starlette.responses import PlainTextResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from gateway.core.line_rules_opcua import is_this_machine
+
 MOST_BYTES = 16_384  #: of a request's body
 BODY_S = 10.0  #: for it to come
-LOOPBACK = frozenset({"127.0.0.1", "localhost", "::1"})
+LOCALHOST = frozenset({"127.0.0.1", "localhost", "::1"})
 
 POLICY = "; ".join(
     (
@@ -40,7 +42,17 @@ HEADERS = {
 }
 
 
-def why_not_this_host(host: str, loopback: bool) -> str:
+def names_of(host: str) -> frozenset[str] | None:
+    """Under which a page on `host` is asked for; None: under any, as where it is reached from other machines.
+
+    Each address of loopback is one of its own: what is bound to 127.0.0.2 is no `localhost`.
+    """
+    if host in LOCALHOST:
+        return LOCALHOST
+    return frozenset({host}) if is_this_machine(host) else None
+
+
+def why_not_this_host(host: str, names: frozenset[str] | None) -> str:
     """Empty: it may be. Another name for this machine in a browser is a stranger's, who would read the answers."""
     try:
         name = urlsplit(f"//{host}").hostname
@@ -48,8 +60,8 @@ def why_not_this_host(host: str, loopback: bool) -> str:
         name = None
     if not name:
         return "the request names no host"
-    if loopback and name not in LOOPBACK:
-        return f"{name} is not this page's; allowed: {', '.join(sorted(LOOPBACK))}"
+    if names is not None and name not in names:
+        return f"{name} is not this page's; allowed: {', '.join(sorted(names))}"
     return ""
 
 
@@ -68,9 +80,10 @@ def why_not_from_here(headers: Mapping[str, str]) -> str:
 class Guarded:
     """An ASGI application, within these rules."""
 
-    def __init__(self, app: ASGIApp, loopback: bool) -> None:
+    def __init__(self, app: ASGIApp, names: frozenset[str] | None) -> None:
+        """`names`: as `names_of`."""
         self._app = app
-        self._loopback = loopback
+        self._names = names
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
@@ -90,7 +103,7 @@ class Guarded:
         await app(scope, receive, send_guarded)
 
     def _why_not(self, method: str, headers: Headers) -> str:
-        refused = why_not_this_host(headers.get("host", ""), self._loopback)
+        refused = why_not_this_host(headers.get("host", ""), self._names)
         return refused or ("" if method in ("GET", "HEAD") else why_not_from_here(headers))
 
 

@@ -17,10 +17,12 @@ from gateway.core.people import Person, Role
 from gateway.operator.access import Access
 from gateway.operator.page.guard import body_of
 from gateway.operator.page.sessions import LONGEST_S, Session, Sessions, Tries
+from gateway.operator.users import RoleOf
 
 Check = Callable[[str, str], Awaitable[Role | None]]
 
 MOST_CHECKS = 4  #: passwords that wait to be checked: each takes memory and time
+LOOK_UP_S = 10.0  #: between two looks at the role of somebody who looks on; whoever says something is looked up then
 TOKEN_HEADER = "x-r2rgate-token"
 
 
@@ -42,10 +44,19 @@ class Door:
     """Lets people in, and says who they are. `anonymous`: whoever has no name may look."""
 
     def __init__(
-        self, check: Check, clock: Callable[[], float], anonymous: bool, secure: bool, port: int, access: Access | None
+        self,
+        check: Check,
+        role_of: RoleOf,
+        clock: Callable[[], float],
+        anonymous: bool,
+        secure: bool,
+        port: int,
+        access: Access | None,
     ) -> None:
         """`access`: is told who comes in, and who does not."""
         self._check = check
+        self._role_of = role_of
+        self._clock = clock
         self._access = access
         self._anonymous = anonymous
         self._secure = secure
@@ -64,14 +75,18 @@ class Door:
 
     def visitor(self, request: Request) -> Visitor:
         """Raises HTTPException 401: log in."""
-        visitor = self._known(self._sessions.find(self._key(request)))
+        visitor = self._known(self._session(request))
         if visitor is None:
             raise HTTPException(401, "log in")
         return visitor
 
-    def may_look(self, request: Request) -> bool:
-        """Still; this is no request of the person."""
-        return self._anonymous or self._sessions.find(self._key(request)) is not None
+    def looks(self, request: Request) -> Role | None:
+        """As whom, still; None: they may not. This is no request of the person."""
+        session = self._sessions.find(self._key(request))
+        if session is not None and self._clock() - session.looked_up_s >= LOOK_UP_S:
+            session = self._session(request)
+        visitor = self._known(session)
+        return None if visitor is None else visitor.role
 
     def person(self, request: Request) -> Person:
         """Who says something. Raises HTTPException where nobody has logged in, or another site's page asks."""
@@ -96,11 +111,11 @@ class Door:
             raise HTTPException(503, "too many people are logging in; try again", {"retry-after": "1"})
         role = await self._role(login)
         if role is None:
-            self._tries.failed(place)
+            self._tries.failed(place, login.name)
             if self._access is not None:
                 self._access.refused("page", place, None, login.name)
             raise HTTPException(403, "name or password is wrong")
-        self._tries.went_well(place)
+        self._tries.went_well(place, login.name)
         self._sessions.end(self._key(request))
         if self._access is not None:
             self._access.came_in(Person(name=login.name, role=role, through="page"), place)
@@ -131,8 +146,23 @@ class Door:
         return answer
 
     async def _me(self, request: Request) -> JSONResponse:
-        visitor = self._known(self._sessions.use(self._key(request)))
+        session = self._session(request)
+        self._sessions.use(self._key(request))
+        visitor = self._known(session)
         return JSONResponse(_told(visitor) if visitor else {"name": None, "role": None, "token": None})
+
+    def _session(self, request: Request) -> Session | None:
+        """With the role that they have now; whoever is no user any more has none."""
+        key = self._key(request)
+        session = self._sessions.find(key)
+        if session is None:
+            return None
+        role, session.looked_up_s = self._role_of(session.name), self._clock()
+        if role is None:
+            self._sessions.end(key)
+            return None
+        session.role = role
+        return session
 
     def _known(self, session: Session | None) -> Visitor | None:
         if session is not None:

@@ -13,6 +13,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 MOST_CONNECTIONS = 100
 IDLE_S = 10.0  #: of a connection without a whole request
+UNHEARD_MS = 15_000  #: that a browser takes nothing of what is sent: it is gone, and frees its place
 CLOSING_S = 1  #: for answers that are on their way
 
 
@@ -25,6 +26,8 @@ class _Connection(H11Protocol):
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
         super().connection_made(transport)
+        ours: socket.socket = transport.get_extra_info("socket")
+        ours.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, UNHEARD_MS)
         self.loop.call_later(IDLE_S, self._look, self.cycle)
 
     def _look(self, before: object) -> None:

@@ -1,9 +1,9 @@
 """Who is logged in at the page, for how long, and how fast names and passwords may be tried. Pure: time is given."""
 
 import secrets
-from collections import OrderedDict
+from collections import Counter, OrderedDict
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from gateway.core.people import Role
 
@@ -16,6 +16,7 @@ FREE_TRIES = 3  #: that fail, before the next has to wait
 LONGEST_WAIT_S = 60.0
 FORGOTTEN_S = 900.0  #: after the last one that failed
 MOST_PLACES = 1000  #: from which tries are remembered
+MOST_COUNTED = 30  #: tries from one place
 
 
 @dataclass
@@ -25,6 +26,7 @@ class Session:
     token: str  #: in a header of every request that changes something: no other site's page can know it
     began_s: float
     seen_s: float
+    looked_up_s: float  #: when it was made sure last that they have this role
 
 
 class Sessions:
@@ -40,7 +42,7 @@ class Sessions:
         own = sorted((one.began_s, old) for old, one in self._by_key.items() if one.name == name)
         for _, old in own[: max(0, len(own) - MOST_EACH + 1)]:
             del self._by_key[old]
-        self._by_key[key] = Session(name, role, secrets.token_urlsafe(32), now_s, now_s)
+        self._by_key[key] = Session(name, role, secrets.token_urlsafe(32), now_s, now_s, now_s)
         while len(self._by_key) > MOST_SESSIONS:
             self._by_key.popitem(last=False)
         return key
@@ -70,12 +72,15 @@ class Sessions:
 
 @dataclass
 class _Failures:
-    count: int
     last_s: float
+    by_name: Counter[str] = field(default_factory=Counter[str])
 
 
 class Tries:
-    """Of names and passwords, by where they come from. Who fails waits, each time twice as long."""
+    """Of names and passwords, by where they come from. Who fails waits, each time twice as long, whatever the name.
+
+    A password that is right clears the tries of its own name: who has one learns no other's the faster by it.
+    """
 
     def __init__(self, clock: Callable[[], float]) -> None:
         self._clock = clock
@@ -84,17 +89,23 @@ class Tries:
     def wait_s(self, place: str) -> float:
         """0: the next may be made now."""
         failures = self._failed.get(place)
-        if failures is None or failures.count < FREE_TRIES:
+        if failures is None or (count := failures.by_name.total()) < FREE_TRIES:
             return 0.0
-        wait_s = min(LONGEST_WAIT_S, 2.0 ** (failures.count - FREE_TRIES))
+        wait_s = min(LONGEST_WAIT_S, 2.0 ** (count - FREE_TRIES))
         return max(0.0, failures.last_s + wait_s - self._clock())
 
-    def failed(self, place: str) -> None:
-        before, now_s = self._failed.pop(place, None), self._clock()
-        count = 0 if before is None or now_s - before.last_s > FORGOTTEN_S else before.count
-        self._failed[place] = _Failures(min(count + 1, 30), now_s)
+    def failed(self, place: str, name: str) -> None:
+        found, now_s = self._failed.pop(place, None), self._clock()
+        if found is None or now_s - found.last_s > FORGOTTEN_S:
+            found = _Failures(now_s)
+        if found.by_name.total() < MOST_COUNTED:
+            found.by_name[name] += 1
+        found.last_s = now_s
+        self._failed[place] = found
         while len(self._failed) > MOST_PLACES:
             self._failed.popitem(last=False)
 
-    def went_well(self, place: str) -> None:
-        self._failed.pop(place, None)
+    def went_well(self, place: str, name: str) -> None:
+        found = self._failed.get(place)
+        if found is not None:
+            del found.by_name[name]

@@ -12,26 +12,26 @@ from gateway.core.verdict import RuleFinding, Verdict
 
 #: Rules with a lower and an upper limit: how much of one of them is used says nothing.
 TWO_SIDED = frozenset({"model validity", "model: residuals"})
-#: What the gateway says of the stage where one approval is not enough.
-TWO_PEOPLE = ("it takes two people", "it takes another person")
 
 
 def proposal_told(shown: ProposalShown) -> dict[str, Any]:
     """Without the matrices: nobody decides on those."""
     proposal, change = shown.proposal, shown.proposal.change
     return {
-        **shown.model_dump(include={"stage", "why", "proposal_hash", "shown", "epoch", "difference"}),
+        **shown.model_dump(
+            include={"stage", "why", "proposal_hash", "shown", "epoch", "difference", "approvals", "approved_by"}
+        ),
         **proposal.model_dump(include={"base", "model", "reason", "evidence", "predicted", "author"}),
         "kind": proposal.kind,
         "lasts_s": change.experiment.duration_s if isinstance(change, ExperimentChange) else None,
-        "two_people": any(said in shown.why for said in TWO_PEOPLE),
         "created": proposal.created,
         "expires": proposal.expires,
-        "verdict": None if shown.verdict is None else _verdict(shown.verdict),
+        "verdict": None if shown.verdict is None else verdict_told(shown.verdict),
     }
 
 
-def _verdict(verdict: Verdict) -> dict[str, Any]:
+def verdict_told(verdict: Verdict) -> dict[str, Any]:
+    """With how much of each limit is used."""
     return {
         "accepted": verdict.accepted,
         "judged": verdict.judged,
@@ -62,6 +62,6 @@ def used(finding: RuleFinding) -> float | None:
         return 1.0
     at_least = math.isclose(margin, value - limit, rel_tol=1e-6, abs_tol=1e-12)
     part, whole = (limit, value) if at_least else (abs(value), abs(limit))
-    if whole <= 0.0:
+    if whole <= 0.0 or part < 0.0:  # at least -10, say: of that nothing is used up
         return None
     return min(1.0, part / whole)

@@ -18,10 +18,7 @@ const BASIC = `${POLICIES}Basic256Sha256`
 const SERVER = 'i=2253'
 const EVENT_FIELDS = ['EventType', 'Message', 'Severity', 'SourceName', 'Time']
 const OWN_FIELDS = ['ProposalId', 'ShownHash', 'BaseRevision', 'Sequence', 'Kind', 'Who']
-const OBJECT = 1
-const VARIABLE = 2
-const METHOD = 4
-const CLASSES = { [OBJECT]: 'Object', [VARIABLE]: 'Variable', [METHOD]: 'Method' }
+const CLASSES = { 1: 'Object', 2: 'Variable', 4: 'Method' }
 
 let certificates
 let serverCertificate // that the client trusts, as a file that somebody has carried to it
@@ -162,7 +159,7 @@ async function read (name, paths) {
   return Object.fromEntries(paths.map((one, i) => [one, told(values[i])]))
 }
 
-// Subscribes to variables, and to the events of the Server object. See `seen` and `events`.
+// Subscribes to variables, and to the events of the Server object; `seen` and `events` tell what has come.
 async function watch (name, paths) {
   const held = sessions.get(name)
   const subscription = await held.session.createSubscription2({

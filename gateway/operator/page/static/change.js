@@ -1,5 +1,6 @@
 // A proposal, and the way to a decision on it. What is decided on is exactly what is shown, by its hash.
 import { $, english, h, replaced, setText } from "./dom.js";
+import { drawCourses } from "./courses.js";
 import { confirmed } from "./dialog.js";
 import { beforeAfter, margins } from "./figures.js";
 import { Refused, ask } from "./net.js";
@@ -65,7 +66,11 @@ export class Change {
 
   fill(shown) {
     this.shown = shown;
-    this.put(JSON.stringify(shown), () => [this.what(shown), this.figures(shown), this.rules(shown), this.bar(shown)]);
+    this.put(JSON.stringify(shown), () => [h("div", { class: "stack" }, this.what(shown), this.courses(shown)), this.figures(shown), this.rules(shown), this.bar(shown)]);
+    const place = $("courses");
+    if (!place || place.dataset.of) return;
+    place.dataset.of = shown.proposal_hash;
+    drawCourses(place, shown.proposal_hash);
   }
 
   what(shown) {
@@ -73,6 +78,7 @@ export class Change {
     return h("section", { class: "panel" },
       h("h2", {}, word(`kind.${shown.kind}`), " ", h("code", {}, shown.proposal_hash.slice(0, 12))),
       h("p", {}, word(`stage.${shown.stage}`), shown.why && [": ", english("span", shown.why)]),
+      shown.shown && twoPeople(shown) && h("p", {}, h("b", {}, twoPeople(shown))),
       h("h3", {}, word("change.difference")), h("ul", {}, shown.difference.map((line) => english("li", line))),
       h("h3", {}, word("change.reason")), quoted,
       shown.evidence.length > 0 && [h("h3", {}, word("change.evidence")), h("ul", {}, shown.evidence.map(evidence))],
@@ -82,6 +88,11 @@ export class Change {
   figures(shown) {
     if (!shown.verdict?.figures.length) return null;
     return h("section", { class: "panel" }, h("h2", {}, word("change.figures")), h("p", { class: "muted" }, word("change.figures-how")), beforeAfter(shown.verdict.figures));
+  }
+
+  courses(shown) {
+    if (shown.kind !== "gains" || !shown.verdict?.accepted) return null;
+    return h("section", { class: "panel" }, h("h2", {}, word("change.courses")), h("div", { id: "courses" }, h("p", {}, word("change.courses-drawing"))));
   }
 
   rules(shown) {
@@ -103,7 +114,7 @@ export class Change {
   }
 
   async decide(shown, approve) {
-    const then = approve ? [shown.two_people && word("change.two-people"), word(`change.then-${shown.kind}`, { lasts: duration(shown.lasts_s ?? 0) })] : [word("change.then-reject")];
+    const then = approve ? [twoPeople(shown), word(`change.then-${shown.kind}`, { lasts: duration(shown.lasts_s ?? 0) })] : [word("change.then-reject")];
     const answer = await confirmed({
       title: word(approve ? "change.sure-approve" : "change.sure-reject"),
       lines: [...then.filter(Boolean), ...judged(shown.verdict?.region), ...shown.difference.map((line) => ({ english: line })),
@@ -121,6 +132,12 @@ export class Change {
     const left_s = Date.parse(this.shown.expires) / 1000 - now_s;
     setText(element, left_s > 0 ? word("change.expires", { left: duration(left_s) }) : word("change.expired"));
   }
+}
+
+// Empty: one is enough.
+function twoPeople(shown) {
+  if (shown.approvals < 2) return "";
+  return shown.approved_by ? word("change.second", { name: shown.approved_by }) : word("change.two-people");
 }
 
 // How far the gate has judged it; beyond that the line does not go with it.

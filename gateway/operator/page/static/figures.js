@@ -1,6 +1,6 @@
-// Numbers of a verdict as bars: how much of each limit is used, and what was simulated before and after.
+// Numbers of a verdict as bars: how much of each limit is used, and what was simulated before and after. Of page and reports.
 import { english, h, svg } from "./dom.js";
-import { figure, number, word } from "./words.js";
+import { figure, number, word } from "./formats.js";
 
 export function margins(findings) {
   const order = (one) => (one.passed ? 0 : 10) + (one.used ?? -1);

@@ -9,7 +9,7 @@ export function paintHealth(tick, line) {
   if (now_ms - painted_ms < 900 && $("view-health").dataset.key) return;
   painted_ms = now_ms;
   const key = JSON.stringify([tick.timing, tick.loop.doubts, tick.buses, tick.agents, tick.historian, tick.link, tick.events, document.documentElement.lang]);
-  replaced($("view-health"), key, () => [diagnoses(tick), timing(tick, line), parts(tick), events(tick)]);
+  replaced($("view-health"), key, () => [h("div", { class: "stack" }, diagnoses(tick), parts(tick)), h("div", { class: "stack" }, timing(tick, line), events(tick))]);
 }
 
 function diagnoses({ loop, change }) {

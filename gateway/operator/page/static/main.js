@@ -7,15 +7,18 @@ import { Refused, ask, keepToken, listen } from "./net.js";
 import { Operate } from "./operate.js";
 import { paintHistory } from "./past.js";
 import { Picture } from "./picture.js";
-import { reply, stopSent } from "./reply.js";
+import { notDone, reply, stopSent } from "./reply.js";
 import { Trends } from "./trends.js";
 import { number, preferred, speak, time, word } from "./words.js";
 
-const STALE_MS = 1000, AGAIN_MS = 3000, STOP_MS = 3000, LONG = 22, VIEWS = ["line", "change", "history", "health"];
-let parts = null, tick = null, heard_ms = 0, broken = false, followed = null, stops = 0, skew_s = 0, list = null, records = [];
+const STALE_MS = 1000, AGAIN_MS = 3000, STOP_MS = 3000, RECORDS_MS = 3000, MOST_RECORDS = 200, LONG = 22, VIEWS = ["line", "change", "history", "health"];
+let parts = null, tick = null, heard_ms = 0, broken = false, followed = null, stops = 0, skew_s = 0, list = null, records = [], again_at = 0, asked_ms = 0;
 
 async function begin() {
   await speak(preferred());
+  const unsaid = sessionStorage.getItem("unsaid");
+  if (unsaid) notDone(unsaid);
+  sessionStorage.removeItem("unsaid");
   try {
     const me = await ask("api/me");
     await (me.role === null ? askName() : enter(me));
@@ -27,8 +30,11 @@ async function begin() {
   }
 }
 
-// The session has ended: everything anew.
-const out = () => location.reload();
+// The session has ended, or its role is another one: everything anew. `unsaid`: what was pressed, and nobody heard.
+function out(unsaid) {
+  if (unsaid) sessionStorage.setItem("unsaid", unsaid);
+  location.reload();
+}
 
 function askName() {
   for (const id of ["now", "views", "logout"]) show($(id), false);
@@ -54,7 +60,7 @@ async function enter(me) {
   setText($("line-name"), `${line.site} / ${line.line}`);
   document.title = `${line.site} / ${line.line}`;
   route();
-  parts = { line, picture: new Picture(line), trends: new Trends(line), alarms: new Alarms(say, may), change: new Change(say, may), operate: new Operate(line, say, may) };
+  parts = { line, picture: new Picture(line), trends: new Trends(line), alarms: new Alarms(say, may), change: new Change(say, may), operate: new Operate(line, say, may, () => list?.in_service) };
   heard_ms = performance.now();
   follow();
 }
@@ -82,7 +88,7 @@ async function logOut() {
 }
 
 function hear(kind, data) {
-  if (kind === "logged-out") return out();
+  if (kind === "anew") return out();
   if (kind === "away") return;
   broken = true; // until all of it is on the screen
   take(data);
@@ -115,6 +121,7 @@ function paint() {
   setText($("waiting"), String(waiting.length));
   show($("prompt"), waiting.length > 0);
   setText($("prompt-text"), word(waiting.length === 1 ? "prompt.one" : "prompt.more", { count: waiting.length }));
+  $("clock").dateTime = new Date(1000 * (tick.wall_s - (loop.age_s ?? 0))).toISOString(); // when the loop measured all this
 }
 
 // Four times a second, whether anything comes or not: how old it is, and how long there is to decide.
@@ -126,10 +133,27 @@ function look() {
   if (stale) setText($("stale"), word(broken ? "stale.broken" : !tick ? "stale.none" : old ? "stale.old" : "stale.loop"));
   setText($("clock"), tick ? (stale ? word("stale.at", { time: time(tick.wall_s) }) : time(tick.wall_s)) : "");
   parts.change.paint(Date.now() / 1000 + skew_s);
+  if (open() === "history" && !document.hidden && performance.now() - asked_ms > RECORDS_MS) more();
+}
+
+// What has been recorded since, while somebody reads it.
+async function more() {
+  asked_ms = performance.now();
+  try {
+    const last = records.at(-1)?.sequence ?? 0, told = await ask(`api/records?after=${last}`);
+    if (told.last < last) return news(); // the audit was begun anew
+    if (last !== (records.at(-1)?.sequence ?? 0) || !told.records.length) return;
+    records = [...records, ...told.records].slice(-MOST_RECORDS);
+    parts.trends.told(records);
+    if (open() === "history") paintHistory(list, records);
+  } catch (error) {
+    if (!(error instanceof Refused)) throw error; // it is asked again in a while
+  }
 }
 
 // Proposals or records may be others now.
 async function news() {
+  clearTimeout(again_at);
   try {
     list = await ask("api/proposals");
     records = (await ask("api/records")).records;
@@ -137,6 +161,7 @@ async function news() {
   } catch (error) {
     if (!(error instanceof Refused)) throw error;
     if (error.status === 401) return out();
+    again_at = setTimeout(news, AGAIN_MS);
   }
   route();
 }
@@ -168,7 +193,7 @@ async function say(said) {
     tell(await ask("api/say", said, stop ? STOP_MS : undefined));
   } catch (error) {
     if (!(error instanceof Refused)) throw error;
-    if (error.status === 401) return out();
+    if (error.status === 401) return out(stop ? "stop" : "said");
     tell(error);
   }
   await news();

@@ -58,11 +58,11 @@ export function listen(heard, lost) {
     if (document.hidden) return;
     const mine = new EventSource("events");
     [source, heard_ms] = [mine, performance.now()];
-    for (const kind of ["tick", "away", "logged-out"]) {
+    for (const kind of ["tick", "away", "anew"]) {
       mine.addEventListener(kind, (event) => {
         if (mine !== source) return;
         heard_ms = performance.now();
-        if (kind === "logged-out") end();
+        if (kind === "anew") end();
         heard(kind, JSON.parse(event.data));
       });
     }

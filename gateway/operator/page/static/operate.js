@@ -1,13 +1,14 @@
 // What an operator does: arm, start, hold, set-points, recipes, back to what is known to be good.
-import { $, h, setText } from "./dom.js";
+import { $, h, setText, show } from "./dom.js";
 import { confirmed } from "./dialog.js";
 import { number, word } from "./words.js";
 
-const TWO_STEPS = ["arm", "start"];
+const TWO_STEPS = ["arm", "start"], BASELINE = "phi_stable";
 
 export class Operate {
-  constructor(line, say, may) {
-    Object.assign(this, { line, say, may });
+  // `runs`: the hash of what is in service.
+  constructor(line, say, may, runs) {
+    Object.assign(this, { line, say, may, runs });
     this.follows = []; // what puts the line's set-points into fields that nobody has touched
     $("operate").replaceChildren(...(may("arm") ? this.forms() : [h("p", {}, word("operate.look-only"))]));
   }
@@ -16,7 +17,25 @@ export class Operate {
     const button = (command) => h("button", { type: "button", onclick: () => this.command(command) }, word(`command.${command}`));
     return [h("p", { id: "operate-state" }), h("div", { class: "buttons" }, ["arm", "start", "hold"].map(button)),
       this.tension(), this.speed(), this.recipe(),
-      h("div", { class: "buttons apart" }, h("button", { type: "button", onclick: () => this.back() }, word("operate.roll-back")))];
+      h("div", { class: "buttons apart" },
+        h("button", { type: "button", onclick: () => this.back() }, word("operate.roll-back")),
+        h("button", { type: "button", id: "abort", hidden: true, onclick: () => this.say({ command: "experiment-abort" }) }, word("operate.abort"))),
+      this.may("archive") && h("div", { class: "buttons" },
+        h("button", { type: "button", onclick: () => this.archive() }, word("operate.archive")),
+        h("button", { type: "button", onclick: () => this.lineChanged() }, word("operate.line-changed")))].filter(Boolean);
+  }
+
+  async archive() {
+    const configuration = this.runs();
+    if (!configuration) return;
+    const lines = [word("operate.then-archive"), word("history.in-service", { hash: configuration.slice(0, 12) })];
+    const because = await confirmed({ title: word("operate.sure-archive"), lines, yes: word("operate.yes-archive"), comment: true, needed: true });
+    if (because) await this.say({ command: "archive", configuration, name: BASELINE, because });
+  }
+
+  async lineChanged() {
+    const because = await confirmed({ title: word("operate.sure-line-changed"), lines: [word("operate.then-line-changed")], yes: word("operate.yes-line-changed"), comment: true, needed: true });
+    if (because) await this.say({ command: "line-changed", because });
   }
 
   async command(command) {
@@ -112,6 +131,7 @@ export class Operate {
     const state = $("operate-state");
     if (!state) return;
     setText(state, word(`next.${tick.loop.state}`));
+    show($("abort"), tick.change?.kind === "experiment" && tick.change.stage === "running");
     for (const follow of this.follows) follow();
   }
 }

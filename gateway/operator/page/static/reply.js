@@ -6,6 +6,9 @@ import { word } from "./words.js";
 // At once: a finger on Stop has to see that it was felt.
 export const stopSent = () => put("status", [h("p", {}, h("b", {}, word("reply.stop-sent")))]);
 
+// Of a session that had ended nothing was handed on; it is said where the page begins anew.
+export const notDone = (what) => put("alert", [h("p", {}, h("b", {}, word(`reply.not-${what}`)))]);
+
 // Only what was looked at and turned down is refused. Where no answer came, it may have been done all the same.
 export function reply(answer, stop = false) {
   const refused = answer instanceof Refused;

@@ -47,7 +47,10 @@ export class Trends {
     const now_ms = performance.now();
     if (now_ms - (this.painted_ms ?? -Infinity) < EVERY_MS) return;
     this.painted_ms = now_ms;
-    if (tick.wall_s < (this.times.at(-1) ?? 0)) for (const list of this.lists()) list.length = 0; // the clock was set back
+    if (tick.wall_s < (this.times.at(-1) ?? 0)) { // the clock was set back: what was stored before has other times now
+      for (const list of this.lists()) list.length = 0;
+      this.load(tick.wall_s);
+    }
     const last = this.times.at(-1) ?? 0;
     if (tick.wall_s === last) return;
     if (this.times.length && tick.wall_s - last > 5) this.push(last + 1, null); // a gap, not a line across it
@@ -122,6 +125,7 @@ export class Trends {
   over(u, chosen, colour) {
     const c = u.ctx, { left, top, width, height } = u.bbox, ratio = devicePixelRatio;
     c.save();
+    [c.textAlign, c.textBaseline] = ["left", "alphabetic"]; // uPlot leaves its axes' behind
     c.font = `bold ${16 * ratio}px system-ui, sans-serif`;
     c.fillStyle = c.strokeStyle = colour("ink");
     for (const mark of this.marks) {

@@ -1,0 +1,38 @@
+// A catalogue's words, and numbers and times as its language writes them. Reports embed this file: it asks nothing of anybody.
+let words = {};
+export let language = "en";
+
+export function useWords(chosen, catalogue) {
+  language = chosen;
+  words = catalogue;
+}
+
+export function word(key, values = {}) {
+  const text = words[key] ?? key;
+  return text.replace(/\{(\w+)\}/g, (_, name) => values[name] ?? "");
+}
+
+export function number(value, digits = 1) {
+  if (value == null) return "–";
+  return value.toLocaleString(language, { minimumFractionDigits: digits, maximumFractionDigits: digits }).replace("-", "−");
+}
+
+// With as many digits as it needs to be told from its neighbours.
+export function figure(value) {
+  if (value == null) return "–";
+  return value.toLocaleString(language, { maximumSignificantDigits: 3, useGrouping: Math.abs(value) >= 1e5 }).replace("-", "−");
+}
+
+export function time(wall_s, withDate = false) {
+  const options = { hour: "2-digit", minute: "2-digit", second: "2-digit", ...(withDate ? { day: "2-digit", month: "2-digit", year: "numeric" } : {}) };
+  return new Date(1000 * wall_s).toLocaleString(language === "en" ? "en-GB" : language, options);
+}
+
+export const instant = (text) => time(Date.parse(text) / 1000, true);
+
+export function duration(seconds) {
+  const whole = Math.max(0, Math.round(seconds));
+  const [hours, minutes] = [Math.floor(whole / 3600), Math.floor((whole % 3600) / 60)];
+  if (hours) return `${hours} h ${String(minutes).padStart(2, "0")} min`;
+  return minutes ? `${minutes} min ${String(whole % 60).padStart(2, "0")} s` : `${whole} s`;
+}
