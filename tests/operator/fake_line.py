@@ -162,7 +162,7 @@ class FakeGateway:
         self.drawn = True
         courses = [] if drawing else [self._course("tension", 1.0, 12.0), self._course("velocity", 1.4, 0.0)]
         return CoursesTold(
-            format=1, proposal=asked.proposal, verdict=verdict_hash(self.verdict), model=None, drawing=drawing,
+            format=1, proposal=asked.proposal, verdict=verdict_hash(self.verdict), model="ab" * 32, drawing=drawing,
             courses=courses,
         ).model_dump_json().encode()  # fmt: skip
 

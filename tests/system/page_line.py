@@ -87,7 +87,7 @@ class AtPage(Spoken):
         return self
 
     def __call__(self, deed: str, *arguments: object) -> Any:
-        """Raises PeerFailed where it cannot be done, within 20 s."""
+        """Raises PeerFailed where it cannot be done, within 40 s."""
         answer = super().__call__(deed, *arguments)
         if "failed" in answer:
             raise PeerFailed(f"{deed} {arguments}: {answer['failed']}")

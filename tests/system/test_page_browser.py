@@ -58,7 +58,7 @@ def test_an_operator_sees_the_line_approves_a_change_and_takes_it_back(line: Pag
     assert line.in_service() == before  # the first of two steps
     at("fill", "#ask-comment", "looks well")
     at("click", YES)
-    at("see", "#reply", "Done")
+    assert "Done" in at("see", "#reply")
     at("see", "#change-body", "On probation")
     assert line.in_service() != before
     at.part("line")

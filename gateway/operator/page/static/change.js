@@ -65,8 +65,11 @@ export class Change {
   }
 
   fill(shown) {
+    // Once it is on the line it differs in nothing from what is: what it would have changed stays as it was shown.
+    if (shown.stage === "waiting" || shown.stage === "received") this.differs = shown;
+    else shown.difference = this.differs?.proposal_hash === shown.proposal_hash ? this.differs.difference : [];
     this.shown = shown;
-    this.put(JSON.stringify(shown), () => [h("div", { class: "stack" }, this.what(shown), this.courses(shown)), this.figures(shown), this.rules(shown), this.bar(shown)]);
+    this.put(JSON.stringify(shown), () => [h("div", { class: shown.verdict?.figures.length ? "stack" : "stack wide" }, this.what(shown), this.courses(shown)), this.figures(shown), this.rules(shown), this.bar(shown)]);
     const place = $("courses");
     if (!place || place.dataset.of) return;
     place.dataset.of = shown.proposal_hash;
@@ -79,7 +82,7 @@ export class Change {
       h("h2", {}, word(`kind.${shown.kind}`), " ", h("code", {}, shown.proposal_hash.slice(0, 12))),
       h("p", {}, word(`stage.${shown.stage}`), shown.why && [": ", english("span", shown.why)]),
       shown.shown && twoPeople(shown) && h("p", {}, h("b", {}, twoPeople(shown))),
-      h("h3", {}, word("change.difference")), h("ul", {}, shown.difference.map((line) => english("li", line))),
+      shown.difference.length > 0 && [h("h3", {}, word("change.difference")), h("ul", {}, shown.difference.map((line) => english("li", line)))],
       h("h3", {}, word("change.reason")), quoted,
       shown.evidence.length > 0 && [h("h3", {}, word("change.evidence")), h("ul", {}, shown.evidence.map(evidence))],
       shown.predicted.length > 0 && [h("h3", {}, word("change.promised")), h("ul", {}, shown.predicted.map(promise))]);

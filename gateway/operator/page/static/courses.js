@@ -18,18 +18,18 @@ export async function drawCourses(place, hash) {
     told = null;
   }
   if (!told?.courses.length) return place.closest("section")?.remove();
-  if (place.isConnected) new Drawing(place, told.courses);
+  if (place.isConnected) new Drawing(place, told);
 }
 
 class Drawing {
-  constructor(place, courses) {
+  constructor(place, { courses, model }) {
     this.courses = courses;
     const spans = courses[0].setpoint_n.map((_, i) => h("option", { value: i }, String(i + 1)));
     this.span = h("select", { onchange: () => this.draw() }, spans);
     this.span.value = this.mostMoved();
     this.places = courses.map(() => h("div", { class: "course", role: "img" }));
     place.replaceChildren(
-      h("div", { class: "row" }, h("p", { class: "muted" }, word("change.courses-how")), h("label", { class: "of-span" }, h("span", {}, word("table.span")), " ", this.span)),
+      h("div", { class: "row" }, h("p", { class: "muted" }, word("change.courses-how"), " ", word(model ? "change.courses-model" : "change.courses-file")), h("label", { class: "of-span" }, h("span", {}, word("table.span")), " ", this.span)),
       h("div", { class: "scenarios" }, courses.map((course, k) => h("figure", {}, h("figcaption", {}, english("b", course.scenario), ", N"), this.places[k]))));
     this.plots = [];
     new ResizeObserver(() => this.draw()).observe(place);
@@ -61,7 +61,8 @@ function options(width, colour) {
   return {
     width, height: TALL, legend: { show: false }, cursor: { show: false }, padding: [10, 14, 0, 0],
     scales: { x: { time: false }, y: { range: (_, min, max) => [min - 1, max + 1] } },
-    axes: [{ ...axis, size: 34, space: 70, values: (_, list) => list.map((t) => `${number(t, 1)} s`) }, { ...axis, size: 46, values: (_, list) => list.map((value) => number(value, 0)) }],
+    axes: [{ ...axis, size: 34, space: 70, incrs: [0.5, 1, 2, 5], values: (_, list) => list.map((t) => `${number(t, 1)} s`) },
+      { ...axis, size: 56, incrs: [0.5, 1, 2, 5, 10, 20], values: (_, list) => list.map((value) => number(value, list.every(Number.isInteger) ? 0 : 1)) }],
     series: [{}, line(colour("muted"), 1.5, [6, 5]), line(colour("before"), 5), line(colour("ink"), 2)],
   };
 }

@@ -1,5 +1,5 @@
 // How the gateway itself fares: timing, buses, history, agents; and what is doubted of the line.
-import { $, english, h, replaced, svg } from "./dom.js";
+import { $, coded, english, h, replaced, svg } from "./dom.js";
 import { number, time, word } from "./words.js";
 
 let painted_ms = 0;
@@ -15,7 +15,7 @@ export function paintHealth(tick, line) {
 function diagnoses({ loop, change }) {
   return h("section", { class: "panel" }, h("h2", {}, word("health.diagnoses")),
     loop.doubts.length ? h("ul", {}, loop.doubts.map((doubt) => english("li", doubt, { class: "attention-text" }))) : h("p", {}, word("health.no-diagnoses")),
-    change && [h("h3", {}, word("health.change")), h("p", {}, word(`kind.${change.kind}`), ", ", word(`stage.${change.stage}`), " ", english("span", change.text))]);
+    change && [h("h3", {}, word("health.change")), h("p", {}, word(`kind.${change.kind}`), ". ", word(`stage.${change.stage}`), change.text && [": ", english("span", change.text)])]);
 }
 
 function timing({ timing, link }, line) {
@@ -43,5 +43,5 @@ function parts({ buses, agents, historian }) {
 
 function events({ events }) {
   return h("section", { class: "panel" }, h("h2", {}, word("health.events")),
-    events.length ? h("ol", { class: "plain records" }, [...events].reverse().map((event) => h("li", {}, h("span", { class: "muted" }, time(event.wall_s)), " ", english("span", event.text)))) : h("p", {}, word("health.no-events")));
+    events.length ? h("ol", { class: "plain records" }, [...events].reverse().map((event) => h("li", {}, h("span", { class: "muted" }, time(event.wall_s)), " ", coded("span", event.text)))) : h("p", {}, word("health.no-events")));
 }

@@ -12,7 +12,7 @@ import { Trends } from "./trends.js";
 import { number, preferred, speak, time, word } from "./words.js";
 
 const STALE_MS = 1000, AGAIN_MS = 3000, STOP_MS = 3000, RECORDS_MS = 3000, MOST_RECORDS = 200, LONG = 22, VIEWS = ["line", "change", "history", "health"];
-let parts = null, tick = null, heard_ms = 0, broken = false, followed = null, stops = 0, skew_s = 0, list = null, records = [], again_at = 0, asked_ms = 0;
+let parts = null, tick = null, heard_ms = 0, broken = false, followed = null, stops = 0, skew_s = 0, list = null, records = [], again_at = 0, asked_ms = 0, asks = 0, newest = 0;
 
 async function begin() {
   await speak(preferred());
@@ -154,9 +154,11 @@ async function more() {
 // Proposals or records may be others now.
 async function news() {
   clearTimeout(again_at);
+  const mine = ++asks;
   try {
-    list = await ask("api/proposals");
-    records = (await ask("api/records")).records;
+    const found = await ask("api/proposals"), told = await ask("api/records");
+    if (mine < newest) return; // what was asked later has come already
+    [newest, list, records] = [mine, found, told.records];
     parts?.trends.told(records);
   } catch (error) {
     if (!(error instanceof Refused)) throw error;

@@ -1,5 +1,5 @@
 // What has been proposed and what became of it, and what the audit tells.
-import { $, english, h, replaced } from "./dom.js";
+import { $, coded, english, h, replaced } from "./dom.js";
 import { instant, time, word } from "./words.js";
 
 export function paintHistory(list, records) {
@@ -21,5 +21,5 @@ function proposals(list) {
 function told(records) {
   return h("section", { class: "panel wide" }, h("h2", {}, word("history.records")),
     !records.length ? h("p", {}, word("history.no-records")) : h("ol", { class: "plain records" }, [...records].reverse().slice(0, 60).map((record) =>
-      h("li", {}, h("span", { class: "muted" }, `${time(record.wall_s, true)} · ${record.who}`), english("p", record.text)))));
+      h("li", {}, h("span", { class: "muted" }, `${time(record.wall_s, true)} · ${record.who}`), coded("p", record.text)))));
 }

@@ -1,5 +1,5 @@
 // What came of what was said, in the gateway's words; it stays until the next, or until it is closed.
-import { $, english, h, replaced, show } from "./dom.js";
+import { $, coded, h, replaced, show } from "./dom.js";
 import { Refused } from "./net.js";
 import { word } from "./words.js";
 
@@ -13,7 +13,7 @@ export const notDone = (what) => put("alert", [h("p", {}, h("b", {}, word(`reply
 export function reply(answer, stop = false) {
   const refused = answer instanceof Refused;
   const text = refused ? answer.message : answer.text;
-  const said = answer.status === 0 ? h("span", {}, text) : english("span", text);
+  const said = answer.status === 0 ? h("span", {}, text) : coded("span", text);
   const reasons = (answer.reasons ?? []).filter((reason) => reason !== text);
   if (refused && answer.unknown) {
     const then = stop ? word("reply.emergency") : word("reply.look-first");
@@ -21,7 +21,7 @@ export function reply(answer, stop = false) {
   }
   put(refused ? "alert" : "status", [
     h("p", {}, h("b", {}, word(refused ? "reply.refused" : "reply.done")), " ", said),
-    reasons.length > 0 && h("ul", {}, reasons.map((reason) => english("li", reason)))]);
+    reasons.length > 0 && h("ul", {}, reasons.map((reason) => coded("li", reason)))]);
 }
 
 function put(role, parts) {

@@ -139,10 +139,11 @@ export class Trends {
       c.fillText(MARKS[mark.kind], x + 4 * ratio, top + 16 * ratio);
     }
     if (chosen === "all") {
+      const x = u.valToPos(this.times.at(-1), "x", true) + 6 * ratio;
       let last = Infinity;
       for (const [i, at] of this.ends(u)) {
         last = Math.min(at, last - 15 * ratio); // one below the other, where lines meet
-        c.fillText(String(i + 1), left + width + 6 * ratio, last + 6 * ratio);
+        c.fillText(String(i + 1), x, last + 6 * ratio);
       }
     }
     c.restore();
