@@ -189,8 +189,15 @@ def _through_the_gate(chain: ChainResult) -> Section:
     rows = tuple(_row(one) for one in chain.changes)
     heads = ("Step", "What", "Verdict", "Came to", "Approved by")
     table = Table("Each candidate of the chain, in order. A proposal is accepted where every rule passes.", heads, rows)
+    approved = tuple(
+        (f"{one.step}, {one.name}", one.approved_over, one.certificate[:16])
+        for one in chain.changes if one.approved_over
+    )  # fmt: skip
     refused = tuple((f"{one.step}, {one.name}", text) for one in chain.changes for text in one.against)
     tables = [table]
+    if approved:
+        told = "What the operator's client had read over OPC UA of each that it approved; SHA-256 of its certificate."
+        tables.append(Table(told, ("Candidate", "Read", "Certificate"), approved))
     if refused:
         tables.append(Table("What the gate has found against those it refused.", ("Candidate", "Rule"), refused))
     return Section("Through the gate", (f"{chain.deployments} deployments.",), tuple(tables))

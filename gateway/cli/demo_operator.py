@@ -139,7 +139,7 @@ class Operator:
         """Through OPC UA, over what the server shows of it, which is returned. Raises DemoFailed where refused."""
         told = await self._through_opc_ua(Approve(proposal=proposal, comment=COMMENT))
         self.progress.step(f"  {SCRIPT}, over OPC UA, reads: {told.seen}")
-        self.progress.step(f"  and approves: {told.sentence}")
+        self.progress.step(f"  and approves: {told.sentence.partition('; ')[0]}")
         return told.seen
 
     async def _through_opc_ua(self, order: Call | Approve) -> Told:

@@ -51,7 +51,7 @@ def report(
     def tell(text: str) -> None:
         typer.echo(printable(text), err=True)
 
-    tell(f"read: {folder}")
+    tell(f"reading {folder}; where nothing was simulated before, the first simulation compiles for some seconds")
     records = read_records(folder)
     lines = {(one.proposal.site, one.proposal.line) for one in records.proposals}
     if others := sorted(lines - {(described.site, described.line)}):

@@ -80,8 +80,8 @@ class Conditions:
             return Simulated(noisy.tension_n[0], noisy.torque_nm[0], inf, inf, inf, inf)
         of_noisy, of_quiet = (self._metrics(one, course) for one in (noisy, quiet))
         return Simulated(
-            noisy.tension_n[0], noisy.torque_nm[0], of_noisy.rmse_n, float(of_quiet.overshoot_pct.max()),
-            float(of_quiet.settling_s.max()), of_noisy.effort_n2m2s,
+            noisy.tension_n[0], noisy.torque_nm[0], of_noisy.rmse_n, float(of_quiet.overshoot_pct.max(initial=0.0)),
+            float(of_quiet.settling_s.max(initial=0.0)), of_noisy.effort_n2m2s,
         )  # fmt: skip
 
     def _rollouts(self, controller: Controller, course: Course, noise: Noise) -> Rollouts:
@@ -116,7 +116,7 @@ def simulated(
     found: dict[str, list[Simulated | str]] = {case.name: [] for case in cases}
     for case in cases:
         for one in named:
-            tell(f"simulated under identical conditions: {one.name}, {case.heading.lower()}")
+            tell(f"simulating {one.name}, {case.heading.lower()}")
             try:
                 found[case.name].append(conditions.run(one.controller, case))
             except ValueError as error:  # of another period, or another number of spans

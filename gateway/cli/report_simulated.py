@@ -1,7 +1,7 @@
 """The report's figures of the paper: courses of tension and torque of each configuration under identical conditions."""
 
 from collections.abc import Mapping, Sequence
-from math import isfinite
+from math import ceil, isfinite
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from gateway.core.signals import FloatArray
 
 MOST_SHOWN = 5  #: with the reference as many as there are colours
 PLOT_EVERY_S = 0.01  #: at least, between the samples of a chart
+MANY_SPANS = 12  #: beyond which there are fewer samples, so that the page stays within some megabytes
 LOST = "ran away"
 
 
@@ -94,7 +95,7 @@ def case_section(
     if not runs:
         return Section(title, (case.description, "None could be simulated."))
     course = course_of(case, period_s)
-    every = max(1, round(PLOT_EVERY_S / period_s))
+    every = max(1, round(PLOT_EVERY_S / period_s)) * ceil(len(spans) / MANY_SPANS)
     time_s: FloatArray = time_of(course, period_s)[::every]
     tension, torque = list[Chart](), list[Chart]()
     for span, span_name in enumerate(spans):

@@ -65,7 +65,7 @@ ALARMS: tuple[Alarm, ...] = (
         "torque-at-limit", "medium", "torques are at their limits",
         cause="set-points or speed too high for the drives; a bearing or a nip that drags; a web that is stuck",
         consequence="tension follows its set-point no longer; proposals are blocked",
-        action="lower tension or speed; feel for a roller that turns hard",
+        action="lower tension or speed; once the line stands, feel for a roller that turns hard",
         after_s=2.0, gone_s=5.0,
     ),
     Alarm(

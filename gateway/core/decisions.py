@@ -92,6 +92,23 @@ class ProposalLine(Strict):
     epoch: int | None  #: of the deployment; null: never deployed
 
 
+class PerformanceTold(Strict):
+    """How well the configuration in service did when it was measured last, on the line as it is."""
+
+    scenario: str
+    measured_s: float  #: Unix time
+    rmse_n: float
+    baseline_rmse_n: float | None  #: of the line's baseline in this scenario; null: none was set
+
+
+class InServiceTold(Strict):
+    """What controls the line, beside its hash."""
+
+    kind: str | None  #: PID, LQR, LQI, LQG or MPC, and whether it is scheduled; null: it is not stored here
+    phase: Literal["commissioning", "operation"]  #: operation: a baseline was set for the line as it is
+    performance: PerformanceTold | None
+
+
 class ProposalList(Strict):
     format: Annotated[int, Field(ge=1, le=1)]
     site: str
@@ -103,6 +120,7 @@ class ProposalList(Strict):
     line_changed_s: float | None = None  #: Unix time at which somebody said last that the line has changed
     since_change: int  #: proposals that have been made since then
     proposals: list[ProposalLine]
+    controller: InServiceTold | None = None  #: null: the gateway is older
 
 
 class ProposalShown(Strict):

@@ -260,6 +260,7 @@ class Operator(Strict):
     anonymous: Literal["none", "read"] = "none"  #: whether somebody without a name may look
     pki: str | None = None  #: folder of certificates; null: `pki` in the line's data folder
     sessions_max: Annotated[int, Field(ge=1, le=100)] = 20  #: of OPC UA clients
+    nodesets: str | None = None  #: folder of companion specifications' node sets, as published; null: own types only
 
 
 class Line(Strict):

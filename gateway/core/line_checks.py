@@ -53,7 +53,7 @@ RULES: tuple[Rule, ...] = (
     _rule("operator", operator.opc_ua_is_an_endpoint),
     _rule("operator", operator.page_is_an_address),
     _rule("operator", operator.ports_differ),
-    _rule("operator", operator.pki_is_a_folder),
+    _rule("operator", operator.folders_are_absolute),
     _rule("limits", process.tension_limits_ordered),
     _rule("limits web", process.web_bears_the_tension),
     _rule("limits", process.steps_within_limits),

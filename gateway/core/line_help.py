@@ -204,6 +204,7 @@ HELP: dict[str, dict[str, str]] = {
         "anonymous": '"read": whoever has no name may look; "none": nobody',
         "pki": "folder with the certificates and the trusted ones; without this key: pki in the line's data folder",
         "sessions_max": "OPC UA clients at once",
+        "nodesets": "folder with the OPC Foundation's node sets (DI, Machinery, ...); without this key: own types only",
     },
     "Recipe": {
         "name": "name of the grade",

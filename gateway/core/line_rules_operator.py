@@ -39,11 +39,12 @@ def ports_differ(line: Line) -> Iterator[Finding]:
         yield Finding(("operator", "page"), wrong, "a port of its own", f'"{page.scheme}://{host}:{other}"')
 
 
-def pki_is_a_folder(line: Line) -> Iterator[Finding]:
+def folders_are_absolute(line: Line) -> Iterator[Finding]:
     """From the root, so that it does not matter where the process is started."""
-    pki = line.operator.pki
-    if pki is not None and not pki.startswith("/"):
-        yield Finding(("operator", "pki"), "is no absolute path", 'a path from the root, as "/etc/r2rgate/pki"')
+    for key in ("pki", "nodesets"):
+        folder = getattr(line.operator, key)
+        if folder is not None and not folder.startswith("/"):
+            yield Finding(("operator", key), "is no absolute path", f'a path from the root, as "/etc/r2rgate/{key}"')
 
 
 def _parts(address: str, schemes: tuple[str, ...]) -> SplitResult | None:

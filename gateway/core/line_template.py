@@ -148,7 +148,7 @@ def _network() -> str:
 
 
 def _operator() -> str:
-    settings = Operator(pki="/etc/r2rgate/pki").model_dump(mode="json")
+    settings = Operator(pki="/etc/r2rgate/pki", nodesets="/etc/r2rgate/nodesets").model_dump(mode="json")
     return table("operator", "Operator", {key: f"#{json.dumps(value)}" for key, value in settings.items()})
 
 

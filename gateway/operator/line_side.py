@@ -11,6 +11,7 @@ from typing import TypeVar
 from pydantic import ValidationError
 
 from gateway.core.access import AtTheDoor
+from gateway.core.courses import CoursesTold, ShowCourses
 from gateway.core.decisions import ListProposals, ProposalList, ProposalShown, ShowProposal
 from gateway.core.line import Strict
 from gateway.core.line_past import RecordsAfter, RecordsTold, TensionsBetween, TensionsTold
@@ -19,6 +20,7 @@ from gateway.core.people import ForPerson, Person, Said
 from gateway.core.status import GatewayStatus
 from gateway.core.topics import (
     GATEWAY_ACCESS,
+    GATEWAY_COURSES,
     GATEWAY_FOR_PERSON,
     GATEWAY_PAST,
     GATEWAY_PROPOSALS,
@@ -37,7 +39,7 @@ ACT_S = 20.0  #: arming, and a deployment, take their time
 Model = TypeVar("Model", bound=Strict)
 
 #: All but what people say.
-READ: tuple[Topic, ...] = (GATEWAY_STATUS, GATEWAY_PROPOSALS, GATEWAY_PAST, GATEWAY_ACCESS)
+READ: tuple[Topic, ...] = (GATEWAY_STATUS, GATEWAY_PROPOSALS, GATEWAY_PAST, GATEWAY_COURSES, GATEWAY_ACCESS)
 TOPICS: tuple[Topic, ...] = (*READ, GATEWAY_FOR_PERSON)
 
 
@@ -91,6 +93,10 @@ class LineSide:
         """Everything on which a person decides. Raises NotTold."""
         return _told(ProposalShown, await self._in_turn(GATEWAY_PROPOSALS, ShowProposal(proposal=proposal)))
 
+    async def courses(self, proposal: str) -> CoursesTold:
+        """Of the whole hash of one that waits; the first answer is mostly that they are being drawn. Raises NotTold."""
+        return _told(CoursesTold, await self._in_turn(GATEWAY_COURSES, ShowCourses(proposal=proposal)))
+
     async def records(self, after: int | None = None) -> RecordsTold:
         """Raises NotTold."""
         return _told(RecordsTold, await self._in_turn(GATEWAY_PAST, RecordsAfter(after=after)))
@@ -138,7 +144,7 @@ class LineSide:
                 self._troubles[look.__name__] = str(error)
             await asyncio.sleep(every_s)
 
-    async def _in_turn(self, topic: Topic, query: ShowProposal | RecordsAfter | TensionsBetween) -> bytes:
+    async def _in_turn(self, topic: Topic, query: ShowProposal | RecordsAfter | TensionsBetween | ShowCourses) -> bytes:
         """Few at a time, so that those who look cannot fill the way to the gateway. Raises NotTold."""
         try:
             async with asyncio.timeout(ASK_S):

@@ -50,6 +50,7 @@ class Way:
             if not self.trouble:
                 try:
                     await self._serve()
+                    self._shut("it has ended")
                 except (CannotServe, PageCannotServe) as error:
                     self._shut(str(error))
             await asyncio.sleep(AGAIN_S)

@@ -20,20 +20,22 @@ class _Account:
 
 
 class Bounded:
-    """By name: `AT_ONCE` in a row, and then one every `EVERY_S`."""
+    """By name: `at_once` in a row, and then one every `every_s`."""
 
-    def __init__(self, clock: Callable[[], float]) -> None:
+    def __init__(self, clock: Callable[[], float], at_once: int = AT_ONCE, every_s: float = EVERY_S) -> None:
         self._clock = clock
+        self._at_once = at_once
+        self._every_s = every_s
         self._by_name: OrderedDict[str, _Account] = OrderedDict()
 
     def left_out(self, name: str) -> int | None:
         """None: this one is left out, too. Else it may be written, and so many before it were not."""
         now_s = self._clock()
-        account = self._by_name.pop(name, None) or _Account(AT_ONCE, now_s)
+        account = self._by_name.pop(name, None) or _Account(self._at_once, now_s)
         self._by_name[name] = account
         while len(self._by_name) > MOST_NAMES:
             self._by_name.popitem(last=False)
-        account.left = min(AT_ONCE, account.left + (now_s - account.at_s) / EVERY_S)
+        account.left = min(self._at_once, account.left + (now_s - account.at_s) / self._every_s)
         account.at_s = now_s
         if account.left < 1.0:
             account.left_out += 1

@@ -11,10 +11,11 @@ from typing import Any
 
 from gateway.core.audit_record import Who
 from gateway.core.decisions import MOST_LISTED, Decide, ProposalLine, ProposalList, ProposalShown, shown_hash
+from gateway.core.deployment import Region
 from gateway.core.judge_context import JudgeContext
 from gateway.core.line import Line
 from gateway.core.messages import Reply
-from gateway.core.proposal import GainsChange, Proposal
+from gateway.core.proposal import GainsChange, Proposal, canonical
 from gateway.core.recording import Recording
 from gateway.core.small_change import beyond_small
 from gateway.core.status import ChangeStatus
@@ -195,6 +196,14 @@ class Deployer:
     async def judged(self) -> None:
         """Until nothing is being judged any more."""
         await self._inbox.judged()
+
+    async def judged_as(self, entry: Entry) -> tuple[bytes, JudgeContext, Region]:
+        """The bytes that were judged, in which context, and for what. Raises AuditUnavailable, NotKnown."""
+        await self._records.fetch([entry])
+        verdict = self._records.verdict(entry)
+        if verdict is None or verdict.region is None:
+            raise NotKnown("it was not accepted")
+        return canonical(self._records.proposal(entry)), await self._records.context(verdict), verdict.region
 
     async def context(self) -> tuple[JudgeContext, list[Recording]]:
         """What a proposal would be judged against now. Raises NotKnown."""

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from gateway.core.audit_record import Who
+from gateway.core.people import SCRIPTS
 
 APPROVED_ONCE = "approved-once"  #: the kind of its record
 _PERSON = re.compile(r"([a-z][a-z0-9._-]{0,31}) \([a-z]+, [a-z-]+\)")  # as `who_is` writes it
@@ -33,7 +34,11 @@ def approver_of(who: Who) -> tuple[str, ...]:
 
 def why_no_person(who: Who, own_uid: int) -> str:
     """Empty: it is somebody in particular. `own_uid`: as which user the gateway runs."""
-    if _PERSON.fullmatch(who.name) is not None or who.uid not in (0, own_uid):
+    if (person := _PERSON.fullmatch(who.name)) is not None:
+        nobody = person[1].startswith(SCRIPTS)  # a program, run by nobody knows whom
+    else:
+        nobody = who.uid in (0, own_uid)
+    if not nobody:
         return ""
     return (
         f"{who.name} is no person, and this line takes two: approve it on the page, or through OPC UA, as a user of "

@@ -28,6 +28,7 @@ from gateway.supervisor.configurations import Configurations, ConfigurationsErro
 from gateway.supervisor.deployer import Deployer
 from gateway.supervisor.deployer_sides import JudgeSide, NotTakenUp
 from gateway.supervisor.experiments import ENDS as EXPERIMENT_ENDS
+from gateway.supervisor.in_service import InServiceView
 from gateway.supervisor.kept_audit import KeptAudit
 from gateway.supervisor.model_store import ModelsError
 from gateway.supervisor.models import Models, begin_repository
@@ -86,6 +87,7 @@ class Gate:
         self.audit.start()
         self._stores: tuple[Configurations, Models] | None = None
         self._shut = "the gate is about to open"  #: why it is, while it is
+        self._in_service = InServiceView(line, folder)
         self._told = ""
         self._refusals = Bounded(clock)
         self._learned: str | None = None  #: what ran when `_learn` looked last
@@ -213,7 +215,9 @@ class Gate:
             return self.shut_reply().model_dump_json().encode()
         await self.deployer.at_hand(None if isinstance(query, ListProposals) else query.proposal)
         if isinstance(query, ListProposals):
-            return self.deployer.listed(query.most, query.skip).model_dump_json().encode()
+            found = self.deployer.listed(query.most, query.skip)
+            told = found.model_copy(update={"controller": await self._in_service.told(self.deployer.book)})
+            return told.model_dump_json().encode()
         found = self.deployer.shown(query.proposal)
         if isinstance(found, str):
             return Reply(ok=False, state="", text=found, reasons=[found]).model_dump_json().encode()

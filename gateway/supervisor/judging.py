@@ -12,8 +12,10 @@ from collections.abc import Sequence
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
-from typing import Any
+from typing import Any, TypeVar
 
+from gateway.core.courses import Courses
+from gateway.core.deployment import Region
 from gateway.core.judge_context import JudgeContext
 from gateway.core.line import Line
 from gateway.core.recording import Recording
@@ -25,6 +27,13 @@ BEGIN_S = 600.0  #: until one is ready: on a new machine it compiles first
 LARGEST_SEED = 2**53  #: below it every number is one in JSON, too
 #: Rules under which this process refuses by itself.
 TIME_RULE, WORKER_RULE = "time", "judge process"
+
+
+Answer = TypeVar("Answer", Verdict, Courses)
+
+
+class Busy(Exception):
+    """Every worker is at a proposal."""
 
 
 class NoVerdict(Exception):
@@ -57,7 +66,7 @@ class _Worker:
             self._answer(BEGIN_S, "has not begun")
             self._ready = True
 
-    def ask(self, job: tuple[Any, ...], limit_s: float) -> Verdict:
+    def ask(self, job: tuple[Any, ...], limit_s: float, wanted: type[Answer]) -> Answer:
         """Raises NoVerdict; the worker is not to be used again then."""
         self.wait_ready()
         try:
@@ -65,7 +74,7 @@ class _Worker:
         except OSError as error:
             raise NoVerdict(WORKER_RULE, f"the judge's process has ended: {error}") from error
         answer = self._answer(limit_s, "has given no verdict")
-        if not isinstance(answer, Verdict):
+        if not isinstance(answer, wanted):
             raise NoVerdict(WORKER_RULE, "the judge's process failed, and has said nothing else")
         return answer
 
@@ -134,6 +143,23 @@ class JudgeWorkers:
         """
         seed = secrets.randbelow(LARGEST_SEED) if seed is None else seed
         limit_s = self._line.gate.verdict_max_s if limit_s is None else limit_s
+        try:
+            return await self._asked((payload, context, list(recordings), seed), limit_s, Verdict)
+        except NoVerdict as none:
+            return await asyncio.to_thread(_refusal, payload, context, self._line, seed, none)
+
+    async def courses(self, payload: bytes, context: JudgeContext, region: Region) -> Courses:
+        """What the figures of a verdict for `region` are of, to be drawn.
+
+        Raises Busy where all are at something, so that no verdict waits for it, and NoVerdict where none come within
+        the time of a verdict.
+        """
+        if self._idle.empty():
+            raise Busy
+        return await self._asked((payload, context, region), self._line.gate.verdict_max_s, Courses)
+
+    async def _asked(self, job: tuple[Any, ...], limit_s: float, wanted: type[Answer]) -> Answer:
+        """Raises NoVerdict."""
         worker = await self._idle.get()
         if worker is None:
             try:
@@ -141,22 +167,18 @@ class JudgeWorkers:
             except BaseException:
                 self._idle.put_nowait(None)  # another one may begin
                 raise
-        asked = asyncio.ensure_future(
-            asyncio.to_thread(worker.ask, (payload, context, list(recordings), seed), limit_s)
-        )
+        asked = asyncio.ensure_future(asyncio.to_thread(worker.ask, job, limit_s, wanted))
         good = False
         try:
-            verdict = await asyncio.shield(asked)
+            answer = await asyncio.shield(asked)
             good = True
-        except NoVerdict as none:
-            return await asyncio.to_thread(_refusal, payload, context, self._line, seed, none)
         finally:
             if not good:  # it is at something, or dead: another one takes its place when there is need
                 self._all.discard(worker)
                 await asyncio.to_thread(worker.end)
                 asked.add_done_callback(_forgotten)
             self._idle.put_nowait(worker if good else None)
-        return verdict
+        return answer
 
     def _begun(self) -> _Worker:
         worker = _Worker(self._line, self._nicer)
@@ -170,14 +192,14 @@ def _refusal(payload: bytes, context: JudgeContext, line: Line, seed: int, none:
     return refusal(payload, context, line, seed, none.rule, str(none))
 
 
-def _forgotten(asked: "asyncio.Future[Verdict]") -> None:
+def _forgotten(asked: "asyncio.Future[Any]") -> None:
     """Nobody waits for this answer any more."""
     if not asked.cancelled():
         asked.exception()
 
 
 def _work(pipe: Connection, line: Line, nicer: int) -> None:
-    """A worker's life: ready, then a verdict for each job, until the other end is gone."""
+    """A worker's life: ready, then a verdict or courses for each job, until the other end is gone."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the process that has started this one
     end_with_parent()
     os.nice(nicer)
@@ -187,7 +209,11 @@ def _work(pipe: Connection, line: Line, nicer: int) -> None:
     try:
         pipe.send("ready")
         while True:
-            payload, context, recordings, seed = pipe.recv()
+            payload, context, *job = pipe.recv()
+            if isinstance(job[0], Region):
+                pipe.send(_courses(payload, context, line, job[0]))
+                continue
+            recordings, seed = job
             try:
                 verdict = judge(payload, context, line, recordings, seed)
             except Exception as error:  # whatever it is, it is no yes
@@ -195,3 +221,13 @@ def _work(pipe: Connection, line: Line, nicer: int) -> None:
             pipe.send(verdict)
     except (EOFError, OSError):
         return
+
+
+def _courses(payload: bytes, context: JudgeContext, line: Line, region: Region) -> Courses:
+    """None, where they cannot be drawn: nobody decides on the picture alone."""
+    from safety.courses import courses_of
+
+    try:
+        return courses_of(payload, context, line, region)
+    except Exception:  # what is judged was found good or bad by other means
+        return Courses(courses=[])

@@ -16,6 +16,8 @@ from gateway.supervisor.audit_file import AuditUnavailable
 from gateway.supervisor.bounded import Bounded, with_left_out
 from gateway.supervisor.peers import who_is
 
+#: What one person can have recorded: more than any hand does, and little enough for a disk.
+MOST_SAID, SAID_EVERY_S = 600, 1.0
 A_PROGRAM = "a program"  #: that decides in a person's place, as the audit has it before its user's name
 
 Decision = Decide | RollBackNow | Archive | LineChanged
@@ -39,6 +41,7 @@ class PersonsDesk:
         self._alarm = alarm
         self._note = note
         self._refusals = Bounded(clock)
+        self._said = Bounded(clock, MOST_SAID, SAID_EVERY_S)
         mailbox.serve(GATEWAY_FOR_PERSON, self._answer)
 
     async def _answer(self, payload: bytes) -> bytes:
@@ -56,16 +59,22 @@ class PersonsDesk:
             return _reply(Reply(ok=False, state="", text=reason, reasons=[reason]))
         if isinstance(said, Decide) and person.is_script:
             said = said.model_copy(update={"script": said.script or A_PROGRAM})
+        left_out = self._said.left_out(who.name)
+        if left_out is None and isinstance(said, Decision | AlarmSaid) and not isinstance(said, RollBackNow):
+            text = f"{person.name} says too much at once: try again in a minute"
+            return _reply(Reply(ok=False, state="", text=text, reasons=[text]))
         if isinstance(said, Decision):
             return _reply(await self._decide(said, who))
         if isinstance(said, AlarmSaid):
             return _reply(await self._alarm(said, who))
-        return _reply(await self._operate(said, who))
+        return _reply(await self._operate(said, who, left_out))
 
-    async def _operate(self, said: Command, who: Who) -> Reply:
-        """First the line, then the record: a stop never waits for a disk."""
+    async def _operate(self, said: Command, who: Who, left_out: int | None) -> Reply:
+        """First the line, then the record: a stop never waits for a disk, and is done whatever was said before."""
         reply = await self._command(command_bytes(said), who)
-        what = {"command": in_words(said), "done": reply.ok, "answer": reply.text}
+        if left_out is None:
+            return reply
+        what = with_left_out({"command": in_words(said), "done": reply.ok, "answer": reply.text}, left_out)
         unkept = await self._kept("operated", who, what)
         return reply.model_copy(update={"text": f"{reply.text}{unkept}"}) if unkept else reply
 

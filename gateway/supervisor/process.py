@@ -23,6 +23,7 @@ from gateway.supervisor.agents_cases import AgentsCases
 from gateway.supervisor.agents_desk import AgentsDesk
 from gateway.supervisor.alarms import Alarms
 from gateway.supervisor.configurations import Configurations
+from gateway.supervisor.courses_desk import CoursesDesk, Draws
 from gateway.supervisor.deployer_sides import JudgeSide
 from gateway.supervisor.dry_runs import DryRuns
 from gateway.supervisor.experiments import MOST_EXPERIMENTS, newest_experiments
@@ -55,7 +56,7 @@ def run_gateway(line: Line, run_folder: Path, data_folder: Path) -> int:
         return EXIT_CANNOT_LISTEN
 
 
-class Judging(JudgeSide, Protocol):
+class Judging(JudgeSide, Draws, Protocol):
     def begin(self) -> None:
         """So that the first verdict does not wait for it."""
         ...
@@ -104,6 +105,7 @@ async def serve(
     gateway.alarms = alarms.status
     PersonsDesk(mailbox, gateway.command, gate.decide, alarms.say, gate.audit.append, clock)
     AccessDesk(mailbox, gate.audit.append, clock)
+    courses = CoursesDesk(mailbox, lambda: gate.deployer, judge)
     past = Past(line, mailbox, data_folder, lambda: historian.path)
     dry_runs = DryRuns(line, JudgeWorkers(line, nicer=NICEST))
     cases = AgentsCases(gate.audit.append, clock)
@@ -129,6 +131,7 @@ async def serve(
         await bus.close()
         await dry_runs.close()
         await past.close()
+        await courses.close()
         await gate.close()
         await judge.close()
         await mailbox.close()

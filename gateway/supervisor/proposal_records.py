@@ -6,6 +6,7 @@ from datetime import UTC, datetime
 from typing import Any
 
 from gateway.core.audit_record import Who
+from gateway.core.judge_context import JudgeContext
 from gateway.core.messages import Reply
 from gateway.core.proposal import Proposal
 from gateway.core.verdict import Verdict
@@ -53,6 +54,11 @@ class ProposalRecords:
     def verdict(self, entry: Entry) -> Verdict | None:
         """None: there is none yet. Raises AuditUnavailable."""
         return None if entry.verdict is None else Verdict.model_validate_json(self._kept(entry.verdict))
+
+    async def context(self, verdict: Verdict) -> JudgeContext:
+        """In which it was judged. Raises AuditUnavailable."""
+        await self._audit.fetch([verdict.context])
+        return JudgeContext.model_validate_json(self._kept(verdict.context))
 
     def _kept(self, id_: str) -> bytes:
         """Raises AuditUnavailable where it is no longer what was stored."""

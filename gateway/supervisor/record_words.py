@@ -86,7 +86,9 @@ def _found(_: str, what: What) -> str:
 
 def _operated(who: str, what: What) -> str:
     done = "done" if what.get("done") else "refused"
-    return f"{who}: {_of(what, 'command')}: {done}: {_clean(str(what.get('answer', '')), LONGEST_TOLD)}"
+    return (
+        f"{who}: {_of(what, 'command')}: {done}: {_clean(str(what.get('answer', '')), LONGEST_TOLD)}{_left_out(what)}"
+    )
 
 
 def _archived(who: str, what: What) -> str:

@@ -41,7 +41,7 @@ def page_figures(page: str, name: str, password: str, log: Path, seconds: float 
             at("see", "#login")
             paints_s.append(at("first_paint_s"))
         at.log_in(name, password)
-        weight = at("traffic")["bytes"]
+        weight = at("bytes")
         latencies_s = at("latencies", seconds)
     p50_s, p95_s, max_s = np.percentile(latencies_s, [50.0, 95.0, 100.0]).tolist()
     return PageFigures(p50_s, p95_s, max_s, len(latencies_s), float(np.median(paints_s)), PAINTS, weight)

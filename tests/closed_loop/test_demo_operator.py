@@ -36,7 +36,7 @@ async def decide(access, user, password, proposal, shown, revision):
 
 def test_a_scripted_operator_approves_what_it_was_shown_and_the_audit_says_that_it_is_a_script(tmp_path):
     async def story(line, access, password, proposal):
-        shown = line.shown(proposal)
+        shown = await asyncio.to_thread(line.shown, proposal)
         panel = await Panel.begin(access, tmp_path / "logs" / "client.log")
         try:
             for hash_, revision in (("0" * 64, shown.epoch), (shown.shown, shown.epoch + 1)):
@@ -44,7 +44,7 @@ def test_a_scripted_operator_approves_what_it_was_shown_and_the_audit_says_that_
                 assert not ok and sentence
             with pytest.raises(ua.UaStatusCodeError, match="BadUserAccessDenied"):
                 await decide(access, "viewer", password, proposal, shown.shown, shown.epoch)
-            assert line.shown(proposal).stage == "waiting"
+            assert (await asyncio.to_thread(line.shown, proposal)).stage == "waiting"
             told = await panel.ask(Approve(proposal=proposal, comment="a test"))
             assert told.ok and "on probation" in told.sentence and "rules passed, most narrowly" in told.seen, told
             ok, sentence = await decide(access, "operator", password, proposal, shown.shown, shown.epoch)

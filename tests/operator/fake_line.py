@@ -13,6 +13,7 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 from gateway.core.alarms import ALARMS, AcknowledgeAlarm, AlarmStatus, ShelveAlarm
+from gateway.core.courses import CoursesTold, DrawnCourse, ShowCourses
 from gateway.core.decisions import (
     QUERY,
     Decide,
@@ -29,7 +30,7 @@ from gateway.core.messages import Reply
 from gateway.core.people import FOR_PERSON, ROLES, ForPerson, Role, why_may_not
 from gateway.core.proposal import Proposal, proposal_hash
 from gateway.core.status import GatewayStatus
-from gateway.core.topics import GATEWAY_FOR_PERSON, GATEWAY_PAST, GATEWAY_PROPOSALS, GATEWAY_STATUS
+from gateway.core.topics import GATEWAY_COURSES, GATEWAY_FOR_PERSON, GATEWAY_PAST, GATEWAY_PROPOSALS, GATEWAY_STATUS
 from gateway.core.verdict import Verdict, verdict_hash
 from gateway.mailbox.port import Mailbox
 from gateway.mailbox.unix import UnixMailbox
@@ -79,6 +80,8 @@ class FakeGateway:
         self.state = "RUN"
         self.epoch = 3
         self.stage = "waiting"
+        self.absent: list[str] = []  #: from the first bus
+        self.drawn = False  #: courses were asked for
         self.approvals = 1  #: that a change takes
         self.first = ""  #: who has approved it, where it takes two
         self.drives: dict[int, str] = {}  #: by span, those that are not ENABLED
@@ -93,6 +96,7 @@ class FakeGateway:
             (GATEWAY_STATUS, self._status),
             (GATEWAY_PROPOSALS, self._proposals),
             (GATEWAY_PAST, self._past),
+            (GATEWAY_COURSES, self._courses),
             (GATEWAY_FOR_PERSON, self._for_person),
         ):
             mailbox.serve(topic, handler)
@@ -109,6 +113,11 @@ class FakeGateway:
         status = json.loads((EXAMPLES / "status.json").read_text())
         now_s = time.time()
         status |= {"wall_s": now_s, "unwind_speed_m_per_s": 0.01 + 1e-4 * math.sin(now_s)}
+        status |= {"speed_setpoint_m_per_s": 0.01}
+        status["events"] = [one | {"wall_s": now_s - 400.0 + i} for i, one in enumerate(status["events"])]
+        ways = {"timeouts": 0, "malformed": 0, "reconnects": 0, "last_error": ""}
+        status["buses"] = [ways | {"name": bus.name, "absent": []} for bus in self.line.buses]
+        status["buses"][0]["absent"] = self.absent
         status["loop"]["state"] = self.state
         status["spans"] = [self._span(status["spans"][0], i, now_s) for i in range(self.line.n)]
         status["alarms"] = [one.model_dump() for one in self.alarms]
@@ -146,6 +155,35 @@ class FakeGateway:
             approved_by=self.first or None,
         )
         return shown.model_dump_json().encode()
+
+    async def _courses(self, payload: bytes) -> bytes:
+        """The first answer is that they are being drawn, as the gateway's is."""
+        asked, drawing = ShowCourses.model_validate_json(payload), not self.drawn
+        self.drawn = True
+        courses = [] if drawing else [self._course("tension", 1.0, 12.0), self._course("velocity", 1.4, 0.0)]
+        return CoursesTold(
+            format=1, proposal=asked.proposal, verdict=verdict_hash(self.verdict), model=None, drawing=drawing,
+            courses=courses,
+        ).model_dump_json().encode()  # fmt: skip
+
+    def _course(self, scenario: str, swing_n: float, step_n: float) -> DrawnCourse:
+        """After 0.3 s a step or a push, and what two laws make of it."""
+        times = [0.04 * k for k in range(130)]
+        since = [max(0.0, t - 0.3) for t in times]
+        asked = [[setpoint + (step_n if t > 0.3 else 0.0) for t in times] for setpoint in self.setpoints]
+
+        def ends(setpoint: float, damping: float, push_n: float) -> list[float | None]:
+            swings = [step_n * math.cos(7.0 * t) + push_n * math.sin(7.0 * t) for t in since]
+            left = [math.exp(-damping * t) * one for t, one in zip(since, swings, strict=True)]
+            return [setpoint + (step_n - one if t > 0.3 else 0.0) for t, one in zip(times, left, strict=True)]
+
+        return DrawnCourse(
+            scenario=scenario, time_s=times, setpoint_n=asked,
+            tension_n={
+                "in service": [ends(one, 1.6, 3.0 * swing_n) for one in self.setpoints],
+                "proposed": [ends(one, 4.0, swing_n) for one in self.setpoints],
+            },
+        )  # fmt: skip
 
     def _list(self) -> ProposalList:
         line = ProposalLine(

@@ -20,7 +20,7 @@ from gateway.cli.certificates import Pair
 from gateway.cli.pki_opcua import self_signed, trust
 from gateway.core.access import AT_THE_DOOR
 from gateway.core.alarms import BY_NAME, AlarmStatus
-from gateway.core.decisions import QUERY, ListProposals, ProposalLine, ProposalList, ProposalShown
+from gateway.core.decisions import QUERY, InServiceTold, ListProposals, ProposalLine, ProposalList, ProposalShown
 from gateway.core.line import Line
 from gateway.core.line_past import PAST_QUERY, RecordsAfter, RecordsTold, RecordTold, TensionsTold
 from gateway.core.messages import Reply
@@ -67,6 +67,7 @@ class FakeGateway:
         self.hidden: set[str] = set()  #: proposals that are listed, and not shown
         self.lists = True  #: proposals, when it is asked
         self.epoch = 3
+        self.controller: InServiceTold | None = None
         self.alarms: list[AlarmStatus] = []
         self.records: list[RecordTold] = []
         self.hold: asyncio.Event | None = None  #: until then nothing that people say is answered
@@ -127,7 +128,7 @@ class FakeGateway:
         ]  # fmt: skip
         return ProposalList(format=1, site=self.line.site, line=self.line.line, in_service="a" * 64,
                             last_known_good="b" * 64, epoch=self.epoch, model=None, since_change=0,
-                            proposals=rows)  # fmt: skip
+                            controller=self.controller, proposals=rows)  # fmt: skip
 
     async def _past(self, payload: bytes) -> bytes:
         query = PAST_QUERY.validate_json(payload)
@@ -292,9 +293,14 @@ class Bench:
 
 
 @asynccontextmanager
-async def bench(spans: int = 2, gateway: bool = True, begin: bool = True, **operator: Any) -> AsyncIterator[Bench]:
-    """A running server; without `gateway` nobody answers it, without `begin` it is only made."""
-    line = line_of(spans)
+async def bench(
+    spans: int = 2, gateway: bool = True, begin: bool = True, line: Line | None = None, **operator: Any
+) -> AsyncIterator[Bench]:
+    """A running server of `line`, or of one with so many spans.
+
+    Without `gateway` nobody answers it, without `begin` it is only made.
+    """
+    line = line or line_of(spans)
     settings = line.operator.model_copy(update={"opc_ua": "opc.tcp://127.0.0.1:0", **operator})
     with short_folder() as folder:
         found = Bench(line.model_copy(update={"operator": settings}), folder)

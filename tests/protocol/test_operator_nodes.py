@@ -7,10 +7,15 @@ from math import isnan
 import pytest
 from asyncua import Client, ua
 
+from gateway.core.decisions import InServiceTold, PerformanceTold
 from gateway.core.line_past import RecordTold, TensionsBetween
 from gateway.core.signals import Quality
+from gateway.core.status import ChangeStatus
+from gateway.mailbox.unix import UnixMailbox
+from gateway.operator.opcua.line_nodes import mode
 from gateway.operator.opcua.space import NAMESPACE
-from tests.protocol.operator_support import SHOWN, alarm, bench, shown
+from tests.protocol.operator_support import SHOWN, FakeGateway, alarm, bench, shown
+from tests.unit.supervisor_support import line_of
 
 CODES = ua.StatusCodes
 
@@ -128,6 +133,58 @@ def test_a_gateway_that_goes_away_leaves_nothing_that_looks_true():
     run(story)
 
 
+def test_the_controller_is_told_by_kind_phase_and_mode_with_how_well_it_did_as_far_as_that_is_known():
+    async def story():
+        async with bench(spans=1) as b, b.connected("vera") as client:
+            measured = PerformanceTold(scenario="commissioning", measured_s=1.7e9, rmse_n=0.5, baseline_rmse_n=None)
+            for told, values in (
+                (None, [None] * 5),
+                (
+                    InServiceTold(kind="LQI", phase="commissioning", performance=None),
+                    ["LQI", "commissioning", *[None] * 3],
+                ),
+                (
+                    InServiceTold(kind="MPC", phase="operation", performance=measured),
+                    ["MPC", "operation", 0.5, None, "2023-11-14T22:13:20Z"],
+                ),
+                (
+                    InServiceTold(
+                        kind="MPC", phase="operation", performance=measured.model_copy(update={"baseline_rmse_n": 0.8})
+                    ),
+                    ["MPC", "operation", 0.5, 0.8, "2023-11-14T22:13:20Z"],
+                ),
+            ):
+                b.gateway.controller = told
+                paths = ["Controller.Kind", "Controller.Phase", *(
+                    f"Performance.{name}" for name in ("Value", "Baseline", "Measured")
+                )]  # fmt: skip
+                for path, value in zip(paths, values, strict=True):
+                    code = CODES.BadNoData if value is None else CODES.Good
+                    found = await b.until(client, f"Line.{path}", has(code))
+                    while found.Value.Value != value:
+                        found = await b.read(client, f"Line.{path}")
+            assert await b.value(client, "Line.Controller.Mode") == "in service"
+
+    run(story)
+
+
+@pytest.mark.parametrize(
+    ("state", "kind", "told"),
+    [
+        ("READY", None, "off"), ("STOP", "gains", "off"), ("RUN", None, "in service"), ("HOLD", None, "in service"),
+        ("RUN", "gains", "on probation"), ("RUN", "experiment", "experiment"),
+    ],
+)  # fmt: skip
+def test_what_the_controller_is_there_for(state, kind, told):
+    line = line_of(1)
+    status = FakeGateway(line, UnixMailbox()).status()
+    change = None
+    if kind is not None:
+        change = ChangeStatus(proposal="a" * 64, kind=kind, stage="running", since_wall_s=None, text="")
+    loop = status.loop.model_copy(update={"state": state})
+    assert mode(status.model_copy(update={"loop": loop, "change": change})) == told
+
+
 def test_before_the_first_status_values_are_waited_for():
     async def story():
         async with bench(spans=1, gateway=False) as b, b.connected("vera") as client:
@@ -204,7 +261,7 @@ def test_every_alarm_of_the_table_has_its_variables_whether_it_is_active_or_not(
             b.gateway.alarms = [alarm("tension-out-of-band"), alarm("load-cell", shelved=True)]
             await b.until(client, f"{path}.Active", lambda found: found.Value.Value is True)
             assert await b.value(client, f"{path}.Text") == "span 1 has 3 N"
-            assert await b.value(client, f"{path}.Since") == "2023-11-14T22:13:20Z"
+            assert await b.value(client, f"{path}.Since") == "2023-11-14T22:13:20.000Z"
             assert await b.value(client, "Line.Alarms.Active") == 1  # the other is out of the way
             assert await b.value(client, "Line.Alarms.First") == "tension-out-of-band"
             assert await b.value(client, "Line.Alarms.load-cell.Shelved") is True

@@ -13,7 +13,7 @@ from gateway.core.people import ROLES
 from gateway.operator.users import FILE_NAME, Users
 from tests.closed_loop.gate_line import GateLine
 from tests.protocol.bus_support import free_port
-from tests.system.peer import Spoken
+from tests.system.peer import PeerFailed, Spoken
 
 PASSWORD = "three old rollers"
 PARTS = ("line", "change", "history", "health")
@@ -85,6 +85,13 @@ class AtPage(Spoken):
     def __enter__(self) -> Self:
         super().__enter__()
         return self
+
+    def __call__(self, deed: str, *arguments: object) -> Any:
+        """Raises PeerFailed where it cannot be done, within 20 s."""
+        answer = super().__call__(deed, *arguments)
+        if "failed" in answer:
+            raise PeerFailed(f"{deed} {arguments}: {answer['failed']}")
+        return answer["came"]
 
     def open(self, page: str, language: str = "en", **window: Any) -> None:
         self("open", page, {"language": LANGUAGES[language], **window})

@@ -112,7 +112,7 @@ def test_it_finds_everything_of_the_line_by_browsing(panel: Panel, policy: str) 
     assert methods == {
         f"Line.{name}"
         for name in ("Decide", "Rollback", "Arm", "Start", "Hold", "Stop", "SetTension", "SetSpeed", "SelectRecipe",
-                     "AcknowledgeAlarm")
+                     "AcknowledgeAlarm", "ShelveAlarm", "Archive", "LineChanged")
     }  # fmt: skip
     assert all(node.endswith(f";s={path}") for path, (_, node) in found.items() if path in MEASURED)
 

@@ -1,7 +1,6 @@
 """The page in Chromium, before a real gateway and a simulated line: as an operator uses it, and as it has to be."""
 
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -26,14 +25,19 @@ def line(tmp_path_factory: pytest.TempPathFactory) -> Iterator[PageLine]:
         yield found
 
 
-@pytest.fixture
-def at(line: PageLine, tmp_path: Path) -> Iterator[AtPage]:
-    """Whatever a test does there, the browser complains of nothing, and has asked nothing of any other place."""
-    with AtPage(tmp_path / "browser.log") as found:
-        found.open(line.page)
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[AtPage]:
+    with AtPage(tmp_path_factory.mktemp("browser") / "browser.log") as found:
         yield found
-        assert found("troubles") == []
-        assert [url for url in found("traffic")["asked"] if not url.startswith(f"{line.page}/")] == []
+
+
+@pytest.fixture
+def at(line: PageLine, browser: AtPage) -> Iterator[AtPage]:
+    """Whatever a test does there, the browser complains of nothing, and has asked nothing of any other place."""
+    browser.open(line.page)
+    yield browser
+    assert browser("troubles") == []
+    assert [url for url in browser("asked") if not url.startswith(f"{line.page}/")] == []
 
 
 def test_an_operator_sees_the_line_approves_a_change_and_takes_it_back(line: PageLine, at: AtPage):
@@ -48,6 +52,7 @@ def test_an_operator_sees_the_line_approves_a_change_and_takes_it_back(line: Pag
     margins = at("texts", ".margins li")
     assert len(margins) >= 5 and all("passed" in one and "not passed" not in one for one in margins)
     assert any("margin" in one and "limit" in one for one in margins)
+    at("see", ".course canvas")  # before and after, over time
     at("click", APPROVE)
     assert "on probation" in at("see", "dialog[open] .lines")
     assert line.in_service() == before  # the first of two steps
@@ -169,7 +174,7 @@ def test_what_is_there_comes_within_a_second_and_weighs_little(line: PageLine, a
         at("see", "#login")
         paints_s.append(at("first_paint_s"))
     at.log_in("operator")
-    assert at("traffic")["bytes"] <= MOST_BYTES
+    assert at("bytes") <= MOST_BYTES
     assert min(paints_s) <= FIRST_PAINT_S, paints_s
 
 

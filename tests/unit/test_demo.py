@@ -224,6 +224,8 @@ def test_the_page_holds_every_figure_and_a_case_that_was_not_run(tmp_path):
     assert chain is not None and chain.audit.head in shown.words
     refused = [text for one in chain.changes for text in one.against]
     assert refused and all(text in shown.words for text in refused)
+    read = [one.approved_over for one in chain.changes if one.approved_by]
+    assert read and all(text and text in shown.words for text in read)
     assert all(" ".join(one.reason.split()) in shown.words for one in chain.asked)
     for title in ("Initial → Adapt1", "Adapt1 → Adapt2", "Selection, with its justification"):
         assert title in shown.words

@@ -1,10 +1,12 @@
 """A change on probation: it is kept, stays, or goes back to what was good."""
 
 from gateway.core.controller import config_hash
+from gateway.core.line_model import model_hash
 from gateway.supervisor.lifecycle import Stage
 from gateway.supervisor.on_the_line import LEASE_S
 from tests.unit.deployer_gateway import ANNA, PROBATION_S, deployed, run, started
-from tests.unit.deployer_support import FIRST, controller, hash_of, proposal
+from tests.unit.deployer_support import FIRST, LINE, controller, hash_of, proposal
+from tests.unit.model_support import model as fitted
 
 
 @run
@@ -60,7 +62,9 @@ async def test_without_a_model_nothing_is_watched_with_one_the_fallback_is():
     assert gateway.loop.watches == [("deploy", None), ("keep", None)]
     # A model is accepted: what runs is looked after, once; then a change by its fallback, and by itself when kept.
     gateway.loop.watches.clear()
-    gateway.deployer.book.model = "7" * 64
+    accepted = fitted(LINE.n, site=LINE.site, line=LINE.line)
+    gateway.surroundings.models[model_hash(accepted)] = accepted
+    gateway.deployer.book.model = model_hash(accepted)
     await gateway.pass_time(2.0)
     assert [(what, watch.fallback) for what, watch in gateway.loop.watches] == [("watch-good", gateway.loop.good)]
     before = gateway.loop.good

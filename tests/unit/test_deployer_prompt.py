@@ -47,5 +47,5 @@ async def test_what_was_shown_before_another_model_was_accepted_is_not_approved(
     shown = gateway.deployer.shown(hash_of(one)).shown
     gateway.deployer.book.model = "f" * 64
     reply = await gateway.decide(one, shown=shown)
-    assert not reply.ok and "no longer what would be done" in reply.reasons[0]
+    assert not reply.ok and "proposals are judged by model ffffffffffff now" in reply.reasons[0]
     assert gateway.stage(one) is Stage.WAITING and gateway.loop.runs == config_hash(FIRST)

@@ -105,9 +105,13 @@ async def test_a_script_is_the_user_that_runs_it_and_cannot_pass_for_another():
 
 
 @pytest.mark.parametrize(
-    "nobody", [Who(name="r2rgate", uid=900, pid=9), Who(name="root", uid=0, pid=9), Who(name="carla", uid=0, pid=9)]
-)
-def test_neither_root_nor_the_gateways_own_user_is_one_of_two_people(nobody):
+    "nobody",
+    [
+        Who(name="r2rgate", uid=900, pid=9), Who(name="root", uid=0, pid=9), Who(name="carla", uid=0, pid=9),
+        person("script-nightly"), person("script-nightly", "opc-ua", "engineer"),
+    ],
+)  # fmt: skip
+def test_neither_root_nor_the_gateways_own_user_nor_a_program_is_one_of_two_people(nobody):
     async def test():
         gateway, one = await waiting()
         for script in ("", "nightly"):  # neither as the first

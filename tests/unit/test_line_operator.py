@@ -36,6 +36,7 @@ def test_a_line_without_the_table_is_reached_on_this_machine_only() -> None:
         {"page": '"http://localhost:9000"'},
         {"page": '"https://0.0.0.0:8443"'},
         {"page": '"https://gateway.plant.example:8443/"', "pki": '"/etc/r2rgate/pki"', "sessions_max": "100"},
+        {"nodesets": '"/etc/r2rgate/nodesets"'},
     ],
 )
 def test_what_is_right_is_taken_without_a_word(changes: dict[str, str]) -> None:
@@ -91,9 +92,11 @@ def test_two_servers_do_not_share_a_port() -> None:
     assert other.endswith('did you mean "http://[::1]:8481"?')
 
 
-def test_the_folder_of_certificates_is_named_from_the_root() -> None:
-    (complaint,) = complaints(pki='"pki"')
-    assert "operator.pki" in complaint and "is no absolute path" in complaint
+@pytest.mark.parametrize("key", ["pki", "nodesets"])
+def test_folders_are_named_from_the_root(key: str) -> None:
+    (complaint,) = complaints(**{key: '"here"'})
+    assert f"operator.{key}" in complaint and "is no absolute path" in complaint
+    assert complaint.endswith(f'as "/etc/r2rgate/{key}"')
 
 
 def test_every_mistake_is_told_at_once_and_a_mistyped_key_with_the_nearest() -> None:

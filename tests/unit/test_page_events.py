@@ -11,14 +11,15 @@ import httpx
 import pytest
 
 from gateway.core.people import Role
-from gateway.operator.page import login
-from gateway.operator.page.events import MOST_BROWSERS
+from gateway.operator.page import login, serve
+from gateway.operator.page.events import MOST_BROWSERS, Ticks
 from gateway.operator.page.login import TOKEN_HEADER
 from gateway.operator.page.serve import serve_on
 from gateway.operator.users import RoleOf
 from tests.operator.fake_line import PASSWORD, alarm
 from tests.operator.fake_line import role_of as role_of_anybody
 from tests.unit.page_support import Page, page
+from tests.unit.supervisor_support import until
 
 
 class Stream:
@@ -169,6 +170,20 @@ def test_who_does_not_read_gets_the_newest_later_and_nothing_queues_up():
                 assert data["wall_s"] > last  # some are left out, none comes twice or late
                 count, last = count + 1, data["wall_s"]
             assert count < ticks / 2
+
+    asyncio.run(story())
+
+
+def test_a_browser_that_takes_nothing_any_more_frees_its_place(monkeypatch: pytest.MonkeyPatch):
+    """It may never say that it is gone: a tablet that was switched off."""
+    monkeypatch.setattr(serve, "UNHEARD_MS", 300)
+
+    async def story() -> None:
+        async with served(spans=60) as at:
+            stream = await at.look(receive_bytes=4096)
+            ticks: Ticks = at.there.app.state.end.__self__
+            assert stream.status == 200 and ticks.looking == 1
+            await until(lambda: ticks.looking == 0)  # nobody reads the stream: it takes what fits into it, and no more
 
     asyncio.run(story())
 

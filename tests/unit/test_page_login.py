@@ -19,7 +19,15 @@ from gateway.operator.page.sessions import (
 from tests.operator.fake_line import PASSWORD
 from tests.unit.page_support import page
 
-ASKED = ("/api/line", "/api/proposals", "/api/proposals/abcdef", "/api/records", "/api/tensions", "/events")
+ASKED = (
+    "/api/line",
+    "/api/proposals",
+    "/api/proposals/abcdef",
+    "/api/courses/abcdef",
+    "/api/records",
+    "/api/tensions",
+    "/events",
+)
 
 
 class Clock:

@@ -163,3 +163,15 @@ def test_set_points_are_offered_as_far_as_the_loop_takes_them():
         limits.tension_min_n + limits.tension_margin_n,
         limits.tension_max_n - limits.tension_margin_n,
     ]
+
+
+def test_courses_come_once_they_are_drawn():
+    async def story() -> None:
+        async with page() as there:
+            await there.log_in("viewer")
+            assert (await there.browser.get(f"/api/courses/{there.gateway.hash}")).json()["drawing"]
+            told = (await there.browser.get(f"/api/courses/{there.gateway.hash}")).json()
+            assert not told["drawing"] and len(told["courses"][0]["setpoint_n"]) == there.line.n
+            assert (await there.browser.get("/api/courses/abcdef")).status_code == 400
+
+    asyncio.run(story())

@@ -6,14 +6,14 @@ from typing import get_args
 
 import pytest
 
-from gateway.core.alarms import Priority
+from gateway.core.alarms import ALARMS, Priority
 from gateway.core.people import ROLES
 from gateway.core.proposal import Kind
 from gateway.core.signals import Quality
 from gateway.core.states import LoopState
 from gateway.core.verdict import ScenarioFigures
 from gateway.operator.page.tick import DRIVES_THAT_FAIL
-from gateway.operator.page.words import LANGUAGES, catalogue, words_of
+from gateway.operator.page.words import ALARM_PARTS, LANGUAGES, catalogue, words_of
 from gateway.supervisor.lifecycle import Stage
 
 STATIC = Path("gateway/operator/page/static")
@@ -25,6 +25,7 @@ FAMILIES: dict[str, list[str]] = {
     "next.": STATES,
     "role.": [*ROLES],
     "priority.": [*get_args(Priority)],
+    "alarm.": [f"{alarm.name}.{part}" for alarm in ALARMS for part in ALARM_PARTS],
     "kind.": [*get_args(Kind)],
     "stage.": [stage.value for stage in Stage],
     "configuration.": [*get_args(ScenarioFigures.model_fields["configuration"].annotation)],

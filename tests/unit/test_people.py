@@ -23,7 +23,7 @@ from gateway.core.topics import GATEWAY_FOR_PERSON
 from gateway.mailbox.inprocess import Hub, InProcessMailbox
 from gateway.supervisor.audit_file import AuditUnavailable
 from gateway.supervisor.bounded import AT_ONCE, EVERY_S
-from gateway.supervisor.persons_desk import PersonsDesk
+from gateway.supervisor.persons_desk import MOST_SAID, SAID_EVERY_S, PersonsDesk
 
 HASH = "a" * 64
 COMMANDS = [
@@ -132,6 +132,20 @@ def test_who_tries_again_and_again_what_they_may_not_is_counted_and_fills_no_dis
     desk.now_s += EVERY_S
     desk.ask("viewer", Stop())
     assert desk.records[-1][2]["left_out"] == 500 - AT_ONCE
+
+
+def test_who_says_more_than_any_hand_does_is_still_heard_and_fills_no_disk(desk):
+    for _ in range(MOST_SAID + 50):
+        assert desk.ask("operator", Hold()).ok
+    assert len(desk.commands) == MOST_SAID + 50 and len(desk.records) == MOST_SAID
+    reply = desk.ask("operator", AcknowledgeAlarm(alarm="load-cell"))
+    assert not reply.ok and "too much at once" in reply.text and not desk.decisions
+    assert desk.ask("operator", RollBackNow()).ok and desk.ask("operator", Stop()).ok
+    desk.now_s += SAID_EVERY_S
+    assert desk.ask("operator", Hold()).ok
+    assert desk.records[-1][2]["left_out"] == 50 + 3
+    desk.now_s += SAID_EVERY_S
+    assert desk.ask("operator", AcknowledgeAlarm(alarm="load-cell")).ok
 
 
 def test_a_stop_is_done_though_nothing_can_be_recorded(desk):

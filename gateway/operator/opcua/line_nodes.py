@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from datetime import UTC, datetime
 
 from gateway.core.decisions import ProposalList
 from gateway.core.line import Line
@@ -12,6 +13,7 @@ from gateway.operator.opcua.space import (
     GOOD,
     LAST_USABLE,
     NO_COMMUNICATION,
+    NO_DATA,
     STRING,
     UINT32,
     Row,
@@ -61,6 +63,7 @@ async def _objects(space: Space, line: Line, speed: tuple[float, float]) -> None
         ("Unwinder", "Roller 0, which the line PLC drives", _unwinder_rows(speed)),
         ("Limits", "What must never be left; changed only in the line's file", _LIMITS),
         ("Controller", "What controls the line, and how it fares", _CONTROLLER),
+        ("Performance", "How well the configuration in service did when it was measured last", _PERFORMANCE),
         ("Connection", "How well this server knows the line; always good", _CONNECTION),
     ):
         kind = await space.type(f"{name}Type", tells, rows)
@@ -80,7 +83,8 @@ def of_status(status: GatewayStatus) -> Iterator[Told]:
     yield _measured(f"{ROOT}.Unwinder.Setpoint", status.speed_setpoint_m_per_s, running)
     change, timing = status.change, status.timing
     for name, value in {
-        "Stage": "" if change is None else change.stage, "StageText": "" if change is None else change.text,
+        "Mode": mode(status), "Stage": "" if change is None else change.stage,
+        "StageText": "" if change is None else change.text,
         "Changing": "" if change is None else change.proposal, "Health": health(status),
         "Doubts": status.loop.doubts, "Missed": timing.missed,
     }.items():  # fmt: skip
@@ -98,11 +102,38 @@ def of_proposals(found: ProposalList) -> Iterator[Told]:
         "Model": found.model or "",
     }.items():  # fmt: skip
         yield Told(f"{ROOT}.Controller.{name}", value)
+    controller = found.controller
+    measured = None if controller is None else controller.performance
+    for path, value in {
+        "Controller.Kind": None if controller is None else controller.kind,
+        "Controller.Phase": None if controller is None else controller.phase,
+        "Performance.Value": None if measured is None else measured.rmse_n,
+        "Performance.Baseline": None if measured is None else measured.baseline_rmse_n,
+        "Performance.Scenario": None if measured is None else measured.scenario,
+        "Performance.Measured": None if measured is None else _rfc_3339(measured.measured_s),
+    }.items():
+        yield Told(f"{ROOT}.{path}", value, NO_DATA if value is None else GOOD)
+
+
+def _rfc_3339(wall_s: float) -> str:
+    return datetime.fromtimestamp(wall_s, UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
 
 
 def list_paths() -> list[str]:
     """Of what the list of proposals tells of the controller."""
-    return [f"{ROOT}.Controller.{name}" for name in ("InService", "LastKnownGood", "Revision", "Model")]
+    controller = ("InService", "LastKnownGood", "Revision", "Model", "Kind", "Phase")
+    return [f"{ROOT}.Controller.{name}" for name in controller] + [
+        f"{ROOT}.Performance.{row.name}" for row in _PERFORMANCE
+    ]
+
+
+def mode(status: GatewayStatus) -> str:
+    """What the controller is there for now."""
+    if status.loop.state not in ("RUN", "HOLD"):
+        return "off"
+    if status.change is None:
+        return "in service"
+    return "experiment" if status.change.kind == "experiment" else "on probation"
 
 
 def health(status: GatewayStatus) -> str:
@@ -119,7 +150,10 @@ def health(status: GatewayStatus) -> str:
 
 def live_paths(line: Line) -> list[str]:
     """Of all that says nothing true when the gateway is away."""
-    groups = {"Operation": _OPERATION, "Unwinder": _unwinder_rows((0.0, 0.0)), "Controller": _CONTROLLER}
+    groups = {
+        "Operation": _OPERATION, "Unwinder": _unwinder_rows((0.0, 0.0)), "Controller": _CONTROLLER,
+        "Performance": _PERFORMANCE,
+    }  # fmt: skip
     paths = [f"{ROOT}.{group}.{row.name}" for group, rows in groups.items() for row in rows]
     paths.remove(f"{ROOT}.Operation.Recipes")
     for number in range(1, line.n + 1):
@@ -222,6 +256,9 @@ _CONTROLLER = (
     Row("LastKnownGood", STRING, "SHA-256 of the configuration that a roll-back goes to"),
     Row("Revision", UINT32, "Counts up with every deployment; Decide asks for it as base_revision"),
     Row("Model", STRING, "SHA-256 of the model by which proposals are judged; empty: the line's file"),
+    Row("Kind", STRING, "PID, LQR, LQI, LQG or MPC; and scheduled, where its gains go with the speed"),
+    Row("Phase", STRING, "commissioning, or operation: a baseline was set for the line as it is"),
+    Row("Mode", STRING, "off, in service, on probation, or experiment"),
     Row("Stage", STRING, "Of a change that is on its way, on probation, or an experiment; empty: there is none"),
     Row("StageText", STRING, "What is still missing to its end"),
     Row("Changing", STRING, "SHA-256 of the proposal of that change"),
@@ -230,6 +267,12 @@ _CONTROLLER = (
     Row("CycleP99", DOUBLE, "Of the loop's cycles in the last ten seconds", SECOND, (0.0, 0.1)),
     Row("LatenessP99", DOUBLE, "Of the loop in the last ten seconds", SECOND, (0.0, 0.1)),
     Row("Missed", UINT32, "Periods skipped in the last ten seconds"),
+)
+_PERFORMANCE = (
+    Row("Value", DOUBLE, "RMSE of the tensions, over all spans", NEWTON, (0.0, 1e3)),
+    Row("Baseline", DOUBLE, "The same of the line's baseline", NEWTON, (0.0, 1e3)),
+    Row("Scenario", STRING, "In which both were measured"),
+    Row("Measured", STRING, "RFC 3339, when Value was"),
 )
 _CONNECTION = (
     Row("Fresh", BOOLEAN, "The gateway tells, and what is told here is no older than two seconds"),

@@ -6,6 +6,7 @@ Without encryption only the endpoints are told: that is how clients find out wha
 import asyncio
 from collections.abc import Callable
 from functools import partial
+from ipaddress import IPv4Address, IPv6Network, ip_address
 from typing import Any
 
 from asyncua import ua as asyncua_ua
@@ -70,7 +71,7 @@ class Processor(UaProcessor):
         transport: asyncio.Transport,
         limits: TransportLimits,
     ) -> None:
-        """`has_its_share`: of the sessions, by address."""
+        """`has_its_share`: of the sessions, by `place_of` the client."""
         super().__init__(server, transport, limits)
         self._logins = logins
         self._proving = proving
@@ -141,7 +142,7 @@ class Processor(UaProcessor):
             raise ServiceError(ua.StatusCodes.BadCertificateUriInvalid)
         await self._end_session()
         self.session = None
-        if self._has_its_share(address_of(self._transport)):
+        if self._has_its_share(place_of(address_of(self._transport))):
             raise ServiceError(ua.StatusCodes.BadTooManySessions)
 
     async def _activate(self, typeid: Any, requesthdr: Any, seqhdr: Any, body: Buffer) -> bool:
@@ -206,6 +207,17 @@ def address_of(transport: asyncio.BaseTransport) -> str:
     """Of the other side in the network; empty where it is gone already."""
     name: Any = transport.get_extra_info("peername")
     return str(name[0]) if name else ""
+
+
+def place_of(address: str) -> str:
+    """By which connections are counted: of IPv6 the /64, in which one machine has as many addresses as it likes."""
+    try:
+        found = ip_address(address.partition("%")[0])
+    except ValueError:
+        return address
+    if isinstance(found, IPv4Address):
+        return str(found)
+    return str(found.ipv4_mapped or IPv6Network((found, 64), strict=False))
 
 
 def _is_urgent(body: Buffer) -> bool:

@@ -142,10 +142,10 @@ class OperatorServer(Server):
     def _processor(self, transport: asyncio.Transport, bounds: TransportLimits) -> Processor:
         return Processor(self.iserver, self._logins, self._proving, self._has_its_share, transport, bounds)
 
-    def _has_its_share(self, address: str) -> bool:
-        """No more sessions are for clients of this address."""
+    def _has_its_share(self, place: str) -> bool:
+        """No more sessions are for clients of this place."""
         most = math.ceil(limits.SHARE * self._sessions_max)
-        return isinstance(self.bserver, Sockets) and self.bserver.sessions_from(address) >= most
+        return isinstance(self.bserver, Sockets) and self.bserver.sessions_from(place) >= most
 
 
 def _load(stack: Stack, pki: Path) -> str:

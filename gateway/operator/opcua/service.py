@@ -10,6 +10,7 @@ from gateway.core.line import Line
 from gateway.operator.access import Access
 from gateway.operator.line_side import LineSide, NotTold
 from gateway.operator.opcua.alarm_nodes import alarms_of, live_alarm_paths, make_alarms
+from gateway.operator.opcua.companion import make_companion
 from gateway.operator.opcua.events import Events
 from gateway.operator.opcua.history import History
 from gateway.operator.opcua.line_nodes import ROOT, Told, list_paths, live_paths, make_line, of_proposals, of_status
@@ -55,6 +56,7 @@ class OpcUa:
         self._say = tell
         self._line = line
         self._side = side
+        self._say = tell
         self._new_status, self._new_proposals = asyncio.Event(), asyncio.Event()
         self._shown: list[ProposalShown] = []  #: those that wait
         self._shown_of: ProposalList | None = None  #: of which list
@@ -79,6 +81,7 @@ class OpcUa:
         self._events = Events(server, self._space, self._side)
         await self._events.make()
         server.iserver.history_manager = History(self._space, self._line, self._side)  # type: ignore[assignment]
+        await make_companion(self._space, self._line, self._say)
         self._side.on_status.append(lambda _: self._new_status.set())
         self._side.on_proposals.append(lambda _: self._new_proposals.set())
         self._new_proposals.set()

@@ -18,7 +18,7 @@ from asyncua.ua.uaerrors import UaStatusCodeError
 
 from gateway.operator.opcua import limits
 from gateway.operator.opcua.limits import LEAST_CHUNK, MAX_CHUNK, MAX_CHUNKS, MAX_MESSAGE
-from gateway.operator.opcua.processor import Processor, address_of
+from gateway.operator.opcua.processor import Processor, address_of, place_of
 
 ua: Any = asyncua_ua  #: what it declares of its values and what they are differ
 
@@ -51,24 +51,24 @@ class Sockets(BinaryServer):
             if one.services.is_nobodys() or now_s - one.without_s > limits.LOGIN_S:
                 one.end()
 
-    def sessions_from(self, address: str) -> int:
+    def sessions_from(self, place: str) -> int:
         """Of connections that are open, also such as nobody has logged in to yet."""
-        return sum(one.address == address and one.services.session is not None for one in self._open())
+        return sum(one.place == place and one.services.session is not None for one in self._open())
 
-    def make_room(self, address: str) -> bool:
+    def make_room(self, place: str) -> bool:
         """For a connection from there, which has no session yet. False: there is none.
 
-        One is ended of the address that has most of them, the oldest on which nobody has shown a trusted certificate:
+        One is ended of the place that has most of them, the oldest on which nobody has shown a trusted certificate:
         who floods takes places from nobody but themselves.
         """
         waiting = [one for one in self._open() if not one.services.is_logged_in()]
         if len(waiting) < limits.MORE_CONNECTIONS:
             return True
-        held = Counter([address, *(one.address for one in waiting)])
+        held = Counter([place, *(one.place for one in waiting)])
         most = max(held.values())
-        theirs = [one for one in waiting if held[one.address] == most]
+        theirs = [one for one in waiting if held[one.place] == most]
         unproven = [one for one in theirs if not one.services.is_encrypted()]
-        if not unproven and held[address] == most:
+        if not unproven and held[place] == most:
             return False
         (unproven or theirs)[0].end()
         return True
@@ -89,17 +89,17 @@ class _Connection(OPCUAProtocol):
     make: MakeProcessor
     make_room: Callable[[str], bool]
     services: Processor  #: of an open one
-    address = ""
+    place = ""  #: as `place_of`
     without_s = 0.0  #: since when it has had no session, as it was seen last
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        address = address_of(transport)
-        if not self.make_room(address):
+        place = place_of(address_of(transport))
+        if not self.make_room(place):
             cast(asyncio.Transport, transport).abort()
             return
         super().connection_made(transport)
         if self.transport is not None:  # otherwise there are too many already
-            self.address, self.without_s = address, time.monotonic()
+            self.place, self.without_s = place, time.monotonic()
             self.processor = self.services = self.make(self.transport, self.limits)
             self.services.set_policies(self.policies)
 

@@ -51,6 +51,7 @@ class Space:
         self._session = server.iserver.isession
         self._rows: dict[str, Row] = {}
         self._told: dict[str, tuple[Any, int]] = {}
+        self._also: dict[str, list[Any]] = {}
 
     def id(self, path: str) -> Any:
         return ua.NodeId(path, self.namespace)
@@ -95,7 +96,12 @@ class Space:
         when = datetime.now(UTC) if wall_s is None else datetime.fromtimestamp(wall_s, UTC)
         variant = ua.Variant(None) if held is None else ua.Variant(held, row.kind, is_array=row.array)
         found = ua.DataValue(variant, StatusCode=ua.StatusCode(code), SourceTimestamp=when)
-        await self.server.write_attribute_value(self.id(path), found)
+        for node_id in (self.id(path), *self._also.get(path, ())):
+            await self.server.write_attribute_value(node_id, found)
+
+    def also(self, path: str, node_id: Any) -> None:
+        """Another node that has whatever `path` is told from now on."""
+        self._also.setdefault(path, []).append(node_id)
 
     async def still(self, path: str, code: int) -> None:
         """The last value, which is no longer sure."""

@@ -35,6 +35,7 @@ class Asks:
             Route("/api/line", self._of_line),
             Route("/api/proposals", self._proposals),
             Route("/api/proposals/{proposal}", self._proposal),
+            Route("/api/courses/{proposal}", self._courses),
             Route("/api/records", self._records),
             Route("/api/tensions", self._tensions),
             Route("/api/say", self._say, methods=["POST"]),
@@ -54,6 +55,15 @@ class Asks:
         self._door.visitor(request)
         try:
             return JSONResponse(proposal_told(await self._side.shown(request.path_params["proposal"])))
+        except ValidationError as error:
+            raise HTTPException(400, _in_words(error)) from None
+        except NotTold as error:
+            raise HTTPException(503, str(error)) from error
+
+    async def _courses(self, request: Request) -> JSONResponse:
+        self._door.visitor(request)
+        try:
+            return JSONResponse((await self._side.courses(request.path_params["proposal"])).model_dump())
         except ValidationError as error:
             raise HTTPException(400, _in_words(error)) from None
         except NotTold as error:

@@ -12,13 +12,22 @@ from starlette.requests import Request
 from starlette.responses import Response
 from starlette.routing import Route
 
+from gateway.core.alarms import ALARMS
+
 LANGUAGES = ("en", "de")
+ALARM_PARTS = ("means", "cause", "consequence", "action")
 
 
 @cache
 def catalogue() -> dict[str, dict[str, str]]:
-    """By key, then by language."""
-    return tomllib.loads((files("gateway.operator.page") / "words.toml").read_text(encoding="utf-8"))
+    """By key, then by language. The English of an alarm is that of the table of alarms."""
+    said: dict[str, dict[str, str]] = tomllib.loads(
+        (files("gateway.operator.page") / "words.toml").read_text(encoding="utf-8")
+    )
+    for alarm in ALARMS:
+        for part in ALARM_PARTS:
+            said.setdefault(f"alarm.{alarm.name}.{part}", {})["en"] = getattr(alarm, part)
+    return said
 
 
 def words_of(language: str) -> dict[str, str]:

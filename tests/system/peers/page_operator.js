@@ -10,8 +10,8 @@ const WITHIN_MS = 20000
 const RULES = ['wcag2a', 'wcag2aa', 'wcag21a', 'wcag21aa', 'wcag22aa', 'best-practice']
 
 let browser, context, page
-const asked = []; let bytes = 0 // of all requests since the page was opened anew: where to, and what came
-const troubles = [] // what the browser complains of
+let bytes = 0 // that have come since the page was opened anew
+const asked = [], troubles = [] // where requests went, and what the browser complains of, until the test asks
 
 // A browser of its own: nothing is kept of the one before.
 async function open (url, { width = 1280, height = 900, language = 'en-GB', touch = false } = {}) {
@@ -19,7 +19,7 @@ async function open (url, { width = 1280, height = 900, language = 'en-GB', touc
   context = await browser.newContext({ viewport: { width, height }, locale: language, hasTouch: touch, timezoneId: 'Europe/Berlin' })
   page = await context.newPage()
   page.setDefaultTimeout(WITHIN_MS)
-  asked.length = bytes = 0
+  bytes = 0
   context.on('request', (request) => asked.push(request.url()))
   page.on('pageerror', (error) => troubles.push(error.message))
   // That nobody is logged in, or may not, is an answer; the browser calls it an error.
@@ -69,9 +69,18 @@ const latencies = (seconds) => page.evaluate((for_ms) => new Promise((resolve) =
   setTimeout(() => { seen.disconnect(); resolve(found) }, for_ms)
 }), seconds * 1000)
 
+// What fails is an answer, too: the browser goes on with the next test.
+const answered = (deed) => async (...args) => {
+  try {
+    return { came: await deed(...args) ?? null }
+  } catch (error) {
+    return { failed: error.message }
+  }
+}
+
 chromium.launch({ executablePath: process.argv[2], chromiumSandbox: false, args: ['--disable-gpu'] }).then((launched) => {
   browser = launched
-  serve({ version: browser.version() }, {
+  const deeds = {
     open,
     click: (selector) => visible(selector).first().click(),
     press: (key) => page.keyboard.press(key),
@@ -88,6 +97,7 @@ chromium.launch({ executablePath: process.argv[2], chromiumSandbox: false, args:
     texts: (selector) => visible(selector).evaluateAll((all) => all.map((one) => (one.innerText ?? one.textContent).trim())),
     count: (selector) => visible(selector).count(),
     part: async (name) => { await page.evaluate((hash) => { location.hash = hash }, name); await visible(`#view-${name}`).waitFor() },
+    size: (width, height) => page.setViewportSize({ width, height }),
     forget_session: () => context.clearCookies(), // as the server does after a while
     violations,
     too_wide: tooWide,
@@ -95,8 +105,10 @@ chromium.launch({ executablePath: process.argv[2], chromiumSandbox: false, args:
     tab_to: tabTo,
     latencies,
     first_paint_s: () => page.evaluate(() => performance.getEntriesByName('first-contentful-paint')[0].startTime / 1000),
-    traffic: () => ({ asked: [...asked], bytes }),
-    troubles: () => [...troubles],
+    bytes: () => bytes,
+    asked: () => asked.splice(0),
+    troubles: () => troubles.splice(0),
     picture: async (path, whole = true) => { await page.screenshot({ path, fullPage: whole, animations: 'disabled' }) }
-  })
+  }
+  serve({ version: browser.version() }, Object.fromEntries(Object.entries(deeds).map(([name, deed]) => [name, answered(deed)])))
 })

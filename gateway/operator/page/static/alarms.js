@@ -4,6 +4,7 @@ import { confirmed } from "./dialog.js";
 import { time, word } from "./words.js";
 
 const SHELF_S = 1800, ORDER = ["high", "medium", "low"];
+const said = (one, part) => word(`alarm.${one.name}.${part}`);
 const shelved = (one) => one.shelved_until_wall_s !== null;
 
 export class Alarms {
@@ -20,7 +21,7 @@ export class Alarms {
     if (!keys.includes(this.told)) setText($("alert"), ""); // what is over is not read out to who looks around
     open.forEach((one, i) => {
       if (!this.known.has(keys[i])) {
-        setText($("alert"), `${word(`priority.${one.priority}`)}: ${one.means}`);
+        setText($("alert"), `${word(`priority.${one.priority}`)}: ${said(one, "means")}`);
         this.told = keys[i];
       }
       this.known.add(keys[i]);
@@ -36,13 +37,13 @@ export class Alarms {
     const state = shelved(one) ? word("alarms.shelved", { until: time(one.shelved_until_wall_s) }) : word(one.active ? "alarms.active" : "alarms.ended");
     const seen = one.acknowledged ? word("alarms.seen-by", { name: one.acknowledged_by }) : word("alarms.unseen");
     return h("li", { class: `alarm ${bad ? one.priority : "over"}` },
-      h("p", {}, h("b", { class: bad ? "tag" : "tag over" }, `${bad ? "▲ " : ""}${word(`priority.${one.priority}`)}`), " ", english("b", one.means)),
+      h("p", {}, h("b", { class: bad ? "tag" : "tag over" }, `${bad ? "▲ " : ""}${word(`priority.${one.priority}`)}`), " ", h("b", {}, said(one, "means"))),
       english("p", one.text),
       h("p", { class: "muted" }, `${time(one.since_wall_s, true)}, ${state}, ${seen}`, one.first_out && `, ${word("alarms.first")}`),
-      h("p", {}, h("b", {}, word("alarms.action")), " ", coded("span", one.action)),
+      h("p", {}, h("b", {}, word("alarms.action")), " ", coded("span", said(one, "action"))),
       h("details", {}, h("summary", { "data-focus": `why-${one.name}` }, word("alarms.why")),
-        h("p", {}, h("b", {}, word("alarms.cause")), " ", coded("span", one.cause)),
-        h("p", {}, h("b", {}, word("alarms.consequence")), " ", coded("span", one.consequence))),
+        h("p", {}, h("b", {}, word("alarms.cause")), " ", coded("span", said(one, "cause"))),
+        h("p", {}, h("b", {}, word("alarms.consequence")), " ", coded("span", said(one, "consequence")))),
       this.may("acknowledge") && h("div", { class: "buttons" },
         !one.acknowledged && h("button", { type: "button", "data-focus": `ack-${one.name}`, onclick: () => this.say({ command: "acknowledge", alarm: one.name, since_wall_s: one.since_wall_s }) }, word("alarms.acknowledge")),
         h("button", { type: "button", "data-focus": `shelve-${one.name}`, onclick: () => this.shelve(one) }, word(shelved(one) ? "alarms.unshelve" : "alarms.shelve"))));
@@ -50,7 +51,7 @@ export class Alarms {
 
   async shelve(one) {
     if (shelved(one)) return this.say({ command: "shelve", alarm: one.name, for_s: 0, because: word("alarms.unshelve") });
-    const because = await confirmed({ title: word("alarms.sure-shelve"), lines: [{ english: one.means }, word("alarms.then-shelve")], yes: word("alarms.shelve"), comment: true, needed: true });
+    const because = await confirmed({ title: word("alarms.sure-shelve"), lines: [said(one, "means"), word("alarms.then-shelve")], yes: word("alarms.shelve"), comment: true, needed: true });
     if (because) await this.say({ command: "shelve", alarm: one.name, for_s: SHELF_S, because });
   }
 }

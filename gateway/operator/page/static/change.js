@@ -1,5 +1,6 @@
 // A proposal, and the way to a decision on it. What is decided on is exactly what is shown, by its hash.
 import { $, english, h, replaced, setText } from "./dom.js";
+import { drawCourses } from "./courses.js";
 import { confirmed } from "./dialog.js";
 import { beforeAfter, margins } from "./figures.js";
 import { Refused, ask } from "./net.js";
@@ -65,7 +66,11 @@ export class Change {
 
   fill(shown) {
     this.shown = shown;
-    this.put(JSON.stringify(shown), () => [this.what(shown), this.figures(shown), this.rules(shown), this.bar(shown)]);
+    this.put(JSON.stringify(shown), () => [h("div", { class: "stack" }, this.what(shown), this.courses(shown)), this.figures(shown), this.rules(shown), this.bar(shown)]);
+    const place = $("courses");
+    if (!place || place.dataset.of) return;
+    place.dataset.of = shown.proposal_hash;
+    drawCourses(place, shown.proposal_hash);
   }
 
   what(shown) {
@@ -83,6 +88,11 @@ export class Change {
   figures(shown) {
     if (!shown.verdict?.figures.length) return null;
     return h("section", { class: "panel" }, h("h2", {}, word("change.figures")), h("p", { class: "muted" }, word("change.figures-how")), beforeAfter(shown.verdict.figures));
+  }
+
+  courses(shown) {
+    if (shown.kind !== "gains" || !shown.verdict?.accepted) return null;
+    return h("section", { class: "panel" }, h("h2", {}, word("change.courses")), h("div", { id: "courses" }, h("p", {}, word("change.courses-drawing"))));
   }
 
   rules(shown) {

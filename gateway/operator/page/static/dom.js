@@ -23,7 +23,7 @@ function filled(element, attributes, children) {
 export const english = (tag, text, attributes = {}) => h(tag, { lang: "en", ...attributes }, text);
 
 // The same, with the commands in it set apart: `r2rgate status`.
-export const coded = (tag, text) => h(tag, { lang: "en" }, text.split("`").map((part, i) => (i % 2 ? h("code", {}, part) : part)));
+export const coded = (tag, text) => h(tag, {}, text.split("`").map((part, i) => (i % 2 ? h("code", {}, part) : part)));
 
 export function setText(element, text) {
   if (element.textContent !== text) element.textContent = text;
