@@ -126,6 +126,7 @@ def flooded(line: OperatorLine, rounds: int, seconds: float) -> Found:
     found.deeds = [json.loads(text) for text in told.read_text(encoding="utf-8").splitlines() if text[0] == "{"]
     status = line.status()
     found.state = "" if status is None else status.loop.state
+    found.why = [] if status is None else [f"{event.kind}: {event.text}" for event in status.events]
     return found
 
 
@@ -188,6 +189,7 @@ def report(bench: Bench, line: OperatorLine, found: Found) -> None:
     bench.figure("memory_growth_after_the_first_round_mb", growth_mb, "MB", len(found.of(BUSY)) - 1)
     bench.tables["cases"] = {case: _row(found, case, lateness_us[case], quiet_us) for case in (QUIET, *CASES, BUSY)}
     bench.tables["failed"] = [f"{one['kind']}: {one['why']}" for one in found.deeds if one["why"]][:20]
+    bench.tables["last events of the line"] = found.why
     bench.tables["attackers"] = {case: found.of(case)[-1].told for case in CASES}
 
 

@@ -72,7 +72,8 @@ class Found:
     turns: list[Turn] = field(default_factory=list[Turn])
     memory: list[tuple[float, float]] = field(default_factory=list[tuple[float, float]])  #: monotonic time, MB
     deeds: list[dict[str, Any]] = field(default_factory=list[dict[str, Any]])  #: of the honest client
-    state: str = ""
+    state: str = ""  #: of the line at the end
+    why: list[str] = field(default_factory=list[str])  #: what has happened to it last
 
     def of(self, case: str) -> list[Turn]:
         return [turn for turn in self.turns if turn.case == case]
