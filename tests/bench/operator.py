@@ -178,8 +178,8 @@ def report(bench: Bench, line: OperatorLine, found: Found) -> None:
             f"{kind}_during_attacks_p99_s", float(np.percentile(took_s, 99, method="higher")), "s", len(took_s)
         )
         bench.figure(f"{kind}_during_attacks_s", max(took_s), "s", len(took_s))
-    anew_s = [one for case in CASES for one in found.took_s(case, "connect")]
-    bench.figure("connections_of_the_honest_that_failed", sum(map(np.isinf, anew_s)), "", len(anew_s))
+    anew = [one for one in found.deeds if one["kind"] == "connect"]  # also while cases begin and end
+    bench.figure("connections_of_the_honest_that_failed", sum(bool(one["why"]) for one in anew), "", len(anew))
     begin_mb, peak_mb = found.memory[0][1], max(mb for _, mb in found.memory)
     first, last = found.of(QUIET)[len(CASES)], found.of(QUIET)[-1]
     bench.figure("memory_begin_mb", begin_mb, "MB", 1)
@@ -188,7 +188,14 @@ def report(bench: Bench, line: OperatorLine, found: Found) -> None:
     growth_mb = _memory_at(found, last.end_s) - _memory_at(found, first.end_s)
     bench.figure("memory_growth_after_the_first_round_mb", growth_mb, "MB", len(found.of(BUSY)) - 1)
     bench.tables["cases"] = {case: _row(found, case, lateness_us[case], quiet_us) for case in (QUIET, *CASES, BUSY)}
-    bench.tables["failed"] = [f"{one['kind']}: {one['why']}" for one in found.deeds if one["why"]][:20]
+    bench.tables["failed"] = [
+        f"{one['at_s'] - found.turns[0].begin_s:.1f} s, {one['kind']}: {one['why']}"
+        for one in found.deeds
+        if one["why"]
+    ][:20]
+    bench.tables["cases began, s"] = [
+        [turn.case, round(turn.begin_s - found.turns[0].begin_s, 1)] for turn in found.turns
+    ]
     bench.tables["last events of the line"] = found.why
     bench.tables["attackers"] = {case: found.of(case)[-1].told for case in CASES}
 
