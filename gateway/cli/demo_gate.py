@@ -10,24 +10,22 @@ from gateway.cli.demo_analysis import Evidence
 from gateway.cli.demo_chain import Chain
 from gateway.cli.demo_line import Setup
 from gateway.cli.demo_result import AuditResult, ChainResult, SwapResult
-from gateway.core.audit_record import Who
+from gateway.cli.line_records import FAR_S, read_records
 from gateway.core.interactions import Interaction
 from gateway.core.signals import FloatArray
-from gateway.supervisor.audit_file import AuditFile
-from gateway.supervisor.audit_verify import verify
 from gateway.supervisor.historian import FILE_NAME
 from gateway.supervisor.history import History
 from sim_plant.recording import Recording
 
 AROUND_S = 1.0  #: a swap: half before it, half after it
-FAR_S = 4e9  #: beyond any wall clock
 
 
 def chain_result(setup: Setup, chain: Chain, evidence: Evidence, interactions: Sequence[Interaction]) -> ChainResult:
     """After every process has ended. `interactions`: with the agents."""
     found = chain.commissioned
     assert found is not None  # the chain was carried out
-    approved, deployments = _decided(setup)
+    records = read_records(setup.data)
+    approved = {one.hash: step.who for one in records.proposals if (step := one.step("approved")) is not None}
     shown = {one.proposal_hash: one for one in chain.shown}
     limits, steps = setup.line.limits, _steps(evidence.recording)
     return ChainResult(
@@ -40,27 +38,18 @@ def chain_result(setup: Setup, chain: Chain, evidence: Evidence, interactions: S
             for one in found.tried
         ],
         asked=asked_result(interactions, chain.shown),
-        deployments=deployments,
+        deployments=sum(step.kind == "deployed" for one in records.proposals for step in one.steps),
         swaps=_swaps(setup, evidence, steps),
         step_allowed_nm=limits.torque_rate_nm_per_s * setup.line.control.period_s,
         step_elsewhere_nm=max(float(sizes.max(initial=0.0)) for _, sizes in steps),
         left_out=chain.left_out,
-        audit=audit_result(setup),
+        audit=AuditResult(
+            records=records.found.records,
+            head=records.found.head,
+            sound=records.found.sound,
+            problems=records.found.problems,
+        ),
     )
-
-
-def audit_result(setup: Setup) -> AuditResult:
-    """As `r2rgate audit verify` finds it."""
-    found = verify(setup.data)
-    return AuditResult(records=found.records, head=found.head, sound=found.sound, problems=found.problems)
-
-
-def _decided(setup: Setup) -> tuple[dict[str, Who], int]:
-    """By proposal who approved it, and how often anything was deployed."""
-    with AuditFile(setup.data) as file:
-        records = [row.record() for row in file.rows()]
-    approved = {str(one.what["proposal"]): one.who for one in records if one.kind == "approved"}
-    return approved, sum(one.kind == "deployed" for one in records)
 
 
 def _steps(recording: Recording) -> list[tuple[FloatArray, FloatArray]]:
