@@ -33,7 +33,12 @@ class AccessDesk:
         self._note = note
         self._bounded = Bounded(clock)
         self._users: UsersNow | None = None  #: as they are on record since this process began
+        self._newest: UsersNow | None = None  #: as they are, on record or not
         mailbox.serve(GATEWAY_ACCESS, self._answer)
+
+    def roles(self) -> Mapping[str, Role] | None:
+        """Of the people who may come in, as they were told last; None: not yet."""
+        return None if self._newest is None else self._newest.roles
 
     async def _answer(self, payload: bytes) -> bytes:
         try:
@@ -50,6 +55,7 @@ class AccessDesk:
             return await self._kept("logged-in", who, {"address": happened.address}, who.name)
         if isinstance(happened, WrongLogins):
             return await self._kept("wrong-logins", peer, happened.model_dump(exclude={"happened"}), WRONG)
+        self._newest = happened
         if happened == self._users:
             return done("known")
         before = None if self._users is None else self._users.roles

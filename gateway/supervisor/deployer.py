@@ -6,7 +6,7 @@ proposals judged, `on_the_line` carries out what is approved.
 """
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from gateway.core.audit_record import Who
@@ -15,14 +15,23 @@ from gateway.core.deployment import Region
 from gateway.core.judge_context import JudgeContext
 from gateway.core.line import Line
 from gateway.core.messages import Reply
+from gateway.core.people import Role
 from gateway.core.proposal import GainsChange, Proposal, canonical
 from gateway.core.recording import Recording
 from gateway.core.small_change import beyond_small
 from gateway.core.status import ChangeStatus
+from gateway.core.verdict import line_hash
 from gateway.mailbox.port import Unreachable
 from gateway.supervisor.audit_file import AuditUnavailable
 from gateway.supervisor.deployer_sides import AuditSide, JudgeSide, LoopSide, NotKnown, NotTakenUp, Surroundings
-from gateway.supervisor.four_eyes import APPROVED_ONCE, FirstApproval, approver_of, why_no_person, why_not_second
+from gateway.supervisor.four_eyes import (
+    APPROVED_ONCE,
+    FirstApproval,
+    approver_of,
+    still_counts,
+    why_no_person,
+    why_not_second,
+)
 from gateway.supervisor.lifecycle import (
     LINE_CHANGED,
     ON_THE_LINE,
@@ -58,12 +67,16 @@ class Deployer:
         clock: Callable[[], float],
         wall_clock: Callable[[], float],
         own_uid: int | None = None,
+        roles: Callable[[], Mapping[str, Role] | None] = lambda: None,
     ) -> None:
         """`take_up` puts into the stores what is about to be put into service; raises NotTakenUp.
 
-        `own_uid`: the user that the gateway runs as; None: that of this process.
+        `own_uid`: the user that the gateway runs as; None: that of this process. `roles`: of the people who may come
+        in, None while they are not known.
         """
         self.book = book
+        self.book.line = line_hash(line)
+        self._roles = roles
         self._own_uid = os.getuid() if own_uid is None else own_uid
         self._line = line
         self._surroundings = surroundings
@@ -286,7 +299,10 @@ class Deployer:
 
     def _first(self, entry: Entry) -> FirstApproval | None:
         """The first approval of what would be approved now; None: there is none."""
-        return entry.first if entry.first is not None and entry.first.shown == self._shown_hash(entry) else None
+        first = entry.first
+        if first is None or first.shown != self._shown_hash(entry):
+            return None
+        return first if still_counts(first, self._own_uid, self._roles()) else None
 
     async def _approve_once(self, entry: Entry, what: dict[str, Any], who: Who) -> Reply:
         await self._records.step(APPROVED_ONCE, what, who)

@@ -2,7 +2,7 @@
 
 import asyncio
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from importlib.metadata import version
 from pathlib import Path
 
@@ -13,6 +13,7 @@ from gateway.core.controller import Controller, ControllerRefused, config_hash, 
 from gateway.core.decisions import DECISION, QUERY, Archive, Decide, LineChanged, ListProposals, RollBackNow
 from gateway.core.line import Line
 from gateway.core.messages import Command, Deploy, Event, Keep, Reply, WatchGood, command_bytes
+from gateway.core.people import Role
 from gateway.core.proposal import GainsChange, ModelChange, Proposal
 from gateway.core.status import ChangeStatus
 from gateway.core.topics import GATEWAY_DECISION, GATEWAY_PROPOSALS, GATEWAY_PROPOSE, LOOP_COMMAND
@@ -75,6 +76,8 @@ class Gate:
         wall_clock: Callable[[], float],
     ) -> None:
         self.deployer: Deployer | None = None
+        #: Of the people who may come in; None: nobody has told yet.
+        self.roles: Callable[[], Mapping[str, Role] | None] = lambda: None
         self._line = line
         self._folder = folder
         self._judge = judge
@@ -153,6 +156,7 @@ class Gate:
         self.deployer = Deployer(
             self._line, book, KeptAudit(self._folder, self.audit), self._loop, self._judge,
             self._around(*self._stores), self._take_up, self._clock, self._wall_clock,
+            roles=lambda: self.roles(),
         )  # fmt: skip
 
     def _learn_again(self, deployer: Deployer) -> None:

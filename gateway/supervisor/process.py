@@ -104,7 +104,7 @@ async def serve(
     alarms = Alarms(mailbox, data_folder, gate.audit.append, gateway.note, clock, wall_clock)
     gateway.alarms = alarms.status
     PersonsDesk(mailbox, gateway.command, gate.decide, alarms.say, gate.audit.append, clock)
-    AccessDesk(mailbox, gate.audit.append, clock)
+    gate.roles = AccessDesk(mailbox, gate.audit.append, clock).roles
     courses = CoursesDesk(mailbox, lambda: gate.deployer, judge)
     past = Past(line, mailbox, data_folder, lambda: historian.path)
     dry_runs = DryRuns(line, JudgeWorkers(line, nicer=NICEST))

@@ -119,6 +119,7 @@ class Inbox:
             "verdict": verdict_hash(verdict),
             "context": context_hash(context),
             "model": None if context.model is None else model_hash(context.model),
+            "line": verdict.line,
             "seed": verdict.seed,
             "because": _first_reason(verdict),
         }
