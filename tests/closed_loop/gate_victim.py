@@ -17,7 +17,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gateway.cli.lifetime import follow_parent
-from gateway.core.courses import Courses
 from gateway.core.deployment import Region
 from gateway.core.judge_context import JudgeContext, context_hash
 from gateway.core.line import Line
@@ -25,7 +24,6 @@ from gateway.core.line_file import load_line
 from gateway.core.recording import Recording
 from gateway.core.verdict import RuleFinding, Verdict, line_hash
 from gateway.supervisor.audit import Audit
-from gateway.supervisor.judging import Busy
 from gateway.supervisor.process import serve
 
 TOLD, TOLD_FILE = struct.Struct("<Q64s"), "told.bin"
@@ -58,9 +56,6 @@ class QuickJudge:
     def begin(self) -> None: ...
 
     async def close(self) -> None: ...
-
-    async def courses(self, payload: bytes, context: JudgeContext, region: Region) -> Courses:
-        raise Busy
 
     async def judge(self, payload: bytes, context: JudgeContext, recordings: list[Recording]) -> Verdict:
         await asyncio.sleep(self._rng.uniform(0.0, 0.03))
