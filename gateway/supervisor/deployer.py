@@ -7,6 +7,7 @@ proposals judged, `on_the_line` carries out what is approved.
 
 import os
 from collections.abc import Callable, Mapping
+from itertools import islice
 from typing import Any
 
 from gateway.core.audit_record import Who
@@ -16,9 +17,8 @@ from gateway.core.judge_context import JudgeContext
 from gateway.core.line import Line
 from gateway.core.messages import Reply
 from gateway.core.people import Role
-from gateway.core.proposal import GainsChange, Proposal, canonical
+from gateway.core.proposal import Proposal, canonical
 from gateway.core.recording import Recording
-from gateway.core.small_change import beyond_small
 from gateway.core.status import ChangeStatus
 from gateway.core.verdict import line_hash
 from gateway.mailbox.port import Unreachable
@@ -48,8 +48,7 @@ from gateway.supervisor.on_the_line import OnTheLine
 from gateway.supervisor.peers import GATEWAY
 from gateway.supervisor.proposal_inbox import Inbox
 from gateway.supervisor.proposal_records import ProposalRecords, done, refused
-
-MOST_AT_HAND = 24  #: proposals that wait, the newest
+from gateway.supervisor.small_changes import SmallChanges
 
 
 class Deployer:
@@ -84,6 +83,7 @@ class Deployer:
         self._records = ProposalRecords(book, audit, wall_clock)
         self._inbox = Inbox(line, self._records, judge, surroundings)
         self._on_the_line = OnTheLine(line, self._records, loop, surroundings, take_up, clock)
+        self._small = SmallChanges(line, self._records)
         self._looked_at: set[str] = set()  #: proposals that would pass without a person, or not
 
     @property
@@ -226,15 +226,12 @@ class Deployer:
         await self._inbox.close()
 
     async def at_hand(self, beginning: str | None = None) -> None:
-        """Before `watch`, `listed`, `shown` and `decide`: what they need of the disk. None: of what waits."""
-        wanted = list[Entry]()
+        """Before `watch`, `listed`, `shown` and `decide`: what they need of the disk. `beginning`: of this proposal."""
+        if self._line.gate.autonomy == "approve-first":  # whether it passes by itself depends on what it is
+            await self._small.look()
         if beginning is not None:
-            wanted = [one for hash_, one in self.book.entries.items() if hash_.startswith(beginning)][:1]
-        elif self._line.gate.autonomy == "approve-first":  # whether it passes by itself depends on what it is
-            wanted = [one for one in reversed(self.book.undecided) if one.stage is Stage.WAITING][:MOST_AT_HAND]
-        if self._line.gate.autonomy == "approve-first":
-            wanted += [self.book.entries[one] for one in self.book.trusted.values()]
-        await self._records.fetch(wanted)
+            found = (one for hash_, one in self.book.entries.items() if hash_.startswith(beginning))
+            await self._records.fetch(islice(found, 1))
 
     def listed(self, most: int, skip: int = 0) -> ProposalList:
         """The newest first, but for the first `skip`; with those that are not done with, where none are left out."""
@@ -285,7 +282,9 @@ class Deployer:
             return f"not kept yet: {self._on_the_line.unseen() or 'about to be'}"
         if entry.stage is not Stage.WAITING:
             return entry.why
-        reasons = self._why_a_person(entry) if self._line.gate.autonomy == "approve-first" else [entry.why]
+        reasons: list[str] | None = [entry.why]
+        if self._line.gate.autonomy == "approve-first" and (reasons := self._small.why_a_person(entry)) is None:
+            reasons = ["whether it passes by its verdict alone was not looked at yet"]
         if self._line.gate.approvals > 1:
             first = self._first(entry)
             two = "it takes two people" if first is None else f"{first.name} has approved it, it takes another person"
@@ -343,33 +342,22 @@ class Deployer:
     async def _approve_small(self) -> None:
         """Where the line's file allows it: what is like enough to what a person approved passes by its verdict alone.
 
-        One a look, and each once: what could not be carried out waits for a person.
+        One a look, and each once: what could not be carried out waits for a person, and what was not looked at yet for
+        the next look.
         """
         if self._line.gate.autonomy != "approve-first" or self.book.on_the_line is not None:
             return
         for entry in self.book.entries.values():
             if entry.stage is Stage.WAITING and entry.proposal not in self._looked_at:
+                if (reasons := self._small.why_a_person(entry)) is None:
+                    continue
                 self._looked_at.add(entry.proposal)
-                if not self._why_a_person(entry):
+                if not reasons:
                     found = await self._on_the_line.settle()
                     what = {"proposal": entry.proposal, "by": VERDICT, "like": self.book.trusted[entry.kind]}
                     await self._records.step("approved", what, GATEWAY)
                     await self._on_the_line.carry_out(self.book.entries[entry.proposal], found, GATEWAY)
                 return
-
-    def _why_a_person(self, entry: Entry) -> list[str]:
-        """Why a person must decide; empty: the verdict is enough."""
-        if (trusted := self.book.trusted.get(entry.kind)) is None:
-            return [f"no person has approved a change of {entry.kind} yet, or one was rolled back since"]
-        before, now = self.book.entries[trusted], self._records.proposal(entry)
-        reasons = beyond_small(self._records.proposal(before).change, now.change, self._line.gate.small_share)
-        if isinstance(now.change, GainsChange):
-            regions = [
-                verdict and verdict.region for verdict in (self._records.verdict(before), self._records.verdict(entry))
-            ]
-            if regions[0] is None or regions[1] is None or not regions[1].within(regions[0]):
-                reasons.append("it would be in service further than what a person approved")
-        return reasons
 
 
 def _line_of(entry: Entry, why: str) -> ProposalLine:
