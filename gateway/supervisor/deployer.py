@@ -23,6 +23,7 @@ from gateway.core.status import ChangeStatus
 from gateway.core.verdict import line_hash
 from gateway.mailbox.port import Unreachable
 from gateway.supervisor.audit_file import AuditUnavailable
+from gateway.supervisor.bounded import with_left_out
 from gateway.supervisor.deployer_sides import AuditSide, JudgeSide, LoopSide, NotKnown, NotTakenUp, Surroundings
 from gateway.supervisor.four_eyes import (
     APPROVED_ONCE,
@@ -128,21 +129,25 @@ class Deployer:
             except (AuditUnavailable, Unreachable, Impossible, NotTakenUp, NotKnown) as error:
                 return refused("it is not carried out", [str(error)])
 
-    async def roll_back(self, comment: str, who: Who) -> Reply:
+    async def roll_back(self, comment: str, who: Who, left_out: int | None = 0) -> Reply:
         """To the last known good configuration, now. Done even where the audit is not there: it is the safe side.
 
         The line first, which waits for no disk and for no step that is under way; what is deployed in between goes back
-        as soon as its step is over.
+        as soon as its step is over. `left_out`: how many were done and not recorded before it; None: nor is this one.
         """
         reason, recorded = comment or f"asked for by {who.name}", ""
         try:
             reply = await self._on_the_line.back(reason)
         except Unreachable as error:
             return refused("not confirmed", [str(error)])
+        if left_out is None and not self._on_watch() and not self._records.one_step.locked():
+            self.look_again()  # whoever says it without end holds up nothing
+            return reply
         async with self._records.one_step:
             given_up = self._on_watch()
             try:
-                await self._records.note("rollback-asked", who, {"comment": comment})
+                if left_out is not None:
+                    await self._records.note("rollback-asked", who, with_left_out({"comment": comment}, left_out))
             except AuditUnavailable as error:
                 recorded = f"; it could not be recorded: {error}"
             try:

@@ -234,8 +234,10 @@ class Gate:
             return _not_understood(error)
         return (await self.decide(decision, who_of(PEER.get()))).model_dump_json().encode()
 
-    async def decide(self, decision: Decide | RollBackNow | Archive | LineChanged, who: Who) -> Reply:
-        """What a person, or a program in a person's place, says."""
+    async def decide(
+        self, decision: Decide | RollBackNow | Archive | LineChanged, who: Who, left_out: int | None = 0
+    ) -> Reply:
+        """What a person, or a program in a person's place, says; `left_out`, as of `Bounded`, of what is never refused."""
         if self.deployer is None:
             reply = self.shut_reply()
         elif isinstance(decision, Decide):
@@ -248,7 +250,7 @@ class Gate:
         elif isinstance(decision, LineChanged):
             reply = await self._line_changed(self.deployer, decision, who)
         else:
-            reply = await self.deployer.roll_back(decision.comment, who)
+            reply = await self.deployer.roll_back(decision.comment, who, left_out)
         self._note("decision", f"{who.name}: {reply.text}", ok=reply.ok, reasons=reply.reasons)
         if isinstance(decision, Decide) and not reply.ok:
             await self._record_refusal(decision, reply, who)
@@ -263,6 +265,7 @@ class Gate:
         try:
             await self.audit.append("refused-decision", who, with_left_out(what, left_out))
         except AuditUnavailable as error:
+            self._refusals.undo(who.name, left_out + 1)
             self._note("gate", f"a refusal could not be recorded: {error}")
 
     async def _line_changed(self, deployer: Deployer, said: LineChanged, who: Who) -> Reply:
