@@ -237,7 +237,7 @@ class Gate:
     async def decide(
         self, decision: Decide | RollBackNow | Archive | LineChanged, who: Who, left_out: int | None = 0
     ) -> Reply:
-        """What a person, or a program in a person's place, says; `left_out`, as of `Bounded`, of what is never refused."""
+        """What a person, or a program in a person's place, says; `left_out`: as of `Bounded`, where none is refused."""
         if self.deployer is None:
             reply = self.shut_reply()
         elif isinstance(decision, Decide):

@@ -124,9 +124,7 @@ def _refused_decision(who: str, what: What) -> str:
 
 def _logged_in(who: str, what: What) -> str:
     untold = what.get("untold", 0)
-    others = (
-        f" (and {untold} others before, of whom nothing else is known)" if isinstance(untold, int) and untold else ""
-    )
+    others = f" (and {untold} others before, of whom nothing else is known)" if untold else ""
     return f"{who} has come in from {_of(what, 'address')}{_left_out(what)}{others}"
 
 
