@@ -68,14 +68,35 @@ def _runs(case: Case, judged: Judged) -> dict[str, tuple[FloatArray, Run]]:
 def _drawn(
     name: str, setpoint_n: FloatArray, run: Run, configs: dict[Drawn, Controller], case: Case, most: int
 ) -> DrawnCourse:
-    every = -(-len(setpoint_n) // most)
-    period_s = case.line.control.period_s
+    every = 1 if len(setpoint_n) <= most else -(-len(setpoint_n) // (most // 2))
+    times = range(len(setpoint_n))
+    if every > 1:
+        times = [k + half for k in times[::every] for half in (0, every // 2)]
     return DrawnCourse(
         scenario=name,
-        time_s=[round(k * period_s, 4) for k in range(0, len(setpoint_n), every)],
-        setpoint_n=[[round(one, 3) for one in span] for span in setpoint_n[::every].T.tolist()],
-        tension_n={whose: _told(run(config)[::every]) for whose, config in configs.items()},
+        time_s=[round(k * case.line.control.period_s, 4) for k in times],
+        setpoint_n=[[round(one, 3) for one in span] for span in _thinned(setpoint_n, every).T.tolist()],
+        tension_n={whose: _told(_thinned(run(config), every)) for whose, config in configs.items()},
     )
+
+
+def _thinned(values: FloatArray, every: int) -> FloatArray:
+    """Of each `every` rows two: least and greatest of each column, in the order they came in. So no peak is lost.
+
+    nan from where a column is.
+    """
+    if every == 1:
+        return values
+    count = -(-len(values) // every)
+    last = np.repeat(values[-1:], count * every - len(values), axis=0)
+    buckets = np.concatenate([values, last]).reshape(count, every, -1)
+    known = np.isfinite(buckets)
+    least = np.argmin(np.where(known, buckets, np.inf), axis=1)
+    greatest = np.argmax(np.where(known, buckets, -np.inf), axis=1)
+    rows = np.stack([np.minimum(least, greatest), np.maximum(least, greatest)], axis=1)
+    found = np.take_along_axis(buckets, rows, axis=1)
+    found[:, 1][~known.all(axis=1)] = np.nan
+    return found.reshape(2 * count, -1)
 
 
 def _told(tension_n: FloatArray) -> list[list[float | None]]:

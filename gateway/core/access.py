@@ -22,6 +22,7 @@ class CameIn(Strict):
     happened: Literal["came-in"] = "came-in"
     person: Person
     address: Address
+    before: Annotated[int, Field(ge=0, le=10**9)] = 0  #: others who came in before, and of whom nothing more is known
 
 
 class WrongPlace(Strict):

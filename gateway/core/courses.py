@@ -20,7 +20,10 @@ class ShowCourses(Strict):
 
 
 class DrawnCourse(Strict):
-    """Of one scenario, at the model's mean and without noise. All lists by span are of the line's spans, in order."""
+    """Of one scenario, at the model's mean and without noise. All lists by span are of the line's spans, in order.
+
+    Of each stretch of time two points, least and greatest of each list in the order they came in: no peak is lost.
+    """
 
     scenario: Annotated[str, Field(min_length=1, max_length=60)]
     time_s: list[float]  #: from the begin of the scenario

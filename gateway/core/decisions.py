@@ -105,7 +105,8 @@ class InServiceTold(Strict):
     """What controls the line, beside its hash."""
 
     kind: str | None  #: PID, LQR, LQI, LQG or MPC, and whether it is scheduled; null: it is not stored here
-    phase: Literal["commissioning", "operation"]  #: operation: a baseline was set for the line as it is
+    #: operation: a baseline was set for the line as it is; null: what was measured cannot be read now.
+    phase: Literal["commissioning", "operation"] | None
     performance: PerformanceTold | None
 
 

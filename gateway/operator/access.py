@@ -40,6 +40,7 @@ class Access:
         self._tell = tell
         self._clock = clock
         self._came: deque[CameIn] = deque(maxlen=MOST_WAITING)
+        self._dropped = 0  #: of them, because too many waited
         self._wrong: OrderedDict[tuple[Through, str, str | None], _Wrong] = OrderedDict()
         self._elsewhere = 0
         self._reported_s = clock()
@@ -48,6 +49,7 @@ class Access:
         self._trouble = ""  #: of the users' file, as it was told
 
     def came_in(self, person: Person, address: str) -> None:
+        self._dropped += len(self._came) == MOST_WAITING
         self._came.append(CameIn(person=person, address=address[:LONGEST_ADDRESS]))
 
     def refused(self, through: Through, address: str, certificate: str | None, name: str) -> None:
@@ -71,9 +73,15 @@ class Access:
     async def look(self) -> None:
         """Tell what there is to tell."""
         await self._tell_users()
-        while self._came and await self._side.at_the_door(first := self._came[0]):
+        while self._came:
+            first, dropped = self._came[0], self._dropped
+            if not await self._side.at_the_door(first.model_copy(update={"before": dropped})):
+                break
+            self._dropped -= dropped
             if self._came and self._came[0] is first:  # so many may have come meanwhile that it is gone
                 self._came.popleft()
+            elif self._dropped:
+                self._dropped -= 1  # it is gone, and was told
         if self._wrong and self._clock() - self._reported_s >= REPORT_S:
             await self._report()
 

@@ -18,6 +18,7 @@ from gateway.supervisor.proposal_records import done, refused
 
 WRONG = "wrong logins"  #: by which all reports of them count together
 CHANGED = "users"  #: and all changes of users
+COUNTED = "counted"  #: what is answered where the number alone will be on record
 
 
 class AccessDesk:
@@ -33,7 +34,13 @@ class AccessDesk:
         self._note = note
         self._bounded = Bounded(clock)
         self._users: UsersNow | None = None  #: as they are on record since this process began
+        self._newest: UsersNow | None = None  #: as they are, on record or not
+        self._untold = 0  #: who came in and was never told of, until a record says how many
         mailbox.serve(GATEWAY_ACCESS, self._answer)
+
+    def roles(self) -> Mapping[str, Role] | None:
+        """Of the people who may come in, as they were told last; None: not yet."""
+        return None if self._newest is None else self._newest.roles
 
     async def _answer(self, payload: bytes) -> bytes:
         try:
@@ -47,9 +54,10 @@ class AccessDesk:
         peer = who_of(PEER.get())
         if isinstance(happened, CameIn):
             who = who_is(happened.person, PEER.get())
-            return await self._kept("logged-in", who, {"address": happened.address}, who.name)
+            return await self._came_in(happened, who)
         if isinstance(happened, WrongLogins):
             return await self._kept("wrong-logins", peer, happened.model_dump(exclude={"happened"}), WRONG)
+        self._newest = happened
         if happened == self._users:
             return done("known")
         before = None if self._users is None else self._users.roles
@@ -59,13 +67,22 @@ class AccessDesk:
             self._users = happened
         return reply
 
+    async def _came_in(self, happened: CameIn, who: Who) -> Reply:
+        untold = self._untold + happened.before
+        what: dict[str, object] = {"address": happened.address} | ({"untold": untold} if untold else {})
+        reply = await self._kept("logged-in", who, what, who.name)
+        if reply.ok:
+            self._untold = untold if reply.text == COUNTED else 0
+        return reply
+
     async def _kept(self, kind: str, who: Who, what: dict[str, object], name: str) -> Reply:
         if (left_out := self._bounded.left_out(name)) is None:
             # Users are told again until they are on record; of what else comes too often the number is.
-            return refused("later", []) if name == CHANGED else done("counted")
+            return refused("later", []) if name == CHANGED else done(COUNTED)
         try:
             await self._note(kind, who, what if name == CHANGED else with_left_out(what, left_out))
         except AuditUnavailable as error:
+            self._bounded.undo(name, left_out)  # it is told again
             return refused("not recorded", [str(error)])
         return done("recorded")
 
@@ -80,4 +97,4 @@ def _changes(before: Mapping[str, Role] | None, now: Mapping[str, Role]) -> list
         f"{name} is {role} instead of {before[name]}"
         for name, role in now.items() if before.get(name, role) != role
     ]  # fmt: skip
-    return sorted([*new, *gone, *other]) or ["a password"]
+    return sorted([*new, *gone, *other]) or ["the file is another, with the same names and roles"]

@@ -44,6 +44,12 @@ class Bounded:
         before, account.left_out = account.left_out, 0
         return before
 
+    def undo(self, name: str, left_out: int) -> None:
+        """What `left_out` let through could not be written: it takes nothing, and so many are told with the next."""
+        if (account := self._by_name.get(name)) is not None:
+            account.left = min(self._at_once, account.left + 1.0)
+            account.left_out += left_out
+
 
 def with_left_out(what: dict[str, object], left_out: int) -> dict[str, object]:
     """The content of a record that stands for those before it, too."""

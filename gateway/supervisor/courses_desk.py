@@ -1,7 +1,7 @@
 """Courses of the proposal that waits, for whoever decides on it: simulated once, when somebody asks, and kept.
 
-The judge's own process makes them, of exactly what it has judged, while it has no proposal to judge: whoever asks never
-waits here, but is told to ask again.
+They are made of exactly what was judged, in a process that no verdict waits for: whoever asks never waits here, but is
+told to ask again. What still waits for a decision is never drawn twice.
 """
 
 import asyncio
@@ -21,15 +21,16 @@ from gateway.mailbox.port import Mailbox
 from gateway.supervisor.audit_file import AuditUnavailable
 from gateway.supervisor.deployer import Deployer
 from gateway.supervisor.deployer_sides import NotKnown
-from gateway.supervisor.judging import Busy, NoVerdict
+from gateway.supervisor.judging import NoVerdict
 from gateway.supervisor.lifecycle import Stage
 
-MOST_KEPT = 8
+MOST_KEPT = 8  #: of what waits no more
+MOST_WAITING = 200  #: that are drawn at all: 200 kB each at most
 
 
 class Draws(Protocol):
     async def courses(self, payload: bytes, context: JudgeContext, region: Region) -> Courses:
-        """Raises Busy, NoVerdict."""
+        """Raises NoVerdict."""
         ...
 
 
@@ -40,7 +41,8 @@ class CoursesDesk:
         """`deployer`: None while the gate is shut."""
         self._deployer = deployer
         self._judge = judge
-        self._kept: OrderedDict[str, bytes] = OrderedDict()  #: by the hash of the verdict
+        #: By the hash of the verdict, with the proposal; those last that were asked for last.
+        self._kept: OrderedDict[str, tuple[str, bytes]] = OrderedDict()
         self._drawing: asyncio.Task[None] | None = None
         mailbox.serve(GATEWAY_COURSES, self._answer)
 
@@ -69,25 +71,32 @@ class CoursesDesk:
         if entry is None or entry.verdict is None:
             raise NotKnown("it is not judged yet")
         if (found := self._kept.get(entry.verdict)) is not None:
-            return found
+            self._kept.move_to_end(entry.verdict)
+            return found[1]
         if entry.kind != "gains" or entry.stage is not Stage.WAITING:
             raise NotKnown("they are drawn of another controller alone, and while it waits for a decision")
+        self._make_room(deployer)
         judged = await deployer.judged_as(entry)
         if self._drawing is None or self._drawing.done():
             work = self._draw(proposal, entry.verdict, *judged)
             self._drawing = asyncio.get_running_loop().create_task(work)
         return _of(proposal, entry.verdict, None, drawing=True)
 
+    def _make_room(self, deployer: Deployer) -> None:
+        """What waits for a decision stays. Raises NotKnown where too much does."""
+        entries = deployer.book.entries
+        over = [one for one, (whose, _) in self._kept.items() if entries[whose].stage is not Stage.WAITING]
+        for one in over[: max(0, len(over) - MOST_KEPT)]:
+            del self._kept[one]
+        if len(self._kept) >= MOST_KEPT + MOST_WAITING:
+            raise NotKnown(f"courses of {len(self._kept)} proposals are kept already: decide some of them first")
+
     async def _draw(self, proposal: str, verdict: str, payload: bytes, context: JudgeContext, region: Region) -> None:
         try:
             courses = (await self._judge.courses(payload, context, region)).courses
-        except Busy:
-            return  # whoever asks again begins it anew
         except NoVerdict:
             courses = []
-        self._kept[verdict] = _of(proposal, verdict, context, courses=courses)
-        while len(self._kept) > MOST_KEPT:
-            self._kept.popitem(last=False)
+        self._kept[verdict] = proposal, _of(proposal, verdict, context, courses=courses)
 
 
 def _of(

@@ -6,7 +6,8 @@ proposals judged, `on_the_line` carries out what is approved.
 """
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from itertools import islice
 from typing import Any
 
 from gateway.core.audit_record import Who
@@ -15,14 +16,23 @@ from gateway.core.deployment import Region
 from gateway.core.judge_context import JudgeContext
 from gateway.core.line import Line
 from gateway.core.messages import Reply
-from gateway.core.proposal import GainsChange, Proposal, canonical
+from gateway.core.people import Role
+from gateway.core.proposal import Proposal, canonical
 from gateway.core.recording import Recording
-from gateway.core.small_change import beyond_small
 from gateway.core.status import ChangeStatus
+from gateway.core.verdict import line_hash
 from gateway.mailbox.port import Unreachable
 from gateway.supervisor.audit_file import AuditUnavailable
+from gateway.supervisor.bounded import with_left_out
 from gateway.supervisor.deployer_sides import AuditSide, JudgeSide, LoopSide, NotKnown, NotTakenUp, Surroundings
-from gateway.supervisor.four_eyes import APPROVED_ONCE, FirstApproval, approver_of, why_no_person, why_not_second
+from gateway.supervisor.four_eyes import (
+    APPROVED_ONCE,
+    FirstApproval,
+    approver_of,
+    still_counts,
+    why_no_person,
+    why_not_second,
+)
 from gateway.supervisor.lifecycle import (
     LINE_CHANGED,
     ON_THE_LINE,
@@ -39,8 +49,7 @@ from gateway.supervisor.on_the_line import OnTheLine
 from gateway.supervisor.peers import GATEWAY
 from gateway.supervisor.proposal_inbox import Inbox
 from gateway.supervisor.proposal_records import ProposalRecords, done, refused
-
-MOST_AT_HAND = 24  #: proposals that wait, the newest
+from gateway.supervisor.small_changes import SmallChanges
 
 
 class Deployer:
@@ -58,12 +67,16 @@ class Deployer:
         clock: Callable[[], float],
         wall_clock: Callable[[], float],
         own_uid: int | None = None,
+        roles: Callable[[], Mapping[str, Role] | None] = lambda: None,
     ) -> None:
         """`take_up` puts into the stores what is about to be put into service; raises NotTakenUp.
 
-        `own_uid`: the user that the gateway runs as; None: that of this process.
+        `own_uid`: the user that the gateway runs as; None: that of this process. `roles`: of the people who may come
+        in, None while they are not known.
         """
         self.book = book
+        self.book.line = line_hash(line)
+        self._roles = roles
         self._own_uid = os.getuid() if own_uid is None else own_uid
         self._line = line
         self._surroundings = surroundings
@@ -71,6 +84,7 @@ class Deployer:
         self._records = ProposalRecords(book, audit, wall_clock)
         self._inbox = Inbox(line, self._records, judge, surroundings)
         self._on_the_line = OnTheLine(line, self._records, loop, surroundings, take_up, clock)
+        self._small = SmallChanges(line, self._records)
         self._looked_at: set[str] = set()  #: proposals that would pass without a person, or not
 
     @property
@@ -115,21 +129,25 @@ class Deployer:
             except (AuditUnavailable, Unreachable, Impossible, NotTakenUp, NotKnown) as error:
                 return refused("it is not carried out", [str(error)])
 
-    async def roll_back(self, comment: str, who: Who) -> Reply:
+    async def roll_back(self, comment: str, who: Who, left_out: int | None = 0) -> Reply:
         """To the last known good configuration, now. Done even where the audit is not there: it is the safe side.
 
         The line first, which waits for no disk and for no step that is under way; what is deployed in between goes back
-        as soon as its step is over.
+        as soon as its step is over. `left_out`: how many were done and not recorded before it; None: nor is this one.
         """
         reason, recorded = comment or f"asked for by {who.name}", ""
         try:
             reply = await self._on_the_line.back(reason)
         except Unreachable as error:
             return refused("not confirmed", [str(error)])
+        if left_out is None and not self._on_watch() and not self._records.one_step.locked():
+            self.look_again()  # whoever says it without end holds up nothing
+            return reply
         async with self._records.one_step:
             given_up = self._on_watch()
             try:
-                await self._records.note("rollback-asked", who, {"comment": comment})
+                if left_out is not None:
+                    await self._records.note("rollback-asked", who, with_left_out({"comment": comment}, left_out))
             except AuditUnavailable as error:
                 recorded = f"; it could not be recorded: {error}"
             try:
@@ -213,15 +231,12 @@ class Deployer:
         await self._inbox.close()
 
     async def at_hand(self, beginning: str | None = None) -> None:
-        """Before `watch`, `listed`, `shown` and `decide`: what they need of the disk. None: of what waits."""
-        wanted = list[Entry]()
+        """Before `watch`, `listed`, `shown` and `decide`: what they need of the disk. `beginning`: of this proposal."""
+        if self._line.gate.autonomy == "approve-first":  # whether it passes by itself depends on what it is
+            await self._small.look()
         if beginning is not None:
-            wanted = [one for hash_, one in self.book.entries.items() if hash_.startswith(beginning)][:1]
-        elif self._line.gate.autonomy == "approve-first":  # whether it passes by itself depends on what it is
-            wanted = [one for one in reversed(self.book.undecided) if one.stage is Stage.WAITING][:MOST_AT_HAND]
-        if self._line.gate.autonomy == "approve-first":
-            wanted += [self.book.entries[one] for one in self.book.trusted.values()]
-        await self._records.fetch(wanted)
+            found = (one for hash_, one in self.book.entries.items() if hash_.startswith(beginning))
+            await self._records.fetch(islice(found, 1))
 
     def listed(self, most: int, skip: int = 0) -> ProposalList:
         """The newest first, but for the first `skip`; with those that are not done with, where none are left out."""
@@ -272,7 +287,9 @@ class Deployer:
             return f"not kept yet: {self._on_the_line.unseen() or 'about to be'}"
         if entry.stage is not Stage.WAITING:
             return entry.why
-        reasons = self._why_a_person(entry) if self._line.gate.autonomy == "approve-first" else [entry.why]
+        reasons: list[str] | None = [entry.why]
+        if self._line.gate.autonomy == "approve-first" and (reasons := self._small.why_a_person(entry)) is None:
+            reasons = ["whether it passes by its verdict alone was not looked at yet"]
         if self._line.gate.approvals > 1:
             first = self._first(entry)
             two = "it takes two people" if first is None else f"{first.name} has approved it, it takes another person"
@@ -286,7 +303,10 @@ class Deployer:
 
     def _first(self, entry: Entry) -> FirstApproval | None:
         """The first approval of what would be approved now; None: there is none."""
-        return entry.first if entry.first is not None and entry.first.shown == self._shown_hash(entry) else None
+        first = entry.first
+        if first is None or first.shown != self._shown_hash(entry):
+            return None
+        return first if still_counts(first, self._own_uid, self._roles()) else None
 
     async def _approve_once(self, entry: Entry, what: dict[str, Any], who: Who) -> Reply:
         await self._records.step(APPROVED_ONCE, what, who)
@@ -327,33 +347,22 @@ class Deployer:
     async def _approve_small(self) -> None:
         """Where the line's file allows it: what is like enough to what a person approved passes by its verdict alone.
 
-        One a look, and each once: what could not be carried out waits for a person.
+        One a look, and each once: what could not be carried out waits for a person, and what was not looked at yet for
+        the next look.
         """
         if self._line.gate.autonomy != "approve-first" or self.book.on_the_line is not None:
             return
         for entry in self.book.entries.values():
             if entry.stage is Stage.WAITING and entry.proposal not in self._looked_at:
+                if (reasons := self._small.why_a_person(entry)) is None:
+                    continue
                 self._looked_at.add(entry.proposal)
-                if not self._why_a_person(entry):
+                if not reasons:
                     found = await self._on_the_line.settle()
                     what = {"proposal": entry.proposal, "by": VERDICT, "like": self.book.trusted[entry.kind]}
                     await self._records.step("approved", what, GATEWAY)
                     await self._on_the_line.carry_out(self.book.entries[entry.proposal], found, GATEWAY)
                 return
-
-    def _why_a_person(self, entry: Entry) -> list[str]:
-        """Why a person must decide; empty: the verdict is enough."""
-        if (trusted := self.book.trusted.get(entry.kind)) is None:
-            return [f"no person has approved a change of {entry.kind} yet, or one was rolled back since"]
-        before, now = self.book.entries[trusted], self._records.proposal(entry)
-        reasons = beyond_small(self._records.proposal(before).change, now.change, self._line.gate.small_share)
-        if isinstance(now.change, GainsChange):
-            regions = [
-                verdict and verdict.region for verdict in (self._records.verdict(before), self._records.verdict(entry))
-            ]
-            if regions[0] is None or regions[1] is None or not regions[1].within(regions[0]):
-                reasons.append("it would be in service further than what a person approved")
-        return reasons
 
 
 def _line_of(entry: Entry, why: str) -> ProposalLine:

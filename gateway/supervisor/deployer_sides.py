@@ -10,6 +10,7 @@ from gateway.core.messages import Command, Reply
 from gateway.core.proposal import Proposal
 from gateway.core.recording import Recording
 from gateway.core.verdict import Verdict
+from gateway.supervisor.audit_file import AuditUnavailable
 from gateway.supervisor.lifecycle import Book
 
 
@@ -19,6 +20,10 @@ class NotTakenUp(Exception):
 
 class NotKnown(Exception):
     """Something without which nothing can be judged or deployed; the text says what, and what to do."""
+
+
+class NotAtHand(AuditUnavailable):
+    """It was not fetched, or could not be; the text says so."""
 
 
 class AuditSide(Protocol):
@@ -33,7 +38,10 @@ class AuditSide(Protocol):
         ...
 
     def blob(self, id_: str) -> bytes | None:
-        """What lies beside the records under this hash. Raises AuditUnavailable."""
+        """What lies beside the records under this hash; None: it is not what was stored. Reads no disk.
+
+        Raises NotAtHand.
+        """
         ...
 
 

@@ -1,7 +1,8 @@
 """Proposals judged for whoever wants to know beforehand: one at a time, after those that are judged for good.
 
-They have a judge's process of their own, begun with the first and nicer than all others, so that a verdict never waits
-for one of them. What it finds is handed out as a `DryRun`; the deployer takes verdicts from its own judge alone.
+They have a judge's process beside that of the deployer, begun with the first and nicer than all others, so that a
+verdict never waits for one of them. What it finds is handed out as a `DryRun`; the deployer takes verdicts from its own
+judge alone.
 """
 
 import asyncio
@@ -14,9 +15,9 @@ from gateway.core.line import Line
 from gateway.core.recording import Recording
 from gateway.core.verdict import Verdict
 from gateway.supervisor.deployer import Deployer
+from gateway.supervisor.judging import LONGER
 
 MOST = 4  #: under way and waiting
-LONGER = 4.0  #: times gate.verdict_max_s: a dry run has only what the others leave of the processors
 
 
 class TooMany(Exception):

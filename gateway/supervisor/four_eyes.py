@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from gateway.core.audit_record import Who
-from gateway.core.people import SCRIPTS
+from gateway.core.people import SCRIPTS, Role, may
 
 APPROVED_ONCE = "approved-once"  #: the kind of its record
 _PERSON = re.compile(r"([a-z][a-z0-9._-]{0,31}) \([a-z]+, [a-z-]+\)")  # as `who_is` writes it
@@ -43,6 +43,19 @@ def why_no_person(who: Who, own_uid: int) -> str:
     return (
         f"{who.name} is no person, and this line takes two: approve it on the page, or through OPC UA, as a user of "
         "`r2rgate users`"
+    )
+
+
+def still_counts(first: FirstApproval, own_uid: int, roles: Mapping[str, Role] | None) -> bool:
+    """Whether a first approval that is on record is that of somebody who may approve now.
+
+    `roles`: of the people who may come in; None: not known yet.
+    """
+    if uids := [one for one in first.approver if one.startswith("uid ")]:
+        return not {"uid 0", f"uid {own_uid}"} & set(uids)
+    return not any(
+        name.startswith(SCRIPTS) or (roles is not None and (name not in roles or not may(roles[name], "decide")))
+        for name in first.approver
     )
 
 

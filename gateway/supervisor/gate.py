@@ -2,7 +2,7 @@
 
 import asyncio
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from importlib.metadata import version
 from pathlib import Path
 
@@ -13,6 +13,7 @@ from gateway.core.controller import Controller, ControllerRefused, config_hash, 
 from gateway.core.decisions import DECISION, QUERY, Archive, Decide, LineChanged, ListProposals, RollBackNow
 from gateway.core.line import Line
 from gateway.core.messages import Command, Deploy, Event, Keep, Reply, WatchGood, command_bytes
+from gateway.core.people import Role
 from gateway.core.proposal import GainsChange, ModelChange, Proposal
 from gateway.core.status import ChangeStatus
 from gateway.core.topics import GATEWAY_DECISION, GATEWAY_PROPOSALS, GATEWAY_PROPOSE, LOOP_COMMAND
@@ -75,6 +76,8 @@ class Gate:
         wall_clock: Callable[[], float],
     ) -> None:
         self.deployer: Deployer | None = None
+        #: Of the people who may come in; None: nobody has told yet.
+        self.roles: Callable[[], Mapping[str, Role] | None] = lambda: None
         self._line = line
         self._folder = folder
         self._judge = judge
@@ -153,6 +156,7 @@ class Gate:
         self.deployer = Deployer(
             self._line, book, KeptAudit(self._folder, self.audit), self._loop, self._judge,
             self._around(*self._stores), self._take_up, self._clock, self._wall_clock,
+            roles=lambda: self.roles(),
         )  # fmt: skip
 
     def _learn_again(self, deployer: Deployer) -> None:
@@ -230,8 +234,10 @@ class Gate:
             return _not_understood(error)
         return (await self.decide(decision, who_of(PEER.get()))).model_dump_json().encode()
 
-    async def decide(self, decision: Decide | RollBackNow | Archive | LineChanged, who: Who) -> Reply:
-        """What a person, or a program in a person's place, says."""
+    async def decide(
+        self, decision: Decide | RollBackNow | Archive | LineChanged, who: Who, left_out: int | None = 0
+    ) -> Reply:
+        """What a person, or a program in a person's place, says; `left_out`: as of `Bounded`, where none is refused."""
         if self.deployer is None:
             reply = self.shut_reply()
         elif isinstance(decision, Decide):
@@ -244,7 +250,7 @@ class Gate:
         elif isinstance(decision, LineChanged):
             reply = await self._line_changed(self.deployer, decision, who)
         else:
-            reply = await self.deployer.roll_back(decision.comment, who)
+            reply = await self.deployer.roll_back(decision.comment, who, left_out)
         self._note("decision", f"{who.name}: {reply.text}", ok=reply.ok, reasons=reply.reasons)
         if isinstance(decision, Decide) and not reply.ok:
             await self._record_refusal(decision, reply, who)
@@ -259,6 +265,7 @@ class Gate:
         try:
             await self.audit.append("refused-decision", who, with_left_out(what, left_out))
         except AuditUnavailable as error:
+            self._refusals.undo(who.name, left_out + 1)
             self._note("gate", f"a refusal could not be recorded: {error}")
 
     async def _line_changed(self, deployer: Deployer, said: LineChanged, who: Who) -> Reply:

@@ -23,6 +23,7 @@ from gateway.core.verdict import Verdict
 from gateway.mailbox.spawned import end_with_parent, interrupt_later, one_thread_each
 
 NICER, NICEST = 10, 19  #: than the process that starts them; and where nobody waits for a verdict
+LONGER = 4.0  #: times gate.verdict_max_s: what is nicest has only what the others leave of the processors
 BEGIN_S = 600.0  #: until one is ready: on a new machine it compiles first
 LARGEST_SEED = 2**53  #: below it every number is one in JSON, too
 #: Rules under which this process refuses by itself.
@@ -30,10 +31,6 @@ TIME_RULE, WORKER_RULE = "time", "judge process"
 
 
 Answer = TypeVar("Answer", Verdict, Courses)
-
-
-class Busy(Exception):
-    """Every worker is at a proposal."""
 
 
 class NoVerdict(Exception):
@@ -149,14 +146,11 @@ class JudgeWorkers:
             return await asyncio.to_thread(_refusal, payload, context, self._line, seed, none)
 
     async def courses(self, payload: bytes, context: JudgeContext, region: Region) -> Courses:
-        """What the figures of a verdict for `region` are of, to be drawn.
+        """What the figures of a verdict for `region` are of, to be drawn; for workers that no proposal waits for.
 
-        Raises Busy where all are at something, so that no verdict waits for it, and NoVerdict where none come within
-        the time of a verdict.
+        Raises NoVerdict where none come in time.
         """
-        if self._idle.empty():
-            raise Busy
-        return await self._asked((payload, context, region), self._line.gate.verdict_max_s, Courses)
+        return await self._asked((payload, context, region), LONGER * self._line.gate.verdict_max_s, Courses)
 
     async def _asked(self, job: tuple[Any, ...], limit_s: float, wanted: type[Answer]) -> Answer:
         """Raises NoVerdict."""

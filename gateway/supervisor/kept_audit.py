@@ -8,9 +8,10 @@ from typing import Any
 
 from gateway.core.audit_record import Who, head_of
 from gateway.supervisor.audit import Audit
-from gateway.supervisor.audit_file import AuditFile
+from gateway.supervisor.audit_file import AuditFile, AuditUnavailable
+from gateway.supervisor.deployer_sides import NotAtHand
 
-MOST_KEPT, LARGEST_KEPT = 64, 1_000_000  #: proposals and verdicts that are being looked at, bytes of one
+MOST_KEPT, MOST_BYTES = 64, 32_000_000  #: proposals and verdicts that are being looked at; one is kept in any case
 LOOKED_AT = ("proposal", "verdict")  #: parts of a record
 
 
@@ -20,7 +21,10 @@ class KeptAudit:
     def __init__(self, folder: Path, audit: Audit) -> None:
         self._folder = folder
         self._audit = audit
-        self._blobs: OrderedDict[str, bytes] = OrderedDict()  #: the last ones that were asked for
+        #: The last ones that were asked for; None: it is not what was stored.
+        self._blobs: OrderedDict[str, bytes | None] = OrderedDict()
+        self._bytes = 0  #: of all of them
+        self._trouble = ""  #: why nothing could be fetched
 
     async def append(
         self, kind: str, who: Who, what: Mapping[str, Any], blobs: Mapping[str, bytes] | None = None
@@ -33,27 +37,35 @@ class KeptAudit:
 
     async def fetch(self, ids: Iterable[str]) -> None:
         """In a thread, so that `blob` does not wait for a disk. Raises AuditUnavailable."""
-        if missing := [one for one in ids if one not in self._blobs][:MOST_KEPT]:
-            for id_, content in (await asyncio.to_thread(self._read, missing)).items():
-                self._keep(id_, content)
+        wanted = list(ids)
+        for id_ in wanted:
+            if id_ in self._blobs:
+                self._blobs.move_to_end(id_)
+        missing = [one for one in wanted if self._blobs.get(one) is None][:MOST_KEPT]
+        if not missing:
+            return
+        try:
+            found = await asyncio.to_thread(self._read, missing)
+        except AuditUnavailable as error:
+            self._trouble = str(error)
+            raise
+        self._trouble = ""
+        for id_ in missing:
+            if id_ in found or self._blobs.get(id_) is None:  # else it was stored meanwhile
+                self._keep(id_, found.get(id_))
 
     def blob(self, id_: str) -> bytes | None:
-        """A file is looked at before it is read, which takes its time: what has a hash for a name is read once."""
-        if (known := self._blobs.get(id_)) is not None:
-            self._blobs.move_to_end(id_)
-            return known
-        found = self._read([id_]).get(id_)
-        if found is not None:
-            self._keep(id_, found)
-        return found
+        if id_ not in self._blobs:
+            raise NotAtHand(self._trouble or f"{id_[:12]} was not read from the audit yet: ask again")
+        self._blobs.move_to_end(id_)
+        return self._blobs[id_]
 
     def _read(self, ids: Iterable[str]) -> dict[str, bytes]:
         with AuditFile(self._folder) as file:
             return {id_: content for id_ in ids if (content := file.blob(id_)) is not None}
 
-    def _keep(self, id_: str, content: bytes) -> None:
-        if len(content) > LARGEST_KEPT:
-            return
+    def _keep(self, id_: str, content: bytes | None) -> None:
+        self._bytes += len(content or b"") - len(self._blobs.pop(id_, None) or b"")
         self._blobs[id_] = content
-        while len(self._blobs) > MOST_KEPT:
-            self._blobs.popitem(last=False)
+        while len(self._blobs) > MOST_KEPT or (self._bytes > MOST_BYTES and len(self._blobs) > 1):
+            self._bytes -= len(self._blobs.popitem(last=False)[1] or b"")

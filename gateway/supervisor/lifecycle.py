@@ -83,6 +83,7 @@ class Entry:
     why: str = ""
     verdict: str | None = None  #: hash
     judged_by: str | None = None  #: hash of the model, once there is a verdict; None: by the line's file
+    line: str | None = None  #: hash of the line's file by which it was judged; None: not on record
     epoch: int | None = None
     by_person: bool = False  #: approved by one, not by its verdict alone
     first: FirstApproval | None = None  #: while it waits for a second one
@@ -100,6 +101,8 @@ class Book:
     epoch: int = 0  #: of the last deployment that the loop has taken, or is being told of
     region: Region = Region()  #: in which the loop lets it run
     model: str | None = None
+    #: Hash of the line's file as this process has read it, which no record tells; None: nobody asks.
+    line: str | None = field(default=None, compare=False)
     changed_s: float | None = None  #: Unix time at which how the line is controlled has changed last
     line_changed_s: float | None = None  #: Unix time at which somebody said last that the line itself has changed
     before_change: int = 0  #: proposals that there were then: they say nothing of the line as it is now
@@ -144,7 +147,11 @@ class Book:
 
     def why_outdated(self, entry: Entry) -> str:
         """Why its verdict counts no more, while it waits; empty: it counts."""
-        if entry.stage not in (Stage.WAITING, Stage.APPROVED) or entry.judged_by == self.model:
+        if entry.stage not in (Stage.WAITING, Stage.APPROVED):
+            return ""
+        if self.line is not None and entry.line != self.line:
+            return "it was judged by the line's file as it was before it was changed: propose it again"
+        if entry.judged_by == self.model:
             return ""
         by = "the line's file" if entry.judged_by is None else f"model {entry.judged_by[:12]}"
         now = "the line's file" if self.model is None else f"model {self.model[:12]}"
@@ -203,7 +210,7 @@ class Book:
         entry = self.entries[proposal]
         more: dict[str, Any] = {key: what[key] for key in ("verdict", "epoch") if key in what}
         if kind == "accepted":  # records of an earlier version do not say by which model
-            more["judged_by"] = what.get("model", self.model)
+            more["judged_by"], more["line"] = what.get("model", self.model), what.get("line")
         if kind == "deploying":
             more["region"] = _region(what)
         if kind == "approved":

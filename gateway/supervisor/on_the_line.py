@@ -78,6 +78,7 @@ class OnTheLine:
             await self._look_after(await self.settle())
 
     async def carry_out(self, entry: Entry, found: InService, who: Who) -> Reply:
+        await self._records.fetch([entry])
         proposal = self._records.proposal(entry)
         self._take_up(proposal, entry.verdict)
         if isinstance(proposal.change, GainsChange):
@@ -228,6 +229,7 @@ class OnTheLine:
     async def _end_unheard(self, entry: Entry, now_s: float) -> None:
         """Of an experiment whose end nobody has told: the loop was started anew, or this process."""
         if self._experiment is None or self._experiment[0] != entry.proposal:
+            await self._records.fetch([entry])
             change = self._records.proposal(entry).change
             takes_s = change.experiment.duration_s if isinstance(change, ExperimentChange) else 0.0
             self._experiment = (entry.proposal, now_s + takes_s + UNHEARD_S)

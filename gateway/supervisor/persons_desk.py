@@ -30,12 +30,12 @@ class PersonsDesk:
         self,
         mailbox: Mailbox,
         command: Callable[[bytes, Who], Awaitable[Reply]],
-        decide: Callable[[Decision, Who], Awaitable[Reply]],
+        decide: Callable[[Decision, Who, int | None], Awaitable[Reply]],
         alarm: Callable[[AlarmSaid, Who], Awaitable[Reply]],
         note: Callable[[str, Who, Mapping[str, Any]], Awaitable[object]],
         clock: Callable[[], float],
     ) -> None:
-        """`note` appends a record to the audit; raises AuditUnavailable."""
+        """`note` appends a record to the audit; raises AuditUnavailable. `decide` is told what was left out, too."""
         self._command = command
         self._decide = decide
         self._alarm = alarm
@@ -55,7 +55,8 @@ class PersonsDesk:
         if reason := why_may_not(person, said.command):
             if (left_out := self._refusals.left_out(who.name)) is not None:
                 what = with_left_out({"command": said.command, "because": reason}, left_out)
-                await self._kept("refused-person", who, what)
+                if await self._kept("refused-person", who, what):
+                    self._refusals.undo(who.name, left_out + 1)
             return _reply(Reply(ok=False, state="", text=reason, reasons=[reason]))
         if isinstance(said, Decide) and person.is_script:
             said = said.model_copy(update={"script": said.script or A_PROGRAM})
@@ -64,7 +65,7 @@ class PersonsDesk:
             text = f"{person.name} says too much at once: try again in a minute"
             return _reply(Reply(ok=False, state="", text=text, reasons=[text]))
         if isinstance(said, Decision):
-            return _reply(await self._decide(said, who))
+            return _reply(await self._decide(said, who, left_out))
         if isinstance(said, AlarmSaid):
             return _reply(await self._alarm(said, who))
         return _reply(await self._operate(said, who, left_out))
@@ -75,7 +76,8 @@ class PersonsDesk:
         if left_out is None:
             return reply
         what = with_left_out({"command": in_words(said), "done": reply.ok, "answer": reply.text}, left_out)
-        unkept = await self._kept("operated", who, what)
+        if unkept := await self._kept("operated", who, what):
+            self._said.undo(who.name, left_out + 1)
         return reply.model_copy(update={"text": f"{reply.text}{unkept}"}) if unkept else reply
 
     async def _kept(self, kind: str, who: Who, what: Mapping[str, Any]) -> str:

@@ -23,7 +23,7 @@ from gateway.supervisor.agents_cases import AgentsCases
 from gateway.supervisor.agents_desk import AgentsDesk
 from gateway.supervisor.alarms import Alarms
 from gateway.supervisor.configurations import Configurations
-from gateway.supervisor.courses_desk import CoursesDesk, Draws
+from gateway.supervisor.courses_desk import CoursesDesk
 from gateway.supervisor.deployer_sides import JudgeSide
 from gateway.supervisor.dry_runs import DryRuns
 from gateway.supervisor.experiments import MOST_EXPERIMENTS, newest_experiments
@@ -56,7 +56,7 @@ def run_gateway(line: Line, run_folder: Path, data_folder: Path) -> int:
         return EXIT_CANNOT_LISTEN
 
 
-class Judging(JudgeSide, Draws, Protocol):
+class Judging(JudgeSide, Protocol):
     def begin(self) -> None:
         """So that the first verdict does not wait for it."""
         ...
@@ -104,10 +104,12 @@ async def serve(
     alarms = Alarms(mailbox, data_folder, gate.audit.append, gateway.note, clock, wall_clock)
     gateway.alarms = alarms.status
     PersonsDesk(mailbox, gateway.command, gate.decide, alarms.say, gate.audit.append, clock)
-    AccessDesk(mailbox, gate.audit.append, clock)
-    courses = CoursesDesk(mailbox, lambda: gate.deployer, judge)
+    gate.roles = AccessDesk(mailbox, gate.audit.append, clock).roles
+    # One process for what nobody's verdict may wait for.
+    beside = JudgeWorkers(line, nicer=NICEST)
+    courses = CoursesDesk(mailbox, lambda: gate.deployer, beside)
     past = Past(line, mailbox, data_folder, lambda: historian.path)
-    dry_runs = DryRuns(line, JudgeWorkers(line, nicer=NICEST))
+    dry_runs = DryRuns(line, beside)
     cases = AgentsCases(gate.audit.append, clock)
     desk = AgentsDesk(gateway.status, gate, dry_runs, Interactions(data_folder), gateway.note, cases)
     line_desk = LineDesk(line, gate, data_folder, experiments, cases)
@@ -129,9 +131,9 @@ async def serve(
         await alarms.keep()
         await opening
         await bus.close()
+        await courses.close()
         await dry_runs.close()
         await past.close()
-        await courses.close()
         await gate.close()
         await judge.close()
         await mailbox.close()

@@ -111,7 +111,9 @@ class Inbox:
                 self._records.trouble = str(error)  # it stays as received, and is judged again
 
     async def _judgement(self, hash_: str) -> tuple[str, dict[str, Any], dict[str, bytes]]:
-        proposal = self._records.proposal(self._records.book.entries[hash_])
+        entry = self._records.book.entries[hash_]
+        await self._records.fetch([entry])
+        proposal = self._records.proposal(entry)
         context, recordings = await self._surroundings.context(self._records.book)
         verdict = await self._judge.judge(canonical(proposal), context, recordings)
         what = {
@@ -119,6 +121,7 @@ class Inbox:
             "verdict": verdict_hash(verdict),
             "context": context_hash(context),
             "model": None if context.model is None else model_hash(context.model),
+            "line": verdict.line,
             "seed": verdict.seed,
             "because": _first_reason(verdict),
         }

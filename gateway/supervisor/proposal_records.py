@@ -48,11 +48,11 @@ class ProposalRecords:
             pass
 
     def proposal(self, entry: Entry) -> Proposal:
-        """Raises AuditUnavailable."""
+        """Once it is fetched. Raises AuditUnavailable."""
         return Proposal.model_validate_json(self._kept(entry.proposal))
 
     def verdict(self, entry: Entry) -> Verdict | None:
-        """None: there is none yet. Raises AuditUnavailable."""
+        """None: there is none yet. Once it is fetched. Raises AuditUnavailable."""
         return None if entry.verdict is None else Verdict.model_validate_json(self._kept(entry.verdict))
 
     async def context(self, verdict: Verdict) -> JudgeContext:
@@ -61,7 +61,7 @@ class ProposalRecords:
         return JudgeContext.model_validate_json(self._kept(verdict.context))
 
     def _kept(self, id_: str) -> bytes:
-        """Raises AuditUnavailable where it is no longer what was stored."""
+        """Raises NotAtHand, and AuditUnavailable where it is no longer what was stored."""
         if (content := self._audit.blob(id_)) is None:
             raise AuditUnavailable(f"the audit has lost {id_[:12]}: `r2rgate audit verify` tells more")
         return content

@@ -123,7 +123,9 @@ def _refused_decision(who: str, what: What) -> str:
 
 
 def _logged_in(who: str, what: What) -> str:
-    return f"{who} has come in from {_of(what, 'address')}{_left_out(what)}"
+    untold = what.get("untold", 0)
+    others = f" (and {untold} others before, of whom nothing else is known)" if untold else ""
+    return f"{who} has come in from {_of(what, 'address')}{_left_out(what)}{others}"
 
 
 def _wrong_logins(_: str, what: What) -> str:
@@ -171,7 +173,7 @@ SENTENCES: dict[str, Callable[[str, What], str]] = {
     "experiment-ends": _experiment_ends,
     "model-in-service": lambda who, what: f"proposals are judged by model {_hash(what, 'model')} from now on",
     "found-in-service": _found,
-    "rollback-asked": lambda who, what: f"{who} asks for what was before{quoted(what.get('comment'))}",
+    "rollback-asked": lambda who, what: f"{who} asks for what was before{quoted(what.get('comment'))}{_left_out(what)}",
     "line-changed": lambda who, what: f"{who} says that the line has changed{quoted(what.get('because'))}",
     "archived": _archived,
     "not-archived": _not_archived,

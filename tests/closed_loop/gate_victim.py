@@ -17,14 +17,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gateway.cli.lifetime import follow_parent
-from gateway.core.courses import Courses
 from gateway.core.deployment import Region
 from gateway.core.judge_context import JudgeContext, context_hash
+from gateway.core.line import Line
 from gateway.core.line_file import load_line
 from gateway.core.recording import Recording
-from gateway.core.verdict import RuleFinding, Verdict
+from gateway.core.verdict import RuleFinding, Verdict, line_hash
 from gateway.supervisor.audit import Audit
-from gateway.supervisor.judging import Busy
 from gateway.supervisor.process import serve
 
 TOLD, TOLD_FILE = struct.Struct("<Q64s"), "told.bin"
@@ -50,22 +49,20 @@ class FastTime:
 class QuickJudge:
     """Says yes to all but those that are bad, after some milliseconds."""
 
-    def __init__(self, rng: random.Random) -> None:
+    def __init__(self, rng: random.Random, line: Line) -> None:
         self._rng = rng
+        self._line = line_hash(line)
 
     def begin(self) -> None: ...
 
     async def close(self) -> None: ...
 
-    async def courses(self, payload: bytes, context: JudgeContext, region: Region) -> Courses:
-        raise Busy
-
     async def judge(self, payload: bytes, context: JudgeContext, recordings: list[Recording]) -> Verdict:
         await asyncio.sleep(self._rng.uniform(0.0, 0.03))
         hash_, accepted = hashlib.sha256(payload).hexdigest(), BAD.encode() not in payload
         return Verdict(
-            format=1, proposal=hash_, payload=hash_, context=context_hash(context), line="0" * 64, kind="gains", seed=1,
-            accepted=accepted, findings=[RuleFinding(rule="test", passed=accepted, text="as a test wants it")],
+            format=1, proposal=hash_, payload=hash_, context=context_hash(context), line=self._line, kind="gains",
+            seed=1, accepted=accepted, findings=[RuleFinding(rule="test", passed=accepted, text="as a test wants it")],
             region=Region(speed_max_m_per_s=0.1) if accepted else None, judged=context.now, program_version="0",
         )  # fmt: skip
 
@@ -82,7 +79,7 @@ def live(folder: Path, scale: float, began_s: float) -> None:
     Audit.append = telling
     line = load_line((folder / "line.toml").read_text(), "line.toml")
     fast = FastTime(scale, began_s)
-    judge = QuickJudge(random.Random(os.getpid()))
+    judge = QuickJudge(random.Random(os.getpid()), line)
     asyncio.run(serve(line, folder / "run", folder / "data", judge, fast.clock, fast.wall_clock, LOOK_S))
 
 

@@ -7,6 +7,7 @@ from gateway.core.controller import config_hash
 from gateway.core.decisions import Decide
 from gateway.core.line_model import model_hash
 from gateway.core.proposal import ModelChange, canonical
+from gateway.core.verdict import line_hash
 from gateway.supervisor.deployer import Deployer
 from gateway.supervisor.lifecycle import Stage, book_of
 from tests.unit.deployer_support import (
@@ -44,6 +45,7 @@ class Gateway:
         self.judge = FakeJudge()
         self.surroundings = FakeSurroundings(self.loop)
         self.proposals = {}
+        self.roles: dict[str, str] | None = None  #: of the people who may come in
         self.begin()
 
     def _checked(self, kind, what) -> None:
@@ -51,10 +53,16 @@ class Gateway:
             base = self.proposals[what["proposal"]].base
             assert self.loop.runs == what["before"] == base, "it was made for another configuration"
 
+        if kind in ("approved", "approved-once", "deploying", "model-in-service"):
+            told = [one for name, one in self.audit.records if name == "accepted"]
+            (by,) = [one["line"] for one in told if one["proposal"] == what["proposal"]]
+            assert by == line_hash(self.line), "it was judged by another line's file"
+
     def begin(self) -> None:
+        self.judge.line = line_hash(self.line)
         book, clock = book_of(self.audit.records), self._now_s
         args = (self.audit, self.loop, self.judge, self.surroundings, lambda proposal, verdict: None, clock, clock)
-        self.deployer = Deployer(self.line, book, *args, own_uid=OPERATORS_UID)
+        self.deployer = Deployer(self.line, book, *args, own_uid=OPERATORS_UID, roles=lambda: self.roles)
 
     def _now_s(self) -> float:
         return self.loop.now_s

@@ -188,14 +188,15 @@ class FakeJudge:
 
     refuses: set[str] = field(default_factory=set)
     region: Region = Region(speed_max_m_per_s=0.1)
+    line: str = "0" * 64  #: hash of its file
 
     async def judge(self, payload, context, recordings) -> Verdict:
         hash_ = hashlib.sha256(payload).hexdigest()
         accepted = hash_ not in self.refuses
         finding = RuleFinding(rule="test", passed=accepted, text="as the test wants it")
         return Verdict(
-            format=1, proposal=hash_, payload=hash_, context=context_hash(context), line="0" * 64, kind="gains", seed=1,
-            accepted=accepted, findings=[finding], region=self.region if accepted else None,
+            format=1, proposal=hash_, payload=hash_, context=context_hash(context), line=self.line, kind="gains",
+            seed=1, accepted=accepted, findings=[finding], region=self.region if accepted else None,
             judged=context.now, program_version="0",
         )  # fmt: skip
 

@@ -35,7 +35,7 @@ class Both:
         self.told: list[str] = []
         self.mailbox = InProcessMailbox(hub)
         self.path = folder / "users.toml"
-        AccessDesk(self.mailbox, self.note, lambda: self.now_s)
+        self.desk = AccessDesk(self.mailbox, self.note, lambda: self.now_s)
         self.side = LineSide(InProcessMailbox(hub))
         self.access = Access(self.side, UsersFile(self.path), self.told.append, lambda: self.now_s)
 
@@ -75,7 +75,10 @@ def test_who_came_in_while_nothing_could_be_recorded_is_on_record_later_and_the_
         both.access.came_in(OTTO.model_copy(update={"name": f"n{number}"}), "")
     assert both.look() == []
     both.audit_open = True
-    assert len([one for one in both.look() if "has come in" in one]) == MOST_WAITING
+    found = [one for one in both.look() if "has come in" in one]
+    assert len(found) == MOST_WAITING
+    told = [one.endswith("(and 5 others before, of whom nothing else is known)") for one in found]
+    assert told == [True] + [False] * (MOST_WAITING - 1)
     assert both.records[-1][1].startswith(f"n{MOST_WAITING + 4} ")
 
 
@@ -135,7 +138,7 @@ def test_every_change_of_the_users_is_on_record_and_nothing_that_proves_a_passwo
     assert both.look() == ["users have changed: otto is engineer instead of operator, vera is gone"]
     assert both.look(10 * REPORT_S) == []  # told again, and known
     users.without("vera").with_user("otto", SECRET + "!", "engineer").write(both.path)
-    assert both.look() == ["users have changed: a password"]
+    assert both.look() == ["users have changed: the file is another, with the same names and roles"]
     both.path.write_text("nonsense")
     for _ in range(3):
         assert both.look(REPORT_S) == []
@@ -187,3 +190,37 @@ def test_the_page_tells_who_has_logged_in_and_from_where_others_tried(both):
     asyncio.run(story())
     assert both.look() == ["otto (operator, page) has come in from 127.0.0.9"]
     assert both.look(REPORT_S) == ["wrong names or passwords: 1 from 127.0.0.9 (page)"]
+
+
+@pytest.mark.parametrize("tries", [1, 5 * AT_ONCE])
+def test_what_happens_while_the_audit_is_away_is_on_record_once_it_is_back_however_often_it_was_told(both, tries):
+    both.look()
+    both.access.came_in(OTTO, "192.0.2.7")
+    both.access.refused("page", "192.0.2.8", None, "x")
+    both.audit_open = False
+    for _ in range(tries):
+        assert both.look(REPORT_S) == []
+    both.audit_open = True
+    assert both.look(REPORT_S) == [
+        "otto (operator, page) has come in from 192.0.2.7", "wrong names or passwords: 1 from 192.0.2.8 (page)",
+    ]  # fmt: skip
+
+
+def test_what_came_too_often_stays_counted_while_the_audit_is_away():
+    bounded = Bounded(lambda: now_s)
+    now_s = 0.0
+    assert [bounded.left_out("a") for _ in range(AT_ONCE + 3)] == [0] * AT_ONCE + [None] * 3
+    for _ in range(2 * AT_ONCE):
+        now_s += EVERY_S
+        assert bounded.left_out("a") == 3
+        bounded.undo("a", 3)
+
+
+def test_the_newest_users_are_known_whether_on_record_or_not(both, users):
+    desk = AccessDesk(InProcessMailbox(Hub()), both.note, lambda: both.now_s)
+    assert desk.roles() is None
+    both.look()
+    both.audit_open = False
+    users.write(both.path)
+    assert both.look() == []
+    assert both.desk.roles() == {"otto": "operator", "vera": "viewer"}

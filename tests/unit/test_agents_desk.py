@@ -38,9 +38,10 @@ from gateway.supervisor.agents_cases import RECORD_EVERY_S, AgentsCases
 from gateway.supervisor.agents_desk import AgentsDesk
 from gateway.supervisor.audit_file import AuditFile, AuditUnavailable
 from gateway.supervisor.deployer_sides import NotKnown
-from gateway.supervisor.dry_runs import LONGER, MOST, DryRuns
+from gateway.supervisor.dry_runs import MOST, DryRuns
 from gateway.supervisor.gate import Gate
 from gateway.supervisor.interactions import Interactions
+from gateway.supervisor.judging import LONGER
 from gateway.supervisor.lifecycle import Stage
 from gateway.supervisor.line_desk import LineDesk
 from tests.unit.deployer_support import FIRST, LINE, Death, FakeJudge, FakeLoop, FakeSurroundings, proposal

@@ -10,8 +10,8 @@ from gateway.core.messages import Reply
 from gateway.core.proposal import canonical
 from gateway.core.topics import GATEWAY_COURSES
 from gateway.mailbox.unix import UnixMailbox
-from gateway.supervisor.courses_desk import CoursesDesk
-from gateway.supervisor.judging import TIME_RULE, Busy, NoVerdict
+from gateway.supervisor.courses_desk import MOST_KEPT, CoursesDesk
+from gateway.supervisor.judging import TIME_RULE, NoVerdict
 from tests.unit.deployer_gateway import Gateway, started
 from tests.unit.deployer_support import FIRST, hash_of, proposal
 from tests.unit.supervisor_support import short_folder
@@ -82,14 +82,14 @@ def test_the_first_to_ask_is_told_to_ask_again_and_they_are_drawn_once():
     told(judge, story)
 
 
-def test_while_the_judge_is_busy_it_is_tried_again_and_what_cannot_be_drawn_is_not():
-    judge = Draws(Busy(), Busy(), NoVerdict(TIME_RULE, "too long"))
+def test_what_cannot_be_drawn_is_not_tried_again():
+    judge = Draws(NoVerdict(TIME_RULE, "too long"))
 
     async def story(gateway: Gateway, ask: Ask) -> None:
         one = await waiting(gateway)
         assert (await drawn(ask, hash_of(one))).courses == []
         assert (await drawn(ask, hash_of(one))).courses == []
-        assert len(judge.asked) == 3
+        assert len(judge.asked) == 1
 
     told(judge, story)
 
@@ -108,5 +108,26 @@ def test_what_waits_no_more_keeps_its_courses_and_gets_no_new_ones():
             assert not refused.ok and refused.reasons
         assert not Reply.model_validate_json(await ask("nonsense")).ok
         assert len(judge.asked) == 1
+
+    told(judge, story)
+
+
+def test_however_many_wait_each_is_drawn_once_and_of_what_waits_no_more_the_last_asked_for_are_kept():
+    judge, count = Draws(), 2 * MOST_KEPT
+
+    async def story(gateway: Gateway, ask: Ask) -> None:
+        every = [await waiting(gateway, number) for number in range(1, count + 1)]
+        for _ in range(2):
+            for one in every:
+                assert (await drawn(ask, hash_of(one))).courses == [DRAWN]
+        assert len(judge.asked) == count
+        for one in every:
+            assert (await gateway.decide(one, approve=False)).ok
+        await drawn(ask, hash_of(every[0]))
+        await drawn(ask, hash_of(await waiting(gateway, count + 1)))  # room is made with the next
+        for one in [every[0], *every[-MOST_KEPT + 1 :]]:
+            assert (await drawn(ask, hash_of(one))).courses == [DRAWN]
+        for one in every[1 : -MOST_KEPT + 1]:
+            assert not Reply.model_validate_json(await ask(hash_of(one))).ok
 
     told(judge, story)

@@ -2,10 +2,12 @@
 
 import asyncio
 
+import pytest
+
 from gateway.core.controller import config_hash
 from gateway.supervisor.lifecycle import Stage, book_of
 from tests.unit.deployer_gateway import ANNA, PROBATION_S, deployed, run, started
-from tests.unit.deployer_support import FIRST, LIFETIME_S, controller, hash_of, model_proposal, proposal
+from tests.unit.deployer_support import FIRST, LIFETIME_S, LINE, controller, hash_of, model_proposal, proposal
 
 
 @run
@@ -186,3 +188,29 @@ def test_records_that_do_not_say_by_which_model_was_judged_count_for_the_one_of_
         ("accepted", {"proposal": "5" * 64, "verdict": "7" * 64}),
     ])  # fmt: skip
     assert book.why_outdated(book.entries["5" * 64]) == "" and book.model == "3" * 64
+    book.line = "8" * 64  # nor do they say by which line's file: by none that is known
+    assert "before it was changed" in book.why_outdated(book.entries["5" * 64])
+
+
+@pytest.mark.parametrize("approved", [False, True])
+def test_what_was_judged_by_another_lines_file_is_not_carried_out(approved):
+    """Narrower limits were written, and the gateway started anew."""
+
+    async def test():
+        gateway = await started()
+        one = proposal(1, config_hash(FIRST), gateway.loop.now_s)
+        await gateway.propose(one)
+        if approved:
+            await gateway.audit.append("approved", ANNA, {"proposal": hash_of(one), "by": "person"})
+        slower = LINE.limits.model_copy(update={"speed_max_m_per_s": 0.5 * LINE.limits.speed_max_m_per_s})
+        gateway.line = LINE.model_copy(update={"limits": slower})
+        gateway.begin()
+        reply = await gateway.decide(one)
+        assert not reply.ok
+        if not approved:
+            assert "by the line's file as it was before it was changed" in reply.reasons[0]
+        await gateway.deployer.watch()
+        assert gateway.stage(one) is Stage.SUPERSEDED and gateway.loop.epoch == 0
+        assert gateway.audit.records[-1][1]["because"].endswith("propose it again")
+
+    asyncio.run(test())

@@ -130,6 +130,13 @@ class LifeCycle(RuleBasedStateMachine):
     def the_line_changes(self):
         self._run(self.gateway.deployer.line_changed("another web", ANNA))
 
+    @rule(speed_max_m_per_s=st.sampled_from([0.5, 1.0]))
+    def the_lines_file_is_edited(self, speed_max_m_per_s):
+        limits = self.line.limits.model_copy(update={"speed_max_m_per_s": speed_max_m_per_s})
+        self.gateway.line = self.line.model_copy(update={"limits": limits})
+        self.gateway.begin()
+        self._run(self._begin())
+
     @rule(effects=st.integers(1, 6), after=st.booleans())
     def death_is_near(self, effects, after):
         self.gateway.death.effects, self.gateway.death.after = effects, after

@@ -1,8 +1,10 @@
 """How proposals are listed: page by page, and nothing that waits is hidden by what came after it."""
 
 from gateway.core.controller import config_hash
+from gateway.supervisor.deployer_sides import NotAtHand
 from gateway.supervisor.lifecycle import Stage
-from tests.unit.deployer_gateway import Gateway, hash_of, run
+from gateway.supervisor.small_changes import MOST_AT_ONCE
+from tests.unit.deployer_gateway import PROBATION_S, TRUSTING, Gateway, hash_of, run, started
 from tests.unit.deployer_support import FIRST, proposal
 
 
@@ -30,3 +32,46 @@ async def test_pages_together_are_everything_once_but_for_what_waits():
     gateway, waits, others = await with_one_that_waits_before_many()
     pages = [[one.proposal for one in gateway.deployer.listed(2, skip).proposals] for skip in (2, 4, 6)]
     assert pages == [[others[2], others[1]], [others[0], waits], []]
+
+
+@run
+async def test_however_much_waits_nothing_is_read_that_was_not_fetched_and_everything_has_its_turn():
+    gateway = await started(TRUSTING)
+    one = proposal(1, config_hash(FIRST), 0.0)
+    await gateway.propose(one)
+    assert (await gateway.decide(one)).ok
+    await gateway.pass_time(PROBATION_S + 1.0)
+    far = [proposal(9, gateway.loop.runs, gateway.loop.now_s, nonce=k) for k in range(2 * MOST_AT_ONCE + 1)]
+    for each in far:
+        await gateway.propose(each)
+    small = proposal(2, gateway.loop.runs, gateway.loop.now_s, nonce=99)
+    await gateway.propose(small)
+    gateway.begin()
+    at_hand, reads = set[str](), list[str]()
+    blob = gateway.audit.blob
+
+    async def fetch(ids):
+        reads.extend(new := [id_ for id_ in ids if id_ not in at_hand])
+        at_hand.clear()  # it is little
+        at_hand.update(ids, new)
+
+    def only_at_hand(id_):
+        if id_ not in at_hand:
+            raise NotAtHand("not read yet")
+        return blob(id_)
+
+    gateway.audit.fetch, gateway.audit.blob = fetch, only_at_hand
+    for looked_at in (MOST_AT_ONCE, 2 * MOST_AT_ONCE):
+        await gateway.deployer.at_hand()
+        told = [line.why for line in reversed(gateway.deployer.listed(100).proposals) if line.stage == "waiting"]
+        assert all("differs by" in why for why in told[:looked_at])
+        assert set(told[looked_at:]) == {"whether it passes by its verdict alone was not looked at yet"}
+    gateway.loop.pass_time(1.0)
+    for _ in range(len(far) + 2):
+        await gateway.deployer.at_hand()
+        await gateway.deployer.watch()
+    assert gateway.stage(small) is Stage.PROBATION
+    read = len(reads)
+    gateway.deployer.listed(100)
+    await gateway.deployer.at_hand()
+    assert len(reads) == read

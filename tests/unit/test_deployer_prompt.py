@@ -49,3 +49,28 @@ async def test_what_was_shown_before_another_model_was_accepted_is_not_approved(
     reply = await gateway.decide(one, shown=shown)
     assert not reply.ok and "proposals are judged by model ffffffffffff now" in reply.reasons[0]
     assert gateway.stage(one) is Stage.WAITING and gateway.loop.runs == config_hash(FIRST)
+
+
+@run
+async def test_who_asks_for_what_was_before_without_end_is_heard_and_fills_no_disk():
+    gateway, one = await deployed()
+    assert (await gateway.deployer.roll_back("", ANNA, None)).ok
+    assert gateway.stage(one) is Stage.ROLLED_BACK and gateway.loop.runs == config_hash(FIRST)
+    records = len(gateway.audit.records)
+    gateway.loop.restart()
+    told, tell = [], gateway.loop.tell
+
+    async def counted(command):
+        told.append(command.command)
+        assert not gateway.deployer._records.one_step.locked()  # noqa: SLF001 (the gateway goes on looking)
+        return await tell(command)
+
+    gateway.loop.tell = counted
+    for _ in range(100):
+        assert (await gateway.deployer.roll_back("", ANNA, None)).ok
+    assert set(told) == {"rollback"} and len(told) == 100
+    assert "rollback-asked" not in gateway.audit.kinds and len(gateway.audit.records) == records
+    gateway.loop.tell = tell
+    assert (await gateway.deployer.roll_back("it squeals", ANNA, 101)).ok
+    (asked,) = [what for kind, what in gateway.audit.records if kind == "rollback-asked"]
+    assert asked == {"comment": "it squeals", "left_out": 101}

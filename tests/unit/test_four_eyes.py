@@ -205,13 +205,17 @@ async def test_without_an_audit_nobody_is_first():
 
 
 @run
-async def test_one_is_enough_where_the_file_says_nothing_and_after_it_says_so():
+async def test_a_line_whose_file_says_two_no_more_judges_anew():
     gateway, one = await waiting()
     await gateway.decide(one, who=ANNA)
-    gateway.line = FOUR_EYES.model_copy(update={"gate": FOUR_EYES.gate.model_copy(update={"approvals": 1})})
+    gateway.line = LINE
     gateway.begin()
-    assert (await gateway.decide(one, who=ANNA)).ok
-    assert gateway.stage(one) is Stage.PROBATION and gateway.audit.kinds.count("approved-once") == 1
+    assert not (await gateway.decide(one, who=ANNA)).ok
+    await gateway.deployer.watch()
+    assert gateway.stage(one) is Stage.SUPERSEDED
+    again = proposal(1, config_hash(FIRST), gateway.loop.now_s, nonce=2)
+    await gateway.propose(again)
+    assert (await gateway.decide(again, who=ANNA)).ok and gateway.stage(again) is Stage.PROBATION
 
 
 @run
@@ -244,3 +248,42 @@ async def test_a_decision_names_nobody_but_who_sent_it():
     decision = Decide(proposal=hash_of(one), shown=shown, approve=True, script="carla (engineer, page)")
     assert (await gateway.deployer.decide(decision, ANNA)).ok
     assert dict(gateway.audit.records)["approved-once"]["approver"] == ["anna", "uid 1000"]
+
+
+@pytest.mark.parametrize("roles", [{}, {"bert": "viewer"}])
+def test_a_first_who_was_removed_or_demoted_since_counts_no_more(roles):
+    async def test():
+        gateway, one = await waiting()
+        await gateway.decide(one, who=person("bert"))
+        gateway.roles = {"bert": "operator", "anna": "operator"}
+        assert "bert (operator, page) has approved it" in why(gateway, one)
+        gateway.roles = {**roles, "anna": "operator"}
+        assert why(gateway, one) == "it takes two people"
+        assert (await gateway.decide(one, who=person("anna"))).ok
+        assert gateway.stage(one) is Stage.WAITING and gateway.audit.kinds.count("approved-once") == 2
+        gateway.roles["carla"] = "engineer"
+        assert (await gateway.decide(one, who=person("carla"))).ok
+        assert gateway.stage(one) is Stage.PROBATION
+
+    asyncio.run(test())
+
+
+@pytest.mark.parametrize(
+    "approver", [["root", "uid 0"], ["r2rgate", f"uid {OPERATORS_PROCESS.uid}"], ["script-nightly"]]
+)
+def test_an_approval_on_record_by_no_person_is_not_the_first(approver):
+    """Versions before took it."""
+
+    async def test():
+        gateway, one = await waiting()
+        await gateway.decide(one, who=person("anna"))
+        kind, what = gateway.audit.records[-1]
+        assert kind == "approved-once"
+        what |= {"approver": approver, "name": approver[0]}
+        gateway.begin()
+        await gateway.deployer.watch()
+        assert why(gateway, one) == "it takes two people"
+        assert (await gateway.decide(one, who=BERT)).ok
+        assert gateway.stage(one) is Stage.WAITING
+
+    asyncio.run(test())

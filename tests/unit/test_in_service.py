@@ -1,6 +1,8 @@
 """What controls the line, by name, and how well it did: out of the stores, and nothing where nothing is known."""
 
 import asyncio
+import os
+import threading
 
 import pytest
 
@@ -59,6 +61,7 @@ def test_it_is_read_again_only_when_something_has_changed(tmp_path, monkeypatch)
     opened: list[str] = []
     right = in_service.open_baselines
     monkeypatch.setattr(in_service, "open_baselines", lambda path: opened.append(path) or right(path))
+    measured(tmp_path, FIRST, 3.0, 5.0)
     for _ in range(3):
         told(view)
     assert len(opened) == 1
@@ -69,9 +72,52 @@ def test_it_is_read_again_only_when_something_has_changed(tmp_path, monkeypatch)
 
 
 @pytest.mark.parametrize("damaged", [configurations.FILE_NAME, baselines.FILE_NAME])
-def test_a_damaged_store_is_nothing_known(tmp_path, damaged):
-    (tmp_path / damaged).write_bytes(b"no database" * 100)
-    assert told(InServiceView(LINE, tmp_path)).kind is None
+def test_a_damaged_store_is_nothing_known_until_it_can_be_read(tmp_path, damaged):
+    with begin_configurations(tmp_path / configurations.FILE_NAME) as store:
+        store.store(LINE.site, LINE.line, FIRST, Origin(1.0, "test", "test"))
+    measured(tmp_path, FIRST, 2.0, 10.0, baseline=True)
+    path = tmp_path / damaged
+    whole, times = path.read_bytes(), (path.stat().st_atime_ns, path.stat().st_mtime_ns)
+
+    def write(content: bytes) -> None:
+        path.write_bytes(content)
+        os.utime(path, ns=times)
+
+    view = InServiceView(LINE, tmp_path)
+    write(b"x" * len(whole))
+    found = told(view)
+    if damaged == configurations.FILE_NAME:
+        assert (found.kind, found.phase) == (None, "operation")
+    else:
+        assert (found.kind, found.phase, found.performance) == ("LQI", None, None)  # and not commissioning
+    write(whole)  # it looks as it did before
+    found = told(view)
+    assert (found.kind, found.phase, found.performance.rmse_n) == ("LQI", "operation", 2.0)
+
+
+def test_a_store_that_is_held_up_holds_up_nobody(tmp_path, monkeypatch):
+    measured(tmp_path, FIRST, 2.0, 10.0)
+    held, right = threading.Event(), in_service.open_baselines
+
+    def slow(path):
+        assert held.wait(60.0)
+        return right(path)
+
+    async def story():
+        view, book = InServiceView(LINE, tmp_path), Book(in_service=config_hash(FIRST))
+        known = await view.told(book)
+        measured(tmp_path, FIRST, 1.0, 20.0)
+        monkeypatch.setattr(in_service, "open_baselines", slow)
+        view._wait_s = 0.0  # noqa: SLF001 (that of the product is for a disk)
+        assert await view.told(book) == await view.told(book) == known
+        other = Book(in_service=config_hash(OTHER))
+        assert await view.told(other) == in_service.UNKNOWN  # the last answer is not of this
+        held.set()
+        view._wait_s = 60.0  # noqa: SLF001
+        await view.told(book)
+        return (await view.told(book)).performance.rmse_n, known.performance.rmse_n
+
+    assert asyncio.run(story()) == (1.0, 2.0)
 
 
 def test_a_schedule_is_named_by_its_law():

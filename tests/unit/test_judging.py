@@ -13,7 +13,7 @@ from gateway.control.design import design_lqi
 from gateway.core.proposal import canonical
 from gateway.core.verdict import Verdict
 from gateway.core.verdict import canonical as verdict_bytes
-from gateway.supervisor.judging import NICEST, Busy, JudgeWorkers
+from gateway.supervisor.judging import NICEST, JudgeWorkers
 from safety.courses import courses_of
 from safety.judge import judge
 from tests.safety.case_support import EXAMPLES, gains, published
@@ -50,7 +50,7 @@ def test_a_worker_judges_as_the_judge_does_and_one_that_gives_none_is_replaced(o
     assert late.proposal == first.proposal and late.kind == "gains"
 
 
-def test_a_worker_draws_courses_while_it_has_nothing_to_judge_and_judges_on(of, payload):
+def test_a_worker_draws_courses_between_what_it_judges(of, payload):
     context, data = of.context(), [of.recording]
 
     async def story():
@@ -60,12 +60,11 @@ def test_a_worker_draws_courses_while_it_has_nothing_to_judge_and_judges_on(of, 
             none = await workers.courses(b"{}", context, verdict.region)
             judging = asyncio.create_task(workers.judge(payload, context, data, seed=5))
             await asyncio.sleep(0)
-            with pytest.raises(Busy):
-                await workers.courses(payload, context, verdict.region)
-            return verdict, drawn, none, await judging, workers.pids
+            waited = await workers.courses(payload, context, verdict.region)
+            return verdict, drawn, waited, none, await judging, workers.pids
 
-    verdict, drawn, none, again, pids = asyncio.run(story())
-    assert drawn == courses_of(payload, context, of.line, verdict.region)
+    verdict, drawn, waited, none, again, pids = asyncio.run(story())
+    assert drawn == waited == courses_of(payload, context, of.line, verdict.region)
     assert none.courses == [] and len(pids) == 1  # what cannot be drawn ends nobody
     assert verdict_bytes(again) == verdict_bytes(verdict)
 

@@ -3,10 +3,13 @@
 import asyncio
 import threading
 
+import pytest
+
 from gateway.core.audit_record import Who, head_of
 from gateway.supervisor.audit import Audit
 from gateway.supervisor.audit_file import AuditFile
-from gateway.supervisor.kept_audit import LARGEST_KEPT, MOST_KEPT, KeptAudit
+from gateway.supervisor.deployer_sides import NotAtHand
+from gateway.supervisor.kept_audit import MOST_BYTES, MOST_KEPT, KeptAudit
 
 GATEWAY = Who(name="gateway")
 
@@ -34,7 +37,11 @@ def test_what_was_stored_or_fetched_is_at_hand_and_read_in_a_thread(tmp_path, mo
         assert where == [False]
         await after.fetch([head_of(b"a verdict")])
         assert where == [False]  # known
-        assert after.blob("0" * 64) is None and where == [False, True]
+        assert after.blob("0" * 64) is None and where == [False]  # there is none
+        for id_ in (head_of(b"another"), "1" * 64):
+            with pytest.raises(NotAtHand):
+                after.blob(id_)
+        assert where == [False]
 
     asyncio.run(story())
     audit.close()
@@ -46,12 +53,18 @@ def test_what_is_kept_at_hand_is_bounded(tmp_path):
 
     async def story():
         kept = KeptAudit(tmp_path, audit)
-        large = bytes(LARGEST_KEPT + 1)
-        await kept.append("proposed", GATEWAY, {}, {"proposal": large})
+        larger = [bytes(MOST_BYTES // 2 + k) for k in range(2)]
+        for content in larger:
+            await kept.append("proposed", GATEWAY, {}, {"proposal": content})
+        assert kept.blob(head_of(larger[1])) == larger[1]
         for number in range(MOST_KEPT + 3):
             await kept.append("proposed", GATEWAY, {}, {"proposal": b"%d" % number})
         assert len(kept._blobs) == MOST_KEPT  # noqa: SLF001 (nothing else tells)
-        assert kept.blob(head_of(large)) == large and kept.blob(head_of(b"0")) == b"0"
+        for content in (*larger, b"0"):
+            with pytest.raises(NotAtHand):
+                kept.blob(head_of(content))
+            await kept.fetch([head_of(content)])
+            assert kept.blob(head_of(content)) == content
 
     asyncio.run(story())
     audit.close()

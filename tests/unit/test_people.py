@@ -48,14 +48,18 @@ class Desk:
         self.commands, self.decisions, self.records = [], [], []
         self.audit_open = True
         self.now_s = 0.0
-        PersonsDesk(self.mailbox, self.command, self.decide, self.decide, self.note, lambda: self.now_s)
+        PersonsDesk(self.mailbox, self.command, self.decide, self.alarm, self.note, lambda: self.now_s)
 
     async def command(self, payload, who):
         self.commands.append((parse_command(payload), who))
         return Reply(ok=True, state="RUN", text="done")
 
-    async def decide(self, decision, who):
-        self.decisions.append((decision, who))
+    async def decide(self, decision, who, left_out):
+        self.left_out = left_out
+        return await self.alarm(decision, who)
+
+    async def alarm(self, said, who):
+        self.decisions.append((said, who))
         return Reply(ok=True, state="", text="decided")
 
     async def note(self, kind, who, what):
@@ -141,6 +145,7 @@ def test_who_says_more_than_any_hand_does_is_still_heard_and_fills_no_disk(desk)
     reply = desk.ask("operator", AcknowledgeAlarm(alarm="load-cell"))
     assert not reply.ok and "too much at once" in reply.text and not desk.decisions
     assert desk.ask("operator", RollBackNow()).ok and desk.ask("operator", Stop()).ok
+    assert desk.left_out is None  # done, and recorded no more
     desk.now_s += SAID_EVERY_S
     assert desk.ask("operator", Hold()).ok
     assert desk.records[-1][2]["left_out"] == 50 + 3
@@ -183,3 +188,15 @@ def test_a_table_of_rights_for_everything_that_can_be_said():
     schema = FOR_PERSON.json_schema()
     said = set(schema["properties"]["said"]["discriminator"]["mapping"])
     assert said == set(LEAST)
+
+
+def test_what_could_not_be_recorded_of_refusals_and_commands_is_counted_and_takes_nothing(desk):
+    desk.audit_open = False
+    for _ in range(2 * AT_ONCE):
+        assert not desk.ask("viewer", Stop()).ok
+    for _ in range(3):
+        assert desk.ask("operator", Hold()).ok
+    desk.audit_open = True
+    desk.ask("viewer", Stop())
+    desk.ask("operator", Hold())
+    assert [what["left_out"] for _, _, what in desk.records] == [2 * AT_ONCE, 3]

@@ -73,7 +73,7 @@ export class Change {
     const place = $("courses");
     if (!place || place.dataset.of) return;
     place.dataset.of = shown.proposal_hash;
-    drawCourses(place, shown.proposal_hash);
+    drawCourses(place, shown.proposal_hash, shown.verdict.figures);
   }
 
   what(shown) {

@@ -5,8 +5,8 @@ import { figure, number, word } from "./words.js";
 
 const AGAIN_MS = 1000, TALL = 200;
 
-// Fills `place` once they are there; without them its part of the page goes.
-export async function drawCourses(place, hash) {
+// Fills `place` once they are there; without them its part of the page goes. `figures`: those of the verdict.
+export async function drawCourses(place, hash, figures) {
   let told = null;
   try {
     while (place.isConnected && !(told && !told.drawing)) {
@@ -18,12 +18,13 @@ export async function drawCourses(place, hash) {
     told = null;
   }
   if (!told?.courses.length) return place.closest("section")?.remove();
-  if (place.isConnected) new Drawing(place, told);
+  if (place.isConnected) new Drawing(place, told, figures);
 }
 
 class Drawing {
-  constructor(place, { courses, model }) {
+  constructor(place, { courses, model }, figures) {
     this.courses = courses;
+    this.figures = figures;
     const spans = courses[0].setpoint_n.map((_, i) => h("option", { value: i }, String(i + 1)));
     this.span = h("select", { onchange: () => this.draw() }, spans);
     this.span.value = this.mostMoved();
@@ -37,8 +38,17 @@ class Drawing {
 
   // The span on which most can be seen.
   mostMoved() {
-    const errors = this.courses[0].setpoint_n.map((_, i) => Math.max(...this.courses.map((course) => rms(course, "in service", i) ?? Infinity)));
-    return errors.indexOf(Math.max(...errors));
+    const off = this.courses[0].setpoint_n.map((_, i) => Math.max(...this.courses.map((course) => furthest(course, i))));
+    return off.indexOf(Math.max(...off));
+  }
+
+  // What is to be seen, for whoever does not see it: the verdict's own figures, of all spans.
+  label({ scenario }, i) {
+    const of = (whose) => this.figures.find((one) => one.scenario === scenario && one.configuration === whose);
+    const told = ({ rmse_n }) => (rmse_n == null ? word("measure.away") : `${figure(rmse_n)} N`);
+    const [now, proposed] = [of("in service"), of("proposed")];
+    if (!now || !proposed) return `${scenario}, ${word("table.span")} ${i + 1}`;
+    return word("change.courses-label", { scenario, span: i + 1, now: told(now), proposed: told(proposed) });
   }
 
   draw() {
@@ -46,9 +56,8 @@ class Drawing {
     const colour = (name) => style.getPropertyValue(`--${name}`).trim();
     for (const plot of this.plots) plot.destroy();
     this.plots = this.courses.map((course, k) => {
-      const place = this.places[k], of = (whose) => rms(course, whose, i);
-      const told = (value) => (value == null ? word("measure.away") : `${figure(value)} N`);
-      place.setAttribute("aria-label", word("change.courses-label", { scenario: course.scenario, span: i + 1, now: told(of("in service")), proposed: told(of("proposed")) }));
+      const place = this.places[k];
+      place.setAttribute("aria-label", this.label(course, i));
       const data = [course.time_s, course.setpoint_n[i], course.tension_n["in service"][i], course.tension_n.proposed[i]];
       return new uPlot(options(Math.floor(place.clientWidth), colour), data, place);
     });
@@ -67,9 +76,7 @@ function options(width, colour) {
   };
 }
 
-// Root mean square of the error of a span, N; null: it ran away.
-function rms(course, whose, i) {
-  const values = course.tension_n[whose][i];
-  if (values.includes(null)) return null;
-  return Math.sqrt(values.reduce((sum, value, k) => sum + (value - course.setpoint_n[i][k]) ** 2, 0) / values.length);
+// How far a span comes from its set-point with what is in service, N.
+function furthest(course, i) {
+  return Math.max(...course.tension_n["in service"][i].map((value, k) => (value == null ? Infinity : Math.abs(value - course.setpoint_n[i][k]))));
 }
