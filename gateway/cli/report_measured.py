@@ -1,14 +1,15 @@
 """What the line itself has shown, in the report: kept measurements, tensions around each deployment, alarms."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import isfinite
+from operator import itemgetter
 from pathlib import Path
 
 import numpy as np
 
 from gateway.cli.commission_measurements import kept as kept_measurements
-from gateway.cli.line_records import FAR_S, LineRecords
+from gateway.cli.line_records import FAR_S, LineRecords, Recorded
 from gateway.cli.report import Chart, Section, Series, Table
 from gateway.cli.report_adaptations import SHORT, what_of, when
 from gateway.commissioning.convergence import Convergence
@@ -36,6 +37,7 @@ class Measured:
     measurements: list[Measurement] = field(default_factory=list[Measurement])
     baselines: set[int] = field(default_factory=set[int])  #: numbers of measurements that are in force
     of_proposals: dict[str, Convergence] = field(default_factory=dict[str, Convergence])
+    deployments: int = 0  #: around the newest of which there are charts
     around: list[Chart] = field(default_factory=list[Chart])
     alarms: list[StoredEvent] = field(default_factory=list[StoredEvent])
     problems: list[str] = field(default_factory=list[str])
@@ -56,10 +58,15 @@ def read_measured(folder: Path, line: Line, records: LineRecords, since_s: float
     try:
         with History(folder / HISTORY) as history:
             found.alarms = [one for one in history.events(since_s, FAR_S) if one.kind in ALARM_EVENTS]
-            found.around = _around(history, line, records, since_s, names)
+            deployed = _deployed(records, since_s)
+            found.deployments = len(deployed)
+            try:
+                found.around.extend(_around(history, line, records, deployed[-MOST_CHARTS:], names))
+            except (HistoryError, NotTold) as error:
+                found.problems.append(f"of tensions around deployments not all is told: {error}")
             found.problems += [f"of the history is damaged: {one}" for one in history.damaged]
-    except (HistoryError, NotTold) as error:
-        found.problems.append(f"of what the line has shown nothing is told: {error}")
+    except HistoryError as error:
+        found.problems.append(f"of alarms, and of tensions around deployments, nothing is told: {error}")
     return found
 
 
@@ -73,7 +80,9 @@ def measured_section(found: Measured, names: Mapping[str, str]) -> Section:
     )  # fmt: skip
     said = () if rows else ("No measurement was kept in this time.",)
     if found.around:
-        said += (f"Below: tensions from {BEFORE_S:g} s before to {AFTER_S:g} s after each deployment, as measured.",)
+        cut = found.deployments > MOST_CHARTS
+        which = f"the newest {MOST_CHARTS} of {found.deployments} deployments" if cut else "each deployment"
+        said += (f"Below: tensions from {BEFORE_S:g} s before to {AFTER_S:g} s after {which}, as measured.",)
     return Section("Measured on the line", said, (table,) if rows else (), tuple(found.around))
 
 
@@ -96,18 +105,24 @@ def _row(one: Measurement, found: Measured, names: Mapping[str, str]) -> tuple[s
     return (when(run.measured_s), name, printable(run.scenario), *figures, mark)
 
 
+def _deployed(records: LineRecords, since_s: float) -> list[tuple[Recorded, float]]:
+    """What was deployed since, with when (Unix time), the oldest first."""
+    steps = [(one, step) for one in records.proposals if (step := one.step("deployed")) is not None]
+    return sorted(((one, step.wall_s) for one, step in steps if step.wall_s >= since_s), key=itemgetter(1))
+
+
 def _around(
-    history: History, line: Line, records: LineRecords, since_s: float, names: Mapping[str, str]
-) -> list[Chart]:
-    """Raises HistoryError, NotTold."""
-    charts: list[Chart] = []
-    for one in records.proposals:
-        step = one.step("deployed")
-        if step is None or step.wall_s < since_s:
-            continue
-        asked = TensionsBetween(from_wall_s=step.wall_s - BEFORE_S, to_wall_s=step.wall_s + AFTER_S, points=POINTS)
+    history: History,
+    line: Line,
+    records: LineRecords,
+    deployed: Sequence[tuple[Recorded, float]],
+    names: Mapping[str, str],
+) -> Iterator[Chart]:
+    """Of those of which the history has something. Raises HistoryError, NotTold."""
+    for one, wall_s in deployed:
+        asked = TensionsBetween(from_wall_s=wall_s - BEFORE_S, to_wall_s=wall_s + AFTER_S, points=POINTS)
         told = thinned(history, asked, line.control.period_s)
-        time_s: FloatArray = np.array(told.wall_s) - step.wall_s
+        time_s: FloatArray = np.array(told.wall_s) - wall_s
         rows = np.array(told.tension_n, dtype=np.float64)  # None becomes NaN
         forward = np.flatnonzero(np.diff(time_s, prepend=-np.inf) > 0.0)
         if len(forward) < 2:
@@ -115,6 +130,5 @@ def _around(
         entry = records.book.entries.get(one.hash)
         name = what_of(one) if entry is None else names.get(entry.changes, what_of(one))
         series = tuple(Series(f"span {k + 1}", row[forward]) for k, row in enumerate(rows))
-        title = f"Measured: {name} takes over at 0 s, {when(step.wall_s)} UTC; tension"
-        charts.append(Chart(title, "N", time_s[forward], series))
-    return charts[-MOST_CHARTS:]
+        title = f"Measured: {name} takes over at 0 s, {when(wall_s)} UTC; tension"
+        yield Chart(title, "N", time_s[forward], series)

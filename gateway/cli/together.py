@@ -30,6 +30,8 @@ MOST_NOTES = 4  #: of the operator's process
 EXIT_S = 60.0  #: how long it shows the last words of a child that has ended; then one line remains
 #: How the operator's process says where it is reached, where not, and where it is again.
 _REACHED, _SHUT, _TRIED, _OPEN = "operator of ", "no ", ", it is tried again", " now"
+#: And how that there are no users, and that there are.
+_NOBODY, _SOMEBODY = "nobody can come in yet", "somebody can come in now"
 #: How the loop's ordinary words at its start begin; all others are for the person at the terminal.
 _ORDINARY = ("loop of ", "pinned to ", "real-time priority ", "memory locked")
 
@@ -127,6 +129,7 @@ class Notices:
         self._faults = ""
         self._ways: dict[str, str] = {}  #: page and OPC UA with their addresses; with "no " what is not served
         self._of_operator: list[str] = []  #: all that it has said
+        self._nobody: list[str] = []  #: that nobody can come in, as long as it is so
         self._operator_notes: deque[tuple[float, str]] = deque(maxlen=MOST_NOTES)  #: with when each was heard
 
     def hear_of_sim(self, said: list[str]) -> None:
@@ -153,6 +156,8 @@ class Notices:
         for text in said[len(before) :] if said[: len(before)] == before else said:
             if text.startswith(_REACHED):
                 self._ways |= dict.fromkeys(text.partition(": ")[2].split(", "), "")
+            elif text.startswith((_NOBODY, _SOMEBODY)):
+                self._nobody = [f"operator: {text}"] if text.startswith(_NOBODY) else []
             elif text.endswith(_OPEN):
                 self._ways[text.removesuffix(_OPEN)] = ""
             else:
@@ -163,7 +168,7 @@ class Notices:
 
     def tell(self, ended: Exit) -> None:
         if ended.name == "operator":
-            self._ways, self._of_operator = {}, []
+            self._ways, self._of_operator, self._nobody = {}, [], []
         self._exits[ended.name] = ended
         self._print(ended.lines())
 
@@ -171,6 +176,7 @@ class Notices:
         """What stands above the status now."""
         notes = [*self._opening, *(f"loop: {text}" for text in self._notes), *([self._faults] if self._faults else [])]
         shown = [", ".join(f"{shut}{way}" for way, shut in self._ways.items())] if self._ways else []
+        shown += self._nobody
         shown += notes if now_s - self._start_s <= NOTES_S else []
         shown += [text for at_s, text in self._operator_notes if now_s - at_s <= NOTES_S]
         for ended in self._exits.values():

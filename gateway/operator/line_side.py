@@ -47,6 +47,10 @@ class NotTold(Exception):
     """The gateway did not tell; the text says why."""
 
 
+class Declined(NotTold):
+    """It has answered, in words: there is no such thing, or not now."""
+
+
 class NoAnswer(Reply):
     """None came that can be read: nobody knows whether what was said was done."""
 
@@ -175,4 +179,4 @@ def _told(model: type[Model], answer: bytes) -> Model:
             reply = Reply.model_validate_json(answer)
         except ValidationError:
             raise NotTold(f"the gateway answered what is none, it is of another version: {error}") from None
-        raise NotTold("; ".join([reply.text, *reply.reasons])) from None
+        raise Declined("; ".join([reply.text, *reply.reasons])) from None

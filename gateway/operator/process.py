@@ -23,6 +23,7 @@ from gateway.operator.users import FILE_NAME, UsersFile, UsersRefused
 from gateway.operator.ways import OpcUaWay, PageWay, Way
 
 EXIT_OK, EXIT_CANNOT_SERVE = 0, 2
+USERS_S = 2.0  #: between two looks whether there are any
 
 
 class NothingServed(Exception):
@@ -63,16 +64,33 @@ async def serve(line: Line, run_folder: Path, data_folder: Path) -> None:
         if not ways:
             raise NothingServed(f"{page.trouble}; {opcua.trouble}")
         print(f"operator of {line.site}/{line.line}: {', '.join(way.name for way in ways)}", flush=True)
-        if not users.path.exists() and line.operator.anonymous == "none":
-            _tell("nobody can come in yet: `r2rgate users add LINE.toml NAME --role ROLE` lets somebody")
         gc.collect()
         gc.freeze()  # half a million nodes and references that stay: to look through them takes 0.15 s each time
-        await _until_one_ends(side.watch(), access.run(), page.keep(), opcua.keep(), stop.wait())
+        works = [side.watch(), access.run(), page.keep(), opcua.keep()]
+        if line.operator.anonymous == "none":
+            works.append(_tell_whether_anybody_can_come_in(users))
+        await _until_one_ends(*works, stop.wait())
     finally:
         await served_page.stop()
         await served_opcua.stop()
         await mailbox.close()
         await saying.close()
+
+
+async def _tell_whether_anybody_can_come_in(users: UsersFile) -> None:
+    """At first only where nobody can; then each time that it changes. Never ends."""
+    nobody = False
+    while True:
+        before = nobody
+        try:
+            nobody = not users.current().entries()
+        except UsersRefused:  # told to whoever tries
+            nobody = before
+        if nobody and not before:
+            _tell("nobody can come in yet: `r2rgate users add LINE.toml NAME --role ROLE` lets somebody")
+        elif before and not nobody:
+            _tell("somebody can come in now")
+        await asyncio.sleep(USERS_S)
 
 
 async def _until_one_ends(*works: Coroutine[object, object, object]) -> None:

@@ -301,7 +301,7 @@ def test_a_line_on_which_nothing_was_ever_proposed_shows_what_controls_it(tmp_pa
     words = Page(text).words
     assert "Nothing has been proposed on this line: how it is controlled has not changed." in words
     assert f"Initial {hash_[:12]}, epoch 0" in words and "Initial LQI" in words
-    assert "Caution: of what the line has shown nothing is told: there is no history at" in words
+    assert "Caution: of alarms, and of tensions around deployments, nothing is told: there is no history at" in words
 
 
 def test_a_time_without_a_change_says_so_and_shows_what_is_in_service(folder: Path) -> None:

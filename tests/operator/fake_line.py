@@ -82,6 +82,8 @@ class FakeGateway:
         self.stage = "waiting"
         self.absent: list[str] = []  #: from the first bus
         self.drawn = False  #: courses were asked for
+        self.no_courses = ""  #: why there are none
+        self.records: list[str] = []  #: of the audit, behind the two that there are
         self.approvals = 1  #: that a change takes
         self.first = ""  #: who has approved it, where it takes two
         self.drives: dict[int, str] = {}  #: by span, those that are not ENABLED
@@ -140,13 +142,12 @@ class FakeGateway:
         if not self.hash.startswith(query.proposal):
             text = f"no proposal begins with {query.proposal}"
             return Reply(ok=False, state="", text=text).model_dump_json().encode()
-        waits = self.stage == "waiting"
         shown = ProposalShown(
             format=1,
             stage=self.stage,
             why="",
             proposal_hash=self.hash,
-            shown=self.shown if waits else None,
+            shown=self.shown if self.stage == "waiting" else None,
             epoch=self.epoch,
             difference=["gain_state changes by 12.4 %", "predictor.gain_state changes by 3.1 %"],
             proposal=self.proposal,
@@ -158,8 +159,9 @@ class FakeGateway:
 
     async def _courses(self, payload: bytes) -> bytes:
         """The first answer is that they are being drawn, as the gateway's is."""
-        asked, drawing = ShowCourses.model_validate_json(payload), not self.drawn
-        self.drawn = True
+        if self.no_courses:
+            return Reply(ok=False, state="", text=self.no_courses).model_dump_json().encode()
+        asked, drawing, self.drawn = ShowCourses.model_validate_json(payload), not self.drawn, True
         courses = [] if drawing else [self._course("tension", 1.0, 12.0), self._course("velocity", 1.4, 0.0)]
         return CoursesTold(
             format=1, proposal=asked.proposal, verdict=verdict_hash(self.verdict), model="ab" * 32, drawing=drawing,
@@ -218,6 +220,7 @@ class FakeGateway:
         now_s = time.time()
         kinds = (("deployed", 240.0, "gateway", "controller c6d8cf9c18f6 was deployed as number 2, on probation"),
                  ("kept", 180.0, "gateway", "controller c6d8cf9c18f6, number 2, was kept"))  # fmt: skip
+        kinds += tuple(("operated", 0.0, "operator", text) for text in self.records)
         records = [
             RecordTold(sequence=i, wall_s=now_s - ago, kind=kind, who=who, text=text, what={"secret": "of the audit"})
             for i, (kind, ago, who, text) in enumerate(kinds, 1)

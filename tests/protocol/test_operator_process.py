@@ -112,6 +112,17 @@ def test_without_a_certificate_yet_there_is_the_page_and_what_to_do_is_said():
             assert "no OPC UA at" in told and "r2rgate pki init" in told and "r2rgate users add" in told
 
 
+def test_that_nobody_can_come_in_is_told_until_there_is_a_user():
+    with short_folder() as folder:
+        set_up(folder)
+        file = folder / "data" / FILE_NAME
+        Users.nobody().write(file)  # the last one was removed
+        with operator(folder) as process:
+            assert process.stderr.readline().startswith("nobody can come in yet: ")
+            Users.nobody().with_user("otto", PASSWORD, "operator").write(file)
+            assert process.stderr.readline() == "somebody can come in now\n"
+
+
 def test_where_both_ports_are_in_use_it_ends_with_code_2_and_says_which():
     with short_folder() as folder:
         set_up(folder)

@@ -211,6 +211,11 @@ def test_the_screen_shows_where_people_reach_the_line_and_where_they_do_not(tmp_
     assert notices.lines(180.1) == [f"{opcua}, {page}"]
     notices.hear_of_operator([*said, said[0]], 190.0)
     assert notices.lines(190.1)[0] == f"no {opcua}, {page}"
+    nobody = "nobody can come in yet: `r2rgate users add LINE.toml NAME --role ROLE` lets somebody"
+    notices.hear_of_operator([*said, said[0], nobody], 191.0)
+    assert f"operator: {nobody}" in notices.lines(191.0 + 10.0 * NOTES_S)
+    notices.hear_of_operator([*said, said[0], nobody, "somebody can come in now"], 192.0)
+    assert not any("can come in" in text for text in notices.lines(192.0))
     notices.tell(Exit("operator", 2, 1, 220.0, tmp_path / "operator.log", ["there is neither"], is_needed=False))
     assert notices.lines(221.0)[0] == "operator has ended with exit code 2; it is started again"
     notices.hear_of_operator([f"operator of demo/line-1: {page}, {opcua}"], 222.0)

@@ -173,5 +173,10 @@ def test_courses_come_once_they_are_drawn():
             told = (await there.browser.get(f"/api/courses/{there.gateway.hash}")).json()
             assert not told["drawing"] and len(told["courses"][0]["setpoint_n"]) == there.line.n
             assert (await there.browser.get("/api/courses/abcdef")).status_code == 400
+            there.gateway.no_courses = "there are no courses of it"
+            none = await there.browser.get(f"/api/courses/{there.gateway.hash}")
+            assert none.status_code == 409 and none.json()["text"] == there.gateway.no_courses
+            await there.gateway_mailbox.close()  # whoever asks again gets them once it is back
+            assert (await there.browser.get(f"/api/courses/{there.gateway.hash}")).status_code == 503
 
     asyncio.run(story())

@@ -13,7 +13,7 @@ from gateway.core.line import Line
 from gateway.core.line_past import TensionsBetween
 from gateway.core.messages import Reply
 from gateway.core.people import LEAST, Said, may, why_may_not
-from gateway.operator.line_side import LineSide, NoAnswer, NotTold
+from gateway.operator.line_side import Declined, LineSide, NoAnswer, NotTold
 from gateway.operator.page.guard import body_of
 from gateway.operator.page.login import Door
 from gateway.operator.page.tick import line_told
@@ -66,6 +66,8 @@ class Asks:
             return JSONResponse((await self._side.courses(request.path_params["proposal"])).model_dump())
         except ValidationError as error:
             raise HTTPException(400, _in_words(error)) from None
+        except Declined as error:  # whoever asks again and again may stop
+            raise HTTPException(409, str(error)) from error
         except NotTold as error:
             raise HTTPException(503, str(error)) from error
 

@@ -95,6 +95,10 @@ chromium.launch({ executablePath: process.argv[2], chromiumSandbox: false, args:
     },
     gone: (selector) => page.locator(selector).filter({ visible: true }).first().waitFor({ state: 'detached' }),
     texts: (selector) => visible(selector).evaluateAll((all) => all.map((one) => (one.innerText ?? one.textContent).trim())),
+    content: (selector) => page.locator(selector).first().textContent(), // also of what only a screen reader has
+    value: (selector) => visible(selector).first().inputValue(),
+    focus: (selector) => visible(selector).first().focus(),
+    cut: (urls, times) => context.route(urls, (route) => route.abort(), { times }), // as a network does for a while
     count: (selector) => visible(selector).count(),
     part: async (name) => { await page.evaluate((hash) => { location.hash = hash }, name); await visible(`#view-${name}`).waitFor() },
     size: (width, height) => page.setViewportSize({ width, height }),

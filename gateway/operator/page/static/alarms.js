@@ -11,6 +11,7 @@ export class Alarms {
   constructor(say, may) {
     Object.assign(this, { say, may });
     this.known = new Set();
+    this.told = []; // what the alert says now
   }
 
   paint({ alarms }) {
@@ -18,14 +19,13 @@ export class Alarms {
     const sorted = [...alarms].sort((a, b) => rank(a) - rank(b) || a.since_wall_s - b.since_wall_s);
     const open = sorted.filter((one) => one.active && !shelved(one));
     const keys = open.map((one) => `${one.name} ${one.since_wall_s}`);
-    if (!keys.includes(this.told)) setText($("alert"), ""); // what is over is not read out to who looks around
-    open.forEach((one, i) => {
-      if (!this.known.has(keys[i])) {
-        setText($("alert"), `${word(`priority.${one.priority}`)}: ${said(one, "means")}`);
-        this.told = keys[i];
-      }
-      this.known.add(keys[i]);
-    });
+    if (!keys.some((key) => this.told.includes(key))) setText($("alert"), ""); // what is over is not read out to who looks around
+    const fresh = open.filter((_, i) => !this.known.has(keys[i]));
+    if (fresh.length) { // in one piece, the highest first: a later text cuts off an earlier one
+      setText($("alert"), fresh.map((one) => `${word(`priority.${one.priority}`)}: ${said(one, "means")}.`).join(" "));
+      this.told = keys.filter((key) => !this.known.has(key));
+    }
+    keys.forEach((key) => this.known.add(key));
     replaced($("now-alarms"), `${document.documentElement.lang} ${open.length} ${open[0]?.name}`, () =>
       open.length ? h("span", { class: `alarm-count ${open[0].priority}` }, `▲ ${open.length}`) : word("alarms.none-short"));
     replaced($("alarm-list"), JSON.stringify([sorted, document.documentElement.lang]), () =>

@@ -48,7 +48,7 @@ export class Change {
       newer && h("section", { class: "panel prompt" }, h("p", {}, word("change.newer")),
         h("button", { type: "button", class: "main", onclick: () => this.fill(newer) }, word("change.show-newer"))),
       others.map((one) => h("section", { class: "panel" }, h("p", {}, word("change.another"), " ",
-        h("a", { class: "button", href: `#change/${one}` }, word("prompt.open"), " ", h("code", {}, one.slice(0, 12))))))]);
+        h("a", { class: "button", href: `#change/${one}`, "data-focus": `other-${one}` }, word("prompt.open"), " ", h("code", {}, one.slice(0, 12))))))]);
   }
 
   put(key, make) {
@@ -70,10 +70,14 @@ export class Change {
     else shown.difference = this.differs?.proposal_hash === shown.proposal_hash ? this.differs.difference : [];
     this.shown = shown;
     this.put(JSON.stringify(shown), () => [h("div", { class: shown.verdict?.figures.length ? "stack" : "stack wide" }, this.what(shown), this.courses(shown)), this.figures(shown), this.rules(shown), this.bar(shown)]);
+    this.draw(shown);
+  }
+
+  async draw(shown) {
     const place = $("courses");
-    if (!place || place.dataset.of) return;
-    place.dataset.of = shown.proposal_hash;
-    drawCourses(place, shown.proposal_hash, shown.verdict.figures);
+    if (!place || place.dataset.begun) return;
+    place.dataset.begun = "yes";
+    if (!(await drawCourses(place, shown.proposal_hash, shown.verdict.figures))) delete place.dataset.begun;
   }
 
   what(shown) {
@@ -95,7 +99,10 @@ export class Change {
 
   courses(shown) {
     if (shown.kind !== "gains" || !shown.verdict?.accepted) return null;
-    return h("section", { class: "panel" }, h("h2", {}, word("change.courses")), h("div", { id: "courses" }, h("p", {}, word("change.courses-drawing"))));
+    const of = JSON.stringify([shown.proposal_hash, shown.verdict]);
+    if (this.drawn?.of !== of) // while it is the same, it is neither drawn again nor loses the span that was chosen
+      this.drawn = { of, section: h("section", { class: "panel" }, h("h2", {}, word("change.courses")), h("div", { id: "courses" }, h("p", {}, word("change.courses-drawing")))) };
+    return this.drawn.section;
   }
 
   rules(shown) {

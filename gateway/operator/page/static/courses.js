@@ -5,20 +5,26 @@ import { figure, number, word } from "./words.js";
 
 const AGAIN_MS = 1000, TALL = 200;
 
-// Fills `place` once they are there; without them its part of the page goes. `figures`: those of the verdict.
+// Fills `place` once they are there, or with the reason why there are none. `figures`: those of the verdict. False: it
+// is to be begun again, once `place` is shown again or the reason may have gone.
 export async function drawCourses(place, hash, figures) {
-  let told = null;
-  try {
-    while (place.isConnected && !(told && !told.drawing)) {
-      if (told) await new Promise((resolve) => setTimeout(resolve, AGAIN_MS));
-      told = await ask(`api/courses/${hash}`);
+  while (place.isConnected) {
+    try {
+      const told = await ask(`api/courses/${hash}`);
+      if (!told.drawing) {
+        told.courses.length ? new Drawing(place, told, figures) : place.replaceChildren(h("p", {}, word("change.courses-none")));
+        return true;
+      }
+    } catch (error) {
+      if (!(error instanceof Refused)) throw error;
+      if (!error.unknown) { // an answer; no way to the gateway is none
+        place.replaceChildren(english("p", error.message));
+        return false;
+      }
     }
-  } catch (error) {
-    if (!(error instanceof Refused)) throw error;
-    told = null;
+    await new Promise((resolve) => setTimeout(resolve, AGAIN_MS));
   }
-  if (!told?.courses.length) return place.closest("section")?.remove();
-  if (place.isConnected) new Drawing(place, told, figures);
+  return false;
 }
 
 class Drawing {
@@ -26,7 +32,7 @@ class Drawing {
     this.courses = courses;
     this.figures = figures;
     const spans = courses[0].setpoint_n.map((_, i) => h("option", { value: i }, String(i + 1)));
-    this.span = h("select", { onchange: () => this.draw() }, spans);
+    this.span = h("select", { "data-focus": "course-span", onchange: () => this.draw() }, spans);
     this.span.value = this.mostMoved();
     this.places = courses.map(() => h("div", { class: "course", role: "img" }));
     place.replaceChildren(

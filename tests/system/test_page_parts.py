@@ -1,0 +1,85 @@
+"""What stands on the page while a line changes under it, in Chromium before a gateway that is none."""
+
+from collections.abc import Iterator
+
+import pytest
+
+from tests.operator.fake_line import PASSWORD, FakeGateway, alarm
+from tests.system.made_up_page import made_up_page
+from tests.system.page_line import AtPage
+
+pytestmark = pytest.mark.timeout(180)
+
+SPANS = 3
+SPAN = "[data-focus=course-span]"
+
+
+@pytest.fixture
+def gateway(browser: AtPage) -> Iterator[FakeGateway]:
+    """With an operator at its page."""
+    with made_up_page(SPANS) as (address, found):
+        browser.open(address)
+        browser.log_in("operator", PASSWORD)
+        yield found
+        browser("troubles")
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[AtPage]:
+    with AtPage(tmp_path_factory.mktemp("browser") / "browser.log") as found:
+        yield found
+
+
+def test_of_alarms_that_come_together_the_highest_is_read_out_first_and_none_is_left_out(
+    gateway: FakeGateway, browser: AtPage
+) -> None:
+    gateway.alarms = [alarm("tension-off"), alarm("device-absent")]
+    browser("see", "#now-alarms", "2")
+    high, medium = gateway.alarms[1], gateway.alarms[0]
+    assert (high.priority, medium.priority) == ("high", "medium")
+    assert browser("content", "#alert").casefold() == f"high: {high.means}. medium: {medium.means}.".casefold()
+    gateway.alarms = [high]
+    browser("see", "#now-alarms", "1")
+    assert high.means in browser("content", "#alert")
+    gateway.alarms = []
+    browser("see", "#now-alarms", "none")
+    assert browser("content", "#alert") == ""
+
+
+def test_a_new_record_leaves_the_focus_where_it_is_in_the_history(gateway: FakeGateway, browser: AtPage) -> None:
+    browser.part("history")
+    browser("see", "#view-history tbody")
+    browser("tab_to", f"Open {gateway.hash[:12]}")
+    gateway.records.append("a record that has just come")
+    browser("see", "#view-history", "a record that has just come")
+    assert browser("focused") == f"Open {gateway.hash[:12]}"
+    gateway.stage = "kept"  # the proposals themselves are others
+    browser("see", "#view-history tbody tr:first-child", "Kept")
+    assert browser("focused") == f"Open {gateway.hash[:12]}"
+
+
+def test_courses_come_although_the_way_to_them_was_cut_for_a_while(gateway: FakeGateway, browser: AtPage) -> None:
+    browser("cut", "**/api/courses/*", 2)
+    browser.part("change")
+    browser("see", ".course canvas")
+
+
+def test_why_there_are_no_courses_is_said_and_they_come_when_there_are(gateway: FakeGateway, browser: AtPage) -> None:
+    gateway.no_courses = "the gate is shut"
+    browser.part("change")
+    browser("see", "#courses", "the gate is shut")
+    gateway.no_courses, gateway.stage = "", "probation"
+    browser("see", "#change-body", "On probation")
+    browser("see", ".course canvas")
+
+
+def test_the_span_that_was_chosen_stays_chosen_and_has_the_focus(gateway: FakeGateway, browser: AtPage) -> None:
+    browser.part("change")
+    browser("see", SPAN)
+    browser("choose", SPAN, str(SPANS))
+    browser("focus", SPAN)
+    gateway.stage = "probation"
+    browser("see", "#change-body", "On probation")
+    assert browser("value", SPAN) == str(SPANS - 1)  # counted from 0
+    assert browser("focused").startswith("Span")
+    assert browser("count", f".course[aria-label*='span {SPANS}:']") == 2
