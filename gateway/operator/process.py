@@ -23,6 +23,7 @@ from gateway.operator.users import FILE_NAME, UsersFile, UsersRefused
 from gateway.operator.ways import OpcUaWay, PageWay, Way
 
 EXIT_OK, EXIT_CANNOT_SERVE = 0, 2
+LOOK_S, MOST_LOOKS = 0.1, 30  #: until somebody who is a user since a moment ago is known as one
 
 
 class NothingServed(Exception):
@@ -59,11 +60,12 @@ async def serve(line: Line, run_folder: Path, data_folder: Path) -> None:
     served_opcua = OpcUaWay(lambda: OpcUa(line, side, pki, check, users.role_of, _tell, access), lambda: page.trouble)
     opcua = Way(f"OPC UA at {line.operator.opc_ua}", served_opcua.begin, served_opcua.serve, _tell)
     try:
+        await access.renew()  # before anybody asks
         ways = [way for way in (page, opcua) if await way.open()]
         if not ways:
             raise NothingServed(f"{page.trouble}; {opcua.trouble}")
         print(f"operator of {line.site}/{line.line}: {', '.join(way.name for way in ways)}", flush=True)
-        if not users.path.exists() and line.operator.anonymous == "none":
+        if not users.was_there and line.operator.anonymous == "none":
             _tell("nobody can come in yet: `r2rgate users add LINE.toml NAME --role ROLE` lets somebody")
         gc.collect()
         gc.freeze()  # half a million nodes and references that stay: to look through them takes 0.15 s each time
@@ -97,7 +99,12 @@ def checked_by(users: UsersFile, tell: Callable[[str], None]) -> Callable[[str, 
             return None
 
     async def check(name: str, password: str) -> Role | None:
-        return await asyncio.to_thread(checked, name, password)
+        role = await asyncio.to_thread(checked, name, password)
+        for _ in range(MOST_LOOKS):
+            if role is None or users.role_of(name) is not None:
+                break
+            await asyncio.sleep(LOOK_S)  # added a moment ago: who is not known yet would be put out at once
+        return role
 
     return check
 
