@@ -73,7 +73,7 @@ class Stack(InternalServer):
         self.max_connections = sessions_max + limits.MORE_CONNECTIONS + limits.BEING_ENDED
         self.max_subscriptions = sessions_max * limits.SUBSCRIPTIONS_EACH
         self.min_session_timeout_ms, self.max_session_timeout_ms = map(float, limits.SESSION_TIMEOUT_MS)
-        self.max_pending_activation_seconds = limits.LOGIN_S
+        self.max_pending_activation_seconds = 0.0  # `Sockets.end_strangers` ends them, whatever they leave unread
         self.max_pending_messages_per_connection = limits.PENDING_MESSAGES
         self.max_unacked_messages_per_subscription = limits.MAX_UNACKNOWLEDGED
         self.max_monitored_item_queue_size = limits.MAX_QUEUE
