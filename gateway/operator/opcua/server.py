@@ -144,7 +144,7 @@ class OperatorServer(Server):
 
     def _has_its_share(self, place: str) -> bool:
         """No more sessions are for clients of this place."""
-        most = math.ceil(limits.SHARE * self._sessions_max)
+        most = max(1, math.floor(limits.SHARE * self._sessions_max))
         return isinstance(self.bserver, Sockets) and self.bserver.sessions_from(place) >= most
 
 
