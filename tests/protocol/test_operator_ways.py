@@ -116,10 +116,16 @@ def test_a_fault_of_this_program_ends_nothing_is_told_once_and_what_it_hides_doe
                 broken.setattr(b.opcua._events, "_tell", lambda _: 1 / 0)  # noqa: SLF001
                 b.gateway.records = [record(1), record(2)]
                 await b.until(client, "Line.Spans.1.Tension", bad)
+                assert (await b.value(client, "Line.Connection.Trouble")).startswith(
+                    "the line cannot be shown: ZeroDiv"
+                )
+                assert await b.value(client, "Line.Connection.Fresh") is False
                 await b.until(client, "Line.Proposals.Current.Id", bad)
                 while b.opcua._events._after != 2:  # noqa: ASYNC110, SLF001
                     await asyncio.sleep(0.01)
             await b.until(client, "Line.Spans.1.Tension", good)
+            await b.until(client, "Line.Connection.Fresh", lambda one: one.Value.Value)
+            assert await b.value(client, "Line.Connection.Trouble") == ""
             await b.until(client, "Line.Proposals.Current.Id", lambda one: good(one) and one.Value.Value)
             assert set(b.said) == {"OPC UA does not tell all: ZeroDivisionError: division by zero"}
             assert len(b.said) <= 3 + 1  # by each task once, and again after it had gone well in between

@@ -53,7 +53,6 @@ class OpcUa:
         )
         self.page_trouble: Callable[[], str] = str  #: why there is no page; empty: there is one
         self._made = False
-        self._say = tell
         self._line = line
         self._side = side
         self._say = tell
@@ -105,7 +104,9 @@ class OpcUa:
     async def _show_line(self) -> None:
         try:
             await self._show_line_as_it_is()
-        except Exception:  # what is shown may be old, and must not look new
+        except Exception as error:  # what is shown may be old, and must not look new
+            trouble = f"the line cannot be shown: {type(error).__name__}: {error}"
+            await self._tell((Told(f"{ROOT}.Connection.Fresh", False), Told(f"{ROOT}.Connection.Trouble", trouble)))
             await self._unsure((*live_paths(self._line), *live_alarm_paths()), self._side.age_s)
             raise
 
