@@ -4,13 +4,14 @@ import asyncio
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 from socket import socket
+from ssl import SSLContext
 
 from starlette.applications import Starlette
 
 from gateway.operator.opcua.server import CannotServe
 from gateway.operator.opcua.service import OpcUa
 from gateway.operator.page.serve import CannotServe as PageCannotServe
-from gateway.operator.page.serve import listening, serve_on
+from gateway.operator.page.serve import listening, serve_on, tls_of
 
 AGAIN_S = 10.0  #: between two attempts
 
@@ -89,15 +90,17 @@ class PageWay:
     def __init__(self, page: Starlette, address: str, certificate: Path | None, key: Path | None) -> None:
         self._page = page
         self._address = address
-        self._tls = certificate, key
+        self._files = certificate, key
+        self._tls: SSLContext | None = None
         self._listener: socket | None = None
 
     async def begin(self) -> None:
+        self._tls = tls_of(*self._files)
         self._listener = listening(self._address)
 
     async def serve(self) -> None:
         assert self._listener is not None  # it has begun
-        await serve_on(self._page, self._listener, *self._tls)
+        await serve_on(self._page, self._listener, self._tls)
 
     async def stop(self) -> None:
         """What serves it has closed it; where nothing has, here."""
