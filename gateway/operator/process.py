@@ -57,7 +57,7 @@ async def serve(line: Line, run_folder: Path, data_folder: Path) -> None:
         page_app(line, side, check, users.role_of, time.monotonic, access), line.operator.page, *page_tls
     )
     page = Way(f"page at {line.operator.page}", served_page.begin, served_page.serve, _tell)
-    served_opcua = OpcUaWay(lambda: OpcUa(line, side, pki, check, users.role_of, _tell, access), lambda: page.trouble)
+    served_opcua = OpcUaWay(OpcUa(line, side, pki, check, users.role_of, _tell, access), lambda: page.trouble)
     opcua = Way(f"OPC UA at {line.operator.opc_ua}", served_opcua.begin, served_opcua.serve, _tell)
     try:
         await access.renew()  # before anybody asks

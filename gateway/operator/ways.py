@@ -63,27 +63,20 @@ class Way:
 
 
 class OpcUaWay:
-    """The server is made when it can be: its certificate may come later."""
+    """All nodes are made at the first attempt, before anybody is served; the certificate may come later."""
 
-    def __init__(self, make: Callable[[], OpcUa], page_trouble: Callable[[], str]) -> None:
-        """`make` raises CannotServe."""
-        self._make = make
-        self._page_trouble = page_trouble
-        self._opcua: OpcUa | None = None
+    def __init__(self, opcua: OpcUa, page_trouble: Callable[[], str]) -> None:
+        self._opcua = opcua
+        self._opcua.page_trouble = page_trouble
 
     async def begin(self) -> None:
-        if self._opcua is None:
-            self._opcua = self._make()
-            self._opcua.page_trouble = self._page_trouble
         await self._opcua.start()
 
     async def serve(self) -> None:
-        assert self._opcua is not None  # it has begun
         await self._opcua.run()
 
     async def stop(self) -> None:
-        if self._opcua is not None:
-            await self._opcua.stop()
+        await self._opcua.stop()
 
 
 class PageWay:

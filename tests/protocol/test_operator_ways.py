@@ -4,7 +4,7 @@ import asyncio
 import socket
 
 import pytest
-from asyncua import Client
+from asyncua import Client, ua
 
 from gateway.operator import ways
 from gateway.operator.opcua import service
@@ -93,6 +93,34 @@ def test_the_server_listens_once_its_port_is_free_and_tells_of_a_page_that_is_no
                         await b.until(client, path, lambda one, trouble=trouble: one.Value.Value == trouble)
                 running.cancel()
                 await asyncio.gather(running, return_exceptions=True)
+
+    run(story)
+
+
+def test_nodes_are_made_once_and_before_the_certificate_is_there(monkeypatch):
+    """They take a second, in which nobody could stop the line, if they came when the page is served already."""
+
+    async def story():
+        async with bench(spans=1, begin=False) as b:
+            made = []
+            make = b.opcua._make  # noqa: SLF001
+
+            async def counted():
+                made.append("once")
+                await make()
+
+            monkeypatch.setattr(b.opcua, "_make", counted)
+            (b.pki / "opcua-server.pem").rename(b.pki / "later.pem")
+            for _ in range(2):
+                with pytest.raises(CannotServe, match="pki init"):
+                    await b.opcua.start()
+                assert made == ["once"]
+            (b.pki / "later.pem").rename(b.pki / "opcua-server.pem")
+            await b.opcua.start()
+            assert made == ["once"]
+            async with b.connected("vera") as client:
+                uris = [(await client.get_namespace_array())[1], await client.get_node(ua.NodeId(2254)).read_value()]
+                assert uris == ["urn:r2rgate:test:line", ["urn:r2rgate:test:line"]]
 
     run(story)
 

@@ -40,7 +40,6 @@ class OpcUa:
         tell: Callable[[str], None],
         access: Access | None = None,
     ) -> None:
-        """Raises CannotServe."""
         anonymous = line.operator.anonymous == "read"
         trust = TrustList(pki, tell, lambda: datetime.now(UTC))
         self.server: OperatorServer = make_server(
@@ -61,7 +60,10 @@ class OpcUa:
         self._shown_of: ProposalList | None = None  #: of which list
 
     async def start(self) -> None:
-        """Raises CannotServe, and may be called again then; `stop` is needed all the same."""
+        """Raises CannotServe, and may be called again then; `stop` is needed all the same.
+
+        The nodes are made first, and once: to make them takes a second, in which nobody is served.
+        """
         if not self._made:
             await self._make()
             self._made = True
