@@ -4,19 +4,19 @@ Nothing here lets anybody in or keeps them out. What cannot be told now is told 
 """
 
 import asyncio
-import hashlib
 from collections import OrderedDict, deque
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
 from typing import Literal
 
 from gateway.core.access import MOST_NAMES, MOST_PLACES, CameIn, UsersNow, WrongLogins, WrongPlace
 from gateway.core.people import Person, Role
 from gateway.operator.line_side import LineSide
-from gateway.operator.users import MOST_BYTES, UsersFile, UsersRefused
+from gateway.operator.users import Users, UsersFile, UsersRefused
 
 LOOK_S = 1.0  #: between two looks at the users' file, and at what there is to tell
 REPORT_S = 60.0  #: between two reports of wrong logins, and after which the users are told again
+READ_S = 1.0  #: that the users' file may take to be read, before it is told that it does not come
 MOST_WAITING = 100  #: who came in while the gateway was away
 LONGEST_ADDRESS = 64
 
@@ -47,6 +47,7 @@ class Access:
         self._told: UsersNow | None = None
         self._told_s = clock()
         self._trouble = ""  #: of the users' file, as it was told
+        self._reading: asyncio.Task[Users] | None = None  #: on its way; a disk may never answer
 
     def came_in(self, person: Person, address: str) -> None:
         self._dropped += len(self._came) == MOST_WAITING
@@ -66,13 +67,18 @@ class Access:
 
     async def run(self) -> None:
         """Until it is cancelled."""
-        while True:
-            await self.look()
-            await asyncio.sleep(LOOK_S)
+        async with asyncio.TaskGroup() as group:
+            group.create_task(_again(self.renew))
+            group.create_task(_again(self._tell_all))  # may wait for the gateway; who may stop the line must not
 
     async def look(self) -> None:
-        """Tell what there is to tell."""
-        await self._tell_users()
+        """Look at the users' file, and tell what there is to tell."""
+        await self.renew()
+        await self._tell_all()
+
+    async def _tell_all(self) -> None:
+        if not self._trouble:
+            await self._tell_users()
         while self._came:
             first, dropped = self._came[0], self._dropped
             if not await self._side.at_the_door(first.model_copy(update={"before": dropped})):
@@ -85,29 +91,35 @@ class Access:
         if self._wrong and self._clock() - self._reported_s >= REPORT_S:
             await self._report()
 
-    async def _tell_users(self) -> None:
+    async def renew(self) -> None:
+        """Look at the users' file, in a thread: the event loop is what a stop goes through."""
         try:
-            now = self._users_now()
+            self._users.keep(await self._read())
         except UsersRefused as refused:
             if str(refused) != self._trouble:
                 self._trouble = str(refused)
                 self._tell(f"nobody can log in: {refused}")
-            return
-        self._trouble = ""
+        else:
+            self._trouble = ""
+
+    async def _read(self) -> Users:
+        """Raises UsersRefused, also where it takes too long; what is on its way then is looked at the next time."""
+        if self._reading is None:
+            self._reading = asyncio.create_task(asyncio.to_thread(self._users.current))
+        done, _ = await asyncio.wait([self._reading], timeout=READ_S)
+        if not done:
+            raise UsersRefused(f"{self._users.path} does not come: its disk does not answer")
+        reading, self._reading = self._reading, None
+        return reading.result()
+
+    async def _tell_users(self) -> None:
+        known = self._users.known
+        roles: dict[str, Role] = {one.name: one.role for one in known.entries()}
+        now = UsersNow(roles=roles, file=known.digest)
         if now == self._told and self._clock() - self._told_s < REPORT_S:
             return
         if await self._side.at_the_door(now):
             self._told, self._told_s = now, self._clock()
-
-    def _users_now(self) -> UsersNow:
-        """Raises UsersRefused."""
-        roles: dict[str, Role] = {one.name: one.role for one in self._users.current().entries()}
-        try:
-            with self._users.path.open("rb") as stream:
-                digest = hashlib.sha256(stream.read(MOST_BYTES)).hexdigest()
-        except OSError:
-            digest = None
-        return UsersNow(roles=roles, file=digest)
 
     async def _report(self) -> None:
         wrong, elsewhere = self._wrong, self._elsewhere
@@ -130,3 +142,9 @@ class Access:
             else:
                 elsewhere += one.count
         self._wrong, self._elsewhere = wrong, self._elsewhere + elsewhere
+
+
+async def _again(do: Callable[[], Awaitable[None]]) -> None:
+    while True:
+        await do()
+        await asyncio.sleep(LOOK_S)

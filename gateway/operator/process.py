@@ -24,6 +24,7 @@ from gateway.operator.ways import OpcUaWay, PageWay, Way
 
 EXIT_OK, EXIT_CANNOT_SERVE = 0, 2
 USERS_S = 2.0  #: between two looks whether there are any
+LOOK_S, MOST_LOOKS = 0.1, 30  #: until somebody who is a user since a moment ago is known as one
 
 
 class NothingServed(Exception):
@@ -57,9 +58,10 @@ async def serve(line: Line, run_folder: Path, data_folder: Path) -> None:
         page_app(line, side, check, users.role_of, time.monotonic, access), line.operator.page, *page_tls
     )
     page = Way(f"page at {line.operator.page}", served_page.begin, served_page.serve, _tell)
-    served_opcua = OpcUaWay(lambda: OpcUa(line, side, pki, check, users.role_of, _tell, access), lambda: page.trouble)
+    served_opcua = OpcUaWay(OpcUa(line, side, pki, check, users.role_of, _tell, access), lambda: page.trouble)
     opcua = Way(f"OPC UA at {line.operator.opc_ua}", served_opcua.begin, served_opcua.serve, _tell)
     try:
+        await access.renew()  # before anybody asks
         ways = [way for way in (page, opcua) if await way.open()]
         if not ways:
             raise NothingServed(f"{page.trouble}; {opcua.trouble}")
@@ -81,11 +83,7 @@ async def _tell_whether_anybody_can_come_in(users: UsersFile) -> None:
     """At first only where nobody can; then each time that it changes. Never ends."""
     nobody = False
     while True:
-        before = nobody
-        try:
-            nobody = not users.current().entries()
-        except UsersRefused:  # told to whoever tries
-            nobody = before
+        before, nobody = nobody, not users.known.entries()
         if nobody and not before:
             _tell("nobody can come in yet: `r2rgate users add LINE.toml NAME --role ROLE` lets somebody")
         elif before and not nobody:
@@ -115,7 +113,12 @@ def checked_by(users: UsersFile, tell: Callable[[str], None]) -> Callable[[str, 
             return None
 
     async def check(name: str, password: str) -> Role | None:
-        return await asyncio.to_thread(checked, name, password)
+        role = await asyncio.to_thread(checked, name, password)
+        for _ in range(MOST_LOOKS):
+            if role is None or users.role_of(name) is not None:
+                break
+            await asyncio.sleep(LOOK_S)  # added a moment ago: who is not known yet would be put out at once
+        return role
 
     return check
 

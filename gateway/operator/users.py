@@ -68,6 +68,7 @@ class Users:
     """Never changed: `with_user` and `without` give others."""
 
     _by_name: Mapping[str, _Entry]
+    digest: str | None = None  #: SHA-256 of the file they were read from; None: of none
 
     @classmethod
     def nobody(cls) -> "Users":
@@ -96,7 +97,7 @@ class Users:
         by_name = {one.name: one for one in found.users}
         if len(by_name) < len(found.users):
             raise UsersRefused(f"{path} has a name twice; allowed: each once")
-        return cls(by_name)
+        return cls(by_name, hashlib.sha256(content).hexdigest())
 
     def check(self, name: str, password: str) -> Role | None:
         """The role of who proves so to be `name`; None: nobody does. Takes some 50 ms: call it in a thread."""
@@ -168,44 +169,43 @@ def change(path: Path, how: Callable[[Users], Users]) -> None:
     lock = os.open(path.with_name(LOCK), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
     try:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        how(UsersFile(path).current()).write(path)
+        how(UsersFile(path).current()).write(path)  # of the last user who is removed an empty file stays
     finally:
         os.close(lock)
 
 
 class UsersFile:
-    """The users of a file as they are now: a change counts from the next question on."""
+    """The users of a file, and what it said when it was looked at last, which no question about a role waits for."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._seen: tuple[int, int, int] | None = None
-        self._users = Users.nobody()
+        self.known = Users.nobody()
+        self.was_there = False  #: when it was looked at; from then on a file that is gone is a fault
 
     def current(self) -> Users:
-        """Nobody, where there is no file. Raises UsersRefused."""
-        try:
-            found = self.path.stat()
-        except FileNotFoundError:
-            self._seen, self._users = None, Users.nobody()
-            return self._users
-        except OSError as error:
-            raise UsersRefused(f"{self.path} cannot be read: {error.strerror}") from error
-        seen = found.st_ino, found.st_mtime_ns, found.st_ctime_ns
-        if seen != self._seen:
-            self._users = Users.read(self.path)
-            self._seen = seen
-        return self._users
+        """As the file has them now; nobody, where there never was one. Waits for the disk; for any thread.
 
-    def role_of(self, name: str) -> Role | None:
-        """As the file has it now; None: there is no such user.
-
-        For whoever has come in before: what was taken from them since counts at once. Where the file cannot be used
-        what it said last holds: nobody new comes in then, but those at work can still stop the line.
+        Raises UsersRefused.
         """
         try:
-            return self.current().role_of(name)
-        except UsersRefused:
-            return self._users.role_of(name)
+            return Users.read(self.path)
+        except UsersRefused as refused:
+            if isinstance(refused.__cause__, FileNotFoundError) and not self.was_there:
+                return Users.nobody()
+            raise
+
+    def keep(self, found: Users) -> None:
+        """What `role_of` tells from now on: what `current` has told. For one writer, on the event loop."""
+        self.known = found
+        self.was_there = self.was_there or found.digest is not None
+
+    def role_of(self, name: str) -> Role | None:
+        """As the file had it when it was looked at last; None: there was no such user. Waits for nothing.
+
+        For whoever has come in before. While the file cannot be read, or is gone as with a disk that is not mounted,
+        what it said last holds: nobody new comes in then, but those at work can still stop the line.
+        """
+        return self.known.role_of(name)
 
 
 def why_weak(name: str, password: str) -> str:

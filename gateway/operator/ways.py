@@ -4,13 +4,14 @@ import asyncio
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 from socket import socket
+from ssl import SSLContext
 
 from starlette.applications import Starlette
 
 from gateway.operator.opcua.server import CannotServe
 from gateway.operator.opcua.service import OpcUa
 from gateway.operator.page.serve import CannotServe as PageCannotServe
-from gateway.operator.page.serve import listening, serve_on
+from gateway.operator.page.serve import listening, serve_on, tls_of
 
 AGAIN_S = 10.0  #: between two attempts
 
@@ -62,42 +63,37 @@ class Way:
 
 
 class OpcUaWay:
-    """The server is made when it can be: its certificate may come later."""
+    """All nodes are made at the first attempt, before anybody is served; the certificate may come later."""
 
-    def __init__(self, make: Callable[[], OpcUa], page_trouble: Callable[[], str]) -> None:
-        """`make` raises CannotServe."""
-        self._make = make
-        self._page_trouble = page_trouble
-        self._opcua: OpcUa | None = None
+    def __init__(self, opcua: OpcUa, page_trouble: Callable[[], str]) -> None:
+        self._opcua = opcua
+        self._opcua.page_trouble = page_trouble
 
     async def begin(self) -> None:
-        if self._opcua is None:
-            self._opcua = self._make()
-            self._opcua.page_trouble = self._page_trouble
         await self._opcua.start()
 
     async def serve(self) -> None:
-        assert self._opcua is not None  # it has begun
         await self._opcua.run()
 
     async def stop(self) -> None:
-        if self._opcua is not None:
-            await self._opcua.stop()
+        await self._opcua.stop()
 
 
 class PageWay:
     def __init__(self, page: Starlette, address: str, certificate: Path | None, key: Path | None) -> None:
         self._page = page
         self._address = address
-        self._tls = certificate, key
+        self._files = certificate, key
+        self._tls: SSLContext | None = None
         self._listener: socket | None = None
 
     async def begin(self) -> None:
+        self._tls = tls_of(*self._files)
         self._listener = listening(self._address)
 
     async def serve(self) -> None:
         assert self._listener is not None  # it has begun
-        await serve_on(self._page, self._listener, *self._tls)
+        await serve_on(self._page, self._listener, self._tls)
 
     async def stop(self) -> None:
         """What serves it has closed it; where nothing has, here."""

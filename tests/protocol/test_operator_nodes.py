@@ -169,20 +169,49 @@ def test_the_controller_is_told_by_kind_phase_and_mode_with_how_well_it_did_as_f
 
 
 @pytest.mark.parametrize(
-    ("state", "kind", "told"),
+    ("state", "stage", "told"),
     [
-        ("READY", None, "off"), ("STOP", "gains", "off"), ("RUN", None, "in service"), ("HOLD", None, "in service"),
-        ("RUN", "gains", "on probation"), ("RUN", "experiment", "experiment"),
+        ("READY", None, "off"), ("STOP", "probation", "off"), ("RUN", None, "in service"), ("HOLD", None, "in service"),
+        ("RUN", "deploying", "deploying"), ("RUN", "probation", "on probation"), ("HOLD", "keeping", "keeping"),
+        ("RUN", "running", "experiment"),
     ],
 )  # fmt: skip
-def test_what_the_controller_is_there_for(state, kind, told):
+def test_what_the_controller_is_there_for(state, stage, told):
     line = line_of(1)
     status = FakeGateway(line, UnixMailbox()).status()
     change = None
-    if kind is not None:
-        change = ChangeStatus(proposal="a" * 64, kind=kind, stage="running", since_wall_s=None, text="")
+    if stage is not None:
+        kind = "experiment" if stage == "running" else "gains"
+        change = ChangeStatus(proposal="a" * 64, kind=kind, stage=stage, since_wall_s=None, text="")
     loop = status.loop.model_copy(update={"state": state})
     assert mode(status.model_copy(update={"loop": loop, "change": change})) == told
+
+
+def test_what_could_not_be_written_is_written_the_next_time(monkeypatch):
+    async def story():
+        async with bench(spans=1, begin=False) as b:
+            await b.opcua.start()
+            space, path, other = b.opcua._space, "Line.Spans.1.Name", ua.NodeId(2255)  # noqa: SLF001
+            written, write = [], b.opcua.server.write_attribute_value
+            space.also(path, other)
+
+            async def broken(node_id, *words):
+                if node_id == other and "not" not in written:
+                    written.append("not")
+                    raise ua.UaError("no room")
+                written.append(node_id)
+                if node_id != other:
+                    await write(node_id, *words)
+
+            monkeypatch.setattr(b.opcua.server, "write_attribute_value", broken)
+            for _ in range(3):
+                try:
+                    await space.tell(path, "another", None)
+                except ua.UaError:
+                    pass
+            assert [one for one in written if one in ("not", other)] == ["not", other]
+
+    run(story)
 
 
 def test_before_the_first_status_values_are_waited_for():
@@ -331,6 +360,11 @@ def test_past_values_say_how_good_they_were_as_live_ones_do():
             for path in ("Line.Spans.1.Tension", "Line.Spans.2.Setpoint"):
                 values = await client.get_node(b.id(path)).read_raw_history(begin, end, 100)
                 assert values and all(one.StatusCode.is_good() for one in values)
+            b.gateway.past_quality = []  # nobody knows of the tensions; a set-point was what was set
+            for path, code in (("Tension", CODES.Uncertain), ("Setpoint", CODES.Good)):
+                values = await client.get_node(b.id(f"Line.Spans.1.{path}")).read_raw_history(begin, end, 100)
+                assert values and {one.StatusCode.value for one in values} == {code}
+                assert all(one.Value.Value is not None for one in values)
 
     run(story)
 

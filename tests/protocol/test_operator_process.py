@@ -135,6 +135,20 @@ def test_where_both_ports_are_in_use_it_ends_with_code_2_and_says_which():
                 assert "the OPC UA server cannot listen on 127.0.0.1" in told
 
 
+def test_an_https_page_without_its_certificate_is_not_told_as_served():
+    with short_folder() as folder:
+        pki = set_up(folder)
+        file = folder / "line.toml"
+        file.write_text(file.read_text(encoding="utf-8").replace('page = "http:', 'page = "https:'), encoding="utf-8")
+        places = load_line(file.read_text(encoding="utf-8"), "line.toml").operator
+        assert places.page.startswith("https:")
+        (pki / "opcua-server.pem").unlink()
+        with operator(folder) as process:  # neither way in can be opened
+            assert process.wait() == 2
+            told = process.stderr.read()
+            assert "no page at https:" in told and "opcua-server.pem" in told and "now" not in told
+
+
 @pytest.mark.parametrize("taken", ["page", "opc_ua"])
 def test_of_two_ways_in_one_goes_on_where_the_others_port_is_in_use(taken):
     with short_folder() as folder, socket.socket() as holder:

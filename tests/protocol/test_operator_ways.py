@@ -4,7 +4,7 @@ import asyncio
 import socket
 
 import pytest
-from asyncua import Client
+from asyncua import Client, ua
 
 from gateway.operator import ways
 from gateway.operator.opcua import service
@@ -97,6 +97,34 @@ def test_the_server_listens_once_its_port_is_free_and_tells_of_a_page_that_is_no
     run(story)
 
 
+def test_nodes_are_made_once_and_before_the_certificate_is_there(monkeypatch):
+    """They take a second, in which nobody could stop the line, if they came when the page is served already."""
+
+    async def story():
+        async with bench(spans=1, begin=False) as b:
+            made = []
+            make = b.opcua._make  # noqa: SLF001
+
+            async def counted():
+                made.append("once")
+                await make()
+
+            monkeypatch.setattr(b.opcua, "_make", counted)
+            (b.pki / "opcua-server.pem").rename(b.pki / "later.pem")
+            for _ in range(2):
+                with pytest.raises(CannotServe, match="pki init"):
+                    await b.opcua.start()
+                assert made == ["once"]
+            (b.pki / "later.pem").rename(b.pki / "opcua-server.pem")
+            await b.opcua.start()
+            assert made == ["once"]
+            async with b.connected("vera") as client:
+                uris = [(await client.get_namespace_array())[1], await client.get_node(ua.NodeId(2254)).read_value()]
+                assert uris == ["urn:r2rgate:test:line", ["urn:r2rgate:test:line"]]
+
+    run(story)
+
+
 def test_a_fault_of_this_program_ends_nothing_is_told_once_and_what_it_hides_does_not_look_true(monkeypatch):
     async def story():
         async with bench(spans=1) as b, b.connected("vera") as client:
@@ -116,10 +144,16 @@ def test_a_fault_of_this_program_ends_nothing_is_told_once_and_what_it_hides_doe
                 broken.setattr(b.opcua._events, "_tell", lambda _: 1 / 0)  # noqa: SLF001
                 b.gateway.records = [record(1), record(2)]
                 await b.until(client, "Line.Spans.1.Tension", bad)
+                assert (await b.value(client, "Line.Connection.Trouble")).startswith(
+                    "the line cannot be shown: ZeroDiv"
+                )
+                assert await b.value(client, "Line.Connection.Fresh") is False
                 await b.until(client, "Line.Proposals.Current.Id", bad)
                 while b.opcua._events._after != 2:  # noqa: ASYNC110, SLF001
                     await asyncio.sleep(0.01)
             await b.until(client, "Line.Spans.1.Tension", good)
+            await b.until(client, "Line.Connection.Fresh", lambda one: one.Value.Value)
+            assert await b.value(client, "Line.Connection.Trouble") == ""
             await b.until(client, "Line.Proposals.Current.Id", lambda one: good(one) and one.Value.Value)
             assert set(b.said) == {"OPC UA does not tell all: ZeroDivisionError: division by zero"}
             assert len(b.said) <= 3 + 1  # by each task once, and again after it had gone well in between

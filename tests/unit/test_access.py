@@ -1,6 +1,8 @@
 """Who came in, who did not, who may: told by the operator's process, on record at the gateway, and no disk filled."""
 
 import asyncio
+import os
+import threading
 from pathlib import Path
 
 import httpx
@@ -11,9 +13,11 @@ from gateway.core.messages import Reply
 from gateway.core.people import Person
 from gateway.core.topics import GATEWAY_ACCESS
 from gateway.mailbox.inprocess import Hub, InProcessMailbox
+from gateway.operator import access
 from gateway.operator.access import MOST_WAITING, REPORT_S, Access
 from gateway.operator.line_side import LineSide
 from gateway.operator.page.app import page_app
+from gateway.operator.process import checked_by
 from gateway.operator.users import Users, UsersFile
 from gateway.supervisor.access_desk import AccessDesk
 from gateway.supervisor.audit_file import AuditUnavailable
@@ -37,7 +41,8 @@ class Both:
         self.path = folder / "users.toml"
         self.desk = AccessDesk(self.mailbox, self.note, lambda: self.now_s)
         self.side = LineSide(InProcessMailbox(hub))
-        self.access = Access(self.side, UsersFile(self.path), self.told.append, lambda: self.now_s)
+        self.users = UsersFile(self.path)
+        self.access = Access(self.side, self.users, self.told.append, lambda: self.now_s)
 
     async def note(self, kind, who, what):
         if not self.audit_open:
@@ -224,3 +229,75 @@ def test_the_newest_users_are_known_whether_on_record_or_not(both, users):
     users.write(both.path)
     assert both.look() == []
     assert both.desk.roles() == {"otto": "operator", "vera": "viewer"}
+
+
+def test_a_disk_that_does_not_answer_holds_up_neither_the_event_loop_nor_who_is_at_work(both, users, monkeypatch):
+    """A named pipe that nobody writes to: whoever opens it waits, as with a disk that hangs."""
+    users.write(both.path)
+
+    async def story():
+        await both.access.look()
+        assert both.users.role_of("otto") == "operator"
+        monkeypatch.setattr(access, "READ_S", 0.01)
+        both.path.unlink()
+        os.mkfifo(both.path, 0o600)
+        threads, before = [], len(both.records)
+        try:
+            for _ in range(3):
+                both.access.came_in(OTTO, "192.0.2.7")
+                await both.access.look()
+                threads.append(threading.active_count())
+        finally:
+            os.close(os.open(both.path, os.O_RDWR))  # and now it answers
+            users.without("otto").write(both.path)
+        assert len(set(threads)) == 1  # no further one waits
+        assert len(both.records) == before + 3
+        assert both.users.role_of("otto") == "operator"
+        while both.users.role_of("otto") is not None:
+            await both.access.look()
+
+    asyncio.run(story())
+    assert "nobody can log in" in both.told[0] and "does not answer" in both.told[0]
+
+
+def test_users_are_looked_at_while_the_gateway_does_not_answer(both, users, monkeypatch):
+    monkeypatch.setattr(access, "LOOK_S", 0.01)
+
+    async def never(_):
+        await asyncio.Event().wait()
+
+    async def story():
+        monkeypatch.setattr(both.side, "at_the_door", never)
+        running = asyncio.create_task(both.access.run())
+        users.write(both.path)
+        while both.users.role_of("otto") is None:  # noqa: ASYNC110 (the test's time limit ends what never comes)
+            await asyncio.sleep(0.01)
+        users.without("otto").write(both.path)
+        while both.users.role_of("otto") is not None:  # noqa: ASYNC110
+            await asyncio.sleep(0.01)
+        running.cancel()
+        await asyncio.gather(running, return_exceptions=True)
+
+    asyncio.run(story())
+
+
+def test_a_users_file_that_is_gone_puts_nobody_out_and_is_told(both, users):
+    users.write(both.path)
+    both.look()
+    both.path.unlink()
+    assert both.look(2 * REPORT_S) == []
+    assert both.users.role_of("otto") == "operator" and "nobody can log in" in both.told[0]
+
+
+def test_who_was_added_a_moment_ago_is_let_in_once_they_are_known(both, users):
+    async def story():
+        users.write(both.path)
+        check = checked_by(both.users, both.told.append)
+        checking = asyncio.create_task(check("otto", SECRET))
+        while not checking.done():
+            await both.access.renew()
+            await asyncio.sleep(0.01)
+        assert checking.result() == both.users.role_of("otto") == "operator"
+        assert await check("otto", SECRET + "!") is None
+
+    asyncio.run(story())

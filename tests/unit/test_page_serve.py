@@ -14,7 +14,7 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 
 from gateway.operator.page import guard, serve
-from gateway.operator.page.serve import CannotServe, listening, serve_on
+from gateway.operator.page.serve import CannotServe, listening, serve_on, tls_of
 from tests.unit.page_support import page
 
 
@@ -44,7 +44,7 @@ def test_beyond_loopback_the_page_speaks_tls(tmp_path: Path):
         async with page(page="https://127.0.0.1:8480") as there:
             listener = socket.create_server(("127.0.0.1", 0))
             port = listener.getsockname()[1]
-            serving = asyncio.create_task(serve_on(there.app, listener, certificate, key))
+            serving = asyncio.create_task(serve_on(there.app, listener, tls_of(certificate, key)))
             trusted = await asyncio.to_thread(ssl.create_default_context, cafile=str(certificate))
             base = f"https://127.0.0.1:{port}"
             async with httpx.AsyncClient(base_url=base, verify=trusted) as browser:
@@ -65,18 +65,13 @@ def test_an_address_that_is_taken_is_told():
             listening(address)
 
 
-def test_a_certificate_that_is_none_is_told_and_the_address_is_free_again(tmp_path: Path):
+@pytest.mark.parametrize("content", [None, "nothing"])
+def test_a_certificate_that_is_none_is_told(tmp_path: Path, content: str | None):
     nothing = tmp_path / "page.pem"
-    nothing.write_text("nothing")
-
-    async def story() -> None:
-        async with page() as there:
-            listener = socket.create_server(("127.0.0.1", 0))
-            with pytest.raises(CannotServe, match=r"page\.pem"):
-                await serve_on(there.app, listener, nothing, nothing)
-            assert listener.fileno() == -1
-
-    asyncio.run(story())
+    if content is not None:
+        nothing.write_text(content)
+    with pytest.raises(CannotServe, match=r"page\.pem"):
+        tls_of(nothing, nothing)
 
 
 @pytest.mark.parametrize(

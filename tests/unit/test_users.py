@@ -119,7 +119,6 @@ def test_a_change_of_the_file_counts_from_the_next_question_on(anna: Users, tmp_
     assert file.current().entries() == []
     anna.write(path)
     assert file.current().check("anna", GOOD) == "operator"
-    assert file.current() is file.current()
     anna.without("anna").write(path)
     assert file.current().check("anna", GOOD) is None
     path.write_text("what?")
@@ -128,7 +127,7 @@ def test_a_change_of_the_file_counts_from_the_next_question_on(anna: Users, tmp_
     with pytest.raises(UsersRefused):
         file.current()  # and it is not what was read before
     path.unlink()
-    assert file.current().entries() == []
+    assert file.current().entries() == []  # it was never kept: there may never have been one
 
 
 @pytest.mark.parametrize(
@@ -256,16 +255,51 @@ def test_at_a_terminal_it_is_asked_twice_and_not_echoed(
 def test_the_role_of_somebody_who_is_in_already_is_the_files_of_now(anna: Users, tmp_path: Path) -> None:
     path = tmp_path / "users.toml"
     file = UsersFile(path)
-    assert file.role_of("anna") is None
+    file.keep(file.current())
+    assert file.role_of("anna") is None and not file.was_there
     anna.write(path)
+    file.keep(file.current())
     assert file.role_of("anna") == "operator" and file.role_of("bert") is None
     anna.with_user("anna", GOOD, "viewer").write(path)
+    file.keep(file.current())
     assert file.role_of("anna") == "viewer"
     path.write_text("nonsense")
+    with pytest.raises(UsersRefused):
+        file.keep(file.current())
     assert file.role_of("anna") == "viewer"  # nobody knows what was meant; who is at work must be able to stop
-    assert UsersFile(path).role_of("anna") is None
-    path.unlink()
+    anna.without("anna").write(path)
+    file.keep(file.current())
     assert file.role_of("anna") is None
+
+
+def test_a_file_that_is_gone_is_no_file_without_users(anna: Users, tmp_path: Path) -> None:
+    """A data disk that is not mounted looks like that, and who is at work must be able to stop."""
+    path = tmp_path / "users.toml"
+    file = UsersFile(path)
+    anna.write(path)
+    file.keep(file.current())
+    path.unlink()
+    with pytest.raises(UsersRefused, match="cannot be read"):
+        file.current()
+    assert file.role_of("anna") == "operator"
+    anna.without("anna").write(path)
+    assert file.current().entries() == []
+
+
+def test_no_question_about_a_role_waits_for_the_disk(
+    anna: Users, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "users.toml"
+    file = UsersFile(path)
+    anna.write(path)
+    file.keep(file.current())
+
+    def asked(*_: object, **__: object) -> None:
+        raise AssertionError("the disk was asked")
+
+    for name in ("open", "stat", "read_bytes"):
+        monkeypatch.setattr(Path, name, asked)
+    assert file.role_of("anna") == "operator"
 
 
 def test_of_two_who_change_the_users_at_once_neither_loses_what_they_did(tmp_path: Path) -> None:
@@ -292,6 +326,7 @@ def test_a_change_that_is_refused_changes_nothing_and_leaves_the_file_to_others(
     assert path.read_bytes() == before
     change(path, lambda users: users.without("anna"))
     assert UsersFile(path).current().entries() == []
+    assert path.exists()  # one that is gone is taken for a fault of the disk
     assert (tmp_path / "users.lock").stat().st_mode & 0o077 == 0
 
 

@@ -19,7 +19,7 @@ from gateway.core.signals import Quality
 from gateway.operator.line_side import LineSide, NotTold
 from gateway.operator.opcua.limits import MAX_HISTORY_POINTS
 from gateway.operator.opcua.line_nodes import CODES, ROOT
-from gateway.operator.opcua.space import DOUBLE, Space
+from gateway.operator.opcua.space import DOUBLE, GOOD, UNCERTAIN, Space
 
 POINTS = 600  #: where a client leaves open how many
 OPEN_S = 3600.0  #: before or behind the one end that is told
@@ -35,12 +35,12 @@ class History:
     def __init__(self, space: Space, line: Line, side: LineSide, wall_clock: Callable[[], float] = time.time) -> None:
         self._side = side
         self._wall_clock = wall_clock
-        self._columns: Mapping[Any, tuple[int, Columns, Columns]] = {
+        self._columns: Mapping[Any, tuple[int, Columns, Columns | None]] = {
             space.id(f"{ROOT}.Spans.{k + 1}.{name}"): (k, values, quality)
             for k in range(line.n)
             for name, values, quality in (
                 ("Tension", lambda told: told.tension_n, lambda told: told.quality),
-                ("Setpoint", lambda told: told.setpoint_n, lambda _: []),
+                ("Setpoint", lambda told: told.setpoint_n, None),
             )
         }
 
@@ -89,10 +89,10 @@ class History:
             return ua.HistoryReadResult(
                 StatusCode=ua.StatusCode(ua.StatusCodes.GoodNoData), HistoryData=ua.HistoryData()
             )
-        quality = qualities(told)[span] if qualities(told) else [Quality.GOOD] * len(told.wall_s)
+        codes = _codes(told, span, qualities)
         values = [
-            _as_of(wall_s, value, CODES[Quality(trust).name])
-            for wall_s, value, trust in zip(told.wall_s, columns(told)[span], quality, strict=True)
+            _as_of(wall_s, value, code)
+            for wall_s, value, code in zip(told.wall_s, columns(told)[span], codes, strict=True)
             if value is not None
         ]
         if backwards:
@@ -100,6 +100,15 @@ class History:
         held = ua.HistoryData()
         held.DataValues = values[:most]
         return ua.HistoryReadResult(HistoryData=held)
+
+
+def _codes(told: TensionsTold, span: int, qualities: Columns | None) -> list[int]:
+    """How good each value was. `qualities`: None for what was set, not measured; of unknown ones nobody can be sure."""
+    if qualities is None:
+        return [GOOD] * len(told.wall_s)
+    if not qualities(told):
+        return [UNCERTAIN] * len(told.wall_s)
+    return [CODES[Quality(one).name] for one in qualities(told)[span]]
 
 
 def _as_of(wall_s: float, value: float, code: int) -> Any:

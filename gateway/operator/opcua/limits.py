@@ -32,6 +32,7 @@ BEING_ENDED = 128  #: connections that count until the event loop has come round
 SHARE = 0.75  #: of the sessions that one address may have: the others can still come in
 PENDING_MESSAGES = 64
 LOGIN_S = 5.0  #: from a connection to a session
+UNHEARD_MS = 15_000  #: that a client takes nothing of what is sent: it is gone, and frees its place
 SESSION_TIMEOUT_MS = (5_000, 10_000)  #: a client that is killed costs so long and no longer
 PUBLISHING_MS = (50.0, 60_000.0)  #: shortest and longest interval of a subscription
 

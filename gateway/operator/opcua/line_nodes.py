@@ -127,13 +127,15 @@ def list_paths() -> list[str]:
     ]
 
 
+#: By the stage of a change.
+_MODES = {"deploying": "deploying", "probation": "on probation", "keeping": "keeping", "running": "experiment"}
+
+
 def mode(status: GatewayStatus) -> str:
     """What the controller is there for now."""
     if status.loop.state not in ("RUN", "HOLD"):
         return "off"
-    if status.change is None:
-        return "in service"
-    return "experiment" if status.change.kind == "experiment" else "on probation"
+    return "in service" if status.change is None else _MODES.get(status.change.stage, "in service")
 
 
 def health(status: GatewayStatus) -> str:
@@ -258,7 +260,7 @@ _CONTROLLER = (
     Row("Model", STRING, "SHA-256 of the model by which proposals are judged; empty: the line's file"),
     Row("Kind", STRING, "PID, LQR, LQI, LQG or MPC; and scheduled, where its gains go with the speed"),
     Row("Phase", STRING, "commissioning, or operation: a baseline was set for the line as it is"),
-    Row("Mode", STRING, "off, in service, on probation, or experiment"),
+    Row("Mode", STRING, "off, in service, deploying, on probation, keeping, or experiment"),
     Row("Stage", STRING, "Of a change that is on its way, on probation, or an experiment; empty: there is none"),
     Row("StageText", STRING, "What is still missing to its end"),
     Row("Changing", STRING, "SHA-256 of the proposal of that change"),

@@ -73,7 +73,7 @@ class Stack(InternalServer):
         self.max_connections = sessions_max + limits.MORE_CONNECTIONS + limits.BEING_ENDED
         self.max_subscriptions = sessions_max * limits.SUBSCRIPTIONS_EACH
         self.min_session_timeout_ms, self.max_session_timeout_ms = map(float, limits.SESSION_TIMEOUT_MS)
-        self.max_pending_activation_seconds = limits.LOGIN_S
+        self.max_pending_activation_seconds = 0.0  # `Sockets.end_strangers` ends them, whatever they leave unread
         self.max_pending_messages_per_connection = limits.PENDING_MESSAGES
         self.max_unacked_messages_per_subscription = limits.MAX_UNACKNOWLEDGED
         self.max_monitored_item_queue_size = limits.MAX_QUEUE
@@ -88,7 +88,6 @@ class OperatorServer(Server):
     """`init`, make nodes, `start`, `stop`."""
 
     def __init__(self, stack: Stack, logins: Logins, proving: OnlyProven, trust: TrustList, pki: Path) -> None:
-        """Raises CannotServe."""
         bound_decoder()
         super().__init__(iserver=stack)
         self._sessions_max = stack.sessions_max
@@ -97,7 +96,7 @@ class OperatorServer(Server):
         self._proving = proving
         self.application_type = ua.ApplicationType.Server
         self.name, self.manufacturer_name, self.product_uri = "r2rgate operator", "r2rgate", PRODUCT
-        self._application_uri = _load(stack, pki)
+        self._pki = pki
         self.set_security_policy(POLICIES)
 
     async def init(self, shelf_file: Path | None = None) -> None:
@@ -107,9 +106,13 @@ class OperatorServer(Server):
             await self.get_node(ua.NodeId(number)).write_value(ua.Variant(limit, ua.VariantType.UInt32))
 
     async def start(self) -> None:
-        """Raises CannotServe, and may be called again then. `stop` is needed all the same."""
+        """Reads the certificate, and listens. Raises CannotServe, and may be called again then.
+
+        `stop` is needed all the same.
+        """
         host, port = self.endpoint.hostname or "", self.endpoint.port or 0
         if self.bserver is None:
+            await self.set_application_uri(_load(self.iserver, self._pki))
             await self._setup_server_nodes()
             policies = [_Trusted(policy, self._trust.why_not) for policy in self._policies]
             await self.iserver.start()
@@ -144,11 +147,11 @@ class OperatorServer(Server):
 
     def _has_its_share(self, place: str) -> bool:
         """No more sessions are for clients of this place."""
-        most = math.ceil(limits.SHARE * self._sessions_max)
+        most = max(1, math.floor(limits.SHARE * self._sessions_max))
         return isinstance(self.bserver, Sockets) and self.bserver.sessions_from(place) >= most
 
 
-def _load(stack: Stack, pki: Path) -> str:
+def _load(stack: InternalServer, pki: Path) -> str:
     """The server's own certificate and key. Returns its ApplicationUri; raises CannotServe."""
     way_out = "`r2rgate pki init --line LINE.toml` makes what is missing"
     try:
@@ -168,7 +171,6 @@ def _load(stack: Stack, pki: Path) -> str:
 def make_server(
     url: str, sessions_max: int, logins: Logins, anonymous: bool, trust: TrustList, pki: Path
 ) -> OperatorServer:
-    """Raises CannotServe."""
     proving = OnlyProven()
     server = OperatorServer(Stack(sessions_max, proving, anonymous), logins, proving, trust, pki)
     server.set_endpoint(url)

@@ -40,7 +40,6 @@ class OpcUa:
         tell: Callable[[str], None],
         access: Access | None = None,
     ) -> None:
-        """Raises CannotServe."""
         anonymous = line.operator.anonymous == "read"
         trust = TrustList(pki, tell, lambda: datetime.now(UTC))
         self.server: OperatorServer = make_server(
@@ -53,7 +52,6 @@ class OpcUa:
         )
         self.page_trouble: Callable[[], str] = str  #: why there is no page; empty: there is one
         self._made = False
-        self._say = tell
         self._line = line
         self._side = side
         self._say = tell
@@ -62,7 +60,10 @@ class OpcUa:
         self._shown_of: ProposalList | None = None  #: of which list
 
     async def start(self) -> None:
-        """Raises CannotServe, and may be called again then; `stop` is needed all the same."""
+        """Raises CannotServe, and may be called again then; `stop` is needed all the same.
+
+        The nodes are made first, and once: to make them takes a second, in which nobody is served.
+        """
         if not self._made:
             await self._make()
             self._made = True
@@ -105,7 +106,9 @@ class OpcUa:
     async def _show_line(self) -> None:
         try:
             await self._show_line_as_it_is()
-        except Exception:  # what is shown may be old, and must not look new
+        except Exception as error:  # what is shown may be old, and must not look new
+            trouble = f"the line cannot be shown: {type(error).__name__}: {error}"
+            await self._tell((Told(f"{ROOT}.Connection.Fresh", False), Told(f"{ROOT}.Connection.Trouble", trouble)))
             await self._unsure((*live_paths(self._line), *live_alarm_paths()), self._side.age_s)
             raise
 

@@ -3,6 +3,7 @@ other.
 """
 
 import asyncio
+import socket
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -43,8 +44,13 @@ class Sockets(BinaryServer):
         await super().stop()
 
     def end_strangers(self) -> None:
-        """Connections of those who are no users any more, and those that have had no session for too long."""
+        """Connections of those who are no users any more, those that have had no session for too long, and those that
+        never finish closing, as their other side takes nothing of what was still to be sent: they would take places.
+        """
         now_s = time.monotonic()
+        for one in self.clients:
+            if isinstance(one, _Connection) and not one.is_open():
+                one.end()
         for one in self._open():
             if one.services.is_logged_in():
                 one.without_s = now_s
@@ -97,6 +103,8 @@ class _Connection(OPCUAProtocol):
         if not self.make_room(place):
             cast(asyncio.Transport, transport).abort()
             return
+        ours: socket.socket = transport.get_extra_info("socket")
+        ours.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, limits.UNHEARD_MS)
         super().connection_made(transport)
         if self.transport is not None:  # otherwise there are too many already
             self.place, self.without_s = place, time.monotonic()

@@ -22,6 +22,7 @@ BOOLEAN, UINT32, DOUBLE, STRING = (
     ua.VariantType.Boolean, ua.VariantType.UInt32, ua.VariantType.Double, ua.VariantType.String,
 )  # fmt: skip
 GOOD: int = ua.StatusCodes.Good
+UNCERTAIN: int = ua.StatusCodes.Uncertain
 WAITING: int = ua.StatusCodes.BadWaitingForInitialData
 LAST_USABLE: int = ua.StatusCodes.UncertainLastUsableValue
 NO_COMMUNICATION: int = ua.StatusCodes.BadNoCommunication
@@ -90,7 +91,6 @@ class Space:
         told = (None if value is None else value if isinstance(value, str | bool | int | float) else tuple(value), code)
         if self._told.get(path) == told:
             return
-        self._told[path] = told
         row = self._rows[path]
         held = list(told[0]) if isinstance(told[0], tuple) else told[0]
         when = datetime.now(UTC) if wall_s is None else datetime.fromtimestamp(wall_s, UTC)
@@ -98,6 +98,7 @@ class Space:
         found = ua.DataValue(variant, StatusCode=ua.StatusCode(code), SourceTimestamp=when)
         for node_id in (self.id(path), *self._also.get(path, ())):
             await self.server.write_attribute_value(node_id, found)
+        self._told[path] = told  # not before all have it: what has failed is tried again
 
     def also(self, path: str, node_id: Any) -> None:
         """Another node that has whatever `path` is told from now on."""

@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import socket
+import ssl
 from collections.abc import Iterator
 from pathlib import Path
 from urllib.parse import SplitResult, urlsplit
@@ -52,7 +53,20 @@ async def serve_page(app: Starlette, address: str, certificate: Path | None = No
 
     Raises CannotServe.
     """
-    await serve_on(app, listening(address), certificate, key)
+    tls = tls_of(certificate, key)
+    await serve_on(app, listening(address), tls)
+
+
+def tls_of(certificate: Path | None, key: Path | None) -> ssl.SSLContext | None:
+    """As PEM files have it; None without any. Raises CannotServe."""
+    if certificate is None:
+        return None
+    found = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
+    try:
+        found.load_cert_chain(certificate, key)
+    except OSError as error:  # ssl.SSLError is one
+        raise CannotServe(f"the page's certificate {certificate} and key {key} cannot be used: {error}") from error
+    return found
 
 
 def listening(address: str) -> socket.socket:
@@ -71,14 +85,10 @@ def port_of(address: SplitResult) -> int:
     return (443 if address.scheme == "https" else 80) if address.port is None else address.port
 
 
-async def serve_on(
-    app: Starlette, listener: socket.socket, certificate: Path | None = None, key: Path | None = None
-) -> None:
-    """Until it is cancelled. `app` is one of `page_app`. Raises CannotServe."""
+async def serve_on(app: Starlette, listener: socket.socket, tls: ssl.SSLContext | None = None) -> None:
+    """Until it is cancelled. `app` is one of `page_app`."""
     config = uvicorn.Config(
         app,
-        ssl_certfile=certificate,
-        ssl_keyfile=key,
         lifespan="off",
         ws="none",
         loop="none",
@@ -92,11 +102,8 @@ async def serve_on(
         timeout_graceful_shutdown=CLOSING_S,
         h11_max_incomplete_event_size=16_384,
     )
-    try:
-        config.load()
-    except OSError as error:  # ssl.SSLError is one
-        listener.close()
-        raise CannotServe(f"the page's certificate {certificate} and key {key} cannot be used: {error}") from error
+    config.load()
+    config.ssl = tls  # read before the address is taken: what cannot be served is not told as served
     server = _Server(config)
     serving = asyncio.ensure_future(server.serve(sockets=[listener]))
     try:
