@@ -85,12 +85,12 @@ def test_a_line_to_play_with_has_a_report_a_page_and_a_change_and_ends_with_ctrl
     process = demo(folder, "--stay")
     assert process.stdout is not None
     told: list[str] = []
-    for line in process.stdout:
-        told.append(line)
-        if "--run-dir" in line:
-            break
-    text = "".join(told)
     try:
+        for line in process.stdout:
+            told.append(line)
+            if "--run-dir" in line:
+                break
+        text = "".join(told)
         assert (folder / "report.html").exists() and (folder / "result.json").exists(), text
         page, password = re.search(r"^page +(\S+)$", text, re.M), re.search(r"for this run: (\S+)$", text, re.M)
         run_folder, waiting = re.search(r"--run-dir (\S+)$", text, re.M), re.search(r"r2rgate approve (\w+)", text)

@@ -3,7 +3,7 @@
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from hashlib import sha256
 from pathlib import Path
@@ -28,8 +28,11 @@ DOOR = ("logged-in", "wrong-logins", "users")  #: records of who comes in
 class OperatorLine(GateLine):
     """`pki` and users are made when it is; `operate` starts the operator's process."""
 
-    def __init__(self, folder: Path, spans: int = 6) -> None:
-        super().__init__(folder, spans=spans)
+    def __init__(
+        self, folder: Path, spans: int = 6, users: Mapping[str, str] = USERS, probation_s: float = 5.5
+    ) -> None:
+        """`users`: the role of each, by name."""
+        super().__init__(folder, spans=spans, probation_s=probation_s)
         self.endpoint, self.page = f"opc.tcp://127.0.0.1:{free_port()}", f"http://127.0.0.1:{free_port()}"
         usually, text = Operator(), (folder / "line.toml").read_text(encoding="utf-8")
         for key, usual, free in (("opc_ua", usually.opc_ua, self.endpoint), ("page", usually.page, self.page)):
@@ -38,7 +41,7 @@ class OperatorLine(GateLine):
             text = text.replace(row, f'{key} = "{free}"')
         (folder / "line.toml").write_text(text, encoding="utf-8")
         self.make_certificate(PANEL, self.data)
-        for name, role in USERS.items():
+        for name, role in users.items():
             self._said("users", "add", folder / "line.toml", name, "--role", role, "--data-dir", self.data)
 
     def __exit__(self, *error: object) -> None:

@@ -45,13 +45,13 @@ from gateway.operator.line_side import TOPICS, LineSide
 from gateway.operator.opcua.service import OpcUa
 from gateway.operator.opcua.space import NAMESPACE
 from gateway.operator.users import UsersFile
+from tests.operator.names import PASSWORD
 from tests.unit.supervisor_support import line_of, short_folder
 
 EXAMPLES = Path(__file__).parents[2] / "docs" / "examples"
 SHOWN = "5" * 64
 NUMBER = 2  #: of the namespace of the line's nodes
 USERS = {"vera": "viewer", "otto": "operator", "emma": "engineer"}
-PASSWORD = "three old rollers"
 logging.getLogger("asyncua").setLevel(logging.CRITICAL)
 
 

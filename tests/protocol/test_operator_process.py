@@ -25,11 +25,10 @@ from gateway.core.line_template import line_template
 from gateway.mailbox.unix import UnixMailbox
 from gateway.operator.opcua.trust import MOST_BYTES, TRUSTED, fingerprint
 from gateway.operator.users import FILE_NAME, Users
+from tests.operator.names import PASSWORD
 from tests.protocol.bus_support import free_port
 from tests.protocol.operator_support import NUMBER, FakeGateway, der, pair
 from tests.unit.supervisor_support import short_folder
-
-PASSWORD = "three old rollers"
 
 
 def set_up(folder: Path, *words: str) -> Path:

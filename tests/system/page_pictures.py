@@ -1,10 +1,9 @@
-"""`python -m tests.system.page_pictures [FOLDER]`: pictures of the page, with a line and a gateway that are none.
+"""`python -m tests.system.page_pictures [FOLDER]`: pictures of the page, before a simulated line with its processes.
 
-They are written to docs/img, in few colours, and are to be looked at.
+They are written to docs/img, in few colours, and are to be looked at. It takes some minutes: what they show happens.
 """
 
-import asyncio
-import shutil
+import subprocess
 import sys
 import tempfile
 import time
@@ -12,89 +11,74 @@ from pathlib import Path
 
 from PIL import Image
 
-from gateway.mailbox.unix import UnixMailbox
-from gateway.operator.line_side import TOPICS, LineSide
-from gateway.operator.page.app import page_app
-from gateway.operator.page.serve import serve_page
-from tests.operator.fake_line import PASSWORD, FakeGateway, alarm, check, role_of
-from tests.protocol.bus_support import free_port
-from tests.system.page_line import AtPage
-from tests.unit.supervisor_support import line_of
+from tests.system.page_line import AtPage, PageLine
 
 FOLDER = Path("docs/img")
 SPANS, COLOURS = 6, 48
-WAIT_S = 1.5  #: so that the last value of a trend is not the only one
+TREND_S = 60.0  #: of a run, so that its course can be seen
+SETTLES_S = 1.5  #: so that nothing is half drawn
+JUDGED_S, KEPT_S = 240.0, 120.0
+FAULT = "load-cell 3 nan for 60"
+REASON = "An LQG in place of the LQI in service: its observer takes the noise of the load cells out of the torques."
+APPROVE, YES = "[data-focus=approve]", "dialog[open] button.main"
 
 
-async def pictures(folder: Path) -> None:
-    line = line_of(SPANS)
-    line = line.model_copy(
-        update={"operator": line.operator.model_copy(update={"page": f"http://127.0.0.1:{free_port()}"})}
-    )
-    run = Path(tempfile.mkdtemp(prefix="r2r-"))
-    served, asked = UnixMailbox(), UnixMailbox()
-    gateway = FakeGateway(line, served)
-    await served.listen(run / "gateway.sock")
-    asked.connect(TOPICS, run / "gateway.sock")
-    side = LineSide(asked)
-    page = page_app(line, side, check, role_of, time.monotonic)
-    tasks = [asyncio.create_task(side.watch()), asyncio.create_task(serve_page(page, line.operator.page))]
-    try:
-        await asyncio.to_thread(_taken, line.operator.page, gateway, folder, run / "browser.log")
-    finally:
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
-        await asyncio.gather(asked.close(), served.close())
-        shutil.rmtree(run)
+def pictures(folder: Path) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix="r2r-") as work, PageLine(Path(work), spans=SPANS) as line:
+        line.run()
+        line.operate()
+        with AtPage(Path(work) / "browser.log") as at:
+            _in_order(line, at, folder)
+            _out_of_order(line, at, folder)
 
 
-def _taken(page: str, gateway: FakeGateway, folder: Path, log: Path) -> None:
-    gateway.stage = "kept"
-    with AtPage(log) as at:
-        at.open(page, width=1280, height=1640)
-        at.log_in("operator", PASSWORD)
-        _picture(at, folder / "page-line.png")
-        gateway.stage = "waiting"
-        at("see", "#prompt")
-        at.part("change")
-        at("see", ".course canvas")
-        at("size", 1280, 1700)
-        _picture(at, folder / "page-change.png")
-        gateway.approvals, gateway.first = 2, "anna"
-        at.open(page, width=1280, height=860)
-        at.log_in("operator", PASSWORD)
-        at.part("change")
-        at("click", "[data-focus=approve]")
-        at("see", "dialog[open]")
-        _picture(at, folder / "page-two-people.png")
-        at("press", "Escape")
-        at.part("history")
-        at("see", "#view-history tbody")
-        at("size", 1280, 620)
-        _picture(at, folder / "page-history.png")
-        gateway.alarms, gateway.absent = [alarm()], ["roller-3"]
-        gateway.drives[2] = "ABSENT"
-        at("see", "#now-alarms", "1")
-        at.part("health")
-        at("see", "#view-health", "roller-3")
-        at("size", 1280, 720)
-        _picture(at, folder / "page-condition.png")
-        at.open(page, "de", width=820, height=1180)
-        at.log_in("operator", PASSWORD)
-        at("see", "#alarm-list .high")
-        _picture(at, folder / "page-tablet-de.png")
+def _in_order(line: PageLine, at: AtPage, folder: Path) -> None:
+    at.open(line.page, width=1280, height=1500)
+    at.log_in("operator")
+    time.sleep(TREND_S)
+    _picture(at, folder / "page-line.png")
+    at.part("health")
+    at("see", "#view-health h2")
+    at("size", 1280, 860)
+    _picture(at, folder / "page-condition.png")
+    proposal = line.propose(line.other, REASON)
+    line.until(proposal, "waiting", JUDGED_S)
+    at.part("change")
+    at("see", ".course canvas")
+    at("size", 1280, 1700)
+    _picture(at, folder / "page-change.png")
+    at("click", APPROVE)
+    at("fill", "#ask-comment", "looks well")
+    at("click", YES)
+    at("see", "#change-body", "On probation")
+    line.until(proposal, "kept", KEPT_S)
+    at.part("history")
+    at("see", "#view-history tbody tr:first-child", "Kept")
+    at("click", "#reply button")
+    at("size", 1280, 640)
+    _picture(at, folder / "page-history.png")
+
+
+def _out_of_order(line: PageLine, at: AtPage, folder: Path) -> None:
+    """The line stops itself."""
+    words = [sys.executable, "-m", "gateway.cli", "fault", "inject", FAULT, "--control", str(line.folder / "recording")]
+    subprocess.run(words, check=True, timeout=60)
+    at("see", "#now-state", "stopped")
+    at.open(line.page, "de", width=820, height=1180)
+    at.log_in("operator")
+    at("see", "#alarm-list .high")
+    _picture(at, folder / "page-tablet-de.png")
 
 
 def _picture(at: AtPage, path: Path) -> None:
-    time.sleep(WAIT_S)
-    path.parent.mkdir(parents=True, exist_ok=True)
+    time.sleep(SETTLES_S)
     at("picture", str(path), False)
     with Image.open(path) as taken:
         few = taken.convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE)
     few.save(path, optimize=True)
-    print(f"{path}: {path.stat().st_size / 1e3:.0f} kB")
+    print(f"{path}: {path.stat().st_size / 1e3:.0f} kB", flush=True)
 
 
 if __name__ == "__main__":
-    asyncio.run(pictures(Path(sys.argv[1]) if len(sys.argv) > 1 else FOLDER))
+    pictures(Path(sys.argv[1]) if len(sys.argv) > 1 else FOLDER)

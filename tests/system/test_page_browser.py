@@ -6,12 +6,12 @@ from typing import Any
 import pytest
 
 from tests.closed_loop.wire import at_rest
-from tests.system.page_line import LANGUAGES, PARTS, PASSWORD, AtPage, PageLine
+from tests.operator.names import PASSWORD
+from tests.system.page_line import LANGUAGES, PARTS, AtPage, PageLine
 
 pytestmark = [pytest.mark.realtime, pytest.mark.timeout(300)]
 
 WINDOWS = {1280: 900, 820: 1180, 390: 844}  #: a desk, a tablet, a telephone: width and height
-FIRST_PAINT_S = 1.0
 MOST_BYTES = 500_000
 NOT_BORNE = ("serious", "critical")
 APPROVE, REJECT, YES = "[data-focus=approve]", "[data-focus=reject]", "dialog[open] button.main"
@@ -21,7 +21,7 @@ APPROVE, REJECT, YES = "[data-focus=approve]", "[data-focus=reject]", "dialog[op
 def line(tmp_path_factory: pytest.TempPathFactory) -> Iterator[PageLine]:
     with PageLine(tmp_path_factory.mktemp("page")) as found:
         found.run()
-        found.start_operator()
+        found.operate()
         yield found
 
 
@@ -101,10 +101,8 @@ def test_a_viewer_sees_everything_and_has_no_button(line: PageLine, at: AtPage):
         at.part(part)
         if part == "change":
             at("see", ".decide", "log in as an operator")
+            assert at("count", ".margins li") >= 5
         assert at("count", f"#stop, #view-{part} button") == 0
-    assert at("count", ".margins li") == 0
-    at.part("change")
-    assert at("count", ".margins li") >= 5
 
 
 def test_everything_goes_by_keyboard_alone(line: PageLine, at: AtPage):
@@ -167,15 +165,10 @@ def test_nothing_stands_in_anybodys_way(line: PageLine, at: AtPage, language: st
     assert found == []
 
 
-def test_what_is_there_comes_within_a_second_and_weighs_little(line: PageLine, at: AtPage):
-    paints_s: list[float] = []
-    for _ in range(3):
-        at.open(line.page)
-        at("see", "#login")
-        paints_s.append(at("first_paint_s"))
+def test_all_that_comes_until_the_line_is_seen_weighs_little(at: AtPage):
+    """And that it comes from one place: see `at`. How soon is a benchmark's."""
     at.log_in("operator")
-    assert at("bytes") <= MOST_BYTES
-    assert min(paints_s) <= FIRST_PAINT_S, paints_s
+    assert 0 < at("bytes") <= MOST_BYTES
 
 
 def test_a_stop_that_nobody_heard_says_so_and_one_that_was_heard_stops(line: PageLine, at: AtPage):

@@ -46,6 +46,16 @@ def test_of_alarms_that_come_together_the_highest_is_read_out_first_and_none_is_
     assert browser("content", "#alert") == ""
 
 
+def test_a_page_that_hears_nothing_new_shows_what_grows_older(gateway: FakeGateway, browser: AtPage) -> None:
+    """By the figure that `make bench-operator` has of it."""
+    assert browser("ages", 1)[-1] >= 0.0
+    frozen = gateway.status()
+    gateway.status = lambda: frozen
+    ages_s = browser("ages", 3)
+    assert len(ages_s) >= 25 and ages_s[-1] - ages_s[0] >= 1.5
+    assert ages_s[20:] == sorted(ages_s[20:])
+
+
 def test_a_new_record_leaves_the_focus_where_it_is_in_the_history(gateway: FakeGateway, browser: AtPage) -> None:
     browser.part("history")
     browser("see", "#view-history tbody")
