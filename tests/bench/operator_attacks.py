@@ -11,7 +11,7 @@ SIGTERM.
 import asyncio
 import itertools
 import json
-import os
+import random
 import signal
 import struct
 import sys
@@ -23,7 +23,8 @@ FROM = "127.0.0.2"  #: the honest client's is 127.0.0.1
 CONNECTIONS = 100
 WORKERS = 8  #: connections with malformed messages at a time
 SAID_S = 10.0  #: for the server to take what is said
-ENDED_S = 0.05  #: for it to end the connection; otherwise this side does
+ENDED_S = 1.0  #: for it to end the connection; otherwise this side does
+GARBAGE = random.Random(1).randbytes(60_000)  #: the same in every run
 CHUNK = 65_535
 RESPONSE_HEADER = 24  #: bytes: time, handle, result, no diagnostics, no texts, nothing additional
 
@@ -100,15 +101,15 @@ BEFORE: dict[str, bytes] = {
     "close before hello": message(b"CLOF", bytes(64)),
     "unknown policy": hello() + open_channel(b"http://example.org/#None"),
     "channel with a certificate that is none": hello() + open_channel(ENCRYPTED, b"\x30\x82\x40\x00" + bytes(16_384)),
-    "channel with a certificate of 60 kB": hello() + open_channel(ENCRYPTED, os.urandom(60_000), bytes(20)),
+    "channel with a certificate of 60 kB": hello() + open_channel(ENCRYPTED, GARBAGE[:60_000], bytes(20)),
     "channel without a certificate": hello() + open_channel(ENCRYPTED),
     "channel again and again": OPENED + open_channel() * 200,
-    "garbage after the channel is open": OPENED + os.urandom(4096),
+    "garbage after the channel is open": OPENED + GARBAGE[:4096],
     "message on a channel of nobody's": OPENED + in_channel(MOST, 1, [(FINAL, bytes(64))]),
 }
 #: And what on one with a channel, without security.
 INSIDE: dict[str, list[Part]] = {
-    "garbage as a message": [(FINAL, os.urandom(2000))],
+    "garbage as a message": [(FINAL, GARBAGE[:2000])],
     "chunks without end": [(CHUNK_OF_MORE, bytes(CHUNK - 24))] * 16,
     "small chunks without end": [(CHUNK_OF_MORE, b"x")] * 2000,
     "aborted chunks": [(ABORTED, bytes(64))] * 200,
@@ -165,6 +166,7 @@ async def deliver(name: str, address: tuple[str, int]) -> bool:
         try:
             async with asyncio.timeout(SAID_S):
                 await _say(name, stream, writer)
+                await writer.drain()
             said = True
             async with asyncio.timeout(ENDED_S):
                 while await stream.read(65_536):
