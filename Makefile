@@ -3,7 +3,8 @@ SHELL := /bin/sh
 VENV  := .venv
 PY    := $(VENV)/bin/python
 RUN   := $(PY) -m gateway.cli
-PARALLEL := --numprocesses auto --maxprocesses 4 --dist loadfile
+# One more than processors: many tests wait for wires.
+PARALLEL := --numprocesses $(shell n=$$(nproc); echo $$((n < 4 ? n + 1 : 4))) --dist loadfile
 export PYTHONDONTWRITEBYTECODE :=
 
 .DEFAULT_GOAL := help

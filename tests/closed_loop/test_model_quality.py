@@ -118,6 +118,7 @@ def test_rollers_are_found_out_of_round_where_round_ones_would_have_another_radi
     assert found.noise.tension_n == pytest.approx(0.1, rel=0.05)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("known_m", [None, (0.035, 1e-5)], ids=["as in the file", "measured"])
 def test_one_roller_out_of_round_among_round_ones(known_m):
     plant = altered(real_plant(), {"effects": {"eccentricity": {"share": [0.0, 0.0, 0.005, 0.0, 0.0, 0.0]}}})
