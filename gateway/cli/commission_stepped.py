@@ -123,7 +123,7 @@ class SteppedGate:
         return self._gate.deployer
 
     async def proposals(self) -> list[ProposalShown]:
-        found = [self.deployer.shown(entry.proposal) for entry in self.deployer.book.since_change]
+        found = [await self._shown(entry.proposal) for entry in list(self.deployer.book.since_change)]
         return [one for one in found if isinstance(one, ProposalShown)]
 
     async def now(self) -> LineNow:
@@ -178,8 +178,13 @@ class SteppedGate:
         payload = command.model_dump_json().encode()
         return Reply.model_validate_json(await self._mailboxes[0].request(GATEWAY_DECISION, payload, ANSWER_S))
 
+    async def _shown(self, proposal: str) -> ProposalShown | str:
+        """A sentence where there is none."""
+        await self.deployer.at_hand(proposal)
+        return self.deployer.shown(proposal)
+
     async def wait_for(self, proposal: str) -> None:
-        shown = self.deployer.shown(proposal)
+        shown = await self._shown(proposal)
         if isinstance(shown, str):
             raise CannotGoOn(shown)
         if shown.stage == Stage.RECEIVED:

@@ -77,7 +77,7 @@ def run_together(
                 time.sleep(REFRESH_S)
     finally:
         console.print("stopping the line, then ending")
-        for child in reversed(children):
+        for child in sorted(reversed(children), key=lambda one: one.name != "loop"):  # others may hang: the line first
             child.end(line.longest_stop_s + PATIENCE_S)
     if final is None:
         return 0

@@ -159,19 +159,23 @@ def test_run_says_simulated_only_of_the_line_that_it_starts(monkeypatch, tmp_pat
     from gateway.cli import together
 
     class Tended:
-        def __init__(self, name, arguments, log):
+        def __init__(self, name, arguments, log, is_needed=True):
+            self.name = name
             seen[name] = arguments()
+
+        def end(self, patience_s):
+            ended.append(self.name)
 
     def stop(children, notices):
         raise InterruptedError
 
     for plant in (None, Path("plant.toml")):
-        seen = {}
+        seen, ended = {}, []
         monkeypatch.setattr(together, "Child", Tended)
         monkeypatch.setattr(together, "_tend", stop)
         monkeypatch.setattr(together, "_Ending", lambda: type("Ending", (), {"asked": False})())
-        monkeypatch.setattr(Tended, "end", lambda self, patience_s: 0, raising=False)
         line = producing().line
         with pytest.raises(InterruptedError):
             together.run_together(tmp_path / "line.toml", line, tmp_path / "c.json", plant, tmp_path, tmp_path)
         assert ("--simulated" in seen["loop"]) == (plant is not None)
+        assert ended[0] == "loop" and len(ended) == len(seen)  # the line stops before anything else is waited for
