@@ -67,7 +67,7 @@ def test_an_operator_sees_the_line_approves_a_change_and_takes_it_back(line: Pag
     at("fill", "#ask-comment", "it hums")
     at("click", YES)
     at("see", "#reply", "Done")
-    assert line.in_service() == before
+    line.look_on(line.in_service, lambda now: now == before)
     at("see", "#markers", "R ")
     at.part("history")
     at("see", "#view-history tbody tr:first-child", "Rolled back")
@@ -107,7 +107,7 @@ def test_a_viewer_sees_everything_and_has_no_button(line: PageLine, at: AtPage):
 
 def test_everything_goes_by_keyboard_alone(line: PageLine, at: AtPage):
     proposal = line.waiting()
-    assert at("focused") == "Name"
+    line.look_on(lambda: at("focused"), lambda now: now == "Name")
     at("write", "operator")
     at("press", "Tab")
     at("write", PASSWORD)

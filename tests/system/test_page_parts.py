@@ -92,4 +92,4 @@ def test_the_span_that_was_chosen_stays_chosen_and_has_the_focus(gateway: FakeGa
     browser("see", "#change-body", "On probation")
     assert browser("value", SPAN) == str(SPANS - 1)  # counted from 0
     assert browser("focused").startswith("Span")
-    assert browser("count", f".course[aria-label*='span {SPANS}:']") == 2
+    assert browser("count", f".course[aria-label*='span {SPANS}.']") == 2
