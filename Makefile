@@ -3,8 +3,7 @@ SHELL := /bin/sh
 VENV  := .venv
 PY    := $(VENV)/bin/python
 RUN   := $(PY) -m gateway.cli
-# One more than processors: many tests wait for wires.
-PARALLEL := --numprocesses $(shell n=$$(nproc); echo $$((n < 4 ? n + 1 : 4))) --dist loadfile
+PARALLEL := --numprocesses auto --maxprocesses 4 --dist loadfile
 export PYTHONDONTWRITEBYTECODE :=
 
 .DEFAULT_GOAL := help
@@ -32,7 +31,7 @@ test: $(VENV)/.compiled ## set up, then all tests but the long ones: those about
 	@$(PY) -m pytest -m "realtime and not long" $(ARGS) || [ $$? -eq 5 ]  # 5: none of them was asked for
 	@$(PY) -m pytest -m "not realtime and not long" $(PARALLEL) $(ARGS) || [ $$? -eq 5 ]
 
-test-long: $(VENV)/.compiled ## the demonstration, whole chains through the gate, comparisons with other libraries (about 3 min)
+test-long: $(VENV)/.compiled ## the demonstration, whole chains through the gate, comparisons with other libraries (about 5 min)
 	@$(PY) -m pytest -m "long and realtime" $(ARGS) || [ $$? -eq 5 ]
 	@$(PY) -m pytest -m "long and not realtime" $(PARALLEL) $(ARGS) || [ $$? -eq 5 ]
 
@@ -105,7 +104,7 @@ bench-gate-live: $(VENV)/.compiled ## the gate on a running line: rollback, swap
 bench-agents-live: $(VENV)/.compiled ## agents that die, hang, flood or lie beside a running line (about 30 min; ARGS="--rounds 1")
 	@$(PY) -m tests.bench.agents_live $(ARGS)
 
-bench-operator: $(VENV)/.compiled ## the OPC UA server flooded beside a running line, what it costs, the page in Chromium; as root (about 8 min; ARGS="--rounds 1 --seconds 5")
+bench-operator: $(VENV)/.compiled ## the OPC UA server flooded beside a running line, what it costs, the page in Chromium; as root (about 12 min; ARGS="--rounds 1 --seconds 7")
 	@$(PY) -m tests.system.needs
 	@$(PY) -m tests.bench.operator $(ARGS)
 

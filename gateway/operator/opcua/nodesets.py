@@ -75,7 +75,7 @@ async def _imported(server: Server, node_set: NodeSet, taken: frozenset[str]) ->
     data = node_set.read()
     try:
         _check_namespaces(data, node_set, taken)
-        # Of definitions asyncua would make Python code, and run it.
+        # Of definitions asyncua would make Python code, and run it. It takes bytes, though it declares a text.
         nodes = await server.import_xml(xmlstring=data, auto_load_definitions=False)  # type: ignore[arg-type]
         return await _harmless(server, nodes)
     except NotUsable:
