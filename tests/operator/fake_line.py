@@ -8,6 +8,7 @@ import asyncio
 import json
 import math
 import sys
+import threading
 import time
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -88,6 +89,8 @@ class FakeGateway:
         self.first = ""  #: who has approved it, where it takes two
         self.drives: dict[int, str] = {}  #: by span, those that are not ENABLED
         self.off_n: dict[int, float] = {}  #: by span, away from its set-point
+        self.answers = threading.Event()  #: while it is not set, what people say is heard and not answered
+        self.answers.set()
         now = datetime.now(UTC).replace(microsecond=0)
         example = json.loads((EXAMPLES / "proposal.json").read_text())
         example |= {"created": now.isoformat(), "expires": (now + timedelta(minutes=42)).isoformat()}
@@ -243,7 +246,9 @@ class FakeGateway:
         )
 
     async def _for_person(self, payload: bytes) -> bytes:
-        return self._heard(FOR_PERSON.validate_json(payload)).model_dump_json().encode()
+        reply = self._heard(FOR_PERSON.validate_json(payload))
+        await asyncio.to_thread(self.answers.wait)
+        return reply.model_dump_json().encode()
 
     def _heard(self, asked: ForPerson) -> Reply:
         self.said.append(asked)

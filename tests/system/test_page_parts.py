@@ -4,7 +4,9 @@ from collections.abc import Iterator
 
 import pytest
 
+from gateway.core.messages import SetTension
 from tests.operator.fake_line import PASSWORD, FakeGateway, alarm
+from tests.operator.real_line import until
 from tests.system.made_up_page import made_up_page
 from tests.system.page_line import AtPage
 
@@ -93,3 +95,20 @@ def test_the_span_that_was_chosen_stays_chosen_and_has_the_focus(gateway: FakeGa
     assert browser("value", SPAN) == str(SPANS - 1)  # counted from 0
     assert browser("focused").startswith("Span")
     assert browser("count", f".course[aria-label*='span {SPANS}.']") == 2
+
+
+def test_what_is_written_while_an_answer_is_on_its_way_stays(gateway: FakeGateway, browser: AtPage) -> None:
+    field, button = (f"#operate form:has-text('Tension') {one}" for one in ("input", "button"))
+    gateway.answers.clear()
+    try:
+        browser("fill", field, "21")
+        browser("click", button)
+        browser("fill", field, "22")
+    finally:
+        gateway.answers.set()
+    browser("see", "#reply", "Done")
+    browser("ages", 1)  # the page has looked at what else is new, and goes on
+    assert browser("value", field) == "22"
+    browser("click", button)
+    until(lambda: [one.said.tension_n for one in gateway.said if isinstance(one.said, SetTension)], [21.0, 22.0].__eq__)
+    browser("see", "#reply", "Done")

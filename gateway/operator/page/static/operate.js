@@ -66,7 +66,9 @@ export class Operate {
     };
     input.addEventListener("blur", () => touched || put());
     this.follows.push(() => document.activeElement !== input && put());
-    return { input, anew };
+    // What was written while the answer was on its way stays.
+    const answered = (sent) => input.value === sent && anew();
+    return { input, anew, answered };
   }
 
   tension() {
@@ -75,8 +77,9 @@ export class Operate {
     const value = this.field(min, max, () => this.last.spans[span.value - 1][1]);
     span.addEventListener("change", value.anew);
     const submit = async () => {
-      await this.say({ command: "set", span: Number(span.value), tension_n: Number(value.input.value) });
-      value.anew();
+      const sent = value.input.value;
+      await this.say({ command: "set", span: Number(span.value), tension_n: Number(sent) });
+      value.answered(sent);
     };
     return this.form("tension", submit,
       h("label", {}, h("span", {}, word("operate.tension")), span),
@@ -87,11 +90,11 @@ export class Operate {
     const max = this.line.speed_max_m_per_s;
     const value = this.field(0, max, () => this.last.speed_setpoint);
     const submit = async () => {
-      const to = Number(value.input.value), from = this.last?.speed_setpoint ?? 0;
+      const sent = value.input.value, to = Number(sent), from = this.last?.speed_setpoint ?? 0;
       const lines = [changed(word("operate.speed"), from, to, "m/s", 3)];
       if (to > from && (await confirmed({ title: word("operate.sure-speed"), lines, yes: word("operate.set") })) === null) return;
       await this.say({ command: "speed", speed_m_per_s: to });
-      value.anew();
+      value.answered(sent);
     };
     return this.form("speed", submit,
       h("label", {}, h("span", {}, `${word("operate.speed")}, m/s, 0 ${word("operate.to")} ${number(max, 2)}`), value.input));
