@@ -285,6 +285,10 @@ class Bench:
     def sessions(self) -> int:
         return len(self.opcua.server.iserver._external_sessions)  # noqa: SLF001 (there is no other way to count)
 
+    async def looked_at_trust(self) -> None:
+        """What is in the folder of the trusted now counts."""
+        await asyncio.to_thread(self.opcua.trust.look)
+
     async def call(self, client: Client, method: str, *arguments: Any) -> tuple[int, list[Any]]:
         """Status code and output arguments of a method of the line."""
         request = ua.CallMethodRequest(self.id("Line"), self.id(f"Line.{method}"), list(arguments))

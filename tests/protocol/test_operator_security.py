@@ -1,6 +1,8 @@
 """Who is let in at the OPC UA server, and what those cannot do who are not, or only to look."""
 
 import asyncio
+import threading
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -23,6 +25,12 @@ def run(story):
 @pytest.fixture(autouse=True)
 def impatient(monkeypatch):
     monkeypatch.setattr(login, "FIRST_DELAY_S", 0.001)
+
+
+async def until(right: Callable[[], bool]) -> None:
+    """The test's time limit ends what never comes."""
+    while not right():  # noqa: ASYNC110 (it is on the wire)
+        await asyncio.sleep(0.02)
 
 
 async def refused(client: Client) -> str:
@@ -105,12 +113,16 @@ def test_a_stranger_is_turned_away_kept_to_be_looked_at_and_let_in_once_trusted(
             assert await refused(await b.client("otto", of="stranger", timeout_s=2.0))
             assert b.checks == 0
             kept = file_of(b.pki / REJECTED, der(pair("stranger")))
+            await until(kept.exists)
             assert kept.read_bytes() == der(pair("stranger"))
             assert any(f"r2rgate pki trust {kept}" in said and "urn:test:stranger" in said for said in b.said)
-            kept.rename(b.pki / TRUSTED / "any-name.der")
-            async with b.connected("otto", of="stranger"):
-                pass
-            (b.pki / TRUSTED / "any-name.der").unlink()  # trust is taken back at once
+            trusted = kept.rename(b.pki / TRUSTED / "any-name.der")
+            await b.looked_at_trust()
+            async with b.connected("otto") as other, b.connected("otto", of="stranger"):
+                assert b.sessions() == 2
+                trusted.unlink()
+                await until(lambda: b.sessions() == 1)  # the session that is open ends, too
+                await b.value(other, "Line.Connection.Fresh")
             assert await refused(await b.client("otto", of="stranger", timeout_s=2.0))
 
     run(story)
@@ -126,8 +138,8 @@ def test_rejected_certificates_do_not_fill_the_disk(monkeypatch):
             for number in range(MOST_REJECTED + 5):
                 (folder / f"{number}.der").write_bytes(b"x")
             assert await refused(await b.client("otto", of="stranger", timeout_s=2.0))
+            await until(file_of(folder, der(pair("stranger"))).exists)
             assert len(list(folder.iterdir())) == MOST_REJECTED
-            assert file_of(folder, der(pair("stranger"))).exists()
 
     run(story)
 
@@ -185,9 +197,32 @@ def test_a_file_among_the_trusted_that_cannot_be_read_keeps_nobody_else_out(monk
             (b.pki / TRUSTED / "00.der").mkdir()
             (b.pki / TRUSTED / "0.der").write_bytes(bytes(len(der(pair("client")))))
             monkeypatch.setattr(Path, "read_bytes", reads)
+            await b.looked_at_trust()
             async with b.connected("otto"):
                 pass
             assert any("0.der cannot be read" in said for said in b.said)
+
+    run(story)
+
+
+def test_a_disk_that_hangs_keeps_out_nobody_who_was_trusted_before(monkeypatch):
+    hanging, over = threading.Event(), threading.Event()
+
+    def hangs(_path, _pattern):
+        hanging.set()
+        over.wait()
+        return []
+
+    async def story():
+        async with bench(spans=1) as b:
+            with monkeypatch.context() as disk:
+                disk.setattr(Path, "glob", hangs)
+                try:
+                    await until(hanging.is_set)
+                    async with b.connected("otto") as client:
+                        assert await b.call(client, "Stop") == (CODES.Good, [True, "done"])
+                finally:
+                    over.set()
 
     run(story)
 

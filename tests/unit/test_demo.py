@@ -275,6 +275,7 @@ def test_who_is_let_in_has_a_certificate_that_is_trusted_and_a_password_that_is_
     assert users[1].check(script.user, script.password) == "operator" and alone.script.password != script.password
     pki = tmp_path / "b" / "pki"
     trusted = TrustList(pki, print, lambda: datetime.now(UTC))
+    trusted.look()
     assert trusted.why_not(from_file(Path(script.certificate).read_bytes())) == ""
 
 

@@ -68,14 +68,16 @@ class Processor(UaProcessor):
         logins: Logins,
         proving: OnlyProven,
         has_its_share: Callable[[str], bool],
+        is_trusted: Callable[[bytes], bool],
         transport: asyncio.Transport,
         limits: TransportLimits,
     ) -> None:
-        """`has_its_share`: of the sessions, by `place_of` the client."""
+        """`has_its_share`: of the sessions, by `place_of` the client; `is_trusted`: a certificate, as it is now."""
         super().__init__(server, transport, limits)
         self._logins = logins
         self._proving = proving
         self._has_its_share = has_its_share
+        self._is_trusted = is_trusted
         self._calls: set[asyncio.Task[None]] = set()  #: without those that are urgent
         self._urgent: set[asyncio.Task[None]] = set()
         self._histories: set[asyncio.Task[None]] = set()
@@ -170,8 +172,10 @@ class Processor(UaProcessor):
         return isinstance(self.session, Session) and self.session.is_activated()
 
     def is_nobodys(self) -> bool:
-        """Whoever has logged in is no user any more."""
-        return isinstance(self.session, Session) and self.session.is_activated() and self.session.person is None
+        """Whoever has logged in is no user any more, or from a client that is trusted no more."""
+        if not isinstance(self.session, Session) or not self.session.is_activated():
+            return False
+        return self.session.person is None or not self._is_trusted(self._certificate())
 
     def _session(self) -> Session:
         """Raises ServiceError. A session lives and dies with its connection: nobody else can take it up."""

@@ -143,7 +143,9 @@ class OperatorServer(Server):
         await super().stop()
 
     def _processor(self, transport: asyncio.Transport, bounds: TransportLimits) -> Processor:
-        return Processor(self.iserver, self._logins, self._proving, self._has_its_share, transport, bounds)
+        return Processor(
+            self.iserver, self._logins, self._proving, self._has_its_share, self._trust.holds, transport, bounds
+        )
 
     def _has_its_share(self, place: str) -> bool:
         """No more sessions are for clients of this place."""

@@ -7,8 +7,10 @@ rejected/  the newest of those that were turned away, to be looked at and truste
 import hashlib
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
+from stat import S_ISREG
 
 from cryptography import x509
 from cryptography.hazmat.primitives.asymmetric.rsa import RSAPublicKey
@@ -88,21 +90,37 @@ def file_of(folder: Path, der: bytes) -> Path:
     return folder / f"{fingerprint(der)[:32]}.der"
 
 
+@dataclass(frozen=True)
+class _File:
+    stamp: tuple[int, int, int]  #: another one: it has to be read anew
+    der: bytes  #: empty: it cannot be read
+
+
 class TrustList:
+    """Certificates are held against what `look` has read last: nobody waits for a disk because a client comes."""
+
     def __init__(self, pki: Path, tell: Callable[[str], None], now: Callable[[], datetime]) -> None:
         self._trusted, self._rejected = pki / TRUSTED, pki / REJECTED
         self._tell = tell
         self._now = now
         self._next_s = time.monotonic()
+        self._files: dict[Path, _File] = {}
+        self._held: frozenset[bytes] = frozenset()  #: by content: a file's name proves nothing
+        self._stranger: bytes | None = None  #: to be kept in the folder of the rejected
+
+    def holds(self, der: bytes) -> bool:
+        """It is trusted, whether it is good now or not."""
+        return der in self._held
 
     def why_not(self, der: bytes) -> str:
-        """Empty: the certificate is trusted, and good now. The folder is read each time: trust may be taken back."""
+        """Empty: the certificate is trusted, and good now."""
         try:
             certificate = certificate_of(der)
         except NotUsable as error:
             return str(error)
-        if not self._is_trusted(der):
-            self._keep(der, certificate)
+        if not self.holds(der):
+            if self._stranger is None and self._may_say():
+                self._stranger = der
             return "it is not trusted"
         now = self._now()
         if not certificate.not_valid_before_utc <= now <= certificate.not_valid_after_utc:
@@ -113,6 +131,17 @@ class TrustList:
             return "it is out of date"
         return ""
 
+    def look(self) -> None:
+        """Read what is trusted now, and keep who was turned away. Waits for the disk; one at a time. Raises OSError."""
+        before = self._files
+        paths = sorted(self._trusted.glob("*.der"))[:MOST_TRUSTED]
+        self._files = {path: self._read(path, before.get(path)) for path in paths}
+        self._held = frozenset(one.der for one in self._files.values() if one.der)
+        if (stranger := self._stranger) is not None:
+            if stranger not in self._held:  # somebody may have trusted it meanwhile
+                self._keep(stranger)
+            self._stranger = None
+
     def _may_say(self) -> bool:
         """Now and then: neither the disk nor the log is for strangers to fill."""
         if time.monotonic() < self._next_s:
@@ -120,23 +149,24 @@ class TrustList:
         self._next_s = time.monotonic() + KEEP_S
         return True
 
-    def _is_trusted(self, der: bytes) -> bool:
-        """By content: a file's name proves nothing."""
-        return any(self._holds(path, der) for path in sorted(self._trusted.glob("*.der"))[:MOST_TRUSTED])
-
-    def _holds(self, path: Path, der: bytes) -> bool:
+    def _read(self, path: Path, before: _File | None) -> _File:
         """A file that cannot be read lets nobody in, and keeps nobody else out."""
         try:
-            return path.is_file() and path.stat().st_size == len(der) and path.read_bytes() == der
+            found = path.stat()
+            stamp = found.st_ino, found.st_size, found.st_ctime_ns
+            if before is not None and before.stamp == stamp:
+                return before
+            usable = S_ISREG(found.st_mode) and found.st_size <= MOST_BYTES
+            return _File(stamp, path.read_bytes() if usable else b"")
         except OSError as error:
-            if self._may_say():
+            if before is None or before.der:
                 self._tell(f"{path} cannot be read, and lets nobody in: {error.strerror}")
-            return False
+            return _File((0, 0, 0), b"")
 
-    def _keep(self, der: bytes, certificate: x509.Certificate) -> None:
+    def _keep(self, der: bytes) -> None:
         """Beside the newest others; told once as long as it lies there."""
         path = file_of(self._rejected, der)
-        if path.exists() or not self._may_say():
+        if path.exists():
             return
         self._rejected.mkdir(mode=0o700, parents=True, exist_ok=True)
         older = sorted(self._rejected.glob("*.der"), key=lambda one: one.stat().st_mtime)
@@ -144,7 +174,7 @@ class TrustList:
             one.unlink(missing_ok=True)
         path.write_bytes(der)
         self._tell(
-            f"the unknown certificate {_told(der, certificate)} was turned away; if it is who it says it is: "
+            f"the unknown certificate {_told(der, certificate_of(der))} was turned away; if it is who it says it is: "
             f"r2rgate pki trust {path} --line LINE.toml"
         )
 
