@@ -332,6 +332,7 @@ def test_records_of_the_audit_and_waiting_proposals_are_events_of_the_server():
             b.gateway.waiting = [one]
             waits = await heard.values.get()
             assert (waits.ProposalId, waits.ShownHash, waits.BaseRevision) == (one.proposal_hash, SHOWN, 3)
+            assert (await heard.values.get()).EventType == ua.NodeId(ua.ObjectIds.DialogConditionType)
             assert heard.values.empty()
 
     run(story)

@@ -197,6 +197,29 @@ def test_a_proposal_is_announced_approved_once_and_deployed(panel: Panel, policy
     assert approval.what["shown"] == shown_hash and approval.what["comment"] == "as discussed"
 
 
+def test_a_proposal_is_a_dialog_that_is_answered_once(panel: Panel) -> None:
+    line, controller = panel.line, panel.other()
+    with panel.as_("otto", **OTTO):
+        proposal, shown_hash, _ = panel.waiting("otto", controller)
+        found = until(
+            lambda: panel.client("conditions", "otto"), lambda found: any(one["Retain"] for one in found.values())
+        )
+        ((dialog, told),) = [(name, one) for name, one in found.items() if one["Retain"]]
+        assert proposal in dialog and shown_hash in dialog and told["DialogState.Id"] is True
+        assert told["EventType"] == "ns=0;i=2830" and told["ResponseOptionSet"] == ["approve", "reject"]
+        assert all(row in told["Prompt"] for row in panel.values("otto", f"Line.Proposals.{proposal}.Difference")[0])
+        assert panel.client("respond", "otto", dialog, 2) == "BadDialogResponseInvalid"
+        assert panel.client("respond", "otto", dialog, 0) == "Good"
+        panel.until("otto", "Line.Controller.InService", config_hash(controller))
+        ended = until(lambda: panel.client("conditions", "otto")[dialog], lambda one: not one["Retain"])
+        assert ended["DialogState.Id"] is False and ended["LastResponse"] == 0
+        with line.unchanged():
+            assert panel.client("respond", "otto", dialog, 0) == "BadNodeIdInvalid"
+    (approval,) = [one for one in line.records() if one.kind == "approved" and one.what.get("proposal") == proposal]
+    assert "otto" in approval.who.name and approval.who.certificate == line.fingerprint(PANEL)
+    assert approval.what["shown"] == shown_hash
+
+
 def test_a_recipe_is_selected_and_the_set_points_go_there(panel: Panel) -> None:
     setpoints = [f"Line.Spans.{k}.Setpoint" for k in range(1, SPANS + 1)]
     recipes = {one.name: list(one.tension_n) for one in panel.line.line.recipes}
@@ -315,8 +338,9 @@ def test_a_stranger_is_turned_away_and_their_certificate_kept_to_be_looked_at(pa
     with line.unchanged():
         assert "disconnected by third party" in panel.refused(certificate=f"opcua-client-{STRANGER}", **OTTO)
     fingerprint = line.fingerprint(STRANGER)
+    log = line.children.log("operator")
+    until(log.read_text, lambda text: f"r2rgate pki trust {line.pki / REJECTED}" in text)
     assert [path.name for path in (line.pki / REJECTED).iterdir()] == [f"{fingerprint[:32]}.der"]
-    assert f"r2rgate pki trust {line.pki / REJECTED}" in line.children.log("operator").read_text()
 
 
 def _of(events: list[dict[str, Any]], kind: str) -> list[dict[str, Any]]:

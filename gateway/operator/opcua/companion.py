@@ -11,7 +11,7 @@ from typing import Any
 from asyncua import ua as asyncua_ua
 
 from gateway.core.line import Line
-from gateway.operator.opcua.instances import declared, make
+from gateway.operator.opcua.instances import declared, make, make_object
 from gateway.operator.opcua.line_nodes import ROOT
 from gateway.operator.opcua.nodeset_files import NotUsable, look_into
 from gateway.operator.opcua.nodesets import NodeSets
@@ -61,12 +61,12 @@ async def _machine(space: Space, line: Line, sets: NodeSets) -> None:
     machines = ua.NodeId(MACHINES, machinery)
     if machines not in space.server.iserver.aspace:
         raise NotUsable(f"the model {MACHINERY} has no folder Machines, i={MACHINES}")
-    await _object(space, MACHINE, machines, ua.ObjectIds.Organizes, ua.ObjectIds.BaseObjectType,
-                  ua.QualifiedName(line.line, space.namespace))  # fmt: skip
+    await make_object(space, MACHINE, machines, ua.ObjectIds.Organizes, ua.ObjectIds.BaseObjectType,
+                      ua.QualifiedName(line.line, space.namespace))  # fmt: skip
     await space.server.get_node(space.id(MACHINE)).add_reference(space.id(ROOT), ua.ObjectIds.Organizes)
     path = f"{MACHINE}.Identification"
-    await _object(space, path, space.id(MACHINE), ua.ObjectIds.HasAddIn, types["MachineIdentificationType"],
-                  ua.QualifiedName("Identification", di))  # fmt: skip
+    await make_object(space, path, space.id(MACHINE), ua.ObjectIds.HasAddIn, types["MachineIdentificationType"],
+                      ua.QualifiedName("Identification", di))  # fmt: skip
     location, name = ua.Variant(line.site, STRING), ua.Variant(ua.LocalizedText(line.line))
     await make(space, path, identification, {"Location": location, "ComponentName": name})
 
@@ -78,14 +78,14 @@ async def _process_values(space: Space, line: Line, sets: NodeSets) -> None:
     machinery = await sets.number(MACHINERY)
     monitoring = (await sets.types(MACHINERY)).get("MonitoringType", ua.ObjectIds.FolderType)
     above, path = space.id(MACHINE), f"{MACHINE}.Monitoring"
-    await _object(space, path, above, ua.ObjectIds.HasAddIn, monitoring, ua.QualifiedName("Monitoring", machinery))
-    await _object(space, PROCESS, space.id(path), ua.ObjectIds.HasComponent, ua.ObjectIds.FolderType,
-                  ua.QualifiedName("Process", machinery))  # fmt: skip
+    await make_object(space, path, above, ua.ObjectIds.HasAddIn, monitoring, ua.QualifiedName("Monitoring", machinery))
+    await make_object(space, PROCESS, space.id(path), ua.ObjectIds.HasComponent, ua.ObjectIds.FolderType,
+                      ua.QualifiedName("Process", machinery))  # fmt: skip
     for number, span in enumerate(line.spans, 1):
         if span.control == "tension":
             path = f"{PROCESS}.{number}"
             name = ua.QualifiedName(f"Tension{number}", space.namespace)
-            await _object(space, path, space.id(PROCESS), ua.ObjectIds.HasComponent, kind, name)
+            await make_object(space, path, space.id(PROCESS), ua.ObjectIds.HasComponent, kind, name)
             await make(space, path, rows, _of_span(line, number))
 
 
@@ -108,13 +108,3 @@ def _type(types: Mapping[str, Any], name: str) -> Any:
     if name not in types:
         raise NotUsable(f"its model has no {name}")
     return types[name]
-
-
-async def _object(space: Space, path: str, above: Any, reference: int, kind: Any, name: Any) -> None:
-    item = ua.AddNodesItem(
-        ParentNodeId=above, ReferenceTypeId=ua.NodeId(reference), RequestedNewNodeId=space.id(path), BrowseName=name,
-        NodeClass=ua.NodeClass.Object, TypeDefinition=ua.NodeId(kind) if isinstance(kind, int) else kind,
-        NodeAttributes=ua.ObjectAttributes(DisplayName=ua.LocalizedText(name.Name), WriteMask=0, UserWriteMask=0),
-    )  # fmt: skip
-    (result,) = await space.server.iserver.isession.add_nodes([item])
-    result.StatusCode.check()

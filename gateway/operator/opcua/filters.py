@@ -13,7 +13,28 @@ MAX_OPERANDS = 500  #: of all elements of a condition together
 
 ua: Any = asyncua_ua  #: what it declares of its values and what they are differ
 
+_HAS_SUBTYPE = ua.NodeId(ua.ObjectIds.HasSubtype)
 _ATTRIBUTES = frozenset(int(one) for one in ua.AttributeIds)
+
+
+class Chooser(WhereClauseEvaluator):
+    """By the condition of an item. OfType holds of subtypes as well (OPC 10000-4, 7.7.3); asyncua's is of one alone."""
+
+    def _eval_el(self, index: int, event: Any) -> Any:
+        element = self.elements[index]
+        if element.FilterOperator != ua.FilterOperator.OfType:
+            return super()._eval_el(index, event)
+        return self._is_a(event.EventType, self._eval_op(element.FilterOperands[0], event))
+
+    def _is_a(self, kind: Any, wanted: Any) -> bool:
+        while kind is not None and kind != wanted:
+            above = [
+                one.NodeId
+                for one in self._aspace[kind].references
+                if one.ReferenceTypeId == _HAS_SUBTYPE and not one.IsForward
+            ]
+            kind = above[0] if above else None
+        return kind is not None
 
 
 class Items(MonitoredItemService):
@@ -28,7 +49,10 @@ class Items(MonitoredItemService):
     def _create_events_monitored_item(self, params: Any) -> Any:
         if not _chooses_events(params.RequestedParameters.Filter):
             return ua.MonitoredItemCreateResult(StatusCode=ua.StatusCode(ua.StatusCodes.BadFilterNotAllowed))
-        return super()._create_events_monitored_item(params)
+        result = super()._create_events_monitored_item(params)
+        if (made := self._monitored_items.get(result.MonitoredItemId)) is not None:
+            made.where_clause_evaluator = Chooser(self.logger, self.aspace, made.filter.WhereClause)
+        return result
 
     async def _create_data_change_monitored_item(self, params: Any) -> Any:
         wanted = params.RequestedParameters
@@ -46,7 +70,7 @@ class Items(MonitoredItemService):
         if wanted.Filter is not None and not (_chooses_events if of_events else _chooses_changes)(wanted.Filter):
             return ua.MonitoredItemModifyResult(StatusCode=ua.StatusCode(ua.StatusCodes.BadFilterNotAllowed))
         if of_events and wanted.Filter is not None:  # asyncua would go on with the condition that was before
-            held.where_clause_evaluator = WhereClauseEvaluator(self.logger, self.aspace, wanted.Filter.WhereClause)
+            held.where_clause_evaluator = Chooser(self.logger, self.aspace, wanted.Filter.WhereClause)
         return super()._modify_monitored_item(params)
 
     def datachange_callback(self, handle: int, value: Any, error: Any = None) -> Any:

@@ -48,6 +48,17 @@ async def declared(server: Server, type_id: Any, known: Iterable[str]) -> list[D
     return found
 
 
+async def make_object(space: Space, path: str, above: Any, reference: int, kind: Any, name: Any) -> None:
+    """`path` below the node `above`, of the type `kind`: a number of the core, or a NodeId."""
+    item = ua.AddNodesItem(
+        ParentNodeId=above, ReferenceTypeId=ua.NodeId(reference), RequestedNewNodeId=space.id(path), BrowseName=name,
+        NodeClass=ua.NodeClass.Object, TypeDefinition=ua.NodeId(kind) if isinstance(kind, int) else kind,
+        NodeAttributes=ua.ObjectAttributes(DisplayName=ua.LocalizedText(name.Name), WriteMask=0, UserWriteMask=0),
+    )  # fmt: skip
+    (result,) = await space.server.iserver.isession.add_nodes([item])
+    result.StatusCode.check()
+
+
 async def make(space: Space, above: str, rows: Sequence[Declared], values: Mapping[str, Any]) -> None:
     """`rows` below the object `above`. `values`: a Variant by path, or the path of an own variable that it follows."""
     for row in rows:

@@ -99,7 +99,7 @@ class Subscriptions(SubscriptionService):
         """A subscription that cannot be told is ended; the others, and who tells, go on."""
         for number in list(self.subscriptions) if subscription_id is None else [subscription_id]:
             try:
-                await super().trigger_event(event, number)
+                await self.subscriptions[number].monitored_item_srv.trigger_event(event)  # asyncua keeps conditions
             except Exception:  # whatever asyncua makes of what that client has asked for
                 await self.delete_subscriptions([number])
 

@@ -5,7 +5,7 @@ false, and a sentence); who may not call at all gets BadUserAccessDenied.
 """
 
 import time
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
@@ -26,6 +26,8 @@ from gateway.operator.opcua.space import BOOLEAN, DOUBLE, STRING, UINT32, Space
 REFUSED_S = 60.0  #: between two refusals of a person's command that the gateway is told of
 
 ua: Any = asyncua_ua  #: what it declares of its values and what they are differ
+
+Called = Callable[..., Awaitable[Any]]  #: as asyncua calls methods: with the object's NodeId, and Variants
 
 
 class NotSent(Exception):
@@ -126,20 +128,24 @@ class _Refusals:
         return True
 
 
-async def make_methods(server: Server, space: Space, line: LineSide) -> None:
+async def make_methods(server: Server, space: Space, line: LineSide) -> Mapping[str, Called]:
+    """Returns what each does, by its name."""
     root = server.get_node(space.id(ROOT))
     refusals = _Refusals()
+    made: dict[str, Called] = {}
     answers = [_argument("ok", BOOLEAN, "It was done"), _argument("sentence", STRING, "What was done, or why not")]
     for method in METHODS:
         inputs = [_argument(one.name, one.kind, one.tells) for one in method.inputs]
         name = ua.QualifiedName(method.name, space.namespace)
         node_id = space.id(f"{ROOT}.{method.name}")
-        node = await root.add_method(node_id, name, _callback(method, line, refusals), inputs, answers)
+        made[method.name] = _callback(method, line, refusals)
+        node = await root.add_method(node_id, name, made[method.name], inputs, answers)
         described = ua.DataValue(ua.Variant(ua.LocalizedText(method.tells), ua.VariantType.LocalizedText))
         await server.write_attribute_value(node.nodeid, described, ua.AttributeIds.Description)
+    return made
 
 
-def _callback(method: Method, line: LineSide, refusals: _Refusals) -> Callable[..., Awaitable[Any]]:
+def _callback(method: Method, line: LineSide, refusals: _Refusals) -> Called:
     async def called(parent: Any, *arguments: Any) -> Any:
         person = CALLER.get()
         if person is None:

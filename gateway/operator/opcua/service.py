@@ -11,6 +11,7 @@ from gateway.operator.access import Access
 from gateway.operator.line_side import LineSide, NotTold
 from gateway.operator.opcua.alarm_nodes import alarms_of, live_alarm_paths, make_alarms
 from gateway.operator.opcua.companion import make_companion
+from gateway.operator.opcua.dialogs import Dialogs
 from gateway.operator.opcua.events import Events
 from gateway.operator.opcua.history import History
 from gateway.operator.opcua.line_nodes import ROOT, Told, list_paths, live_paths, make_line, of_proposals, of_status
@@ -41,13 +42,13 @@ class OpcUa:
         access: Access | None = None,
     ) -> None:
         anonymous = line.operator.anonymous == "read"
-        trust = TrustList(pki, tell, lambda: datetime.now(UTC))
+        self.trust = TrustList(pki, tell, lambda: datetime.now(UTC))
         self.server: OperatorServer = make_server(
             line.operator.opc_ua,
             line.operator.sessions_max,
             Logins(check, role_of, anonymous, access),
             anonymous,
-            trust,
+            self.trust,
             pki,
         )
         self.page_trouble: Callable[[], str] = str  #: why there is no page; empty: there is one
@@ -67,6 +68,7 @@ class OpcUa:
         if not self._made:
             await self._make()
             self._made = True
+        await self._look_at_trust()
         await self.server.start()
 
     async def _make(self) -> None:
@@ -78,7 +80,9 @@ class OpcUa:
         await make_alarms(self._space)
         self._proposals = ProposalNodes(self._space)
         await self._proposals.make()
-        await make_methods(server, self._space, self._side)
+        methods = await make_methods(server, self._space, self._side)
+        self._dialogs = Dialogs(self._space, methods["Decide"])
+        await self._dialogs.make()
         self._events = Events(server, self._space, self._side)
         await self._events.make()
         server.iserver.history_manager = History(self._space, self._line, self._side)  # type: ignore[assignment]
@@ -92,6 +96,7 @@ class OpcUa:
         works = (
             (self._show_line, self._new_status), (self._show_proposals, self._new_proposals),
             (self._events.look, asyncio.Event()), (self._end_strangers, asyncio.Event()),
+            (self._look_at_trust, asyncio.Event()),
         )  # fmt: skip
         async with asyncio.TaskGroup() as group:
             for do, event in works:
@@ -99,6 +104,10 @@ class OpcUa:
 
     async def stop(self) -> None:
         await self.server.stop()
+
+    async def _look_at_trust(self) -> None:
+        """In a thread: it may wait for a disk, and nobody shall wait for that."""
+        await asyncio.to_thread(self.trust.look)
 
     async def _end_strangers(self) -> None:
         self.server.end_strangers()
@@ -136,23 +145,28 @@ class OpcUa:
             await self._show_those_that_wait()
         except Exception:  # as above; the next look begins anew
             self._shown_of = None
-            await self._proposals.unsure(NO_COMMUNICATION)
+            await self._unsure_of_proposals(NO_COMMUNICATION)
             raise
 
     async def _show_those_that_wait(self) -> None:
         """What is shown must be of the moment: where the gateway does not tell, nothing is."""
         found = self._side.proposals
         if found is None or not self._list_is_fresh():
-            await self._proposals.unsure(WAITING if found is None else NO_COMMUNICATION)
+            await self._unsure_of_proposals(WAITING if found is None else NO_COMMUNICATION)
             return
         if found is not self._shown_of:
             shown, missed = await self._waiting(found)
             if missed and (not shown or not self._list_is_fresh()):
-                await self._proposals.unsure(NO_COMMUNICATION)
+                await self._unsure_of_proposals(NO_COMMUNICATION)
                 return
             self._shown, self._shown_of = shown, None if missed else found
         await self._proposals.show(self._shown)
         await self._events.waiting(self._shown)
+        await self._dialogs.show(self._shown)
+
+    async def _unsure_of_proposals(self, code: int) -> None:
+        await self._proposals.unsure(code)
+        await self._dialogs.unsure(code)
 
     def _list_is_fresh(self) -> bool:
         return _is_fresh(self._side.age_s) and _is_fresh(self._side.proposals_age_s)

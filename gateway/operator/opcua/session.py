@@ -16,6 +16,9 @@ ua: Any = asyncua_ua  #: what it declares of its values and what they are differ
 #: Who calls the method that runs. asyncua tells its methods nothing of that.
 CALLER: ContextVar[Person | None] = ContextVar("caller", default=None)
 
+#: Which subscriptions are that session's, by their numbers.
+OWNS: ContextVar[Callable[[int], bool]] = ContextVar("owns", default=lambda _: False)
+
 
 def _nobody() -> Person | None:
     return None
@@ -41,11 +44,12 @@ class Session(InternalSession):
 
     async def call(self, params: list[Any]) -> list[Any]:
         at_most(len(params), MAX_CALLS)
-        before = CALLER.set(self.person)
+        caller, owns = CALLER.set(self.person), OWNS.set(self._owns)
         try:
             return await super().call(params)
         finally:
-            CALLER.reset(before)
+            CALLER.reset(caller)
+            OWNS.reset(owns)
 
     async def history_read(self, params: Any) -> list[Any]:
         at_most(len(params.NodesToRead), MAX_HISTORIES)

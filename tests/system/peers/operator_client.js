@@ -8,7 +8,7 @@ const { serve } = require('./control')
 const { OPCUACertificateManager } = require('node-opcua-certificate-manager')
 const {
   AttributeIds, BrowseDirection, constructEventFilter, DataType, EndpointDescription, MessageSecurityMode, OPCUAClient,
-  TimestampsToReturn, UserTokenPolicy, UserTokenType
+  ofType, TimestampsToReturn, UserTokenPolicy, UserTokenType
 } = require('node-opcua-client')
 
 const [endpoint, pki, folder] = process.argv.slice(2)
@@ -18,6 +18,9 @@ const BASIC = `${POLICIES}Basic256Sha256`
 const SERVER = 'i=2253'
 const EVENT_FIELDS = ['EventType', 'Message', 'Severity', 'SourceName', 'Time']
 const OWN_FIELDS = ['ProposalId', 'ShownHash', 'BaseRevision', 'Sequence', 'Kind', 'Who']
+const CONDITION_FIELDS = [
+  'EventType', 'ConditionName', 'Retain', 'DialogState.Id', 'Prompt', 'ResponseOptionSet', 'LastResponse'
+]
 const CLASSES = { 1: 'Object', 2: 'Variable', 4: 'Method' }
 
 let certificates
@@ -190,6 +193,39 @@ async function watch (name, paths) {
   return { refused: [...new Set([...statuses, events.statusCode?.name ?? 'Good'])].filter((one) => one !== 'Good') }
 }
 
+// Subscribes to conditions, and asks once more for those that are; `conditions` tells what has come of each.
+async function conditions (name) {
+  const held = sessions.get(name)
+  if (!held.conditions) {
+    held.conditions = new Map()
+    const subscription = await held.session.createSubscription2({
+      requestedPublishingInterval: 100, requestedLifetimeCount: 1000, requestedMaxKeepAliveCount: 10, publishingEnabled: true
+    })
+    const filter = constructEventFilter(['ConditionId', ...CONDITION_FIELDS], ofType('ConditionType'))
+    const item = await subscription.monitor(
+      { nodeId: SERVER, attributeId: AttributeIds.EventNotifier },
+      { filter, queueSize: 100, discardOldest: true }, TimestampsToReturn.Both
+    )
+    item.on('changed', ([id, ...fields]) => held.conditions.set(
+      id.value.toString(), Object.fromEntries(CONDITION_FIELDS.map((one, i) => [one, plain(fields[i].value)]))
+    ))
+    const refreshed = await held.session.call({
+      objectId: 'i=2782', methodId: 'i=3875', inputArguments: [{ dataType: DataType.UInt32, value: subscription.subscriptionId }]
+    })
+    if (refreshed.statusCode.name !== 'Good') throw new Error(refreshed.statusCode.name)
+  }
+  return Object.fromEntries(held.conditions)
+}
+
+// An answer to a dialog, by the method of its type.
+async function respond (name, dialog, selected) {
+  const { session } = sessions.get(name)
+  const result = await session.call({
+    objectId: dialog, methodId: 'i=9069', inputArguments: [{ dataType: DataType.Int32, value: selected }]
+  })
+  return result.statusCode.name
+}
+
 // A method of the line, with arguments of the types that the server asks for.
 async function call (name, method, ...values) {
   const held = sessions.get(name)
@@ -236,6 +272,8 @@ open().then(() => serve({}, {
   read,
   watch,
   call,
+  conditions,
+  respond,
   write,
   history,
   seen: (name) => Object.fromEntries(sessions.get(name).seen),
