@@ -7,6 +7,7 @@ from asyncua import ua
 
 from gateway.core.decisions import Decide
 from gateway.core.messages import Reply
+from gateway.operator.opcua import dialogs
 from tests.protocol.operator_support import SHOWN, bench, shown
 from tests.protocol.test_operator_nodes import Heard, run
 
@@ -117,17 +118,20 @@ def test_who_may_not_decide_answers_no_dialog_and_neither_does_what_is_no_answer
             for selected in (2, -1, 2**31 - 1):
                 assert await answered(client, told.NodeId, selected) == CODES.BadDialogResponseInvalid
             assert await answered(client, told.NodeId, True, ua.VariantType.Boolean) == CODES.BadInvalidArgument
-            assert await called(client, told.NodeId, RESPOND) == CODES.BadInvalidArgument
+            assert await called(client, told.NodeId, RESPOND) == CODES.BadArgumentsMissing
             for nobody in (b.id("Line"), RESPOND, ua.NodeId(ua.ObjectIds.DialogConditionType)):
                 assert await answered(client, nobody, 0) == CODES.BadDialogNotActive
             assert len(b.gateway.heard) == 1
             assert await answered(client, told.NodeId, 0) == CODES.BadInvalidState  # the gateway has refused it
-            b.gateway.epoch = 4
+            await b.gateway_mailbox.close()
+            assert await answered(client, told.NodeId, 0) != CODES.Good
 
     run(story)
 
 
-def test_who_comes_later_asks_for_all_that_waits_and_for_nobody_else():
+def test_who_comes_later_asks_for_all_that_waits_and_for_nobody_else(monkeypatch):
+    monkeypatch.setattr(dialogs, "REFRESH_S", 0.0)
+
     async def story():
         async with bench(spans=1) as b, b.connected("vera") as client, b.connected("otto") as other:
             b.gateway.waiting = [shown(reason="the second"), shown(reason="the first")]
@@ -148,7 +152,11 @@ def test_who_comes_later_asks_for_all_that_waits_and_for_nobody_else():
             assert await called(client, CONDITION, REFRESH, not_mine) == CODES.BadSubscriptionIdInvalid
             no_item = ua.Variant(4711, ua.VariantType.UInt32)
             assert await called(client, CONDITION, REFRESH2, number, no_item) == CODES.BadMonitoredItemIdInvalid
-            assert await called(client, CONDITION, REFRESH) == CODES.BadInvalidArgument
+            assert await called(client, CONDITION, REFRESH) == CODES.BadArgumentsMissing
+            monkeypatch.setattr(dialogs, "REFRESH_S", 60.0)
+            assert await called(client, CONDITION, REFRESH, number) == CODES.BadRefreshInProgress
+            assert await called(other, CONDITION, REFRESH, not_mine) == CODES.Good  # each for itself
+            assert [(await strange.values.get()).EventType.Identifier for _ in range(4)] == kinds
             assert heard.values.empty() and strange.values.empty()
 
     run(story)
@@ -186,9 +194,13 @@ def test_a_dialog_can_be_browsed_and_answered_by_its_own_method():
             b.gateway.waiting = [one]
             heard, _, _ = await watched(client)
             (folder,) = await client.get_node(b.id("Line")).get_children_by_path([["2:Dialogs"]])
-            await heard.values.get()
+            told = await heard.values.get()
             (dialog,) = await folder[0].get_children()
             assert await dialog.read_type_definition() == ua.NodeId(ua.ObjectIds.DialogConditionType)
+            for name, value in (("EventId", told.EventId), ("Message", told.Message)):
+                assert await (await dialog.get_child(f"0:{name}")).read_value() == value
+            options = await dialog.get_child("0:ResponseOptionSet")
+            assert await options.read_value_rank() == ua.ValueRank.OneDimension
             prompt = await (await dialog.get_child("0:Prompt")).read_value()
             assert prompt.Text.startswith("Put this controller into service?")
             assert await (await dialog.get_child(["0:DialogState", "0:Id"])).read_value() is True
@@ -196,5 +208,24 @@ def test_a_dialog_can_be_browsed_and_answered_by_its_own_method():
             chosen = ua.Variant(1, ua.VariantType.Int32)
             assert await called(client, dialog.nodeid, respond.nodeid, chosen) == CODES.Good
             assert b.gateway.heard[0].said.approve is False
+
+    run(story)
+
+
+def test_a_dialog_that_cannot_be_made_hides_no_proposal_and_is_made_when_it_can(monkeypatch):
+    async def story():
+        async with bench(spans=1) as b, b.connected("otto") as client:
+            with monkeypatch.context() as fault:
+                fault.setattr(dialogs, "prompt", lambda _: 1 / 0)
+                one = shown(reason="for two")
+                b.gateway.waiting = [one.model_copy(update={"approvals": 2})]
+                path = f"Line.Proposals.{one.proposal_hash}.Id"
+                await b.until(client, path, lambda found: found.StatusCode.is_good())
+                while not any("ZeroDivisionError" in said for said in b.said):  # noqa: ASYNC110 (it is on the wire)
+                    await asyncio.sleep(0.01)
+                assert (await b.read(client, path)).StatusCode.is_good()
+                assert await b.opcua.server.get_node(b.id("Line.Dialogs")).get_children() == []
+            heard, _, _ = await watched(client)
+            assert "It takes 2 different people." in (await heard.values.get()).Prompt.Text
 
     run(story)

@@ -208,7 +208,7 @@ def test_a_file_among_the_trusted_that_cannot_be_read_keeps_nobody_else_out(monk
 def test_a_disk_that_hangs_keeps_out_nobody_who_was_trusted_before(monkeypatch):
     hanging, over = threading.Event(), threading.Event()
 
-    def hangs(_path, _pattern):
+    def hangs(_path):
         hanging.set()
         over.wait()
         return []
@@ -216,13 +216,30 @@ def test_a_disk_that_hangs_keeps_out_nobody_who_was_trusted_before(monkeypatch):
     async def story():
         async with bench(spans=1) as b:
             with monkeypatch.context() as disk:
-                disk.setattr(Path, "glob", hangs)
+                disk.setattr(Path, "iterdir", hangs)
                 try:
                     await until(hanging.is_set)
                     async with b.connected("otto") as client:
                         assert await b.call(client, "Stop") == (CODES.Good, [True, "done"])
                 finally:
                     over.set()
+
+    run(story)
+
+
+def test_a_folder_of_the_trusted_that_is_gone_puts_nobody_out_and_a_file_that_is_taken_away_does():
+    async def story():
+        async with bench(spans=1) as b, b.connected("otto") as client:
+            folder = b.pki / TRUSTED
+            away = folder.rename(b.pki / "elsewhere")
+            await until(lambda: any("FileNotFoundError" in said for said in b.said))
+            b.opcua.server.end_strangers()
+            async with b.connected("vera"):
+                assert await b.call(client, "Stop") == (CODES.Good, [True, "done"])
+            away.rename(folder)
+            for path in folder.iterdir():
+                path.unlink()
+            await until(lambda: b.sessions() == 0)
 
     run(story)
 

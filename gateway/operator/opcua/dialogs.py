@@ -5,20 +5,25 @@ proposal, the revision and the shown hash. What is shown anew is another dialog,
 was not looked at. `Respond` is `Decide` of these three, asked and refused in the same way.
 """
 
-from collections.abc import Sequence
+import asyncio
+import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any
+from uuid import uuid4
 
 from asyncua import ua as asyncua_ua
-from asyncua.common.event_objects import DialogCondition
+from asyncua.common.event_objects import DialogCondition, RefreshEndEvent, RefreshStartEvent
 from asyncua.server.event_generator import EventGenerator
 
 from gateway.core.decisions import ProposalShown
+from gateway.core.messages import Reply
+from gateway.operator.line_side import NoAnswer
 from gateway.operator.opcua.events import MEDIUM
 from gateway.operator.opcua.instances import Declared, declared, make, make_object
 from gateway.operator.opcua.line_nodes import ROOT
-from gateway.operator.opcua.methods import Called
+from gateway.operator.opcua.methods import Asked, Input, argument, wrong
 from gateway.operator.opcua.proposal_nodes import FOLDER as PROPOSALS
 from gateway.operator.opcua.session import OWNS
 from gateway.operator.opcua.space import BOOLEAN, GOOD, STRING, UINT32, Space
@@ -26,7 +31,7 @@ from gateway.operator.opcua.space import BOOLEAN, GOOD, STRING, UINT32, Space
 FOLDER = f"{ROOT}.Dialogs"
 APPROVE, REJECT = 0, 1  #: as `Respond` has them
 NOTHING = -1  #: no option is chosen by pressing Return, or by closing the window
-MOST_LINES = 12  #: of what would change, in a prompt
+REFRESH_S = 1.0  #: between two refreshes of a session
 QUESTIONS = {
     "gains": "Put this controller into service?",
     "experiment": "Run this experiment?",
@@ -34,6 +39,11 @@ QUESTIONS = {
 }  #: by the kind of a proposal
 
 ua: Any = asyncua_ua  #: what it declares of its values and what they are differ
+
+
+_SELECTED = Input("SelectedResponse", ua.VariantType.Int32, "Of ResponseOptionSet: 0 approves, 1 rejects")
+_SUBSCRIPTION = Input("SubscriptionId", UINT32, "")
+_ITEM = Input("MonitoredItemId", UINT32, "")
 
 
 @dataclass(frozen=True)
@@ -51,35 +61,35 @@ class _Dialog:
 
 
 class Dialogs:
-    def __init__(self, space: Space, decide: Called) -> None:
+    def __init__(self, space: Space, decide: Asked, clock: Callable[[], float] = time.monotonic) -> None:
         """`decide`: the line's method of that name."""
         self._space = space
         self._decide = decide
+        self._clock = clock
         self._rows: list[Declared] = []
         self._open: dict[str, _Dialog] = {}  #: by path
+        self._refreshed_s: dict[Any, float] = {}  #: by session, of the last second
 
     async def make(self) -> None:
         server = self._space.server
         await self._space.object(FOLDER, ROOT, "What waits for a person, as dialogs; the same as in Proposals")
         self._rows = await declared(server, ua.NodeId(ua.ObjectIds.DialogConditionType), ())
-        session = server.iserver.isession
-        self._ends = [EventGenerator(session), EventGenerator(session)]
-        for emits, kind in zip(self._ends, ("RefreshStartEventType", "RefreshEndEventType"), strict=True):
-            await emits.init(getattr(ua.ObjectIds, kind), add_generates_event=False)
         for number, called in (
             (ua.ObjectIds.DialogConditionType_Respond, self._respond),
             (ua.ObjectIds.ConditionType_ConditionRefresh, self._refresh),
-            (ua.ObjectIds.ConditionType_ConditionRefresh2, self._refresh),
+            (ua.ObjectIds.ConditionType_ConditionRefresh2, self._refresh_item),
         ):
-            session.add_method_callback(ua.NodeId(number), called)
+            server.iserver.isession.add_method_callback(ua.NodeId(number), called)
 
     async def show(self, waiting: Sequence[ProposalShown]) -> None:
-        """Those that wait, as they are shown now: others end."""
+        """Those that wait, as they are shown now: others end. Others have their turn between two."""
         wanted = {_path(one): one for one in waiting}
         for path in [path for path in self._open if path not in wanted]:
             await self._end(path)
+            await asyncio.sleep(0)
         for path in reversed([path for path in wanted if path not in self._open]):
             await self._begin(path, wanted[path])
+            await asyncio.sleep(0)
         await self._quality(GOOD)
 
     async def unsure(self, code: int) -> None:
@@ -97,74 +107,105 @@ class Dialogs:
         kind = ua.NodeId(ua.ObjectIds.DialogConditionType)
         name = ua.QualifiedName(f"Proposal {shown.proposal_hash[:12]}", self._space.namespace)
         await make_object(self._space, path, self._space.id(FOLDER), ua.ObjectIds.HasComponent, kind, name)
-        await make(self._space, path, self._rows, {})
-        await self._space.server.get_node(self._space.id(path)).add_method(
-            self._space.id(f"{path}.Respond"), ua.QualifiedName("Respond", 0), self._respond, [_selected()], []
-        )
-        event: Any = DialogCondition(self._space.id(PROPOSALS), severity=MEDIUM)
-        event.add_property("NodeId", self._space.id(path), ua.VariantType.NodeId)  # the ConditionId, for Respond
-        _set(event, _first_state(shown), now)
-        emits = EventGenerator(self._space.server.iserver.isession)
-        await emits.init(event, add_generates_event=False)
-        self._open[path] = _Dialog(path, shown.proposal_hash, shown.shown or "", shown.epoch, emits)
-        await self._tell(self._open[path], f"a proposal waits for a person: {shown.proposal_hash[:12]}")
+        try:
+            event: Any = DialogCondition(self._space.id(PROPOSALS), severity=MEDIUM)
+            event.add_property("NodeId", self._space.id(path), ua.VariantType.NodeId)  # the ConditionId, for Respond
+            _set(event, _first_state(shown), now)
+            options = ua.Variant(event.ResponseOptionSet, ua.VariantType.LocalizedText)
+            await make(self._space, path, self._rows, {"ResponseOptionSet": options})
+            await self._space.server.get_node(self._space.id(path)).add_method(
+                self._space.id(f"{path}.Respond"), ua.QualifiedName("Respond", 0), self._respond,
+                [argument(_SELECTED.name, _SELECTED.kind, _SELECTED.tells)], [],
+            )  # fmt: skip
+            emits = EventGenerator(self._space.server.iserver.isession)
+            await emits.init(event, add_generates_event=False)
+            made = _Dialog(path, shown.proposal_hash, shown.shown or "", shown.epoch, emits)
+            await self._tell(made, f"a proposal waits for a person: {shown.proposal_hash[:12]}")
+        except BaseException:
+            await self._space.remove(path)
+            raise
+        self._open[path] = made
 
     async def _end(self, path: str) -> None:
         one = self._open.pop(path)
-        _set(one.event, {"Retain": (False, BOOLEAN)} | _dialog_state(active=False), datetime.now(UTC))
-        await self._tell(one, f"it waits no more, or is shown anew: {one.proposal[:12]}")
-        await self._space.remove(path)
+        try:
+            _set(one.event, {"Retain": (False, BOOLEAN)} | _dialog_state(active=False), datetime.now(UTC))
+            await self._tell(one, f"it waits no more, or is shown anew: {one.proposal[:12]}")
+        finally:
+            await self._space.remove(path)
 
     async def _tell(self, one: _Dialog, message: str) -> None:
-        """Its nodes first: who hears of it may look at them at once."""
-        one.event.Message = ua.LocalizedText(message, "en")
+        """As an event, and as the nodes that have the same."""
+        one.event.Message = _text(message)
+        await one.emits.trigger()
         for row in self._rows:
             name = row.path.replace(".", "/")
             kind = one.event.data_types.get(name)
             if row.node_class == ua.NodeClass.Variable and kind is not None:
                 value = ua.DataValue(ua.Variant(getattr(one.event, name), kind))
                 await self._space.server.write_attribute_value(self._space.id(f"{one.path}.{row.path}"), value)
-        await one.emits.trigger(message=message)
 
     async def _respond(self, parent: Any, *arguments: Any) -> Any:
         one = self._open.get(parent.Identifier) if parent.NamespaceIndex == self._space.namespace else None
         if one is None:
             return ua.StatusCode(ua.StatusCodes.BadDialogNotActive)
-        if len(arguments) != 1 or arguments[0].VariantType is not ua.VariantType.Int32 or arguments[0].is_array:
-            return ua.StatusCode(ua.StatusCodes.BadInvalidArgument)
-        if arguments[0].Value not in (APPROVE, REJECT):
+        if result := wrong([_SELECTED], arguments):
+            return result
+        selected = arguments[0].Value
+        if selected not in (APPROVE, REJECT):
             return ua.StatusCode(ua.StatusCodes.BadDialogResponseInvalid)
-        answer = await self._decide(
-            parent, ua.Variant(one.proposal, STRING), ua.Variant(one.shown, STRING), ua.Variant(one.revision, UINT32),
-            ua.Variant(arguments[0].Value == APPROVE, BOOLEAN), ua.Variant("", STRING),
+        reply = await self._decide(
+            ua.Variant(one.proposal, STRING), ua.Variant(one.shown, STRING), ua.Variant(one.revision, UINT32),
+            ua.Variant(selected == APPROVE, BOOLEAN), ua.Variant("", STRING),
         )  # fmt: skip
-        if isinstance(answer, ua.CallMethodResult):
-            return answer.StatusCode
-        if not answer[0].Value:
+        if not isinstance(reply, Reply):
+            return reply
+        if isinstance(reply, NoAnswer):
+            return ua.StatusCode(ua.StatusCodes.BadTimeout)
+        if not reply.ok:
             return ua.StatusCode(ua.StatusCodes.BadInvalidState)  # `Respond` has no room for the sentence
-        if one.path in self._open:
-            _set(one.event, {"LastResponse": (arguments[0].Value, ua.VariantType.Int32)}, datetime.now(UTC))
-            await self._tell(one, f"answered: {'approve' if arguments[0].Value == APPROVE else 'reject'}")
+        if self._open.get(one.path) is one:
+            _set(one.event, {"LastResponse": (selected, ua.VariantType.Int32)}, datetime.now(UTC))
+            await self._tell(one, f"answered: {'approve' if selected == APPROVE else 'reject'}")
         return ua.StatusCode()
 
     async def _refresh(self, _parent: Any, *arguments: Any) -> Any:
-        """ConditionRefresh of a subscription, ConditionRefresh2 of one of its items: all that waits, once more."""
-        numbers = [one.Value for one in arguments]
-        if not 1 <= len(numbers) <= 2 or not all(one.VariantType is UINT32 and not one.is_array for one in arguments):
-            return ua.StatusCode(ua.StatusCodes.BadInvalidArgument)
-        service = self._space.server.iserver.subscription_service
-        held = service.subscriptions.get(numbers[0])
-        if held is None or not OWNS.get()(numbers[0]):
+        """ConditionRefresh: all that waits once more, for a subscription."""
+        return wrong([_SUBSCRIPTION], arguments) or await self._refreshed(arguments[0].Value, None)
+
+    async def _refresh_item(self, _parent: Any, *arguments: Any) -> Any:
+        """ConditionRefresh2: for one of its items."""
+        result = wrong([_SUBSCRIPTION, _ITEM], arguments)
+        return result or await self._refreshed(*(one.Value for one in arguments))
+
+    async def _refreshed(self, number: int, item: int | None) -> Any:
+        service: Any = self._space.server.iserver.subscription_service
+        held = service.subscriptions.get(number)
+        if held is None or not OWNS.get()(number):
             return ua.StatusCode(ua.StatusCodes.BadSubscriptionIdInvalid)
-        item = numbers[1] if len(numbers) == 2 else None
-        if item is not None and item not in held.monitored_item_srv._monitored_items:  # noqa: SLF001 (no other way)
+        if item is not None and not held.monitored_item_srv.is_of_events(item):
             return ua.StatusCode(ua.StatusCodes.BadMonitoredItemIdInvalid)
-        begins, ends = self._ends
-        await begins.trigger(message="what waits, once more", subscription_id=numbers[0])
+        now_s = self._clock()
+        self._refreshed_s = {one: at_s for one, at_s in self._refreshed_s.items() if now_s - at_s < REFRESH_S}
+        if held.session_id in self._refreshed_s:
+            return ua.StatusCode(ua.StatusCodes.BadRefreshInProgress)
+        self._refreshed_s[held.session_id] = now_s
+        await held.monitored_item_srv.trigger_event(_end_of_refresh(RefreshStartEvent()), item)
         for one in list(self._open.values()):
-            await held.monitored_item_srv.trigger_event(one.event, item)
-        await ends.trigger(message="that is all", subscription_id=numbers[0])
+            if self._open.get(one.path) is one:
+                await held.monitored_item_srv.trigger_event(one.event, item)
+            await asyncio.sleep(0)  # the others' turn
+        await held.monitored_item_srv.trigger_event(_end_of_refresh(RefreshEndEvent()), item)
         return ua.StatusCode()
+
+
+def _end_of_refresh(event: Any) -> Any:
+    """Its beginning, or its end."""
+    event.EventId = uuid4().bytes
+    event.SourceNode, event.SourceName = ua.NodeId(ua.ObjectIds.Server), "Server"
+    event.Time = event.ReceiveTime = datetime.now(UTC)
+    event.Message = _text("what waits, once more")
+    return event
 
 
 def _path(shown: ProposalShown) -> str:
@@ -203,25 +244,17 @@ def _set(event: Any, values: dict[str, tuple[Any, Any]], now: datetime) -> None:
 
 def prompt(shown: ProposalShown) -> str:
     """The question, and what the gateway has computed of the answer; nothing that its author says of itself."""
-    lines = shown.difference[:MOST_LINES]
-    more = len(shown.difference) - len(lines)
     findings = [] if shown.verdict is None else shown.verdict.findings
     return "\n".join(
         [
             QUESTIONS[shown.proposal.kind],
-            *lines,
-            *([f"and {more} more"] if more else []),
+            *shown.difference,
             f"{sum(one.passed for one in findings)} of {len(findings)} rules of the gate pass.",
+            *([f"It takes {shown.approvals} different people."] if shown.approvals > 1 else []),
             f"It can be decided on until {shown.proposal.expires}.",
             f"All of it: {PROPOSALS}.{shown.proposal_hash}",
         ]
     )
-
-
-def _selected() -> Any:
-    said = _text("Of ResponseOptionSet: 0 approves, 1 rejects")
-    kind = ua.NodeId(ua.ObjectIds.Int32)
-    return ua.Argument(Name="SelectedResponse", DataType=kind, ValueRank=-1, ArrayDimensions=[], Description=said)
 
 
 def _text(said: str) -> Any:

@@ -20,21 +20,26 @@ _ATTRIBUTES = frozenset(int(one) for one in ua.AttributeIds)
 class Chooser(WhereClauseEvaluator):
     """By the condition of an item. OfType holds of subtypes as well (OPC 10000-4, 7.7.3); asyncua's is of one alone."""
 
+    def __init__(self, *given: Any) -> None:
+        super().__init__(*given)
+        self._lineages: dict[Any, frozenset[Any]] = {}  #: by type; they do not change
+
     def _eval_el(self, index: int, event: Any) -> Any:
         element = self.elements[index]
         if element.FilterOperator != ua.FilterOperator.OfType:
             return super()._eval_el(index, event)
-        return self._is_a(event.EventType, self._eval_op(element.FilterOperands[0], event))
+        if event.EventType not in self._lineages:
+            self._lineages[event.EventType] = frozenset(self._lineage(event.EventType))
+        return self._eval_op(element.FilterOperands[0], event) in self._lineages[event.EventType]
 
-    def _is_a(self, kind: Any, wanted: Any) -> bool:
-        while kind is not None and kind != wanted:
-            above = [
-                one.NodeId
-                for one in self._aspace[kind].references
-                if one.ReferenceTypeId == _HAS_SUBTYPE and not one.IsForward
-            ]
-            kind = above[0] if above else None
-        return kind is not None
+    def _lineage(self, kind: Any) -> list[Any]:
+        """A type, and all that it is derived from."""
+        found = [kind]
+        for one in found:
+            references = self._aspace[one].references
+            above = [ref.NodeId for ref in references if ref.ReferenceTypeId == _HAS_SUBTYPE and not ref.IsForward]
+            found += [node_id for node_id in above if node_id not in found]
+        return found
 
 
 class Items(MonitoredItemService):
@@ -42,6 +47,10 @@ class Items(MonitoredItemService):
 
     def event_items(self) -> int:
         return sum(held.where_clause_evaluator is not None for held in self._monitored_items.values())
+
+    def is_of_events(self, number: int) -> bool:
+        held = self._monitored_items.get(number)
+        return held is not None and held.where_clause_evaluator is not None
 
     def items(self) -> int:
         return len(self._monitored_items)

@@ -27,7 +27,8 @@ REFUSED_S = 60.0  #: between two refusals of a person's command that the gateway
 
 ua: Any = asyncua_ua  #: what it declares of its values and what they are differ
 
-Called = Callable[..., Awaitable[Any]]  #: as asyncua calls methods: with the object's NodeId, and Variants
+#: What comes of Variants: the gateway's reply, or asyncua's result of a call that was none.
+Asked = Callable[..., Awaitable[Any]]
 
 
 class NotSent(Exception):
@@ -128,39 +129,48 @@ class _Refusals:
         return True
 
 
-async def make_methods(server: Server, space: Space, line: LineSide) -> Mapping[str, Called]:
+async def make_methods(server: Server, space: Space, line: LineSide) -> Mapping[str, Asked]:
     """Returns what each does, by its name."""
     root = server.get_node(space.id(ROOT))
     refusals = _Refusals()
-    made: dict[str, Called] = {}
-    answers = [_argument("ok", BOOLEAN, "It was done"), _argument("sentence", STRING, "What was done, or why not")]
+    made: dict[str, Asked] = {}
+    answers = [argument("ok", BOOLEAN, "It was done"), argument("sentence", STRING, "What was done, or why not")]
     for method in METHODS:
-        inputs = [_argument(one.name, one.kind, one.tells) for one in method.inputs]
+        inputs = [argument(one.name, one.kind, one.tells) for one in method.inputs]
         name = ua.QualifiedName(method.name, space.namespace)
         node_id = space.id(f"{ROOT}.{method.name}")
-        made[method.name] = _callback(method, line, refusals)
-        node = await root.add_method(node_id, name, made[method.name], inputs, answers)
+        made[method.name] = _asked(method, line, refusals)
+        node = await root.add_method(node_id, name, _callback(made[method.name]), inputs, answers)
         described = ua.DataValue(ua.Variant(ua.LocalizedText(method.tells), ua.VariantType.LocalizedText))
         await server.write_attribute_value(node.nodeid, described, ua.AttributeIds.Description)
     return made
 
 
-def _callback(method: Method, line: LineSide, refusals: _Refusals) -> Called:
-    async def called(parent: Any, *arguments: Any) -> Any:
+def _callback(asked: Asked) -> Callable[..., Awaitable[Any]]:
+    async def called(_parent: Any, *arguments: Any) -> Any:
+        reply = await asked(*arguments)
+        if not isinstance(reply, Reply):
+            return reply
+        return [ua.Variant(reply.ok, BOOLEAN), ua.Variant(_sentence(reply), STRING)]
+
+    return called
+
+
+def _asked(method: Method, line: LineSide, refusals: _Refusals) -> Asked:
+    async def asked(*arguments: Any) -> Any:
         person = CALLER.get()
         if person is None:
             return _result(ua.StatusCodes.BadUserAccessDenied)
         if why_may_not(person, method.command):
-            if not _wrong(method.inputs, arguments) and refusals.is_due(person.name, method.command):
+            if not wrong(method.inputs, arguments) and refusals.is_due(person.name, method.command):
                 # The gateway refuses it as well, and its audit has to know that it was tried.
                 await _said(method, line, person, [_value(one) for one in arguments])
             return _result(ua.StatusCodes.BadUserAccessDenied)
-        if wrong := _wrong(method.inputs, arguments):
-            return wrong
-        reply = await _said(method, line, person, [_value(one) for one in arguments])
-        return [ua.Variant(reply.ok, BOOLEAN), ua.Variant(_sentence(reply), STRING)]
+        if result := wrong(method.inputs, arguments):
+            return result
+        return await _said(method, line, person, [_value(one) for one in arguments])
 
-    return called
+    return asked
 
 
 async def _said(method: Method, line: LineSide, person: Person, values: Sequence[Any]) -> Reply:
@@ -183,7 +193,7 @@ def _sentence(reply: Reply) -> str:
     return "; ".join([reply.text, *(reason for reason in reply.reasons if reason not in reply.text)])
 
 
-def _wrong(inputs: Sequence[Input], arguments: Sequence[Any]) -> Any:
+def wrong(inputs: Sequence[Input], arguments: Sequence[Any]) -> Any:
     """The result of a call that cannot be one; None: it can."""
     if len(arguments) < len(inputs):
         return _result(ua.StatusCodes.BadArgumentsMissing)
@@ -212,7 +222,7 @@ def _result(code: int) -> Any:
     return ua.CallMethodResult(StatusCode=ua.StatusCode(code))
 
 
-def _argument(name: str, kind: Any, tells: str) -> Any:
+def argument(name: str, kind: Any, tells: str) -> Any:
     return ua.Argument(
         Name=name, DataType=ua.NodeId(kind.value), ValueRank=-1, ArrayDimensions=[],
         Description=ua.LocalizedText(tells),

@@ -18,7 +18,7 @@ from gateway.operator.opcua.line_nodes import ROOT, Told, list_paths, live_paths
 from gateway.operator.opcua.login import Check, Logins
 from gateway.operator.opcua.methods import make_methods
 from gateway.operator.opcua.proposal_nodes import MOST_WAITING, ProposalNodes
-from gateway.operator.opcua.server import OperatorServer, make_server
+from gateway.operator.opcua.server import CannotServe, OperatorServer, make_server
 from gateway.operator.opcua.space import NAMESPACE, NO_COMMUNICATION, WAITING, Space
 from gateway.operator.opcua.trust import TrustList
 from gateway.operator.users import RoleOf
@@ -56,9 +56,10 @@ class OpcUa:
         self._line = line
         self._side = side
         self._say = tell
-        self._new_status, self._new_proposals = asyncio.Event(), asyncio.Event()
+        self._new_status, self._new_proposals, self._new_told = asyncio.Event(), asyncio.Event(), asyncio.Event()
         self._shown: list[ProposalShown] = []  #: those that wait
         self._shown_of: ProposalList | None = None  #: of which list
+        self._told: tuple[ProposalShown, ...] | int = WAITING  #: what the nodes show; why nothing is known
 
     async def start(self) -> None:
         """Raises CannotServe, and may be called again then; `stop` is needed all the same.
@@ -68,7 +69,10 @@ class OpcUa:
         if not self._made:
             await self._make()
             self._made = True
-        await self._look_at_trust()
+        try:
+            await self._look_at_trust()
+        except OSError as error:
+            raise CannotServe(f"{error.filename} cannot be read: {error.strerror}") from error
         await self.server.start()
 
     async def _make(self) -> None:
@@ -97,6 +101,7 @@ class OpcUa:
             (self._show_line, self._new_status), (self._show_proposals, self._new_proposals),
             (self._events.look, asyncio.Event()), (self._end_strangers, asyncio.Event()),
             (self._look_at_trust, asyncio.Event()),
+            (self._show_dialogs, self._new_told),
         )  # fmt: skip
         async with asyncio.TaskGroup() as group:
             for do, event in works:
@@ -162,11 +167,20 @@ class OpcUa:
             self._shown, self._shown_of = shown, None if missed else found
         await self._proposals.show(self._shown)
         await self._events.waiting(self._shown)
-        await self._dialogs.show(self._shown)
+        self._told = tuple(self._shown)
+        self._new_told.set()
 
     async def _unsure_of_proposals(self, code: int) -> None:
+        self._told = code
+        self._new_told.set()
         await self._proposals.unsure(code)
-        await self._dialogs.unsure(code)
+
+    async def _show_dialogs(self) -> None:
+        """As the proposals are shown; what is wrong here leaves those as they are."""
+        if isinstance(self._told, int):
+            await self._dialogs.unsure(self._told)
+        else:
+            await self._dialogs.show(self._told)
 
     def _list_is_fresh(self) -> bool:
         return _is_fresh(self._side.age_s) and _is_fresh(self._side.proposals_age_s)

@@ -93,7 +93,11 @@ def file_of(folder: Path, der: bytes) -> Path:
 @dataclass(frozen=True)
 class _File:
     stamp: tuple[int, int, int]  #: another one: it has to be read anew
-    der: bytes  #: empty: it cannot be read
+    der: bytes  #: empty: it lets nobody in
+    unreadable: bool = False
+
+
+_NOTHING = _File((0, 0, 0), b"")
 
 
 class TrustList:
@@ -132,10 +136,19 @@ class TrustList:
         return ""
 
     def look(self) -> None:
-        """Read what is trusted now, and keep who was turned away. Waits for the disk; one at a time. Raises OSError."""
+        """Read what is trusted now, and keep who was turned away. Waits for the disk; one at a time.
+
+        While the folder cannot be listed, what it held last holds. Raises OSError then; a folder that was never there
+        holds nothing.
+        """
+        try:
+            paths = sorted(one for one in self._trusted.iterdir() if one.suffix == ".der")[:MOST_TRUSTED]
+        except FileNotFoundError:
+            if self._files:
+                raise
+            paths = []
         before = self._files
-        paths = sorted(self._trusted.glob("*.der"))[:MOST_TRUSTED]
-        self._files = {path: self._read(path, before.get(path)) for path in paths}
+        self._files = {path: self._read(path, before.get(path, _NOTHING)) for path in paths}
         self._held = frozenset(one.der for one in self._files.values() if one.der)
         if (stranger := self._stranger) is not None:
             if stranger not in self._held:  # somebody may have trusted it meanwhile
@@ -149,19 +162,22 @@ class TrustList:
         self._next_s = time.monotonic() + KEEP_S
         return True
 
-    def _read(self, path: Path, before: _File | None) -> _File:
-        """A file that cannot be read lets nobody in, and keeps nobody else out."""
+    def _read(self, path: Path, before: _File) -> _File:
+        """While a file cannot be read, what it held last holds; it keeps nobody else out."""
         try:
             found = path.stat()
             stamp = found.st_ino, found.st_size, found.st_ctime_ns
-            if before is not None and before.stamp == stamp:
+            if before.stamp == stamp:
                 return before
             usable = S_ISREG(found.st_mode) and found.st_size <= MOST_BYTES
             return _File(stamp, path.read_bytes() if usable else b"")
+        except FileNotFoundError:
+            return _NOTHING
         except OSError as error:
-            if before is None or before.der:
-                self._tell(f"{path} cannot be read, and lets nobody in: {error.strerror}")
-            return _File((0, 0, 0), b"")
+            if not before.unreadable:
+                holds = "what it held last holds" if before.der else "it lets nobody in"
+                self._tell(f"{path} cannot be read, and {holds}: {error.strerror}")
+            return _File((0, 0, 0), before.der, unreadable=True)
 
     def _keep(self, der: bytes) -> None:
         """Beside the newest others; told once as long as it lies there."""

@@ -54,21 +54,28 @@ export class Operate {
   // A field for a number, with the line's own in it until somebody writes another.
   field(min, max, now) {
     const input = h("input", { type: "number", min, max, step: "any", required: true, inputmode: "decimal" });
-    let touched = false;
+    let touched = false, writings = 0;
     const put = () => {
       const text = String((this.last && now()) ?? "");
       if (!touched && input.value !== text) input.value = text;
     };
-    input.addEventListener("input", () => (touched = input.value !== ""));
+    input.addEventListener("input", () => {
+      touched = input.value !== "";
+      writings += 1;
+    });
     const anew = () => {
       touched = false;
+      writings += 1;
       put();
     };
     input.addEventListener("blur", () => touched || put());
     this.follows.push(() => document.activeElement !== input && put());
-    // What was written while the answer was on its way stays.
-    const answered = (sent) => input.value === sent && anew();
-    return { input, anew, answered };
+    // What is written, or chosen, while the answer is on its way stays.
+    const sending = () => {
+      const sent = writings;
+      return () => writings === sent && anew();
+    };
+    return { input, anew, sending };
   }
 
   tension() {
@@ -77,9 +84,9 @@ export class Operate {
     const value = this.field(min, max, () => this.last.spans[span.value - 1][1]);
     span.addEventListener("change", value.anew);
     const submit = async () => {
-      const sent = value.input.value;
-      await this.say({ command: "set", span: Number(span.value), tension_n: Number(sent) });
-      value.answered(sent);
+      const answered = value.sending();
+      await this.say({ command: "set", span: Number(span.value), tension_n: Number(value.input.value) });
+      answered();
     };
     return this.form("tension", submit,
       h("label", {}, h("span", {}, word("operate.tension")), span),
@@ -90,11 +97,11 @@ export class Operate {
     const max = this.line.speed_max_m_per_s;
     const value = this.field(0, max, () => this.last.speed_setpoint);
     const submit = async () => {
-      const sent = value.input.value, to = Number(sent), from = this.last?.speed_setpoint ?? 0;
+      const to = Number(value.input.value), answered = value.sending(), from = this.last?.speed_setpoint ?? 0;
       const lines = [changed(word("operate.speed"), from, to, "m/s", 3)];
       if (to > from && (await confirmed({ title: word("operate.sure-speed"), lines, yes: word("operate.set") })) === null) return;
       await this.say({ command: "speed", speed_m_per_s: to });
-      value.answered(sent);
+      answered();
     };
     return this.form("speed", submit,
       h("label", {}, h("span", {}, `${word("operate.speed")}, m/s, 0 ${word("operate.to")} ${number(max, 2)}`), value.input));
