@@ -1,11 +1,12 @@
 """`make bench-operator`: `r2rgate operator` flooded beside a line that runs; the loop's own frames say how late it was.
 
 Quiet, a case, quiet, and so on, in one run: clients that read at full speed, connections opened and left, messages that
-are none, clients killed in mid-subscription, all of it at once, and the same load on the processors with nothing on the
-network. In all of it an honest client reads ten times a second, calls a method every second, and connects anew every
-three; each of its deeds counts for the case in which it began. `lateness_p99_ratio_CASE` is the 99th percentile of how
-late the loop woke in the case, through that in quiet. Quiet begins once the sessions of clients that were killed are
-over; a frame of the loop that is not in the history would be missing from a percentile, so these are counted.
+are none, clients killed in mid-subscription, clients that ask for what waits again and again, the flood of all but the
+last, and the same load on the processors with nothing on the network. In all of it an honest client reads ten times a
+second, calls a method every second, and connects anew every three; each of its deeds counts for the case in which it
+began. `lateness_p99_ratio_CASE` is the 99th percentile of how late the loop woke in the case, through that in quiet.
+Quiet begins once the sessions of clients that were killed are over; a frame of the loop that is not in the history
+would be missing from a percentile, so these are counted.
 
 The attackers are no nicer than anybody else and run on the processors of the line. What they themselves take of these
 is in the table `cases` (in processors, so 1.5 of 2 means that little is left); `busy` takes as much, as the operator's
@@ -31,6 +32,7 @@ from typing import Any
 import numpy as np
 
 from gateway.cli.children import ChildFailed
+from gateway.control.design import design_lqg, task_of
 from gateway.core.signals import FloatArray
 from gateway.supervisor.historian import FILE_NAME
 from gateway.supervisor.history import History
@@ -51,6 +53,7 @@ CASES: dict[str, Sequence[str]] = {
     "connections": CONNECTIONS,
     "malformed": MALFORMED,
     "killed": KILLER,
+    "refreshers": ("refresher",) * 4,
     "flood": (*READERS, *CONNECTIONS, *MALFORMED, *KILLER),
 }
 BUSY, QUIET = "busy", "quiet"
@@ -66,6 +69,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder, OperatorLine(Path(folder)) as line:
         line.run()
         line.operate()
+        line.until(line.propose(design_lqg(task_of(line.line)), "for those who ask what waits"), "waiting", 150.0)
         cost(bench, line, COST_S * given.seconds / SECONDS)
         page(bench, line, COST_S * given.seconds / SECONDS)
         found = flooded(line, given.rounds, given.seconds)
@@ -135,7 +139,7 @@ def flooded(line: OperatorLine, rounds: int, seconds: float) -> Found:
 
 
 def _words(line: OperatorLine, kind: str) -> list[str]:
-    if kind in ("reader", "killer"):
+    if kind in ("reader", "refresher", "killer"):
         return [CLIENTS, kind, line.endpoint, str(line.pki)]
     return [ATTACKS, kind, line.endpoint.removeprefix("opc.tcp://")]
 

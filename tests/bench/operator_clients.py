@@ -3,6 +3,7 @@
     honest      reads, calls a method, and connects anew, now and then; tells how long each took
     reader      reads a hundred nodes again and again, as fast as it is answered
     subscriber  has fifty variables told, every 100 ms
+    refresher   has the events of all conditions told ten times over, and asks for what waits again and again
     killer      begins a subscriber, kills it as soon as it is told something, and again
     page        a browser that looks on (ADDRESS is the page's)
 
@@ -27,6 +28,7 @@ from asyncua.client.client import Client
 from asyncua.crypto.security_policies import SecurityPolicyBasic256Sha256
 from cryptography import x509
 
+from gateway.operator.opcua.limits import MAX_CALLS, MAX_EVENT_ITEMS
 from gateway.operator.opcua.trust import application_uri
 from tests.operator.names import PANEL, PASSWORD
 
@@ -127,7 +129,10 @@ async def reader(address: str, pki: Path, ended: asyncio.Event) -> None:
 
 class _Told:
     def __init__(self) -> None:
-        self.changes = 0
+        self.changes = self.events = 0
+
+    def event_notification(self, event: Any) -> None:
+        self.events += 1
 
     def datachange_notification(self, node: Any, val: Any, data: Any) -> None:
         self.changes += 1
@@ -142,6 +147,20 @@ async def subscriber(address: str, pki: Path, ended: asyncio.Event) -> None:
     await ended.wait()
     print(json.dumps({"answers": told.changes}))
     await client.disconnect()
+
+
+async def refresher(address: str, pki: Path, ended: asyncio.Event) -> None:
+    client, told = await connected_at_last(address, pki), _Told()
+    subscription = await client.create_subscription(100, told)
+    kind = client.get_node(ua.ObjectIds.DialogConditionType)
+    for _ in range(MAX_EVENT_ITEMS):
+        await subscription.subscribe_events(evtypes=kind)
+    ready()
+    of = ua.NodeId(ua.ObjectIds.ConditionType), ua.NodeId(ua.ObjectIds.ConditionType_ConditionRefresh)
+    number = ua.Variant(subscription.subscription_id, ua.VariantType.UInt32)
+    while not ended.is_set():
+        await client.uaclient.call([ua.CallMethodRequest(*of, [number])] * MAX_CALLS)
+    print(json.dumps({"answers": told.events}))
 
 
 async def page(address: str, _: Path, ended: asyncio.Event) -> None:
@@ -184,7 +203,7 @@ def killer(address: str, pki: Path) -> None:
 
 
 logging.getLogger("asyncua").setLevel(logging.CRITICAL)
-KINDS = {one.__name__: one for one in (honest, reader, subscriber, page)}
+KINDS = {one.__name__: one for one in (honest, reader, subscriber, refresher, page)}
 
 
 async def begin(kind: Kind, address: str, pki: Path) -> None:
