@@ -34,6 +34,7 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[AtPage]:
 @pytest.fixture
 def at(line: PageLine, browser: AtPage) -> Iterator[AtPage]:
     """Whatever a test does there, the browser complains of nothing, and has asked nothing of any other place."""
+    line.run_again()
     browser.open(line.page)
     yield browser
     assert browser("troubles") == []
