@@ -104,7 +104,7 @@ bench-gate-live: $(VENV)/.compiled ## the gate on a running line: rollback, swap
 bench-agents-live: $(VENV)/.compiled ## agents that die, hang, flood or lie beside a running line (about 30 min; ARGS="--rounds 1")
 	@$(PY) -m tests.bench.agents_live $(ARGS)
 
-bench-operator: $(VENV)/.compiled ## the OPC UA server flooded beside a running line, what it costs, the page in Chromium; as root (about 12 min; ARGS="--rounds 1 --seconds 7")
+bench-operator: $(VENV)/.compiled ## the OPC UA server flooded beside a running line, what it costs, the page in Chromium; as root (about 14 min; ARGS="--rounds 1 --seconds 7")
 	@$(PY) -m tests.system.needs
 	@$(PY) -m tests.bench.operator $(ARGS)
 
