@@ -296,6 +296,12 @@ class Bench:
         return result.StatusCode.value, [one.Value for one in result.OutputArguments or ()]
 
 
+async def comes(right: Callable[[], bool]) -> None:
+    """What a thread or the other side of a socket does; the test's time limit ends what never comes."""
+    while not right():  # noqa: ASYNC110 (there is no event to wait for)
+        await asyncio.sleep(0.02)
+
+
 @asynccontextmanager
 async def bench(
     spans: int = 2, gateway: bool = True, begin: bool = True, line: Line | None = None, **operator: Any

@@ -1,6 +1,5 @@
 """Proposals as dialogs: one for each as it is shown, its answer bound to that, all once more for whoever asks."""
 
-import asyncio
 from typing import Any
 
 from asyncua import ua
@@ -8,7 +7,7 @@ from asyncua import ua
 from gateway.core.decisions import Decide
 from gateway.core.messages import Reply
 from gateway.operator.opcua import dialogs
-from tests.protocol.operator_support import SHOWN, bench, shown
+from tests.protocol.operator_support import SHOWN, bench, comes, shown
 from tests.protocol.test_operator_nodes import Heard, run
 
 CODES = ua.StatusCodes
@@ -179,8 +178,7 @@ def test_nobody_is_told_that_something_waits_which_nobody_knows():
             assert again.Quality.is_good() and again.NodeId == told.NodeId
             b.gateway.waiting = []
             assert (await heard.values.get()).Retain is False
-            while await b.opcua.server.get_node(b.id("Line.Dialogs")).get_children():  # noqa: ASYNC110 (on the wire)
-                await asyncio.sleep(0.01)
+            await comes(lambda: told.NodeId not in b.opcua.server.iserver.aspace)
             b.gateway.waiting = [shown(reason="the type has kept its method")]
             assert await answered(client, (await heard.values.get()).NodeId, 0) == CODES.BadUserAccessDenied
 
@@ -221,8 +219,7 @@ def test_a_dialog_that_cannot_be_made_hides_no_proposal_and_is_made_when_it_can(
                 b.gateway.waiting = [one.model_copy(update={"approvals": 2})]
                 path = f"Line.Proposals.{one.proposal_hash}.Id"
                 await b.until(client, path, lambda found: found.StatusCode.is_good())
-                while not any("ZeroDivisionError" in said for said in b.said):  # noqa: ASYNC110 (it is on the wire)
-                    await asyncio.sleep(0.01)
+                await comes(lambda: any("ZeroDivisionError" in said for said in b.said))
                 assert (await b.read(client, path)).StatusCode.is_good()
                 assert await b.opcua.server.get_node(b.id("Line.Dialogs")).get_children() == []
             heard, _, _ = await watched(client)

@@ -2,7 +2,7 @@
 
 import asyncio
 import threading
-from collections.abc import Callable
+from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
@@ -10,8 +10,8 @@ from asyncua import Client, ua
 from asyncua.crypto import security_policies as policies
 
 from gateway.operator.opcua import login
-from gateway.operator.opcua.trust import MOST_REJECTED, REJECTED, TRUSTED, file_of
-from tests.protocol.operator_support import PASSWORD, bench, der, pair
+from gateway.operator.opcua.trust import MOST_REJECTED, REJECTED, TRUSTED, TrustList, file_of
+from tests.protocol.operator_support import PASSWORD, bench, comes, der, pair
 
 CODES = ua.StatusCodes
 SIGN, ENCRYPT = ua.MessageSecurityMode.Sign, ua.MessageSecurityMode.SignAndEncrypt
@@ -25,12 +25,6 @@ def run(story):
 @pytest.fixture(autouse=True)
 def impatient(monkeypatch):
     monkeypatch.setattr(login, "FIRST_DELAY_S", 0.001)
-
-
-async def until(right: Callable[[], bool]) -> None:
-    """The test's time limit ends what never comes."""
-    while not right():  # noqa: ASYNC110 (it is on the wire)
-        await asyncio.sleep(0.02)
 
 
 async def refused(client: Client) -> str:
@@ -113,7 +107,7 @@ def test_a_stranger_is_turned_away_kept_to_be_looked_at_and_let_in_once_trusted(
             assert await refused(await b.client("otto", of="stranger", timeout_s=2.0))
             assert b.checks == 0
             kept = file_of(b.pki / REJECTED, der(pair("stranger")))
-            await until(kept.exists)
+            await comes(kept.exists)
             assert kept.read_bytes() == der(pair("stranger"))
             assert any(f"r2rgate pki trust {kept}" in said and "urn:test:stranger" in said for said in b.said)
             trusted = kept.rename(b.pki / TRUSTED / "any-name.der")
@@ -121,7 +115,7 @@ def test_a_stranger_is_turned_away_kept_to_be_looked_at_and_let_in_once_trusted(
             async with b.connected("otto") as other, b.connected("otto", of="stranger"):
                 assert b.sessions() == 2
                 trusted.unlink()
-                await until(lambda: b.sessions() == 1)  # the session that is open ends, too
+                await comes(lambda: b.sessions() == 1)  # the session that is open ends, too
                 await b.value(other, "Line.Connection.Fresh")
             assert await refused(await b.client("otto", of="stranger", timeout_s=2.0))
 
@@ -138,7 +132,7 @@ def test_rejected_certificates_do_not_fill_the_disk(monkeypatch):
             for number in range(MOST_REJECTED + 5):
                 (folder / f"{number}.der").write_bytes(b"x")
             assert await refused(await b.client("otto", of="stranger", timeout_s=2.0))
-            await until(file_of(folder, der(pair("stranger"))).exists)
+            await comes(file_of(folder, der(pair("stranger"))).exists)
             assert len(list(folder.iterdir())) == MOST_REJECTED
 
     run(story)
@@ -218,7 +212,7 @@ def test_a_disk_that_hangs_keeps_out_nobody_who_was_trusted_before(monkeypatch):
             with monkeypatch.context() as disk:
                 disk.setattr(Path, "iterdir", hangs)
                 try:
-                    await until(hanging.is_set)
+                    await comes(hanging.is_set)
                     async with b.connected("otto") as client:
                         assert await b.call(client, "Stop") == (CODES.Good, [True, "done"])
                 finally:
@@ -232,16 +226,34 @@ def test_a_folder_of_the_trusted_that_is_gone_puts_nobody_out_and_a_file_that_is
         async with bench(spans=1) as b, b.connected("otto") as client:
             folder = b.pki / TRUSTED
             away = folder.rename(b.pki / "elsewhere")
-            await until(lambda: any("FileNotFoundError" in said for said in b.said))
+            await comes(lambda: any("cannot be listed" in said for said in b.said))
             b.opcua.server.end_strangers()
             async with b.connected("vera"):
                 assert await b.call(client, "Stop") == (CODES.Good, [True, "done"])
             away.rename(folder)
             for path in folder.iterdir():
                 path.unlink()
-            await until(lambda: b.sessions() == 0)
+            await comes(lambda: b.sessions() == 0)
 
     run(story)
+
+
+def test_a_folder_that_cannot_be_listed_is_told_once_and_one_that_never_was_is_no_trouble(tmp_path, monkeypatch):
+    said: list[str] = []
+    trusted, stranger = TrustList(tmp_path, said.append, lambda: datetime.now(UTC)), der(pair("stranger"))
+    trusted.look()
+    assert said == [] and trusted.why_not(stranger) == "it is not trusted"
+    trusted.look()
+    assert file_of(tmp_path / REJECTED, stranger).read_bytes() == stranger and len(said) == 1
+
+    def denied(_path):
+        raise PermissionError(13, "Permission denied")
+
+    with monkeypatch.context() as disk:
+        disk.setattr(Path, "iterdir", denied)
+        trusted.look()
+        trusted.look()
+    assert len(said) == 2 and "may this user read it?" in said[1]
 
 
 def test_a_session_cannot_be_taken_up_by_another_connection():

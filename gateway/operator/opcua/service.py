@@ -18,7 +18,7 @@ from gateway.operator.opcua.line_nodes import ROOT, Told, list_paths, live_paths
 from gateway.operator.opcua.login import Check, Logins
 from gateway.operator.opcua.methods import make_methods
 from gateway.operator.opcua.proposal_nodes import MOST_WAITING, ProposalNodes
-from gateway.operator.opcua.server import CannotServe, OperatorServer, make_server
+from gateway.operator.opcua.server import OperatorServer, make_server
 from gateway.operator.opcua.space import NAMESPACE, NO_COMMUNICATION, WAITING, Space
 from gateway.operator.opcua.trust import TrustList
 from gateway.operator.users import RoleOf
@@ -69,10 +69,7 @@ class OpcUa:
         if not self._made:
             await self._make()
             self._made = True
-        try:
-            await self._look_at_trust()
-        except OSError as error:
-            raise CannotServe(f"{error.filename} cannot be read: {error.strerror}") from error
+        await self._look_at_trust()
         await self.server.start()
 
     async def _make(self) -> None:

@@ -109,6 +109,7 @@ class TrustList:
         self._now = now
         self._next_s = time.monotonic()
         self._files: dict[Path, _File] = {}
+        self._trouble = ""  #: why the folder cannot be listed, as it was told
         self._held: frozenset[bytes] = frozenset()  #: by content: a file's name proves nothing
         self._stranger: bytes | None = None  #: to be kept in the folder of the rejected
 
@@ -138,22 +139,34 @@ class TrustList:
     def look(self) -> None:
         """Read what is trusted now, and keep who was turned away. Waits for the disk; one at a time.
 
-        While the folder cannot be listed, what it held last holds. Raises OSError then; a folder that was never there
-        holds nothing.
+        While the folder cannot be listed, what it held last holds. Raises OSError where who was turned away cannot be
+        kept; the next one is tried again.
         """
         try:
             paths = sorted(one for one in self._trusted.iterdir() if one.suffix == ".der")[:MOST_TRUSTED]
-        except FileNotFoundError:
-            if self._files:
-                raise
-            paths = []
+        except OSError as error:
+            if not isinstance(error, FileNotFoundError) or self._files:
+                self._cannot_list(error)
+                return
+            paths = []  # nobody was ever trusted
+        self._trouble = ""
         before = self._files
         self._files = {path: self._read(path, before.get(path, _NOTHING)) for path in paths}
         self._held = frozenset(one.der for one in self._files.values() if one.der)
-        if (stranger := self._stranger) is not None:
-            if stranger not in self._held:  # somebody may have trusted it meanwhile
-                self._keep(stranger)
-            self._stranger = None
+        self._keep_stranger()
+
+    def _cannot_list(self, error: OSError) -> None:
+        if self._trouble != str(error):
+            self._tell(
+                f"{self._trusted} cannot be listed: {error.strerror}. Whoever was trusted stays so, and nobody can be "
+                "let in or out until it can: is its disk there, and may this user read it?"
+            )
+        self._trouble = str(error)
+
+    def _keep_stranger(self) -> None:
+        stranger, self._stranger = self._stranger, None
+        if stranger is not None and stranger not in self._held:  # somebody may have trusted it meanwhile
+            self._keep(stranger)
 
     def _may_say(self) -> bool:
         """Now and then: neither the disk nor the log is for strangers to fill."""
