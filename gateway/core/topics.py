@@ -48,11 +48,12 @@ GATEWAY_ALARM = Topic("gateway/alarm", "request", "10/s", kept=True)  #: AlarmSa
 GATEWAY_ACCESS = Topic("gateway/access", "request", "1/s", kept=True)  #: AtTheDoor -> Reply
 GATEWAY_PAST = Topic("gateway/past", "request", "20/s", kept=False)  #: PastQuery -> RecordsTold, TensionsTold
 GATEWAY_COURSES = Topic("gateway/courses", "request", "20/s", kept=False)  #: ShowCourses -> CoursesTold
+GATEWAY_ASKED = Topic("gateway/asked", "request", "20/s", kept=False)  #: ShowAsked -> AskedTold
 
 TOPICS = (
     LOOP_TELEMETRY, LOOP_EVENT, LOOP_BUSES, LOOP_COMMAND, GATEWAY_COMMAND, GATEWAY_STATUS, GATEWAY_PROPOSE,
     GATEWAY_PROPOSALS, GATEWAY_DECISION, GATEWAY_FOR_PERSON, GATEWAY_ALARM, GATEWAY_ACCESS,
-    GATEWAY_PAST, GATEWAY_COURSES,
+    GATEWAY_PAST, GATEWAY_COURSES, GATEWAY_ASKED,
 )  # fmt: skip
 
 # The bus of the agents. What is no row here nobody may send there: its access rules are made from this table.

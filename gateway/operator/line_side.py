@@ -11,6 +11,7 @@ from typing import TypeVar
 from pydantic import ValidationError
 
 from gateway.core.access import AtTheDoor
+from gateway.core.asked_before import AskedTold, ShowAsked
 from gateway.core.courses import CoursesTold, ShowCourses
 from gateway.core.decisions import ListProposals, ProposalList, ProposalShown, ShowProposal
 from gateway.core.line import Strict
@@ -20,6 +21,7 @@ from gateway.core.people import ForPerson, Person, Said
 from gateway.core.status import GatewayStatus
 from gateway.core.topics import (
     GATEWAY_ACCESS,
+    GATEWAY_ASKED,
     GATEWAY_COURSES,
     GATEWAY_FOR_PERSON,
     GATEWAY_PAST,
@@ -39,7 +41,9 @@ ACT_S = 20.0  #: arming, and a deployment, take their time
 Model = TypeVar("Model", bound=Strict)
 
 #: All but what people say.
-READ: tuple[Topic, ...] = (GATEWAY_STATUS, GATEWAY_PROPOSALS, GATEWAY_PAST, GATEWAY_COURSES, GATEWAY_ACCESS)
+READ: tuple[Topic, ...] = (
+    GATEWAY_STATUS, GATEWAY_PROPOSALS, GATEWAY_PAST, GATEWAY_COURSES, GATEWAY_ASKED, GATEWAY_ACCESS,
+)  # fmt: skip
 TOPICS: tuple[Topic, ...] = (*READ, GATEWAY_FOR_PERSON)
 
 
@@ -101,6 +105,10 @@ class LineSide:
         """Of the whole hash of one that waits; the first answer is mostly that they are being drawn. Raises NotTold."""
         return _told(CoursesTold, await self._in_turn(GATEWAY_COURSES, ShowCourses(proposal=proposal)))
 
+    async def asked(self, proposal: str) -> AskedTold:
+        """What was asked of agents before it was made, and the notes that were looked up. Raises NotTold."""
+        return _told(AskedTold, await self._in_turn(GATEWAY_ASKED, ShowAsked(proposal=proposal)))
+
     async def records(self, after: int | None = None) -> RecordsTold:
         """Raises NotTold."""
         return _told(RecordsTold, await self._in_turn(GATEWAY_PAST, RecordsAfter(after=after)))
@@ -148,7 +156,7 @@ class LineSide:
                 self._troubles[look.__name__] = str(error)
             await asyncio.sleep(every_s)
 
-    async def _in_turn(self, topic: Topic, query: ShowProposal | RecordsAfter | TensionsBetween | ShowCourses) -> bytes:
+    async def _in_turn(self, topic: Topic, query: Strict) -> bytes:
         """Few at a time, so that those who look cannot fill the way to the gateway. Raises NotTold."""
         try:
             async with asyncio.timeout(ASK_S):
@@ -160,7 +168,7 @@ class LineSide:
         finally:
             self._asking.release()
 
-    async def _ask(self, topic: Topic, query: ListProposals | ShowProposal | RecordsAfter | TensionsBetween) -> bytes:
+    async def _ask(self, topic: Topic, query: ListProposals) -> bytes:
         return await self._request(topic, query.model_dump_json().encode())
 
     async def _request(self, topic: Topic, payload: bytes, within_s: float = ASK_S) -> bytes:

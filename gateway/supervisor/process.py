@@ -22,6 +22,7 @@ from gateway.supervisor.agents_bus import AgentsBus
 from gateway.supervisor.agents_cases import AgentsCases
 from gateway.supervisor.agents_desk import AgentsDesk
 from gateway.supervisor.alarms import Alarms
+from gateway.supervisor.asked_desk import AskedDesk
 from gateway.supervisor.configurations import Configurations
 from gateway.supervisor.courses_desk import CoursesDesk
 from gateway.supervisor.deployer_sides import JudgeSide
@@ -111,7 +112,9 @@ async def serve(
     past = Past(line, mailbox, data_folder, lambda: historian.path)
     dry_runs = DryRuns(line, beside)
     cases = AgentsCases(gate.audit.append, clock)
-    desk = AgentsDesk(gateway.status, gate, dry_runs, Interactions(data_folder), gateway.note, cases)
+    log = Interactions(data_folder)
+    desk = AgentsDesk(gateway.status, gate, dry_runs, log, gateway.note, cases)
+    AskedDesk(mailbox, lambda: gate.deployer, log)
     line_desk = LineDesk(line, gate, data_folder, experiments, cases)
     bus = AgentsBus(line, run_folder, (desk, line_desk), gateway.note, cases, clock)
     gateway.agents_bus = bus.status

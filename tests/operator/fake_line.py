@@ -14,6 +14,7 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 from gateway.core.alarms import ALARMS, AcknowledgeAlarm, AlarmStatus, ShelveAlarm
+from gateway.core.asked_before import AskedTold, Before, NoteBefore, ShowAsked
 from gateway.core.courses import CoursesTold, DrawnCourse, ShowCourses
 from gateway.core.decisions import (
     QUERY,
@@ -31,7 +32,14 @@ from gateway.core.messages import Reply
 from gateway.core.people import FOR_PERSON, ROLES, ForPerson, Role, why_may_not
 from gateway.core.proposal import Proposal, proposal_hash
 from gateway.core.status import GatewayStatus
-from gateway.core.topics import GATEWAY_COURSES, GATEWAY_FOR_PERSON, GATEWAY_PAST, GATEWAY_PROPOSALS, GATEWAY_STATUS
+from gateway.core.topics import (
+    GATEWAY_ASKED,
+    GATEWAY_COURSES,
+    GATEWAY_FOR_PERSON,
+    GATEWAY_PAST,
+    GATEWAY_PROPOSALS,
+    GATEWAY_STATUS,
+)
 from gateway.core.verdict import Verdict, verdict_hash
 from gateway.mailbox.port import Mailbox
 from gateway.mailbox.unix import UnixMailbox
@@ -43,6 +51,23 @@ from tests.unit.supervisor_support import line_of, short_folder
 EXAMPLES = Path("docs/examples")
 PASSWORD = "demonstration"
 IN_SERVICE = "c6d8cf9c18f6d8b1da935a6124c0cd14f017292be653fbbb0dbf92362e1c9e54"
+
+ASKED = Before(
+    interaction="0123456789abcdef", agent="initial-control", decision="design.selection",
+    task="Which of the tuned controllers is proposed.", chosen="LQI with Kalman filter", by="rules", instead="",
+)  # fmt: skip
+NOTES = [
+    NoteBefore(
+        key="control/integral-action", title="Integral action and constant disturbances", tier=1, overruled_by=[],
+        passage="A controller without integral action leaves an error wherever friction takes a constant torque.",
+        speaks_to_a_model=False,
+    ),
+    NoteBefore(
+        key="practice/bearing-friction", title="Friction of idler bearings", tier=2, overruled_by=["line/friction"],
+        passage="Old grease makes an idler turn hard when the line is cold; it takes tension from span to span.",
+        speaks_to_a_model=True,
+    ),
+]  # fmt: skip
 
 
 async def check(name: str, password: str) -> Role | None:
@@ -84,6 +109,8 @@ class FakeGateway:
         self.absent: list[str] = []  #: from the first bus
         self.drawn = False  #: courses were asked for
         self.no_courses = ""  #: why there are none
+        self.notes = list(NOTES)
+        self.no_log = ""  #: why nothing can be told of what was asked
         self.records: list[str] = []  #: of the audit, behind the two that there are
         self.approvals = 1  #: that a change takes
         self.first = ""  #: who has approved it, where it takes two
@@ -94,6 +121,7 @@ class FakeGateway:
         now = datetime.now(UTC).replace(microsecond=0)
         example = json.loads((EXAMPLES / "proposal.json").read_text())
         example |= {"created": now.isoformat(), "expires": (now + timedelta(minutes=42)).isoformat()}
+        example["evidence"] = [*example["evidence"], {"what": f"interaction {ASKED.interaction}"}]
         self.proposal = Proposal.model_validate(example)
         self.verdict = Verdict.model_validate_json((EXAMPLES / "verdict.json").read_text())
         self.setpoints = (line.recipes[0].tension_n * 10)[: line.n]
@@ -102,6 +130,7 @@ class FakeGateway:
             (GATEWAY_PROPOSALS, self._proposals),
             (GATEWAY_PAST, self._past),
             (GATEWAY_COURSES, self._courses),
+            (GATEWAY_ASKED, self._asked),
             (GATEWAY_FOR_PERSON, self._for_person),
         ):
             mailbox.serve(topic, handler)
@@ -170,6 +199,13 @@ class FakeGateway:
             format=1, proposal=asked.proposal, verdict=verdict_hash(self.verdict), model="ab" * 32, drawing=drawing,
             courses=courses,
         ).model_dump_json().encode()  # fmt: skip
+
+    async def _asked(self, payload: bytes) -> bytes:
+        if self.no_log:
+            return Reply(ok=False, state="", text=self.no_log).model_dump_json().encode()
+        proposal = ShowAsked.model_validate_json(payload).proposal
+        told = AskedTold(format=1, proposal=proposal, asked=[ASKED], notes=self.notes, missing=[])
+        return told.model_dump_json().encode()
 
     def _course(self, scenario: str, swing_n: float, step_n: float) -> DrawnCourse:
         """After 0.3 s a step or a push, and what two laws make of it."""

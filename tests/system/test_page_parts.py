@@ -85,6 +85,32 @@ def test_why_there_are_no_courses_is_said_and_they_come_when_there_are(gateway: 
     browser("see", ".course canvas")
 
 
+def test_the_notes_that_a_proposal_rests_on_are_there_by_their_titles_and_what_is_opened_stays_open(
+    gateway: FakeGateway, browser: AtPage
+) -> None:
+    browser("cut", "**/api/asked/*", 2)
+    browser.part("change")
+    browser("see", "#asked", "Which of the tuned controllers is proposed.")
+    titles = browser("texts", "#asked summary")
+    assert titles == [
+        "Integral action and constant disturbances (control theory)",
+        "Friction of idler bearings (roll-to-roll practice)",
+    ]
+    browser("click", "#asked summary:has-text('Friction')")
+    browser("see", "#asked blockquote", "Old grease")
+    assert "line/friction says otherwise" in browser("see", "#asked details[open]", "It cannot.")
+    assert not browser("violations")
+    gateway.stage = "probation"
+    browser("see", "#change-body", "On probation")
+    browser("see", "#asked blockquote", "Old grease")
+
+
+def test_why_nothing_is_told_of_the_notes_is_said(gateway: FakeGateway, browser: AtPage) -> None:
+    gateway.no_log = "the log cannot be read"
+    browser.part("change")
+    browser("see", "#asked", "the log cannot be read")
+
+
 def test_the_span_that_was_chosen_stays_chosen_and_has_the_focus(gateway: FakeGateway, browser: AtPage) -> None:
     browser.part("change")
     browser("see", SPAN)

@@ -24,6 +24,7 @@ ASKED = (
     "/api/proposals",
     "/api/proposals/abcdef",
     "/api/courses/abcdef",
+    "/api/asked/abcdef",
     "/api/records",
     "/api/tensions",
     "/events",

@@ -14,6 +14,7 @@ from gateway.operator.page.tick import DRIVES_THAT_FAIL, IN_MOTION, OFF_SHARE, a
 from gateway.operator.page.told import TWO_SIDED, proposal_told, used
 from gateway.supervisor import alarm_conditions
 from safety.rules import model_residuals, validity
+from tests.operator.fake_line import ASKED
 from tests.unit.page_support import page
 from tests.unit.supervisor_support import line_of
 
@@ -163,6 +164,20 @@ def test_set_points_are_offered_as_far_as_the_loop_takes_them():
         limits.tension_min_n + limits.tension_margin_n,
         limits.tension_max_n - limits.tension_margin_n,
     ]
+
+
+def test_what_a_proposal_rests_on_is_told():
+    async def story() -> None:
+        async with page() as there:
+            await there.log_in("viewer")
+            told = (await there.browser.get(f"/api/asked/{there.gateway.hash}")).json()
+            assert [one["interaction"] for one in told["asked"]] == [ASKED.interaction]
+            assert [one["title"] for one in told["notes"]] == [one.title for one in there.gateway.notes]
+            there.gateway.no_log = "the log cannot be read"
+            none = await there.browser.get(f"/api/asked/{there.gateway.hash}")
+            assert none.status_code == 409 and none.json()["text"] == there.gateway.no_log
+
+    asyncio.run(story())
 
 
 def test_courses_come_once_they_are_drawn():

@@ -1,6 +1,7 @@
 """What the page asks for: the line, proposals, records, tensions of the past; and what people say."""
 
 import json
+from collections.abc import Awaitable, Callable
 from typing import Annotated, Any
 
 from pydantic import Field, TypeAdapter, ValidationError
@@ -9,7 +10,7 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse
 from starlette.routing import Route
 
-from gateway.core.line import Line
+from gateway.core.line import Line, Strict
 from gateway.core.line_past import TensionsBetween
 from gateway.core.messages import Reply
 from gateway.core.people import LEAST, Said, may, why_may_not
@@ -36,6 +37,7 @@ class Asks:
             Route("/api/proposals", self._proposals),
             Route("/api/proposals/{proposal}", self._proposal),
             Route("/api/courses/{proposal}", self._courses),
+            Route("/api/asked/{proposal}", self._asked),
             Route("/api/records", self._records),
             Route("/api/tensions", self._tensions),
             Route("/api/say", self._say, methods=["POST"]),
@@ -61,9 +63,15 @@ class Asks:
             raise HTTPException(503, str(error)) from error
 
     async def _courses(self, request: Request) -> JSONResponse:
+        return await self._of_proposal(request, self._side.courses)
+
+    async def _asked(self, request: Request) -> JSONResponse:
+        return await self._of_proposal(request, self._side.asked)
+
+    async def _of_proposal(self, request: Request, tell: Callable[[str], Awaitable[Strict]]) -> JSONResponse:
         self._door.visitor(request)
         try:
-            return JSONResponse((await self._side.courses(request.path_params["proposal"])).model_dump())
+            return JSONResponse((await tell(request.path_params["proposal"])).model_dump())
         except ValidationError as error:
             raise HTTPException(400, _in_words(error)) from None
         except Declined as error:  # whoever asks again and again may stop

@@ -1,5 +1,6 @@
 // A proposal, and the way to a decision on it. What is decided on is exactly what is shown, by its hash.
 import { $, english, h, replaced, setText } from "./dom.js";
+import { tellAsked } from "./asked.js";
 import { drawCourses } from "./courses.js";
 import { confirmed } from "./dialog.js";
 import { beforeAfter, margins } from "./figures.js";
@@ -73,14 +74,13 @@ export class Change {
     this.draw(shown);
   }
 
-  async draw(shown) {
-    const place = $("courses");
-    if (!place || place.dataset.begun) return;
-    place.dataset.begun = "yes";
-    if (!(await drawCourses(place, shown.proposal_hash, shown.verdict.figures))) delete place.dataset.begun;
+  draw(shown) {
+    begun($("courses"), (place) => drawCourses(place, shown.proposal_hash, shown.verdict.figures));
+    begun($("asked"), (place) => tellAsked(place, shown.proposal_hash));
   }
 
   what(shown) {
+    const plain = shown.evidence.filter((one) => !wasAsked(one));
     const quoted = h("figure", { class: "quote" }, english("blockquote", shown.reason), h("figcaption", {}, word("change.said-by", { author: shown.author, when: instant(shown.created) })));
     return h("section", { class: "panel" },
       h("h2", {}, word(`kind.${shown.kind}`), " ", h("code", {}, shown.proposal_hash.slice(0, 12))),
@@ -88,7 +88,8 @@ export class Change {
       shown.shown && twoPeople(shown) && h("p", {}, h("b", {}, twoPeople(shown))),
       shown.difference.length > 0 && [h("h3", {}, word("change.difference")), h("ul", {}, shown.difference.map((line) => english("li", line)))],
       h("h3", {}, word("change.reason")), quoted,
-      shown.evidence.length > 0 && [h("h3", {}, word("change.evidence")), h("ul", {}, shown.evidence.map(evidence))],
+      shown.evidence.length > 0 && [h("h3", {}, word("change.evidence")),
+        plain.length > 0 && h("ul", {}, plain.map(evidence)), plain.length < shown.evidence.length && this.before(shown)],
       shown.predicted.length > 0 && [h("h3", {}, word("change.promised")), h("ul", {}, shown.predicted.map(promise))]);
   }
 
@@ -99,10 +100,17 @@ export class Change {
 
   courses(shown) {
     if (shown.kind !== "gains" || !shown.verdict?.accepted) return null;
-    const of = JSON.stringify([shown.proposal_hash, shown.verdict]);
+    const of = JSON.stringify([document.documentElement.lang, shown.proposal_hash, shown.verdict]);
     if (this.drawn?.of !== of) // while it is the same, it is neither drawn again nor loses the span that was chosen
       this.drawn = { of, section: h("section", { class: "panel" }, h("h2", {}, word("change.courses")), h("div", { id: "courses" }, h("p", {}, word("change.courses-drawing")))) };
     return this.drawn.section;
+  }
+
+  // While it is the same, nothing that was opened closes.
+  before(shown) {
+    const of = `${document.documentElement.lang} ${shown.proposal_hash}`;
+    if (this.told?.of !== of) this.told = { of, place: h("div", { id: "asked" }) };
+    return this.told.place;
   }
 
   rules(shown) {
@@ -143,6 +151,16 @@ export class Change {
     setText(element, left_s > 0 ? word("change.expires", { left: duration(left_s) }) : word("change.expired"));
   }
 }
+
+// Once; again where it came to nothing.
+async function begun(place, fill) {
+  if (!place || place.dataset.begun) return;
+  place.dataset.begun = "yes";
+  if (!(await fill(place))) delete place.dataset.begun;
+}
+
+// Told apart, with what was chosen and why.
+const wasAsked = (one) => one.what.startsWith("interaction ");
 
 // Empty: one is enough.
 function twoPeople(shown) {

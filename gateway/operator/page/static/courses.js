@@ -1,30 +1,17 @@
 // What the gate has simulated of a proposal, over time: now and proposed, one over the other.
 import { english, h } from "./dom.js";
-import { Refused, ask } from "./net.js";
+import { answered } from "./net.js";
 import { figure, number, word } from "./words.js";
 
-const AGAIN_MS = 1000, TALL = 200;
+const TALL = 200;
 
 // Fills `place` once they are there, or with the reason why there are none. `figures`: those of the verdict. False: it
 // is to be begun again, once `place` is shown again or the reason may have gone.
 export async function drawCourses(place, hash, figures) {
-  while (place.isConnected) {
-    try {
-      const told = await ask(`api/courses/${hash}`);
-      if (!told.drawing) {
-        told.courses.length ? new Drawing(place, told, figures) : place.replaceChildren(h("p", {}, word("change.courses-none")));
-        return true;
-      }
-    } catch (error) {
-      if (!(error instanceof Refused)) throw error;
-      if (!error.unknown) { // an answer; no way to the gateway is none
-        place.replaceChildren(english("p", error.message));
-        return false;
-      }
-    }
-    await new Promise((resolve) => setTimeout(resolve, AGAIN_MS));
-  }
-  return false;
+  const told = await answered(place, `api/courses/${hash}`, ({ drawing }) => !drawing);
+  if (!told) return false;
+  told.courses.length ? new Drawing(place, told, figures) : place.replaceChildren(h("p", {}, word("change.courses-none")));
+  return true;
 }
 
 class Drawing {

@@ -1,7 +1,8 @@
 // The way to the operator's process and back: questions, what a person says, and the stream of ticks.
+import { english } from "./dom.js";
 import { word } from "./words.js";
 
-const WITHIN_MS = 25000, SILENT_MS = 5000;
+const WITHIN_MS = 25000, SILENT_MS = 5000, AGAIN_MS = 1000;
 
 export class Refused extends Error {
   constructor(status, text, reasons) {
@@ -35,6 +36,25 @@ export async function ask(path, body, within_ms = WITHIN_MS) {
   found = parsed(found) ?? { text: answer.statusText };
   if (!answer.ok) throw new Refused(answer.status, found.text ?? answer.statusText, found.reasons ?? []);
   return found;
+}
+
+// Asks again while nobody answers, or `is` does not hold of the answer, as long as `place` stands on the page. Null, with
+// the reason in `place`: it was refused.
+export async function answered(place, path, is = () => true) {
+  while (place.isConnected) {
+    try {
+      const told = await ask(path);
+      if (is(told)) return told;
+    } catch (error) {
+      if (!(error instanceof Refused)) throw error;
+      if (!error.unknown) { // an answer; no way to the gateway is none
+        place.replaceChildren(english("p", error.message));
+        return null;
+      }
+    }
+    await new Promise((resolve) => setTimeout(resolve, AGAIN_MS));
+  }
+  return null;
 }
 
 function parsed(text) {

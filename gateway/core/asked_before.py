@@ -1,0 +1,51 @@
+"""What a proposal says it rests on, out of the agents' log: what was asked before it was made, and with which notes.
+
+Who decides reads it as a quotation: the gateway has kept these words, it has not written them.
+"""
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from gateway.core.line import Strict
+from gateway.core.line_model import Digest
+
+MOST_ASKED = 12  #: questions of a proposal that are told; more than that nobody reads
+MOST_NOTES = 12
+MOST_TITLE = 200  #: letters
+MOST_PASSAGE = 600
+
+
+class ShowAsked(Strict):
+    proposal: Digest
+
+
+class Before(Strict):
+    """A question that was answered before the proposal was made."""
+
+    interaction: str  #: its id in the log, as `r2rgate log` takes it
+    agent: str
+    decision: str
+    task: str
+    chosen: str  #: title of the option
+    by: str  #: the agent, or "rules"
+    instead: str  #: why the rules, where a language model was asked
+
+
+class NoteBefore(Strict):
+    """A passage that was looked up for one of the questions."""
+
+    key: str
+    title: str
+    tier: Literal[1, 2, 3]
+    passage: str  #: its begin, where it is long
+    overruled_by: list[str]  #: keys of what says otherwise, and counts for more
+    speaks_to_a_model: bool  #: it reads as an instruction to whoever reads it
+
+
+class AskedTold(Strict):
+    format: Annotated[int, Field(ge=1, le=1)]
+    proposal: Digest
+    asked: list[Before]  #: in the order in which the proposal names them
+    notes: list[NoteBefore]  #: each once, what fitted best first
+    missing: list[str]  #: sentences: what it names and nobody finds
