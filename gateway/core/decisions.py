@@ -24,6 +24,7 @@ class Decide(Strict):
     command: Literal["decide"] = "decide"
     proposal: Digest
     shown: Digest  #: `shown_hash` of what the person has seen
+    revision: Annotated[int, Field(ge=0)] | None = None  #: of what was in service then, where they have named it
     approve: bool
     comment: Comment = ""
     script: Annotated[str, Field(max_length=80)] = ""  #: program that decides in a person's place; empty: a person

@@ -324,6 +324,9 @@ class Deployer:
             return [f"it has expired at {entry.expires}"]
         if because := self.book.why_outdated(entry):
             return [because]
+        if decision.revision not in (None, self.book.epoch):
+            now = f"in service is revision {self.book.epoch}"
+            return [f"what was shown was of revision {decision.revision}, {now}: look at it again, then decide"]
         if decision.shown != self._shown_hash(entry):
             return ["what was shown is no longer what would be done: look at it again, then decide"]
         first = self._first(entry) if decision.approve and self._line.gate.approvals > 1 else None

@@ -72,7 +72,9 @@ def test_what_waits_is_a_dialog_and_its_answer_a_decision_on_what_was_shown():
             assert await answered(client, told.NodeId, 0) == CODES.Good
             (said,) = b.gateway.heard
             assert said.person.name == "otto"
-            assert said.said == Decide(proposal=one.proposal_hash, shown=SHOWN, approve=True, comment="")
+            assert said.said == Decide(
+                proposal=one.proposal_hash, shown=SHOWN, revision=one.epoch, approve=True, comment=""
+            )
             answer = await heard.values.get()
             assert (answer.NodeId, answer.LastResponse, answer.Retain) == (told.NodeId, 0, True)
             b.gateway.waiting = []
@@ -99,7 +101,7 @@ def test_what_is_shown_anew_is_another_dialog_and_the_first_is_answered_by_nobod
             assert b.gateway.heard == []
             assert await answered(client, begun[1].NodeId, 1) == CODES.Good
             assert b.gateway.heard[0].said == Decide(
-                proposal=one.proposal_hash, shown="6" * 64, approve=False, comment=""
+                proposal=one.proposal_hash, shown="6" * 64, revision=one.epoch, approve=False, comment=""
             )
 
     run(story)

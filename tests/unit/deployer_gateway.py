@@ -75,10 +75,10 @@ class Gateway:
         await self.deployer.judged()
         return reply
 
-    async def decide(self, one, approve=True, shown=None, script="", who=ANNA):
+    async def decide(self, one, approve=True, shown=None, script="", who=ANNA, revision=None):
         view = self.deployer.shown(hash_of(one))
         hash_ = shown or (view.shown if not isinstance(view, str) else None) or "0" * 64
-        decision = Decide(proposal=hash_of(one), shown=hash_, approve=approve, script=script)
+        decision = Decide(proposal=hash_of(one), shown=hash_, approve=approve, script=script, revision=revision)
         return await self.deployer.decide(decision, who)
 
     def stage(self, one) -> Stage:

@@ -46,6 +46,19 @@ async def test_an_approval_is_of_what_was_shown_and_good_once():
 
 
 @run
+async def test_whoever_names_a_revision_decides_on_that_alone():
+    gateway = await started()
+    one = proposal(1, config_hash(FIRST), gateway.loop.now_s)
+    await gateway.propose(one)
+    epoch = gateway.deployer.book.epoch
+    for approve in (True, False):
+        reply = await gateway.decide(one, approve, revision=epoch + 1)
+        assert not reply.ok and f"of revision {epoch + 1}, in service is revision {epoch}" in reply.reasons[0]
+    assert gateway.stage(one) is Stage.WAITING
+    assert (await gateway.decide(one, revision=epoch)).ok
+
+
+@run
 async def test_what_was_shown_on_another_configuration_is_not_approved():
     gateway = await started()
     one, other = (proposal(number, config_hash(FIRST), 0.0) for number in (1, 2))

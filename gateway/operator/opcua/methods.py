@@ -4,6 +4,7 @@ The gateway holds it against the same table of roles again. What is refused for 
 false, and a sentence); who may not call at all gets BadUserAccessDenied.
 """
 
+import re
 import time
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -24,6 +25,8 @@ from gateway.operator.opcua.session import CALLER
 from gateway.operator.opcua.space import BOOLEAN, DOUBLE, STRING, UINT32, Space
 
 REFUSED_S = 60.0  #: between two refusals of a person's command that the gateway is told of
+
+_WHOLE = re.compile("[0-9a-f]{64}")  #: id of a proposal; else it is the begin of one
 
 ua: Any = asyncua_ua  #: what it declares of its values and what they are differ
 
@@ -52,15 +55,13 @@ class Method:
 
 
 async def _decide(line: LineSide, id: str, hash: str, base_revision: int, approve: bool, comment: str) -> Said:
-    try:
-        shown = await line.shown(id)
-    except (NotTold, ValidationError) as error:
-        raise NotSent(f"the proposal cannot be looked up: {_first(error)}") from error
-    if shown.epoch != base_revision:
-        raise NotSent(
-            f"what was shown was of revision {base_revision}, in service is revision {shown.epoch}: look at it again"
-        )
-    return Decide(proposal=shown.proposal_hash, shown=hash, approve=approve, comment=comment)
+    """Whether it holds is for the gateway to say, which has on record what it refuses."""
+    if not _WHOLE.fullmatch(id):
+        try:
+            id = (await line.shown(id)).proposal_hash
+        except (NotTold, ValidationError) as error:
+            raise NotSent(f"the proposal cannot be looked up: {_first(error)}") from error
+    return Decide(proposal=id, shown=hash, revision=base_revision, approve=approve, comment=comment)
 
 
 async def _acknowledge(_line: LineSide, name: str, since: str, comment: str) -> Said:
