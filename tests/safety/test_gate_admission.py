@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from gateway.control.design import MpcWeights, design_lqi, design_mpc, task_of
+from gateway.core.controller import config_hash
+from gateway.core.line_model import model_hash
 from gateway.core.proposal import proposal_hash
 from safety.case import Case
 from safety.findings import told
@@ -23,31 +25,62 @@ def test_authority(of, context, redesigned):
     assert len(of_author("nobody", autonomy="closed")) == 2
 
 
+def test_authority_tells_who_may_propose_and_whom_somebody_may_have_meant(of, context, redesigned):
+    def found(author, **gate):
+        return authority.check(case_of(gains(redesigned, context, author=author), context, of, **gate))
+
+    assert found("agents") == [told("authority", True, "agents may propose")]
+    allowed = "allowed: gate.authors, which are rules, agents, engineer"
+    closed = "gate.autonomy of the line's file is closed: nothing is changed on this line"
+    assert found("agent") == [told("authority", False, f"author is agent; {allowed}; did you mean agents?")]
+    assert found("zzz", autonomy="closed") == [
+        told("authority", False, f"author is zzz; {allowed}"), told("authority", False, closed)
+    ]  # fmt: skip
+
+
 STALE = {
-    "site": ({"site": "elsewhere"}, {}, "it is for elsewhere/line-1"),
-    "base": ({"base": "0" * 64}, {}, "in service is"),
-    "model": ({"model": "0" * 64}, {}, "it was made by the model 0000"),
-    "the file": ({"model": None}, {}, "it was made by the line's file"),
-    "no model": ({"model": "0" * 64}, {"model": None}, "no model is accepted"),
-    "expired": ({}, {"now": EXPIRES}, "it has expired"),
-    "future": ({}, {"now": "2026-08-03T14:04:59+00:00"}, "it comes from the future"),
-    "for ever": ({"expires": "2026-08-04T14:05:01+00:00"}, {}, "allowed: gate.expiry_max_s, 86400 s"),
-}
+    "site": ({"site": "elsewhere"}, {}, "it is for elsewhere/line-1; allowed: this line, demo/line-1"),
+    "base": (
+        {"base": "0" * 64}, {},
+        "it changes the configuration 000000000000; in service is {in_service}: propose anew from there",
+    ),
+    "model": ({"model": "0" * 64}, {}, "it was made by the model 000000000000; allowed: the model {accepted}"),
+    "the file": ({"model": None}, {}, "it was made by the line's file; allowed: the model {accepted}"),
+    "no model": (
+        {"model": "0" * 64}, {"model": None},
+        "it was made by the model 000000000000; allowed: the line's file: no model is accepted",
+    ),
+    "expired": (
+        {}, {"now": EXPIRES},
+        "it has expired: expires is 2026-08-03T15:05:00+00:00, now is 2026-08-03T15:05:00+00:00",
+    ),
+    "future": (
+        {}, {"now": "2026-08-03T14:04:59+00:00"},
+        "it comes from the future: created is 2026-08-03T14:05:00+00:00, now is 2026-08-03T14:04:59+00:00: look at the "
+        "clocks",
+    ),
+    "for ever": (
+        {"expires": "2026-08-04T14:05:01+00:00"}, {},
+        "it would stand for 86401 s; allowed: gate.expiry_max_s, 86400 s",
+    ),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", STALE)
 def test_freshness(of, context, redesigned, name):
     given, surroundings, words = STALE[name]
     now = context.model_copy(update=surroundings)
-    assert words in refused(freshness.check(case_of(gains(redesigned, context, **given), now, of)))[0]
+    text = words.format(in_service=config_hash(context.in_service)[:12], accepted=model_hash(of.model)[:12])
+    assert freshness.check(case_of(gains(redesigned, context, **given), now, of)) == [told("freshness", False, text)]
 
 
 def test_what_is_just_fresh_passes_and_what_was_decided_does_not(of, context, redesigned):
     given = gains(redesigned, context, created=NOW, expires="2026-08-04T14:06:00+00:00")
-    assert refused(freshness.check(case_of(given, context, of))) == []
+    fresh = "it is about what is in service, and stands until 2026-08-04T14:06:00+00:00"
+    assert freshness.check(case_of(given, context, of)) == [told("freshness", True, fresh)]
     decided = context.model_copy(update={"decided": [proposal_hash(given)]})
     again = Case(of.line, decided, given, proposal_hash(given), [of.recording], 1)
-    assert "decided already" in refused(freshness.check(again))[0]
+    assert refused(freshness.check(again)) == ["it has been decided already; allowed: a new proposal"]
     moved = {"kind": "model", "model": of.model.model_dump()}
     assert refused(freshness.check(case_of(proposal(moved, context, model=None), context, of))) == []
 
@@ -80,8 +113,17 @@ def test_state_of_the_line(of, context, redesigned):
     assert "the line is in HOLD; allowed: RUN" in found(line_state.check_experiment, state="HOLD")[0]
     assert found(line_state.check_experiment) == [] == found(line_state.check_model, state="STOP", moving=True)
     everything = {"moving": True, "experiment": True, "on_probation": True, "doubts": ["cell 3"], "tension_n": [30.0]}
-    assert len(found(line_state.check_gains, **everything)) == 5
     probation = "a change is on probation: wait until it is kept or rolled back"
+    assert found(line_state.check_gains, **everything) == [
+        "what is measured is in doubt: cell 3",
+        probation,
+        "an experiment is under way: wait for its end",
+        "set-points or speed are on their way: wait until they stand",
+        "state.tension_n has 1 entries; allowed: 6, one per span",
+    ]
+    assert line_state.check_gains(case_of(gains(redesigned, context), context, of)) == [
+        told("state of the line", True, "the line stands and is believed")
+    ]
     assert found(line_state.check_model, on_probation=True) == [probation]
 
 

@@ -2,6 +2,8 @@
 
 from dataclasses import replace
 from math import inf, nan
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +12,7 @@ from gateway.control.prediction import gains_of, imagined, innovations, predict,
 from gateway.core.line_model import theta_of
 from gateway.core.theta import Noise
 from safety.excitation import excited_parts, newest, recent, same_speed
-from safety.findings import at_most, told
+from safety.findings import at_least, at_most, told
 from safety.predicting import Foretold, foretold, with_swings
 from safety.rules import alignment, validity
 from tests.safety.case_support import case_of, gains, refused, with_state
@@ -38,6 +40,33 @@ def test_one_load_cell_that_the_model_does_not_explain_is_enough(of, context, re
 
     assert "up to 1.5" in found(tension_n=0.06)[0]
     assert "takes the noise for greater" in found(tension_n=0.25)[0]
+
+
+@pytest.mark.parametrize(
+    ("value", "each", "limit", "text"),
+    [
+        (0.9, [1.0, 0.5, 1.51], (at_most, 1.51, 1.5), "is 1.51 of speed 2; allowed: up to 1.5: identify again"),
+        (
+            1.1, [1.0, 0.49, 1.5], (at_least, 0.49, 0.5),
+            "is 0.49 of tension 2; allowed: 0.5 and more: the model takes the noise for greater than it is",
+        ),
+        (0.9, [1.0, 0.5, 1.5], (at_least, 0.9, 0.8), "is 0.900; allowed: 0.8 to 1.2"),
+        (1.0, [1.0, 0.5, 1.5], (at_most, 1.0, 1.2), "is 1.000; allowed: 0.8 to 1.2"),
+        (1.25, [1.0, 1.0, 1.0], (at_most, 1.25, 1.2), "is 1.250; allowed: 0.8 to 1.2"),
+    ],
+)  # fmt: skip
+def test_validity_tells_first_of_what_is_loud_then_of_what_is_quiet_then_of_all(
+    of, case, monkeypatch, value, each, limit, text
+):
+    names = ["tension 1", "tension 2", "speed 2"]
+    monkeypatch.setattr(validity, "foretold_of", lambda *_: [])
+    monkeypatch.setattr(validity, "by_speed", lambda _: [(0.0512, [])])
+    monkeypatch.setattr(validity, "seconds", lambda _: 12.34)
+    monkeypatch.setattr(validity, "normalised", lambda _: value)
+    monkeypatch.setattr(validity, "normalised_by_output", lambda _: (names, np.array(each)))
+    finding, figure, bound = limit
+    said = f"normalised innovation squared at 0.0512 m/s over 12.3 s {text}"
+    assert validity.of_model(case, of.model, "proposed") == [finding("proposed", figure, bound, "", said)]
 
 
 def test_models_that_cannot_be_looked_at_are_not_valid(of, context, redesigned):
@@ -139,6 +168,47 @@ def test_alignment_at_its_limit_and_data_that_do_not_tell(of, context, case, red
     assert "do not tell" in found(alignment_max_s=1e-6).text and not found(alignment_max_s=1e-6).passed
 
 
+def test_alignment_tells_of_the_channel_that_is_late_at_the_least_by_most(of, case, monkeypatch):
+    def found(late_s, spread_s):
+        figures = (np.array(late_s + [0.0] * 8), np.array(spread_s + [1.0] * 8))
+        monkeypatch.setattr(alignment, "lateness", lambda *_: figures)
+        return alignment.of_model(case, of.model, "proposed")
+
+    # The first is late by more, and nobody knows it as well; the last is not known at all.
+    late_s, spread_s = [4e-3, -3e-3, *[1e-4] * 7, 9e-3], [1e-3, 2e-4, *[1e-4] * 7, 2e-3]
+    text = (
+        "tension 2 tells -3.0 ms late, within 0.4 ms; allowed: gate.alignment_max_s, 2 ms either way, as far as its "
+        "interval goes; 9 of 18 channels tell"
+    )
+    assert found(late_s, spread_s) == [at_most("proposed", 3e-3 - 1.96 * 2e-4, 2e-3, "s", text)]
+    text = "the data do not tell whether channels are aligned: a longer or larger experiment"
+    assert found(late_s, [2e-3] * 10) == [told("proposed", False, text)]
+
+
+def test_lateness_is_that_of_least_squares_over_all_parts(case, monkeypatch):
+    # By hand: 1*2 + 1*4 of one part and 2*3 of the other, over 1 + 1 + 4. The second channel shows nothing.
+    parts = [
+        (np.array([[[1.0], [1.0]], [[0.0], [0.0]]]), np.array([[2.0], [4.0]])),
+        (np.array([[[2.0]], [[0.0]]]), np.array([[3.0]])),
+    ]
+    monkeypatch.setattr(alignment, "sensitivities", lambda _, predicted: predicted.figures)
+    monkeypatch.setattr(alignment, "channels", lambda _: ["one", "other"])
+    found: list[Any] = [SimpleNamespace(predicted=SimpleNamespace(stretch=None, figures=one)) for one in parts]
+    with np.errstate(all="raise"):  # nobody is bothered with a channel that shows nothing
+        late_s, spread_s = alignment.lateness(case.believed, found)
+    assert late_s == pytest.approx([2.0, 0.0]) and spread_s == pytest.approx([6.0**-0.5, inf])
+
+
+@pytest.mark.parametrize("channel", ["tension_n", "torque_nm"])
+def test_what_comes_a_period_later_than_it_was_tells_late_and_not_early(of, redesigned, channel):
+    values = getattr(of.recording, channel).copy()
+    values[1:, 2] = values[:-1, 2]
+    late = replace(of, recording=replace(of.recording, **{channel: values}))
+    (found,) = alignment.check(case_of(gains(redesigned, late.context()), late.context(), late))
+    assert found.text.startswith("tension 3 tells +10." if channel == "tension_n" else "torque 3 tells +")
+    assert found.text.endswith("18 of 18 channels tell") and not found.passed
+
+
 def test_rollers_out_of_round_are_known_as_they_were_learned(of, case):
     round_theta, stretch = theta_of(of.model), stretch_of(case.excited[0].recording)
     noise, swing = Noise(), np.zeros((6, 2))
@@ -193,5 +263,7 @@ def test_of_much_data_the_newest_are_looked_at_and_every_speed(of):
     (part,) = excited_parts(of.recording)
     slow = replace(part, speed_m_per_s=0.01)
     assert newest([part] * 5 + [slow] * 5, 5.0) == [part, part, slow]
+    part_s = part.recording.samples * part.recording.period_s
+    assert newest([part] * 3, part_s) == [part] and newest([part] * 3, part_s + 0.5) == [part] * 2
     assert same_speed(0.004, 0.002) and same_speed(0.002, 0.004), "as far apart as one speed may be"
     assert same_speed(0.05, 0.0524) and same_speed(0.002, 0.0039) and not same_speed(0.1, 0.106)
