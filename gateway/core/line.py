@@ -189,7 +189,7 @@ class Gate(Strict):
     data_max_age_s: Positive = 604_800.0
     alignment_max_s: Positive = 0.002  #: by which a channel may tell late, as its interval has it
     # Stability
-    decay_min_per_s: NonNegative = 0.05  #: of the slowest mode, at the vertices of what the model leaves open
+    decay_min_per_s: Positive = 0.05  #: of the slowest mode, at the vertices of what the model leaves open
     delay_margin_min_s: Positive = 0.004  #: beyond the measured latency
     # Simulated corners of what the model leaves open
     corners: Annotated[int, Field(ge=8, le=1024)] = 32

@@ -2,7 +2,9 @@
 
 A channel that is late by d shows y - d y'. What that does to the innovations w (white, of size 1) is linear, w = d s:
 least squares give d = s'w / s's with the variance 1 / s's. y' is taken from what was predicted up to the sample before,
-which no innovation has touched yet: of a true model the mean of d is 0.
+which no innovation has touched yet: of a true model the mean of d is 0. A torque jumps from period to period, and its
+slope is another for late and for early: one that is told late was already the next one, one that is told early still the
+one before. Whichever explains more counts.
 """
 
 from dataclasses import replace
@@ -59,20 +61,22 @@ def channels(stretch: Stretch) -> list[str]:
 
 def lateness(theta: Theta, found: list[Foretold]) -> tuple[FloatArray, FloatArray]:
     """Of each channel by itself, the others taken for right: seconds, and their standard deviation (c,)."""
-    information = gradient = np.zeros(len(channels(found[0].predicted.stretch)))
+    information = gradient = np.zeros((2, len(channels(found[0].predicted.stretch))))
     for one in found:
         shown, white = sensitivities(theta, one.predicted)
-        information = information + np.square(shown).sum(axis=(1, 2))
-        gradient = gradient + (shown * white).sum(axis=(1, 2))
+        information = information + np.square(shown).sum(axis=(2, 3))
+        gradient = gradient + (shown * white).sum(axis=(2, 3))
     with np.errstate(divide="ignore", invalid="ignore"):
         late, spread = gradient / information, 1.0 / np.sqrt(information)
-    return np.where(information > 0.0, late, 0.0), spread
+    late = np.where(information > 0.0, late, 0.0)
+    more = (gradient * late).argmax(axis=0)[np.newaxis]
+    return np.take_along_axis(late, more, axis=0)[0], np.take_along_axis(spread, more, axis=0)[0]
 
 
 def sensitivities(theta: Theta, predicted: Predicted) -> tuple[FloatArray, FloatArray]:
-    """What a second's lateness of each channel does to the whitened innovations, (c, k, m), and these, (k, m).
+    """What a second's lateness of each channel does to the whitened innovations, (2, c, k, m), and these, (k, m).
 
-    Rollers out of round turn as was learned from the whole stretch, whatever a channel tells.
+    First by the slope from the sample before, then, of torques, by that to the next one. Rollers out of round turn as was learned from the whole stretch, whatever a channel tells.
     """
     stretch, period_s = with_swings(predicted), predicted.stretch.recording.period_s
     before = np.zeros_like(stretch.measured)
@@ -80,12 +84,14 @@ def sensitivities(theta: Theta, predicted: Predicted) -> tuple[FloatArray, Float
     before[stretch.first + 2 :] = np.diff(states, axis=0) / period_s
     rows = [_whitened(theta, predicted, replace(stretch, measured=_moved(stretch.measured, before, j)))
             for j in range(before.shape[1])]  # fmt: skip
-    turned = np.zeros_like(stretch.torque_nm)
-    turned[1:] = np.diff(stretch.torque_nm, axis=0) / period_s
-    rows += [_whitened(theta, predicted, replace(stretch, torque_nm=_moved(stretch.torque_nm, turned, j)))
-             for j in range(stretch.n)]  # fmt: skip
+    jumps = np.diff(stretch.torque_nm, axis=0, prepend=stretch.torque_nm[:1], append=stretch.torque_nm[-1:]) / period_s
+    turned = [
+        [_whitened(theta, predicted, replace(stretch, torque_nm=_moved(stretch.torque_nm, slope, j)))
+         for j in range(stretch.n)]
+        for slope in (jumps[:-1], jumps[1:])
+    ]  # fmt: skip
     white = _whitened(theta, predicted, stretch)
-    return (np.array(rows) - white) / PROBE_S, white
+    return (np.array([[*rows, *either] for either in turned]) - white) / PROBE_S, white
 
 
 def _moved(values: FloatArray, rate: FloatArray, column: int) -> FloatArray:

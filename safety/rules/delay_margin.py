@@ -1,5 +1,7 @@
 """How much more delay the loop stands than the line has: what is left for a late computer, bus or drive."""
 
+from math import ceil
+
 from gateway.control.design.task import LEAST_DRAW_SPEED_M_PER_S
 from gateway.core.controller_schedule import ScheduledConfig
 from gateway.core.verdict import RuleFinding
@@ -30,8 +32,11 @@ def check(case: Case) -> list[RuleFinding]:
 
 
 def stands_s(case: Case, speed_m_per_s: float, most_s: float) -> float:
-    """The delay up to which every step of `STEP_S` is stable, `most_s` at the most; below 0: unstable without any."""
-    steps = max(1, round(most_s / STEP_S))
+    """The delay up to which every step of `STEP_S` is stable, at the most the first that is no less than `most_s`.
+
+    Below 0: unstable without any.
+    """
+    steps = max(1, ceil(most_s / STEP_S - 1e-9))
     for step in range(steps + 1):
         if not decay_per_s(case.controller, case, case.believed, speed_m_per_s, step * STEP_S) > 0.0:
             return (step - 1) * STEP_S

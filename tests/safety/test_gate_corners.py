@@ -144,6 +144,7 @@ def test_of_a_schedule_each_law_up_to_the_fastest_speed_is_asked_for_its_delay_m
         ([1.0] * 8 + [-1.0] * 9, 0.008, 0.007),
         ([1.0] * 3 + [0.0] + [1.0] * 9, 0.008, 0.002),
         ([-1.0] + [1.0] * 9, 0.008, -0.001),
+        ([1.0] * 10, 0.0084, 0.009),  # as far as is asked for, and not a part of a millisecond less
     ],
 )
 def test_the_loop_stands_up_to_the_last_millisecond_before_the_first_that_does_not_decay(

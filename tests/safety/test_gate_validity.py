@@ -188,26 +188,30 @@ def test_alignment_tells_of_the_channel_that_is_late_at_the_least_by_most(of, ca
 
 
 def test_lateness_is_that_of_least_squares_over_all_parts(case, monkeypatch):
-    # By hand: 1*2 + 1*4 of one part and 2*3 of the other, over 1 + 1 + 4. The second channel shows nothing.
-    parts = [
-        (np.array([[[1.0], [1.0]], [[0.0], [0.0]]]), np.array([[2.0], [4.0]])),
-        (np.array([[[2.0]], [[0.0]]]), np.array([[3.0]])),
-    ]
+    # By hand: 1*2 + 1*4 of one part and 2*3 of the other, over 1 + 1 + 4. The second channel shows nothing. The third
+    # explains 6**2 / 2 by the slope from before and (2*2 + 3*4)**2 / 13 by that to the next: 19.7, which is more.
+    before = [[[1.0], [1.0]], [[0.0], [0.0]], [[1.0], [1.0]]], [[[2.0]], [[0.0]], [[0.0]]]
+    after = [[[1.0], [1.0]], [[0.0], [0.0]], [[2.0], [3.0]]], [[[2.0]], [[0.0]], [[0.0]]]
+    white = [[2.0], [4.0]], [[3.0]]
+    parts = [(np.array([before[k], after[k]]), np.array(white[k])) for k in (0, 1)]
     monkeypatch.setattr(alignment, "sensitivities", lambda _, predicted: predicted.figures)
-    monkeypatch.setattr(alignment, "channels", lambda _: ["one", "other"])
+    monkeypatch.setattr(alignment, "channels", lambda _: ["one", "other", "third"])
     found: list[Any] = [SimpleNamespace(predicted=SimpleNamespace(stretch=None, figures=one)) for one in parts]
     with np.errstate(all="raise"):  # nobody is bothered with a channel that shows nothing
         late_s, spread_s = alignment.lateness(case.believed, found)
-    assert late_s == pytest.approx([2.0, 0.0]) and spread_s == pytest.approx([6.0**-0.5, inf])
+    assert late_s == pytest.approx([2.0, 0.0, 16.0 / 13.0]) and spread_s == pytest.approx([6.0**-0.5, inf, 13.0**-0.5])
 
 
-@pytest.mark.parametrize("channel", ["tension_n", "torque_nm"])
-def test_what_comes_a_period_later_than_it_was_tells_late_and_not_early(of, redesigned, channel):
+@pytest.mark.parametrize(
+    ("channel", "later", "told_late_ms"), [("tension_n", 1, 10.5), ("torque_nm", 1, 10.0), ("torque_nm", -1, -10.0)]
+)
+def test_what_is_told_a_period_late_or_early_tells_just_that(of, redesigned, channel, later, told_late_ms):
     values = getattr(of.recording, channel).copy()
-    values[1:, 2] = values[:-1, 2]
+    values[:, 2] = np.roll(values[:, 2], later)
     late = replace(of, recording=replace(of.recording, **{channel: values}))
     (found,) = alignment.check(case_of(gains(redesigned, late.context()), late.context(), late))
-    assert found.text.startswith("tension 3 tells +10." if channel == "tension_n" else "torque 3 tells +")
+    name, _, number = found.text.partition(" tells ")
+    assert name == f"{channel.partition('_')[0]} 3" and float(number.split()[0]) == pytest.approx(told_late_ms, abs=0.6)
     assert found.text.endswith("18 of 18 channels tell") and not found.passed
 
 
