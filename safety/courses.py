@@ -83,7 +83,7 @@ def _drawn(
 def _thinned(values: FloatArray, every: int) -> FloatArray:
     """Of each `every` rows two: least and greatest of each column, in the order they came in. So no peak is lost.
 
-    nan from where a column is.
+    nan from where a column is; of the stretch in which it begins the first of the two is left.
     """
     if every == 1:
         return values

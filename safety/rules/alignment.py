@@ -3,8 +3,8 @@
 A channel that is late by d shows y - d y'. What that does to the innovations w (white, of size 1) is linear, w = d s:
 least squares give d = s'w / s's with the variance 1 / s's. y' is taken from what was predicted up to the sample before,
 which no innovation has touched yet: of a true model the mean of d is 0. A torque jumps from period to period, and its
-slope is another for late and for early: one that is told late was already the next one, one that is told early still the
-one before. Whichever explains more counts.
+slope is another for late and for early: what is told late was already the next one, what is told early still the one
+before. Whichever explains more counts.
 """
 
 from dataclasses import replace
@@ -76,7 +76,8 @@ def lateness(theta: Theta, found: list[Foretold]) -> tuple[FloatArray, FloatArra
 def sensitivities(theta: Theta, predicted: Predicted) -> tuple[FloatArray, FloatArray]:
     """What a second's lateness of each channel does to the whitened innovations, (2, c, k, m), and these, (k, m).
 
-    First by the slope from the sample before, then, of torques, by that to the next one. Rollers out of round turn as was learned from the whole stretch, whatever a channel tells.
+    First by the slope from the sample before, then, of torques, by that to the next one. Rollers out of round turn as
+    was learned from the whole stretch, whatever a channel tells.
     """
     stretch, period_s = with_swings(predicted), predicted.stretch.recording.period_s
     before = np.zeros_like(stretch.measured)

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from gateway.control.design import design_lqi
-from gateway.core.courses import MOST_NUMBERS, MOST_POINTS
+from gateway.core.courses import MOST_NUMBERS, MOST_POINTS, DrawnCourse
 from gateway.core.deployment import Region
 from gateway.core.experiment import Experiment
-from gateway.core.proposal import ExperimentChange, canonical
+from gateway.core.proposal import ExperimentChange, ProposalRefused, canonical
 from gateway.core.signals import FloatArray
 from safety import courses
 from safety.courses import courses_of
@@ -106,3 +106,85 @@ def test_no_peak_is_lost_between_what_is_drawn(of, judged, monkeypatch):
         assert peaks == [29.0, 11.0]
         assert all(sorted(set(span)) == [20.0, 29.0] for span in others)
         assert moves.time_s == sorted(set(moves.time_s)) and len(moves.time_s) <= MOST_POINTS
+
+
+@pytest.fixture
+def handmade(of, judged, monkeypatch):
+    """Courses of one move with set-points (k, n), which a configuration goes through as `came` has it: (k, n)."""
+
+    def drawn(setpoint_n, came, region=None, **control):
+        asked = []
+        monkeypatch.setattr(courses, "_runs", lambda _, judged: asked.append(judged) or {"moves": (setpoint_n, came)})
+        line = of.line.model_copy(update={"control": of.line.control.model_copy(update=control)})
+        given, verdict = judged
+        (found,) = courses_of(canonical(given), of.context(), line, region or verdict.region).courses
+        return found, asked[0]
+
+    return drawn
+
+
+def test_it_is_told_to_a_millinewton_and_to_a_tenth_of_a_millisecond(handmade, judged):
+    setpoint_n = np.array([[20.12349, 30.0], [20.5, 30.00051], [21.0, 30.0]])
+    off_n = np.array([[0.0, 0.0], [0.00049, -1.00051], [math.nan, math.inf]])
+
+    def came(config):
+        return setpoint_n + (off_n if config == judged[0].change.controller else 1.0)
+
+    assert handmade(setpoint_n, came, period_s=0.00333)[0] == DrawnCourse(
+        scenario="moves",
+        time_s=[0.0, 0.0033, 0.0067],
+        setpoint_n=[[20.123, 20.5, 21.0], [30.0, 30.001, 30.0]],
+        tension_n={
+            "in service": [[21.123, 21.5, 22.0], [31.0, 31.001, 31.0]],
+            "proposed": [[20.123, 20.5, None], [30.0, 29.0, None]],
+        },
+    )
+
+
+def test_of_a_long_course_there_are_two_points_of_each_stretch_and_all_of_one_that_just_fits(of, handmade, monkeypatch):
+    setpoint_n = np.array([[10.0] * 4 + [12.0] * 7]).T
+    came_n = np.array([[10.0, 9.0, 10.0, 13.0, 12.0, 12.0, 12.5, 12.0, 12.0, 11.5, 12.0]]).T
+
+    def drawn(points):
+        """Where an answer may have no more numbers: of each point a set-point and two tensions of each span."""
+        monkeypatch.setattr(courses, "MOST_NUMBERS", points * 3 * of.line.n)
+        found, _ = handmade(setpoint_n, lambda config: came_n)
+        assert found.tension_n["in service"] == found.tension_n["proposed"]
+        return found.time_s, found.setpoint_n[0], found.tension_n["proposed"][0]
+
+    in_full = [round(0.01 * k, 4) for k in range(11)], setpoint_n[:, 0].tolist(), came_n[:, 0].tolist()
+    assert drawn(11) == in_full
+    assert drawn(4) == ([0.0, 0.03, 0.06, 0.09], [10.0, 12.0, 12.0, 12.0], [9.0, 13.0, 12.5, 11.5])
+
+
+def test_numbers_without_end_are_none_and_nothing_to_warn_of(handmade):
+    setpoint_n = np.full((2, 1), 1e308)
+    found, _ = handmade(setpoint_n, lambda config: setpoint_n * [[1.0], [10.0]])
+    assert found.tension_n["proposed"] == [[1e308, None]]
+
+
+def test_they_are_as_large_as_what_it_was_judged_for_or_else_as_the_line_permits(of, handmade):
+    def judged_for(region):
+        _, asked = handmade(np.full((2, 1), 20.0), lambda config: np.full((2, 1), 20.0), region)
+        assert asked.tension_n.tolist() == of.context().state.tension_n
+        return asked.speed_max_m_per_s, asked.tension_step_n, asked.speed_step_m_per_s
+
+    narrow = Region(speed_max_m_per_s=0.03, tension_step_max_n=5.0, speed_step_max_m_per_s=0.01)
+    assert judged_for(narrow) == (0.03, 5.0, 0.01)
+    limits = of.line.limits
+    assert judged_for(Region()) == (
+        limits.speed_max_m_per_s, limits.tension_step_max_n, limits.speed_step_max_m_per_s,
+    ) == (0.12, 24.0, 0.09)  # fmt: skip
+
+
+def test_what_is_larger_than_the_line_takes_is_not_drawn(of, judged):
+    payload = canonical(judged[0])
+
+    def drawn(most_bytes):
+        gate = of.line.gate.model_copy(update={"proposal_max_bytes": most_bytes})
+        still = judged[1].region.model_copy(update={"tension_step_max_n": 0.0})
+        return courses_of(payload, of.context(), of.line.model_copy(update={"gate": gate}), still).courses
+
+    assert len(drawn(len(payload))) == 1
+    with pytest.raises(ProposalRefused, match=f"allowed: {len(payload) - 1}"):
+        drawn(len(payload) - 1)

@@ -1,11 +1,13 @@
 """Rules on what a configuration gains: no worse than what is in service and the baseline, and promises kept."""
 
 from dataclasses import replace
-from math import inf
+from math import inf, nan
 
+import numpy as np
 import pytest
 
-from gateway.control.design import design_lqi, task_of
+from gateway.control.design import LqiWeights, design_lqi, task_of
+from gateway.control.rollout import Course, Rollouts
 from gateway.core.deployment import Region
 from gateway.core.line import Span
 from gateway.core.verdict import ScenarioFigures
@@ -160,3 +162,66 @@ def test_spans_without_a_load_cell_keep_their_set_point(of, context, case):
              for i, span in enumerate(of.line.spans)]  # fmt: skip
     low, high = judged_of(replace(case, line=of.line.model_copy(update={"spans": spans}))).levels()
     assert low[0] == high[0] == context.state.tension_n[0] and (high[1:] - low[1:] == 24.0).all()
+
+
+@pytest.fixture
+def drawn(of, context, redesigned):
+    """Of a line whose first span is without a load cell."""
+    spans = [span.model_copy(update={"control": "draw"}) if i == 0 else span for i, span in enumerate(of.line.spans)]
+    return replace(case_of(gains(redesigned, context), context, of), line=of.line.model_copy(update={"spans": spans}))
+
+
+def simulated(squared_error_n2, beyond_n, settled, effort_n2m2s):
+    one = np.ones((1, 6))
+    return Rollouts(np.array([squared_error_n2]), one, one, np.array([settled]), np.array([beyond_n]), one, one, one,
+                    np.array([effort_n2m2s]))  # fmt: skip
+
+
+def test_figures_are_of_spans_with_a_load_cell_but_for_the_effort_and_of_the_line_at_rest_where_noise_is_luck(
+    drawn, monkeypatch
+):
+    """The second span steps by 4 N in the first period and goes 1 N too far; the others stand at 20 N."""
+    tension_n = np.full((8, 6), 20.0)
+    tension_n[1:, 1] = 24.0
+    noisy = simulated([400.0, 1.0, 2.0, 3.0, 2.0, 1.0], [9.0] * 6, [900.0] * 6, [1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
+    quiet = simulated([900.0] * 6, [9.0, 1.0, 1.0, 0.0, 0.0, 0.0], [700.0, 5.0, 120.0, 0.0, 0.0, 0.0], [99.0] * 6)
+    monkeypatch.setattr(
+        performance, "simulate", lambda config, plants, course, setup: noisy if setup.tension_noise_n else quiet
+    )
+    course = Course(tension_n, np.full(8, 0.05), changed=1)
+    monkeypatch.setattr(performance, "improvement_courses", lambda judged: {"tension": course})
+    monkeypatch.setattr(performance, "way_of_moves", lambda judged: None)
+    found = performance.performance(drawn.controller, drawn, judged_of(drawn))
+    assert found == {"tension": Figures(3.0, 25.0, 1.2, 21.0)}
+
+
+def test_of_a_move_there_is_the_error_of_spans_with_a_load_cell_and_nothing_else(drawn, monkeypatch):
+    def follow(config, plants, way, setup):
+        return way.course(setup.period_s).tension_n + [50.0, 3.0, 0.0, -4.0, 0.0, 0.0]
+
+    monkeypatch.setattr(performance, "improvement_courses", lambda judged: {})
+    monkeypatch.setattr(performance, "follow", follow)
+    found = performance.performance(drawn.controller, drawn, judged_of(drawn))
+    assert found == {"moves": Figures(pytest.approx(5.0), 0.0, 0.0, 0.0)}
+
+
+def test_what_is_no_number_has_no_end(case, monkeypatch):
+    gone = [nan] + [1.0] * 5
+    monkeypatch.setattr(performance, "simulate", lambda *_: simulated(gone, gone, gone, gone))
+    monkeypatch.setattr(performance, "follow", lambda *_: np.full((1, 6), nan))
+    found = performance.performance(case.controller, case, judged_of(case))
+    assert found == {"tension": LOST, "velocity": LOST, "moves": Figures(inf, 0.0, 0.0, 0.0)}
+
+
+def test_a_baseline_that_is_in_service_itself_is_simulated_once(of, context, redesigned, monkeypatch):
+    def configurations(baseline):
+        asked = []
+        monkeypatch.setattr(performance, "performance", lambda config, *_: asked.append(config) or {})
+        known = context.model_copy(update={"baseline": baseline})
+        found = performance.performances(case_of(gains(redesigned, known), known, of))
+        assert set(found) == {"in service", "baseline", "proposed"}
+        return asked
+
+    other = design_lqi(of.task(), LqiWeights(torque_per_nm2=0.01))
+    assert configurations(context.in_service.model_copy()) == [context.in_service, redesigned]
+    assert configurations(other) == [context.in_service, other, redesigned]

@@ -8,6 +8,7 @@ import pytest
 from gateway.control.design import LqgWeights, design_lqg, design_lqi, design_lqr, task_of
 from gateway.core.experiment import Abort, Experiment, Leg
 from gateway.core.proposal import canonical as proposal_bytes
+from gateway.core.proposal import proposal_hash
 from gateway.core.verdict import canonical
 from safety import judge as judging
 from safety.judge import failed, judge, refusal
@@ -124,6 +125,13 @@ def test_data_that_are_not_those_of_the_context_are_judged_by_nobody(of, context
     assert against(none) == {"data"} and "0 recordings were given" in none.reasons[0]
     other = replace(of.recording, torque_nm=of.recording.torque_nm + 1e-6)
     assert "is not the recording" in judge(payload, context, of.line, [other], 1).reasons[0]
+    named = [one.model_copy(update={"digest": "0123456789abcdef" * 4}) for one in context.data]
+    verdict = judge(payload, context.model_copy(update={"data": named}), of.line, [other], 1)
+    assert verdict.reasons == [
+        f"{named[0].path} is not the recording that the context names: its digest is {other.digest()[:12]}; allowed: "
+        "0123456789ab"
+    ]
+    assert (verdict.proposal, verdict.kind) == (proposal_hash(gains(redesigned, context)), "gains")
 
 
 def test_a_rule_that_fails_and_one_that_finds_nothing_are_refusals(of, context, redesigned, monkeypatch):

@@ -3,6 +3,7 @@
 import json
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -10,6 +11,7 @@ from hypothesis import strategies as st
 from gateway.control.design import design_lqi
 from gateway.core.proposal import canonical
 from safety import judge as judging
+from safety.findings import at_most
 from safety.judge import judge
 from safety.rules.table import Rule
 from tests.safety.case_support import gains
@@ -115,6 +117,20 @@ def test_a_matrix_with_a_row_or_an_entry_too_few_is_refused(said, good, data):
 )
 def test_what_breaks_parsers_is_refused(said, payload):
     assert not said(payload).accepted
+
+
+def test_numbers_that_run_away_within_a_rule_are_its_own_to_judge(of, good, monkeypatch):
+    """Whatever the caller makes of them: a warning, or an exception that the rule would fail by."""
+
+    def overflowing(case):
+        return [at_most("overflow", float(np.float64(1e308) * 10.0), 1.0, "N", "no end")]
+
+    monkeypatch.setattr(judging, "RULES", {"gains": (Rule("overflow", overflowing),)})
+    monkeypatch.setattr(judging, "REPORTED", {"gains": (Rule("overflow", overflowing),)})
+    monkeypatch.setattr(judging, "FIGURES", {})
+    with np.errstate(all="raise"):
+        verdict = judge(json.dumps(good).encode(), of.context(), of.line, [of.recording], 1)
+    assert verdict.reasons == ["no end"] and [one.text for one in verdict.reported] == ["no end"]
 
 
 def test_a_lone_surrogate_in_a_reason_is_refused(said, good):
