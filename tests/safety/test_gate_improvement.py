@@ -202,7 +202,8 @@ def test_of_a_move_there_is_the_error_of_spans_with_a_load_cell_and_nothing_else
     monkeypatch.setattr(performance, "improvement_courses", lambda judged: {})
     monkeypatch.setattr(performance, "follow", follow)
     found = performance.performance(drawn.controller, drawn, judged_of(drawn))
-    assert found == {"moves": Figures(pytest.approx(5.0), 0.0, 0.0, 0.0)}
+    assert found == {"moves": Figures(found["moves"].rmse_n, 0.0, 0.0, 0.0)}
+    assert found["moves"].rmse_n == pytest.approx(5.0)
 
 
 def test_what_is_no_number_has_no_end(case, monkeypatch):
