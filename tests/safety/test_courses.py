@@ -157,6 +157,14 @@ def test_of_a_long_course_there_are_two_points_of_each_stretch_and_all_of_one_th
     assert drawn(4) == ([0.0, 0.03, 0.06, 0.09], [10.0, 12.0, 12.0, 12.0], [9.0, 13.0, 12.5, 11.5])
 
 
+def test_of_the_stretch_in_which_it_runs_away_the_extreme_before_is_drawn(of, handmade, monkeypatch):
+    gone = [math.nan] * 4
+    came_n = np.array([[10.0, 13.0, 9.0, *gone], [10.0, 9.0, 13.0, *gone]]).T
+    monkeypatch.setattr(courses, "MOST_NUMBERS", 2 * 3 * of.line.n)
+    found, _ = handmade(np.full((7, 2), 10.0), lambda config: came_n)
+    assert found.tension_n["proposed"] == [[13.0, None], [9.0, None]]
+
+
 def test_numbers_without_end_are_none_and_nothing_to_warn_of(handmade):
     setpoint_n = np.full((2, 1), 1e308)
     found, _ = handmade(setpoint_n, lambda config: setpoint_n * [[1.0], [10.0]])
