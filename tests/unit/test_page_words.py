@@ -11,14 +11,17 @@ from gateway.core.people import ROLES
 from gateway.core.proposal import Kind
 from gateway.core.signals import Quality
 from gateway.core.states import LoopState
-from gateway.core.verdict import ScenarioFigures
+from gateway.core.verdict import ScenarioFigures, Verdict
 from gateway.operator.page.tick import DRIVES_THAT_FAIL
 from gateway.operator.page.words import ALARM_PARTS, LANGUAGES, catalogue, words_of
 from gateway.supervisor.lifecycle import Stage
+from safety.rules.improvement import NAMES
 
 STATIC = Path("gateway/operator/page/static")
 STATES = [*LoopState.__members__, "UNKNOWN"]
 COMMANDS = ("arm", "start")
+#: Symbols of the paper.
+UNTRANSLATED = {"paper: C_safe", "paper: P_improved", "paper: S_robust"}
 #: Keys that are put together while the page runs: what stands before the value, and the values there are.
 FAMILIES: dict[str, list[str]] = {
     "state.": STATES,
@@ -37,12 +40,26 @@ FAMILIES: dict[str, list[str]] = {
     "health.": ["cycle", "lateness"],
     "operate.": ["tension", "speed", "recipe"],
     "reply.not-": ["stop", "said"],
+    "tier.": ["1", "2", "3"],
     "operate.sure-": [*COMMANDS],
     "operate.then-": [*COMMANDS],
 }
 #: Said as `word(why)`: the page is told which.
 TOLD = {"span.outside", "span.off"} | {f"drive.{name}" for name in DRIVES_THAT_FAIL}
 TOLD |= {f"quality.{name}" for name in Quality.__members__ if name != "GOOD"}
+
+
+def named_by_the_gate() -> set[str]:
+    """Rules and courses, as the code of the gate has them, and as they stand in a verdict of it."""
+    verdict = Verdict.model_validate_json(Path("docs/examples/verdict.json").read_bytes())
+    names = {one.rule for one in verdict.findings + verdict.reported} - UNTRANSLATED
+    names |= {one.scenario for one in verdict.figures} | set(NAMES.values()) | {"in service", "baseline"}
+    for file in [*Path("safety").rglob("*.py"), Path("gateway/supervisor/judging.py")]:
+        text = file.read_text()
+        for constants in re.findall(r"^(?:[A-Z]+_)?RULE\b.* = (.*)$", text, re.MULTILINE):
+            names |= set(re.findall(r'"([^"]+)"', constants))
+        names |= set(re.findall(r'"(?:\{RULE\}|corners|experiment|paper): ([a-z]+(?: [a-z]+)*)"', text))
+    return names
 
 
 def said() -> set[str]:
@@ -56,6 +73,7 @@ def said() -> set[str]:
             keys |= set(re.findall(r'"([a-z-]+(?:\.[\w -]+)?)"', re.sub(r"\{[^{}]*\}\s*$", "", call)))
         for prefix in re.findall(r"word\(`([\w.-]+)\$\{", text):
             keys |= {prefix + value for value in FAMILIES[prefix]}
+    keys |= {f"gate.{part}" for name in named_by_the_gate() for part in re.split(": |, ", name)}
     page = (STATIC / "index.html").read_text()
     return keys | set(re.findall(r'data-(?:word|label)="([^"]+)"', page))
 

@@ -1,6 +1,7 @@
 """The page's own words, in every language that it speaks: one catalogue, words.toml.
 
-What the gateway says stays as it says it, in English, and the page marks it as that.
+What the gateway says stays as it says it, in English, and the page marks it as that; but alarms, and what rules and
+courses are called, are told in each language.
 """
 
 import json
@@ -15,18 +16,22 @@ from starlette.routing import Route
 from gateway.core.alarms import ALARMS
 
 LANGUAGES = ("en", "de")
+NAMED = "gate."  #: before each part of what the gate calls a rule or a course
 ALARM_PARTS = ("means", "cause", "consequence", "action")
 
 
 @cache
 def catalogue() -> dict[str, dict[str, str]]:
-    """By key, then by language. The English of an alarm is that of the table of alarms."""
+    """By key, then by language. English are the table of alarms, and what the gate calls its rules."""
     said: dict[str, dict[str, str]] = tomllib.loads(
         (files("gateway.operator.page") / "words.toml").read_text(encoding="utf-8")
     )
     for alarm in ALARMS:
         for part in ALARM_PARTS:
             said.setdefault(f"alarm.{alarm.name}.{part}", {})["en"] = getattr(alarm, part)
+    for key, words in said.items():
+        if key.startswith(NAMED):
+            words["en"] = key.removeprefix(NAMED)
     return said
 
 

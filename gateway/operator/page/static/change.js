@@ -5,7 +5,7 @@ import { drawCourses } from "./courses.js";
 import { confirmed } from "./dialog.js";
 import { beforeAfter, margins } from "./figures.js";
 import { Refused, ask } from "./net.js";
-import { duration, figure, instant, word } from "./words.js";
+import { duration, figure, instant, named, word } from "./words.js";
 
 export class Change {
   constructor(say, may) {
@@ -183,5 +183,5 @@ function evidence(one) {
 
 function promise(one) {
   const parts = [["rmse_n", "N"], ["overshoot_pct", "%"], ["settling_s", "s"]].filter(([name]) => one[name] != null);
-  return h("li", {}, english("span", one.scenario), ": ", parts.map(([name, unit]) => `${word(`measure.${name}`)} ${figure(one[name])} ${unit}`).join(", "));
+  return h("li", {}, h("span", {}, named(one.scenario)), ": ", parts.map(([name, unit]) => `${word(`measure.${name}`)} ${figure(one[name])} ${unit}`).join(", "));
 }

@@ -1,7 +1,7 @@
 // What the gate has simulated of a proposal, over time: now and proposed, one over the other.
 import { english, h } from "./dom.js";
 import { answered } from "./net.js";
-import { figure, number, word } from "./words.js";
+import { figure, named, number, word } from "./words.js";
 
 const TALL = 200;
 
@@ -24,7 +24,7 @@ class Drawing {
     this.places = courses.map(() => h("div", { class: "course", role: "img" }));
     place.replaceChildren(
       h("div", { class: "row" }, h("p", { class: "muted" }, word("change.courses-how"), " ", word(model ? "change.courses-model" : "change.courses-file")), h("label", { class: "of-span" }, h("span", {}, word("table.span")), " ", this.span)),
-      h("div", { class: "scenarios" }, courses.map((course, k) => h("figure", {}, h("figcaption", {}, english("b", course.scenario), ", N"), this.places[k]))));
+      h("div", { class: "scenarios" }, courses.map((course, k) => h("figure", {}, h("figcaption", {}, h("b", {}, named(course.scenario)), ", N"), this.places[k]))));
     this.plots = [];
     new ResizeObserver(() => this.draw()).observe(place);
   }

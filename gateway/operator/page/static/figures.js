@@ -1,6 +1,6 @@
 // Numbers of a verdict as bars: how much of each limit is used, and what was simulated before and after. Of page and reports.
 import { english, h, svg } from "./dom.js";
-import { figure, number, word } from "./formats.js";
+import { figure, named, number, word } from "./formats.js";
 
 export function margins(findings) {
   const order = (one) => (one.passed ? 0 : 10) + (one.used ?? -1);
@@ -13,7 +13,7 @@ function margin(finding) {
   const limits = finding.used == null ? null : h("span", { class: "numbers" },
     word("margin.numbers", { value: figure(finding.value) + unit, limit: figure(finding.limit) + unit, margin: figure(finding.margin) + unit }));
   return h("li", { class: finding.passed ? "" : "failed" },
-    h("div", { class: "row" }, english("b", finding.rule), h("span", { class: finding.passed ? "" : "alarm-text" }, word(finding.passed ? "margin.passed" : "margin.failed"))),
+    h("div", { class: "row" }, h("b", {}, named(finding.rule)), h("span", { class: finding.passed ? "" : "alarm-text" }, word(finding.passed ? "margin.passed" : "margin.failed"))),
     finding.used != null && bar(finding),
     limits,
     english("p", finding.text, { class: "muted" }));
@@ -33,7 +33,7 @@ export function beforeAfter(figures) {
   const scenarios = [...new Set(figures.map((one) => one.scenario))];
   return h("div", { class: "scenarios" }, scenarios.map((scenario) => {
     const of = Object.fromEntries(figures.filter((one) => one.scenario === scenario).map((one) => [one.configuration, one]));
-    return h("figure", {}, h("figcaption", {}, english("b", scenario)), MEASURES.map(([name, unit]) => compared(name, unit, of)));
+    return h("figure", {}, h("figcaption", {}, h("b", {}, named(scenario))), MEASURES.map(([name, unit]) => compared(name, unit, of)));
   }));
 }
 

@@ -12,6 +12,9 @@ export function word(key, values = {}) {
   return text.replace(/\{(\w+)\}/g, (_, name) => values[name] ?? "");
 }
 
+// What the gate calls a rule or a course, part by part; of what the catalogue does not know the gate's own word stays.
+export const named = (text) => text.split(/(: |, )/).map((part) => words[`gate.${part}`] ?? part).join("");
+
 export function number(value, digits = 1) {
   if (value == null) return "–";
   return value.toLocaleString(language, { minimumFractionDigits: digits, maximumFractionDigits: digits }).replace("-", "−");
