@@ -13,6 +13,8 @@ from gateway.core.proposal import Kind
 class LoopStatus(Strict):
     running: bool  #: frames arrive
     state: str  #: a name of LoopState; UNKNOWN without a loop
+    phase: str  #: a name of Phase: where in that state it is; UNKNOWN without a loop
+    standstill: bool  #: the unwinder is known to stand still
     text: str  #: the state in words
     next: str  #: what a person can do now
     age_s: float | None  #: of the newest frame

@@ -10,8 +10,8 @@ import numpy as np
 
 from gateway.core.signals import FloatArray, IntArray
 
-VERSION = 2
-_HEADER = struct.Struct("<HHIdffIffBBHB")
+VERSION = 3
+_HEADER = struct.Struct("<HHIdffIffBBBBHB")
 _FLOAT = np.dtype("<f4")
 FLOAT_FIELDS = ("tension_n", "tension_setpoint_n", "speed_m_per_s", "torque_nm", "torque_actual_nm")
 BYTE_FIELDS = ("tension_quality", "drive_state")
@@ -33,6 +33,8 @@ class Frame:
     unwind_speed_m_per_s: float
     speed_setpoint_m_per_s: float
     state: int  #: LoopState
+    phase: int  #: Phase
+    standstill: bool  #: the unwinder is known to stand still
     saturated: bool  #: a torque or its rate is at its limit
     held: int  #: periods in a row in which a signal was missing and the outputs were held
     doubts: int  #: a mask of Doubt: why proposals are blocked
@@ -58,6 +60,8 @@ def pack(frame: Frame) -> bytes:
         frame.unwind_speed_m_per_s,
         frame.speed_setpoint_m_per_s,
         frame.state,
+        frame.phase,
+        frame.standstill,
         frame.saturated,
         min(frame.held, 0xFFFF),
         frame.doubts,
@@ -72,7 +76,8 @@ def unpack(payload: bytes) -> Frame:
     if len(payload) < _HEADER.size:
         raise MalformedFrame(f"{len(payload)} bytes are shorter than a header")
     version, n, *scalars = _HEADER.unpack_from(payload)
-    sequence, time_s, lateness, cycle, missed, unwind, setpoint, state, saturated, held, doubts = scalars
+    sequence, time_s, lateness, cycle, missed, unwind, setpoint, state, phase, *flags = scalars
+    standstill, saturated, held, doubts = flags
     if version != VERSION:
         raise MalformedFrame(f"version {version}, this program reads {VERSION}")
     expected = _HEADER.size + n * (4 * len(FLOAT_FIELDS) + len(BYTE_FIELDS))
@@ -82,7 +87,8 @@ def unpack(payload: bytes) -> Frame:
         floats = np.frombuffer(payload, "<f4", n * len(FLOAT_FIELDS), _HEADER.size).astype(np.float64).reshape(-1, n)
     octets: IntArray = np.frombuffer(payload, np.int8, n * len(BYTE_FIELDS), expected - n * len(BYTE_FIELDS))
     return Frame(
-        sequence, time_s, lateness, cycle, missed, unwind, setpoint, state, bool(saturated), held, doubts,
+        sequence, time_s, lateness, cycle, missed, unwind, setpoint, state, phase, bool(standstill),
+        bool(saturated), held, doubts,
         floats[0], floats[1], floats[2], floats[3], floats[4], octets[:n], octets[n:],
     )  # fmt: skip
 
@@ -100,6 +106,8 @@ def frame_dtype(n: int) -> np.dtype[np.void]:
         ("unwind_speed_m_per_s", "<f4"),
         ("speed_setpoint_m_per_s", "<f4"),
         ("state", "u1"),
+        ("phase", "u1"),
+        ("standstill", "u1"),
         ("saturated", "u1"),
         ("held", "<u2"),
         ("doubts", "u1"),

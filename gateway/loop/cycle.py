@@ -328,6 +328,8 @@ class Cycle:
                 unwind_speed_m_per_s=float(inputs.unwind_speed.value[0]),
                 speed_setpoint_m_per_s=self.setpoints.speed_m_per_s,
                 state=self.machine.state,
+                phase=self.machine.phase,
+                standstill=standing(inputs),
                 saturated=saturated,
                 held=account.held,
                 doubts=int(self.watch.doubts),

@@ -9,7 +9,7 @@ import numpy as np
 from gateway.core.doubts import in_words
 from gateway.core.line import Line
 from gateway.core.signals import DriveState, Quality
-from gateway.core.states import LoopState
+from gateway.core.states import LoopState, Phase
 from gateway.core.status import LoopStatus, SpanStatus, Spread, TimingStatus
 from gateway.core.telemetry import Frame
 from gateway.supervisor.telemetry_sink import Cycle, TelemetrySink
@@ -32,10 +32,13 @@ def loop_status(line: Line, sink: TelemetrySink, now_s: float) -> LoopStatus:
     age_s, frame = sink.age_s(now_s), sink.newest()
     running = age_s is not None and age_s <= LOST_S
     state = _name(LoopState, frame.state) if frame is not None and running else "UNKNOWN"
+    phase = _name(Phase, frame.phase) if frame is not None and running else "UNKNOWN"
     text, what_next = WORDS[state]
     return LoopStatus(
         running=running,
         state=state,
+        phase=phase,
+        standstill=frame.standstill if frame is not None and running else False,
         text=text,
         next=what_next,
         age_s=None if age_s is None else round(age_s, 3),

@@ -21,7 +21,7 @@ class Telemetry:
     """A header of 44 bytes with version 2 and the number of spans, five float32 and two bytes for each span."""
 
     name = "telemetry frame"
-    _head = struct.Struct("<HHIdffIffBBHB")
+    _head = struct.Struct("<HHIdffIffBBBBHB")
 
     def valid(self, dice: Random) -> bytes:
         values = np.array([dice.uniform(-100.0, 100.0) for _ in range(SPANS)])
@@ -36,6 +36,8 @@ class Telemetry:
                 0.1,
                 0.1,
                 dice.randrange(5),
+                dice.randrange(10),
+                True,
                 False,
                 0,
                 0,
@@ -51,7 +53,7 @@ class Telemetry:
 
     def check(self, data: bytes) -> str:
         head = self._head.unpack_from(data) if len(data) >= self._head.size else None
-        sound = head is not None and head[0] == 2 and len(data) == self._head.size + head[1] * 22
+        sound = head is not None and head[0] == 3 and len(data) == self._head.size + head[1] * 22
         try:
             frame = unpack(data)
         except MalformedFrame:

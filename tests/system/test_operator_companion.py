@@ -9,7 +9,10 @@ from pathlib import Path
 from asyncua import Client, ua
 
 from gateway.cli.pki_opcua import trust
+from gateway.core.states import Phase
 from gateway.operator.opcua.companion import DI, MACHINE, MACHINERY, MACHINES, PROCESS, PROCESS_VALUES
+from gateway.operator.opcua.packml import BASE, EXECUTE, OBJECTS, PACKML, PATH
+from gateway.operator.opcua.packml import MACHINE as MACHINE_STATE
 from tests.operator.real_line import until
 from tests.protocol.operator_support import PASSWORD, Bench, bench, pair
 from tests.system.needs import PEERS
@@ -17,7 +20,9 @@ from tests.system.peer import Spoken
 
 FOLDER = PEERS / "node_modules" / "node-opcua-nodesets" / "nodesets"
 SPANS = 6
-BROUGHT = (DI, MACHINERY, PROCESS_VALUES, "http://opcfoundation.org/UA/IA/", "http://opcfoundation.org/UA/PADIM/")
+BROUGHT = (
+    DI, MACHINERY, PROCESS_VALUES, PACKML, "http://opcfoundation.org/UA/IA/", "http://opcfoundation.org/UA/PADIM/",
+)  # fmt: skip
 _UA = "{http://opcfoundation.org/UA/2011/03/UANodeSet.xsd}"
 _BELOW = ("HasComponent", "HasProperty")
 _MANDATORY = "i=78"
@@ -95,7 +100,38 @@ async def _story() -> None:
             own = await b.read(client, f"Line.Spans.{number}.Tension")
             assert value["AnalogSignal"].Value == own.Value and value["AnalogSignal"].StatusCode == own.StatusCode
             assert {"EngineeringUnits", "EURange"} <= set(await names(client, b.id(f"{PROCESS}.{number}.AnalogSignal")))
+        await _states(b, client)
         await _nothing_takes(b, client)
+
+
+async def _states(b: Bench, client: Client) -> None:
+    """The numbers of states are those of the published file; what is not active says so."""
+    number = await client.get_namespace_index(PACKML)
+    folder = client.get_node(ua.NodeId(OBJECTS, number))
+    assert [one.nodeid for one in await folder.get_children()] == [b.id(PATH)]
+    must = Published(FOLDER).mandatory(PACKML, "PackMLStatusObjectType")
+    assert {"UnitModeCurrent", "CurMachSpeed"} <= must <= set(await names(client, b.id(f"{PATH}.Status")))
+    for phase, standstill, states in (
+        (Phase.RUNNING, False, {BASE: "Cleared", MACHINE_STATE: "Running", EXECUTE: "Execute"}),
+        (Phase.HOLDING, True, {BASE: "Cleared", MACHINE_STATE: "Running", EXECUTE: "Held"}),
+        (Phase.SLOWING, False, {BASE: "Cleared", MACHINE_STATE: "Stopping"}),
+    ):
+        b.gateway.phase, b.gateway.standstill = phase, standstill
+        deepest, last = list(states.items())[-1]
+        await b.until(client, f"{deepest}.CurrentState", lambda found, last=last: _text(found) == last)
+        for path in (BASE, MACHINE_STATE, EXECUTE):
+            told = await b.read(client, f"{path}.CurrentState")
+            if path not in states:
+                assert told.StatusCode.value == ua.StatusCodes.BadStateNotActive
+                continue
+            assert _text(told) == states[path]
+            if path != EXECUTE:  # whose instance has none in the published type
+                node_id = (await b.read(client, f"{path}.CurrentState.Id")).Value.Value
+                assert (await client.get_node(node_id).read_browse_name()).Name == states[path]
+
+
+def _text(told: ua.DataValue) -> str:
+    return told.Value.Value.Text if told.StatusCode.is_good() else ""
 
 
 async def _nothing_takes(b: Bench, client: Client) -> None:
@@ -126,7 +162,8 @@ def test_a_client_on_another_stack_reads_process_values_and_hears_of_changes(tmp
             (b.pki / "opcua-client-panel.pem").write_bytes(panel.certificate)
             (b.pki / "opcua-client-panel.key.pem").write_bytes(panel.private_key)
             async with b.connected("vera") as own:
-                await b.until(own, f"{PROCESS}.2.AnalogSignal", lambda found: found.StatusCode.is_good())
+                for path in (f"{PROCESS}.2.AnalogSignal", f"{EXECUTE}.CurrentState"):
+                    await b.until(own, path, lambda found: found.StatusCode.is_good())
             await asyncio.to_thread(_on_another_stack, b, tmp_path)
 
     asyncio.run(asyncio.wait_for(story(), 240.0))
@@ -145,6 +182,8 @@ def _on_another_stack(b: Bench, folder: Path) -> None:
             }  # fmt: skip
         found = client("read", "vera", [signal, setpoint, location])
         assert [found[path]["value"] for path in (signal, setpoint, location)] == [21.0, 21.0, b.line.site]
+        state = f"{EXECUTE}.CurrentState"
+        assert client("read", "vera", [state])[state]["value"]["text"] == "Execute"
         assert client("watch", "vera", [signal])["refused"] == []
         b.gateway.tension_n = 30.0
         heard = until(lambda: client("seen", "vera").get(signal), lambda seen: seen and seen["last"]["value"] == 31.0)

@@ -35,8 +35,8 @@ def bus(absent: list[str], last_error: str = "") -> BusReport:
 
 def status(loop: dict[str, Any] | None = None, **changes: Any) -> GatewayStatus:
     runs = LoopStatus(
-        running=True, state="RUN", text="", next="", age_s=0.01, period_s=0.01, held=0, saturated=False, doubts=[],
-        restarts=0,
+        running=True, state="RUN", phase="RUNNING", standstill=False, text="", next="", age_s=0.01, period_s=0.01,
+        held=0, saturated=False, doubts=[], restarts=0,
     )  # fmt: skip
     well = GatewayStatus(
         format=1, site="demo", line="line", wall_s=1_700_000_000.0, uptime_s=10.0,

@@ -16,7 +16,7 @@ import numpy as np
 from gateway.core.line import Line
 from gateway.core.line_template import line_template
 from gateway.core.signals import DriveState, Quality
-from gateway.core.states import LoopState
+from gateway.core.states import LoopState, Phase
 from gateway.core.telemetry import Frame, pack
 
 
@@ -68,6 +68,8 @@ def frame_of(sequence: int, time_s: float, spans: int = 6, **changes: Any) -> by
         "unwind_speed_m_per_s": 0.1,
         "speed_setpoint_m_per_s": 0.1,
         "state": LoopState.RUN,
+        "phase": Phase.RUNNING,
+        "standstill": False,
         "saturated": False,
         "held": 0,
         "doubts": 0,

@@ -8,7 +8,7 @@ import pytest
 
 from gateway.core.controller import config_hash
 from gateway.core.deployment import Region
-from gateway.core.states import LoopState
+from gateway.core.states import LoopState, Phase
 from gateway.core.telemetry import Frame
 from gateway.supervisor.configurations import STABLE, Origin, begin_configurations
 from gateway.supervisor.lifecycle import Book, Entry, Stage
@@ -19,7 +19,7 @@ from tests.unit.deployer_support import LINE, controller
 
 SMALL, WIDE = Region(speed_max_m_per_s=0.02, tension_step_max_n=4.0), Region(speed_max_m_per_s=0.1)
 STOOD = Frame(
-    0, 0.0, 0.0, 0.0, 0, 0.0, 0.0, LoopState.READY, False, 0, 0,
+    0, 0.0, 0.0, 0.0, 0, 0.0, 0.0, LoopState.READY, Phase.READY, True, False, 0, 0,
     *(np.ones(LINE.n) for _ in range(5)), *(np.zeros(LINE.n, dtype=np.int64) for _ in range(2)),
 )  # fmt: skip
 

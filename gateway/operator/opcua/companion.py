@@ -1,7 +1,6 @@
 """The line as companion specifications have it, where their node sets are at hand: a machine with its identification,
-and each tension as a process value. It stands beside the line's own nodes, tells the same, and takes nothing.
-
-PackML is not among them: what the loop tells of its state is coarser than PackML's states.
+each tension as a process value, and its state as PackML's. It stands beside the line's own nodes, tells the same, and
+takes nothing.
 """
 
 from collections.abc import Callable, Mapping
@@ -15,6 +14,7 @@ from gateway.operator.opcua.instances import declared, make, make_object
 from gateway.operator.opcua.line_nodes import ROOT
 from gateway.operator.opcua.nodeset_files import NotUsable, look_into
 from gateway.operator.opcua.nodesets import NodeSets
+from gateway.operator.opcua.packml import PACKML, PackMl, make_packml
 from gateway.operator.opcua.space import DOUBLE, STRING, Space
 from gateway.operator.opcua.units import NEWTON
 
@@ -32,10 +32,10 @@ _SIGNAL, _SETPOINT = "AnalogSignal", "ProcessValueSetpoint"
 _LIMITS = (f"{_SIGNAL}.LowLimit", f"{_SIGNAL}.HighLimit")
 
 
-async def make_companion(space: Space, line: Line, tell: Callable[[str], None]) -> None:
-    """What cannot be made is left out and told."""
+async def make_companion(space: Space, line: Line, tell: Callable[[str], None]) -> PackMl | None:
+    """What cannot be made is left out and told. Returns what tells PackML's states, where the folder has its model."""
     if line.operator.nodesets is None:
-        return
+        return None
     folder = look_into(Path(line.operator.nodesets))
     for problem in folder.problems:
         tell(f"companion types: {problem}")
@@ -48,9 +48,15 @@ async def make_companion(space: Space, line: Line, tell: Callable[[str], None]) 
         try:
             await part(space, line, sets)
         except Exception as problem:  # whatever asyncua makes of types that are not as they should be
-            why = str(problem) if isinstance(problem, NotUsable) else f"{type(problem).__name__}: {problem!s:.200}"
-            tell(f"{lost}: {why}")
-            return
+            tell(f"{lost}: {_why(problem)}")
+            break
+    if PACKML not in folder.node_sets:
+        return None
+    try:
+        return await make_packml(space, line, sets)
+    except Exception as problem:  # as above
+        tell(f"the line is no PackML machine; own types only for its state: {_why(problem)}")
+        return None
 
 
 async def _machine(space: Space, line: Line, sets: NodeSets) -> None:
@@ -101,6 +107,10 @@ def _of_span(line: Line, number: int) -> dict[str, Any]:
         values[f"{path}.EngineeringUnits"] = ua.Variant(NEWTON.information(), ua.VariantType.ExtensionObject)
         values[f"{path}.EURange"] = ua.Variant(ua.Range(low, high), ua.VariantType.ExtensionObject)
     return values
+
+
+def _why(problem: Exception) -> str:
+    return str(problem) if isinstance(problem, NotUsable) else f"{type(problem).__name__}: {problem!s:.200}"
 
 
 def _type(types: Mapping[str, Any], name: str) -> Any:

@@ -17,6 +17,7 @@ from gateway.operator.opcua.history import History
 from gateway.operator.opcua.line_nodes import ROOT, Told, list_paths, live_paths, make_line, of_proposals, of_status
 from gateway.operator.opcua.login import Check, Logins
 from gateway.operator.opcua.methods import make_methods
+from gateway.operator.opcua.packml import PackMl
 from gateway.operator.opcua.proposal_nodes import MOST_WAITING, ProposalNodes
 from gateway.operator.opcua.server import OperatorServer, make_server
 from gateway.operator.opcua.space import NAMESPACE, NO_COMMUNICATION, WAITING, Space
@@ -56,6 +57,7 @@ class OpcUa:
         self._line = line
         self._side = side
         self._say = tell
+        self._packml: PackMl | None = None
         self._new_status, self._new_proposals, self._new_told = asyncio.Event(), asyncio.Event(), asyncio.Event()
         self._shown: list[ProposalShown] = []  #: those that wait
         self._shown_of: ProposalList | None = None  #: of which list
@@ -87,7 +89,7 @@ class OpcUa:
         self._events = Events(server, self._space, self._side)
         await self._events.make()
         server.iserver.history_manager = History(self._space, self._line, self._side)  # type: ignore[assignment]
-        await make_companion(self._space, self._line, self._say)
+        self._packml = await make_companion(self._space, self._line, self._say)
         self._side.on_status.append(lambda _: self._new_status.set())
         self._side.on_proposals.append(lambda _: self._new_proposals.set())
         self._new_proposals.set()
@@ -120,7 +122,7 @@ class OpcUa:
         except Exception as error:  # what is shown may be old, and must not look new
             trouble = f"the line cannot be shown: {type(error).__name__}: {error}"
             await self._tell((Told(f"{ROOT}.Connection.Fresh", False), Told(f"{ROOT}.Connection.Trouble", trouble)))
-            await self._unsure((*live_paths(self._line), *live_alarm_paths()), self._side.age_s)
+            await self._unsure_of_the_line(self._side.age_s)
             raise
 
     async def _show_line_as_it_is(self) -> None:
@@ -131,16 +133,23 @@ class OpcUa:
         await self._tell(Told(f"{ROOT}.Connection.{name}", value) for name, value in connection.items())
         if side.status is not None and fresh:
             await self._tell((*of_status(side.status), *alarms_of(side.status)), side.status.wall_s)
+            if self._packml is not None:
+                await self._packml.show(side.status)
             if side.proposals is not None and _is_fresh(side.proposals_age_s):
                 await self._tell(of_proposals(side.proposals))
             else:
                 await self._unsure(list_paths(), side.proposals_age_s)
         else:
-            await self._unsure((*live_paths(self._line), *live_alarm_paths()), age_s)
+            await self._unsure_of_the_line(age_s)
 
     async def _unsure(self, paths: Iterable[str], age_s: float | None) -> None:
         for path in paths:
-            await self._space.tell(path, None, None, WAITING if age_s is None else NO_COMMUNICATION)
+            await self._space.tell(path, None, None, _unknown(age_s))
+
+    async def _unsure_of_the_line(self, age_s: float | None) -> None:
+        await self._unsure((*live_paths(self._line), *live_alarm_paths()), age_s)
+        if self._packml is not None:
+            await self._packml.unsure(_unknown(age_s))
 
     async def _show_proposals(self) -> None:
         try:
@@ -198,6 +207,11 @@ class OpcUa:
     async def _tell(self, values: Iterable[Told], wall_s: float | None = None) -> None:
         for one in values:
             await self._space.tell(one.path, one.value, wall_s, one.code)
+
+
+def _unknown(age_s: float | None) -> int:
+    """Why nothing is known; None: nothing has ever come."""
+    return WAITING if age_s is None else NO_COMMUNICATION
 
 
 def _is_fresh(age_s: float | None) -> bool:
