@@ -10,6 +10,7 @@ from gateway.control.design import MpcWeights, design_mpc
 from gateway.control.judged_courses import OTHERS_LOW, CornerCourses, corner_courses, programme_courses
 from gateway.control.rollout import Rollouts, course_through, plants_of_thetas, simulate
 from safety import corner_runs, programme
+from safety.findings import told
 from safety.rules import corners, improvement, paper, roller_speed
 from safety.simulated import judged_of, setup_of
 from tests.safety.case_support import case_of, gains, refused
@@ -134,6 +135,28 @@ def test_where_small_moves_leave_the_band_large_ones_are_not_looked_at(of, conte
     for rule in (roller_speed, paper):
         assert all("not looked at" in text for text in refused(rule.check(case)))
     assert {text.split(":")[1].split(",")[0] for text in refused(improvement.check(case))} == {" without end", " never"}
+
+
+@pytest.mark.parametrize(
+    ("fails", "lost"),
+    [
+        (True, "it is refused for its small moves: no large ones were looked at"),
+        (
+            False,
+            "the programme itself was simulated on 4 corners, and for shorter; on the others only small moves, by the "
+            "law that it is where no limit is reached: how it plans at its limits there has not been seen",
+        ),
+    ],
+    ids=["refused before", "looked at"],
+)
+def test_what_was_not_looked_at_of_a_programme_is_told_and_is_nothing_against_it(
+    of, context, clear, monkeypatch, fails, lost
+):
+    monkeypatch.setattr(programme, "fails_in_small", lambda _: fails)
+    for name in ("in_small", "by_itself"):
+        monkeypatch.setattr(programme, name, lambda _: {})
+    found = corners.check(case_of(gains(clear, context), context, of))
+    assert found[-1] == told("corners: what is lost", True, lost)
 
 
 def test_a_first_predictive_configuration_is_looked_at_on_all_corners(of, clear, monkeypatch):
