@@ -8,6 +8,8 @@ from hypothesis import strategies as st
 from gateway.core.signals import DriveState, Quality
 from safety.actions import Action, most_severe
 from safety.envelope import EnvelopeState, Supervision, check_timing, check_torque, limit_torque
+from safety.limits import envelope_limits
+from tests.closed_loop.conftest import demo_line
 from tests.safety.envelope_support import (
     AT_STANDSTILL,
     EVERYTHING,
@@ -54,6 +56,14 @@ def test_a_signal_that_comes_and_goes_stops_the_line_as_well():
     assert stops.index(True) == 9
     rarely = [gone, *[healthy()] * 9] * 5
     assert all(most_severe(story(*rarely[:k]).findings) < Action.STOP for k in range(1, 50))
+
+
+def test_a_load_cell_measures_the_spans_that_the_lines_file_controls_by_tension():
+    line = demo_line(3)
+    assert envelope_limits(line).measured.tolist() == [1.0, 1.0, 1.0]
+    by_draw = line.spans[1].model_copy(update={"control": "draw"})
+    mixed = line.model_copy(update={"spans": [line.spans[0], by_draw, line.spans[2]]})
+    assert envelope_limits(mixed).measured.tolist() == [1.0, 0.0, 1.0]
 
 
 def test_a_draw_span_has_no_load_cell_and_none_is_missed():

@@ -67,6 +67,22 @@ def test_changes_that_the_programme_makes_itself_last_two_seconds_and_are_looked
     assert lasting["speed change"] == lasting[OTHERS_LOW] == 200
 
 
+@pytest.mark.parametrize("kind", ["lqi", "mpc"])
+def test_courses_of_either_kind_of_law_last_as_long_as_is_asked_and_have_no_tail_where_none_is(
+    of, context, redesigned, clear, kind
+):
+    case = case_of(gains({"lqi": redesigned, "mpc": clear}[kind], context), context, of)
+    judged = judged_of(case)
+
+    def change_of(courses):
+        return courses["speed change"].course.periods, courses["speed change"].course.tail
+
+    # 0.3 s before the change, and a second at each speed; the tail is the end of the last one
+    assert change_of(corner_runs.courses_through(case, judged, 1.0, 0.0)) == (230, 0)
+    whole = corner_runs.courses_through(case, judged, 1.0, 0.5)
+    assert change_of(whole) == (230, 50) and (OTHERS_LOW in whole) is (kind == "mpc")
+
+
 def in_small_of(**figures):
     """Of seven plants; what is given is of one span of some of them, by their number, else 0."""
     found = {name: np.zeros((7, 6)) for name in ("swing", "chatter", "beyond")}
