@@ -32,9 +32,10 @@ from gateway.supervisor.deployer_sides import NotKnown
 from gateway.supervisor.interactions import Interactions, InteractionsError
 from gateway.supervisor.proposal_records import refused
 
-_ID = re.compile(
-    "[0-9a-f]{16}"
-)  #: of an interaction: what the log also takes, its number or the begin of its id, is none
+MOST_KEPT = 8  #: answers
+RULES = "rules"  #: as agents say it of a choice that no language model has made
+
+_ID = re.compile("[0-9a-f]{16}")  #: of an interaction
 
 
 class AskedDesk:
