@@ -69,7 +69,8 @@ def posterior_of(model: LineModel) -> ModelPosterior:
     if model.posterior is not None:
         return model.posterior
     names = [name for name in model.intervals if name.split("[")[0] in PHYSICAL and model.intervals[name].low > 0.0]
-    if missing := [base for base in PHYSICAL if not any(name.split("[")[0] == base for name in names)]:
+    known = {base for base in PHYSICAL if base in names or {f"{base}[{i}]" for i in range(1, model.n + 1)} <= {*names}}
+    if missing := [base for base in PHYSICAL if base not in known]:
         raise Unbelievable(
             f"the model has neither a posterior nor an interval of {', '.join(missing)}: nobody knows how wrong it "
             "may be; identify again"

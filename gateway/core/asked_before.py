@@ -10,7 +10,7 @@ from pydantic import Field
 from gateway.core.line import Strict
 from gateway.core.line_model import Digest
 
-MOST_ASKED = 12  #: questions of a proposal that are told; more than that nobody reads
+MOST_ASKED = 8  #: questions of a proposal that are told; more than that nobody reads
 MOST_NOTES = 12
 MOST_TITLE = 200  #: letters
 MOST_PASSAGE = 600
@@ -24,11 +24,10 @@ class Before(Strict):
     """A question that was answered before the proposal was made."""
 
     interaction: str  #: its id in the log, as `r2rgate log` takes it
-    agent: str
-    decision: str
+    agent: str  #: whose log it is in, as the gateway knows it
     task: str
     chosen: str  #: title of the option
-    by: str  #: the agent, or "rules"
+    by_rules: bool  #: not by a language model
     instead: str  #: why the rules, where a language model was asked
 
 

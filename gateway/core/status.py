@@ -13,8 +13,9 @@ from gateway.core.proposal import Kind
 class LoopStatus(Strict):
     running: bool  #: frames arrive
     state: str  #: a name of LoopState; UNKNOWN without a loop
-    phase: str  #: a name of Phase: where in that state it is; UNKNOWN without a loop
-    standstill: bool  #: the unwinder is known to stand still
+    phase: str = "UNKNOWN"  #: a name of Phase: where in that state it is; UNKNOWN without a loop, or one that is older
+    by_person: bool = False  #: in STOP, because a person wanted it
+    standstill: bool = False  #: no speed is asked for, and unwinder and rollers are known to stand still
     text: str  #: the state in words
     next: str  #: what a person can do now
     age_s: float | None  #: of the newest frame

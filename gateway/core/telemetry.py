@@ -11,7 +11,7 @@ import numpy as np
 from gateway.core.signals import FloatArray, IntArray
 
 VERSION = 3
-_HEADER = struct.Struct("<HHIdffIffBBBBHB")
+_HEADER = struct.Struct("<HHIdffIffBBBBBHB")
 _FLOAT = np.dtype("<f4")
 FLOAT_FIELDS = ("tension_n", "tension_setpoint_n", "speed_m_per_s", "torque_nm", "torque_actual_nm")
 BYTE_FIELDS = ("tension_quality", "drive_state")
@@ -34,7 +34,8 @@ class Frame:
     speed_setpoint_m_per_s: float
     state: int  #: LoopState
     phase: int  #: Phase
-    standstill: bool  #: the unwinder is known to stand still
+    by_person: bool  #: in STOP, because a person wanted it
+    standstill: bool  #: no speed is asked for, and unwinder and rollers are known to stand still
     saturated: bool  #: a torque or its rate is at its limit
     held: int  #: periods in a row in which a signal was missing and the outputs were held
     doubts: int  #: a mask of Doubt: why proposals are blocked
@@ -61,6 +62,7 @@ def pack(frame: Frame) -> bytes:
         frame.speed_setpoint_m_per_s,
         frame.state,
         frame.phase,
+        frame.by_person,
         frame.standstill,
         frame.saturated,
         min(frame.held, 0xFFFF),
@@ -77,7 +79,7 @@ def unpack(payload: bytes) -> Frame:
         raise MalformedFrame(f"{len(payload)} bytes are shorter than a header")
     version, n, *scalars = _HEADER.unpack_from(payload)
     sequence, time_s, lateness, cycle, missed, unwind, setpoint, state, phase, *flags = scalars
-    standstill, saturated, held, doubts = flags
+    by_person, standstill, saturated, held, doubts = flags
     if version != VERSION:
         raise MalformedFrame(f"version {version}, this program reads {VERSION}")
     expected = _HEADER.size + n * (4 * len(FLOAT_FIELDS) + len(BYTE_FIELDS))
@@ -87,8 +89,8 @@ def unpack(payload: bytes) -> Frame:
         floats = np.frombuffer(payload, "<f4", n * len(FLOAT_FIELDS), _HEADER.size).astype(np.float64).reshape(-1, n)
     octets: IntArray = np.frombuffer(payload, np.int8, n * len(BYTE_FIELDS), expected - n * len(BYTE_FIELDS))
     return Frame(
-        sequence, time_s, lateness, cycle, missed, unwind, setpoint, state, phase, bool(standstill),
-        bool(saturated), held, doubts,
+        sequence, time_s, lateness, cycle, missed, unwind, setpoint, state, phase, bool(by_person),
+        bool(standstill), bool(saturated), held, doubts,
         floats[0], floats[1], floats[2], floats[3], floats[4], octets[:n], octets[n:],
     )  # fmt: skip
 
@@ -107,6 +109,7 @@ def frame_dtype(n: int) -> np.dtype[np.void]:
         ("speed_setpoint_m_per_s", "<f4"),
         ("state", "u1"),
         ("phase", "u1"),
+        ("by_person", "u1"),
         ("standstill", "u1"),
         ("saturated", "u1"),
         ("held", "<u2"),

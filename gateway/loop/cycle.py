@@ -12,7 +12,7 @@ from gateway.control.laws import make_law
 from gateway.core.controller import Controller
 from gateway.core.line import Line
 from gateway.core.signals import BoolArray, DriveRequest, DriveState, FloatArray, Inputs, Outputs, Quality
-from gateway.core.states import LoopState, Phase
+from gateway.core.states import OPERATORS_STOP, LoopState, Phase
 from gateway.core.telemetry import Frame
 from gateway.loop import machine as machines
 from gateway.loop.configurations import Configurations, LawOf
@@ -21,6 +21,7 @@ from gateway.loop.guard import Guard
 from gateway.loop.machine import Machine, Observation, Times
 from gateway.loop.pacer import Tick
 from gateway.loop.setpoints import Setpoints
+from gateway.loop.standstill import Standstill, standing
 from gateway.loop.torque import LawFailed, TorquePath
 from gateway.loop.watch import Watch
 from safety.actions import Action, Finding, most_severe
@@ -104,6 +105,7 @@ class Cycle:
         self._envelope = EnvelopeState()
         self._latched_s = clock()  #: when the drives latched the torque of the period before
         self._still_on = np.zeros(line.n, dtype=np.int64)  #: periods in a row ENABLED while told OFF
+        self._standstill = Standstill(line.control.period_s)
         self._shaped_moves = line.moves.model_copy(update={"shape": "minimum-jerk"})
 
     async def period(self, tick: Tick) -> None:
@@ -318,6 +320,8 @@ class Cycle:
             quality = np.where(self.watch.stuck, _BAD, quality).astype(np.int8)
         account.skipped += tick.skipped
         account.sequence += 1
+        machine = self.machine
+        asked = machine.phase is not Phase.OFF and self.setpoints.speed_m_per_s != 0.0
         self._record(
             Frame(
                 sequence=account.sequence,
@@ -327,9 +331,10 @@ class Cycle:
                 missed=account.skipped,
                 unwind_speed_m_per_s=float(inputs.unwind_speed.value[0]),
                 speed_setpoint_m_per_s=self.setpoints.speed_m_per_s,
-                state=self.machine.state,
-                phase=self.machine.phase,
-                standstill=standing(inputs),
+                state=machine.state,
+                phase=machine.phase,
+                by_person=machine.state is LoopState.STOP and machine.reason.startswith(OPERATORS_STOP),
+                standstill=self._standstill.look(inputs, asked),
                 saturated=saturated,
                 held=account.held,
                 doubts=int(self.watch.doubts),
@@ -342,9 +347,3 @@ class Cycle:
                 drive_state=inputs.drive_state,
             )
         )
-
-
-def standing(inputs: Inputs) -> bool:
-    """Whether the unwinder is known to stand still."""
-    unwind = inputs.unwind_speed
-    return unwind.good() and abs(unwind.value.item(0)) <= machines.STANDSTILL_M_PER_S

@@ -5,6 +5,7 @@ It only reads, in a thread, one question at a time; an answer always fits a mess
 
 import asyncio
 import re
+from collections import OrderedDict
 from collections.abc import Callable, Iterable, Sequence
 
 from pydantic import ValidationError
@@ -46,6 +47,8 @@ class AskedDesk:
         self._deployer = deployer
         self._log = log
         self._reading = asyncio.Lock()
+        #: By proposal. What an agent writes into its log later changes nothing of what was told before.
+        self._kept: OrderedDict[str, AskedTold] = OrderedDict()
         mailbox.serve(GATEWAY_ASKED, self._answer)
 
     async def _answer(self, payload: bytes) -> bytes:
@@ -64,41 +67,49 @@ class AskedDesk:
         except (NotKnown, AuditUnavailable) as error:
             return _refused("it is not told", [str(error)])
         if isinstance(shown, str):
-            return _refused(shown, [shown])
+            return _refused("it is not told", [shown])
         async with self._reading:
-            told = await asyncio.to_thread(self._told, wanted.proposal, shown.proposal.evidence)
-        return told.model_dump_json().encode()
+            if wanted.proposal not in self._kept:
+                self._keep(await asyncio.to_thread(self._told, wanted.proposal, shown.proposal.evidence))
+            return self._kept[wanted.proposal].model_dump_json().encode()
+
+    def _keep(self, told: AskedTold) -> None:
+        self._kept[told.proposal] = told
+        while len(self._kept) > MOST_KEPT:
+            self._kept.popitem(last=False)
 
     def _told(self, proposal: str, evidence: Sequence[Evidence]) -> AskedTold:
         asked, found, missing = list[Before](), list[Note](), list[str]()
-        named = list(dict.fromkeys(interactions_of(evidence)))
+        named = list(dict.fromkeys(_named(evidence)))
+        try:
+            there = self._log.several(named[:MOST_ASKED])
+        except InteractionsError as error:
+            there, missing = {}, [str(error)]
         for one in named[:MOST_ASKED]:
-            try:
-                interaction = self._found(one)
-            except InteractionsError as error:
-                missing.append(str(error))
+            if (interaction := there.get(one)) is None:
+                missing += [f"{one} is in the agents' log nowhere"]
                 continue
             found += interaction.notes
-            if interaction.question is not None and interaction.answer is not None:
+            if interaction.question is None or interaction.answer is None:
+                missing += [f"{one} is no question, but something computed: `r2rgate log {one}` tells it"]
+            else:
                 asked.append(_before(interaction, interaction.question, interaction.answer))
         if len(named) > MOST_ASKED:
             missing.append(f"{len(named) - MOST_ASKED} more questions are not told here; `r2rgate log` has them")
         return AskedTold(format=1, proposal=proposal, asked=asked, notes=_notes(found), missing=missing)
 
-    def _found(self, id_: str) -> Interaction:
-        """Raises InteractionsError."""
-        if not _ID.fullmatch(id_):
-            raise InteractionsError(
-                f"{id_[:MOST_TITLE]!r} is no id of an interaction: it has 16 digits, 0 to 9 and a to f"
-            )
-        return self._log.find(id_)
+
+def _named(evidence: Sequence[Evidence]) -> list[str]:
+    """Ids of interactions; what has a number or a hash beside it speaks for itself."""
+    plain = [one for one in evidence if one.value is None and one.digest is None]
+    return [one for one in interactions_of(plain) if _ID.fullmatch(one)]
 
 
 def _before(one: Interaction, question: Question, answer: Answer) -> Before:
     chosen = next((option.title for option in question.options if option.id == answer.choice.option), "")
     return Before(
-        interaction=one.id, agent=one.agent, decision=question.decision, task=question.task,
-        chosen=chosen or answer.choice.option, by=answer.by, instead=answer.instead[:MOST_PASSAGE],
+        interaction=one.id, agent=one.agent, task=question.task, chosen=chosen or answer.choice.option,
+        by_rules=answer.by == RULES, instead=answer.instead[:MOST_PASSAGE],
     )  # fmt: skip
 
 

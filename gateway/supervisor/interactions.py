@@ -4,7 +4,7 @@ One SQLite file beside the history. Of each agent the oldest go once it has its 
 disk, and drives out nobody's but its own.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -115,10 +115,14 @@ class Interactions:
         if len(exact) != 1:
             what = "is the beginning of several: name more of it" if exact else "is in the log nowhere"
             raise InteractionsError(f"{id_} {what}; `r2rgate log` lists them")
-        try:
-            return unpack(exact[0][1])
-        except InteractionRefused as refused:
-            raise InteractionsError(f"{id_} is damaged in the log: {refused}") from refused
+        return _unpacked(id_, exact[0][1])
+
+    def several(self, ids: Sequence[str]) -> dict[str, Interaction]:
+        """Those that are there, by whole id. Raises InteractionsError."""
+        marks = ", ".join("?" * len(ids))
+        with self._there() as connection:
+            rows = rows_of(connection, f"SELECT id, content FROM interaction WHERE id IN ({marks})", tuple(ids))
+        return {id_: _unpacked(id_, content) for id_, content in rows}
 
     @contextmanager
     def _begun(self) -> Iterator[apsw.Connection]:
@@ -129,3 +133,11 @@ class Interactions:
     def _there(self) -> Iterator[apsw.Connection]:
         with told(self.path, KIND), closing(open_there(self.path, KIND)) as connection:
             yield connection
+
+
+def _unpacked(id_: str, content: bytes) -> Interaction:
+    """Raises InteractionsError."""
+    try:
+        return unpack(content)
+    except InteractionRefused as refused:
+        raise InteractionsError(f"{id_} is damaged in the log: {refused}") from refused

@@ -11,7 +11,7 @@ from gateway.core.line import Line
 from gateway.core.signals import DriveState, Quality
 from gateway.core.states import LoopState, Phase
 from gateway.core.status import LoopStatus, SpanStatus, Spread, TimingStatus
-from gateway.core.telemetry import Frame
+from gateway.core.telemetry import VERSION, Frame
 from gateway.supervisor.telemetry_sink import Cycle, TelemetrySink
 
 LOST_S = 1.0  #: a loop whose newest frame is older than this is taken to be gone
@@ -34,10 +34,14 @@ def loop_status(line: Line, sink: TelemetrySink, now_s: float) -> LoopStatus:
     state = _name(LoopState, frame.state) if frame is not None and running else "UNKNOWN"
     phase = _name(Phase, frame.phase) if frame is not None and running else "UNKNOWN"
     text, what_next = WORDS[state]
+    if not running and sink.other_version is not None:
+        text = f"what comes from the loop is of version {sink.other_version}, this program reads {VERSION}: it may run"
+        what_next = "stop the line, then start the loop anew, of the same version as the gateway"
     return LoopStatus(
         running=running,
         state=state,
         phase=phase,
+        by_person=frame.by_person if frame is not None and running else False,
         standstill=frame.standstill if frame is not None and running else False,
         text=text,
         next=what_next,

@@ -28,6 +28,7 @@ class TelemetrySink:
         self.dropped = 0  #: gaps in the sequence
         self.malformed = 0
         self.restarts = 0  #: a loop that began to count anew
+        self.other_version: int | None = None  #: of telemetry, that came last and cannot be read
         self.cycles: deque[Cycle] = deque()  #: of the loop that runs, over WINDOW_S
         self._spans = spans
         self._dtype = frame_dtype(spans)
@@ -36,16 +37,18 @@ class TelemetrySink:
         self._sequence = 0
 
     def take(self, payload: bytes) -> None:
-        if len(payload) != self._dtype.itemsize:
+        version = int.from_bytes(payload[:2], "little")
+        if version != VERSION or len(payload) != self._dtype.itemsize:
             self.malformed += 1
+            self.other_version = version if version != VERSION else None
             return
         row = np.frombuffer(payload, self._dtype)[0]
         time_s = float(row["time_s"])
-        if row["version"] != VERSION or row["n"] != self._spans or not isfinite(time_s):
+        if row["n"] != self._spans or not isfinite(time_s):
             self.malformed += 1
             return
         self._count(int(row["sequence"]))
-        self._newest = payload
+        self._newest, self.other_version = payload, None
         self.cycles.append(Cycle(time_s, float(row["cycle_s"]), float(row["lateness_s"]), int(row["missed"])))
         while self.cycles[0].time_s < time_s - WINDOW_S:
             self.cycles.popleft()

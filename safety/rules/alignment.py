@@ -76,8 +76,9 @@ def lateness(theta: Theta, found: list[Foretold]) -> tuple[FloatArray, FloatArra
 def sensitivities(theta: Theta, predicted: Predicted) -> tuple[FloatArray, FloatArray]:
     """What a second's lateness of each channel does to the whitened innovations, (2, c, k, m), and these, (k, m).
 
-    First by the slope from the sample before, then, of torques, by that to the next one. Rollers out of round turn as
-    was learned from the whole stretch, whatever a channel tells.
+    First by the slope from the sample before, then, of torques, by that to the next one, where what is measured does
+    not act on the torque within a period: else an innovation would be in the slope that it is held against. Rollers out
+    of round turn as was learned from the whole stretch, whatever a channel tells.
     """
     stretch, period_s = with_swings(predicted), predicted.stretch.recording.period_s
     before = np.zeros_like(stretch.measured)
@@ -89,7 +90,7 @@ def sensitivities(theta: Theta, predicted: Predicted) -> tuple[FloatArray, Float
     turned = [
         [_whitened(theta, predicted, replace(stretch, torque_nm=_moved(stretch.torque_nm, slope, j)))
          for j in range(stretch.n)]
-        for slope in (jumps[:-1], jumps[1:])
+        for slope in (jumps[:-1], jumps[1:] if theta.latency_s >= period_s - 1e-9 else jumps[:-1])
     ]  # fmt: skip
     white = _whitened(theta, predicted, stretch)
     return (np.array([[*rows, *either] for either in turned]) - white) / PROBE_S, white

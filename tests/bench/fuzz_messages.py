@@ -21,7 +21,7 @@ class Telemetry:
     """A header of 44 bytes with version 2 and the number of spans, five float32 and two bytes for each span."""
 
     name = "telemetry frame"
-    _head = struct.Struct("<HHIdffIffBBBBHB")
+    _head = struct.Struct("<HHIdffIffBBBBBHB")
 
     def valid(self, dice: Random) -> bytes:
         values = np.array([dice.uniform(-100.0, 100.0) for _ in range(SPANS)])
@@ -37,6 +37,7 @@ class Telemetry:
                 0.1,
                 dice.randrange(5),
                 dice.randrange(10),
+                False,
                 True,
                 False,
                 0,

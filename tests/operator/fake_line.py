@@ -53,8 +53,8 @@ PASSWORD = "demonstration"
 IN_SERVICE = "c6d8cf9c18f6d8b1da935a6124c0cd14f017292be653fbbb0dbf92362e1c9e54"
 
 ASKED = Before(
-    interaction="0123456789abcdef", agent="initial-control", decision="design.selection",
-    task="Which of the tuned controllers is proposed.", chosen="LQI with Kalman filter", by="rules", instead="",
+    interaction="0123456789abcdef", agent="initial-control", task="Which of the tuned controllers is proposed.",
+    chosen="LQI with Kalman filter", by_rules=True, instead="",
 )  # fmt: skip
 NOTES = [
     NoteBefore(

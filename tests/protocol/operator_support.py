@@ -64,7 +64,7 @@ class FakeGateway:
         self.heard: list[ForPerson] = []
         self.reply = Reply(ok=True, state="RUN", text="done")
         self.running, self.quality, self.tension_n = True, "GOOD", 20.0
-        self.phase, self.standstill = Phase.RUNNING, False
+        self.phase, self.by_person, self.standstill = Phase.RUNNING, False, False
         self.waiting: list[ProposalShown] = []
         self.hidden: set[str] = set()  #: proposals that are listed, and not shown
         self.lists = True  #: proposals, when it is asked
@@ -100,7 +100,7 @@ class FakeGateway:
             format=1, site=self.line.site, line=self.line.line, wall_s=datetime.now(UTC).timestamp(), uptime_s=9.0,
             loop=LoopStatus(running=self.running, state=STATE_OF[self.phase].name if self.running else "UNKNOWN",
                             phase=self.phase.name if self.running else "UNKNOWN",
-                            standstill=self.standstill, text="controlled",
+                            by_person=self.by_person, standstill=self.standstill, text="controlled",
                             next="hold", age_s=0.01, period_s=0.01, held=0, saturated=False, doubts=[], restarts=0),
             unwind_speed_m_per_s=0.1, speed_setpoint_m_per_s=0.1, stands=True, change=None,
             limits=LimitsStatus(tension_min_n=limits.tension_min_n, tension_max_n=limits.tension_max_n,

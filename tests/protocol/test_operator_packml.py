@@ -9,7 +9,7 @@ from gateway.core.states import Phase
 from gateway.operator.opcua.packml import BASE, EXECUTE, MACHINE, PACKML, PATH, states_of
 from gateway.operator.opcua.space import NAMESPACE
 from tests.protocol.nodeset_support import MANDATORY, OPTIONAL, SMALL, TYPE, node, node_set, write
-from tests.protocol.operator_support import alarm, bench
+from tests.protocol.operator_support import bench
 from tests.protocol.test_operator_nodesets import served
 from tests.unit.alarm_support import status
 
@@ -55,7 +55,7 @@ def run(story):
 
 
 @pytest.mark.parametrize(
-    ("phase", "standstill", "by_itself", "states"),
+    ("phase", "standstill", "by_person", "states"),
     [
         ("UNKNOWN", True, False, None),
         ("SILENT", True, False, None),  # nothing is commanded, whoever may move the web
@@ -66,18 +66,17 @@ def run(story):
         ("RUNNING", False, False, ("Cleared", "Running", "Execute")),
         ("HOLDING", False, False, ("Cleared", "Running", "Holding")),
         ("HOLDING", True, False, ("Cleared", "Running", "Held")),
-        ("SLOWING", False, False, ("Cleared", "Stopping", "")),
-        ("UNLOADING", True, False, ("Cleared", "Stopping", "")),  # there is torque yet
-        ("OFF", False, False, ("Cleared", "Stopping", "")),  # it coasts, or nobody knows
-        ("OFF", True, False, ("Cleared", "Stopped", "")),
-        ("SLOWING", False, True, ("Aborting", "", "")),
-        ("OFF", False, True, ("Aborting", "", "")),
-        ("OFF", True, True, ("Aborted", "", "")),
+        ("SLOWING", False, True, ("Cleared", "Stopping", "")),
+        ("UNLOADING", True, True, ("Cleared", "Stopping", "")),  # there is torque yet
+        ("OFF", False, True, ("Cleared", "Stopping", "")),  # it coasts, or nobody knows
+        ("OFF", True, True, ("Cleared", "Stopped", "")),
+        ("SLOWING", False, False, ("Aborting", "", "")),
+        ("OFF", False, False, ("Aborting", "", "")),
+        ("OFF", True, False, ("Aborted", "", "")),
     ],
 )
-def test_each_phase_is_a_state_and_a_standstill_is_told_where_it_is_measured(phase, standstill, by_itself, states):
-    alarms = [alarm("line-stopped").model_copy(update={"active": by_itself})]
-    assert states_of(status({"phase": phase, "standstill": standstill}, alarms=alarms)) == states
+def test_each_phase_is_a_state_and_a_standstill_is_told_where_it_is_measured(phase, standstill, by_person, states):
+    assert states_of(status({"phase": phase, "standstill": standstill, "by_person": by_person})) == states
 
 
 def test_every_phase_of_the_loop_is_known():
@@ -99,11 +98,14 @@ def test_states_follow_the_line_and_say_why_they_are_not_known(tmp_path):
             number = await client.get_namespace_index(PACKML)
             told = await b.read(client, f"{EXECUTE}.CurrentState.Id")
             assert told.Value.Value == ua.NodeId(1100 + 1 + EXECUTE_STATES.index("Execute"), number)
-            b.gateway.alarms, b.gateway.phase = [alarm("line-stopped")], Phase.SLOWING
-            await b.until(client, f"{BASE}.CurrentState.Id", lambda found: found.Value.Value.Identifier == 1302)
+            b.gateway.phase = Phase.SLOWING
+            await b.until(  # which is told last
+                client, f"{EXECUTE}.CurrentState", lambda found: found.StatusCode.value == CODES.BadStateNotActive
+            )
+            assert (await b.read(client, f"{BASE}.CurrentState.Id")).Value.Value.Identifier == 1302
             assert await states() == ["Aborting", CODES.BadStateNotActive, CODES.BadStateNotActive]
             b.gateway.running = False
-            await b.until(client, f"{BASE}.CurrentState", lambda found: not found.StatusCode.is_good())
+            await b.until(client, f"{EXECUTE}.CurrentState", lambda found: found.StatusCode.value == CODES.BadNoData)
             assert await states() == [CODES.BadNoData] * 3
             methods = await client.get_node(b.id(PATH)).get_methods()
             assert methods == []
@@ -118,6 +120,10 @@ def test_states_follow_the_line_and_say_why_they_are_not_known(tmp_path):
         ({**WITH, PACKML: node_set(PACKML, "")}, "its model has no PackMLBaseObjectType, PackMLBaseStateMachineType"),
         ({**WITH, PACKML: node_set(PACKML, NODES.replace("ns=1;i=72", "ns=1;i=73"))}, "has no folder PackMLObjects"),
         ({**WITH, PACKML: node_set(PACKML, NODES, {NAMESPACE: ""})}, f"no file there holds the model {NAMESPACE}"),
+        (
+            {**WITH, PACKML: node_set(PACKML, NODES.replace("1:Held", "1:Kept"))},
+            "PackMLExecuteStateMachineType has no state Held",
+        ),
         (
             {**WITH, PACKML: node_set(PACKML, NODES.replace("1:MachineState", "1:Machine"))},
             "does not declare BaseStateMachine.MachineState.CurrentState",

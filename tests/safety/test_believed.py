@@ -59,6 +59,16 @@ def test_intervals_of_single_rollers_stand_in_for_a_posterior_and_combinations_d
     assert np.array(found.covariance) == pytest.approx(np.diag([0.01, 0.04, *(1e-4 * np.arange(1, 19) ** 2)]))
 
 
+@pytest.mark.parametrize("left_out", [1, 6])
+def test_an_interval_of_one_roller_says_nothing_of_the_others(left_out: int) -> None:
+    known = {"stiffness_n": 0.1, "length_m": 0.1, "inertia_kg_m2": 0.1, "friction_nms_per_rad": 0.1}
+    radii = {f"radius_m[{i}]": 0.1 for i in range(1, 7)}
+    assert posterior_of(with_intervals(**known, **radii)).names == [*known, *radii]
+    del radii[f"radius_m[{left_out}]"]
+    with pytest.raises(Unbelievable, match="an interval of radius_m:"):
+        posterior_of(with_intervals(**known, **radii))
+
+
 def test_what_neither_a_posterior_nor_an_interval_above_0_tells_of_is_named() -> None:
     def said(model: LineModel) -> str:
         with pytest.raises(Unbelievable) as told:

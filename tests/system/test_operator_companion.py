@@ -116,9 +116,9 @@ async def _states(b: Bench, client: Client) -> None:
         (Phase.HOLDING, True, {BASE: "Cleared", MACHINE_STATE: "Running", EXECUTE: "Held"}),
         (Phase.SLOWING, False, {BASE: "Cleared", MACHINE_STATE: "Stopping"}),
     ):
-        b.gateway.phase, b.gateway.standstill = phase, standstill
-        deepest, last = list(states.items())[-1]
-        await b.until(client, f"{deepest}.CurrentState", lambda found, last=last: _text(found) == last)
+        b.gateway.phase, b.gateway.by_person, b.gateway.standstill = phase, True, standstill
+        last = states.get(EXECUTE, "")
+        await b.until(client, f"{EXECUTE}.CurrentState", lambda found, last=last: _text(found) == last)
         for path in (BASE, MACHINE_STATE, EXECUTE):
             told = await b.read(client, f"{path}.CurrentState")
             if path not in states:

@@ -35,7 +35,7 @@ def bus(absent: list[str], last_error: str = "") -> BusReport:
 
 def status(loop: dict[str, Any] | None = None, **changes: Any) -> GatewayStatus:
     runs = LoopStatus(
-        running=True, state="RUN", phase="RUNNING", standstill=False, text="", next="", age_s=0.01, period_s=0.01,
+        running=True, state="RUN", phase="RUNNING", text="", next="", age_s=0.01, period_s=0.01,
         held=0, saturated=False, doubts=[], restarts=0,
     )  # fmt: skip
     well = GatewayStatus(

@@ -69,6 +69,7 @@ def frame_of(sequence: int, time_s: float, spans: int = 6, **changes: Any) -> by
         "speed_setpoint_m_per_s": 0.1,
         "state": LoopState.RUN,
         "phase": Phase.RUNNING,
+        "by_person": False,
         "standstill": False,
         "saturated": False,
         "held": 0,

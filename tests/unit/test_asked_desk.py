@@ -8,6 +8,7 @@ import pytest
 
 from gateway.commissioning.past import asked as naming
 from gateway.core.asked_before import MOST_ASKED, MOST_NOTES, MOST_PASSAGE, AskedTold
+from gateway.core.computations import Computed
 from gateway.core.controller import config_hash
 from gateway.core.interactions import Answer, Interaction, Note, pack
 from gateway.core.messages import Reply
@@ -40,6 +41,14 @@ def interaction(number: int, *notes: Note, by: str = "rules", instead: str = "",
     )  # fmt: skip
 
 
+def computation(number: int) -> Interaction:
+    done = Computed(call={"call": "margins"}, number=1, seconds=0.1)
+    return Interaction(
+        format=1, id=f"{number:016x}", agent="code", at="2026-01-05T10:00:00.000+00:00", prompt="", seconds=1.0,
+        asked_by="adaptation", task="margins", computations=[done],
+    )  # fmt: skip
+
+
 def told(kept: Sequence[Interaction], story: Callable[[Interactions, Ask], Awaitable[None]]) -> None:
     """`Ask` makes a proposal with that evidence, and asks what it rests on."""
 
@@ -52,8 +61,8 @@ def told(kept: Sequence[Interaction], story: Callable[[Interactions, Ask], Await
             await served.listen(folder / "gateway.sock")
             way.connect((GATEWAY_ASKED,), folder / "gateway.sock")
 
-            async def ask(*evidence: Evidence) -> bytes:
-                payload = json.dumps({"proposal": await _proposed(gateway, evidence)}).encode()
+            async def ask(*evidence: Evidence, again: bool = False) -> bytes:
+                payload = json.dumps({"proposal": await _proposed(gateway, evidence, again)}).encode()
                 return await way.request(GATEWAY_ASKED, payload, 5.0)
 
             await story(log, ask)
@@ -63,9 +72,9 @@ def told(kept: Sequence[Interaction], story: Callable[[Interactions, Ask], Await
     asyncio.run(whole())
 
 
-async def _proposed(gateway: Gateway, evidence: Sequence[Evidence]) -> str:
+async def _proposed(gateway: Gateway, evidence: Sequence[Evidence], again: bool) -> str:
     one = proposal(1, config_hash(FIRST), gateway.loop.now_s).model_copy(update={"evidence": list(evidence)})
-    assert (await gateway.propose(one)).ok
+    assert (await gateway.propose(one)).ok is not again
     return hash_of(one)
 
 
@@ -78,7 +87,8 @@ def test_what_was_asked_stands_in_the_order_of_the_proposal_and_what_was_chosen_
         numbers = (Evidence(what="rmse", value=3.0), naming(second.id), naming(first.id), naming(third.id))
         found = AskedTold.model_validate_json(await ask(*numbers))
         assert [one.interaction for one in found.asked] == [second.id, first.id, third.id]
-        assert [one.by for one in found.asked] == ["adaptation", "rules", "rules"]
+        assert [one.by_rules for one in found.asked] == [False, True, True]
+        assert {one.agent for one in found.asked} == {"adaptation"}
         assert found.asked[0].chosen == QUESTION.options[-1].title and found.asked[0].task == QUESTION.task
         assert [one.instead for one in found.asked] == ["", "", "the model was silent"]
         assert found.missing == []
@@ -107,9 +117,8 @@ def test_each_note_is_told_once_with_the_passage_that_fitted_best():
 @pytest.mark.parametrize(
     "what, said",
     [
-        ("interaction 00000000000000ff", "in the log nowhere"),
-        ("interaction 1", "is no id of an interaction"),  # the log would take it for the first that it has
-        ("interaction ../../etc", "is no id of an interaction"),
+        ("interaction 00000000000000ff", "in the agents' log nowhere"),
+        ("interaction 00000000000000cc", "is no question, but something computed"),
     ],
 )
 def test_what_a_proposal_names_and_nobody_finds_is_said(what: str, said: str):
@@ -119,7 +128,28 @@ def test_what_a_proposal_names_and_nobody_finds_is_said(what: str, said: str):
         (sentence,) = found.missing
         assert said in sentence
 
+    told([interaction(1), computation(0xCC)], story)
+
+
+@pytest.mark.parametrize("what", ["interaction 1", "interaction of spans 2 and 3", "interaction ../../etc"])
+def test_what_is_no_id_is_plain_evidence_and_so_is_what_has_a_number(what: str):
+    async def story(_: Interactions, ask: Ask) -> None:
+        numbered = naming(f"{1:016x}").model_copy(update={"value": 4.1})
+        found = AskedTold.model_validate_json(await ask(Evidence(what=what), numbered))
+        assert found.asked == [] and found.notes == [] and found.missing == []
+
     told([interaction(1)], story)
+
+
+def test_what_was_told_stays_whatever_the_log_says_later():
+    async def story(log: Interactions, ask: Ask) -> None:
+        first = await ask(naming(f"{1:016x}"))
+        log.path.unlink()
+        one = interaction(1, note("another"))
+        log.keep(pack(one), one)
+        assert await ask(naming(f"{1:016x}"), again=True) == first
+
+    told([interaction(1, note("a"))], story)
 
 
 def test_without_a_log_it_is_said_and_with_a_damaged_one_too():
@@ -134,10 +164,15 @@ def test_without_a_log_it_is_said_and_with_a_damaged_one_too():
 
 
 def test_whatever_agents_have_written_the_answer_fits_a_message():
-    long = "\N{REVERSED PILCROW SIGN}" * 3_000  # three bytes each
+    long = "\x01" * 2_000  # as JSON six bytes each
+    question = QUESTION.model_copy(update={"task": long[:600], "options": [
+        one.model_copy(update={"title": long[:600]}) for one in QUESTION.options
+    ]})  # fmt: skip
     names = [f"{k}{long}" for k in range(8)]
     kept = [
-        interaction(k, *(note(f"{k}-{i}{long}", passage=long, overruled_by=names) for i in range(2)))
+        interaction(
+            k, *(note(f"{k}-{i}{long}", passage=long, overruled_by=names) for i in range(2)), instead=long[:1000]
+        ).model_copy(update={"question": question})
         for k in range(1, MOST_ASKED + 4)
     ]
 
@@ -170,7 +205,7 @@ def test_what_is_asked_of_no_proposal_or_of_a_gate_that_is_shut_is_refused():
             assert "not understood" in await refusal(b"nonsense")
             assert "the gate is shut" in await refusal(unknown)
             open_ = True
-            assert "0 proposals begin with" in await refusal(unknown)
+            assert "it is not told" in await refusal(unknown)
             await way.close()
             await served.close()
 

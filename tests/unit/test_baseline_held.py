@@ -19,7 +19,7 @@ from tests.unit.deployer_support import LINE, controller
 
 SMALL, WIDE = Region(speed_max_m_per_s=0.02, tension_step_max_n=4.0), Region(speed_max_m_per_s=0.1)
 STOOD = Frame(
-    0, 0.0, 0.0, 0.0, 0, 0.0, 0.0, LoopState.READY, Phase.READY, True, False, 0, 0,
+    0, 0.0, 0.0, 0.0, 0, 0.0, 0.0, LoopState.READY, Phase.READY, False, True, False, 0, 0,
     *(np.ones(LINE.n) for _ in range(5)), *(np.zeros(LINE.n, dtype=np.int64) for _ in range(2)),
 )  # fmt: skip
 

@@ -12,8 +12,9 @@ from pydantic import ValidationError
 from gateway.core.alarms import BY_NAME, AlarmStatus
 from gateway.core.messages import Arm, Event, Reply
 from gateway.core.signals import DriveState, Quality
-from gateway.core.states import LoopState
+from gateway.core.states import LoopState, Phase
 from gateway.core.status import BusStatus, GatewayStatus
+from gateway.core.telemetry import VERSION
 from gateway.core.topics import GATEWAY_COMMAND, GATEWAY_STATUS, LOOP_COMMAND, LOOP_EVENT, LOOP_TELEMETRY
 from gateway.mailbox.inprocess import Hub, InProcessMailbox
 from gateway.mailbox.port import MAX_PAYLOAD, PEER, Counters, Peer
@@ -87,6 +88,21 @@ def test_without_a_loop_it_says_so_and_what_to_do() -> None:
     assert [span.tension_n for span in status.spans] == [None] * 6
     assert {span.quality for span in status.spans} == {"MISSING"}
     assert status.timing.cycle is None
+
+
+def test_a_loop_of_another_version_is_none_that_is_gone() -> None:
+    bench = Bench()
+    older = bytearray(frame_of(0, 0.01))
+    older[:2] = (VERSION - 1).to_bytes(2, "little")
+    for payload in (bytes(older), bytes(older[:-3])):
+        assert bench.loop.publish(LOOP_TELEMETRY, payload)
+        told = bench.gateway.status().loop
+        assert not told.running and told.state == told.phase == "UNKNOWN"
+        assert f"of version {VERSION - 1}, this program reads {VERSION}: it may run" in told.text
+        assert "start the loop anew" in told.next
+    bench.run_loop(1, phase=Phase.OFF, by_person=True, standstill=True)
+    told = bench.gateway.status().loop
+    assert (told.running, told.phase, told.by_person, told.standstill) == (True, "OFF", True, True)
 
 
 def test_what_the_loop_says_is_what_the_status_says() -> None:

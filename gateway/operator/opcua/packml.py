@@ -24,7 +24,6 @@ PATH = "PackML"
 BASE = f"{PATH}.BaseStateMachine"
 MACHINE = f"{BASE}.MachineState"
 EXECUTE = f"{MACHINE}.ExecuteState"
-STOPPED_BY_ITSELF = "line-stopped"  #: the alarm that says so
 
 ua: Any = asyncua_ua  #: what it declares of its values and what they are differ
 
@@ -48,6 +47,12 @@ _RUNNING = {
 }  # fmt: skip
 
 
+#: Names of states that are told, by machine.
+_TOLD = (
+    {"Cleared", "Aborting", "Aborted"}, {"Running", "Stopping", "Stopped"}, {*_RUNNING.values(), "Holding", "Held"},
+)  # fmt: skip
+
+
 def states_of(status: GatewayStatus) -> States | None:
     """None: nobody commands the machine, so nobody knows."""
     phase = Phase.__members__.get(status.loop.phase)
@@ -58,15 +63,15 @@ def states_of(status: GatewayStatus) -> States | None:
             return States("Cleared", "Running", "Held" if status.loop.standstill else "Holding")
         case Phase.SLOWING | Phase.UNLOADING | Phase.OFF:
             stands = phase is Phase.OFF and status.loop.standstill
-            if any(alarm.name == STOPPED_BY_ITSELF and alarm.active for alarm in status.alarms):
-                return States("Aborted" if stands else "Aborting")
-            return States("Cleared", "Stopped" if stands else "Stopping")
+            if status.loop.by_person:
+                return States("Cleared", "Stopped" if stands else "Stopping")
+            return States("Aborted" if stands else "Aborting")
         case _:
             return States("Cleared", "Running", _RUNNING[phase])
 
 
 async def make_packml(space: Space, line: Line, sets: NodeSets) -> "PackMl":
-    """Raises NotUsable, and nothing is made then."""
+    """Raises NotUsable where something is not declared; nothing is made then."""
     types, number = await sets.types(PACKML), await sets.number(PACKML)
     if missing := {"PackMLBaseObjectType", *_TYPES.values()} - types.keys():
         raise NotUsable(f"its model has no {', '.join(sorted(missing))}")
@@ -76,6 +81,9 @@ async def make_packml(space: Space, line: Line, sets: NodeSets) -> "PackMl":
     if lacking := wanted - names:
         raise NotUsable(f"PackMLBaseObjectType does not declare {', '.join(sorted(lacking))}")
     ids = {path: await _states(space, types[name]) for path, name in _TYPES.items()}
+    for path, told in zip(_TYPES, _TOLD, strict=True):
+        if unknown := told - ids[path].keys():
+            raise NotUsable(f"{_TYPES[path]} has no state {', '.join(sorted(unknown))}")
     folder = ua.NodeId(OBJECTS, number)
     if folder not in space.server.iserver.aspace:
         raise NotUsable(f"the model {PACKML} has no folder PackMLObjects, i={OBJECTS}")

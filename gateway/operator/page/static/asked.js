@@ -17,7 +17,7 @@ export async function tellAsked(place, hash) {
 }
 
 function question(one) {
-  const by = one.by === "rules" ? word("change.by-rules") : word("change.by-agent", { agent: one.by });
+  const by = one.by_rules ? word("change.by-rules") : word("change.by-agent", { agent: one.agent });
   return h("li", {}, english("span", one.task), " ", english("b", one.chosen), ` (${by}) `, h("code", {}, one.interaction),
     one.instead && [h("br"), english("span", one.instead)]);
 }

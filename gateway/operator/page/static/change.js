@@ -109,7 +109,7 @@ export class Change {
   // While it is the same, nothing that was opened closes.
   before(shown) {
     const of = `${document.documentElement.lang} ${shown.proposal_hash}`;
-    if (this.told?.of !== of) this.told = { of, place: h("div", { id: "asked" }) };
+    if (this.told?.of !== of) this.told = { of, place: h("div", { id: "asked" }, h("p", { class: "muted" }, word("change.asked-wait"))) };
     return this.told.place;
   }
 
@@ -160,7 +160,7 @@ async function begun(place, fill) {
 }
 
 // Told apart, with what was chosen and why.
-const wasAsked = (one) => one.what.startsWith("interaction ");
+const wasAsked = (one) => /^interaction [0-9a-f]{16}$/.test(one.what) && one.value == null && !one.digest;
 
 // Empty: one is enough.
 function twoPeople(shown) {

@@ -37,11 +37,12 @@ class Drawing {
 
   // What is to be seen, for whoever does not see it: the verdict's own figures, of all spans.
   label({ scenario }, i) {
+    const name = named(scenario);
     const of = (whose) => this.figures.find((one) => one.scenario === scenario && one.configuration === whose);
     const told = ({ rmse_n }) => (rmse_n == null ? word("measure.away") : `${figure(rmse_n)} N`);
     const [now, proposed] = [of("in service"), of("proposed")];
-    if (!now || !proposed) return `${scenario}, ${word("table.span")} ${i + 1}`;
-    return word("change.courses-label", { scenario, span: i + 1, now: told(now), proposed: told(proposed) });
+    if (!now || !proposed) return `${name}, ${word("table.span")} ${i + 1}`;
+    return word("change.courses-label", { scenario: name, span: i + 1, now: told(now), proposed: told(proposed) });
   }
 
   draw() {
