@@ -5,7 +5,8 @@ import numpy as np
 from gateway.core.signals import Inputs
 from gateway.loop import machine as machines
 
-STILL_S = 0.3  #: for so long nothing has moved: noise is no movement, and one sample no standstill
+STILL_S = 0.3  #: for so long nothing has moved: one sample is no standstill
+MOVES_M_PER_S = 2.0 * machines.STANDSTILL_M_PER_S  #: what stood moves again; less may be noise
 
 
 def standing(inputs: Inputs) -> bool:
@@ -20,11 +21,15 @@ class Standstill:
     def __init__(self, period_s: float) -> None:
         self._period_s = period_s
         self._still = 0  #: periods in a row
+        self._stands = False
 
     def look(self, inputs: Inputs, asked: bool) -> bool:
         """Once a period. `asked`: a speed is wanted."""
-        speed = inputs.speed
-        still = not asked and standing(inputs) and speed.good()
-        still = still and float(np.abs(speed.value).max()) <= machines.STANDSTILL_M_PER_S
-        self._still = self._still + 1 if still else 0
-        return self._still * self._period_s >= STILL_S
+        known = not asked and inputs.unwind_speed.good() and inputs.speed.good()
+        fastest = (
+            max(abs(inputs.unwind_speed.value.item(0)), float(np.abs(inputs.speed.value).max())) if known else np.inf
+        )
+        most = MOVES_M_PER_S if self._stands else machines.STANDSTILL_M_PER_S
+        self._still = self._still + 1 if fastest <= most else 0
+        self._stands = self._still * self._period_s >= STILL_S
+        return self._stands

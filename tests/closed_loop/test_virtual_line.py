@@ -15,6 +15,7 @@ from gateway.core.scenario import TENSION
 from gateway.core.signals import Quality
 from gateway.core.states import Phase
 from gateway.core.telemetry import Frame
+from gateway.loop.standstill import MOVES_M_PER_S
 from sim_plant.recording import EVENTS_FILE, TRACE_FILE
 from tests.closed_loop.conftest import demo_line, real_plant
 from tests.closed_loop.virtual_line import VirtualLine
@@ -125,6 +126,12 @@ def test_a_line_is_brought_up_and_down_by_the_operator_alone():
         assert not line.truth.world.torque_nm.any()
         assert line.truth.recorder.unsafe_total == 0, line.truth.recorder.unsafe_events
         phases = [transition.phase for transition in line.transitions]
+        line.step(1000)  # without torque the web draws on the rollers for some seconds
+        told = line.recorded()
+        assert told[-1].by_person and told[-1].standstill and told[-1].phase == Phase.OFF
+        assert {frame.by_person for frame in told if frame.phase < Phase.SLOWING} == {False}
+        assert not [frame for frame in told if frame.standstill and np.abs(frame.speed_m_per_s).max() > MOVES_M_PER_S]
+        assert not [frame for frame in told if frame.standstill and frame.phase == Phase.RUNNING]
     assert phases == [
         Phase.ARMING, Phase.READY, Phase.ENABLING, Phase.TENSIONING, Phase.RUNNING,
         Phase.SLOWING, Phase.UNLOADING, Phase.OFF,

@@ -5,7 +5,7 @@ import pytest
 
 from gateway.core.signals import Inputs, Quality
 from gateway.loop.machine import STANDSTILL_M_PER_S
-from gateway.loop.standstill import STILL_S, Standstill
+from gateway.loop.standstill import MOVES_M_PER_S, STILL_S, Standstill
 
 PERIOD_S = 0.01
 PERIODS = round(STILL_S / PERIOD_S)
@@ -56,9 +56,21 @@ def test_it_is_not_told_while_a_speed_is_asked_for() -> None:
     assert not told(still(), 10 * PERIODS, asked=True)
 
 
+def test_what_stands_moves_again_only_where_it_is_more_than_noise() -> None:
+    standstill, inputs = Standstill(PERIOD_S), still()
+    for _ in range(PERIODS):
+        standstill.look(inputs, asked=False)
+    inputs.speed.value[0] = MOVES_M_PER_S
+    assert standstill.look(inputs, asked=False)
+    inputs.speed.value[0] = 1.01 * MOVES_M_PER_S
+    assert not standstill.look(inputs, asked=False)
+    inputs.speed.value[0] = MOVES_M_PER_S  # from here it has to be less again
+    assert not [k for k in range(2 * PERIODS) if standstill.look(inputs, asked=False)]
+
+
 def test_one_movement_begins_it_anew() -> None:
     standstill, inputs, moved = Standstill(PERIOD_S), still(), still()
-    moving_roller(moved)
+    moved.speed.value[2] = -1.01 * MOVES_M_PER_S
     for _ in range(2 * PERIODS):
         standstill.look(inputs, asked=False)
     assert not standstill.look(moved, asked=False)
