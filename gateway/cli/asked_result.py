@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from gateway.cli.demo_result import AskedResult, FigureResult, NoteResult, OptionResult
-from gateway.commissioning.past import interactions_of
+from gateway.core.asked_before import interactions_of
 from gateway.core.decisions import ProposalShown
 from gateway.core.interactions import Answer, Interaction
 from gateway.core.questions import Option, Question

@@ -26,7 +26,8 @@ from gateway.commissioning.chain import Look, Pending, next_step, refused_at_onc
 from gateway.commissioning.convergence import Convergence, Diagnosis
 from gateway.commissioning.decisions import RULES, Decided, Decider, Rules
 from gateway.commissioning.ladder import MOST_OWN, OWN, Ended, Next
-from gateway.commissioning.past import KINDS, Follows, Outcome, Past, Step, asked, named, past_of
+from gateway.commissioning.past import KINDS, Follows, Outcome, Past, Step, named, past_of
+from gateway.core.asked_before import asked
 from gateway.core.decisions import ProposalShown
 from gateway.core.line import Line
 from gateway.core.line_problem import printable, quoted

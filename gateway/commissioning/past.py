@@ -38,7 +38,6 @@ KINDS = {
 }  # fmt: skip
 MOST_RUNG = 1000
 PROPOSED_BY = "commissioning: "  #: how the evidence begins that names step and rung
-ASKED = "interaction "  #: and the evidence that names a question to an agent, by its id in the log
 
 OPEN_STAGES = frozenset({"received", "waiting", "approved", "deploying", "probation", "keeping", "running"})
 UNDECIDED = frozenset({"received", "waiting"})  #: of somebody else's: nobody need wait for it
@@ -80,16 +79,6 @@ def past_of(shown: ProposalShown) -> Past:
 def named(step: Step, rung: int) -> Evidence:
     """By which a proposal of the chain is known."""
     return Evidence(what=f"{PROPOSED_BY}{step}", value=float(rung))
-
-
-def asked(interaction: str) -> Evidence:
-    """A question that was asked before the proposal was made."""
-    return Evidence(what=f"{ASKED}{interaction}")
-
-
-def interactions_of(evidence: Sequence[Evidence]) -> list[str]:
-    """Ids of what was asked before a proposal was made."""
-    return [one.what.removeprefix(ASKED) for one in evidence if one.what.startswith(ASKED)]
 
 
 def _named(kind: str, evidence: Sequence[Evidence]) -> tuple[Step | None, int]:

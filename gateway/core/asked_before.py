@@ -3,17 +3,30 @@
 Who decides reads it as a quotation: the gateway has kept these words, it has not written them.
 """
 
+from collections.abc import Sequence
 from typing import Annotated, Literal
 
 from pydantic import Field
 
 from gateway.core.line import Strict
 from gateway.core.line_model import Digest
+from gateway.core.proposal import Evidence
 
+ASKED = "interaction "  #: how the evidence begins that names a question to an agent, by its id in the log
 MOST_ASKED = 8  #: questions of a proposal that are told; more than that nobody reads
 MOST_NOTES = 12
 MOST_TITLE = 200  #: letters
 MOST_PASSAGE = 600
+
+
+def asked(interaction: str) -> Evidence:
+    """A question that was asked before the proposal was made."""
+    return Evidence(what=f"{ASKED}{interaction}")
+
+
+def interactions_of(evidence: Sequence[Evidence]) -> list[str]:
+    """Ids of what was asked before a proposal was made."""
+    return [one.what.removeprefix(ASKED) for one in evidence if one.what.startswith(ASKED)]
 
 
 class ShowAsked(Strict):

@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterable, Sequence
 
 from pydantic import ValidationError
 
-from gateway.commissioning.past import interactions_of
 from gateway.core.asked_before import (
     MOST_ASKED,
     MOST_NOTES,
@@ -20,6 +19,7 @@ from gateway.core.asked_before import (
     Before,
     NoteBefore,
     ShowAsked,
+    interactions_of,
 )
 from gateway.core.interactions import Answer, Interaction, Note
 from gateway.core.json_problems import NotJson, document_of, problems

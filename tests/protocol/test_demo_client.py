@@ -49,7 +49,7 @@ def test_it_arms_and_approves_exactly_what_it_has_read_from_a_process_of_its_own
                 await panel.close()
             with pytest.raises(DemoFailed, match="does not answer"):
                 await panel.ask(Call(method="Arm"))
-            decide = Decide(proposal=one.proposal_hash, shown=SHOWN, approve=True, comment="a test")
+            decide = Decide(proposal=one.proposal_hash, shown=SHOWN, revision=one.epoch, approve=True, comment="a test")
             assert [heard.said for heard in b.gateway.heard] == [Arm(), decide, decide]
             assert {(heard.person.name, heard.person.through) for heard in b.gateway.heard} == {("otto", "opc-ua")}
             assert all(heard.person.certificate for heard in b.gateway.heard)

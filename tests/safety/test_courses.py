@@ -165,6 +165,14 @@ def test_of_the_stretch_in_which_it_runs_away_the_extreme_before_is_drawn(of, ha
     assert found.tension_n["proposed"] == [[13.0, None], [9.0, None]]
 
 
+def test_a_span_that_runs_away_takes_no_other_from_the_drawing(of, handmade, monkeypatch):
+    gone = [math.nan] * 4
+    came_n = np.array([[10.0, 13.0, 9.0, *gone], [10.0, 9.0, 13.0, 12.0, 11.0, 12.0, 11.5]]).T
+    monkeypatch.setattr(courses, "MOST_NUMBERS", 2 * 3 * of.line.n)
+    found, _ = handmade(np.full((7, 2), 10.0), lambda config: came_n)
+    assert found.tension_n["proposed"] == [[13.0, None], [9.0, 13.0]]
+
+
 def test_numbers_without_end_are_none_and_nothing_to_warn_of(handmade):
     setpoint_n = np.full((2, 1), 1e308)
     found, _ = handmade(setpoint_n, lambda config: setpoint_n * [[1.0], [10.0]])

@@ -17,4 +17,5 @@ def test_numbers_at_their_limit_pass_and_what_is_no_number_never_does():
 
 def test_words_are_printable_and_no_longer_than_the_format_takes():
     assert told("r", True, "a\x1b[2Jb").text == "a\\u001b[2Jb"
-    assert len(told("r", True, "x" * 3000).text) == 2000
+    assert told("r", True, "x" * 2000).text == "x" * 2000
+    assert told("r", True, "x" * 2001).text == "x" * 1996 + " ..."

@@ -189,17 +189,21 @@ def test_alignment_tells_of_the_channel_that_is_late_at_the_least_by_most(of, ca
 
 def test_lateness_is_that_of_least_squares_over_all_parts(case, monkeypatch):
     # By hand: 1*2 + 1*4 of one part and 2*3 of the other, over 1 + 1 + 4. The second channel shows nothing. The third
-    # explains 6**2 / 2 by the slope from before and (2*2 + 3*4)**2 / 13 by that to the next: 19.7, which is more.
-    before = [[[1.0], [1.0]], [[0.0], [0.0]], [[1.0], [1.0]]], [[[2.0]], [[0.0]], [[0.0]]]
-    after = [[[1.0], [1.0]], [[0.0], [0.0]], [[2.0], [3.0]]], [[[2.0]], [[0.0]], [[0.0]]]
+    # explains 6**2 / 2 by the slope from before and (2*2 + 3*4)**2 / 13 by that to the next: 19.7, which is more. The
+    # fourth shows little, 0.5*2 over 0.25, and is told all the same.
+    little, none = [[0.5], [0.0]], [[0.0]]
+    before = [[[1.0], [1.0]], [[0.0], [0.0]], [[1.0], [1.0]], little], [[[2.0]], none, none, none]
+    after = [[[1.0], [1.0]], [[0.0], [0.0]], [[2.0], [3.0]], little], [[[2.0]], none, none, none]
     white = [[2.0], [4.0]], [[3.0]]
     parts = [(np.array([before[k], after[k]]), np.array(white[k])) for k in (0, 1)]
     monkeypatch.setattr(alignment, "sensitivities", lambda _, predicted: predicted.figures)
-    monkeypatch.setattr(alignment, "channels", lambda _: ["one", "other", "third"])
+    monkeypatch.setattr(alignment, "channels", lambda _: ["one", "other", "third", "fourth"])
     found: list[Any] = [SimpleNamespace(predicted=SimpleNamespace(stretch=None, figures=one)) for one in parts]
     with np.errstate(all="raise"):  # nobody is bothered with a channel that shows nothing
         late_s, spread_s = alignment.lateness(case.believed, found)
-    assert late_s == pytest.approx([2.0, 0.0, 16.0 / 13.0]) and spread_s == pytest.approx([6.0**-0.5, inf, 13.0**-0.5])
+    assert late_s == pytest.approx([2.0, 0.0, 16.0 / 13.0, 4.0]) and spread_s == pytest.approx(
+        [6.0**-0.5, inf, 13.0**-0.5, 2.0]
+    )
 
 
 @pytest.mark.parametrize(

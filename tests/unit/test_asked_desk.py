@@ -6,8 +6,8 @@ from collections.abc import Awaitable, Callable, Sequence
 
 import pytest
 
-from gateway.commissioning.past import asked as naming
 from gateway.core.asked_before import MOST_ASKED, MOST_NOTES, MOST_PASSAGE, AskedTold
+from gateway.core.asked_before import asked as naming
 from gateway.core.computations import Computed
 from gateway.core.controller import config_hash
 from gateway.core.interactions import Answer, Interaction, Note, pack

@@ -15,7 +15,8 @@ from gateway.cli.demo_failed import DemoFailed
 from gateway.cli.demo_line import LanguageModelAsked, Ports, Setup, line_text
 from gateway.cli.demo_result import ChangeResult, RuleResult
 from gateway.cli.main import app
-from gateway.commissioning.past import Step, asked, named
+from gateway.commissioning.past import Step, named
+from gateway.core.asked_before import asked
 from gateway.core.interactions import Answer, Interaction, Note, pack
 from gateway.core.line_file import load_line
 from gateway.core.questions import Choice
