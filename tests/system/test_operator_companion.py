@@ -183,7 +183,7 @@ def _on_another_stack(b: Bench, folder: Path) -> None:
         found = client("read", "vera", [signal, setpoint, location])
         assert [found[path]["value"] for path in (signal, setpoint, location)] == [21.0, 21.0, b.line.site]
         state = f"{EXECUTE}.CurrentState"
-        assert client("read", "vera", [state])[state]["value"]["text"] == "Execute"
+        assert client("read", "vera", [state])[state]["value"] == "Execute"
         assert client("watch", "vera", [signal])["refused"] == []
         b.gateway.tension_n = 30.0
         heard = until(lambda: client("seen", "vera").get(signal), lambda seen: seen and seen["last"]["value"] == 31.0)
