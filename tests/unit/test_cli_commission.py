@@ -16,8 +16,8 @@ from gateway.commissioning.convergence import Convergence, Diagnosis, SpanFigure
 from gateway.commissioning.decisions import Decided, Rules
 from gateway.commissioning.ladder import LADDERS, MOST_OWN, OWN
 from gateway.commissioning.past import Follows, Step
-from gateway.core.asked_before import interactions_of
 from gateway.control.design import design_lqi, task_of
+from gateway.core.asked_before import interactions_of
 from gateway.core.controller import config_hash
 from gateway.core.decisions import QUERY, ListProposals, ProposalLine, ProposalList, ProposalShown
 from gateway.core.messages import Event, Reply
