@@ -137,10 +137,13 @@ def test_german_is_spoken_and_another_language_is_kept(line: PageLine, at: AtPag
     at.log_in("viewer")
     assert [one.split()[0] for one in at("texts", "#views a")] == ["Anlage", "Änderung", "Verlauf", "Zustand"]
     assert all("," in one for one in at("texts", "#picture .tension"))
+    at.part("change")
+    margins = "\n".join(at("texts", ".margins li"))
+    assert "der Zug fällt auf" in margins and "allowed" not in margins
     at("choose", "#language", "en")
     at("see", "#views a", "Condition")
-    at.part("change")
     at("see", "#change-body", "What would change")
+    assert "tension falls to" in "\n".join(at("texts", ".margins li"))
 
 
 @pytest.mark.parametrize("language", LANGUAGES)

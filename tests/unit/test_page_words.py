@@ -58,7 +58,7 @@ def named_by_the_gate() -> set[str]:
         text = file.read_text()
         for constants in re.findall(r"^(?:[A-Z]+_)?RULE\b.* = (.*)$", text, re.MULTILINE):
             names |= set(re.findall(r'"([^"]+)"', constants))
-        names |= set(re.findall(r'"(?:\{RULE\}|corners|experiment|paper): ([a-z]+(?: [a-z]+)*)"', text))
+        names |= set(re.findall(r'"(?:\{RULE\}|corners|experiment|paper|model): ([a-z-]+(?: [a-z]+)*)"', text))
     return names
 
 

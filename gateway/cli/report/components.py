@@ -5,7 +5,7 @@ import re
 from gateway.cli.report.shell import static
 from gateway.operator.page.words import words_of
 
-MODULES = ("dom.js", "formats.js", "figures.js")  #: each after those that it imports
+MODULES = ("dom.js", "formats.js", "sentences.js", "figures.js")  #: each after those that it imports
 OFFERED = ("h", "useWords", "beforeAfter", "margins")
 FAMILIES = ("configuration.", "margin.", "measure.")  #: of the words that they say
 

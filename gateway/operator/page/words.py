@@ -1,7 +1,7 @@
 """The page's own words, in every language that it speaks: one catalogue, words.toml.
 
-What the gateway says stays as it says it, in English, and the page marks it as that; but alarms, and what rules and
-courses are called, are told in each language.
+Alarms, what rules and courses are called, and the sentences of sentences.toml are told in each language. What else the
+gateway says stays as it says it, in English, and the page marks it as that.
 """
 
 import json
@@ -35,8 +35,20 @@ def catalogue() -> dict[str, dict[str, str]]:
     return said
 
 
+@cache
+def sentences() -> dict[str, dict[str, str]]:
+    """ "sentences" and, found only within others, "parts": from English, with names in braces for what differs."""
+    return tomllib.loads((files("gateway.operator.page") / "sentences.toml").read_text(encoding="utf-8"))
+
+
 def words_of(language: str) -> dict[str, str]:
-    return {key: said[language] for key, said in catalogue().items()}
+    """By key; but for English also sentences, by the English ones with "sentence." or "part." before."""
+    said = {key: said[language] for key, said in catalogue().items()}
+    if language == "en":
+        return said
+    for family, some in (("sentence.", sentences()["sentences"]), ("part.", sentences()["parts"])):
+        said |= {family + english: there for english, there in some.items()}
+    return said
 
 
 def words_routes() -> list[Route]:

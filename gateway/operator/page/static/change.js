@@ -5,6 +5,7 @@ import { drawCourses } from "./courses.js";
 import { confirmed } from "./dialog.js";
 import { beforeAfter, margins } from "./figures.js";
 import { Refused, ask } from "./net.js";
+import { translated } from "./sentences.js";
 import { duration, figure, instant, named, word } from "./words.js";
 
 export class Change {
@@ -84,9 +85,9 @@ export class Change {
     const quoted = h("figure", { class: "quote" }, english("blockquote", shown.reason), h("figcaption", {}, word("change.said-by", { author: shown.author, when: instant(shown.created) })));
     return h("section", { class: "panel" },
       h("h2", {}, word(`kind.${shown.kind}`), " ", h("code", {}, shown.proposal_hash.slice(0, 12))),
-      h("p", {}, word(`stage.${shown.stage}`), shown.why && [": ", english("span", shown.why)]),
+      h("p", {}, word(`stage.${shown.stage}`), shown.why && [": ", translated("span", shown.why)]),
       shown.shown && twoPeople(shown) && h("p", {}, h("b", {}, twoPeople(shown))),
-      shown.difference.length > 0 && [h("h3", {}, word("change.difference")), h("ul", {}, shown.difference.map((line) => english("li", line)))],
+      shown.difference.length > 0 && [h("h3", {}, word("change.difference")), h("ul", {}, shown.difference.map((line) => translated("li", line)))],
       h("h3", {}, word("change.reason")), quoted,
       shown.evidence.length > 0 && [h("h3", {}, word("change.evidence")),
         plain.length > 0 && h("ul", {}, plain.map(evidence)), plain.length < shown.evidence.length && this.before(shown)],
@@ -135,8 +136,8 @@ export class Change {
     const then = approve ? [twoPeople(shown), word(`change.then-${shown.kind}`, { lasts: duration(shown.lasts_s ?? 0) })] : [word("change.then-reject")];
     const answer = await confirmed({
       title: word(approve ? "change.sure-approve" : "change.sure-reject"),
-      lines: [...then.filter(Boolean), ...judged(shown.verdict?.region), ...shown.difference.map((line) => ({ english: line })),
-        shown.why && { english: shown.why }, word("change.hash", { hash: shown.shown.slice(0, 12) })].filter(Boolean),
+      lines: [...then.filter(Boolean), ...judged(shown.verdict?.region), ...shown.difference.map((line) => ({ said: line })),
+        shown.why && { said: shown.why }, word("change.hash", { hash: shown.shown.slice(0, 12) })].filter(Boolean),
       yes: word(approve ? "change.yes-approve" : "change.yes-reject"), comment: true, wide: true,
     });
     if (answer === null) return;

@@ -1,5 +1,6 @@
 // The second step of whatever takes two: what will happen, in words, and a comment. Escape is no.
-import { $, english, h } from "./dom.js";
+import { $, h } from "./dom.js";
+import { translated } from "./sentences.js";
 import { word } from "./words.js";
 
 const WITH_IT = ["stop", "stale", "reply"]; // nothing outside an open window can be touched
@@ -23,7 +24,7 @@ export function confirmed({ title, lines = [], yes, comment = false, needed = fa
     h("form", { method: "dialog" },
       h("h2", { id: "ask-title" }, title),
       h("div", { class: wide ? "lines" : "", tabindex: wide && 0, role: wide && "group", "aria-labelledby": wide && "ask-title" },
-        ...lines.map((line) => (line.english ? english("p", line.english) : h("p", {}, line)))),
+        ...lines.map((line) => (line.said ? translated("p", line.said) : h("p", {}, line)))),
       comment && h("label", {}, h("span", {}, word(needed ? "ask.comment-needed" : "ask.comment")), text),
       h("div", { class: "buttons" }, no, h("button", { class: "main", value: "yes" }, yes)),
     ),

@@ -1,6 +1,7 @@
 // Numbers of a verdict as bars: how much of each limit is used, and what was simulated before and after. Of page and reports.
-import { english, h, svg } from "./dom.js";
+import { h, svg } from "./dom.js";
 import { figure, named, number, word } from "./formats.js";
+import { translated } from "./sentences.js";
 
 export function margins(findings) {
   const order = (one) => (one.passed ? 0 : 10) + (one.used ?? -1);
@@ -16,7 +17,7 @@ function margin(finding) {
     h("div", { class: "row" }, h("b", {}, named(finding.rule)), h("span", { class: finding.passed ? "" : "alarm-text" }, word(finding.passed ? "margin.passed" : "margin.failed"))),
     finding.used != null && bar(finding),
     limits,
-    english("p", finding.text, { class: "muted" }));
+    translated("p", finding.text, { class: "muted" }));
 }
 
 function bar({ used, passed }) {

@@ -1,10 +1,21 @@
 // A catalogue's words, and numbers and times as its language writes them. Reports embed this file: it asks nothing of anybody.
 let words = {};
+let made = {};
 export let language = "en";
 
 export function useWords(chosen, catalogue) {
   language = chosen;
   words = catalogue;
+  made = {};
+}
+
+// Sentences with names in braces: those whose keys begin so, taken apart; what says most by itself comes first.
+export function templates(family) {
+  made[family] ??= Object.keys(words).filter((key) => key.startsWith(family)).map((key) => {
+    const literals = key.slice(family.length).split(/\{\w+\}/);
+    return { literals, names: [...key.matchAll(/\{(\w+)\}/g)].map((one) => one[1]), said: words[key], size: literals.join("").length };
+  }).sort((a, b) => b.size - a.size);
+  return made[family];
 }
 
 export function word(key, values = {}) {

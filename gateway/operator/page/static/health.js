@@ -1,5 +1,6 @@
 // How the gateway itself fares: timing, buses, history, agents; and what is doubted of the line.
 import { $, coded, english, h, replaced, svg } from "./dom.js";
+import { translated } from "./sentences.js";
 import { number, time, word } from "./words.js";
 
 let painted_ms = 0;
@@ -14,8 +15,8 @@ export function paintHealth(tick, line) {
 
 function diagnoses({ loop, change }) {
   return h("section", { class: "panel" }, h("h2", {}, word("health.diagnoses")),
-    loop.doubts.length ? h("ul", {}, loop.doubts.map((doubt) => english("li", doubt, { class: "attention-text" }))) : h("p", {}, word("health.no-diagnoses")),
-    change && [h("h3", {}, word("health.change")), h("p", {}, word(`kind.${change.kind}`), ". ", word(`stage.${change.stage}`), change.text && [": ", english("span", change.text)])]);
+    loop.doubts.length ? h("ul", {}, loop.doubts.map((doubt) => translated("li", doubt, { class: "attention-text" }))) : h("p", {}, word("health.no-diagnoses")),
+    change && [h("h3", {}, word("health.change")), h("p", {}, word(`kind.${change.kind}`), ". ", word(`stage.${change.stage}`), change.text && [": ", translated("span", change.text)])]);
 }
 
 function timing({ timing, link }, line) {

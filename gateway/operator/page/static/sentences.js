@@ -1,0 +1,58 @@
+// What the gate and the loop say, in the page's language as far as the catalogue has it. A sentence of the catalogue has
+// names in braces where sentences differ; what stands there may be a number, a name, or again a part of a sentence.
+import { english, h } from "./dom.js";
+import { language, named, templates } from "./formats.js";
+
+const MOST_PIECES = 20;
+const NUMBER = /^[+-]?\d+(\.\d+)?(e[+-]?\d+)?(?: \S{1,5}|%)?$/;
+
+// Marked as English where the catalogue does not have it; where it has it, the gate's own words are the tooltip.
+export function translated(tag, text, attributes = {}) {
+  const said = sentence(text);
+  return said == null ? english(tag, text, attributes) : h(tag, { title: text, ...attributes }, said);
+}
+
+// One sentence, or several with semicolons between them; a sentence may have semicolons, too. Null: not in the catalogue.
+export function sentence(text) {
+  const pieces = text.split("; "), said = Array(pieces.length + 1).fill(null); // what is said of the pieces from each on
+  if (pieces.length > MOST_PIECES) return found(text, templates("sentence."));
+  said[pieces.length] = [];
+  for (let from = pieces.length - 1; from >= 0; from--) {
+    for (let to = from + 1; to <= pieces.length && !said[from]; to++) {
+      const first = said[to] && found(pieces.slice(from, to).join("; "), templates("sentence."));
+      if (first != null) said[from] = [first, ...said[to]];
+    }
+  }
+  return said[0] && said[0].join("; ");
+}
+
+function found(text, some) {
+  for (const { literals, names, said } of some) {
+    const between = standing(literals, text);
+    if (between) return said.replace(/\{(\w+)\}/g, (_, name) => within(between[names.indexOf(name)]));
+  }
+  return null;
+}
+
+// What stands between the literals, each of which is taken where it comes first; null where they are not the text's.
+function standing(literals, text) {
+  if (!text.startsWith(literals[0])) return null;
+  const between = [];
+  let at = literals[0].length;
+  for (const [i, literal] of literals.entries()) {
+    if (i === 0) continue;
+    const next = i === literals.length - 1 ? text.length - literal.length : text.indexOf(literal, at + 1);
+    if (next <= at || !text.startsWith(literal, next)) return null;
+    between.push(text.slice(at, next));
+    at = next + literal.length;
+  }
+  return at === text.length ? between : null;
+}
+
+function within(text) {
+  if (NUMBER.test(text)) return text.replace(".", (1.5).toLocaleString(language).charAt(1)).replace("-", "−");
+  const part = (one) => found(one, templates("part."));
+  const pieces = text.split(", "), known = pieces.map(part);
+  if (known.every((one) => one != null)) return known.join(", ");
+  return part(text) ?? sentence(text) ?? pieces.map((one, i) => known[i] ?? named(one)).join(", ");
+}
