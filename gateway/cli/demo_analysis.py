@@ -9,7 +9,6 @@ import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from importlib.metadata import version
 from typing import Any
 
 import numpy as np
@@ -20,7 +19,7 @@ from gateway.cli.demo_failed import DemoFailed
 from gateway.cli.demo_line import Setup
 from gateway.cli.demo_result import CaseResult, ChainResult, ConfigurationResult, DemoResult, Percentiles, TimingResult
 from gateway.cli.demo_stepped import SteppedAside
-from gateway.cli.demo_words import command_line, machine_lines, now_iso
+from gateway.cli.origin import command_line, machine_lines, now_iso, versions_of
 from gateway.core.controller import Controller, config_hash
 from gateway.core.metrics import rmse_n, rmse_per_span_n
 from gateway.core.scenario import PAPER
@@ -78,7 +77,7 @@ def measure(
         command=command_line(),
         date=now_iso(),
         seed=setup.seed,
-        versions={name: version(name) for name in LIBRARIES},
+        versions=versions_of(LIBRARIES),
         machine=machine_lines(setup.out / "logs" / "loop.log"),
         configurations=found,
         truth_rmse_n={case.name: stepped.rmse_n(stepped.on_truth(), case) for case in PAPER},

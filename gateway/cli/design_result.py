@@ -1,12 +1,7 @@
 """What `r2rgate design` writes beside the configuration. Schema in docs/schemas/design.schema.json."""
 
-import os
-import platform
-import sys
-from datetime import UTC, datetime
-from importlib.metadata import version
-
 from gateway.cli.design_phase import Design
+from gateway.cli.origin import command_line, machine, now_iso, versions_of
 from gateway.commissioning.assessment import Assessment
 from gateway.commissioning.records import Attempt, DecisionRecord, Stop
 from gateway.commissioning.selection import Candidate
@@ -55,11 +50,10 @@ def result_of(line: Line, found: Design, seed: int, model: LineModel | None = No
     name = "" if found.chosen is None else found.chosen.architecture
     chosen = next((one for one in found.candidates if one.architecture == name), None)
     return DesignResult(
-        command=" ".join(["r2rgate", *sys.argv[1:]]),
-        date=datetime.now(UTC).isoformat(timespec="seconds"),
-        versions={name: version(name) for name in LIBRARIES},
-        machine=f"{os.cpu_count()} processors, {platform.system()} {platform.release()}, "
-        f"Python {platform.python_version()}",
+        command=command_line(),
+        date=now_iso(),
+        versions=versions_of(LIBRARIES),
+        machine=machine(),
         line=f"{line.site}/{line.line}",
         model="" if model is None else model_hash(model),
         seed=seed,

@@ -101,18 +101,15 @@ def _answering(model: str, url: str) -> tuple["Agents", str]:
 def _result(
     model: str, digest: str, url: str, seed: int, spans: int, tasks: int, complete: bool, found: "list[TaskResult]"
 ) -> "EvalResult":
-    import platform
-    from importlib.metadata import version
-
-    from gateway.cli.demo_words import command_line, now_iso
     from gateway.cli.eval_figures import figures_of
     from gateway.cli.eval_result import EvalResult
+    from gateway.cli.origin import command_line, machine, now_iso, versions_of
 
     return EvalResult(
         command=command_line(),
         date=now_iso(),
-        machine=f"{platform.system()} {platform.release()}, {platform.machine()}, Python {platform.python_version()}",
-        versions={name: version(name) for name in LIBRARIES},
+        machine=machine(),
+        versions=versions_of(LIBRARIES),
         model=model,
         digest=digest,
         url=url,

@@ -1,14 +1,10 @@
 """From what was given and what was identified to the result that is printed, kept and shown."""
 
-import os
-import platform
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from importlib.metadata import version
 from math import exp, isfinite
 from typing import Literal
 
-from gateway.cli.demo_words import command_line, now_iso
 from gateway.cli.identify_result import (
     CombinationRow,
     ErrorsRow,
@@ -26,6 +22,7 @@ from gateway.cli.identify_result import (
     Told,
     ValidationRow,
 )
+from gateway.cli.origin import command_line, machine, now_iso, versions_of
 from gateway.core.line import Line
 from gateway.core.line_model import ChannelDelay
 from gateway.core.recording import Recording
@@ -65,9 +62,8 @@ def result_of(
     return IdentifyResult(
         command=command_line(),
         date=now_iso(),
-        versions={name: version(name) for name in LIBRARIES},
-        machine=f"{os.cpu_count()} processors, {platform.system()} {platform.release()}, "
-        f"Python {platform.python_version()}",
+        versions=versions_of(LIBRARIES),
+        machine=machine(),
         line=f"{data.line.site}/{data.line.line}",
         measured={name: IntervalRow(value=v, low=low, high=high) for name, (v, low, high) in measured.items()},
         recordings=[

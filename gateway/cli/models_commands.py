@@ -179,11 +179,9 @@ def report(
 
     Example: r2rgate models report --out models.html
     """
-    import platform
-    from importlib.metadata import version
 
-    from gateway.cli.demo_words import command_line, now_iso
     from gateway.cli.models_report import page_of
+    from gateway.cli.origin import command_line, machine, now_iso, versions_of
     from gateway.cli.report.page_render import render_page
 
     try:
@@ -195,9 +193,7 @@ def report(
             raise ModelsError(f"{place.path} has models of {named}: name the line with --line")
     except ModelsError as error:
         _refuse(error)
-    versions = {name: version(name) for name in LIBRARIES}
-    machine = f"{platform.system()} {platform.release()}, Python {platform.python_version()}"
-    page = page_of(*lines[0], entries, now_iso(), command_line(), versions, machine)
+    page = page_of(*lines[0], entries, now_iso(), command_line(), versions_of(LIBRARIES), machine())
     _write(out, render_page(page).encode())
     typer.echo(f"report: {out}, {len(entries)} version{'' if len(entries) == 1 else 's'}")
 

@@ -149,10 +149,7 @@ def _result(
     rounds: list["AdaptationResult"],
     wall_s: float,
 ) -> "RehearseResult":
-    import platform
-    from importlib.metadata import version
-
-    from gateway.cli.demo_words import command_line, now_iso
+    from gateway.cli.origin import command_line, machine, now_iso, versions_of
     from gateway.cli.rehearse_designs import without_term
     from gateway.cli.rehearse_result import Conditions, NamedFile, RehearseResult
 
@@ -160,8 +157,8 @@ def _result(
     return RehearseResult(
         command=command_line(),
         date=now_iso(),
-        machine=f"{platform.system()} {platform.release()}, {platform.machine()}, Python {platform.python_version()}",
-        versions={name: version(name) for name in LIBRARIES},
+        machine=machine(),
+        versions=versions_of(LIBRARIES),
         seed=seed,
         adaptations=adaptations,
         llm="off",

@@ -1,17 +1,14 @@
 """A line's report as a page: what became of how it is controlled, on which evidence, and whether the records hold."""
 
-import os
-import platform
 from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import datetime
-from importlib.metadata import version
 from pathlib import Path
 
 from gateway.cli.asked_result import asked_result, interactions_in
 from gateway.cli.demo_asked_page import asked_section
-from gateway.cli.demo_words import command_line, now_iso
 from gateway.cli.line_records import LineRecords, Recorded
+from gateway.cli.origin import command_line, machine, now_iso, versions_of
 from gateway.cli.report import Page, Section, Table
 from gateway.cli.report_adaptations import (
     adaptations_section,
@@ -89,8 +86,8 @@ def page_of(line: Line, folder: Path, since_s: float, records: LineRecords, tell
         origin=f"Line {line.site}/{line.line}",
         when=now_iso(),
         command=command_line(),
-        versions={name: version(name) for name in LIBRARIES},
-        machine=f"{platform.system()} {platform.release()}, {os.cpu_count() or 1} processors",
+        versions=versions_of(LIBRARIES),
+        machine=machine(),
         answer=tuple(_answer(told, chosen, cases, found)),
         sections=tuple(sections),
         notes=(
