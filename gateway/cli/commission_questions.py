@@ -29,12 +29,13 @@ _ASKED: dict[Step, tuple[Decision, str, str]] = {
     Step.FIRST: (
         "design.architecture",
         "which configuration, designed on the line's file, is proposed to begin with",
-        "those are quicker that come first; what comes later stands more that is not as the file says",
+        "of those that have not failed it is the quickest; what comes later stands more that is not as the file says",
     ),
     Step.EXPERIMENT: (
         "identify.experiment",
         "with which experiment the line is to be identified",
-        "the fastest and largest tells most; it is taken first, and a smaller or slower one where it is refused",
+        "of those that have not failed it is the fastest and largest, which tells most; a smaller or slower one "
+        "follows where it is refused",
     ),
     Step.MODEL: (
         "identify.data",
@@ -44,7 +45,8 @@ _ASKED: dict[Step, tuple[Decision, str, str]] = {
     Step.REDESIGN: (
         "adapt.change",
         "which configuration is proposed on the accepted model",
-        "the first has the least tracking error on the model of those that do no worse than what is in service",
+        "of those that have not failed it has the least tracking error on the model; all do no worse than what is in "
+        "service",
     ),
 }
 
@@ -108,8 +110,8 @@ def diagnosis_question(
             Option(id=Follows.LEAVE, title="nothing that could be gained is significant: it stays as it is"),
         ],
         usual=found.follows,
-        why="a gap of a tenth between measured and predicted error is the model's; without one it is the design's; "
-        "where the criteria are met and there is no gap, nothing is left to do",
+        why="a gap of a tenth, either way, between measured and predicted error is the model's; without one nothing is "
+        "left to do where the criteria are met, and a calmer design follows where they are not",
     )  # fmt: skip
 
 
