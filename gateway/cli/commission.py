@@ -22,7 +22,15 @@ from gateway.cli.commission_questions import (
 from gateway.cli.commission_result import Commissioned, candidate_name, commissioned
 from gateway.cli.commission_side import CannotGoOn, GateSide, measured_on, put, region_kept
 from gateway.commissioning.candidates import Exhausted, NotOffered, fastest_m_per_s
-from gateway.commissioning.chain import Look, Pending, next_step, refused_at_once, region_speed, still_due
+from gateway.commissioning.chain import (
+    Look,
+    Pending,
+    may_experiment,
+    next_step,
+    refused_at_once,
+    region_speed,
+    still_due,
+)
 from gateway.commissioning.convergence import Convergence, Diagnosis
 from gateway.commissioning.decisions import RULES, Decided, Decider, Rules
 from gateway.commissioning.ladder import MOST_OWN, OWN, Ended, Next
@@ -85,6 +93,10 @@ async def commission(
 
 class CannotBeJudged(Exception):
     """A measurement, and so whether the line does what it should."""
+
+
+class _MoreData(NotOffered):
+    """No model of the data that there are, from whichever recordings: another experiment comes first."""
 
 
 class _Chain:
@@ -163,8 +175,11 @@ class _Chain:
                 await self._require_faith(made.identified, now)
         except NotOffered as refused:
             self._tell(f"{step.step}, {candidate_name(rung)}: cannot be made: {refused}")
-            last = isinstance(refused, Exhausted)
-            failed = Past(KINDS[step.step], Outcome.FAILED, step.step, rung, str(refused), last=last)
+            more_data = isinstance(refused, _MoreData)
+            last = more_data or isinstance(refused, Exhausted)
+            failed = Past(
+                KINDS[step.step], Outcome.FAILED, step.step, 0 if more_data else rung, str(refused), last=last
+            )
             self._unmade.append((len(self._shown), failed))
             self._asked.clear()
             return
@@ -186,13 +201,13 @@ class _Chain:
         return decided, next(one.rung for one in offers if option_id(one.rung) == decided.choice.option)
 
     async def _require_faith(self, found: Identified, now: LineNow) -> None:
-        """Raises NotOffered where the model is not trusted enough to be proposed: once, then the gate judges it."""
-        if self._doubted:
+        """Raises _MoreData where the model is not trusted enough to be proposed: once, then the gate judges it."""
+        if self._doubted or not may_experiment(self.past):
             return
         decided = await self._decided(fidelity_question(self._line, found, now, self.past))
         if decided.choice.option == MORE_DATA:
             self._doubted = True
-            raise NotOffered(f"{decided.by} asks for more data first: {decided.choice.reason}"[:MOST_REASON])
+            raise _MoreData(f"{decided.by} asks for more data first: {decided.choice.reason}"[:MOST_REASON])
 
     async def _decided(self, question: Question) -> Decided:
         decided = await asyncio.to_thread(self._decider.decide, question)

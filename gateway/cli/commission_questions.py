@@ -29,12 +29,12 @@ _ASKED: dict[Step, tuple[Decision, str, str]] = {
     Step.FIRST: (
         "design.architecture",
         "which configuration, designed on the line's file, is proposed to begin with",
-        "of those that have not failed it is the quickest; what comes later stands more that is not as the file says",
+        "of those that are offered it is the quickest; what comes later stands more that is not as the file says",
     ),
     Step.EXPERIMENT: (
         "identify.experiment",
         "with which experiment the line is to be identified",
-        "of those that have not failed it is the fastest and largest, which tells most; a smaller or slower one "
+        "of those that are offered it is the fastest and largest, which tells most; a smaller or slower one "
         "follows where it is refused",
     ),
     Step.MODEL: (

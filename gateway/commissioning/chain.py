@@ -103,8 +103,7 @@ def _model(
     found = on_ladder(Step.MODEL, since)
     if isinstance(found, Next):
         return found
-    since_model = past[_last_done(past, "model") + 1 :]
-    number = sum(_is_done(one, "experiment") and one.step is not Step.MEASUREMENT for one in since_model)
+    number = _experiments_since_model(past)
     if number >= MOST_EXPERIMENTS:
         measured = any(one.step is Step.MEASUREMENT and _is_done(one, "experiment") for one in past)
         return Ended(measured, found.text)
@@ -130,6 +129,11 @@ def _measured(
     if isinstance(found, Ended):
         return Ended(True, f"{what}; {measured.why}; {found.text}", measured.converged)
     return found
+
+
+def may_experiment(past: Sequence[Past]) -> bool:
+    """Whether another experiment follows where there is no model from the data of the newest."""
+    return _experiments_since_model(past) < MOST_EXPERIMENTS
 
 
 def still_due(past: Sequence[Past], adaptations: int) -> bool:
@@ -159,6 +163,11 @@ def _is_done(one: Past, kind: str) -> bool:
 
 def _last_done(past: Sequence[Past], kind: str) -> int:
     return max((i for i, one in enumerate(past) if _is_done(one, kind)), default=-1)
+
+
+def _experiments_since_model(past: Sequence[Past]) -> int:
+    since_model = past[_last_done(past, "model") + 1 :]
+    return sum(_is_done(one, "experiment") and one.step is not Step.MEASUREMENT for one in since_model)
 
 
 def _known_by_measurement(past: Sequence[Past]) -> int:

@@ -25,8 +25,9 @@ def check_experiment(case: Case) -> list[RuleFinding]:
 
 def check_model(case: Case) -> list[RuleFinding]:
     """A model moves nothing, but a change under watch is watched by the model of before."""
-    state = case.context.state
-    return _told(["a change is on probation: wait until it is kept or rolled back"] if state.on_probation else [])
+    if case.context.state.on_probation:
+        return [told(RULE, False, "a change is on probation: wait until it is kept or rolled back")]
+    return [told(RULE, True, "no change is on probation")]
 
 
 def _doubtful(case: Case) -> Iterator[str]:
@@ -48,4 +49,6 @@ def _standing(case: Case) -> Iterator[str]:
 
 
 def _told(wrong: list[str]) -> list[RuleFinding]:
-    return [told(RULE, False, text) for text in wrong] or [told(RULE, True, "the line stands and is believed")]
+    return [told(RULE, False, text) for text in wrong] or [
+        told(RULE, True, "set-points and speed stand, and what is measured is believed")
+    ]

@@ -122,9 +122,12 @@ def test_state_of_the_line(of, context, redesigned):
         "state.tension_n has 1 entries; allowed: 6, one per span",
     ]
     assert line_state.check_gains(case_of(gains(redesigned, context), context, of)) == [
-        told("state of the line", True, "the line stands and is believed")
+        told("state of the line", True, "set-points and speed stand, and what is measured is believed")
     ]
     assert found(line_state.check_model, on_probation=True) == [probation]
+    assert line_state.check_model(case_of(gains(redesigned, context), context, of)) == [
+        told("state of the line", True, "no change is on probation")
+    ]
 
 
 def test_set_points_of_another_number_than_spans_are_no_place_to_judge_from(of, context, redesigned):

@@ -110,8 +110,8 @@ def test_the_log_keeps_each_once_and_finds_it_by_number_and_id(tmp_path: Path) -
     log = Interactions(tmp_path)
     with pytest.raises(InteractionsError, match="no agent has been asked"):
         log.newest(5)
-    _, one = virtually(asked(persona="perfect"))
-    other = one.model_copy(update={"id": "b" * 16, "agent": "sysid"})
+    _, drawn = virtually(asked(persona="perfect"))
+    one, other = drawn.model_copy(update={"id": "a" * 16}), drawn.model_copy(update={"id": "b" * 16, "agent": "sysid"})
     assert [log.keep(pack(each), each) for each in (one, other, one)] == [1, 2, 1]
     assert [row.number for row in log.newest(5)] == [2, 1] and [row.agent for row in log.newest(5, "sysid")] == [
         "sysid"

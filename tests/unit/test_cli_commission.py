@@ -7,11 +7,14 @@ from datetime import UTC, datetime
 import pytest
 
 from gateway.cli.commission import commission
-from gateway.cli.commission_changes import LineNow
+from gateway.cli.commission_changes import Changes, LineNow, Made, Offer
 from gateway.cli.commission_history import approvals, history
 from gateway.cli.commission_live import LiveGate
 from gateway.cli.commission_measurements import SCENARIO, keep, kept
+from gateway.cli.commission_questions import MORE_DATA, PROPOSE
 from gateway.cli.commission_side import CannotGoOn
+from gateway.commissioning.candidates import NotOffered
+from gateway.commissioning.chain import MOST_EXPERIMENTS
 from gateway.commissioning.convergence import Convergence, Diagnosis, SpanFigures
 from gateway.commissioning.decisions import Decided, Rules
 from gateway.commissioning.ladder import LADDERS, MOST_OWN, OWN
@@ -22,7 +25,7 @@ from gateway.core.controller import config_hash
 from gateway.core.decisions import QUERY, ListProposals, ProposalLine, ProposalList, ProposalShown
 from gateway.core.messages import Event, Reply
 from gateway.core.proposal import parse_proposal, proposal_hash
-from gateway.core.questions import Choice, Question, wrong_with
+from gateway.core.questions import Choice, Option, Question, wrong_with
 from gateway.core.topics import GATEWAY_PROPOSALS, GATEWAY_PROPOSE, LOOP_EVENT, LOOP_TELEMETRY
 from gateway.core.verdict import RuleFinding, Verdict
 from gateway.mailbox.inprocess import Hub, InProcessMailbox
@@ -191,6 +194,52 @@ def test_no_words_of_an_agent_end_the_phase_however_long_they_are_once_printed(t
     found = asyncio.run(commission(LINE, gateway.side, gateway.told.append, decider=Breathless()))
     assert len(found.tried) == MOST_OWN + LADDERS[Step.FIRST]
     assert all(len(one.proposal.reason) <= 4000 for one in gateway.shown.values())
+
+
+def test_an_agent_that_asks_for_more_data_has_them_before_any_model_is_proposed_and_is_asked_once(
+    tmp_path, monkeypatch
+):
+    class Modelled(Changes):
+        made: list[int] = []  #: rungs
+
+        def _models(self, step, now, recordings):
+            def make(_):
+                self.made.append(step.rung)
+                if len(self.made) > 1:
+                    raise NotOffered("these data give no model")
+                return Made(None, "from these data", identified=object())
+
+            return [Offer(step.rung, "a model", make)]
+
+    class Doubtful(Rules):
+        asked: list[str] = []
+
+        def decide(self, question):
+            self.asked.append(question.decision)
+            if question.decision != "identify.fidelity":
+                return super().decide(question)
+            return Decided(Choice(option=MORE_DATA, reason="too few"), "sysid")
+
+    async def recordings():
+        return [None, None]
+
+    def question(line, found, now, past):
+        options = [Option(id=PROPOSE, title="propose"), Option(id=MORE_DATA, title="more data")]
+        return Question(
+            format=1, site=line.site, line=line.line, decision="identify.fidelity", task="whether", options=options,
+            usual=PROPOSE, why="the gate judges",
+        )  # fmt: skip
+
+    monkeypatch.setattr("gateway.cli.commission.Changes", Modelled)
+    monkeypatch.setattr("gateway.cli.commission.fidelity_question", question)
+    gateway = OneProcess(tmp_path, stage="kept")
+    gateway.side.recordings = recordings
+    found = asyncio.run(commission(LINE, gateway.side, gateway.told.append, decider=Doubtful()))
+    assert not found.reached
+    kinds = [one.proposal.kind for one in gateway.shown.values()]
+    assert kinds == ["gains", *["experiment"] * MOST_EXPERIMENTS]
+    assert Doubtful.asked.count("identify.fidelity") == 1
+    assert Modelled.made == [0, *[0, 1] * (MOST_EXPERIMENTS - 1)]  # not once more from all recordings
 
 
 def test_where_an_agent_does_not_answer_the_rules_decide_and_it_is_told(tmp_path):

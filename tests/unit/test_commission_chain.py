@@ -24,6 +24,7 @@ from gateway.commissioning.chain import (
     STRETCH,
     Look,
     Pending,
+    may_experiment,
     next_step,
     refused_at_once,
 )
@@ -136,6 +137,18 @@ def test_data_that_give_no_model_are_followed_by_a_larger_experiment_a_few_times
         sizes += [] if failed else [(step.size, step.number)]
         past.append(after(step, past, Outcome.FAILED if failed else Outcome.DONE))
     assert sizes == [(1.0, 0), (1.0, 1), (2.0, 2)] and len(sizes) == MOST_EXPERIMENTS and not step.reached
+
+
+def test_where_more_data_are_asked_for_an_experiment_follows_at_once_as_long_as_there_may_be_one():
+    past = [Past("gains", Outcome.DONE, Step.FIRST, 0, speed_m_per_s=0.02)]
+    for _ in range(MOST_EXPERIMENTS):
+        assert may_experiment(past)
+        step = asked(past)
+        assert isinstance(step, Next) and step.step is Step.EXPERIMENT
+        past.append(after(step, past))
+        assert asked(past).step is Step.MODEL
+        past.append(Past("model", Outcome.FAILED, Step.MODEL, 0, "more data first", last=True))
+    assert not may_experiment(past) and isinstance(asked(past), Ended)
 
 
 def test_a_measurement_is_no_experiment_that_gave_no_model():

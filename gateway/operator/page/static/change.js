@@ -5,7 +5,7 @@ import { drawCourses } from "./courses.js";
 import { confirmed } from "./dialog.js";
 import { beforeAfter, margins } from "./figures.js";
 import { Refused, ask } from "./net.js";
-import { translated } from "./sentences.js";
+import { translated, translatedWhy } from "./sentences.js";
 import { duration, figure, instant, named, word } from "./words.js";
 
 export class Change {
@@ -85,7 +85,7 @@ export class Change {
     const quoted = h("figure", { class: "quote" }, english("blockquote", shown.reason), h("figcaption", {}, word("change.said-by", { author: shown.author, when: instant(shown.created) })));
     return h("section", { class: "panel" },
       h("h2", {}, word(`kind.${shown.kind}`), " ", h("code", {}, shown.proposal_hash.slice(0, 12))),
-      h("p", {}, word(`stage.${shown.stage}`), shown.why && [": ", translated("span", shown.why)]),
+      h("p", {}, word(`stage.${shown.stage}`), shown.why && [": ", translatedWhy("span", shown)]),
       shown.shown && twoPeople(shown) && h("p", {}, h("b", {}, twoPeople(shown))),
       shown.difference.length > 0 && [h("h3", {}, word("change.difference")), h("ul", {}, shown.difference.map((line) => translated("li", line)))],
       h("h3", {}, word("change.reason")), quoted,

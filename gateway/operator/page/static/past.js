@@ -1,6 +1,6 @@
 // What has been proposed and what became of it, and what the audit tells.
 import { $, coded, h, replaced } from "./dom.js";
-import { translated } from "./sentences.js";
+import { translatedWhy } from "./sentences.js";
 import { instant, time, word } from "./words.js";
 
 // Each part by itself: a new record leaves what has the focus among the proposals alone.
@@ -18,7 +18,7 @@ function proposals(list) {
       h("thead", {}, h("tr", {}, names.map((name) => h("th", { scope: "col" }, word(`history.${name}`))))),
       h("tbody", {}, list.proposals.map((one) => h("tr", {},
         h("td", {}, instant(one.created)), h("td", {}, word(`kind.${one.kind}`)), h("td", {}, one.author), h("td", {}, word(`stage.${one.stage}`)),
-        translated("td", one.why), h("td", {}, one.epoch ?? "–"),
+        translatedWhy("td", one), h("td", {}, one.epoch ?? "–"),
         h("td", {}, h("a", { class: "button", href: `#change/${one.proposal}`, "data-focus": `open-${one.proposal}`, "aria-label": `${word("history.open")} ${one.proposal.slice(0, 12)}` }, word("history.open"))))))))];
 }
 

@@ -1,7 +1,6 @@
 // Ten minutes of tensions and of the line's speed, with marks where the controller became another one.
-import { $, h, replaced } from "./dom.js";
+import { $, english, h, replaced } from "./dom.js";
 import { Refused, ask } from "./net.js";
-import { translated } from "./sentences.js";
 import { number, time, word } from "./words.js";
 
 const LONG_S = 600, EVERY_MS = 500, MARKS = { deployed: "D", "rolled-back": "R" };
@@ -40,7 +39,7 @@ export class Trends {
   told(records) {
     this.marks = records.filter((record) => MARKS[record.kind]).slice(-20);
     replaced($("markers"), JSON.stringify([this.marks, document.documentElement.lang]), () =>
-      this.marks.slice(-3).reverse().map((mark) => h("li", {}, h("b", {}, MARKS[mark.kind]), ` ${time(mark.wall_s, true)} `, translated("span", mark.text))));
+      this.marks.slice(-3).reverse().map((mark) => h("li", {}, h("b", {}, MARKS[mark.kind]), ` ${time(mark.wall_s, true)} `, english("span", mark.text))));
     this.draw();
   }
 
