@@ -80,6 +80,9 @@ def test_what_neither_a_posterior_nor_an_interval_above_0_tells_of_is_named() ->
         "the model has neither a posterior nor an interval of radius_m: nobody knows how wrong it may be; "
         "identify again"
     )
+    assert "interval of stiffness_n, length_m, inertia_kg_m2, friction_nms_per_rad:" in said(
+        with_intervals(**{f"radius_m[{i}]": 0.1 for i in range(1, 7)})
+    )
     down_to_0 = with_intervals(**known, radius_m=0.1)
     down_to_0.intervals["length_m"] = ModelInterval(value=1.0, low=0.0, high=2.0)
     down_to_0.intervals["radius_m"] = ModelInterval(value=1.0, low=0.0, high=2.0)

@@ -123,6 +123,12 @@ def handmade(of, judged, monkeypatch):
     return drawn
 
 
+def test_of_three_samples_two_are_drawn_each_where_a_sample_is(handmade):
+    setpoint_n = np.full((MOST_POINTS + 6, 2), 20.0)
+    found, _ = handmade(setpoint_n, lambda config: setpoint_n, period_s=0.01)
+    assert [round(100.0 * time_s, 6) for time_s in found.time_s[:6]] == [0.0, 1.0, 3.0, 4.0, 6.0, 7.0]
+
+
 def test_it_is_told_to_a_millinewton_and_to_a_tenth_of_a_millisecond(handmade, judged):
     setpoint_n = np.array([[20.12349, 30.0], [20.5, 30.00051], [21.0, 30.0]])
     off_n = np.array([[0.0, 0.0], [0.00049, -1.00051], [math.nan, math.inf]])

@@ -8,7 +8,7 @@ import pytest
 
 from gateway.core.recording import Recording
 from gateway.core.theta import Noise
-from safety.excitation import MOVING, excited_parts, recent
+from safety.excitation import MOVING, SAME_M_PER_S, excited_parts, recent
 
 MOVED_N = 0.25  #: of the hand-made tensions; a power of two, so that their standard deviation is this very number
 
@@ -65,3 +65,16 @@ def test_where_a_period_lasts_a_tenth_of_a_second_each_sample_is_a_speed():
 
 def test_a_speed_that_was_held_for_one_sample_takes_no_other_with_it():
     assert lengths_of(recorded([0.05, *[0.06] * 39], period_s=0.1)) == [39]
+
+
+def test_a_level_that_lasts_long_is_several_parts_wherever_it_begins():
+    """15 s are two of 7.5 s, and the 10 s after them one; the latest first."""
+    assert lengths_of(recorded([0.05] * 1500 + [0.1] * 1000)) == [1000, 750, 750]
+
+
+def test_a_part_may_be_as_short_as_is_asked():
+    assert lengths_of(recorded([0.05] * 200)) == [200] and lengths_of(recorded([0.05] * 199)) == []
+
+
+def test_a_speed_may_be_as_far_away_as_is_allowed():
+    assert lengths_of(recorded([0.0] * 200 + [SAME_M_PER_S] * 200)) == [400]

@@ -112,10 +112,16 @@ def test_state_of_the_line(of, context, redesigned):
     assert found(line_state.check_gains, state="STOP") == [stopped]
     assert "the line is in HOLD; allowed: RUN" in found(line_state.check_experiment, state="HOLD")[0]
     assert found(line_state.check_experiment) == [] == found(line_state.check_model, state="STOP", moving=True)
-    everything = {"moving": True, "experiment": True, "on_probation": True, "doubts": ["cell 3"], "tension_n": [30.0]}
+    everything = {
+        "moving": True,
+        "experiment": True,
+        "on_probation": True,
+        "doubts": ["cell 3", "cell 4"],
+        "tension_n": [30.0],
+    }
     probation = "a change is on probation: wait until it is kept or rolled back"
     assert found(line_state.check_gains, **everything) == [
-        "what is measured is in doubt: cell 3",
+        "what is measured is in doubt: cell 3; cell 4",
         probation,
         "an experiment is under way: wait for its end",
         "set-points or speed are on their way: wait until they stand",

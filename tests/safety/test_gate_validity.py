@@ -183,8 +183,37 @@ def test_alignment_tells_of_the_channel_that_is_late_at_the_least_by_most(of, ca
         "interval goes; 9 of 18 channels tell"
     )
     assert found(late_s, spread_s) == [at_most("proposed", 3e-3 - 1.96 * 2e-4, 2e-3, "s", text)]
+    # 60 s late says itself to the tenth of a millisecond, and what is known as well as it must be is known.
+    (told_late,) = found([60.0, *[0.0] * 9], [1e-4, *[2e-3 / 1.96] * 9])
+    assert told_late.text.startswith("tension 1 tells +60000.0 ms late, within 0.2 ms;")
+    assert told_late.text.endswith("10 of 18 channels tell")
+    (told_late,) = found([60.0, *[0.0] * 9], [1.0, *[1e-4] * 9])
+    assert told_late.text.endswith("9 of 18 channels tell")
     text = "the data do not tell whether channels are aligned: a longer or larger experiment"
     assert found(late_s, [2e-3] * 10) == [told("proposed", False, text)]
+
+
+def test_alignment_looks_at_the_newest_data_only(of, case, monkeypatch):
+    asked: list[float] = []
+    kept = alignment.foretold_of
+
+    def foretold_of(of_case, model, noise, most_s):
+        asked.append(most_s)
+        return kept(of_case, model, noise, most_s)
+
+    monkeypatch.setattr(alignment, "foretold_of", foretold_of)
+    alignment.of_model(case, of.model)
+    assert asked == [alignment.MOST_S]
+
+
+@pytest.mark.parametrize(("latency_s", "same"), [(0.004, True), (0.01, False), (0.02, False)])
+def test_a_torque_that_acts_within_a_period_is_held_against_the_slope_before_it_alone(of, case, latency_s, same):
+    theta = replace(theta_of(of.model), latency_s=latency_s)
+    (predicted, *_) = (one.predicted for one in alignment.foretold_of(case, of.model, Noise(), alignment.MOST_S))
+    (before, after), _ = alignment.sensitivities(theta, predicted)
+    torques = slice(-predicted.stretch.n, None)
+    assert np.array_equal(before[: torques.start], after[: torques.start])
+    assert np.array_equal(before[torques], after[torques]) == same
 
 
 def test_lateness_is_that_of_least_squares_over_all_parts(case, monkeypatch):
