@@ -43,7 +43,7 @@ coverage: setup ## every line and branch of safety/, run by its own tests (about
 	@$(PY) -m coverage run -m pytest tests/safety tests/unit/test_monitor.py tests/unit/test_recoverability.py
 	@$(PY) -m coverage report
 
-mutate: setup ## changes of safety/ that no test of it notices (hours; goes on where it was interrupted; ARGS="safety.envelope.*")
+mutate: setup ## changes of safety/ that no test of it notices (half an hour; goes on where it was interrupted; ARGS="safety.envelope.*")
 	@$(PY) -m tests.mutation.mutate $(ARGS)
 
 check: setup ## lint, types, import contracts

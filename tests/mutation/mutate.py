@@ -5,8 +5,8 @@ come by there, the quickest first; what the type checker refuses is noticed too,
 notices survives: it is killed by a test, or stands in tests/mutation/survivors.toml with the reason why it may live.
 Anything else is printed, and the command fails.
 
-Takes hours; what is known is kept in mutants/ and not asked again until the function has changed. What has survived
-without a reason is asked again each time, for there may be a test of it by now.
+Takes half an hour on two cores; what is known is kept in mutants/ and not asked again until the function has changed.
+What has survived without a reason is asked again each time, for there may be a test of it by now.
     make mutate ARGS="safety.envelope.*"      only these
     make mutate ARGS=--known                  runs nothing: what is known
 """

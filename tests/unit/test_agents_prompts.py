@@ -1,10 +1,11 @@
-"""The prompts of the agents name the questions that each is asked, and the options that are always there."""
+"""The prompts of the agents name the questions that each is asked, and the options by their names."""
 
 import pytest
 
 from agents.monitoring.diagnosis import NONE_OF_THEM
 from agents.roles import ROLES
 from gateway.cli.commission_questions import LEAST, LEAST_SIZE, MORE_DATA, MOST, MOST_SIZE, PROPOSE, option_id
+from gateway.commissioning import design_questions, tuning_question
 from gateway.commissioning.design_questions import FIRST, LINEARISED, NONLINEAR, PRIORITIES
 from gateway.commissioning.past import Follows
 from gateway.commissioning.tuning_question import NEXT, STOP
@@ -37,4 +38,9 @@ def test_each_agent_is_told_its_options_by_the_names_that_it_has_to_give(agent, 
 def test_the_ranges_of_knobs_are_those_that_hold():
     assert f"{LEAST:g} to {MOST:g}" in ROLES["adaptation"].own_words
     assert f"{LEAST_SIZE:g} to {MOST_SIZE:g}" in ROLES["sysid"].own_words
-    assert f"{LEAST:g} to {MOST:g}" in ROLES["initial-control"].own_words
+    design = ROLES["initial-control"].own_words
+    assert design.count(f"{LEAST:g} to {MOST:g}") == 2 and (LEAST, MOST) == (
+        tuning_question.LEAST,
+        tuning_question.MOST,
+    )
+    assert f"{design_questions.LEAST:g} to {design_questions.MOST:g}" in design
