@@ -171,10 +171,10 @@ def test_alignment_at_its_limit_and_data_that_do_not_tell(of, context, case, red
 
 
 def test_alignment_tells_of_the_channel_that_is_late_at_the_least_by_most(of, case, monkeypatch):
-    def found(late_s, spread_s):
+    def found(late_s, spread_s, of_case=case):
         figures = (np.array(late_s + [0.0] * 8), np.array(spread_s + [1.0] * 8))
         monkeypatch.setattr(alignment, "lateness", lambda *_: figures)
-        return alignment.of_model(case, of.model, "proposed")
+        return alignment.of_model(of_case, of.model, "proposed")
 
     # The first is late by more, and nobody knows it as well; the last is not known at all.
     late_s, spread_s = [4e-3, -3e-3, *[1e-4] * 7, 9e-3], [1e-3, 2e-4, *[1e-4] * 7, 2e-3]
@@ -189,6 +189,12 @@ def test_alignment_tells_of_the_channel_that_is_late_at_the_least_by_most(of, ca
     assert told_late.text.endswith("10 of 18 channels tell")
     (told_late,) = found([60.0, *[0.0] * 9], [1.0, *[1e-4] * 9])
     assert told_late.text.endswith("9 of 18 channels tell")
+    gate = case.line.gate.model_copy(update={"alignment_max_s": 1.0})
+    wide = replace(case, line=case.line.model_copy(update={"gate": gate}))
+    (told_late,) = found([60.0, *[0.0] * 9], [0.5, *[1e-4] * 9], wide)
+    assert told_late.text.startswith(
+        "tension 1 tells +60000.0 ms late, within 980.0 ms; allowed: gate.alignment_max_s, 1000 ms"
+    )
     text = "the data do not tell whether channels are aligned: a longer or larger experiment"
     assert found(late_s, [2e-3] * 10) == [told("proposed", False, text)]
 
