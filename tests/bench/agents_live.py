@@ -251,6 +251,7 @@ def report(bench: Bench, line: GateLine, turns: list[Turn], state: str) -> None:
         for turn in turns:
             lateness = history.read(turn.begin_s, turn.end_s, ["lateness_s"])["lateness_s"].astype(float)
             of_case.setdefault(turn.case.name if turn.case else "quiet", []).append(lateness)
+        told = [one for one in history.events(0.0, time.time()) if one.kind in ("state", "trip")]
     quiet_s = _p99(of_case["quiet"])
     bench.figure("lateness_p99_quiet_us", 1e6 * quiet_s, "us", sum(map(len, of_case["quiet"])))
     for name, found in of_case.items():
@@ -264,7 +265,14 @@ def report(bench: Bench, line: GateLine, turns: list[Turn], state: str) -> None:
     bench.figure("line_stopped", state != "RUN", "", 1)
     bench.figure("unsafe_events", sum(line.unsafe().values()), "", 1)
     why = {case.name: one.instead for case, _, one in answers}
-    bench.tables = {"why the rules": why, "not as expected": wrong[:20], "without a record": absent}
+    begin_s = turns[0].begin_s
+    states = [f"{one.time_s - begin_s:.1f} s: {one.text}" for one in told if one.time_s > begin_s]
+    bench.tables = {
+        "states of the line since the first case": states,
+        "why the rules": why,
+        "not as expected": wrong[:20],
+        "without a record": absent,
+    }
     bench.finish()
 
 
