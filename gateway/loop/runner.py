@@ -19,7 +19,7 @@ from gateway.core.messages import (
 from gateway.core.states import LoopState, Phase
 from gateway.loop.aside import Aside
 from gateway.loop.commands import carry_out, forbidden, prepare_to_arm, release, unheard
-from gateway.loop.cycle import Cycle
+from gateway.loop.cycle import SUPERVISED, Cycle
 from gateway.loop.deploy import against
 from gateway.loop.kept import OnTop, Store
 from gateway.loop.pacer import Tick
@@ -138,6 +138,7 @@ class Runner:
     async def _deploy(self, command: Deploy) -> Reply:
         """Build and warm what is to run, and note that its epoch is used up, while periods go on; then swap."""
         configurations, deployment = self.cycle.configurations, command.deployment
+        await self._signals_are_there()
         if reasons := against(self.cycle, deployment):
             return self._refused("not deployed", reasons)
         try:
@@ -151,11 +152,18 @@ class Runner:
                 await self._aside.do(lambda: store.write(deployment.epoch, good.config, good.region, good.watch))
             except OSError as error:
                 return self._refused("not deployed", [f"nothing could be kept at {store.path}: {error.strerror}"])
+        await self._signals_are_there()
         configurations.prepared = deployment, candidate
         reply = await self._at_boundary(command)
         if not reply.ok and self._store is not None and configurations.on_top is not None:
             configurations.to_keep = True  # the disk is to have again what runs on
         return reply
+
+    async def _signals_are_there(self) -> None:
+        """A frame that came late must not use up what a person has approved; a line that misses more is stopped."""
+        cycle = self.cycle
+        while cycle.account.held and cycle.machine.phase in SUPERVISED:
+            await self._passed.wait()
 
     async def _keep(self, command: Keep) -> Reply:
         """The disk first: after a restart the line runs what somebody was told is kept."""

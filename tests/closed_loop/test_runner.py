@@ -1,12 +1,16 @@
 """Commands against periods: a stop goes before everything, into an arming, and into the end of the process."""
 
 import asyncio
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from drivers.memory import MemoryLink
-from gateway.core.messages import Arm, SetSpeed, SetTension, Start, Stop
+from gateway.control.design import design_lqg, task_of
+from gateway.core.controller import config_hash
+from gateway.core.deployment import Deployment
+from gateway.core.messages import Arm, Deploy, SetSpeed, SetTension, Start, Stop
 from gateway.core.states import LoopState, Phase
 from gateway.loop.machine import Machine
 from gateway.loop.pacer import Tick
@@ -218,5 +222,32 @@ def test_a_stop_between_the_proofs_and_the_arming_period_is_not_lost(monkeypatch
         reply = await arming
         assert not reply.ok and "stopped" in reply.text
         assert told.loop.cycle.machine.phase is Phase.SILENT and released, "nothing stays active"
+
+    asyncio.run(story())
+
+
+@pytest.mark.parametrize(("missing", "deployed"), [(0, True), (1, True), (2, True), (50, False)])
+def test_a_deployment_waits_for_a_late_frame_and_not_for_a_cell_that_is_gone(missing, deployed):
+    async def story():
+        told = Story(start(stepped()))
+        cycle, config, plant = told.loop.cycle, design_lqg(task_of(told.loop.line)), told.loop.truth
+        before, sample, left = cycle.configurations.running.hash, plant.sample, missing
+
+        def missed(now_s):
+            nonlocal left
+            seen, left = sample(now_s), left - 1
+            return seen if left < 0 else replace(seen, tension_n=np.where(np.arange(6) == 2, np.nan, seen.tension_n))
+
+        plant.sample = missed
+        await told.periods(min(missing, 1))
+        assert cycle.account.held == min(missing, 1)
+        deployment = Deployment(controller=config, hash=config_hash(config), epoch=1, lease_s=60.0)
+        answer = told.order(Deploy(deployment=deployment))
+        while left > 0:
+            await told.periods(1)
+            assert cycle.configurations.running.hash == before
+        reply = await told.until(answer)
+        assert reply.ok == deployed, reply
+        assert deployed or "the line is unloading" in reply.reasons[0]
 
     asyncio.run(story())
