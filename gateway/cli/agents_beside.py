@@ -4,9 +4,9 @@ import asyncio
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from threading import Thread
 
 from gateway.cli.asked_agents import AskedAgents
+from gateway.cli.background import in_background
 from gateway.commissioning.decisions import AGENTS
 from gateway.core.line import Line
 from gateway.mailbox.bus import BusUnavailable, connect
@@ -24,8 +24,7 @@ def agents_beside(line: Line, run_dir: Path | None) -> Iterator[AskedAgents]:
     if AGENTS not in line.gate.authors:
         raise CannotBeAsked(f'gate.authors is {", ".join(line.gate.authors) or "empty"}; "agents" decide here: add it')
     loop = asyncio.new_event_loop()
-    thread = Thread(target=loop.run_forever, daemon=True)
-    thread.start()
+    thread = in_background(loop.run_forever)
     try:
         folder = run_dir or default_run_folder(line)
         bus = asyncio.run_coroutine_threadsafe(connect(folder, line.site, line.line), loop).result()

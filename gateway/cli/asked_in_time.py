@@ -1,8 +1,9 @@
 """A decider that always answers, in time, and with what answers the question, whoever is behind it."""
 
 from queue import Empty, SimpleQueue
-from threading import Lock, Thread
+from threading import Lock
 
+from gateway.cli.background import in_background
 from gateway.commissioning.decisions import RULES, Decided, Decider
 from gateway.core.questions import Question, usual_choice, wrong_with
 
@@ -25,7 +26,7 @@ class InTime:
             if self._late:
                 return _rules(question, "there was no answer in time to a question before")
             box: SimpleQueue[Decided] = SimpleQueue()
-            Thread(target=lambda: box.put(_asked(self._decider, question)), daemon=True).start()
+            in_background(lambda: box.put(_asked(self._decider, question)))
             try:
                 return box.get(timeout=self._within_s)
             except Empty:

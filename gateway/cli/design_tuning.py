@@ -15,6 +15,7 @@ from typing import TypeVar
 
 import numpy as np
 
+from gateway.cli.background import in_background
 from gateway.cli.timed_law import TimedLaw
 from gateway.cli.workers import Workers, processors
 from gateway.commissioning.architectures import ARCHITECTURES, Architecture
@@ -119,9 +120,7 @@ def _listening(wire: "SimpleQueue[T | None]", heard: Callable[[T], None]) -> Thr
         while (found := wire.get()) is not None:
             heard(found)
 
-    thread = Thread(target=listen, daemon=True)
-    thread.start()
-    return thread
+    return in_background(listen)
 
 
 def _begin_worker(wires: _Wires) -> None:

@@ -8,11 +8,11 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
-from threading import Thread
 from typing import Any
 
 from agents.rag.library import open_library
 from gateway.cli.agents_here import AgentsHere
+from gateway.cli.background import in_background
 from gateway.cli.eval_baselines import Searching
 from gateway.cli.eval_result import Policy, TaskResult, Trial
 from gateway.cli.eval_run import Carrying, Decides, TrialFailed, failed_trial, told
@@ -144,8 +144,7 @@ def _told(tell: Tell) -> Iterator[Any]:
         while (text := queue.get()) is not None:
             tell(text)
 
-    thread = Thread(target=pass_on, daemon=True)
-    thread.start()
+    thread = in_background(pass_on)
     yield queue  # interrupted, it is left as it is: who was ended in the middle of a word has the lock for good
     queue.put(None)
     thread.join()

@@ -8,9 +8,11 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from queue import SimpleQueue
 
 import pytest
 
+from gateway.cli.background import in_background
 from gateway.core.line_template import line_template
 
 PATIENCE_S = 30.0  #: for what takes a tenth of a second; what it ends would take minutes
@@ -95,3 +97,10 @@ def test_an_interrupted_design_says_what_is_kept(send: Callable[[int, int], None
     assert last == f"interrupted: {out} and its record are as before"
     assert all(ATTEMPT.match(one) for one in attempts)
     assert out.read_text() == "as before" and set(tmp_path.iterdir()) == {line, out}
+
+
+def test_a_thread_in_the_background_leaves_ctrl_c_to_the_main_one() -> None:
+    found: SimpleQueue[set[int]] = SimpleQueue()
+    in_background(lambda: found.put(signal.pthread_sigmask(signal.SIG_BLOCK, ()))).join(PATIENCE_S)
+    assert signal.SIGINT in found.get(timeout=PATIENCE_S)
+    assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, ())

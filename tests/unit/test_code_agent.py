@@ -305,7 +305,7 @@ def test_a_computation_may_take_half_of_the_time_that_is_left_and_no_more() -> N
 
 
 def test_where_computations_do_not_fit_into_the_context_it_answers_without_them() -> None:
-    narrow = {"context_tokens": 3600, "answer_tokens": 512}
+    narrow = {"context_tokens": 4500, "answer_tokens": 512}
     answer, kept, of_code, _ = virtually(asked(PERSONAS["perfect"], **narrow))
     assert (answer.choice.option, answer.by) == ("mpc", "adaptation") and not of_code
     assert purposes(kept) == ["reason", "compute", "answer"] and kept.exchanges[1]["failure"] == "too-long"
@@ -318,7 +318,7 @@ def test_where_the_results_do_not_fit_it_answers_without_them() -> None:
 
     async def story() -> tuple[Answer, Interaction]:
         kept = Kept()
-        settings = SETTINGS.model_copy(update={"context_tokens": 5200, "answer_tokens": 512})
+        settings = SETTINGS.model_copy(update={"context_tokens": 5600, "answer_tokens": 512})
         clock = asyncio.get_running_loop().time
         async with LanguageModel(settings, clock, InProcess(Engine(PERSONAS["perfect"]))) as model:
             agent = Agent(
