@@ -58,12 +58,14 @@ async def commission(
     adaptations: int = 1,
     most_redesigns: int | None = None,
     decider: Decider = RULES_DECIDE,
+    last_word: bool = True,
 ) -> Commissioned:
     """Until the chain has ended, one way or the other. Every rung is tried once, so that it does.
 
     `wanted_m_per_s`: up to which the line is to be adapted; None: as fast as its drives hold.
     `adaptations`: redesigns at least; `most_redesigns`: it is left there once so many have been kept.
-    `decider`: who chooses among the candidates.
+    `decider`: who chooses among the candidates. `last_word`: the rules propose theirs in the end, where agents have
+    chosen what is in service and the rules' own design promises significantly more.
     """
     if why := refused_at_once(line):
         return Commissioned(False, why, [], None)
@@ -71,10 +73,7 @@ async def commission(
     while True:
         try:
             await chain.read()
-            kept_now = sum(one.step is Step.REDESIGN and one.outcome is Outcome.DONE for one in chain.past)
-            if most_redesigns is not None and kept_now >= most_redesigns:
-                return chain.ended(Ended(True, f"{kept_now} redesigns are kept"))
-            step = await chain.next()
+            step = await chain.next(most_redesigns, last_word)
             if isinstance(step, Ended):
                 return chain.ended(step)
             if isinstance(step, Pending):
@@ -124,11 +123,12 @@ class _Chain:
         self._shown, self._measured = await self._side.proposals(), await measured_on(self._line, self._side)
         self.past = _merged(self._shown, self._unmade, self._measured)
 
-    async def next(self) -> Next | Pending | Look | Ended:
+    async def next(self, most_redesigns: int | None, last_word: bool) -> Next | Pending | Look | Ended:
         now = await self._side.now()
         fastest = fastest_m_per_s(self._line, now.model)
         wanted = fastest if self._wanted_m_per_s is None else min(self._wanted_m_per_s, fastest)
-        return next_step(self.past, first_speed_m_per_s(self._line), wanted, self._adaptations)
+        first = first_speed_m_per_s(self._line)
+        return next_step(self.past, first, wanted, self._adaptations, most_redesigns, last_word)
 
     def ended(self, how: Ended) -> Commissioned:
         return commissioned(how, self.past, self._shown, self._measured)

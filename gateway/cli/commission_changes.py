@@ -16,8 +16,8 @@ from gateway.cli.identify_model import model_of_found
 from gateway.commissioning.architectures import ARCHITECTURES
 from gateway.commissioning.candidates import FIRST_LAWS, Exhausted, Law, NotOffered, at_end, configuration, experiment
 from gateway.commissioning.chain import first_legs
-from gateway.commissioning.convergence import Convergence, convergence, measurement
-from gateway.commissioning.ladder import AS_IT_IS, Next
+from gateway.commissioning.convergence import SIGNIFICANT, Convergence, convergence, measurement
+from gateway.commissioning.ladder import AS_IT_IS, BY_RULES, Next
 from gateway.commissioning.past import Step
 from gateway.commissioning.redesign import Offer as Redesign
 from gateway.commissioning.redesign import redesigns
@@ -193,6 +193,8 @@ class Changes:
         """On the accepted model; in the end the configuration in service, for what data have shown since."""
         assert now.model is not None  # a redesign follows a model
         on = f"on model {model_hash(now.model)[:12]}, whose data go up to {now.model.region.speed_to_m_per_s:.3g} m/s"
+        if step.rung >= BY_RULES:
+            return [self._better(step.rung, now, region, on)]
         as_it_is = Made(GainsChange(controller=now.in_service), f"the configuration in service, {on}")
         rungs = [one.rung for one in (step, *step.others)]
         designed = [] if rungs == [AS_IT_IS] else self._designs(now, region)
@@ -205,6 +207,16 @@ class Changes:
             elif rung == step.rung:
                 raise Exhausted(_nothing_left(len(designed)))
         return offers
+
+    def _better(self, rung: int, now: LineNow, region: Region | None, on: str) -> Offer:
+        """Than what agents have put into service: significantly, on the same model, by the rules' own design."""
+        better = [one for one in self._designs(now, region) if one.share <= 1.0 - SIGNIFICANT]
+        if rung - BY_RULES >= len(better):
+            raise Exhausted(f"no other design of the rules promises {SIGNIFICANT:.0%} less tracking error")
+        one = better[rung - BY_RULES]
+        promise = f"it promises {one.share:.0%} of the tracking error of what is in service, which agents have chosen"
+        made = Made(GainsChange(controller=one.controller), f"{one.law.text} {on}; {promise}")
+        return Offer(rung, one.law.text, lambda _: made, (), one.law, one)
 
     def _designs(self, now: LineNow, region: Region | None) -> list[Redesign]:
         """What has been designed last, again."""

@@ -8,9 +8,9 @@ from collections.abc import Callable, Iterable, Sequence
 from gateway.cli.commission_changes import LineNow, Offer
 from gateway.commissioning.architectures import ARCHITECTURES
 from gateway.commissioning.convergence import Convergence, SpanFigures
-from gateway.commissioning.ladder import OWN, Next
+from gateway.commissioning.ladder import BY_RULES, OWN, Next
 from gateway.commissioning.past import Follows, Outcome, Past, Step
-from gateway.commissioning.redesign import Figures, ratio
+from gateway.commissioning.redesign import Figures
 from gateway.core.controller import config_hash
 from gateway.core.line import Line
 from gateway.core.questions import Decision, Figure, Knob, Option, Question, figure
@@ -145,11 +145,14 @@ def _tried(past: Sequence[Past]) -> list[str]:
     """The newest last."""
     words = {Outcome.DONE: "done", Outcome.FAILED: "failed", Outcome.AGAIN: "came at a wrong moment"}
     return [
-        f"tried: {one.step}, {'own numbers' if one.rung >= OWN else option_id(one.rung)}: {words[one.outcome]}"
-        f"{f': {one.why}' if one.why else ''}"
+        f"tried: {one.step}, {_candidate(one.rung)}: {words[one.outcome]}{f': {one.why}' if one.why else ''}"
         for one in past
         if one.step is not None and one.outcome in words
     ]
+
+
+def _candidate(rung: int) -> str:
+    return option_id(rung) if rung < OWN else "own numbers" if rung < BY_RULES else "that of the rules"
 
 
 def _brief(facts: Sequence[str]) -> list[str]:
@@ -162,9 +165,8 @@ def _figures(offer: Offer) -> list[Figure]:
     if offer.redesign is None:
         return []
     figures, before = offer.redesign.figures, offer.redesign.before
-    share = sum(ratio(figures[name].rmse_n, before[name].rmse_n) for name in before) / len(before)
     return [
-        figure("tracking error over that in service, mean of the courses", share, ""),
+        figure("tracking error over that in service, mean of the courses", offer.redesign.share, ""),
         _worst("tracking error on the model", "N", figures.values(), lambda one: one.rmse_n),
         _worst("the same in service", "N", before.values(), lambda one: one.rmse_n),
         _worst("overshoot", "%", figures.values(), lambda one: one.overshoot_pct),

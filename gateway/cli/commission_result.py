@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from gateway.commissioning.chain import region_speed
 from gateway.commissioning.convergence import Convergence
-from gateway.commissioning.ladder import OWN, Ended
+from gateway.commissioning.ladder import BY_RULES, OWN, Ended
 from gateway.commissioning.past import Past
 from gateway.core.decisions import ProposalShown
 
@@ -66,4 +66,6 @@ def tried_of(one: Past, shown: ProposalShown | None, measured: Convergence | Non
 
 
 def candidate_name(rung: int) -> str:
+    if rung >= BY_RULES:
+        return f"candidate {rung - BY_RULES + 1} of the rules"
     return f"candidate {rung + 1}" if rung < OWN else f"own numbers {rung - OWN + 1}"

@@ -26,6 +26,7 @@ def policy_figures(name: str, trials: Sequence[Trial]) -> PolicyFigures:
         converged=sum(one.converged for one in trials),
         iterations=float(np.mean([one.iterations for one in trials])),
         deployments=float(np.mean([one.deployments for one in trials])),
+        overruled=sum(one.overruled for one in trials),
         to_truth_p50=float(np.median(ratios)) if ratios else None,
         to_truth_p95=float(np.percentile(ratios, 95)) if ratios else None,
         to_truth_worst=max(ratios, default=None),

@@ -45,6 +45,7 @@ class Trial(Strict):
     iterations: int  #: candidates that were proposed, or could not be made
     experiments: int  #: that were run
     deployments: int  #: of redesigns that were kept
+    overruled: int = 0  #: of those, in the end by the rules' own in the place of what was chosen
     rejections: list[Rejections]
     asked: Asked
     controller: str  #: hash of what is in service in the end
@@ -77,6 +78,7 @@ class PolicyFigures(Strict):
     converged: int
     iterations: float  #: mean
     deployments: float  #: mean
+    overruled: int = 0  #: redesigns that the rules have put in the place of what was chosen, in the end
     to_truth_p50: float | None
     to_truth_p95: float | None
     to_truth_worst: float | None

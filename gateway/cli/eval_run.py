@@ -18,6 +18,7 @@ from gateway.cli.eval_tasks import MOST_DEPLOYMENTS, TOP_M_PER_S, Task
 from gateway.cli.eval_truth import Worth, designed_on_truth, worth
 from gateway.cli.stepped import SteppedLoop
 from gateway.commissioning.decisions import RULES, Decided, Decider
+from gateway.commissioning.ladder import BY_RULES
 from gateway.commissioning.past import Step
 from gateway.core.controller import Controller, config_hash
 from gateway.core.interactions import Interaction
@@ -79,8 +80,10 @@ class Carrying:
             self._worth[hash_] = worth(self.task, config)
         return self._worth[hash_]
 
-    def carried_out(self, decides: Decides, tell: Tell = lambda text: None) -> Carried:
+    def carried_out(self, decides: Decides, tell: Tell = lambda text: None, last_word: bool = True) -> Carried:
         """From the line's file to where the chain ends, or `MOST_DEPLOYMENTS` redesigns are in service.
+
+        `last_word`: the rules have it, as in production, with one more; a search is measured without.
 
         Raises TrialFailed, whatever goes wrong on the way.
         """
@@ -94,7 +97,7 @@ class Carrying:
                 decider = Noted(decides(side, asyncio.get_running_loop()))
                 found = await commission(
                     task.line, side, tell, wanted_m_per_s=TOP_M_PER_S, most_redesigns=MOST_DEPLOYMENTS,
-                    decider=decider,
+                    decider=decider, last_word=last_word,
                 )  # fmt: skip
                 return found, (await side.now()).in_service, decider
 
@@ -120,6 +123,7 @@ class Carrying:
             iterations=len(found.tried),
             experiments=sum(one.kind == "experiment" and one.stage == "done" for one in found.tried),
             deployments=sum(one.step == Step.REDESIGN and one.stage == "kept" for one in found.tried),
+            overruled=sum(one.rung >= BY_RULES and one.stage == "kept" for one in found.tried),
             rejections=rejections(found.tried, interactions),
             asked=_asked(carried.asked, interactions),
             controller=config_hash(carried.in_service),

@@ -37,6 +37,10 @@ def remarks(result: EvalResult) -> list[str]:
     count = f"{len(result.tasks)} of {result.tasks_asked}" if not result.complete else f"{len(result.tasks)}"
     told = [f"tasks: {count}, {result.spans} spans, seed {result.seed}; each was tried once; {RATIOS}"]
     told += [f"{one.policy}: {rejected(one.rejections)}" for one in result.figures if one.rejections]
+    told += [
+        f"{one.policy}: {one.overruled} times the rules had the last word, with a design that promised a tenth less"
+        for one in result.figures if one.overruled
+    ]  # fmt: skip
     for one in result.figures:
         if spent := one.asked.tokens_in + one.asked.tokens_out:
             told.append(f"{one.policy}: {spent} tokens, {one.asked.seconds:.0f} s for answers")

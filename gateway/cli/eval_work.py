@@ -70,7 +70,8 @@ def carried_out(job: Job, tell: Tell = lambda text: None) -> TaskResult:
 
         try:
             with _decides(policy, job, carrying.task, kept.append, said) as decides:
-                trials.append(carrying.trial(policy, carrying.carried_out(decides, said), kept))
+                carried = carrying.carried_out(decides, said, last_word=policy == "model")
+            trials.append(carrying.trial(policy, carried, kept))
         except Exception as error:  # as above
             failed = error if isinstance(error, TrialFailed) else TrialFailed(told(error), 0)
             trials.append(failed_trial(policy, str(failed), kept, failed.unsafe_events))

@@ -15,6 +15,9 @@ foreseen what is not as it should be, so that a newer one has nothing to add, a 
 Where a proposal is refused, the next, less ambitious candidate of a short ladder is taken (`LADDERS`), or whichever of
 those that are left somebody chooses, or one with numbers of its own. What has been tried is read from the gate's own
 list of proposals, in which each says its step and its rung: whoever asks again after a restart goes on where it ended.
+
+The rules have the last word: where agents have chosen what is in service in the end, and the rules' design on the same
+model promises significantly more, that one is proposed before the chain ends (decision 40).
 """
 
 from collections.abc import Sequence
@@ -22,8 +25,10 @@ from dataclasses import dataclass, replace
 from math import sqrt
 
 from gateway.commissioning.candidates import NEAR
-from gateway.commissioning.ladder import AS_IT_IS, Ended, Next, on_ladder
+from gateway.commissioning.decisions import AGENTS, RULES
+from gateway.commissioning.ladder import AS_IT_IS, BY_RULES, Ended, Next, on_ladder
 from gateway.commissioning.past import Follows, Outcome, Past, Step
+from gateway.commissioning.redesign import RUNGS
 from gateway.core.line import Line
 
 MOST_EXPERIMENTS = 3  #: in a row, without a model from their data
@@ -55,14 +60,39 @@ class Look:
 
 
 def next_step(
-    past: Sequence[Past], first_speed_m_per_s: float, wanted_m_per_s: float, adaptations: int = 1
-) -> Next | Pending | Look | Ended:
+    past: Sequence[Past], first_speed_m_per_s: float, wanted_m_per_s: float, adaptations: int = 1,
+    most_redesigns: int | None = None, last_word: bool = True,
+) -> Next | Pending | Look | Ended:  # fmt: skip
     """`past` oldest first. Speeds: of a first configuration's region, and up to which the line is to be adapted.
 
     `adaptations`: redesigns at least, also where the first has converged already. A further one may come to nothing.
+    `most_redesigns`: it is left there once so many have been kept. `last_word`: the rules have it.
     """
     if open_ := next((one for one in reversed(past) if one.outcome is Outcome.OPEN), None):
         return Pending(open_.proposal, open_.kind)
+    kept = sum(one.step is Step.REDESIGN and one.outcome is Outcome.DONE for one in past)
+    if most_redesigns is not None and kept >= most_redesigns:
+        found: Next | Look | Ended = Ended(True, f"{kept} redesigns are kept")
+    else:
+        found = _next_step(past, first_speed_m_per_s, wanted_m_per_s, adaptations)
+    return _last_word(past, found) if last_word and isinstance(found, Ended) and found.reached else found
+
+
+def _last_word(past: Sequence[Past], ended: Ended) -> Next | Ended:
+    """What the rules would have, once, in the place of what agents have chosen on the same model."""
+    model = _last_done(past, "model")
+    kept = [i for i, one in enumerate(past) if _is_done(one, "gains") and one.rung != AS_IT_IS]
+    if model < 0 or not kept or past[kept[-1]].author != AGENTS:
+        return ended
+    if any(i > model and past[i].author == RULES for i in kept):  # and something was found to be better
+        return ended
+    found = on_ladder(Step.REDESIGN, past[_last_done(past, "gains") + 1 :], BY_RULES, BY_RULES + RUNGS)
+    return ended if isinstance(found, Ended) else Next(Step.REDESIGN, found.rung, own=0)
+
+
+def _next_step(
+    past: Sequence[Past], first_speed_m_per_s: float, wanted_m_per_s: float, adaptations: int
+) -> Next | Look | Ended:
     last = {kind: _last_done(past, kind) for kind in ("gains", "experiment", "model")}
     since = past[max(last.values()) + 1 :]
     if last["gains"] < 0:

@@ -17,6 +17,8 @@ LADDERS: dict[Step, int] = {
 }
 #: From here on: no rung, but somebody's own numbers. So many in a row, then only the ladder is left.
 OWN, MOST_OWN = 100, 3
+#: From here on: designs that the rules propose in the end, where somebody else has chosen what is in service.
+BY_RULES = 200
 AS_IT_IS = RUNGS  #: of a redesign: the configuration in service stays, and is judged for what data have shown since
 MOST_AGAIN = 3  #: times that one rung is proposed again, because the moment was wrong
 
@@ -60,9 +62,11 @@ def on_ladder(step: Step, since: Sequence[Past], least: int = 0, end: int | None
     # What is in service, as it is, comes last: it is no answer to the question which design is the next.
     designs = [rung for rung in left[1:] if step is not Step.REDESIGN or rung != AS_IT_IS]
     others = tuple(Next(step, rung) for rung in designs if len(again[rung]) <= MOST_AGAIN)
-    return Next(step, left[0], others=others, own=MOST_OWN - sum(one.rung >= OWN for one in tried))
+    return Next(step, left[0], others=others, own=MOST_OWN - sum(OWN <= one.rung < BY_RULES for one in tried))
 
 
 def _has_failed(rung: int, tried: Sequence[Past]) -> bool:
     failed = [one for one in tried if one.outcome is Outcome.FAILED]
-    return any(one.rung == rung or (one.last and one.rung <= rung < AS_IT_IS) for one in failed)
+    return any(
+        one.rung == rung or (one.last and one.rung <= rung and not one.rung < AS_IT_IS <= rung) for one in failed
+    )

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
+from gateway.commissioning.decisions import RULES
 from gateway.core.decisions import ProposalShown
 from gateway.core.proposal import Evidence
 from gateway.core.verdict import OF_THE_MOMENT, Verdict
@@ -58,6 +59,7 @@ class Past:
     converged: bool = False  #: of a measurement: the line did what it should, as the model foresees
     follows: Follows | None = None  #: from a measurement; None: nobody has looked at it yet
     last: bool = False  #: there is no design on a higher rung either
+    author: str = RULES
 
 
 def past_of(shown: ProposalShown) -> Past:
@@ -73,6 +75,7 @@ def past_of(shown: ProposalShown) -> Past:
         why=shown.why,
         speed_m_per_s=None if region is None else region.speed_max_m_per_s,
         proposal=shown.proposal_hash,
+        author=shown.proposal.author,
     )
 
 

@@ -71,6 +71,11 @@ class Offer:
     figures: Mapping[str, Figures]
     before: Mapping[str, Figures]  #: the same of what is in service
 
+    @property
+    def share(self) -> float:
+        """Its tracking error over that in service, mean of the courses."""
+        return float(np.mean([ratio(self.figures[name].rmse_n, of.rmse_n) for name, of in self.before.items()]))
+
 
 @dataclass(frozen=True)
 class Beside:

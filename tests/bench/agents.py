@@ -213,16 +213,16 @@ def written(bench: Bench, found: Sequence[OfTask]) -> None:
 
 
 HEADS = (
-    "persona", "reached", "converged", "tried", "deployed", "/truth p50", "/truth p95", "/truth worst", "/begin worst",
-    "unsafe", "answered", "tokens", "virtual s", "processor s", "the same as off", "refused",
+    "persona", "reached", "converged", "tried", "deployed", "overruled", "/truth p50", "/truth p95", "/truth worst",
+    "/begin worst", "unsafe", "answered", "tokens", "virtual s", "processor s", "the same as off", "refused",
 )  # fmt: skip
 
 
 def _row(of: PolicyFigures, again: int) -> tuple[object, ...]:
     return (
         of.policy, f"{of.reached}/{of.trials}", f"{of.converged}/{of.trials}", round(of.iterations, 1),
-        round(of.deployments, 1), *(_ratio(value) for value in (of.to_truth_p50, of.to_truth_p95, of.to_truth_worst,
-                                                                of.to_begin_worst)),
+        round(of.deployments, 1), of.overruled,
+        *(_ratio(value) for value in (of.to_truth_p50, of.to_truth_p95, of.to_truth_worst, of.to_begin_worst)),
         of.unsafe_accepted, f"{of.asked.answered}/{of.asked.questions}", of.asked.tokens_in + of.asked.tokens_out,
         round(of.asked.seconds), round(of.processor_s), again, rejected(of.rejections),
     )  # fmt: skip

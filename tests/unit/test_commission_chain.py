@@ -28,9 +28,10 @@ from gateway.commissioning.chain import (
     next_step,
     refused_at_once,
 )
-from gateway.commissioning.ladder import AS_IT_IS, LADDERS, MOST_AGAIN, MOST_OWN, OWN, Ended, Next
+from gateway.commissioning.decisions import AGENTS, RULES
+from gateway.commissioning.ladder import AS_IT_IS, BY_RULES, LADDERS, MOST_AGAIN, MOST_OWN, OWN, Ended, Next
 from gateway.commissioning.past import Follows, Outcome, Past, Step, named, past_of
-from gateway.commissioning.redesign import LAWS, PREDICTIVE
+from gateway.commissioning.redesign import LAWS, PREDICTIVE, RUNGS
 from gateway.control.design import design_lqi, is_stable, task_of
 from gateway.core.controller import config_hash
 from gateway.core.decisions import ProposalShown
@@ -47,8 +48,8 @@ KINDS = {
 LINE = line_of(2)
 
 
-def asked(past, adaptations=1):
-    return next_step(past, FIRST_M_PER_S, WANTED_M_PER_S, adaptations)
+def asked(past, adaptations=1, **limits):
+    return next_step(past, FIRST_M_PER_S, WANTED_M_PER_S, adaptations, **limits)
 
 
 def looked_at(past, settled=True, gains=False):
@@ -272,13 +273,61 @@ def test_it_ends_whatever_the_gate_says_and_whoever_chooses(outcomes, share, pic
         if isinstance(step, Look):
             past = looked_at(past, settled=len(past) % 2 == 0)
             continue
-        assert isinstance(step, Next) and step.rung < LADDERS[step.step]
+        assert isinstance(step, Next)
+        theirs = step.rung >= BY_RULES
+        assert step.rung < (BY_RULES + RUNGS if theirs else LADDERS[step.step])
+        assert not theirs or any(one.author == AGENTS for one in past)
         reached = max((one.speed_m_per_s or 0.0 for one in past if one.kind == "gains"), default=FIRST_M_PER_S)
         assert all(speed <= max(STRETCH * reached, FIRST_M_PER_S) * (1.0 + 1e-9) for speed in step.speeds_m_per_s)
         one = after(picked(step, pick), past, outcome)
+        one = replace(one, author=AGENTS if pick % 2 and not theirs else RULES)
         speed = None if one.speed_m_per_s is None else share * one.speed_m_per_s
         past.append(replace(one, speed_m_per_s=speed) if one.kind == "gains" else one)
     raise AssertionError(f"{len(past)} proposals, and no end")
+
+
+BY_AGENTS = [*ADAPTED[:3], replace(ADAPTED[3], author=AGENTS)]
+
+
+def at_the_end(past):
+    """Measured and looked at: the chain would end."""
+    return looked_at([*past, replace(after(asked(past), past), speed_m_per_s=0.12)])
+
+
+def test_where_agents_have_chosen_what_is_in_service_the_rules_have_the_last_word_once():
+    past = at_the_end(BY_AGENTS)
+    step = asked(past)
+    assert step == Next(Step.REDESIGN, BY_RULES) and not step.others and step.own <= 0
+    refused = after(step, past, Outcome.FAILED)
+    assert asked([*past, refused]) == Next(Step.REDESIGN, BY_RULES + 1)
+    none = replace(refused, last=True)  # there is no design that promises as much
+    assert isinstance(asked([*past, none]), Ended) and asked([*past, none]).converged
+    kept = [*past, replace(after(step, past), speed_m_per_s=0.12)]
+    assert asked(kept).step is Step.MEASUREMENT and isinstance(asked(at_the_end(kept)), Ended)
+
+
+@pytest.mark.parametrize(
+    "past",
+    [
+        ADAPTED,
+        [*ADAPTED[:3], replace(ADAPTED[3], author="anna", step=None)],  # a person's own
+        [replace(ADAPTED[0], author=AGENTS), *ADAPTED[1:]],
+        [*ADAPTED, replace(ADAPTED[3], rung=3, author=AGENTS)],  # the rules' was in service on that model
+    ],
+)
+def test_nobody_is_overruled_who_has_left_it_to_the_rules_or_is_a_person(past):
+    assert isinstance(asked(at_the_end(past)), Ended)
+
+
+def test_what_agents_began_with_and_stays_as_it_is_is_theirs():
+    as_it_is = [replace(ADAPTED[0], author=AGENTS), *ADAPTED[1:3], replace(ADAPTED[3], rung=AS_IT_IS)]
+    assert asked(at_the_end(as_it_is)) == Next(Step.REDESIGN, BY_RULES)
+
+
+def test_the_last_word_comes_also_where_no_more_redesigns_are_wanted_and_not_where_it_is_not_had():
+    assert asked(BY_AGENTS, most_redesigns=1) == Next(Step.REDESIGN, BY_RULES)
+    assert isinstance(asked(ADAPTED, most_redesigns=1), Ended)
+    assert isinstance(asked(BY_AGENTS, most_redesigns=1, last_word=False), Ended)
 
 
 def shown(stage, rules=(), why=""):

@@ -43,7 +43,7 @@ def test_a_policy_that_fails_costs_neither_the_others_nor_the_task(monkeypatch: 
             self.task = task
             self.left = 1
 
-        def carried_out(self, decides: Any, tell: Any) -> None:
+        def carried_out(self, decides: Any, tell: Any, last_word: bool) -> None:
             self.left -= 1
             if self.left == 0:
                 raise TrialFailed("KeyError: mpc", 2)
