@@ -25,6 +25,7 @@ from gateway.commissioning.candidates import Exhausted, NotOffered, fastest_m_pe
 from gateway.commissioning.chain import (
     Look,
     Pending,
+    from_one_experiment,
     may_experiment,
     next_step,
     refused_at_once,
@@ -63,7 +64,7 @@ async def commission(
     """Until the chain has ended, one way or the other. Every rung is tried once, so that it does.
 
     `wanted_m_per_s`: up to which the line is to be adapted; None: as fast as its drives hold.
-    `adaptations`: redesigns at least; `most_redesigns`: it is left there once so many have been kept.
+    `adaptations`: redesigns at least; `most_redesigns`: once so many are kept it is only measured what the last does.
     `decider`: who chooses among the candidates. `last_word`: the rules propose theirs in the end, where agents have
     chosen what is in service and the rules' own design promises significantly more.
     """
@@ -149,9 +150,10 @@ class _Chain:
             raise CannotBeJudged(str(error)) from error
         self._tell(f"measurement: {found.text}")
         due = still_due(self.past, self._adaptations)
-        decided = await self._decided(diagnosis_question(self._line, found, now, self.past, due))
+        few = from_one_experiment(self.past)
+        decided = await self._decided(diagnosis_question(self._line, found, now, self.past, due, few))
         follows, because = Follows(decided.choice.option), decided.choice.reason
-        if decided.by != RULES:
+        if decided.by != RULES or follows is not found.follows:
             found = found.model_copy(update={"diagnosis": Diagnosis(follows=follows, by=decided.by, because=because)})
         try:
             effort = self._changes.effort_n2m2s(recordings[0])

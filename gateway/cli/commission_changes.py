@@ -17,7 +17,7 @@ from gateway.commissioning.architectures import ARCHITECTURES
 from gateway.commissioning.candidates import FIRST_LAWS, Exhausted, Law, NotOffered, at_end, configuration, experiment
 from gateway.commissioning.chain import first_legs
 from gateway.commissioning.convergence import SIGNIFICANT, Convergence, convergence, measurement
-from gateway.commissioning.ladder import AS_IT_IS, BY_RULES, Next
+from gateway.commissioning.ladder import ALL, AS_IT_IS, BY_RULES, NEWEST, Next
 from gateway.commissioning.past import Step
 from gateway.commissioning.redesign import Offer as Redesign
 from gateway.commissioning.redesign import redesigns
@@ -149,16 +149,16 @@ class Changes:
         return self._experiment_for[1]
 
     def _models(self, step: Next, now: LineNow, recordings: Sequence[Recording]) -> list[Offer]:
-        """Of the newest experiment, which goes the fastest; on the second rung of all.
+        """Of the newest experiment, which goes the fastest, or of all recordings.
 
         A fit takes as long as its data: of four times as much for what is at most half as wide an interval.
         """
         if not recordings:
             raise NotOffered("there is no recording of an experiment")
-        if step.rung > 0 and len(recordings) == 1:
+        if step.rung != NEWEST and len(recordings) == 1:
             raise NotOffered("there is no other recording")
         rungs = [step.rung, *(one.rung for one in step.others if len(recordings) > 1)]
-        return [self._model(rung, now, list(recordings[:1] if rung == 0 else recordings)) for rung in rungs]
+        return [self._model(rung, now, list(recordings if rung == ALL else recordings[:1])) for rung in rungs]
 
     def _model(self, rung: int, now: LineNow, used: list[Recording]) -> Offer:
         which = "the last experiment" if len(used) == 1 else f"the last {len(used)} experiments"

@@ -22,7 +22,7 @@ SIZE = "larger moves tell more, and take tensions further from their set-points"
 MOST_FACTS = 24
 MOST_LETTERS = 600
 PROPOSE, MORE_DATA = "propose", "more-data"
-IN_ANY_CASE = "another adaptation is asked for: an experiment, a model and a redesign follow in any case"
+IN_ANY_CASE = "another adaptation is asked for: a newer model and a redesign follow in any case"
 
 #: A measurement leaves nothing to choose.
 _ASKED: dict[Step, tuple[Decision, str, str]] = {
@@ -40,7 +40,8 @@ _ASKED: dict[Step, tuple[Decision, str, str]] = {
     Step.MODEL: (
         "identify.data",
         "from which recordings a model is made",
-        "the newest goes the fastest; more data take longer and are taken where it gives no model",
+        "before a measurement the newest, which goes the fastest, and more data, which take longer, where it gives no "
+        "model; then all, and the newest where the line has become another one",
     ),
     Step.REDESIGN: (
         "adapt.change",
@@ -90,10 +91,14 @@ def fidelity_question(line: Line, found: Identified, now: LineNow, past: Sequenc
 
 
 def diagnosis_question(
-    line: Line, found: Convergence, now: LineNow, past: Sequence[Past], due: bool = False
+    line: Line, found: Convergence, now: LineNow, past: Sequence[Past], due: bool = False, few: bool = False
 ) -> Question:
-    """Why the line does not do what it should, and so what follows. `due`: another adaptation does in any case."""
+    """Why the line does not do what it should, and so what follows.
+
+    `due`: another adaptation does in any case. `few`: the model is of one experiment, and more has been recorded.
+    """
     in_any_case = [IN_ANY_CASE] if due else []
+    of_all = [Option(id=Follows.ALL_DATA, title="the model foresees it, from one experiment: a model of all data")]
     figures = [figure("measured tracking error over the predicted one, less 1", found.gap, "")]
     worst_first = sorted(found.spans.items(), key=lambda each: -each[1].rmse_n)  # those of many spans are too many
     for name, one in worst_first:
@@ -106,12 +111,13 @@ def diagnosis_question(
         figures=figures[:64],
         options=[
             Option(id=Follows.NEWER_MODEL, title="the model does not foresee it: another experiment and a newer model"),
+            *(of_all if few else []),
             Option(id=Follows.CALMER, title="the model foresees it: a calmer configuration on the same model"),
             Option(id=Follows.LEAVE, title="nothing that could be gained is significant: it stays as it is"),
         ],
-        usual=found.follows,
-        why="a gap of a tenth, either way, between measured and predicted error is the model's; without one nothing is "
-        "left to do where the criteria are met, and a calmer design follows where they are not",
+        usual=Follows.ALL_DATA if few and found.follows is Follows.LEAVE else found.follows,
+        why="a gap of a tenth, either way, between measured and predicted error is the model's; without one a calmer "
+        "design follows where the criteria are not met, and where they are a model of all data, once",
     )  # fmt: skip
 
 

@@ -160,6 +160,17 @@ def why(choice: Choice) -> str:
     name = _name(chosen.structure)
     if not others:
         return f"{name}: no other structure was tried"
+    if choice.turned is not None:
+        before, ahead = choice.turned
+        if ahead < 0.0:
+            return (
+                f"{name}: a part of the data does not tell it from {_name(before.structure)}, which all of them leave "
+                f"behind by {-ahead:.1f} in log evidence"
+            )
+        return (
+            f"{name}: a part of the data prefers {_name(before.structure)}, to which all of them give only "
+            f"{ahead:.1f} more log evidence; {ENOUGH:g} (20 to 1) would be needed for more parameters"
+        )
     if chosen is not best:
         return (
             f"{name}: {_name(best.structure)} has more log evidence, but only by "

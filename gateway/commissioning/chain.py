@@ -26,7 +26,7 @@ from math import sqrt
 
 from gateway.commissioning.candidates import NEAR
 from gateway.commissioning.decisions import AGENTS, RULES
-from gateway.commissioning.ladder import AS_IT_IS, BY_RULES, Ended, Next, on_ladder
+from gateway.commissioning.ladder import ALL, AS_IT_IS, BY_RULES, NEWEST, Ended, Next, on_ladder
 from gateway.commissioning.past import Follows, Outcome, Past, Step
 from gateway.commissioning.redesign import RUNGS
 from gateway.core.line import Line
@@ -66,16 +66,23 @@ def next_step(
     """`past` oldest first. Speeds: of a first configuration's region, and up to which the line is to be adapted.
 
     `adaptations`: redesigns at least, also where the first has converged already. A further one may come to nothing.
-    `most_redesigns`: it is left there once so many have been kept. `last_word`: the rules have it.
+    `most_redesigns`: once so many are kept it is only measured what the last one does. `last_word`: the rules have it.
     """
     if open_ := next((one for one in reversed(past) if one.outcome is Outcome.OPEN), None):
         return Pending(open_.proposal, open_.kind)
     kept = sum(one.step is Step.REDESIGN and one.outcome is Outcome.DONE for one in past)
-    if most_redesigns is not None and kept >= most_redesigns:
-        found: Next | Look | Ended = Ended(True, f"{kept} redesigns are kept")
-    else:
-        found = _next_step(past, first_speed_m_per_s, wanted_m_per_s, adaptations)
+    found = _next_step(past, first_speed_m_per_s, wanted_m_per_s, adaptations)
+    if most_redesigns is not None and kept >= most_redesigns and isinstance(found, Next):
+        found = found if found.step is Step.MEASUREMENT else _enough(past, kept)
     return _last_word(past, found) if last_word and isinstance(found, Ended) and found.reached else found
+
+
+def _enough(past: Sequence[Past], kept: int) -> Ended:
+    """So many redesigns were kept, and the last one has been measured."""
+    at = _last_done(past, "experiment")
+    measured = past[at] if at > _last_done(past, "gains") and past[at].step is Step.MEASUREMENT else None
+    told = f"{kept} redesign{'' if kept == 1 else 's'} kept" + (f"; {measured.why}" if measured else "")
+    return Ended(True, told, measured is not None and measured.converged)
 
 
 def _last_word(past: Sequence[Past], ended: Ended) -> Next | Ended:
@@ -129,13 +136,16 @@ def _next_step(
 def _model(
     past: Sequence[Past], since: Sequence[Past], first_speed_m_per_s: float, wanted_m_per_s: float
 ) -> Next | Ended:
-    """From the data of an experiment; another experiment where they give none."""
-    found = on_ladder(Step.MODEL, since)
+    """From the data of an experiment; another experiment where they give none.
+
+    Once a measurement has been made all data come first: each by itself has been made use of.
+    """
+    measured = any(one.step is Step.MEASUREMENT and _is_done(one, "experiment") for one in past)
+    found = on_ladder(Step.MODEL, since, ALL) if measured else on_ladder(Step.MODEL, since, NEWEST, ALL + 1)
     if isinstance(found, Next):
         return found
     number = _experiments_since_model(past)
     if number >= MOST_EXPERIMENTS:
-        measured = any(one.step is Step.MEASUREMENT and _is_done(one, "experiment") for one in past)
         return Ended(measured, found.text)
     return _experiment(past, since, first_speed_m_per_s, wanted_m_per_s, number)
 
@@ -153,17 +163,28 @@ def _measured(
     rounds = sum(one.step is Step.MEASUREMENT and _is_done(one, "experiment") for one in past)
     if rounds >= MOST_ROUNDS:
         return Ended(True, f"{what}, and after {rounds} measurements that is left as it is; {measured.why}")
-    calmer = not due and measured.follows is Follows.CALMER
-    # What is in service has been judged for all that data have shown: as it is, it is no candidate here.
-    found = on_ladder(Step.REDESIGN, since, _known_by_measurement(past), AS_IT_IS) if calmer else more
+    found = more
+    if measured.follows is Follows.CALMER and not due:
+        # What is in service has been judged for all that data have shown: as it is, it is no candidate here.
+        found = on_ladder(Step.REDESIGN, since, _known_by_measurement(past), AS_IT_IS)
+    elif from_one_experiment(past) and (measured.follows is not Follows.NEWER_MODEL or isinstance(more, Ended)):
+        found = on_ladder(Step.MODEL, since, ALL, ALL + 1)
     if isinstance(found, Ended):
         return Ended(True, f"{what}; {measured.why}; {found.text}", measured.converged)
     return found
 
 
+def from_one_experiment(past: Sequence[Past]) -> bool:
+    """Whether the accepted model is one of this chain, of the newest experiment that there was alone."""
+    at = _last_done(past, "model")
+    return at >= 0 and past[at].step is Step.MODEL and past[at].rung == NEWEST
+
+
 def may_experiment(past: Sequence[Past]) -> bool:
     """Whether another experiment follows where there is no model from the data of the newest."""
-    return _experiments_since_model(past) < MOST_EXPERIMENTS
+    at = _last_done(past, "experiment")
+    of_measurement = at >= 0 and past[at].step is Step.MEASUREMENT
+    return not of_measurement and _experiments_since_model(past) < MOST_EXPERIMENTS
 
 
 def still_due(past: Sequence[Past], adaptations: int) -> bool:

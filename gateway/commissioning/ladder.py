@@ -11,7 +11,7 @@ from gateway.commissioning.redesign import RUNGS
 LADDERS: dict[Step, int] = {
     Step.FIRST: len(FIRST_LAWS),
     Step.EXPERIMENT: 4,
-    Step.MODEL: 2,
+    Step.MODEL: 3,
     Step.REDESIGN: RUNGS + 1,
     Step.MEASUREMENT: 2,
 }
@@ -19,6 +19,8 @@ LADDERS: dict[Step, int] = {
 OWN, MOST_OWN = 100, 3
 #: From here on: designs that the rules propose in the end, where somebody else has chosen what is in service.
 BY_RULES = 200
+#: Of a model: from the newest experiment, from all recordings, and where those were tried first, from the newest.
+NEWEST, ALL, NEWEST_AFTER_ALL = 0, 1, 2
 AS_IT_IS = RUNGS  #: of a redesign: the configuration in service stays, and is judged for what data have shown since
 MOST_AGAIN = 3  #: times that one rung is proposed again, because the moment was wrong
 
@@ -55,7 +57,7 @@ def on_ladder(step: Step, since: Sequence[Past], least: int = 0, end: int | None
     left = [rung for rung in range(least, end) if not _has_failed(rung, tried)]
     if not left:
         last = f"; the last one: {tried[-1].why}" if tried else ""
-        return Ended(False, f"no {step} of {end} candidates gets through{last}")
+        return Ended(False, f"no {step} of {end - least} candidates gets through{last}")
     again = {rung: [one for one in tried if one.outcome is Outcome.AGAIN and one.rung == rung] for rung in left}
     if len(usual := again[left[0]]) > MOST_AGAIN:
         return Ended(False, f"the {step} has come at a wrong moment {len(usual)} times; the last time: {usual[-1].why}")

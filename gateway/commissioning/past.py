@@ -22,6 +22,7 @@ class Follows(StrEnum):
     """What a measurement leads to."""
 
     NEWER_MODEL = "newer-model"  #: the line does otherwise than the model foresees: another round
+    ALL_DATA = "all-data"  #: it does as foreseen, from few data: a model of all that has been recorded, and a redesign
     CALMER = "calmer"  #: the model has foreseen it: a calmer configuration on the same one
     LEAVE = "leave"  #: nothing significant is left to gain
 

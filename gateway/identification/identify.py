@@ -15,10 +15,10 @@ from gateway.identification.assessment import assess
 from gateway.identification.comparison import WINDOW_S, Comparison, compare
 from gateway.identification.estimate import Estimate, Structure
 from gateway.identification.findings import Assessment, Finding
-from gateway.identification.prediction_error import LEAST_S, Fit, fit_stretches, stretches_of
+from gateway.identification.prediction_error import LEAST_S, Fit, stretches_of
 from gateway.identification.prior import Prior
 from gateway.identification.recursive import estimated_recursively, live
-from gateway.identification.structure_choice import Choice, choose
+from gateway.identification.structure_choice import Choice, choose, decided
 from gateway.identification.subspace import estimated_by_subspace
 from gateway.identification.validation import Validation, validate
 
@@ -38,7 +38,7 @@ class NotIdentified(Exception):
 @dataclass(frozen=True)
 class Identified:
     assessments: list[Assessment]  #: of each recording
-    choice: Choice  #: of the structure, from the part before
+    choice: Choice  #: of the structure: candidates from the part before, decided by all data
     comparison: Comparison  #: of the methods, on the held-out part
     validation: Validation  #: of the chosen structure, on the held-out part
     failed: dict[str, str]  #: methods that gave no estimate, and why
@@ -83,7 +83,12 @@ def identify(
         tell("prediction error, structure by structure")
         began_s = clock()
         choice = choose(before, line, noise0, held_out, measured=dict(measured or {}), priors=priors)
-        estimates.append((choice.fitted.estimate, clock() - began_s))
+        took_s = clock() - began_s
+        tell("the model from all data")
+        unwinder = choice.fitted.stretches[0].unwinder
+        held = stretches_of(held_out, unwinder)
+        choice, fitted = decided(choice, stretches_of(recordings, unwinder), held)
+        estimates.append((choice.fitted.estimate, took_s))
         for name, method in _others(line, choice).items():
             tell(name)
             began_s = clock()
@@ -92,12 +97,7 @@ def identify(
             except ValueError as error:
                 failed[name] = str(error)
         tell("validating")
-        unwinder = choice.fitted.stretches[0].unwinder
-        held = stretches_of(held_out, unwinder)
         validation = validate(choice.fitted.estimate.theta, choice.fitted.noise, held, noise0)
-        tell("the model from all data")
-        whole = stretches_of(recordings, unwinder)
-        fitted = fit_stretches(whole, choice.fitted.prior, choice.fitted.noise, start=choice.fitted.logs)
     except Unpredictable as error:
         raise NotIdentified([str(error)], assessments) from error
     comparison = compare(estimates, held_out, choice.fitted.noise)

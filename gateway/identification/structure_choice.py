@@ -4,9 +4,9 @@ The evidence is the likelihood of the data under a structure with its parameters
 that explains nothing costs the volume of prior that it excludes. Held-out likelihood needs no prior, and less care.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from math import sqrt
+from math import inf, sqrt
 
 import numpy as np
 
@@ -23,6 +23,7 @@ from gateway.identification.prior import Prior, prior_of
 SHARED = (
     Structure(), Structure(coulomb=True), Structure(torque_lag=True), Structure(coulomb=True, torque_lag=True)
 )  # fmt: skip
+OPEN = 6.0  #: log evidence that a part of the data leave a structure behind the best, and all of them may turn
 SURE = 3.0  #: standard errors by which held-out data must prefer another structure
 _LOOKS = 3  #: for eccentric rollers, each with the noise that is left without those found before
 ONE_SPEED = 1.3  #: the fastest over the slowest: less is one speed
@@ -45,6 +46,7 @@ class Choice:
     candidates: list[Candidate]  #: the most evidence first
     chosen: Candidate
     cautions: list[str]
+    turned: tuple[Candidate, float] | None = None  #: what a part chose, and its log evidence less the chosen's from all
 
     @property
     def fitted(self) -> Fit:
@@ -95,13 +97,37 @@ def choose(
         # Swings belong to a radius: from the prior's a fit would not come back to them.
         start = own.parameters.logs(first.parameters.theta(first.logs)) if eccentric else None
         candidates.append(_candidate(fit_stretches(stretches, own, first.noise, start=start), held))
-    best = _chosen(candidates)
+    best = _fewest(candidates)
     own = prior(replace(best.structure, per_roller=True))
     start = own.parameters.logs(best.fitted.parameters.theta(best.fitted.logs))
     candidates.append(_candidate(fit_stretches(best.fitted.stretches, own, best.fitted.noise, start=start), held))
     candidates.sort(key=lambda candidate: -candidate.evidence)
-    chosen = _chosen(candidates)
+    chosen = _fewest(candidates)
     return Choice(candidates, chosen, _cautions(candidates, chosen, stretches, held or []))
+
+
+def decided(choice: Choice, stretches: list[Stretch], held_out: list[Stretch]) -> tuple[Choice, Fit]:
+    """The structure that all data call for, of those that a part of them left open, and its fit to all of them.
+
+    Evidence needs no data held back, and a part of them may be too little: rollers that are each some per cent off
+    are taken for alike, whose radius is then wrong by more than they differ. `held_out` is what the part left out.
+    """
+    best = max(candidate.evidence for candidate in choice.candidates)
+    fits = {
+        candidate.structure: fit_stretches(
+            stretches, candidate.fitted.prior, candidate.fitted.noise, start=candidate.fitted.logs
+        )
+        for candidate in choice.candidates
+        if candidate is choice.chosen or candidate.evidence >= best - OPEN
+    }
+    chosen = _fewest(choice.candidates, {structure: fitted.evidence for structure, fitted in fits.items()})
+    fitted = fits[chosen.structure]
+    if chosen is choice.chosen:
+        return choice, fitted
+    turned = choice.chosen, fits[choice.chosen.structure].evidence - fitted.evidence
+    return replace(
+        choice, chosen=chosen, cautions=_cautions(choice.candidates, chosen, stretches, held_out), turned=turned
+    ), fitted
 
 
 def _candidate(fitted: Fit, held: list[Stretch] | None) -> Candidate:
@@ -112,11 +138,14 @@ def _candidate(fitted: Fit, held: list[Stretch] | None) -> Candidate:
     return Candidate(structure, fitted, score(fitted, held), float(np.mean(np.square(white))))
 
 
-def _chosen(candidates: list[Candidate]) -> Candidate:
-    """The one with fewest parameters of those that the best has not 20 to 1 against."""
-    best = max(candidate.evidence for candidate in candidates)
-    near = [candidate for candidate in candidates if candidate.evidence >= best - ENOUGH]
-    return min(near, key=lambda candidate: (candidate.fitted.parameters.size, -candidate.evidence))
+def _fewest(candidates: list[Candidate], from_all: Mapping[Structure, float] | None = None) -> Candidate:
+    """The one with fewest parameters of those that the best has not 20 to 1 against.
+
+    `from_all`: the evidence of those that it is between, from all data.
+    """
+    evidence = {one.structure: one.evidence for one in candidates} if from_all is None else from_all
+    near = [one for one in candidates if evidence.get(one.structure, -inf) >= max(evidence.values()) - ENOUGH]
+    return min(near, key=lambda one: (one.fitted.parameters.size, -evidence[one.structure]))
 
 
 def _cautions(

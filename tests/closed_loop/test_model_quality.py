@@ -3,17 +3,19 @@
 import numpy as np
 import pytest
 
+from gateway.cli.identify_outcome import why
 from gateway.core.theta import Noise
 from gateway.identification.eccentric_rollers import with_swings
 from gateway.identification.estimate import Structure
 from gateway.identification.identifiability import identifiability
+from gateway.identification.identify import identify, parts
 from gateway.identification.prediction_error import fit, stretches_of
 from gateway.identification.prior import prior_of
 from gateway.identification.structure_choice import choose
 from gateway.identification.validation import validate
 from tests.bench.gate_contexts import SPEEDS_M_PER_S
 from tests.bench.gate_validity import unruly_line
-from tests.closed_loop.recorded import demonstration_line, real_plant, recorded
+from tests.closed_loop.recorded import demonstration_line, per_roller, real_plant, recorded
 from tests.closed_loop.truths import altered, with_friction_and_lag
 
 BOTH = Structure(coulomb=True, torque_lag=True)
@@ -140,6 +142,23 @@ def test_friction_and_lag_are_chosen_where_they_are(with_friction):
     assert found.chosen.normalised == pytest.approx(1.0, abs=0.1)
     assert found.chosen.held_out == max(candidate.held_out for candidate in found.candidates)
     assert not found.cautions
+
+
+def test_a_structure_that_a_part_of_the_data_leaves_open_is_decided_by_all_of_them():
+    """Rollers that are each up to 2 % off: taken for alike, they have a radius that is wrong by three times that."""
+    plant = per_roller(real_plant().model_copy(update={"spans": 2}), 0.02, 3)
+    data = recorded(plant, 3, 2.5, (0.03, 0.05))
+    before, held = parts([data])
+    part = choose(before, demonstration_line(2), Noise(), held)
+    assert part.chosen.structure == Structure() and part.turned is None
+    found = identify([data], demonstration_line(2), Noise(), lambda: 0.0)
+    assert found.choice.chosen.structure == found.estimate.structure == Structure(per_roller=True)
+    assert found.choice.turned is not None and found.choice.turned[0].structure == Structure()
+    assert "a part of the data does not tell it from 'as in the paper'" in why(found.choice)
+    taken_for_alike, apart = (
+        np.abs(one.theta.web.radius_m / plant.parameters().radius_m - 1.0).max() for one in (part.fitted, found.fitted)
+    )
+    assert apart < 0.6 * taken_for_alike
 
 
 def test_nothing_is_chosen_beyond_what_is_there_and_one_speed_is_told():

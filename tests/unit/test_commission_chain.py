@@ -24,12 +24,24 @@ from gateway.commissioning.chain import (
     STRETCH,
     Look,
     Pending,
+    from_one_experiment,
     may_experiment,
     next_step,
     refused_at_once,
 )
 from gateway.commissioning.decisions import AGENTS, RULES
-from gateway.commissioning.ladder import AS_IT_IS, BY_RULES, LADDERS, MOST_AGAIN, MOST_OWN, OWN, Ended, Next
+from gateway.commissioning.ladder import (
+    ALL,
+    AS_IT_IS,
+    BY_RULES,
+    LADDERS,
+    MOST_AGAIN,
+    MOST_OWN,
+    NEWEST_AFTER_ALL,
+    OWN,
+    Ended,
+    Next,
+)
 from gateway.commissioning.past import Follows, Outcome, Past, Step, named, past_of
 from gateway.commissioning.redesign import LAWS, PREDICTIVE, RUNGS
 from gateway.control.design import design_lqi, is_stable, task_of
@@ -208,24 +220,75 @@ def test_what_is_not_settled_leads_to_another_model_and_redesign_a_few_times(gai
     assert rungs == ([0, 0] if gains else [1, 2])  # what the model has foreseen, a newer one would give again
 
 
-def test_so_many_adaptations_as_are_asked_for_each_rest_on_an_experiment_of_their_own():
+def test_of_so_many_adaptations_as_are_asked_for_the_second_is_from_all_data_and_those_after_it_from_new_ones():
     past, steps, rungs = list(ADAPTED), [], []
     while not isinstance(step := asked(past, adaptations=3), Ended):
         if isinstance(step, Look):
             past = looked_at(past, settled=False)
             continue
         steps.append(step.step)
-        rungs += [step.rung] if step.step is Step.REDESIGN else []
+        rungs += [step.rung] if step.step in {Step.REDESIGN, Step.MODEL} else []
         past.append(replace(after(step, past), speed_m_per_s=0.12))
-    again = [Step.EXPERIMENT, Step.MODEL, Step.REDESIGN, Step.MEASUREMENT]
-    assert steps == [Step.MEASUREMENT, *again, *again] and rungs == [0, 0]
+    again = [Step.MODEL, Step.REDESIGN, Step.MEASUREMENT]
+    assert steps == [Step.MEASUREMENT, *again, Step.EXPERIMENT, *again] and rungs == [ALL, 0, ALL, 0]
+
+
+def concluded(past, follows):
+    """Measured, and this was concluded from it."""
+    measured = after(asked(past), past)
+    return [*past, replace(measured, follows=follows, converged=True, why="as it should", speed_m_per_s=0.12)]
+
+
+def test_a_model_of_one_experiment_is_followed_by_one_of_all_data_once():
+    past = concluded(ADAPTED, Follows.ALL_DATA)
+    step = asked(past)
+    assert step == Next(Step.MODEL, ALL) and not step.others and not may_experiment(past)
+    for _ in range(2):  # and a redesign on it
+        past.append(replace(after(asked(past), past), speed_m_per_s=0.12))
+    assert not from_one_experiment(past) and asked(past).step is Step.MEASUREMENT
+    ended = asked(concluded(past, Follows.LEAVE))
+    assert isinstance(ended, Ended) and ended.converged
+
+
+def test_where_all_data_give_no_model_what_has_converged_stays():
+    past = concluded(ADAPTED, Follows.ALL_DATA)
+    refused = after(asked(past), past, Outcome.FAILED)
+    ended = asked([*past, refused])
+    assert isinstance(ended, Ended) and ended.reached and ended.converged
+
+
+def test_where_no_experiment_gets_through_after_a_measurement_there_are_all_data():
+    past = concluded(ADAPTED, Follows.NEWER_MODEL)
+    while asked(past).step is Step.EXPERIMENT:
+        past.append(after(asked(past), past, Outcome.FAILED))
+    assert asked(past) == Next(Step.MODEL, ALL)
+
+
+def test_after_a_measurement_all_data_come_first_and_then_the_newest():
+    past = concluded(ADAPTED, Follows.NEWER_MODEL)
+    past.append(after(asked(past), past))
+    step = asked(past)
+    assert [one.rung for one in (step, *step.others)] == [ALL, NEWEST_AFTER_ALL]
+    past.append(after(step, past, Outcome.FAILED))
+    assert asked(past).rung == NEWEST_AFTER_ALL
+
+
+def test_once_enough_redesigns_are_kept_it_is_measured_what_the_last_one_does_and_no_more():
+    measured = asked(ADAPTED, most_redesigns=1)
+    assert measured.step is Step.MEASUREMENT
+    past = [*ADAPTED, after(measured, ADAPTED)]
+    assert isinstance(asked(past, most_redesigns=1), Look)
+    for follows, converged in ((Follows.ALL_DATA, True), (Follows.NEWER_MODEL, False), (Follows.LEAVE, True)):
+        past[-1] = replace(past[-1], follows=follows, converged=converged)
+        ended = asked(past, most_redesigns=1)
+        assert isinstance(ended, Ended) and ended.reached and ended.converged is converged
 
 
 @pytest.mark.parametrize(
     ("refused", "gains", "tried"),
     [
         (Step.MEASUREMENT, True, LADDERS[Step.MEASUREMENT]),
-        (Step.EXPERIMENT, True, 1 + LADDERS[Step.EXPERIMENT]),
+        (Step.EXPERIMENT, True, 2 * (1 + LADDERS[Step.EXPERIMENT]) + 2),  # after the first, a model of all data
         (Step.REDESIGN, True, 3 + LADDERS[Step.REDESIGN]),
         (Step.REDESIGN, False, AS_IT_IS),  # what is in service is no candidate against itself
     ],
@@ -325,9 +388,9 @@ def test_what_agents_began_with_and_stays_as_it_is_is_theirs():
 
 
 def test_the_last_word_comes_also_where_no_more_redesigns_are_wanted_and_not_where_it_is_not_had():
-    assert asked(BY_AGENTS, most_redesigns=1) == Next(Step.REDESIGN, BY_RULES)
-    assert isinstance(asked(ADAPTED, most_redesigns=1), Ended)
-    assert isinstance(asked(BY_AGENTS, most_redesigns=1, last_word=False), Ended)
+    assert asked(at_the_end(BY_AGENTS), most_redesigns=1) == Next(Step.REDESIGN, BY_RULES)
+    assert isinstance(asked(at_the_end(ADAPTED), most_redesigns=1), Ended)
+    assert isinstance(asked(at_the_end(BY_AGENTS), most_redesigns=1, last_word=False), Ended)
 
 
 def shown(stage, rules=(), why=""):

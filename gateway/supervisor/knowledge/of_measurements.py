@@ -19,6 +19,7 @@ _SERVES: list[Decision] = [
 MOST_RECENT = 12
 _FOLLOWS = {
     "newer-model": "the line does otherwise than the model foresees: a newer model is wanted",
+    "all-data": "the line does as the model foresees, which is of one experiment: a model of all data is wanted",
     "calmer": "the model has foreseen it: a calmer configuration on the same model is wanted",
     "leave": "nothing significant is left to gain",
 }
