@@ -9,10 +9,10 @@ its data are there for the next model. Of each span the worst of its changes cou
 overshoot of the step's size, or of T_ref,i where the span does not step, and the band of settling 2 % of T_ref,i. What
 noise of the load cells adds to overshoot and settling is taken off by a mean over `SMOOTHED_S`.
 
-The prediction is a rollout on the accepted model with the set-points and speeds of the recording, looked at in the
-same way. Where what was measured is what was foreseen, a newer model would foresee the same, and lead to no other
-design: so the gap between the two says whether there is anything to gain. (Data of moves that stand for long give no
-model by themselves.)
+The prediction is a rollout on the accepted model with the set-points and speeds of the recording, and the noise of its
+load cells, looked at in the same way. Where what was measured is what was foreseen, a model of other data would foresee
+the same in moves of this size: so the gap between the two says whether the line does what the model does not. (Data of
+moves that stand for long tell too little by themselves; beside those of an experiment they tell what it left open.)
 """
 
 from collections.abc import Sequence
@@ -183,10 +183,11 @@ def convergence(line: Line, recording: Recording, in_service: Controller, model:
 
 
 def _rolled_out(line: Line, recording: Recording, config: Controller, model: LineModel) -> FloatArray:
-    """Tensions (k, n) of the model, with the set-points and speeds of the recording."""
-    course = Course(recording.tension_setpoint_n, recording.unwind_speed_m_per_s)
-    setup = loop_of(line, noise_of(model) or Noise())
-    return simulate(config, plants_of_thetas([theta_of(model)]), course, setup, record=True).tension_n[0]
+    """Tensions (k, n) of the model as its load cells tell them, with the set-points and speeds of the recording."""
+    course, noise = Course(recording.tension_setpoint_n, recording.unwind_speed_m_per_s), noise_of(model) or Noise()
+    simulated = simulate(config, plants_of_thetas([theta_of(model)]), course, loop_of(line, noise), record=True)
+    tension_n: FloatArray = simulated.tension_n[0]
+    return tension_n + noise.tension_n * np.random.default_rng(0).standard_normal(tension_n.shape)
 
 
 def _figures(line: Line, recording: Recording, tension_n: FloatArray) -> dict[str, SpanFigures]:

@@ -10,7 +10,7 @@ from gateway.core.line import Line
 from gateway.core.recording import Recording
 from gateway.core.signals import FloatArray
 from gateway.core.unnamed_terms import widest
-from gateway.identification.findings import Finding, Severity
+from gateway.identification.findings import EXCITATION, Finding, Severity
 from gateway.identification.regressions import MOVING, WINDOW_S, EquationFit, moving
 
 AMPLITUDE_N, DURATION_S = 2.0, 5.0  #: of the experiment that is recommended where nothing better is known
@@ -67,14 +67,14 @@ def assess_excitation(
         if name in predicted and predicted[name] > limit:
             lacking = max(lacking, predicted[name] / limit)
             what = f"these data tell it to +-{predicted[name]:.1%}, wanted is +-{limit:.1%}"
-            found.append(Finding("excitation", Severity.REFUSAL, what, title, predicted[name], limit))
+            found.append(Finding(EXCITATION, Severity.REFUSAL, what, title, predicted[name], limit))
     for kind, title, unit in (("roller", "speed", "m/s"), ("span", "tension", "N")):
         quiet = [fit for fit in fits if fit.kind == kind and not moving(fit)]
         if quiet:
             names = f"{kind} {', '.join(str(fit.index + 1) for fit in quiet)}"
             worst = min(fit.change for fit in quiet)
             what = f"{title} moves hardly more than by noise (least {worst:.2g} {unit} in {WINDOW_S:g} s)"
-            found.append(Finding("excitation", Severity.REFUSAL, what, names, worst, MOVING))
+            found.append(Finding(EXCITATION, Severity.REFUSAL, what, names, worst, MOVING))
     text = _experiment(recording, lacking if found else 1.0)
     found = [Finding(f.kind, f.severity, f.what, f.where, f.value, f.limit, f.mend, text) for f in found]
     return found + _friction(recording, predicted, wanted) + _apart(predicted, wanted)

@@ -7,6 +7,8 @@ from enum import IntEnum
 from gateway.identification.alignment import Alignment
 from gateway.identification.regressions import EquationFit
 
+EXCITATION = "excitation"  #: kind of a finding: these data do not move the line enough to tell
+
 
 class Severity(IntEnum):
     NOTE = 0  #: good to know

@@ -14,7 +14,7 @@ from gateway.core.theta import Noise
 from gateway.identification.assessment import assess
 from gateway.identification.comparison import WINDOW_S, Comparison, compare
 from gateway.identification.estimate import Estimate, Structure
-from gateway.identification.findings import Assessment, Finding
+from gateway.identification.findings import EXCITATION, Assessment, Finding, Severity, gravest_first
 from gateway.identification.prediction_error import LEAST_S, Fit, stretches_of
 from gateway.identification.prior import Prior
 from gateway.identification.recursive import estimated_recursively, live
@@ -70,7 +70,7 @@ def identify(
     Raises NotIdentified.
     """
     tell("assessing the data")
-    assessments = [assess(recording, line) for recording in recordings]
+    assessments = _together([assess(recording, line) for recording in recordings])
     refusals = [str(finding) for assessment in assessments for finding in assessment.refusals]
     if refusals:
         raise NotIdentified(refusals, assessments)
@@ -118,6 +118,18 @@ def parts(recordings: Sequence[Recording]) -> tuple[list[Recording], list[Record
             else:
                 before.append(stretch)
     return before, after
+
+
+def _together(assessments: Sequence[Assessment]) -> list[Assessment]:
+    """Beside a recording that tells enough, one that moves too little to tell by itself is no reason to refuse."""
+    if all(EXCITATION in one.kinds() for one in assessments):
+        return list(assessments)
+
+    def beside(one: Finding) -> Finding:
+        too_little = one.kind == EXCITATION and one.severity is Severity.REFUSAL
+        return replace(one, severity=Severity.WARNING, experiment="") if too_little else one
+
+    return [replace(one, findings=gravest_first(map(beside, one.findings))) for one in assessments]
 
 
 def _others(line: Line, choice: Choice) -> dict[str, Callable[[Sequence[Recording]], Estimate]]:

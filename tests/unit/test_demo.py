@@ -94,7 +94,7 @@ class Side:
 
 def shown_as(hash_, stage, config=None, step=Step.REDESIGN):
     change = SimpleNamespace(kind="model") if config is None else GainsChange(controller=config)
-    proposal = SimpleNamespace(change=change, kind=change.kind, evidence=[named(step, 0)])
+    proposal = SimpleNamespace(change=change, kind=change.kind, evidence=[named(step, 0)], author="rules")
     return SimpleNamespace(proposal_hash=hash_, stage=stage, why="", proposal=proposal, verdict=None)
 
 
