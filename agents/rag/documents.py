@@ -32,6 +32,7 @@ class Document(Strict):
     applies_to: str = ""
     sources: list[str] = []
     keywords: list[str] = []
+    asked: list[str] = []  #: questions that it answers, as people put them
     serves: list[Decision] = []  #: empty: nobody has said; it counts as serving none in particular
     confidence: float = NOTES_CONFIDENCE
     date: str = ""  #: ISO 8601; empty: not known
@@ -71,6 +72,7 @@ def of_note(note: Note, origin: Origin = "note") -> Document:
         applies_to=head.applies_to,
         sources=head.sources,
         keywords=head.keywords,
+        asked=head.asked,
         serves=head.serves,
         confidence=head.confidence,
         date=head.date or "",

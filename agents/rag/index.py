@@ -12,7 +12,7 @@ from agents.rag.conflicts import conflicts_among
 from agents.rag.database import DatabaseError
 from agents.rag.documents import Document
 from agents.rag.embedder import Embedder, EmbedderId, Vectors
-from agents.rag.index_file import HEADS, PASSAGES, IndexRefused, open_index
+from agents.rag.index_file import ASKED, HEADS, PASSAGES, IndexRefused, open_index
 from agents.rag.injection import Flag, flags_in
 from agents.rag.lexical import Words
 from agents.rag.question_words import concepts_of
@@ -106,7 +106,7 @@ class Index:
         with self._told():
             return {
                 sha256: np.frombuffer(vector, dtype=np.float32)
-                for table in (HEADS, PASSAGES)
+                for table in (HEADS, ASKED, PASSAGES)
                 for sha256, vector in self._connection.execute(f"SELECT sha256, embedding FROM {table}")
             }
 

@@ -21,8 +21,9 @@ from agents.rag.injection import flags_in
 from agents.rag.words import stems
 
 APPLICATION_ID = 0x52324B4E  # "R2KN"
-HEADS, PASSAGES = "head_vector", "vector"  #: tables of vectors: of documents, and of chunks
-SCHEMA = 1  #: another one is no loss: the index is made anew from the documents
+#: Tables of vectors: of documents, of questions that they answer, and of chunks.
+HEADS, ASKED, PASSAGES = "head_vector", "asked_vector", "vector"
+SCHEMA = 2  #: another one is no loss: the index is made anew from the documents
 
 _TABLES = """
 CREATE TABLE meta (key TEXT PRIMARY KEY NOT NULL, value TEXT NOT NULL);
@@ -32,6 +33,7 @@ CREATE TABLE document (
     content TEXT NOT NULL,          -- the document as JSON (agents/rag/documents.py)
     title_stems TEXT NOT NULL,      -- one space before and after each, as all stems here
     keyword_stems TEXT NOT NULL,
+    asked_stems TEXT NOT NULL,      -- of the questions that it answers
     about_stems TEXT NOT NULL       -- of topic and applies_to
 );
 CREATE TABLE chunk (
@@ -44,12 +46,13 @@ CREATE TABLE chunk (
 );
 CREATE INDEX chunk_by_document ON chunk (document);
 -- What is put in are stems already, so that the tokenizer only splits.
-CREATE VIRTUAL TABLE word USING fts5(title, keywords, text, content = '', tokenize = 'unicode61 remove_diacritics 0');
+CREATE VIRTUAL TABLE word USING fts5(
+    title, keywords, asked, text, content = '', tokenize = 'unicode61 remove_diacritics 0');
 CREATE VIRTUAL TABLE word_count USING fts5vocab(word, row);
 """
 _VECTORS = """
 CREATE VIRTUAL TABLE {table} USING vec0(
-    tier INTEGER PARTITION KEY, embedding FLOAT[{dimension}] DISTANCE_METRIC=cosine, +sha256 TEXT);
+    tier INTEGER PARTITION KEY, embedding FLOAT[{dimension}] DISTANCE_METRIC=cosine, +document INTEGER, +sha256 TEXT);
 """
 
 
@@ -63,13 +66,15 @@ def passages_of(documents: Sequence[Document]) -> list[list[Chunk]]:
 
 
 def embedded_texts(documents: Sequence[Document], passages: Sequence[Sequence[Chunk]]) -> list[str]:
-    """The head of every document, then every passage with what it is about, in their order."""
+    """The head of every document, then the questions, then every passage with what it is about, in their order."""
     heads = [". ".join(filter(None, (one.title, ", ".join(one.keywords)))) for one in documents]
-    return heads + [
+    asked = [question for document in documents for question in document.asked]
+    chunked = [
         ". ".join(filter(None, (document.title, chunk.heading, chunk.text)))
         for document, chunks in zip(documents, passages, strict=True)
         for chunk in chunks
     ]
+    return [*heads, *asked, *chunked]
 
 
 def hash_of(text: str) -> str:
@@ -140,7 +145,7 @@ def _fill(connection: Database, content: Content) -> None:
     connection.execute("PRAGMA journal_mode = OFF; PRAGMA synchronous = OFF")  # nobody sees it before it is whole
     connection.execute(f"PRAGMA application_id = {APPLICATION_ID}; PRAGMA user_version = {SCHEMA}; BEGIN")
     connection.execute(_TABLES)
-    totals = [0, 0, 0]
+    totals = [0, 0, 0, 0]
     number = 0
     for k, (document, chunks) in enumerate(zip(content.documents, content.passages, strict=True), start=1):
         head = _insert_document(connection, k, document)
@@ -162,17 +167,17 @@ def _fill(connection: Database, content: Content) -> None:
     connection.execute("COMMIT")
 
 
-def _insert_document(connection: Database, number: int, document: Document) -> tuple[list[str], list[str]]:
-    """The stems of its title, and of its keywords with what it is about."""
+def _insert_document(connection: Database, number: int, document: Document) -> tuple[list[str], ...]:
+    """The stems of its title, of its keywords with what it is about, and of the questions that it answers."""
     title, keywords = stems(document.title), stems(", ".join(document.keywords))
-    about = stems(f"{document.topic}. {document.applies_to}")
-    row = (number, document.tier, document.model_dump_json(), *map(_spaced, (title, keywords, about)))
-    connection.execute("INSERT INTO document VALUES (?, ?, ?, ?, ?, ?)", row)
-    return title, keywords + about
+    about, asked = stems(f"{document.topic}. {document.applies_to}"), stems(" ".join(document.asked))
+    row = (number, document.tier, document.model_dump_json(), *map(_spaced, (title, keywords, asked, about)))
+    connection.execute("INSERT INTO document VALUES (?, ?, ?, ?, ?, ?, ?)", row)
+    return title, keywords + about, asked
 
 
 def _insert_chunk(
-    connection: Database, number: int, document: int, chunk: Chunk, head: tuple[list[str], list[str]]
+    connection: Database, number: int, document: int, chunk: Chunk, head: Sequence[list[str]]
 ) -> list[str]:
     """The stems of its text."""
     words = stems(f"{chunk.heading}. {chunk.text}")
@@ -180,22 +185,26 @@ def _insert_chunk(
     row = (number, document, chunk.heading, chunk.text, _spaced(words), flags)
     connection.execute("INSERT INTO chunk VALUES (?, ?, ?, ?, ?, ?)", row)
     texts = (" ".join(some) for some in (*head, words))
-    connection.execute("INSERT INTO word (rowid, title, keywords, text) VALUES (?, ?, ?, ?)", (number, *texts))
+    connection.execute(
+        "INSERT INTO word (rowid, title, keywords, asked, text) VALUES (?, ?, ?, ?, ?)", (number, *texts)
+    )
     return words
 
 
 def _fill_vectors(connection: Database, content: Content, dimension: int, vectors: Vectors) -> None:
-    heads = [document.tier for document in content.documents]
-    chunks = [tier for tier, some in zip(heads, content.passages, strict=True) for _ in some]
-    hashes = [hash_of(text) for text in embedded_texts(content.documents, content.passages)]
-    start = 0
-    for table, tiers in ((HEADS, heads), (PASSAGES, chunks)):
+    heads = list(enumerate(content.documents, start=1))
+    asked = [each for each in heads for _ in each[1].asked]
+    chunks = [each for each, some in zip(heads, content.passages, strict=True) for _ in some]
+    texts = iter(zip(vectors, embedded_texts(content.documents, content.passages), strict=True))
+    for table, of in ((HEADS, heads), (ASKED, asked), (PASSAGES, chunks)):
         connection.execute(_VECTORS.format(table=table, dimension=dimension))
         rows = [
-            (k, tier, vectors[start + k - 1].tobytes(), hashes[start + k - 1]) for k, tier in enumerate(tiers, start=1)
+            (k, document.tier, vector.tobytes(), number, hash_of(text))
+            for k, ((number, document), (vector, text)) in enumerate(zip(of, texts, strict=False), start=1)
         ]
-        connection.executemany(f"INSERT INTO {table} (rowid, tier, embedding, sha256) VALUES (?, ?, ?, ?)", rows)
-        start += len(tiers)
+        connection.executemany(
+            f"INSERT INTO {table} (rowid, tier, embedding, document, sha256) VALUES (?, ?, ?, ?, ?)", rows
+        )
 
 
 def _spaced(words: Sequence[str]) -> str:

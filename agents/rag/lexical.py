@@ -22,7 +22,7 @@ PASSAGES_A_DOCUMENT = 4  #: of a long document, the best ones count
 MOST_MENTIONS = 3000  #: passages with a word of the question that are scored in the first search, over all words
 SATURATION = 5.0  #: k1: how much more a second mention says than a first
 LENGTH = 0.3  #: b: how far a long field counts less
-TITLE, KEYWORDS, BODY = 5.0, 5.0, 1.0
+TITLE, KEYWORDS, ASKED, BODY = 5.0, 5.0, 3.0, 1.0
 
 
 Field = tuple[str, float]  #: stems, a space before and after each; what one mention there counts
@@ -31,12 +31,14 @@ Worth = list[tuple[float, list[tuple[str, float]], list[tuple[Phrase, float]]]]
 
 
 class Words:
-    """The words of an index. `mean_stems`: of titles, of keywords, of passages."""
+    """The words of an index. `mean_stems`: of titles, of keywords, of questions, of passages."""
 
     def __init__(self, connection: Database, chunks: int, mean_stems: Sequence[float]) -> None:
         self._connection = connection
         self._chunks = chunks
-        self._mean_title, self._mean_keywords, self._mean_text = (max(mean, 1.0) for mean in mean_stems)
+        self._mean_title, self._mean_keywords, self._mean_asked, self._mean_text = (
+            max(mean, 1.0) for mean in mean_stems
+        )
 
     def search(
         self, concepts: Sequence[Concept], tiers: Sequence[Tier]
@@ -58,8 +60,9 @@ class Words:
         limit = f"ORDER BY score LIMIT {MOST_PASSAGES}" if set(tiers) == set(TIERS) else ""
         rows = self._connection.execute(
             "SELECT word.rowid, chunk.document, -score FROM"
-            f" (SELECT rowid, bm25(word, {TITLE}, {KEYWORDS}, {BODY}) AS score FROM word WHERE word MATCH ? {limit})"
-            " AS word JOIN chunk ON chunk.id = word.rowid JOIN document ON document.id = chunk.document"
+            f" (SELECT rowid, bm25(word, {TITLE}, {KEYWORDS}, {ASKED}, {BODY}) AS score FROM word"
+            f" WHERE word MATCH ? {limit}) AS word"
+            " JOIN chunk ON chunk.id = word.rowid JOIN document ON document.id = chunk.document"
             f" WHERE document.tier IN ({','.join('?' * len(tiers))}) ORDER BY score LIMIT {MOST_PASSAGES}",
             (match, *tiers),
         )
@@ -90,14 +93,15 @@ class Words:
         words = frozenset(word for _, singles, _ in worth for word, _ in singles)
         words |= frozenset(word for _, _, longer in worth for phrase, _ in longer for word in phrase)
         texts = self._stems("chunk", "stems", [chunk for some in chunks.values() for chunk in some])
-        heads = self._stems("document", "title_stems, keyword_stems, about_stems", chunks)
+        heads = self._stems("document", "title_stems, keyword_stems, asked_stems, about_stems", chunks)
         found: list[FoundDocument] = []
         for document, own in chunks.items():
-            title, keywords, about = heads[document]
+            title, keywords, asked, about = heads[document]
             body = about + "".join(texts[chunk][0] for chunk in own)
             fields = [
                 _field(title, TITLE, self._mean_title),
                 _field(keywords, KEYWORDS, self._mean_keywords),
+                _field(asked, ASKED, self._mean_asked),
                 _field(body, BODY, self._mean_text * len(own)),
             ]
             found.append(FoundDocument(document, _score(worth, words, fields), own[0]))

@@ -50,6 +50,7 @@ class Head(Strict):
     applies_to: Words
     serves: Annotated[list[Decision], Field(min_length=1)]
     keywords: Annotated[list[Words], Field(min_length=1)]
+    asked: list[Words] = []  #: questions that it answers, as people put them: in other words than its own
     kind: Literal["note", "failure"] = "note"
     fault_class: Annotated[FaultClass | None, Field(alias="class")] = None
     adjustable: bool | None = None  #: whether set-points or control can answer it, without hands

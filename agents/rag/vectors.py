@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from agents.rag.database import Database
 from agents.rag.documents import Tier
-from agents.rag.index_file import HEADS, PASSAGES
+from agents.rag.index_file import ASKED, HEADS, PASSAGES
 from agents.rag.stages import FoundDocument, FoundPassage
 
 MOST_NEAR = 50  #: of passages, and of heads
@@ -24,21 +24,29 @@ def nearest_passages(connection: Database, vector: NDArray[np.float32], tiers: S
 def nearest_documents(
     connection: Database, vector: NDArray[np.float32], tiers: Sequence[Tier], passages: Sequence[FoundPassage]
 ) -> list[FoundDocument]:
-    """By the mean of head and best passage; what is not among the nearest counts as the farthest of those."""
-    heads = dict(_nearest(connection, HEADS, vector, tiers))
+    """By the mean of head, best passage and nearest question that it answers, or of the two where it names none.
+
+    What is not among the nearest counts as the farthest of those.
+    """
+    heads, asked = dict(_nearest(connection, HEADS, vector, tiers)), _asked(connection, vector, tiers)
     best: dict[int, FoundPassage] = {}
     for passage in passages:
         best.setdefault(passage.document, passage)
-    least_head = min(heads.values(), default=0.0)
-    least_passage = min((one.score for one in passages), default=0.0)
-    first = _first_chunks(connection, [document for document in heads if document not in best])
-    found = [
-        FoundDocument(
-            document,
-            0.5 * heads.get(document, least_head) + 0.5 * (best[document].score if document in best else least_passage),
-            best[document].chunk if document in best else first[document],
+    near = {document: passage.score for document, passage in best.items()}
+    every = list(dict.fromkeys((*best, *heads, *asked)))
+    first = _first_chunks(connection, [document for document in every if document not in best])
+    with_questions = _with_questions(connection, every)
+    least = [min(of.values(), default=0.0) for of in (heads, near, asked)]
+
+    def score(document: int) -> float:
+        head, passage, question = (
+            of.get(document, farthest) for of, farthest in zip((heads, near, asked), least, strict=True)
         )
-        for document in {**best, **heads}
+        return (head + passage + question) / 3.0 if document in with_questions else 0.5 * (head + passage)
+
+    found = [
+        FoundDocument(document, score(document), best[document].chunk if document in best else first[document])
+        for document in every
     ]
     return sorted(found, key=lambda one: -one.score)
 
@@ -55,6 +63,24 @@ def _nearest(
         )
         found += [(number, 1.0 - distance) for number, distance in rows]
     return sorted(found, key=lambda pair: -pair[1])[:MOST_NEAR]
+
+
+def _asked(connection: Database, vector: NDArray[np.float32], tiers: Sequence[Tier]) -> dict[int, float]:
+    """By document, the cosine of the nearest question that it answers."""
+    near = _nearest(connection, ASKED, vector, tiers)
+    numbers = ",".join(str(number) for number, _ in near)
+    of = dict(connection.execute(f"SELECT rowid, document FROM {ASKED} WHERE rowid IN ({numbers})").fetchall())
+    found: dict[int, float] = {}
+    for number, cosine in near:
+        found.setdefault(of[number], cosine)
+    return found
+
+
+def _with_questions(connection: Database, documents: Sequence[int]) -> set[int]:
+    """Those that say which questions they answer."""
+    numbers = ",".join(map(str, documents))
+    rows = connection.execute(f"SELECT id FROM document WHERE id IN ({numbers}) AND trim(asked_stems) != ''")
+    return {number for (number,) in rows}
 
 
 def _first_chunks(connection: Database, documents: Sequence[int]) -> dict[int, int]:

@@ -36,6 +36,13 @@ def test_a_failure_mode_has_four_parts() -> None:
     assert note.parts == {"Symptom": "a", "Signature": "b", "Test": "c", "Action": "d"}
 
 
+def test_each_note_says_which_questions_it_answers(notes: list[Note]) -> None:
+    """By those it is found in other words than its own; a question that two notes answer best tells neither."""
+    asked = [question for note in notes for question in note.head.asked]
+    assert all(len(note.head.asked) >= 4 for note in notes) and len(set(asked)) == len(asked)
+    assert all(question.endswith("?") for question in asked)
+
+
 @pytest.mark.parametrize(
     ("content", "said"),
     [

@@ -55,6 +55,18 @@ def test_the_passage_that_answers_is_quoted_under_its_heading(tmp_path: Path) ->
         assert (passage.heading, passage.text) == ("Draw", "Tension by draw disappears there.")
 
 
+@pytest.mark.parametrize("embedder", [None, WordCounter()], ids=["by words", "by meaning"])
+def test_a_question_that_a_document_answers_in_other_words_finds_it(
+    tmp_path: Path, embedder: WordCounter | None
+) -> None:
+    said = [document("drag", "Friction of a bearing rises.", asked=["Why does it squeal?", "May I go on running?"])]
+    with index_of(tmp_path / "i", [*DOCUMENTS, *said], embedder) as index:
+        found = asyncio.run(index.ask(Asked("It squeals, why?"), embedder))
+        assert found.hits[0].document.name == "drag" and found.hits[0].passage.text == "Friction of a bearing rises."
+        by_meaning = [(one.document, one.score) for one in found.embedding_documents]
+        assert embedder is None or (by_meaning[0][0] == 4 and by_meaning[0][1] > 2.0 * by_meaning[1][1])
+
+
 @given(question=st.text(max_size=200))
 def test_no_question_is_too_strange(notes: Index, question: str) -> None:
     notes.retrieve(Asked(question))
