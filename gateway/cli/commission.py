@@ -20,13 +20,13 @@ from gateway.cli.commission_questions import (
     step_question,
 )
 from gateway.cli.commission_result import Commissioned, candidate_name, commissioned
-from gateway.cli.commission_side import CannotGoOn, GateSide, measured_on, put, region_kept
+from gateway.cli.commission_side import CannotGoOn, GateSide, measured_on, proposed_on_model, put, region_kept
 from gateway.commissioning.candidates import Exhausted, NotOffered, fastest_m_per_s
 from gateway.commissioning.chain import (
     Look,
     Pending,
-    from_one_experiment,
     may_experiment,
+    may_use_all,
     next_step,
     refused_at_once,
     region_speed,
@@ -64,7 +64,7 @@ async def commission(
     """Until the chain has ended, one way or the other. Every rung is tried once, so that it does.
 
     `wanted_m_per_s`: up to which the line is to be adapted; None: as fast as its drives hold.
-    `adaptations`: redesigns at least; `most_redesigns`: once so many are kept it is only measured what the last does.
+    `adaptations`: redesigns at least; `most_redesigns`: once so many are kept none follows.
     `decider`: who chooses among the candidates. `last_word`: the rules propose theirs in the end, where agents have
     chosen what is in service and the rules' own design promises significantly more.
     """
@@ -150,7 +150,7 @@ class _Chain:
             raise CannotBeJudged(str(error)) from error
         self._tell(f"measurement: {found.text}")
         due = still_due(self.past, self._adaptations)
-        few = from_one_experiment(self.past)
+        few = may_use_all(self.past, len(recordings))
         decided = await self._decided(diagnosis_question(self._line, found, now, self.past, due, few))
         follows, because = Follows(decided.choice.option), decided.choice.reason
         if decided.by != RULES or follows is not found.follows:
@@ -167,7 +167,9 @@ class _Chain:
         _require_slow(self._line, step, now)
         rung = step.rung
         try:
-            offers = await asyncio.to_thread(self._changes.offers, step, now, recordings, region_kept(self._shown))
+            offers = await asyncio.to_thread(
+                self._changes.offers, step, now, recordings, region_kept(self._shown), proposed_on_model(self._shown)
+            )
             decided, rung = await self._chosen(step, offers, now)
             what = f"{step.step}, {candidate_name(rung)}"
             self._tell(f"{what}: being made")

@@ -5,7 +5,7 @@ is without being made; where its design has knobs, they may be turned.
 """
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from math import inf
@@ -17,7 +17,7 @@ from gateway.commissioning.architectures import ARCHITECTURES
 from gateway.commissioning.candidates import FIRST_LAWS, Exhausted, Law, NotOffered, at_end, configuration, experiment
 from gateway.commissioning.chain import first_legs
 from gateway.commissioning.convergence import SIGNIFICANT, Convergence, convergence, measurement
-from gateway.commissioning.ladder import ALL, AS_IT_IS, BY_RULES, NEWEST, Next
+from gateway.commissioning.ladder import ALL, AS_IT_IS, BY_RULES, Next
 from gateway.commissioning.past import Step
 from gateway.commissioning.redesign import Offer as Redesign
 from gateway.commissioning.redesign import redesigns
@@ -81,8 +81,13 @@ class Changes:
         self._designed: tuple[LineNow, Region | None, list[Redesign]] | None = None
         self._experiment_for: tuple[object, Experiment] | None = None  #: and what it was designed from
 
-    def offers(self, step: Next, now: LineNow, recordings: Sequence[Recording], region: Region | None) -> list[Offer]:
-        """The candidate of `step`, and those of its `others` that there are. `recordings`: the newest first.
+    def offers(
+        self, step: Next, now: LineNow, recordings: Sequence[Recording], region: Region | None,
+        proposed: Collection[str] = (),
+    ) -> list[Offer]:  # fmt: skip
+        """The candidate of `step`, and those of its `others` that there are.
+
+        `recordings`: the newest first; `proposed`: hashes of the configurations that were, on the accepted model.
 
         Raises NotOffered where there is no such candidate as the step's own.
         """
@@ -94,6 +99,8 @@ class Changes:
             case Step.MODEL:
                 return self._models(step, now, recordings)
             case Step.REDESIGN:
+                if step.rung >= BY_RULES:
+                    return [self._better(step.rung, now, region, proposed)]
                 return self._redesigns(step, now, region)
             case Step.MEASUREMENT:
                 return [self._measurement(step, now, region)]
@@ -155,7 +162,7 @@ class Changes:
         """
         if not recordings:
             raise NotOffered("there is no recording of an experiment")
-        if step.rung != NEWEST and len(recordings) == 1:
+        if step.rung == ALL and len(recordings) == 1:
             raise NotOffered("there is no other recording")
         rungs = [step.rung, *(one.rung for one in step.others if len(recordings) > 1)]
         return [self._model(rung, now, list(recordings if rung == ALL else recordings[:1])) for rung in rungs]
@@ -192,9 +199,7 @@ class Changes:
     def _redesigns(self, step: Next, now: LineNow, region: Region | None) -> list[Offer]:
         """On the accepted model; in the end the configuration in service, for what data have shown since."""
         assert now.model is not None  # a redesign follows a model
-        on = f"on model {model_hash(now.model)[:12]}, whose data go up to {now.model.region.speed_to_m_per_s:.3g} m/s"
-        if step.rung >= BY_RULES:
-            return [self._better(step.rung, now, region, on)]
+        on = _on(now.model)
         as_it_is = Made(GainsChange(controller=now.in_service), f"the configuration in service, {on}")
         rungs = [one.rung for one in (step, *step.others)]
         designed = [] if rungs == [AS_IT_IS] else self._designs(now, region)
@@ -208,14 +213,25 @@ class Changes:
                 raise Exhausted(_nothing_left(len(designed)))
         return offers
 
-    def _better(self, rung: int, now: LineNow, region: Region | None, on: str) -> Offer:
-        """Than what agents have put into service: significantly, on the same model, by the rules' own design."""
-        better = [one for one in self._designs(now, region) if one.share <= 1.0 - SIGNIFICANT]
-        if rung - BY_RULES >= len(better):
-            raise Exhausted(f"no other design of the rules promises {SIGNIFICANT:.0%} less tracking error")
-        one = better[rung - BY_RULES]
-        promise = f"it promises {one.share:.0%} of the tracking error of what is in service, which agents have chosen"
-        made = Made(GainsChange(controller=one.controller), f"{one.law.text} {on}; {promise}")
+    def _better(self, rung: int, now: LineNow, region: Region | None, proposed: Collection[str]) -> Offer:
+        """Than what agents have put into service: significantly, on the same model, by the rules' own design.
+
+        One that has been proposed on that model has had its verdict.
+        """
+        assert now.model is not None  # a redesign follows a model
+        better = [
+            one
+            for one in self._designs(now, region)
+            if one.share <= 1.0 - SIGNIFICANT and config_hash(one.controller) not in proposed
+        ]
+        if not better:
+            raise Exhausted(f"the rules have no design that promises {SIGNIFICANT:.0%} less tracking error")
+        one = better[0]
+        promise = (
+            f"in simulated changes it promises {one.share:.0%} of the tracking error of what is in service, "
+            "which agents have chosen"
+        )
+        made = Made(GainsChange(controller=one.controller), f"{one.law.text} {_on(now.model)}; {promise}")
         return Offer(rung, one.law.text, lambda _: made, (), one.law, one)
 
     def _designs(self, now: LineNow, region: Region | None) -> list[Redesign]:
@@ -237,6 +253,10 @@ class Changes:
             return Made(GainsChange(controller=controller), "; ".join(said))
 
         return Offer(rung, one.law.text, make, _knobs(one.law), one.law, one)
+
+
+def _on(model: LineModel) -> str:
+    return f"on model {model_hash(model)[:12]}, whose data go up to {model.region.speed_to_m_per_s:.3g} m/s"
 
 
 def _knobs(law: Law) -> tuple[str, ...]:

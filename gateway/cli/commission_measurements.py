@@ -9,6 +9,7 @@ from pydantic import ValidationError
 
 from gateway.cli.commission_changes import LineNow
 from gateway.commissioning.convergence import Convergence
+from gateway.commissioning.past import Follows
 from gateway.core.controller import config_hash
 from gateway.core.line import Line
 from gateway.core.line_model import model_hash
@@ -33,7 +34,7 @@ def kept(folder: Path, line: Line) -> dict[str, Convergence]:
 
 
 def keep(folder: Path, line: Line, now: LineNow, proposal: str, found: Convergence, effort_n2m2s: float) -> None:
-    """Where nothing is left to do, it is what the line is held against from now on. Raises BaselinesError."""
+    """Where nothing is to follow, it is what the line is held against from now on. Raises BaselinesError."""
     worst, at_s = found.worst, now.at.timestamp()
     settling_s = float("inf") if worst.settling_s is None else worst.settling_s
     run = MeasuredRun(
@@ -48,5 +49,5 @@ def keep(folder: Path, line: Line, now: LineNow, proposal: str, found: Convergen
     )
     with begin_baselines(folder / FILE_NAME) as database:
         stored = database.add(run)
-        if found.settled:
+        if found.settled and found.follows is Follows.LEAVE:
             database.set_baseline(stored.number, at_s, WHO, f"the end of commissioning: {found.text}"[:400])

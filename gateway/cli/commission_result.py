@@ -46,7 +46,8 @@ def commissioned(
     ended: Ended, past: Sequence[Past], shown: Sequence[ProposalShown], measured: Mapping[str, Convergence]
 ) -> Commissioned:
     by_hash = {one.proposal_hash: one for one in shown}
-    tried = [tried_of(one, by_hash.get(one.proposal), measured.get(one.proposal)) for one in past]
+    candidates = [one for one in past if one.proposal or one.rung < BY_RULES]  # else the rules had nothing better
+    tried = [tried_of(one, by_hash.get(one.proposal), measured.get(one.proposal)) for one in candidates]
     return Commissioned(ended.reached, ended.text, tried, region_speed(past), ended.converged)
 
 

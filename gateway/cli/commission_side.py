@@ -9,13 +9,14 @@ from gateway.cli.commission_changes import LineNow
 from gateway.cli.commission_measurements import kept
 from gateway.commissioning.convergence import Convergence
 from gateway.commissioning.decisions import RULES
+from gateway.commissioning.past import Outcome, past_of
 from gateway.core.controller import config_hash
 from gateway.core.decisions import ProposalShown
 from gateway.core.deployment import Region
 from gateway.core.line import Line
 from gateway.core.line_model import model_hash
 from gateway.core.messages import Reply
-from gateway.core.proposal import Change, Evidence, Proposal, canonical, proposal_hash
+from gateway.core.proposal import Change, Evidence, GainsChange, Proposal, canonical, proposal_hash
 from gateway.core.recording import Recording
 from gateway.supervisor.baselines import BaselinesError
 
@@ -93,6 +94,14 @@ async def put(
     if not reply.ok:
         raise CannotGoOn("; ".join([reply.text, *reply.reasons]))
     return proposal_hash(proposal)
+
+
+def proposed_on_model(shown: Sequence[ProposalShown]) -> frozenset[str]:
+    """Hashes of the configurations that have had their answer since the accepted model was kept."""
+    at = max((i for i, one in enumerate(shown) if one.proposal.kind == "model" and one.stage == "kept"), default=-1)
+    answered = (one for one in shown[at + 1 :] if past_of(one).outcome in {Outcome.DONE, Outcome.FAILED})
+    changes = (one.proposal.change for one in answered)
+    return frozenset(config_hash(change.controller) for change in changes if isinstance(change, GainsChange))
 
 
 def region_kept(shown: Sequence[ProposalShown]) -> Region | None:

@@ -1,16 +1,18 @@
 """The chain by which a new line is commissioned through the gate: what is proposed next, and when it is over. Pure.
 
     configuration on the line's file -> experiment -> model -> redesign on it -> experiment at higher speeds -> ...
-        -> measurement -> experiment -> model -> redesign -> measurement -> ...
+        -> measurement -> model of all data -> redesign -> measurement
+        or -> measurement -> experiment -> model -> redesign -> measurement -> ...
 
 Each link rests on what the gate has let through before: a first configuration needs no model, an experiment only the
 configuration in service, a model only the experiment's data, a redesign the model, and speeds beyond what data have
 shown only an experiment there. So the chain can always begin, and each round ends where the next one does.
 
 Once a configuration is in service over the line's range of speeds, what it does there is measured (algorithm 2):
-where the criteria of convergence are met and no significant gain is predicted any more, the chain has come to its end;
-otherwise another experiment, model, redesign and measurement follow, `MOST_ROUNDS` times at most. Where the model has
-foreseen what is not as it should be, so that a newer one has nothing to add, a calmer candidate follows at once.
+where the criteria of convergence are met and no significant gain is predicted any more, the chain has come to its end,
+after a model of all that has been recorded and a redesign on it (decision 41); where the line does otherwise than
+foreseen another experiment, model, redesign and measurement follow, `MOST_ROUNDS` measurements at most. Where the model
+has foreseen what is not as it should be, a calmer candidate follows at once.
 
 Where a proposal is refused, the next, less ambitious candidate of a short ladder is taken (`LADDERS`), or whichever of
 those that are left somebody chooses, or one with numbers of its own. What has been tried is read from the gate's own
@@ -66,15 +68,23 @@ def next_step(
     """`past` oldest first. Speeds: of a first configuration's region, and up to which the line is to be adapted.
 
     `adaptations`: redesigns at least, also where the first has converged already. A further one may come to nothing.
-    `most_redesigns`: once so many are kept it is only measured what the last one does. `last_word`: the rules have it.
+    `most_redesigns`: once so many are kept none follows; what the last one does is measured, where it may go as fast as
+    is wanted. `last_word`: the rules have it.
     """
     if open_ := next((one for one in reversed(past) if one.outcome is Outcome.OPEN), None):
         return Pending(open_.proposal, open_.kind)
     kept = sum(one.step is Step.REDESIGN and one.outcome is Outcome.DONE for one in past)
     found = _next_step(past, first_speed_m_per_s, wanted_m_per_s, adaptations)
-    if most_redesigns is not None and kept >= most_redesigns and isinstance(found, Next):
-        found = found if found.step is Step.MEASUREMENT else _enough(past, kept)
+    if most_redesigns is not None and kept >= most_redesigns and _goes_on(found):
+        found = _enough(past, kept)
     return _last_word(past, found) if last_word and isinstance(found, Ended) and found.reached else found
+
+
+def _goes_on(found: Next | Look | Ended) -> bool:
+    """To something else than a measurement, or nowhere."""
+    if isinstance(found, Ended):
+        return not found.reached
+    return isinstance(found, Next) and found.step is not Step.MEASUREMENT
 
 
 def _enough(past: Sequence[Past], kept: int) -> Ended:
@@ -92,6 +102,8 @@ def _last_word(past: Sequence[Past], ended: Ended) -> Next | Ended:
     if model < 0 or not kept or past[kept[-1]].author != AGENTS:
         return ended
     if any(i > model and past[i].author == RULES for i in kept):  # and something was found to be better
+        return ended
+    if _known_by_measurement(past) > 0:  # what promises more on this model has been measured, and was not good enough
         return ended
     found = on_ladder(Step.REDESIGN, past[_last_done(past, "gains") + 1 :], BY_RULES, BY_RULES + RUNGS)
     return ended if isinstance(found, Ended) else Next(Step.REDESIGN, found.rung, own=0)
@@ -160,15 +172,17 @@ def _measured(
     due = still_due(past, adaptations)
     if measured.follows is Follows.LEAVE and not due:
         return Ended(True, f"{what}; {measured.why}", measured.converged)
-    rounds = sum(one.step is Step.MEASUREMENT and _is_done(one, "experiment") for one in past)
-    if rounds >= MOST_ROUNDS:
-        return Ended(True, f"{what}, and after {rounds} measurements that is left as it is; {measured.why}")
+    if not _rounds_left(past):
+        left = f"{what}, and after {MOST_ROUNDS} measurements that is left as it is; {measured.why}"
+        return Ended(True, left, measured.converged)
     found = more
     if measured.follows is Follows.CALMER and not due:
         # What is in service has been judged for all that data have shown: as it is, it is no candidate here.
         found = on_ladder(Step.REDESIGN, since, _known_by_measurement(past), AS_IT_IS)
     elif from_one_experiment(past) and (measured.follows is not Follows.NEWER_MODEL or isinstance(more, Ended)):
         found = on_ladder(Step.MODEL, since, ALL, ALL + 1)
+        if isinstance(found, Ended) and (due or not measured.converged):
+            found = more
     if isinstance(found, Ended):
         return Ended(True, f"{what}; {measured.why}; {found.text}", measured.converged)
     return found
@@ -178,6 +192,15 @@ def from_one_experiment(past: Sequence[Past]) -> bool:
     """Whether the accepted model is one of this chain, of the newest experiment that there was alone."""
     at = _last_done(past, "model")
     return at >= 0 and past[at].step is Step.MODEL and past[at].rung == NEWEST
+
+
+def may_use_all(past: Sequence[Past], recordings: int) -> bool:
+    """Whether a model of all recordings may follow a measurement."""
+    return from_one_experiment(past) and recordings > 1 and _rounds_left(past)
+
+
+def _rounds_left(past: Sequence[Past]) -> bool:
+    return sum(one.step is Step.MEASUREMENT and _is_done(one, "experiment") for one in past) < MOST_ROUNDS
 
 
 def may_experiment(past: Sequence[Past]) -> bool:

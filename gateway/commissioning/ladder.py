@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from gateway.commissioning.candidates import FIRST_LAWS
-from gateway.commissioning.past import Outcome, Past, Step
+from gateway.commissioning.past import BY_RULES, Outcome, Past, Step
 from gateway.commissioning.redesign import RUNGS
 
 #: Candidates of each step.
@@ -17,8 +17,6 @@ LADDERS: dict[Step, int] = {
 }
 #: From here on: no rung, but somebody's own numbers. So many in a row, then only the ladder is left.
 OWN, MOST_OWN = 100, 3
-#: From here on: designs that the rules propose in the end, where somebody else has chosen what is in service.
-BY_RULES = 200
 #: Of a model: from the newest experiment, from all recordings, and where those were tried first, from the newest.
 NEWEST, ALL, NEWEST_AFTER_ALL = 0, 1, 2
 AS_IT_IS = RUNGS  #: of a redesign: the configuration in service stays, and is judged for what data have shown since

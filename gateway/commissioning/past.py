@@ -39,6 +39,8 @@ KINDS = {
     Step.MEASUREMENT: "experiment",
 }  # fmt: skip
 MOST_RUNG = 1000
+#: From here on: designs that the rules propose in the end, where somebody else has chosen what is in service.
+BY_RULES = 200
 PROPOSED_BY = "commissioning: "  #: how the evidence begins that names step and rung
 
 OPEN_STAGES = frozenset({"received", "waiting", "approved", "deploying", "probation", "keeping", "running"})
@@ -59,7 +61,7 @@ class Past:
     proposal: str = ""  #: hash; empty: it could not be made
     converged: bool = False  #: of a measurement: the line did what it should, as the model foresees
     follows: Follows | None = None  #: from a measurement; None: nobody has looked at it yet
-    last: bool = False  #: there is no design on a higher rung either
+    last: bool = False  #: there is no design on a higher rung either, or a person wants none
     author: str = RULES
 
 
@@ -77,6 +79,7 @@ def past_of(shown: ProposalShown) -> Past:
         speed_m_per_s=None if region is None else region.speed_max_m_per_s,
         proposal=shown.proposal_hash,
         author=shown.proposal.author,
+        last=rung >= BY_RULES and shown.stage == "rejected",
     )
 
 

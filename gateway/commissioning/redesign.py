@@ -74,7 +74,8 @@ class Offer:
     @property
     def share(self) -> float:
         """Its tracking error over that in service, mean of the courses."""
-        return float(np.mean([ratio(self.figures[name].rmse_n, of.rmse_n) for name, of in self.before.items()]))
+        errors = [(self.figures[name].rmse_n, of.rmse_n) for name, of in self.before.items()]
+        return float(np.mean([0.0 if one < before == inf else ratio(one, before) for one, before in errors]))
 
 
 @dataclass(frozen=True)

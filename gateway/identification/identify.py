@@ -127,7 +127,8 @@ def _together(assessments: Sequence[Assessment]) -> list[Assessment]:
 
     def beside(one: Finding) -> Finding:
         too_little = one.kind == EXCITATION and one.severity is Severity.REFUSAL
-        return replace(one, severity=Severity.WARNING, experiment="") if too_little else one
+        what = f"{one.what}; another recording tells enough"
+        return replace(one, severity=Severity.WARNING, what=what, experiment="") if too_little else one
 
     return [replace(one, findings=gravest_first(map(beside, one.findings))) for one in assessments]
 

@@ -97,6 +97,7 @@ def choose(
         # Swings belong to a radius: from the prior's a fit would not come back to them.
         start = own.parameters.logs(first.parameters.theta(first.logs)) if eccentric else None
         candidates.append(_candidate(fit_stretches(stretches, own, first.noise, start=start), held))
+    candidates = _one_each(candidates)
     best = _fewest(candidates)
     own = prior(replace(best.structure, per_roller=True))
     start = own.parameters.logs(best.fitted.parameters.theta(best.fitted.logs))
@@ -128,6 +129,11 @@ def decided(choice: Choice, stretches: list[Stretch], held_out: list[Stretch]) -
     return replace(
         choice, chosen=chosen, cautions=_cautions(choice.candidates, chosen, stretches, held_out), turned=turned
     ), fitted
+
+
+def _one_each(candidates: Sequence[Candidate]) -> list[Candidate]:
+    """Of one structure from different beginnings the one with more evidence."""
+    return list({one.structure: one for one in sorted(candidates, key=lambda one: one.evidence)}.values())
 
 
 def _candidate(fitted: Fit, held: list[Stretch] | None) -> Candidate:

@@ -256,6 +256,7 @@ def report(bench: Bench, line: GateLine, turns: list[Turn], state: str) -> None:
     bench.figure("lateness_p99_quiet_us", 1e6 * quiet_s, "us", sum(map(len, of_case["quiet"])))
     for name, found in of_case.items():
         if name != "quiet":
+            bench.figure(f"lateness_p99_{name}_us", 1e6 * _p99(found), "us", sum(map(len, found)))
             bench.figure(f"lateness_p99_ratio_{name}", _p99(found) / quiet_s, "", sum(map(len, found)))
     answers = [(turn.case, took_s, one) for turn in turns if turn.case for took_s, one in turn.answers]
     wrong = [f"{case.name}: {why}" for case, _, one in answers if (why := _wrong(case, one))]

@@ -33,5 +33,6 @@ def test_beside_an_experiment_a_recording_that_moves_too_little_by_itself_is_mad
     assert found.estimate.samples > 1.3 * lively.samples and found.validation.valid
     told = [one for one in found.warnings if one.kind == EXCITATION]
     assert told and all(one.severity is Severity.WARNING and not one.experiment for one in told)
+    assert all("another recording tells enough" in one.what for one in told)
     with pytest.raises(NotIdentified):
         identify([quiet, replace(quiet, source="again")], LINE, Noise(), lambda: 0.0)

@@ -26,6 +26,7 @@ from gateway.commissioning.chain import (
     Pending,
     from_one_experiment,
     may_experiment,
+    may_use_all,
     next_step,
     refused_at_once,
 )
@@ -273,6 +274,28 @@ def test_after_a_measurement_all_data_come_first_and_then_the_newest():
     assert asked(past).rung == NEWEST_AFTER_ALL
 
 
+def test_where_all_data_give_no_model_and_an_adaptation_is_due_an_experiment_follows():
+    for follows, converged, adaptations in ((Follows.LEAVE, True, 2), (Follows.ALL_DATA, False, 1)):
+        past = concluded(ADAPTED, follows)
+        past[-1] = replace(past[-1], converged=converged)
+        refused = after(asked(past, adaptations), past, Outcome.FAILED)
+        assert refused.step is Step.MODEL and asked([*past, refused], adaptations).step is Step.EXPERIMENT
+
+
+def test_what_is_as_it_should_be_at_the_last_measurement_has_converged():
+    past = list(ADAPTED)
+    for _ in range(MOST_ROUNDS - 1):
+        past = concluded(past, Follows.CALMER)
+        past.append(replace(after(asked(past), past), speed_m_per_s=0.12))
+    assert may_use_all(past, 2) and not may_use_all(past, 1)
+    past = concluded(past, Follows.LEAVE)
+    assert not may_use_all(past, 2)
+    ended = asked(past)
+    assert isinstance(ended, Ended) and ended.converged
+    ended = asked([*past[:-1], replace(past[-1], follows=Follows.ALL_DATA)])
+    assert isinstance(ended, Ended) and ended.converged
+
+
 def test_once_enough_redesigns_are_kept_it_is_measured_what_the_last_one_does_and_no_more():
     measured = asked(ADAPTED, most_redesigns=1)
     assert measured.step is Step.MEASUREMENT
@@ -369,6 +392,19 @@ def test_where_agents_have_chosen_what_is_in_service_the_rules_have_the_last_wor
     assert asked(kept).step is Step.MEASUREMENT and isinstance(asked(at_the_end(kept)), Ended)
 
 
+def test_the_last_word_is_not_for_what_has_been_measured_and_was_not_good_enough():
+    past = concluded(BY_AGENTS, Follows.CALMER)
+    past.append(replace(after(asked(past), past), speed_m_per_s=0.12, author=AGENTS))
+    assert isinstance(asked(concluded(past, Follows.LEAVE)), Ended)
+
+
+def test_a_person_who_rejects_what_the_rules_would_have_is_not_asked_again():
+    past = at_the_end(BY_AGENTS)
+    wanted = asked(past)
+    rejected = past_of(shown("rejected", step=wanted.step, rung=wanted.rung))
+    assert rejected.rung == BY_RULES and isinstance(asked([*past, rejected]), Ended)
+
+
 @pytest.mark.parametrize(
     "past",
     [
@@ -393,12 +429,12 @@ def test_the_last_word_comes_also_where_no_more_redesigns_are_wanted_and_not_whe
     assert isinstance(asked(at_the_end(BY_AGENTS), most_redesigns=1, last_word=False), Ended)
 
 
-def shown(stage, rules=(), why=""):
+def shown(stage, rules=(), why="", step=Step.FIRST, rung=2):
     """As the gate shows a proposal of the chain; `rules` are those that fail."""
     config = design_lqi(task_of(LINE))
     proposal = Proposal(
         format=1, site=LINE.site, line=LINE.line, change=GainsChange(controller=config), base=config_hash(config),
-        model=None, reason="to begin with", evidence=[named(Step.FIRST, 2)], author="rules",
+        model=None, reason="to begin with", evidence=[named(step, rung)], author="rules",
         created="2026-01-05T06:00:00+00:00", expires="2026-01-05T07:00:00+00:00",
     )  # fmt: skip
     findings = [RuleFinding(rule=rule, passed=False, text="no") for rule in rules]
