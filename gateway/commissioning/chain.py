@@ -103,8 +103,6 @@ def _last_word(past: Sequence[Past], ended: Ended) -> Next | Ended:
         return ended
     if any(i > model and past[i].author == RULES for i in kept):  # and something was found to be better
         return ended
-    if _known_by_measurement(past) > 0:  # what promises more on this model has been measured, and was not good enough
-        return ended
     found = on_ladder(Step.REDESIGN, past[_last_done(past, "gains") + 1 :], BY_RULES, BY_RULES + RUNGS)
     return ended if isinstance(found, Ended) else Next(Step.REDESIGN, found.rung, own=0)
 

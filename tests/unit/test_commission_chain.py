@@ -2,11 +2,13 @@
 
 from dataclasses import replace
 from itertools import cycle, islice
+from types import SimpleNamespace
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from gateway.cli.commission_side import proposed_on_model
 from gateway.commissioning.architectures import ARCHITECTURES
 from gateway.commissioning.candidates import (
     FIRST_LAWS,
@@ -392,10 +394,10 @@ def test_where_agents_have_chosen_what_is_in_service_the_rules_have_the_last_wor
     assert asked(kept).step is Step.MEASUREMENT and isinstance(asked(at_the_end(kept)), Ended)
 
 
-def test_the_last_word_is_not_for_what_has_been_measured_and_was_not_good_enough():
+def test_the_last_word_is_had_whatever_agents_have_concluded_from_their_own_choices():
     past = concluded(BY_AGENTS, Follows.CALMER)
     past.append(replace(after(asked(past), past), speed_m_per_s=0.12, author=AGENTS))
-    assert isinstance(asked(concluded(past, Follows.LEAVE)), Ended)
+    assert asked(concluded(past, Follows.LEAVE)) == Next(Step.REDESIGN, BY_RULES)
 
 
 def test_a_person_who_rejects_what_the_rules_would_have_is_not_asked_again():
@@ -447,6 +449,15 @@ def shown(stage, rules=(), why="", step=Step.FIRST, rung=2):
         format=1, stage=stage, why=why, proposal_hash=proposal_hash(proposal), shown=None, epoch=0, difference=[],
         proposal=proposal, verdict=verdict,
     )  # fmt: skip
+
+
+def test_what_has_had_its_answer_on_the_accepted_model_is_known_by_its_hash():
+    hash_ = config_hash(design_lqi(task_of(LINE)))
+    model = SimpleNamespace(proposal=SimpleNamespace(kind="model"), stage="kept")
+    assert proposed_on_model([shown("refused", ("corners",)), model]) == frozenset()
+    assert proposed_on_model([model, shown("expired"), shown("refused", ("cool-down",))]) == frozenset()
+    for answered in (shown("refused", ("corners",)), shown("rejected"), shown("kept"), shown("rolled-back")):
+        assert proposed_on_model([model, answered]) == {hash_}
 
 
 @pytest.mark.parametrize(
