@@ -20,7 +20,7 @@ from gateway.commissioning.convergence import SIGNIFICANT, Convergence, converge
 from gateway.commissioning.ladder import ALL, AS_IT_IS, BY_RULES, Next
 from gateway.commissioning.past import Step
 from gateway.commissioning.redesign import Offer as Redesign
-from gateway.commissioning.redesign import redesigns
+from gateway.commissioning.redesign import OF_TOLERANCE, redesigns
 from gateway.core.controller import Controller, config_hash
 from gateway.core.deployment import Region, first_region
 from gateway.core.experiment import Experiment
@@ -78,7 +78,7 @@ class Changes:
         self.line = line
         self._wanted_m_per_s = wanted_m_per_s
         #: And what they were designed from
-        self._designed: tuple[LineNow, Region | None, list[Redesign]] | None = None
+        self._designed: tuple[LineNow, Region | None, float, list[Redesign]] | None = None
         self._experiment_for: tuple[object, Experiment] | None = None  #: and what it was designed from
 
     def offers(
@@ -93,6 +93,8 @@ class Changes:
         """
         match step.step:
             case Step.FIRST:
+                if step.rung >= BY_RULES:
+                    return [self._quicker(step.rung, now, proposed)]
                 return [self._first(one, now) for one in (step, *step.others)]
             case Step.EXPERIMENT:
                 return [self._experiment(one, now) for one in (step, *step.others)]
@@ -130,6 +132,20 @@ class Changes:
             return Made(GainsChange(controller=controller), "; ".join(said))
 
         return Offer(step.rung, f"{law.text} on the line's file", make, _knobs(law), law)
+
+    def _quicker(self, rung: int, now: LineNow, proposed: Collection[str]) -> Offer:
+        """With which the rules would have begun, before the one that agents chose and that led to no model."""
+        made = self._first(Next(Step.FIRST, rung - BY_RULES), now)
+
+        def make(factors: Factors) -> Made:
+            quicker = made.make(factors)
+            assert isinstance(quicker.change, GainsChange)
+            if config_hash(quicker.change.controller) in proposed:
+                raise NotOffered("it has been proposed before")
+            why = "the rules would have begun with it: what agents chose in its place has led to no model"
+            return replace(quicker, reason=f"{quicker.reason}; {why}")
+
+        return replace(made, rung=rung, make=make, knobs=())
 
     def _experiment(self, step: Next, now: LineNow) -> Offer:
         speeds = " and ".join(f"{speed:.3g}" for speed in step.speeds_m_per_s)
@@ -216,12 +232,13 @@ class Changes:
     def _better(self, rung: int, now: LineNow, region: Region | None, proposed: Collection[str]) -> Offer:
         """Than what agents have put into service: significantly, on the same model, by the rules' own design.
 
-        One that has been proposed on that model has had its verdict.
+        One that has been proposed on that model has had its verdict. The others may use all that the gate tolerates:
+        there is none after them that would not.
         """
         assert now.model is not None  # a redesign follows a model
         better = [
             one
-            for one in self._designs(now, region)
+            for one in self._designs(now, region, of_tolerance=1.0)
             if one.share <= 1.0 - SIGNIFICANT and config_hash(one.controller) not in proposed
         ]
         if not better:
@@ -234,14 +251,17 @@ class Changes:
         made = Made(GainsChange(controller=one.controller), f"{one.law.text} {_on(now.model)}; {promise}")
         return Offer(rung, one.law.text, lambda _: made, (), one.law, one)
 
-    def _designs(self, now: LineNow, region: Region | None) -> list[Redesign]:
+    def _designs(self, now: LineNow, region: Region | None, of_tolerance: float = OF_TOLERANCE) -> list[Redesign]:
         """What has been designed last, again."""
         assert now.model is not None
-        if self._designed is None or self._designed[1] != region or not _same(self._designed[0], now):
+        last = self._designed
+        if last is None or last[1:3] != (region, of_tolerance) or not _same(last[0], now):
             judged = Region() if region is None else region
-            found = redesigns(self.line, now.model, now.in_service, now.tension_n, judged, self._wanted_m_per_s)
-            self._designed = now, region, found
-        return self._designed[2]
+            found = redesigns(
+                self.line, now.model, now.in_service, now.tension_n, judged, self._wanted_m_per_s, of_tolerance
+            )
+            last = self._designed = now, region, of_tolerance, found
+        return last[3]
 
     def _redesign(self, rung: int, one: Redesign, now: LineNow, on: str) -> Offer:
         def make(factors: Factors) -> Made:

@@ -202,6 +202,7 @@ async def _initial(operator: Operator, setup: Setup, stepped: SteppedAside) -> l
     stepped.ask(setup.config)
     period_s, recipe = setup.line.control.period_s, setup.line.recipes[0]
     windows = [await run_with_repeats(operator, setup.config, case, period_s) for case in PAPER]
+    operator.progress.step(f"back to {recipe.name}, from where the chain goes on: settling at its set-points")
     await operator.order(SelectRecipe(name=recipe.name))
     await operator.wait_settled(recipe.tension_n, recipe.speed_m_per_s)
     return windows

@@ -18,8 +18,9 @@ Where a proposal is refused, the next, less ambitious candidate of a short ladde
 those that are left somebody chooses, or one with numbers of its own. What has been tried is read from the gate's own
 list of proposals, in which each says its step and its rung: whoever asks again after a restart goes on where it ended.
 
-The rules have the last word: where agents have chosen what is in service in the end, and the rules' design on the same
-model promises significantly more, that one is proposed before the chain ends (decision 40).
+The rules have the last word: where agents have led to what is in service in the end, and the rules' design on the same
+model promises significantly more, that one is proposed before the chain ends; where no model came to be accepted, the
+quicker configurations that the rules would have begun with (decision 40).
 """
 
 from collections.abc import Sequence
@@ -28,7 +29,7 @@ from math import sqrt
 
 from gateway.commissioning.candidates import NEAR
 from gateway.commissioning.decisions import AGENTS, RULES
-from gateway.commissioning.ladder import ALL, AS_IT_IS, BY_RULES, NEWEST, Ended, Next, on_ladder
+from gateway.commissioning.ladder import ALL, AS_IT_IS, BY_RULES, LADDERS, NEWEST, Ended, Next, on_ladder
 from gateway.commissioning.past import Follows, Outcome, Past, Step
 from gateway.commissioning.redesign import RUNGS
 from gateway.core.line import Line
@@ -77,7 +78,7 @@ def next_step(
     found = _next_step(past, first_speed_m_per_s, wanted_m_per_s, adaptations)
     if most_redesigns is not None and kept >= most_redesigns and _goes_on(found):
         found = _enough(past, kept)
-    return _last_word(past, found) if last_word and isinstance(found, Ended) and found.reached else found
+    return _last_word(past, found) if last_word and isinstance(found, Ended) else found
 
 
 def _goes_on(found: Next | Look | Ended) -> bool:
@@ -96,15 +97,34 @@ def _enough(past: Sequence[Past], kept: int) -> Ended:
 
 
 def _last_word(past: Sequence[Past], ended: Ended) -> Next | Ended:
-    """What the rules would have, once, in the place of what agents have chosen on the same model."""
+    """What the rules would have in the place of what agents have led to; again, while that promises as much again."""
+    since = past[_last_done(past, "gains") + 1 :]
+    found: Next | Ended = ended
+    if _last_done(past, "model") >= 0 and ended.reached and _led_by_agents(past):
+        found = on_ladder(Step.REDESIGN, since, BY_RULES, BY_RULES + RUNGS)
+    elif _last_done(past, "model") < 0 and (first := _began_by_agents(past)):
+        found = on_ladder(Step.FIRST, since, BY_RULES, BY_RULES + first)
+    return ended if isinstance(found, Ended) else Next(found.step, found.rung, own=0)
+
+
+def _led_by_agents(past: Sequence[Past]) -> bool:
+    """Whether they have chosen what is in service, or what the rules then had to be calmer than, on the same model."""
     model = _last_done(past, "model")
     kept = [i for i, one in enumerate(past) if _is_done(one, "gains") and one.rung != AS_IT_IS]
-    if model < 0 or not kept or past[kept[-1]].author != AGENTS:
-        return ended
-    if any(i > model and past[i].author == RULES for i in kept):  # and something was found to be better
-        return ended
-    found = on_ladder(Step.REDESIGN, past[_last_done(past, "gains") + 1 :], BY_RULES, BY_RULES + RUNGS)
-    return ended if isinstance(found, Ended) else Next(Step.REDESIGN, found.rung, own=0)
+    if not kept:
+        return False
+    on_model = {past[i].author for i in kept if i > model}
+    if past[kept[-1]].author == AGENTS:
+        return RULES not in on_model  # else something was found to be better than theirs
+    return past[kept[-1]].author == RULES and AGENTS in on_model
+
+
+def _began_by_agents(past: Sequence[Past]) -> int:
+    """Candidates that the rules would have begun with before what agents have: all of them before own numbers."""
+    at = _last_done(past, "gains")
+    if at < 0 or past[at].author != AGENTS or past[at].step is not Step.FIRST:
+        return 0
+    return min(past[at].rung, LADDERS[Step.FIRST])
 
 
 def _next_step(
@@ -120,6 +140,7 @@ def _next_step(
         more = _experiment(past, since, first_speed_m_per_s, wanted_m_per_s, 0)
         return _measured(past, newest, since, adaptations, more)
     if newest is not None and not of_measurement:
+        since = past[last["experiment"] + 1 :]  # whatever has been put into service since: the same data give the same
         return _model(past, since, first_speed_m_per_s, wanted_m_per_s)
     reached = region_speed(past) or 0.0
     if last["model"] > last["gains"]:

@@ -88,9 +88,11 @@ class Beside:
 
 def redesigns(
     line: Line, model: LineModel, in_service: Controller, tension_n: Sequence[float], region: Region,
-    wanted_m_per_s: float = inf,
+    wanted_m_per_s: float = inf, of_tolerance: float = OF_TOLERANCE,
 ) -> list[Offer]:  # fmt: skip
     """At most `RUNGS`, for steps as the line's file permits and speeds up to those of the model's data.
+
+    No worse than what is in service by more than `of_tolerance` times the gate's tolerances.
 
     Or up to a higher one of `region`, for which the configuration in service was judged. Predictive control is offered
     once it is the highest that the drives hold, or `wanted_m_per_s`: on the way there it would only take the gate's
@@ -104,14 +106,14 @@ def redesigns(
     )
     designed = _designed(line, model, speed, LAWS)
     beside = Beside(in_service, region)
-    found = _worth(designed, beside, line, model, judged, BRIEF_S if _slow(in_service) else LASTING_S)
+    found = _worth(designed, beside, line, model, judged, BRIEF_S if _slow(in_service) else LASTING_S, of_tolerance)
     places = sorted({round(k * (len(found) - 1) / (LINEAR_RUNGS - 1)) for k in range(LINEAR_RUNGS)}) if found else []
     linear = [found[place] for place in places]
     if speed < NEAR * min(wanted_m_per_s, fastest_m_per_s(line, model)):
         return linear
     predictive = _designed(line, model, speed, PREDICTIVE)
     best = [(one.law, one.controller) for one in linear[:1]]
-    found = _worth([*predictive, *best], beside, line, model, judged, BRIEF_S)
+    found = _worth([*predictive, *best], beside, line, model, judged, BRIEF_S, of_tolerance)
     return [*takewhile(lambda each: (each.law, each.controller) not in best, found), *linear]
 
 
@@ -126,7 +128,7 @@ def _designed(line: Line, model: LineModel, speed_m_per_s: float, laws: Sequence
 
 def _worth(
     designed: Sequence[tuple[Law, Controller]], beside: Beside, line: Line, model: LineModel, judged: Judged,
-    lasting_s: float,
+    lasting_s: float, of_tolerance: float,
 ) -> list[Offer]:  # fmt: skip
     """Those that do no worse than what is in service, the one with the least tracking error first."""
     known = judged.within(beside.region)
@@ -135,7 +137,7 @@ def _worth(
     for law, config in designed:
         figures = predicted(config, line, model, judged, lasting_s)
         figures_known = figures if known is judged else predicted(config, line, model, known, lasting_s)
-        if all(no_worse(line, figures_known[name], before_known[name]) for name in before_known):
+        if all(no_worse(line, figures_known[name], before_known[name], of_tolerance) for name in before_known):
             whole = sum(ratio(figures[name].rmse_n, before[name].rmse_n) for name in before)
             found.append((whole, Offer(law, config, judged.speed_max_m_per_s, figures, before)))
     return [offer for _, offer in sorted(found, key=lambda each: each[0])]
@@ -174,8 +176,8 @@ def ratio(rmse_n: float, before_n: float) -> float:
     return rmse_n / before_n if 0.0 < before_n < inf else rmse_n
 
 
-def no_worse(line: Line, one: Figures, before: Figures) -> bool:
-    """As the gate compares them, but with a part of its tolerances. What is no number is worse."""
+def no_worse(line: Line, one: Figures, before: Figures, of_tolerance: float = OF_TOLERANCE) -> bool:
+    """As the gate compares them, with a part of its tolerances. What is no number is worse."""
     gate = line.gate
     rows = (
         (one.rmse_n, before.rmse_n, gate.tolerance_n, 0.0),
@@ -184,7 +186,7 @@ def no_worse(line: Line, one: Figures, before: Figures) -> bool:
     )
     return all(
         value == reference
-        or value <= max(reference + OF_TOLERANCE * max(gate.tolerance_share * reference, floor), OF_TOLERANCE * fine)
+        or value <= max(reference + of_tolerance * max(gate.tolerance_share * reference, floor), of_tolerance * fine)
         for value, reference, floor, fine in rows
     )
 
