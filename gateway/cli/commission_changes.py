@@ -19,8 +19,8 @@ from gateway.commissioning.chain import first_legs
 from gateway.commissioning.convergence import SIGNIFICANT, Convergence, convergence, measurement
 from gateway.commissioning.ladder import ALL, AS_IT_IS, BY_RULES, Next
 from gateway.commissioning.past import Step
-from gateway.commissioning.redesign import Offer as Redesign
 from gateway.commissioning.redesign import OF_TOLERANCE, redesigns
+from gateway.commissioning.redesign import Offer as Redesign
 from gateway.core.controller import Controller, config_hash
 from gateway.core.deployment import Region, first_region
 from gateway.core.experiment import Experiment
@@ -230,23 +230,29 @@ class Changes:
         return offers
 
     def _better(self, rung: int, now: LineNow, region: Region | None, proposed: Collection[str]) -> Offer:
-        """Than what agents have put into service: significantly, on the same model, by the rules' own design.
+        """Than what agents have put into service: significantly so in a course on the same model, and in the mean.
 
-        One that has been proposed on that model has had its verdict. The others may use all that the gate tolerates:
-        there is none after them that would not.
+        A step that torque limits is as good by any design, and would hide in the mean what the others differ by. One
+        that has been proposed on that model has had its verdict. The others may use all that the gate tolerates: there
+        is none after them that would not.
         """
         assert now.model is not None  # a redesign follows a model
         better = [
             one
             for one in self._designs(now, region, of_tolerance=1.0)
-            if one.share <= 1.0 - SIGNIFICANT and config_hash(one.controller) not in proposed
+            if one.share < 1.0
+            and min(one.shares.values()) <= 1.0 - SIGNIFICANT
+            and config_hash(one.controller) not in proposed
         ]
         if not better:
-            raise Exhausted(f"the rules have no design that promises {SIGNIFICANT:.0%} less tracking error")
+            raise Exhausted(
+                f"the rules have no design that promises {SIGNIFICANT:.0%} less tracking error in any course"
+            )
         one = better[0]
+        course, share = min(one.shares.items(), key=lambda each: each[1])
         promise = (
-            f"in simulated changes it promises {one.share:.0%} of the tracking error of what is in service, "
-            "which agents have chosen"
+            f"in the simulated {course} course it promises {share:.0%}, in the mean of all {one.share:.0%}, of the "
+            "tracking error of what is in service, to which agents have led"
         )
         made = Made(GainsChange(controller=one.controller), f"{one.law.text} {_on(now.model)}; {promise}")
         return Offer(rung, one.law.text, lambda _: made, (), one.law, one)

@@ -36,6 +36,7 @@ from gateway.core.line import Line
 
 MOST_EXPERIMENTS = 3  #: in a row, without a model from their data
 MOST_ROUNDS = 3  #: measurements, before what they show is left as it is
+MOST_LAST_WORDS = 2  #: of the rules that are kept on one model
 STRETCH = 3.0  #: of the speed that data have shown: an experiment goes no faster
 LEAST_RISE = 1.05  #: of the speed, from one adapted configuration to the next; fewer than two in a row rise less
 SLOWER_LEG = 0.5  #: of an experiment's speed: its other one
@@ -97,7 +98,7 @@ def _enough(past: Sequence[Past], kept: int) -> Ended:
 
 
 def _last_word(past: Sequence[Past], ended: Ended) -> Next | Ended:
-    """What the rules would have in the place of what agents have led to; again, while that promises as much again."""
+    """What the rules would have in the place of what agents have led to; once more where that promises as much again."""
     since = past[_last_done(past, "gains") + 1 :]
     found: Next | Ended = ended
     if _last_done(past, "model") >= 0 and ended.reached and _led_by_agents(past):
@@ -111,7 +112,7 @@ def _led_by_agents(past: Sequence[Past]) -> bool:
     """Whether they have chosen what is in service, or what the rules then had to be calmer than, on the same model."""
     model = _last_done(past, "model")
     kept = [i for i, one in enumerate(past) if _is_done(one, "gains") and one.rung != AS_IT_IS]
-    if not kept:
+    if not kept or sum(past[i].rung >= BY_RULES for i in kept if i > model) >= MOST_LAST_WORDS:
         return False
     on_model = {past[i].author for i in kept if i > model}
     if past[kept[-1]].author == AGENTS:

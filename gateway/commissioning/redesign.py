@@ -74,8 +74,13 @@ class Offer:
     @property
     def share(self) -> float:
         """Its tracking error over that in service, mean of the courses."""
-        errors = [(self.figures[name].rmse_n, of.rmse_n) for name, of in self.before.items()]
-        return float(np.mean([0.0 if one < before == inf else ratio(one, before) for one, before in errors]))
+        return float(np.mean(list(self.shares.values())))
+
+    @property
+    def shares(self) -> dict[str, float]:
+        """The same by course."""
+        errors = {name: (self.figures[name].rmse_n, of.rmse_n) for name, of in self.before.items()}
+        return {name: 0.0 if one < before == inf else ratio(one, before) for name, (one, before) in errors.items()}
 
 
 @dataclass(frozen=True)

@@ -393,7 +393,10 @@ def test_where_agents_have_chosen_what_is_in_service_the_rules_have_the_last_wor
     kept = [*past, replace(after(step, past), speed_m_per_s=0.12)]
     assert asked(kept).step is Step.MEASUREMENT
     # A quicker one may be no worse than that one in what it was worse in than the one before.
-    assert asked(at_the_end(kept)) == Next(Step.REDESIGN, BY_RULES)
+    again = at_the_end(kept)
+    assert asked(again) == Next(Step.REDESIGN, BY_RULES)
+    twice = [*again, replace(after(asked(again), again), speed_m_per_s=0.12)]
+    assert asked(twice).step is Step.MEASUREMENT and isinstance(asked(at_the_end(twice)), Ended)
 
 
 def test_the_last_word_is_had_whatever_agents_have_concluded_from_their_own_choices():
