@@ -98,7 +98,7 @@ def _enough(past: Sequence[Past], kept: int) -> Ended:
 
 
 def _last_word(past: Sequence[Past], ended: Ended) -> Next | Ended:
-    """What the rules would have in the place of what agents have led to; once more where that promises as much again."""
+    """What the rules would have in the place of what agents have led to; and once more."""
     since = past[_last_done(past, "gains") + 1 :]
     found: Next | Ended = ended
     if _last_done(past, "model") >= 0 and ended.reached and _led_by_agents(past):
