@@ -249,11 +249,8 @@ class Changes:
                 f"the rules have no design that promises {SIGNIFICANT:.0%} less tracking error in any course"
             )
         one = better[0]
-        course, share = min(one.shares.items(), key=lambda each: each[1])
-        promise = (
-            f"in the simulated {course} course it promises {share:.0%}, in the mean of all {one.share:.0%}, of the "
-            "tracking error of what is in service, to which agents have led"
-        )
+        told = " and ".join(f"{share:.0%} ({course})" for course, share in one.shares.items())
+        promise = f"simulated, it promises {told} of the tracking error of what is in service, to which agents have led"
         made = Made(GainsChange(controller=one.controller), f"{one.law.text} {_on(now.model)}; {promise}")
         return Offer(rung, one.law.text, lambda _: made, (), one.law, one)
 

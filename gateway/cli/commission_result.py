@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from gateway.commissioning.chain import region_speed
 from gateway.commissioning.convergence import Convergence
 from gateway.commissioning.ladder import BY_RULES, OWN, Ended
-from gateway.commissioning.past import Past
+from gateway.commissioning.past import Past, Step
 from gateway.core.decisions import ProposalShown
 
 
@@ -46,7 +46,8 @@ def commissioned(
     ended: Ended, past: Sequence[Past], shown: Sequence[ProposalShown], measured: Mapping[str, Convergence]
 ) -> Commissioned:
     by_hash = {one.proposal_hash: one for one in shown}
-    candidates = [one for one in past if one.proposal or one.rung < BY_RULES]  # else the rules had nothing better
+    # Where the rules could not make a redesign they had nothing better.
+    candidates = [one for one in past if one.proposal or one.rung < BY_RULES or one.step is not Step.REDESIGN]
     tried = [tried_of(one, by_hash.get(one.proposal), measured.get(one.proposal)) for one in candidates]
     return Commissioned(ended.reached, ended.text, tried, region_speed(past), ended.converged)
 

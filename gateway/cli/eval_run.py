@@ -123,7 +123,9 @@ class Carrying:
             iterations=len(found.tried),
             experiments=sum(one.kind == "experiment" and one.stage == "done" for one in found.tried),
             deployments=sum(one.step == Step.REDESIGN and one.stage == "kept" for one in found.tried),
-            overruled=sum(one.rung >= BY_RULES and one.stage == "kept" for one in found.tried),
+            overruled=sum(
+                one.step == Step.REDESIGN and one.rung >= BY_RULES and one.stage == "kept" for one in found.tried
+            ),
             rejections=rejections(found.tried, interactions),
             asked=_asked(carried.asked, interactions),
             controller=config_hash(carried.in_service),

@@ -36,7 +36,6 @@ from gateway.core.line import Line
 
 MOST_EXPERIMENTS = 3  #: in a row, without a model from their data
 MOST_ROUNDS = 3  #: measurements, before what they show is left as it is
-MOST_LAST_WORDS = 2  #: of the rules that are kept on one model
 STRETCH = 3.0  #: of the speed that data have shown: an experiment goes no faster
 LEAST_RISE = 1.05  #: of the speed, from one adapted configuration to the next; fewer than two in a row rise less
 SLOWER_LEG = 0.5  #: of an experiment's speed: its other one
@@ -98,34 +97,38 @@ def _enough(past: Sequence[Past], kept: int) -> Ended:
 
 
 def _last_word(past: Sequence[Past], ended: Ended) -> Next | Ended:
-    """What the rules would have in the place of what agents have led to; and once more."""
+    """What the rules would have, once on a model, in the place of what agents have led to."""
     since = past[_last_done(past, "gains") + 1 :]
     found: Next | Ended = ended
     if _last_done(past, "model") >= 0 and ended.reached and _led_by_agents(past):
         found = on_ladder(Step.REDESIGN, since, BY_RULES, BY_RULES + RUNGS)
-    elif _last_done(past, "model") < 0 and (first := _began_by_agents(past)):
-        found = on_ladder(Step.FIRST, since, BY_RULES, BY_RULES + first)
+    elif quicker := _quicker_than_agents_began(past):
+        found = on_ladder(Step.FIRST, since, BY_RULES, BY_RULES + quicker)
     return ended if isinstance(found, Ended) else Next(found.step, found.rung, own=0)
 
 
 def _led_by_agents(past: Sequence[Past]) -> bool:
-    """Whether they have chosen what is in service, or what the rules then had to be calmer than, on the same model."""
+    """Whether they have chosen what is in service, or what the rules then had to be calmer than, on the same model.
+
+    Not where a design of the rules was in service on it before, and something was found to be better.
+    """
     model = _last_done(past, "model")
     kept = [i for i, one in enumerate(past) if _is_done(one, "gains") and one.rung != AS_IT_IS]
-    if not kept or sum(past[i].rung >= BY_RULES for i in kept if i > model) >= MOST_LAST_WORDS:
+    if not kept or past[kept[-1]].rung >= BY_RULES:
         return False
-    on_model = {past[i].author for i in kept if i > model}
-    if past[kept[-1]].author == AGENTS:
-        return RULES not in on_model  # else something was found to be better than theirs
-    return past[kept[-1]].author == RULES and AGENTS in on_model
+    authors = [past[i].author for i in kept if i > model] or [past[kept[-1]].author]
+    while authors and authors[-1] == RULES:
+        authors.pop()
+    return bool(authors) and authors[-1] == AGENTS and RULES not in authors
 
 
-def _began_by_agents(past: Sequence[Past]) -> int:
-    """Candidates that the rules would have begun with before what agents have: all of them before own numbers."""
+def _quicker_than_agents_began(past: Sequence[Past]) -> int:
+    """Candidates before the one that agents began with, where experiments have led to no model; 0: none, or not so."""
     at = _last_done(past, "gains")
-    if at < 0 or past[at].author != AGENTS or past[at].step is not Step.FIRST:
+    if _last_done(past, "model") >= 0 or _experiments_since_model(past) < MOST_EXPERIMENTS:
         return 0
-    return min(past[at].rung, LADDERS[Step.FIRST])
+    began = past[at] if at >= 0 and past[at].step is Step.FIRST and past[at].author == AGENTS else None
+    return began.rung if began is not None and began.rung < LADDERS[Step.FIRST] else 0
 
 
 def _next_step(
@@ -141,8 +144,8 @@ def _next_step(
         more = _experiment(past, since, first_speed_m_per_s, wanted_m_per_s, 0)
         return _measured(past, newest, since, adaptations, more)
     if newest is not None and not of_measurement:
-        since = past[last["experiment"] + 1 :]  # whatever has been put into service since: the same data give the same
-        return _model(past, since, first_speed_m_per_s, wanted_m_per_s)
+        data = past[last["experiment"] + 1 :]  # whatever has been put into service since: the same data give the same
+        return _model(past, data, since, first_speed_m_per_s, wanted_m_per_s)
     reached = region_speed(past) or 0.0
     if last["model"] > last["gains"]:
         found = on_ladder(Step.REDESIGN, since, _known_by_measurement(past))
@@ -166,14 +169,16 @@ def _next_step(
 
 
 def _model(
-    past: Sequence[Past], since: Sequence[Past], first_speed_m_per_s: float, wanted_m_per_s: float
-) -> Next | Ended:
+    past: Sequence[Past], data: Sequence[Past], since: Sequence[Past], first_speed_m_per_s: float,
+    wanted_m_per_s: float,
+) -> Next | Ended:  # fmt: skip
     """From the data of an experiment; another experiment where they give none.
 
+    `data`: what has been tried since the experiment; `since`: since anything was done.
     Once a measurement has been made all data come first: each by itself has been made use of.
     """
     measured = any(one.step is Step.MEASUREMENT and _is_done(one, "experiment") for one in past)
-    found = on_ladder(Step.MODEL, since, ALL) if measured else on_ladder(Step.MODEL, since, NEWEST, ALL + 1)
+    found = on_ladder(Step.MODEL, data, ALL) if measured else on_ladder(Step.MODEL, data, NEWEST, ALL + 1)
     if isinstance(found, Next):
         return found
     number = _experiments_since_model(past)

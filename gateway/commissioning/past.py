@@ -39,7 +39,7 @@ KINDS = {
     Step.MEASUREMENT: "experiment",
 }  # fmt: skip
 MOST_RUNG = 1000
-#: From here on: designs that the rules propose in the end, where somebody else has chosen what is in service.
+#: From here on: what the rules propose in the end, where agents have led to what is in service.
 BY_RULES = 200
 PROPOSED_BY = "commissioning: "  #: how the evidence begins that names step and rung
 
