@@ -38,7 +38,7 @@ def remarks(result: EvalResult) -> list[str]:
     told = [f"tasks: {count}, {result.spans} spans, seed {result.seed}; each was tried once; {RATIOS}"]
     told += [f"{one.policy}: {rejected(one.rejections)}" for one in result.figures if one.rejections]
     told += [
-        f"{one.policy}: {one.overruled} times the rules had the last word, with a design that promised a tenth less in a course"
+        f"{one.policy}: {one.overruled} times the rules had the last word (decision 40)"
         for one in result.figures if one.overruled
     ]  # fmt: skip
     for one in result.figures:
