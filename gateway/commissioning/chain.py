@@ -28,13 +28,11 @@ from dataclasses import dataclass, replace
 from math import sqrt
 
 from gateway.commissioning.candidates import NEAR
-from gateway.commissioning.decisions import AGENTS, RULES
-from gateway.commissioning.ladder import ALL, AS_IT_IS, BY_RULES, LADDERS, NEWEST, Ended, Next, on_ladder
-from gateway.commissioning.past import Follows, Outcome, Past, Step
-from gateway.commissioning.redesign import RUNGS
+from gateway.commissioning.ladder import ALL, AS_IT_IS, MOST_EXPERIMENTS, NEWEST, Ended, Next, on_ladder
+from gateway.commissioning.last_word import by_rules
+from gateway.commissioning.past import Follows, Outcome, Past, Step, experiments_since_model, is_done, last_done
 from gateway.core.line import Line
 
-MOST_EXPERIMENTS = 3  #: in a row, without a model from their data
 MOST_ROUNDS = 3  #: measurements, before what they show is left as it is
 STRETCH = 3.0  #: of the speed that data have shown: an experiment goes no faster
 LEAST_RISE = 1.05  #: of the speed, from one adapted configuration to the next; fewer than two in a row rise less
@@ -78,7 +76,7 @@ def next_step(
     found = _next_step(past, first_speed_m_per_s, wanted_m_per_s, adaptations)
     if most_redesigns is not None and kept >= most_redesigns and _goes_on(found):
         found = _enough(past, kept)
-    return _last_word(past, found) if last_word and isinstance(found, Ended) else found
+    return by_rules(past, found) if last_word and isinstance(found, Ended) else found
 
 
 def _goes_on(found: Next | Look | Ended) -> bool:
@@ -90,51 +88,16 @@ def _goes_on(found: Next | Look | Ended) -> bool:
 
 def _enough(past: Sequence[Past], kept: int) -> Ended:
     """So many redesigns were kept, and the last one has been measured."""
-    at = _last_done(past, "experiment")
-    measured = past[at] if at > _last_done(past, "gains") and past[at].step is Step.MEASUREMENT else None
+    at = last_done(past, "experiment")
+    measured = past[at] if at > last_done(past, "gains") and past[at].step is Step.MEASUREMENT else None
     told = f"{kept} redesign{'' if kept == 1 else 's'} kept" + (f"; {measured.why}" if measured else "")
     return Ended(True, told, measured is not None and measured.converged)
-
-
-def _last_word(past: Sequence[Past], ended: Ended) -> Next | Ended:
-    """What the rules would have, once on a model, in the place of what agents have led to."""
-    since = past[_last_done(past, "gains") + 1 :]
-    found: Next | Ended = ended
-    if _last_done(past, "model") >= 0 and ended.reached and _led_by_agents(past):
-        found = on_ladder(Step.REDESIGN, since, BY_RULES, BY_RULES + RUNGS)
-    elif quicker := _quicker_than_agents_began(past):
-        found = on_ladder(Step.FIRST, since, BY_RULES, BY_RULES + quicker)
-    return ended if isinstance(found, Ended) else Next(found.step, found.rung, own=0)
-
-
-def _led_by_agents(past: Sequence[Past]) -> bool:
-    """Whether they have chosen what is in service, or what the rules then had to be calmer than, on the same model.
-
-    Not where a design of the rules was in service on it before, and something was found to be better.
-    """
-    model = _last_done(past, "model")
-    kept = [i for i, one in enumerate(past) if _is_done(one, "gains") and one.rung != AS_IT_IS]
-    if not kept or past[kept[-1]].rung >= BY_RULES:
-        return False
-    authors = [past[i].author for i in kept if i > model] or [past[kept[-1]].author]
-    while authors and authors[-1] == RULES:
-        authors.pop()
-    return bool(authors) and authors[-1] == AGENTS and RULES not in authors
-
-
-def _quicker_than_agents_began(past: Sequence[Past]) -> int:
-    """Candidates before the one that agents began with, where experiments have led to no model; 0: none, or not so."""
-    at = _last_done(past, "gains")
-    if _last_done(past, "model") >= 0 or _experiments_since_model(past) < MOST_EXPERIMENTS:
-        return 0
-    began = past[at] if at >= 0 and past[at].step is Step.FIRST and past[at].author == AGENTS else None
-    return began.rung if began is not None and began.rung < LADDERS[Step.FIRST] else 0
 
 
 def _next_step(
     past: Sequence[Past], first_speed_m_per_s: float, wanted_m_per_s: float, adaptations: int
 ) -> Next | Look | Ended:
-    last = {kind: _last_done(past, kind) for kind in ("gains", "experiment", "model")}
+    last = {kind: last_done(past, kind) for kind in ("gains", "experiment", "model")}
     since = past[max(last.values()) + 1 :]
     if last["gains"] < 0:
         return on_ladder(Step.FIRST if last["model"] < 0 else Step.REDESIGN, since)
@@ -149,10 +112,10 @@ def _next_step(
     reached = region_speed(past) or 0.0
     if last["model"] > last["gains"]:
         found = on_ladder(Step.REDESIGN, since, _known_by_measurement(past))
-        measured = any(one.step is Step.MEASUREMENT and _is_done(one, "experiment") for one in past)
+        measured = any(one.step is Step.MEASUREMENT and is_done(one, "experiment") for one in past)
         return Ended(True, found.text) if isinstance(found, Ended) and measured else found
     if last["model"] >= 0 and reached >= NEAR * wanted_m_per_s:
-        adapted = any(_is_done(one, "gains") and one.rung != AS_IT_IS for one in past[_first_model(past) :])
+        adapted = any(is_done(one, "gains") and one.rung != AS_IT_IS for one in past[_first_model(past) :])
         what = (
             "an adapted configuration" if adapted else "the configuration of the begin, judged on the line's own model,"
         )
@@ -177,11 +140,11 @@ def _model(
     `data`: what has been tried since the experiment; `since`: since anything was done.
     Once a measurement has been made all data come first: each by itself has been made use of.
     """
-    measured = any(one.step is Step.MEASUREMENT and _is_done(one, "experiment") for one in past)
+    measured = any(one.step is Step.MEASUREMENT and is_done(one, "experiment") for one in past)
     found = on_ladder(Step.MODEL, data, ALL) if measured else on_ladder(Step.MODEL, data, NEWEST, ALL + 1)
     if isinstance(found, Next):
         return found
-    number = _experiments_since_model(past)
+    number = experiments_since_model(past)
     if number >= MOST_EXPERIMENTS:
         return Ended(measured, found.text)
     return _experiment(past, since, first_speed_m_per_s, wanted_m_per_s, number)
@@ -215,7 +178,7 @@ def _measured(
 
 def from_one_experiment(past: Sequence[Past]) -> bool:
     """Whether the accepted model is one of this chain, of the newest experiment that there was alone."""
-    at = _last_done(past, "model")
+    at = last_done(past, "model")
     return at >= 0 and past[at].step is Step.MODEL and past[at].rung == NEWEST
 
 
@@ -225,48 +188,35 @@ def may_use_all(past: Sequence[Past], recordings: int) -> bool:
 
 
 def _rounds_left(past: Sequence[Past]) -> bool:
-    return sum(one.step is Step.MEASUREMENT and _is_done(one, "experiment") for one in past) < MOST_ROUNDS
+    return sum(one.step is Step.MEASUREMENT and is_done(one, "experiment") for one in past) < MOST_ROUNDS
 
 
 def may_experiment(past: Sequence[Past]) -> bool:
     """Whether another experiment follows where there is no model from the data of the newest."""
-    at = _last_done(past, "experiment")
+    at = last_done(past, "experiment")
     of_measurement = at >= 0 and past[at].step is Step.MEASUREMENT
-    return not of_measurement and _experiments_since_model(past) < MOST_EXPERIMENTS
+    return not of_measurement and experiments_since_model(past) < MOST_EXPERIMENTS
 
 
 def still_due(past: Sequence[Past], adaptations: int) -> bool:
     """Whether a further adaptation follows whatever a measurement has shown. A model has been accepted."""
-    return sum(_is_done(one, "gains") for one in past[_first_model(past) :]) < adaptations
+    return sum(is_done(one, "gains") for one in past[_first_model(past) :]) < adaptations
 
 
 def region_speed(past: Sequence[Past]) -> float | None:
     """Up to which the configuration that was kept last has been judged; None: there is none, or nobody says."""
-    at = _last_done(past, "gains")
+    at = last_done(past, "gains")
     return None if at < 0 else past[at].speed_m_per_s
 
 
 def _first_model(past: Sequence[Past]) -> int:
-    return next(i for i, one in enumerate(past) if _is_done(one, "model"))
+    return next(i for i, one in enumerate(past) if is_done(one, "model"))
 
 
 def _stands_still(past: Sequence[Past]) -> bool:
     """Whether the last two adapted configurations were let through for hardly more speed than the one before them."""
-    speeds = [one.speed_m_per_s or 0.0 for one in past if _is_done(one, "gains")][-3:]
+    speeds = [one.speed_m_per_s or 0.0 for one in past if is_done(one, "gains")][-3:]
     return len(speeds) == 3 and speeds[2] < LEAST_RISE**2 * speeds[0] and speeds[2] < LEAST_RISE * speeds[1]
-
-
-def _is_done(one: Past, kind: str) -> bool:
-    return one.kind == kind and one.outcome is Outcome.DONE
-
-
-def _last_done(past: Sequence[Past], kind: str) -> int:
-    return max((i for i, one in enumerate(past) if _is_done(one, kind)), default=-1)
-
-
-def _experiments_since_model(past: Sequence[Past]) -> int:
-    since_model = past[_last_done(past, "model") + 1 :]
-    return sum(_is_done(one, "experiment") and one.step is not Step.MEASUREMENT for one in since_model)
 
 
 def _known_by_measurement(past: Sequence[Past]) -> int:
@@ -274,10 +224,10 @@ def _known_by_measurement(past: Sequence[Past]) -> int:
 
     A newer model would give the same: the next candidate on the same model is a calmer one.
     """
-    on_it = past[_last_done(past, "model") + 1 :]
-    done = [one for one in on_it if one.step is Step.MEASUREMENT and _is_done(one, "experiment")]
+    on_it = past[last_done(past, "model") + 1 :]
+    done = [one for one in on_it if one.step is Step.MEASUREMENT and is_done(one, "experiment")]
     calmer = sum(one.follows is Follows.CALMER for one in done)
-    rungs = [one.rung for one in on_it if one.step is Step.REDESIGN and _is_done(one, "gains") and one.rung < AS_IT_IS]
+    rungs = [one.rung for one in on_it if one.step is Step.REDESIGN and is_done(one, "gains") and one.rung < AS_IT_IS]
     return min(max(calmer, *(1 + rung for rung in rungs)), AS_IT_IS) if calmer and rungs else calmer
 
 
@@ -292,7 +242,7 @@ def _experiment(
     if isinstance(found, Ended):
         return found
     shown = region_speed(past) or first_m_per_s
-    first = _last_done(past, "model") < 0
+    first = last_done(past, "model") < 0
 
     def at(rung: int) -> Next:
         if first:

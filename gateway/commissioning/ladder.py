@@ -20,6 +20,7 @@ OWN, MOST_OWN = 100, 3
 #: Of a model: from the newest experiment, from all recordings, and where those were tried first, from the newest.
 NEWEST, ALL, NEWEST_AFTER_ALL = 0, 1, 2
 AS_IT_IS = RUNGS  #: of a redesign: the configuration in service stays, and is judged for what data have shown since
+MOST_EXPERIMENTS = 3  #: in a row, without a model from their data
 MOST_AGAIN = 3  #: times that one rung is proposed again, because the moment was wrong
 
 

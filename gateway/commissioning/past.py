@@ -109,3 +109,19 @@ def _outcome(stage: str, why: str, verdict: Verdict | None) -> Outcome:
         against = {one.rule for one in verdict.findings if not one.passed}
         return Outcome.AGAIN if against <= OF_THE_MOMENT else Outcome.FAILED
     return Outcome.FAILED
+
+
+def is_done(one: Past, kind: str) -> bool:
+    """Whether something of `kind` was let through, and kept or carried out."""
+    return one.kind == kind and one.outcome is Outcome.DONE
+
+
+def last_done(past: Sequence[Past], kind: str) -> int:
+    """Where in `past`; -1: none."""
+    return max((i for i, one in enumerate(past) if is_done(one, kind)), default=-1)
+
+
+def experiments_since_model(past: Sequence[Past]) -> int:
+    """That were made, but for measurements."""
+    since_model = past[last_done(past, "model") + 1 :]
+    return sum(is_done(one, "experiment") and one.step is not Step.MEASUREMENT for one in since_model)

@@ -14,10 +14,9 @@ from gateway.cli.commission_measurements import SCENARIO, keep, kept
 from gateway.cli.commission_questions import MORE_DATA, PROPOSE
 from gateway.cli.commission_side import CannotGoOn
 from gateway.commissioning.candidates import NotOffered
-from gateway.commissioning.chain import MOST_EXPERIMENTS
 from gateway.commissioning.convergence import Convergence, Diagnosis, SpanFigures
 from gateway.commissioning.decisions import Decided, Rules
-from gateway.commissioning.ladder import LADDERS, MOST_OWN, OWN
+from gateway.commissioning.ladder import LADDERS, MOST_EXPERIMENTS, MOST_OWN, OWN
 from gateway.commissioning.past import Follows, Step
 from gateway.control.design import design_lqi, task_of
 from gateway.core.asked_before import interactions_of

@@ -21,7 +21,6 @@ from gateway.commissioning.candidates import (
     values_of,
 )
 from gateway.commissioning.chain import (
-    MOST_EXPERIMENTS,
     MOST_ROUNDS,
     STRETCH,
     Look,
@@ -39,6 +38,7 @@ from gateway.commissioning.ladder import (
     BY_RULES,
     LADDERS,
     MOST_AGAIN,
+    MOST_EXPERIMENTS,
     MOST_OWN,
     NEWEST_AFTER_ALL,
     OWN,
