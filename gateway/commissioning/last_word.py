@@ -22,16 +22,13 @@ def by_rules(past: Sequence[Past], ended: Ended) -> Next | Ended:
 def _led_by_agents(past: Sequence[Past]) -> bool:
     """Whether they have chosen what is in service, or what the rules then had to be calmer than, on the same model.
 
-    Not where a design of the rules was in service on it before, and something was found to be better.
+    Not where the rules have had their last word on it.
     """
     model = last_done(past, "model")
     kept = [i for i, one in enumerate(past) if is_done(one, "gains") and one.rung != AS_IT_IS]
-    if not kept or past[kept[-1]].rung >= BY_RULES:
-        return False
-    authors = [past[i].author for i in kept if i > model] or [past[kept[-1]].author]
-    while authors and authors[-1] == RULES:
-        authors.pop()
-    return bool(authors) and authors[-1] == AGENTS and RULES not in authors
+    on_model = [past[i] for i in kept if i > model] or [past[i] for i in kept[-1:]]
+    others = [one.author for one in on_model if one.author != RULES]
+    return others[-1:] == [AGENTS] and all(one.rung < BY_RULES for one in on_model)
 
 
 def _quicker_than_agents_began(past: Sequence[Past]) -> int:

@@ -407,6 +407,12 @@ def test_the_last_word_is_had_where_the_rules_only_had_to_be_calmer_than_what_ag
     assert asked(concluded(past, Follows.LEAVE)) == Next(Step.REDESIGN, BY_RULES)
 
 
+@pytest.mark.parametrize("since", [[], [replace(ADAPTED[3], rung=4)]])
+def test_the_last_word_is_had_where_agents_have_replaced_a_design_of_the_rules(since):
+    past = [*ADAPTED, replace(ADAPTED[3], rung=3, author=AGENTS), *since]
+    assert asked(at_the_end(past)) == Next(Step.REDESIGN, BY_RULES)
+
+
 @pytest.mark.parametrize(
     ("rung", "author", "left"),
     [(2, AGENTS, 2), (OWN, AGENTS, 0), (0, AGENTS, 0), (2, RULES, 0), (2, "anna", 0)],
@@ -458,8 +464,7 @@ def test_a_person_who_rejects_what_the_rules_would_have_is_not_asked_again():
         ADAPTED,
         [*ADAPTED[:3], replace(ADAPTED[3], author="anna", step=None)],  # a person's own
         [replace(ADAPTED[0], author=AGENTS), *ADAPTED[1:]],
-        [*ADAPTED, replace(ADAPTED[3], rung=3, author=AGENTS)],  # the rules' was in service on that model
-        [*ADAPTED, replace(ADAPTED[3], rung=3, author=AGENTS), replace(ADAPTED[3], rung=4)],
+        [*BY_AGENTS, replace(ADAPTED[3], rung=BY_RULES), replace(ADAPTED[3], rung=4, author=AGENTS)],  # had already
         [*BY_AGENTS, replace(ADAPTED[3], author="anna", step=None), replace(ADAPTED[3], rung=4)],  # calmer than hers
     ],
 )
