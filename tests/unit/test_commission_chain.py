@@ -2,24 +2,12 @@
 
 from dataclasses import replace
 from itertools import cycle, islice
-from types import SimpleNamespace
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gateway.cli.commission_side import proposed_on_model
-from gateway.commissioning.architectures import ARCHITECTURES
-from gateway.commissioning.candidates import (
-    FIRST_LAWS,
-    Law,
-    NotOffered,
-    at_end,
-    configuration,
-    experiment,
-    fastest_m_per_s,
-    values_of,
-)
+from gateway.commissioning.candidates import FIRST_LAWS
 from gateway.commissioning.chain import (
     MOST_ROUNDS,
     STRETCH,
@@ -28,7 +16,6 @@ from gateway.commissioning.chain import (
     from_one_experiment,
     may_experiment,
     may_use_all,
-    next_step,
     refused_at_once,
 )
 from gateway.commissioning.decisions import AGENTS, RULES
@@ -45,43 +32,9 @@ from gateway.commissioning.ladder import (
     Ended,
     Next,
 )
-from gateway.commissioning.past import Follows, Outcome, Past, Step, named, past_of
-from gateway.commissioning.redesign import LAWS, PREDICTIVE, RUNGS
-from gateway.control.design import design_lqi, is_stable, task_of
-from gateway.core.controller import config_hash
-from gateway.core.decisions import ProposalShown
-from gateway.core.deployment import Region
-from gateway.core.proposal import GainsChange, Proposal, proposal_hash
-from gateway.core.verdict import RuleFinding, Verdict
-from tests.unit.supervisor_support import line_of
-
-FIRST_M_PER_S, WANTED_M_PER_S = 0.02, 0.12
-KINDS = {
-    Step.FIRST: "gains", Step.EXPERIMENT: "experiment", Step.MODEL: "model", Step.REDESIGN: "gains",
-    Step.MEASUREMENT: "experiment",
-}  # fmt: skip
-LINE = line_of(2)
-
-
-def asked(past, adaptations=1, **limits):
-    return next_step(past, FIRST_M_PER_S, WANTED_M_PER_S, adaptations, **limits)
-
-
-def looked_at(past, settled=True, gains=False):
-    """The last measurement, once somebody has looked at it."""
-    why = "as it should" if settled else "span 2 overshoots"
-    follows = Follows.LEAVE if settled else Follows.NEWER_MODEL if gains else Follows.CALMER
-    return [*past[:-1], replace(past[-1], converged=settled, follows=follows, why=why)]
-
-
-def after(step: Next, past, outcome=Outcome.DONE) -> Past:
-    """What the gate's list has of a proposal. A configuration is let through for what the last experiment has shown."""
-    shown = max((one.speed_m_per_s for one in past if one.kind == "experiment" and one.outcome is Outcome.DONE),
-                default=FIRST_M_PER_S)  # fmt: skip
-    fastest = max(step.speeds_m_per_s, default=None)
-    speed = {Step.FIRST: FIRST_M_PER_S, Step.REDESIGN: shown, Step.EXPERIMENT: fastest, Step.MEASUREMENT: fastest}
-    done = outcome is Outcome.DONE or step.step is Step.EXPERIMENT
-    return Past(KINDS[step.step], outcome, step.step, step.rung, "why", speed.get(step.step) if done else None, "p")
+from gateway.commissioning.past import Follows, Outcome, Past, Step
+from gateway.commissioning.redesign import RUNGS
+from tests.unit.chain_support import ADAPTED, FIRST_M_PER_S, LINE, after, asked, concluded, looked_at
 
 
 def test_where_everything_gets_through_each_round_goes_faster_until_the_range_is_covered():
@@ -198,13 +151,6 @@ def test_what_an_engineer_has_done_meanwhile_counts():
     assert asked(looked_at(past)).converged
 
 
-ADAPTED = [
-    Past("gains", Outcome.DONE, Step.FIRST, speed_m_per_s=0.02),
-    Past("experiment", Outcome.DONE, Step.EXPERIMENT, speed_m_per_s=0.12),
-    Past("model", Outcome.DONE, Step.MODEL), Past("gains", Outcome.DONE, Step.REDESIGN, speed_m_per_s=0.12),
-]  # fmt: skip
-
-
 @pytest.mark.parametrize("gains", [True, False])
 def test_what_is_not_settled_leads_to_another_model_and_redesign_a_few_times(gains):
     past, steps, rungs = list(ADAPTED), [], []
@@ -234,12 +180,6 @@ def test_of_so_many_adaptations_as_are_asked_for_the_second_is_from_all_data_and
         past.append(replace(after(step, past), speed_m_per_s=0.12))
     again = [Step.MODEL, Step.REDESIGN, Step.MEASUREMENT]
     assert steps == [Step.MEASUREMENT, *again, Step.EXPERIMENT, *again] and rungs == [ALL, 0, ALL, 0]
-
-
-def concluded(past, follows):
-    """Measured, and this was concluded from it."""
-    measured = after(asked(past), past)
-    return [*past, replace(measured, follows=follows, converged=True, why="as it should", speed_m_per_s=0.12)]
 
 
 def test_a_model_of_one_experiment_is_followed_by_one_of_all_data_once():
@@ -374,175 +314,6 @@ def test_it_ends_whatever_the_gate_says_and_whoever_chooses(outcomes, share, pic
     raise AssertionError(f"{len(past)} proposals, and no end")
 
 
-BY_AGENTS = [*ADAPTED[:3], replace(ADAPTED[3], author=AGENTS)]
-
-
-def at_the_end(past):
-    """Measured and looked at: the chain would end."""
-    return looked_at([*past, replace(after(asked(past), past), speed_m_per_s=0.12)])
-
-
-def test_where_agents_have_chosen_what_is_in_service_the_rules_have_the_last_word_once():
-    past = at_the_end(BY_AGENTS)
-    step = asked(past)
-    assert step == Next(Step.REDESIGN, BY_RULES) and not step.others and step.own <= 0
-    refused = after(step, past, Outcome.FAILED)
-    assert asked([*past, refused]) == Next(Step.REDESIGN, BY_RULES + 1)
-    none = replace(refused, last=True)  # there is no design that promises as much
-    assert isinstance(asked([*past, none]), Ended) and asked([*past, none]).converged
-    kept = [*past, replace(after(step, past), speed_m_per_s=0.12)]
-    assert asked(kept).step is Step.MEASUREMENT and isinstance(asked(at_the_end(kept)), Ended)
-
-
-def test_the_last_word_is_had_whatever_agents_have_concluded_from_their_own_choices():
-    past = concluded(BY_AGENTS, Follows.CALMER)
-    past.append(replace(after(asked(past), past), speed_m_per_s=0.12, author=AGENTS))
-    assert asked(concluded(past, Follows.LEAVE)) == Next(Step.REDESIGN, BY_RULES)
-
-
-def test_the_last_word_is_had_where_the_rules_only_had_to_be_calmer_than_what_agents_had_chosen():
-    past = concluded(BY_AGENTS, Follows.CALMER)
-    past.append(replace(after(asked(past), past), speed_m_per_s=0.12))
-    assert past[-1].author == RULES
-    assert asked(concluded(past, Follows.LEAVE)) == Next(Step.REDESIGN, BY_RULES)
-
-
-@pytest.mark.parametrize("since", [[], [replace(ADAPTED[3], rung=4)]])
-def test_the_last_word_is_had_where_agents_have_replaced_a_design_of_the_rules(since):
-    past = [*ADAPTED, replace(ADAPTED[3], rung=3, author=AGENTS), *since]
-    assert asked(at_the_end(past)) == Next(Step.REDESIGN, BY_RULES)
-
-
-@pytest.mark.parametrize(
-    ("rung", "author", "left"),
-    [(2, AGENTS, 2), (OWN, AGENTS, 0), (0, AGENTS, 0), (2, RULES, 0), (2, "anna", 0)],
-)
-def test_where_no_model_came_of_it_the_rules_propose_what_they_would_have_begun_with(rung, author, left):
-    past = [replace(ADAPTED[0], rung=rung, author=author)]
-    while isinstance(step := asked(past), Next) and step.rung < BY_RULES:
-        past.append(after(step, past, Outcome.FAILED if step.step is Step.MODEL else Outcome.DONE))
-    proposed = []
-    while isinstance(step, Next):
-        proposed.append(step.rung - BY_RULES)
-        assert step.step is Step.FIRST and not step.others and step.own <= 0
-        past.append(after(step, past, Outcome.FAILED))
-        step = asked(past)
-    assert proposed == list(range(left)) and not step.reached
-    if left:
-        kept = [*past[:-left], replace(past[-1], rung=BY_RULES, outcome=Outcome.DONE)]
-        assert isinstance(asked(kept), Ended) and not asked(kept).reached
-
-
-def test_the_rules_do_not_propose_what_they_would_have_begun_with_where_no_experiment_was_made():
-    past = [replace(ADAPTED[0], rung=2, author=AGENTS)]
-    while isinstance(step := asked(past), Next):
-        assert step.step is Step.EXPERIMENT
-        past.append(after(step, past, Outcome.FAILED))
-    assert step.text.startswith("no experiment of 4")
-
-
-def test_a_configuration_that_was_put_into_service_gets_experiments_and_old_data_no_model_again():
-    """After one experiment without a model, and four refused under what was in service."""
-    past = [ADAPTED[0]]
-    while isinstance(step := asked(past), Next):
-        done = step.step is Step.EXPERIMENT and not any(one.step is Step.EXPERIMENT for one in past)
-        past.append(after(step, past, Outcome.DONE if done else Outcome.FAILED))
-    past.append(replace(ADAPTED[0], author="anna", step=None))
-    assert asked(past).step is Step.EXPERIMENT
-
-
-def test_a_person_who_rejects_what_the_rules_would_have_is_not_asked_again():
-    past = at_the_end(BY_AGENTS)
-    wanted = asked(past)
-    rejected = past_of(shown("rejected", step=wanted.step, rung=wanted.rung))
-    assert rejected.rung == BY_RULES and isinstance(asked([*past, rejected]), Ended)
-
-
-@pytest.mark.parametrize(
-    "past",
-    [
-        ADAPTED,
-        [*ADAPTED[:3], replace(ADAPTED[3], author="anna", step=None)],  # a person's own
-        [replace(ADAPTED[0], author=AGENTS), *ADAPTED[1:]],
-        [*BY_AGENTS, replace(ADAPTED[3], rung=BY_RULES), replace(ADAPTED[3], rung=4, author=AGENTS)],  # had already
-        [*BY_AGENTS, replace(ADAPTED[3], author="anna", step=None), replace(ADAPTED[3], rung=4)],  # calmer than hers
-    ],
-)
-def test_nobody_is_overruled_who_has_left_it_to_the_rules_or_is_a_person(past):
-    assert isinstance(asked(at_the_end(past)), Ended)
-
-
-def test_what_agents_began_with_and_stays_as_it_is_is_theirs():
-    as_it_is = [replace(ADAPTED[0], author=AGENTS), *ADAPTED[1:3], replace(ADAPTED[3], rung=AS_IT_IS)]
-    assert asked(at_the_end(as_it_is)) == Next(Step.REDESIGN, BY_RULES)
-
-
-def test_the_last_word_comes_also_where_no_more_redesigns_are_wanted_and_not_where_it_is_not_had():
-    assert asked(at_the_end(BY_AGENTS), most_redesigns=1) == Next(Step.REDESIGN, BY_RULES)
-    assert isinstance(asked(at_the_end(ADAPTED), most_redesigns=1), Ended)
-    assert isinstance(asked(at_the_end(BY_AGENTS), most_redesigns=1, last_word=False), Ended)
-
-
-def shown(stage, rules=(), why="", step=Step.FIRST, rung=2):
-    """As the gate shows a proposal of the chain; `rules` are those that fail."""
-    config = design_lqi(task_of(LINE))
-    proposal = Proposal(
-        format=1, site=LINE.site, line=LINE.line, change=GainsChange(controller=config), base=config_hash(config),
-        model=None, reason="to begin with", evidence=[named(step, rung)], author="rules",
-        created="2026-01-05T06:00:00+00:00", expires="2026-01-05T07:00:00+00:00",
-    )  # fmt: skip
-    findings = [RuleFinding(rule=rule, passed=False, text="no") for rule in rules]
-    verdict = Verdict(
-        format=1, proposal=proposal_hash(proposal), payload="0" * 64, context="0" * 64, line="0" * 64, kind="gains",
-        seed=1, accepted=not rules, findings=findings or [RuleFinding(rule="decay", passed=True, text="yes")],
-        region=None if rules else Region(speed_max_m_per_s=0.02), judged=proposal.created, program_version="0",
-    )  # fmt: skip
-    return ProposalShown(
-        format=1, stage=stage, why=why, proposal_hash=proposal_hash(proposal), shown=None, epoch=0, difference=[],
-        proposal=proposal, verdict=verdict,
-    )  # fmt: skip
-
-
-def test_what_has_had_its_answer_on_the_accepted_model_is_known_by_its_hash():
-    hash_ = config_hash(design_lqi(task_of(LINE)))
-    model = SimpleNamespace(proposal=SimpleNamespace(kind="model"), stage="kept")
-    assert proposed_on_model([shown("refused", ("corners",)), model]) == frozenset()
-    assert proposed_on_model([model, shown("expired"), shown("refused", ("cool-down",))]) == frozenset()
-    for answered in (shown("refused", ("corners",)), shown("rejected"), shown("kept"), shown("rolled-back")):
-        assert proposed_on_model([model, answered]) == {hash_}
-
-
-@pytest.mark.parametrize(
-    ("stage", "rules", "why", "outcome"),
-    [
-        ("kept", (), "", Outcome.DONE),
-        ("done", (), "", Outcome.DONE),
-        ("done", (), "a torque was at a limit", Outcome.FAILED),
-        ("waiting", (), "", Outcome.OPEN),
-        ("probation", (), "", Outcome.OPEN),
-        ("refused", ("cool-down",), "", Outcome.AGAIN),
-        ("refused", ("cool-down", "corners: error"), "", Outcome.FAILED),
-        ("rejected", (), "by anna", Outcome.FAILED),
-        ("rolled-back", (), "tension 1 swings", Outcome.FAILED),
-        ("superseded", (), "", Outcome.AGAIN),
-    ],
-)
-def test_a_proposal_says_of_itself_where_in_the_chain_it_belongs(stage, rules, why, outcome):
-    found = past_of(shown(stage, rules, why))
-    assert (found.step, found.rung, found.outcome, found.why) == (Step.FIRST, 2, outcome, why)
-    assert found.speed_m_per_s == (None if rules else 0.02)
-
-
-def test_somebody_elses_proposal_that_nobody_has_decided_holds_nothing_up_and_a_forged_step_is_none():
-    own = shown("waiting")
-    of_others = own.model_copy(update={"proposal": own.proposal.model_copy(update={"evidence": []})})
-    assert past_of(own).outcome is Outcome.OPEN and past_of(of_others).outcome is Outcome.AGAIN
-    assert asked([past_of(of_others)]) == Next(Step.FIRST, 0)
-    for evidence in (named(Step.EXPERIMENT, 0), named(Step.FIRST, -3)):
-        forged = own.proposal.model_copy(update={"evidence": [evidence]})
-        assert past_of(own.model_copy(update={"proposal": forged})).step is None
-
-
 def test_after_a_calmer_one_comes_none_that_is_quicker():
     past = [*ADAPTED[:3], replace(ADAPTED[3], rung=3)]
     past = looked_at([*past, after(asked(past), past)], settled=False)
@@ -554,44 +325,11 @@ def test_a_closed_line_is_told_at_once():
     assert "closed" in refused_at_once(LINE.model_copy(update={"gate": gate})) and refused_at_once(LINE) == ""
 
 
-@pytest.mark.parametrize("law", [*FIRST_LAWS, *LAWS, *PREDICTIVE], ids=lambda law: law.text)
-def test_every_candidate_holds_the_line_that_it_is_made_for(law):
-    assert is_stable(configuration(LINE, None, 0.02, law), task_of(LINE))
-
-
-def test_a_knob_that_ends_before_somebodys_number_says_so():
-    knob = next(one for one in ARCHITECTURES["lqi"].knobs if one.name == "torque_per_nm2")
-    law = Law("lqi", (("torque_per_nm2", 1e12), ("integral_per_n2s2", 1.0)))
-    (said,) = at_end(LINE, None, FIRST_M_PER_S, law)
-    assert f"torque_per_nm2 ends at {knob.most:g}" in said
-    assert values_of(task_of(LINE), law)["torque_per_nm2"] == knob.most
-    assert not at_end(LINE, None, FIRST_M_PER_S, Law("lqi", (("torque_per_nm2", 2.0),)))
-
-
-def test_the_line_goes_as_fast_as_its_drives_hold():
-    most = fastest_m_per_s(LINE, None)
-    weak = LINE.model_copy(update={"limits": LINE.limits.model_copy(update={"torque_nm": 20.0})})
-    assert 0.0 < fastest_m_per_s(weak, None) < most <= LINE.limits.speed_max_m_per_s
-    roller = LINE.rollers[0]
-    omega_per_s = fastest_m_per_s(weak, None) / roller.radius_m.value
-    assert roller.friction_nms_per_rad.value * omega_per_s < 0.9 * 20.0
-
-
-def test_a_first_experiment_keeps_to_the_steps_of_a_first_configuration_and_is_refused_where_it_cannot():
-    config = configuration(LINE, None, 0.02, FIRST_LAWS[0])
-    given = (LINE, None, config, LINE.recipes[0].tension_n, 0.01)
-    found = experiment(*given, [0.01, 0.02], size=8.0)
-    assert found.step_max_n == LINE.gate.first_step_max_n and [leg.speed_m_per_s for leg in found.legs] == [0.01, 0.02]
-    assert found.abort.deviation_n > max(found.amplitude_n) and found.rate_n_per_s is None
-    with pytest.raises(NotOffered, match="allowed"):
-        experiment(*given, [0.01, 2.0 * LINE.limits.speed_max_m_per_s])
-
-
-def test_on_a_slow_line_set_points_of_an_experiment_move_on_ramps():
-    """The rollers of a line for 0.03 m/s may run ahead of the web by no more than 0.018 m/s at 0.02 m/s."""
-    slow = LINE.model_copy(update={"limits": LINE.limits.model_copy(update={"speed_max_m_per_s": 0.03})})
-    config = configuration(slow, None, 0.02, FIRST_LAWS[0])
-    found = experiment(slow, None, config, LINE.recipes[0].tension_n, 0.01, [0.01, 0.02])
-    assert found.rate_n_per_s is not None and 1.0 < found.rate_n_per_s < LINE.moves.tension_rate_n_per_s
-    assert found.dwell_s > 2.0 * max(found.amplitude_n) / found.rate_n_per_s
-    assert max(found.amplitude_n) > 0.5
+def test_a_configuration_that_was_put_into_service_gets_experiments_and_old_data_no_model_again():
+    """After one experiment without a model, and four refused under what was in service."""
+    past = [ADAPTED[0]]
+    while isinstance(step := asked(past), Next):
+        done = step.step is Step.EXPERIMENT and not any(one.step is Step.EXPERIMENT for one in past)
+        past.append(after(step, past, Outcome.DONE if done else Outcome.FAILED))
+    past.append(replace(ADAPTED[0], author="anna", step=None))
+    assert asked(past).step is Step.EXPERIMENT

@@ -1,21 +1,121 @@
 """What the rules propose in the end, in the place of what agents have led to."""
 
+from dataclasses import replace
 from datetime import UTC, datetime
 
 import pytest
 
 from gateway.cli.commission_changes import Changes, LineNow
 from gateway.commissioning.candidates import FIRST_LAWS, Exhausted, Law, NotOffered, configuration
-from gateway.commissioning.ladder import BY_RULES, Next
-from gateway.commissioning.past import Step
+from gateway.commissioning.decisions import AGENTS, RULES
+from gateway.commissioning.ladder import AS_IT_IS, BY_RULES, OWN, Ended, Next
+from gateway.commissioning.past import Follows, Outcome, Step, past_of
 from gateway.commissioning.redesign import Figures, no_worse
 from gateway.core.controller import config_hash
 from gateway.core.deployment import Region
+from tests.unit.chain_support import ADAPTED, after, asked, concluded, looked_at, shown
 from tests.unit.test_redesign import LINE, MODEL, TENSION_N
 
 #: As a late adversary leaves it: calm, and as good as any in a step that torque limits.
 CALM = configuration(LINE, MODEL, 0.06, Law("lqi", (("torque_per_nm2", 4.0), ("integral_per_n2s2", 0.3))))
 CHANGES = Changes(LINE)
+BY_AGENTS = [*ADAPTED[:3], replace(ADAPTED[3], author=AGENTS)]
+
+
+def at_the_end(past):
+    """Measured and looked at: the chain would end."""
+    return looked_at([*past, replace(after(asked(past), past), speed_m_per_s=0.12)])
+
+
+def test_where_agents_have_chosen_what_is_in_service_the_rules_have_the_last_word_once():
+    past = at_the_end(BY_AGENTS)
+    step = asked(past)
+    assert step == Next(Step.REDESIGN, BY_RULES) and not step.others and step.own <= 0
+    refused = after(step, past, Outcome.FAILED)
+    assert asked([*past, refused]) == Next(Step.REDESIGN, BY_RULES + 1)
+    none = replace(refused, last=True)  # there is no design that promises as much
+    assert isinstance(asked([*past, none]), Ended) and asked([*past, none]).converged
+    kept = [*past, replace(after(step, past), speed_m_per_s=0.12)]
+    assert asked(kept).step is Step.MEASUREMENT and isinstance(asked(at_the_end(kept)), Ended)
+
+
+def test_the_last_word_is_had_whatever_agents_have_concluded_from_their_own_choices():
+    past = concluded(BY_AGENTS, Follows.CALMER)
+    past.append(replace(after(asked(past), past), speed_m_per_s=0.12, author=AGENTS))
+    assert asked(concluded(past, Follows.LEAVE)) == Next(Step.REDESIGN, BY_RULES)
+
+
+def test_the_last_word_is_had_where_the_rules_only_had_to_be_calmer_than_what_agents_had_chosen():
+    past = concluded(BY_AGENTS, Follows.CALMER)
+    past.append(replace(after(asked(past), past), speed_m_per_s=0.12))
+    assert past[-1].author == RULES
+    assert asked(concluded(past, Follows.LEAVE)) == Next(Step.REDESIGN, BY_RULES)
+
+
+@pytest.mark.parametrize("since", [[], [replace(ADAPTED[3], rung=4)]])
+def test_the_last_word_is_had_where_agents_have_replaced_a_design_of_the_rules(since):
+    past = [*ADAPTED, replace(ADAPTED[3], rung=3, author=AGENTS), *since]
+    assert asked(at_the_end(past)) == Next(Step.REDESIGN, BY_RULES)
+
+
+@pytest.mark.parametrize(
+    ("rung", "author", "left"),
+    [(2, AGENTS, 2), (OWN, AGENTS, 0), (0, AGENTS, 0), (2, RULES, 0), (2, "anna", 0)],
+)
+def test_where_no_model_came_of_it_the_rules_propose_what_they_would_have_begun_with(rung, author, left):
+    past = [replace(ADAPTED[0], rung=rung, author=author)]
+    while isinstance(step := asked(past), Next) and step.rung < BY_RULES:
+        past.append(after(step, past, Outcome.FAILED if step.step is Step.MODEL else Outcome.DONE))
+    proposed = []
+    while isinstance(step, Next):
+        proposed.append(step.rung - BY_RULES)
+        assert step.step is Step.FIRST and not step.others and step.own <= 0
+        past.append(after(step, past, Outcome.FAILED))
+        step = asked(past)
+    assert proposed == list(range(left)) and not step.reached
+    if left:
+        kept = [*past[:-left], replace(past[-1], rung=BY_RULES, outcome=Outcome.DONE)]
+        assert isinstance(asked(kept), Ended) and not asked(kept).reached
+
+
+def test_the_rules_do_not_propose_what_they_would_have_begun_with_where_no_experiment_was_made():
+    past = [replace(ADAPTED[0], rung=2, author=AGENTS)]
+    while isinstance(step := asked(past), Next):
+        assert step.step is Step.EXPERIMENT
+        past.append(after(step, past, Outcome.FAILED))
+    assert step.text.startswith("no experiment of 4")
+
+
+def test_a_person_who_rejects_what_the_rules_would_have_is_not_asked_again():
+    past = at_the_end(BY_AGENTS)
+    wanted = asked(past)
+    rejected = past_of(shown("rejected", step=wanted.step, rung=wanted.rung))
+    assert rejected.rung == BY_RULES and isinstance(asked([*past, rejected]), Ended)
+
+
+@pytest.mark.parametrize(
+    "past",
+    [
+        ADAPTED,
+        [*ADAPTED[:3], replace(ADAPTED[3], author="anna", step=None)],  # a person's own
+        [replace(ADAPTED[0], author=AGENTS), *ADAPTED[1:]],
+        [*BY_AGENTS, replace(ADAPTED[3], rung=BY_RULES), replace(ADAPTED[3], rung=4, author=AGENTS)],  # had already
+        [*BY_AGENTS, replace(ADAPTED[3], author="anna", step=None), replace(ADAPTED[3], rung=4)],  # calmer than hers
+    ],
+)
+def test_nobody_is_overruled_who_has_left_it_to_the_rules_or_is_a_person(past):
+    assert isinstance(asked(at_the_end(past)), Ended)
+
+
+def test_what_agents_began_with_and_stays_as_it_is_is_theirs():
+    as_it_is = [replace(ADAPTED[0], author=AGENTS), *ADAPTED[1:3], replace(ADAPTED[3], rung=AS_IT_IS)]
+    assert asked(at_the_end(as_it_is)) == Next(Step.REDESIGN, BY_RULES)
+
+
+def test_the_last_word_comes_also_where_no_more_redesigns_are_wanted_and_not_where_it_is_not_had():
+    assert asked(at_the_end(BY_AGENTS), most_redesigns=1) == Next(Step.REDESIGN, BY_RULES)
+    assert isinstance(asked(at_the_end(ADAPTED), most_redesigns=1), Ended)
+    assert isinstance(asked(at_the_end(BY_AGENTS), most_redesigns=1, last_word=False), Ended)
 
 
 def now(in_service, model=MODEL):
