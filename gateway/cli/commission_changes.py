@@ -19,8 +19,8 @@ from gateway.commissioning.chain import first_legs
 from gateway.commissioning.convergence import SIGNIFICANT, Convergence, convergence, measurement
 from gateway.commissioning.ladder import ALL, AS_IT_IS, BY_RULES, Next
 from gateway.commissioning.past import Step
-from gateway.commissioning.redesign import OF_TOLERANCE, redesigns
 from gateway.commissioning.redesign import Offer as Redesign
+from gateway.commissioning.redesign import redesigns
 from gateway.core.controller import Controller, config_hash
 from gateway.core.deployment import Region, first_region
 from gateway.core.experiment import Experiment
@@ -78,7 +78,7 @@ class Changes:
         self.line = line
         self._wanted_m_per_s = wanted_m_per_s
         #: And what they were designed from
-        self._designed: tuple[LineNow, Region | None, float, list[Redesign]] | None = None
+        self._designed: tuple[LineNow, Region | None, bool, list[Redesign]] | None = None
         self._experiment_for: tuple[object, Experiment] | None = None  #: and what it was designed from
 
     def offers(
@@ -233,13 +233,12 @@ class Changes:
         """Than what agents have put into service: significantly so in a course on the same model, and in the mean.
 
         A step that torque limits is as good by any design, and would hide in the mean what the others differ by. One
-        that has been proposed on that model has had its verdict. The others may use all that the gate tolerates: there
-        is none after them that would not.
+        that has been proposed on that model has had its verdict.
         """
         assert now.model is not None  # a redesign follows a model
         better = [
             one
-            for one in self._designs(now, region, of_tolerance=1.0)
+            for one in self._designs(now, region, last=True)
             if one.share < 1.0
             and min(one.shares.values()) <= 1.0 - SIGNIFICANT
             and config_hash(one.controller) not in proposed
@@ -254,17 +253,15 @@ class Changes:
         made = Made(GainsChange(controller=one.controller), f"{one.law.text} {_on(now.model)}; {promise}")
         return Offer(rung, one.law.text, lambda _: made, (), one.law, one)
 
-    def _designs(self, now: LineNow, region: Region | None, of_tolerance: float = OF_TOLERANCE) -> list[Redesign]:
-        """What has been designed last, again."""
+    def _designs(self, now: LineNow, region: Region | None, last: bool = False) -> list[Redesign]:
+        """What has been designed before, again. `last`: see `redesigns`."""
         assert now.model is not None
-        last = self._designed
-        if last is None or last[1:3] != (region, of_tolerance) or not _same(last[0], now):
+        known = self._designed
+        if known is None or known[1:3] != (region, last) or not _same(known[0], now):
             judged = Region() if region is None else region
-            found = redesigns(
-                self.line, now.model, now.in_service, now.tension_n, judged, self._wanted_m_per_s, of_tolerance
-            )
-            last = self._designed = now, region, of_tolerance, found
-        return last[3]
+            found = redesigns(self.line, now.model, now.in_service, now.tension_n, judged, self._wanted_m_per_s, last)
+            known = self._designed = now, region, last, found
+        return known[3]
 
     def _redesign(self, rung: int, one: Redesign, now: LineNow, on: str) -> Offer:
         def make(factors: Factors) -> Made:

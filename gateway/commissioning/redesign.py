@@ -46,6 +46,11 @@ LAWS = (
 PREDICTIVE = tuple(
     Law("mpc", (("torque_per_nm2", torque), ("disturbance_nm_per_sqrt_s", 0.25))) for torque in (1.0, 2.0, 4.0)
 )
+#: Calmer still, with which predictive control overshoots a step at the torque limit by less; the others hardly differ
+#: in that.
+CALM_PREDICTIVE = tuple(
+    Law("mpc", (("torque_per_nm2", torque), ("disturbance_nm_per_sqrt_s", 0.25))) for torque in (8.0, 16.0)
+)
 LINEAR_RUNGS = 4  #: of all others that are worth it: the best, and more at even distances down to the calmest
 RUNGS = len(PREDICTIVE) + LINEAR_RUNGS
 LASTING_S, BRIEF_S = 2.5, 1.0  #: of each change; with predictive control
@@ -93,15 +98,15 @@ class Beside:
 
 def redesigns(
     line: Line, model: LineModel, in_service: Controller, tension_n: Sequence[float], region: Region,
-    wanted_m_per_s: float = inf, of_tolerance: float = OF_TOLERANCE,
+    wanted_m_per_s: float = inf, last: bool = False,
 ) -> list[Offer]:  # fmt: skip
     """At most `RUNGS`, for steps as the line's file permits and speeds up to those of the model's data.
-
-    No worse than what is in service by more than `of_tolerance` times the gate's tolerances.
 
     Or up to a higher one of `region`, for which the configuration in service was judged. Predictive control is offered
     once it is the highest that the drives hold, or `wanted_m_per_s`: on the way there it would only take the gate's
     time.
+
+    `last`: there is nothing after them, so they may use all that the gate tolerates, and `CALM_PREDICTIVE` is offered.
     """
     shown_m_per_s = region.speed_max_m_per_s or 0.0
     speed = min(max(model.region.speed_to_m_per_s, shown_m_per_s), line.limits.speed_max_m_per_s)
@@ -109,6 +114,7 @@ def redesigns(
     judged = Judged(
         line, np.array(tension_n), speed, limits.tension_step_max_n, min(limits.speed_step_max_m_per_s, speed)
     )
+    of_tolerance, predictive_laws = (1.0, (*PREDICTIVE, *CALM_PREDICTIVE)) if last else (OF_TOLERANCE, PREDICTIVE)
     designed = _designed(line, model, speed, LAWS)
     beside = Beside(in_service, region)
     found = _worth(designed, beside, line, model, judged, BRIEF_S if _slow(in_service) else LASTING_S, of_tolerance)
@@ -116,7 +122,7 @@ def redesigns(
     linear = [found[place] for place in places]
     if speed < NEAR * min(wanted_m_per_s, fastest_m_per_s(line, model)):
         return linear
-    predictive = _designed(line, model, speed, PREDICTIVE)
+    predictive = _designed(line, model, speed, predictive_laws)
     best = [(one.law, one.controller) for one in linear[:1]]
     found = _worth([*predictive, *best], beside, line, model, judged, BRIEF_S, of_tolerance)
     return [*takewhile(lambda each: (each.law, each.controller) not in best, found), *linear]

@@ -13,12 +13,12 @@ from gateway.commissioning.candidates import (
     fastest_m_per_s,
     values_of,
 )
-from gateway.commissioning.redesign import LAWS, PREDICTIVE
+from gateway.commissioning.redesign import CALM_PREDICTIVE, LAWS, PREDICTIVE
 from gateway.control.design import is_stable, task_of
 from tests.unit.chain_support import FIRST_M_PER_S, LINE
 
 
-@pytest.mark.parametrize("law", [*FIRST_LAWS, *LAWS, *PREDICTIVE], ids=lambda law: law.text)
+@pytest.mark.parametrize("law", [*FIRST_LAWS, *LAWS, *PREDICTIVE, *CALM_PREDICTIVE], ids=lambda law: law.text)
 def test_every_candidate_holds_the_line_that_it_is_made_for(law):
     assert is_stable(configuration(LINE, None, 0.02, law), task_of(LINE))
 

@@ -10,7 +10,7 @@ from gateway.commissioning.candidates import FIRST_LAWS, Exhausted, Law, NotOffe
 from gateway.commissioning.decisions import AGENTS, RULES
 from gateway.commissioning.ladder import AS_IT_IS, BY_RULES, OWN, Ended, Next
 from gateway.commissioning.past import Follows, Outcome, Step, past_of
-from gateway.commissioning.redesign import Figures, no_worse
+from gateway.commissioning.redesign import CALM_PREDICTIVE, PREDICTIVE, Figures, no_worse, redesigns
 from gateway.core.controller import config_hash
 from gateway.core.deployment import Region
 from tests.unit.chain_support import ADAPTED, after, asked, concluded, looked_at, shown
@@ -165,3 +165,13 @@ def test_the_last_word_may_use_all_that_the_gate_tolerates():
     fine = LINE.gate.fine_overshoot_pct
     before, one = (Figures(rmse_n=1.0, overshoot_pct=pct, settling_s=0.3) for pct in (0.5 * fine, 0.98 * fine))
     assert no_worse(LINE, one, before, of_tolerance=1.0) and not no_worse(LINE, one, before)
+
+
+def test_the_last_word_has_calmer_predictive_control_too_which_overshoots_less():
+    offers = redesigns(LINE, MODEL, CALM, TENSION_N, Region(), last=True)
+    overshoot_pct = {one.law: one.figures["tension"].overshoot_pct for one in offers}
+    calm, usual = (
+        [overshoot_pct[law] for law in laws if law in overshoot_pct] for laws in (CALM_PREDICTIVE, PREDICTIVE)
+    )
+    assert len(calm) == 2 and usual and max(calm) < min(usual)
+    assert not set(CALM_PREDICTIVE) & {one.law for one in redesigns(LINE, MODEL, CALM, TENSION_N, Region())}
