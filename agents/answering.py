@@ -12,11 +12,11 @@ from agents.clocks import SYSTEM, Clocks
 from agents.code.agent import CodeAgent
 from agents.language_model.asking import Passage
 from agents.language_model.budget import Budget
-from agents.language_model.client import LanguageModel
+from agents.language_model.client import Heard, LanguageModel
 from agents.language_model.deciding import Answered, Exchange, decide
 from agents.rag.stages import Asked, Hit, Retrieval
 from agents.roles import ROLES, Role
-from gateway.core.interactions import Answer, Interaction, Note
+from gateway.core.interactions import Answer, Interaction, Note, fits
 from gateway.core.questions import Question, usual_choice
 from gateway.core.topics import AgentName
 
@@ -24,6 +24,9 @@ RULES = "rules"
 MOST_NOTES = 5
 MOST_PASSAGE = 1500  #: letters of each
 MOST_INSTEAD = 1000
+#: Of each text of a model that is kept, the most that fit into a record. An honest model's answers fit whole; what one
+#: that talks without end has said is kept in part, with its length and digest.
+KEPT_LETTERS = (65_536, 16_384, 4_096, 1_024)
 
 Search = Callable[[Asked], Awaitable[Retrieval]]  #: raises whatever it likes: knowledge is a help, not a condition
 Keep = Callable[[Interaction], Awaitable[None]]
@@ -41,7 +44,7 @@ class Agent:
 
     def __init__(
         self, name: AgentName, search: Search, keep: Keep, model: LanguageModel | None,
-        budget: Callable[[], Budget],
+        budget: Callable[[Question], Budget],
         clocks: Clocks = SYSTEM,
         code: CodeAgent | None = None,
     ) -> None:  # fmt: skip
@@ -53,17 +56,17 @@ class Agent:
         self._clocks = clocks
         self._code = code
 
-    async def answer(self, question: Question) -> Answer:
-        """Raises NotTheirs."""
+    async def answer(self, question: Question, heard: Heard | None = None) -> Answer:
+        """`heard` is told each piece of what the model says, as it comes. Raises NotTheirs."""
         if question.decision not in self.role.decides:
             raise NotTheirs(f"{question.decision} is decided by {question.agent}, not by {self.role.name}")
         began_s, at = self._clocks.monotonic_s(), self._clocks.now()
         found, unknown = await self._known(question)
         hits = [] if found is None else found.hits
-        answer, exchanges = await self._asked(question, hits)
+        answer, exchanges = await self._asked(question, hits, heard)
         if unknown:
             answer = answer.model_copy(update={"instead": f"{answer.instead}; {unknown}".strip("; ")[:MOST_INSTEAD]})
-        interaction = Interaction(
+        whole = Interaction(
             format=1,
             id=secrets.token_hex(8),
             agent=self.role.name,
@@ -81,8 +84,8 @@ class Agent:
             tokens_out=sum(one.tokens_out or 0 for one in exchanges),
             seconds=max(self._clocks.monotonic_s() - began_s, 0.0),
         )  # fmt: skip
-        await self._keep(interaction)
-        return answer.model_copy(update={"interaction": interaction.id})
+        await self._keep(_fitting(whole))
+        return answer.model_copy(update={"interaction": whole.id})
 
     async def _known(self, question: Question) -> tuple[Retrieval | None, str]:
         """What is known of the question, or why nothing could be looked up."""
@@ -92,12 +95,17 @@ class Agent:
         except Exception as error:  # knowledge is a help, not a condition
             return None, f"nothing could be looked up: {error}"
 
-    async def _asked(self, question: Question, hits: Sequence[Hit]) -> tuple[Answer, tuple[Exchange, ...]]:
+    async def _asked(
+        self, question: Question, hits: Sequence[Hit], heard: Heard | None
+    ) -> tuple[Answer, tuple[Exchange, ...]]:
         if self._model is None:
             return Answer(choice=usual_choice(question), by=RULES), ()
         passages = [Passage(f"{hit.document.title} ({hit.document.key})", _told(hit)) for hit in hits]
         compute = None if self._code is None else self._code.task(self.role.name, question.task).compute
-        found = await decide(self._model, self.role.prompt, question, passages, budget=self._budget(), compute=compute)
+        found = await decide(
+            self._model, self.role.prompt, question, passages, budget=self._budget(question), heard=heard,
+            compute=compute,
+        )  # fmt: skip
         if isinstance(found, Answered):
             return Answer(choice=found.choice, by=self.role.name), found.exchanges
         instead = f"the language model gave no answer ({found.kind}): {found.text}"[:MOST_INSTEAD]
@@ -118,6 +126,30 @@ def _note(hit: Hit) -> Note:
         passage=hit.passage.text, overruled_by=hit.overruled_by,
         speaks_to_a_model=[f"{one.kind}: {one.passage}" for one in hit.passage.flags],
     )  # fmt: skip
+
+
+def _fitting(whole: Interaction) -> Interaction:
+    """With no more of what a model has said than fits into a record."""
+    found = whole
+    for most in KEPT_LETTERS:
+        if fits(found):
+            break
+        found = whole.model_copy(update={"exchanges": [_shortened(row, most) for row in whole.exchanges]})
+    return found
+
+
+def _shortened(row: dict[str, Any], most: int) -> dict[str, Any]:
+    messages = [said | {"content": _beginning(said["content"], most)} for said in row["messages"]]
+    refused = [_beginning(reason, most) for reason in row["refused"]]
+    said = {key: _beginning(row[key], most) for key in ("raw", "thinking")}
+    return row | said | {"messages": messages, "refused": refused}
+
+
+def _beginning(text: str, most: int) -> str:
+    if len(text) <= most:
+        return text
+    digest = hashlib.sha256(text.encode("utf-8", "surrogatepass")).hexdigest()
+    return f"{text[:most]} [... cut here: {len(text)} letters in all, SHA-256 {digest}]"
 
 
 def _model_named(exchanges: Sequence[Exchange]) -> str:

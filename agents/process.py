@@ -7,7 +7,7 @@ nothing but its names and who is asked, and reaches the line by the bus alone.
 import asyncio
 import signal
 import sys
-import time
+from collections import deque
 from collections.abc import Awaitable, Callable
 from contextlib import AsyncExitStack
 from functools import partial
@@ -24,6 +24,7 @@ from agents.language_model.budget import Budget
 from agents.language_model.client import LanguageModel
 from agents.language_model.no_answer import NoAnswer
 from agents.line_on_bus import LineOnBus
+from agents.progress import told
 from agents.rag.embedders import embedder_named
 from agents.roles import ROLES
 from gateway.core.computations import ComputeReply, ComputeRequest
@@ -34,13 +35,14 @@ from gateway.core.messages import Reply
 from gateway.core.questions import Question
 from gateway.core.topics import AGENT_COMPUTE, AGENT_DECIDE, ASK_LOG, AgentName
 from gateway.mailbox.bus import BusUnavailable, TlsEndpoint, connect
-from gateway.mailbox.port import Mailbox, Unreachable
+from gateway.mailbox.port import Mailbox, RemoteError, Unreachable
 
 EXIT_OK, EXIT_NO_BUS = 0, 1  # another try may find it
-ANOTHER_TASK_S = 3600.0
+MOST_TASKS = 32  #: whose tokens are counted; the one that has been asked for last is the last to be forgotten
 LOOKS: AgentName = "monitoring"  #: in whose name the process asks what is known of the line
 CODE: AgentName = "code"
 LOG_S = 5.0  #: for the gateway to take an interaction
+MOST_WAITING = 20  #: interactions of an agent, while the gateway is away
 COMPUTE_MAX_S = 120.0  #: for all calls of a request
 
 Tell = Callable[[str], None]
@@ -83,38 +85,37 @@ def begin(
     bus: Mailbox, line: Line, search: Search, model: LanguageModel | None, tell: Tell, materials: Materials
 ) -> None:  # fmt: skip
     """Every agent answers on `bus` from now on. `materials`: what the Code agent computes with."""
-    budget = _Task(line.agents.task_max_tokens)
+    budgets = Budgets(line.agents.task_max_tokens)
     asking = asyncio.Lock()  # one model, one question at a time
     code = CodeAgent(line, materials, _keep(bus, "code", tell))
     for name in ROLES:
         if not ROLES[name].decides:
             continue
-        agent = Agent(name, search, _keep(bus, name, tell), model, budget.now, code=code)
-        bus.serve(AGENT_DECIDE.of(name), _handler(agent, asking))
+        agent = Agent(name, search, _keep(bus, name, tell), model, budgets.of, code=code)
+        bus.serve(AGENT_DECIDE.of(name), _handler(agent, asking, tell))
     bus.serve(AGENT_COMPUTE.of("code"), _computing(code))
 
 
-class _Task:
-    """What one commissioning may cost. After an hour without a question the next one begins another."""
+class Budgets:
+    """What one run of a phase, such as a commissioning, may cost, however long a person takes to approve."""
 
-    def __init__(self, most_tokens: int, clock: Callable[[], float] = time.monotonic) -> None:
-        self._budget = Budget(most_tokens)
-        self._clock = clock
-        self._asked_s = clock()
+    def __init__(self, most_tokens: int) -> None:
+        self._most_tokens = most_tokens
+        self._of: dict[str, Budget] = {}
 
-    def now(self) -> Budget:
-        """For a question that has just come."""
-        before_s, self._asked_s = self._asked_s, self._clock()
-        if self._asked_s - before_s > ANOTHER_TASK_S:
-            self._budget = Budget(self._budget.most_tokens)
-        return self._budget
+    def of(self, question: Question) -> Budget:
+        budget = self._of.pop(question.run, None) or Budget(self._most_tokens)
+        self._of[question.run] = budget
+        while len(self._of) > MOST_TASKS:
+            del self._of[next(iter(self._of))]
+        return budget
 
 
-def _handler(agent: Agent, asking: asyncio.Lock) -> Callable[[bytes], Awaitable[bytes]]:
+def _handler(agent: Agent, asking: asyncio.Lock, tell: Tell) -> Callable[[bytes], Awaitable[bytes]]:
     async def decide(payload: bytes) -> bytes:
         question = _read(payload, Question)
-        async with asking:
-            return (await agent.answer(question)).model_dump_json().encode()
+        async with asking, told(question, tell) as said:
+            return (await agent.answer(question, said.hear)).model_dump_json().encode()
 
     return decide
 
@@ -140,14 +141,26 @@ def _read(payload: bytes, kind: type[T]) -> T:
 
 
 def _keep(bus: Mailbox, name: AgentName, tell: Tell) -> Keep:
+    """What the gateway is not there to take goes to it with the next one."""
+    waiting: deque[Interaction] = deque(maxlen=MOST_WAITING)
+
     async def keep(interaction: Interaction) -> None:
-        try:
-            reply = Reply.model_validate_json(await bus.request(ASK_LOG.of(name), pack(interaction), LOG_S))
-            why = "" if reply.ok else reply.text
-        except (Unreachable, ValidationError, ValueError) as error:
-            why = str(error)
-        if why:
-            tell(f"interaction {interaction.id} is not in the log: {why}")
+        waiting.append(interaction)
+        while waiting:
+            one = waiting[0]
+            try:
+                reply = Reply.model_validate_json(await bus.request(ASK_LOG.of(name), pack(one), LOG_S))
+                why = "" if reply.ok else "; ".join([reply.text, *reply.reasons])
+            except (ValidationError, ValueError, RemoteError) as error:
+                why = str(error)
+            except Unreachable as error:
+                tell(f"interaction {one.id} is not in the log yet: {error}")
+                return
+            waiting.popleft()
+            if why:
+                tell(f"interaction {one.id} is not in the log: {why}")
+            if waiting:
+                await asyncio.sleep(1.0 / ASK_LOG.most_per_s)
 
     return keep
 

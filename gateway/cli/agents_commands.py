@@ -21,7 +21,7 @@ def agents(
     run_dir: RunFolder = None,
     data_dir: DataFolder = None,
     gateway: Annotated[
-        str | None, typer.Option(help="HOST:PORT of a gateway on another machine, as its line's [network] has it.")
+        str | None, typer.Option(help="HOST:PORT of a gateway on another machine, as its line's \\[network] has it.")
     ] = None,
     certificate: Annotated[
         Path | None,

@@ -56,7 +56,7 @@ class AgentsHere:
                 transport = None if self._transport is None else self._transport()
                 model = await held.enter_async_context(LanguageModel(self._settings, clock, transport))
             clocks = Clocks(clock, lambda: datetime.now(UTC))
-            agent = Agent(question.agent, self._search, self._kept, model, lambda: self._budget, clocks)
+            agent = Agent(question.agent, self._search, self._kept, model, lambda _: self._budget, clocks)
             return decided_by(await agent.answer(question), question)
 
     async def _kept(self, interaction: Interaction) -> None:

@@ -5,9 +5,10 @@ costs it that time once: then it is not asked for `REST_S`. The gateway is told 
 """
 
 import asyncio
+import secrets
 import time
 from collections.abc import Callable
-from concurrent.futures import CancelledError
+from concurrent.futures import CancelledError, wait
 from contextlib import suppress
 from math import inf
 
@@ -21,6 +22,7 @@ from gateway.core.topics import AGENT_DECIDE, ASK_UNANSWERED
 from gateway.mailbox.port import Mailbox, Unreachable
 
 REST_S = 600.0
+TOLD_EVERY_S = 10.0  #: that an agent is still waited for
 LOOKED_UP_S = 20.0  #: for an agent to look up what is known, and to write it down
 TELL_S = 2.0  #: for the gateway to hear that an agent has failed
 
@@ -33,6 +35,7 @@ class AskedAgents:
     """`Decider` of `line`. `bus` belongs to `loop`; `decide` is called from another thread, and blocks that one.
 
     `within_s`: for an answer; None: as long as the line's file lets the agent ask its model, and a little more.
+    `tell` says, from that thread, who is waited for.
     """
 
     def __init__(
@@ -42,6 +45,8 @@ class AskedAgents:
         loop: asyncio.AbstractEventLoop,
         within_s: float | None = None,
         clock: Callable[[], float] = time.monotonic,
+        tell: Callable[[str], None] = lambda text: None,
+        tell_every_s: float = TOLD_EVERY_S,
     ) -> None:
         self._bus = bus
         self._loop = loop
@@ -49,6 +54,9 @@ class AskedAgents:
         asked_s = 0.0 if agents.llm == "off" else agents.load_max_s + agents.answer_max_s
         self.within_s = LOOKED_UP_S + asked_s if within_s is None else within_s  #: for an answer
         self._clock = clock
+        self._tell_person = tell
+        self._tell_every_s = tell_every_s
+        self._run = secrets.token_hex(8)
         self._resting_until_s: dict[str, float] = {}  #: agents that let the phase wait
 
     def decide(self, question: Question) -> Decided:
@@ -56,6 +64,11 @@ class AskedAgents:
             return self._by_rules(question, f"{question.agent} did not answer in time a while ago")
         began_s = self._clock()
         asked = asyncio.run_coroutine_threadsafe(self._asked(question), self._loop)
+        while not wait([asked], self._tell_every_s).done:
+            waited_s = self._clock() - began_s
+            self._tell_person(
+                f"{question.decision}: {question.agent} is thinking, {waited_s:.0f} s of at most {self.within_s:.0f}"
+            )
         try:
             answer = asked.result()
         except (Unreachable, ValidationError, CancelledError) as error:
@@ -75,13 +88,13 @@ class AskedAgents:
 
     async def _tell(self, question: Question, why: str) -> None:
         """It is the gateway's to keep; a phase goes on without it, too."""
-        payload = Unanswered(decision=question.decision, why=why[:MOST_WHY]).model_dump_json().encode()
+        payload = Unanswered(question=question, why=why[:MOST_WHY]).model_dump_json().encode()
         with suppress(Unreachable):
             await self._bus.request(ASK_UNANSWERED.of(question.agent), payload, TELL_S)
 
     async def _asked(self, question: Question) -> Answer:
         """Raises Unreachable, ValidationError."""
-        payload = question.model_dump_json().encode()
+        payload = question.model_copy(update={"run": self._run}).model_dump_json().encode()
         return Answer.model_validate_json(
             await self._bus.request(AGENT_DECIDE.of(question.agent), payload, self.within_s)
         )

@@ -20,7 +20,7 @@ from gateway.cli.commission_questions import (
     step_question,
 )
 from gateway.cli.commission_result import Commissioned, candidate_name, commissioned
-from gateway.cli.commission_side import CannotGoOn, GateSide, measured_on, proposed_on_model, put, region_kept
+from gateway.cli.commission_side import Away, CannotGoOn, GateSide, measured_on, proposed_on_model, put, region_kept
 from gateway.commissioning.candidates import Exhausted, NotOffered, fastest_m_per_s
 from gateway.commissioning.chain import (
     Look,
@@ -63,6 +63,8 @@ async def commission(
 ) -> Commissioned:
     """Until the chain has ended, one way or the other. Every rung is tried once, so that it does.
 
+    A gateway that goes away on the way is waited for. All that has been done stands in its list, so it goes on there.
+
     `wanted_m_per_s`: up to which the line is to be adapted; None: as fast as its drives hold.
     `adaptations`: redesigns at least; `most_redesigns`: once so many are kept none follows.
     `decider`: who chooses among the candidates. `last_word`: the rules propose theirs in the end, where agents have
@@ -87,6 +89,9 @@ async def commission(
         except CannotBeJudged as error:
             text = f"an adapted configuration is in service up to {region_speed(chain.past) or 0.0:.3g} m/s"
             return chain.ended(Ended(True, f"{text}; what was measured cannot be judged: {error}"))
+        except Away as away:
+            if not chain.past or not await side.is_back():
+                return chain.ended(Ended(False, str(away)))
         except CannotGoOn as stopped:
             return chain.ended(Ended(False, str(stopped)))
 

@@ -124,7 +124,7 @@ async def with_agents(line: "Line", run_dir: "Path | None", work: Callable[["Dec
         typer.echo(f"the agents cannot be asked, the rules decide: {error}")
         return await work(Rules())
     try:
-        return await work(AskedAgents(line, bus, asyncio.get_running_loop()))
+        return await work(AskedAgents(line, bus, asyncio.get_running_loop(), tell=typer.echo))
     finally:
         await bus.close()
 

@@ -3,13 +3,14 @@
 import asyncio
 import time
 from collections.abc import Awaitable, Callable
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 
 from pydantic import ValidationError
 
 from gateway.cli.commission_changes import LineNow
-from gateway.cli.commission_side import CannotGoOn
+from gateway.cli.commission_side import Away, CannotGoOn
 from gateway.commissioning.past import OPEN_STAGES, Outcome, past_of
 from gateway.core.decisions import (
     MOST_LISTED,
@@ -25,7 +26,7 @@ from gateway.core.messages import Reply
 from gateway.core.recording import Recording
 from gateway.core.status import GatewayStatus
 from gateway.core.topics import GATEWAY_DECISION, GATEWAY_PROPOSALS, GATEWAY_PROPOSE, GATEWAY_STATUS, Topic
-from gateway.mailbox.port import Mailbox, Unreachable
+from gateway.mailbox.port import Mailbox, RemoteError, Unreachable
 from gateway.supervisor import configurations as configurations_store
 from gateway.supervisor import models as models_store
 from gateway.supervisor.configurations import ConfigurationsError, open_configurations
@@ -38,6 +39,7 @@ TOPICS = (GATEWAY_PROPOSE, GATEWAY_PROPOSALS, GATEWAY_STATUS, GATEWAY_DECISION) 
 ANSWER_S = 20.0
 POLL_S = 0.5
 READY_WITHIN_S = 600.0
+BACK_WITHIN_S = 120.0  #: a gateway that is started anew
 STORED_WITHIN_S = 5.0
 
 
@@ -159,6 +161,17 @@ class LiveGate:
             self._tell(f"  the gate lets it through; a person decides: r2rgate approve {proposal[:12]}")
         await self._pause(POLL_S)
 
+    async def is_back(self) -> bool:
+        began_s = self._clock()
+        self._tell(f"the gateway does not answer; waiting for it, {BACK_WITHIN_S:g} s at most")
+        while self._clock() - began_s < BACK_WITHIN_S:
+            with suppress(CannotGoOn):  # it answers before its gate is open, and before it has heard of the line
+                await self.now()
+                self._tell("the gateway answers again")
+                return True
+            await self._pause(POLL_S)
+        return False
+
     async def _listed(self, skip: int = 0) -> ProposalList:
         query = ListProposals(most=MOST_LISTED, skip=skip)
         answer = await self._ask(GATEWAY_PROPOSALS, query.model_dump_json().encode())
@@ -193,8 +206,10 @@ class LiveGate:
     async def _ask(self, topic: Topic, payload: bytes) -> bytes:
         try:
             return await self._mailbox.request(topic, payload, ANSWER_S)
-        except Unreachable as error:
+        except RemoteError as error:
             raise CannotGoOn(str(error)) from error
+        except Unreachable as error:
+            raise Away(str(error)) from error
 
 
 def _refusal(answer: bytes) -> str:

@@ -27,8 +27,12 @@ class CannotGoOn(Exception):
     """The line or its gateway does not let the chain go on; the text says why, and what to do."""
 
 
+class Away(CannotGoOn):
+    """The gateway does not answer."""
+
+
 class GateSide(Protocol):
-    """A gate and the line behind it. Every method raises CannotGoOn."""
+    """A gate and the line behind it. Every method raises CannotGoOn, and Away where nobody answers."""
 
     async def proposals(self) -> list[ProposalShown]:
         """All that were made since the line was said to have changed last; the oldest first."""
@@ -56,6 +60,10 @@ class GateSide(Protocol):
 
     async def wait_for(self, proposal: str) -> None:
         """A while, or until it stands otherwise than now."""
+        ...
+
+    async def is_back(self) -> bool:
+        """Once whoever was away answers again; False: not within a while."""
         ...
 
 

@@ -183,6 +183,9 @@ class SteppedGate:
         await self.deployer.at_hand(proposal)
         return self.deployer.shown(proposal)
 
+    async def is_back(self) -> bool:
+        return True  # in this process: never away
+
     async def wait_for(self, proposal: str) -> None:
         shown = await self._shown(proposal)
         if isinstance(shown, str):

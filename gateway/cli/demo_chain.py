@@ -76,6 +76,9 @@ class Measured:
     async def propose(self, payload: bytes) -> Reply:
         return await self._side.propose(payload)
 
+    async def is_back(self) -> bool:
+        return await self._side.is_back()
+
     async def ready(self) -> None:
         await self.measure_kept()
         await self._side.ready()
@@ -162,7 +165,7 @@ async def carry_out(operator: Operator, setup: Setup, stepped: SteppedAside) -> 
             wanted_m_per_s=FASTEST_M_PER_S,
             adaptations=ADAPTATIONS,
             most_redesigns=ADAPTATIONS,
-            decider=AskedAgents(setup.line, bus, asyncio.get_running_loop()),
+            decider=AskedAgents(setup.line, bus, asyncio.get_running_loop(), tell=operator.progress.step),
         )
         await side.measure_kept()
         return found

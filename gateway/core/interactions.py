@@ -14,9 +14,10 @@ from gateway.core.computations import MOST_CALLS, By, Computed
 from gateway.core.json_problems import NotJson, document_of, problems
 from gateway.core.line import NonNegative, Strict
 from gateway.core.line_model import Instant
-from gateway.core.questions import Choice, Decision, Question
+from gateway.core.questions import Choice, Question
 
 MOST_BYTES = 1024 * 1024  #: of an interaction as JSON, unpacked
+MOST_PACKED = 240 * 1024  #: bytes: it travels in one message of the bus (gateway/mailbox/port.py, MAX_PAYLOAD)
 MOST_WHY = 400  #: letters
 
 
@@ -44,7 +45,7 @@ class Answer(Strict):
 class Unanswered(Strict):
     """A question that a phase has decided by the rules, because the agent it asked did not answer it."""
 
-    decision: Decision
+    question: Question
     why: Annotated[str, Field(min_length=1, max_length=MOST_WHY)]
 
 
@@ -106,6 +107,12 @@ class InteractionRefused(Exception):
 def pack(interaction: Interaction) -> bytes:
     """As it travels and is kept: JSON, compressed."""
     return zlib.compress(interaction.model_dump_json().encode())
+
+
+def fits(interaction: Interaction) -> bool:
+    """Whether it can be sent to the gateway and kept there."""
+    text = interaction.model_dump_json().encode()
+    return len(text) <= MOST_BYTES and len(zlib.compress(text)) <= MOST_PACKED
 
 
 def unpack(packed: bytes) -> Interaction:

@@ -100,6 +100,7 @@ class Question(Strict):
     usual: OptionId  #: what the rules choose
     why: Sentence  #: and why they do
     knobs: Annotated[list[Knob], Field(max_length=16)] = []
+    run: Annotated[str, Field(pattern=r"^([0-9a-f]{16})?$")] = ""  #: of who asks, whose questions are one task
 
     @property
     def agent(self) -> AgentName:
@@ -185,5 +186,5 @@ def _unknown(what: str, name: str, allowed: list[str]) -> str:
 
 
 def question_json(question: Question) -> str:
-    """As one line; keys in the order in which they are declared, so that it reads as it is meant."""
-    return json.dumps(question.model_dump(mode="json"), allow_nan=False)
+    """As a model is shown it: one line, keys in the order in which they are declared: so it reads as it is meant."""
+    return json.dumps(question.model_dump(mode="json", exclude={"run"}), allow_nan=False)

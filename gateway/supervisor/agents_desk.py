@@ -4,6 +4,7 @@ The agent's name is a part of what it asks on; whoever asks there is that agent,
 """
 
 import asyncio
+import secrets
 import time
 from collections.abc import Callable
 from functools import partial
@@ -13,10 +14,11 @@ from pydantic import ValidationError
 from gateway.core.audit_record import Who
 from gateway.core.decisions import QUERY
 from gateway.core.dry_run import DryRun
-from gateway.core.interactions import InteractionRefused, Unanswered, unpack
+from gateway.core.interactions import Answer, Interaction, InteractionRefused, Unanswered, pack, unpack
 from gateway.core.json_problems import NotJson, document_of, problems
 from gateway.core.messages import Reply
 from gateway.core.proposal import ProposalRefused, parse_proposal
+from gateway.core.questions import usual_choice
 from gateway.core.status import GatewayStatus
 from gateway.core.topics import (
     AGENT_NAMES,
@@ -35,8 +37,9 @@ from gateway.supervisor.deployer_sides import NotKnown
 from gateway.supervisor.dry_runs import DryRuns, TooMany
 from gateway.supervisor.gate import Gate
 from gateway.supervisor.interactions import Interactions, InteractionsError
-from gateway.supervisor.proposal_records import refused
+from gateway.supervisor.proposal_records import iso, refused
 
+RULES = "rules"
 AUTHOR = "agents"  #: of all their proposals
 MOST_TEXT = 400  #: letters of an event
 #: Of all agents, beyond the first few. The list of proposals is a person's, and what the phases know of their past.
@@ -125,14 +128,23 @@ class AgentsDesk:
         return _bytes(Reply(ok=True, state="", text=f"kept as {number}"))
 
     async def _hear(self, agent: AgentName, payload: bytes) -> bytes:
-        """From a phase: it went on by the rules."""
+        """From a phase: it went on by the rules. The question is kept in the log, of which the agent knows nothing."""
         try:
             told = Unanswered.model_validate(document_of(payload))
         except NotJson as error:
             return _bytes(self._refused(agent, "it is not understood", [str(error)]))
         except ValidationError as error:
             return _bytes(self._refused(agent, "it is not understood", problems(error, Unanswered)))
-        self._cases.note("unanswered", f"{told.decision}: {told.why}", agent)
+        self._cases.note("unanswered", f"{told.question.decision}: {told.why}", agent)
+        one = Interaction(
+            format=1, id=secrets.token_hex(8), agent=agent, at=iso(time.time()), question=told.question, prompt="",
+            answer=Answer(choice=usual_choice(told.question), by=RULES, instead=told.why), seconds=0.0,
+        )  # fmt: skip
+        try:
+            async with self._writing:
+                await asyncio.to_thread(self._log.keep, pack(one), one)
+        except InteractionsError as error:
+            self._note("interaction", f"agent {agent}, {told.question.decision}: it is not kept: {error}", ok=False)
         return _bytes(Reply(ok=True, state="", text="it is noted"))
 
     def _refused(self, agent: AgentName, text: str, reasons: list[str]) -> Reply:

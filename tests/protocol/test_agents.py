@@ -17,7 +17,7 @@ from gateway.core.messages import Reply
 from gateway.core.questions import Question, usual_choice
 from gateway.core.topics import AGENT_DECIDE, AGENT_NAMES, ASK_LOG
 from gateway.mailbox.zenoh_mailbox import ZenohMailbox
-from tests.protocol.bus_support import LINE, client, never, router, run
+from tests.protocol.bus_support import LINE, client, is_here, never, router, run
 from tests.unit.language_model_support import QUESTION
 
 #: As `r2rgate agents` has it.
@@ -81,7 +81,8 @@ def test_the_process_answers_until_it_is_killed_and_then_the_rules_do_at_once() 
                 found = await answered(phases)
                 assert (found.choice, found.by, found.instead) == (usual_choice(QUESTION), "rules", "")
                 assert kept[0].id == found.interaction
-                assert kept[0].question == QUESTION and kept[0].notes and kept[0].agent == "adaptation"
+                assert kept[0].question is not None and kept[0].question.model_copy(update={"run": ""}) == QUESTION
+                assert kept[0].notes and kept[0].agent == "adaptation"
                 child.kill()
                 await child.wait()
                 killed = await decided(phases)
@@ -121,11 +122,34 @@ def test_an_agent_that_lies_hangs_or_sends_garbage_leaves_the_decision_to_the_ru
                 found = await decided(phases)
                 assert found.by == "rules" and found.choice == usual_choice(QUESTION)
                 assert found.instead or found.author == "rules"
-            hung = AskedAgents(LINE, phases, asyncio.get_running_loop(), within_s=0.2)
+            told: list[str] = []
+            hung = AskedAgents(
+                LINE, phases, asyncio.get_running_loop(), within_s=0.2, tell=told.append, tell_every_s=0.05
+            )
             found = await asyncio.to_thread(hung.decide, QUESTION.model_copy(update={"decision": "identify.data"}))
             assert found.by == "rules" and "did not answer" in found.instead
+            assert told and all("sysid is thinking" in one for one in told)
             again = await asyncio.to_thread(hung.decide, QUESTION.model_copy(update={"decision": "identify.data"}))
             assert "a while ago" in again.instead  # it has had its time
+
+    run(story)
+
+
+def test_what_the_gateway_was_not_there_to_keep_goes_to_it_with_the_next() -> None:
+    async def nothing(_: Asked) -> Retrieval:
+        raise OSError("nothing here")
+
+    async def story(folder: Path) -> None:
+        async with router(folder) as gateway, client(folder) as agents, client(folder) as phases:
+            told: list[str] = []
+            begin(agents, LINE, nothing, None, told.append, Given())
+            first = await answered(phases)
+            assert "not in the log yet" in told[-1]
+            kept = serve_log(gateway)
+            await is_here(agents, ASK_LOG.of("adaptation"))
+            second = await decided(phases)
+            ids = [one.id for one in kept]
+            assert first.interaction in ids and ids[-1] == second.interaction and len(ids) == len(set(ids))
 
     run(story)
 

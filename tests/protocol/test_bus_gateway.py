@@ -20,7 +20,7 @@ from gateway.mailbox.unix import UnixMailbox
 from gateway.mailbox.zenoh_mailbox import ZenohMailbox
 from gateway.supervisor.audit_file import AuditFile
 from gateway.supervisor.proposal_records import iso
-from tests.protocol.bus_support import AGENT, LINE, LONG_S, client, run
+from tests.protocol.bus_support import AGENT, LINE, LONG_S, client, is_here, run
 from tests.unit.language_model_support import QUESTION
 from tests.unit.supervisor_support import child, until
 
@@ -200,6 +200,33 @@ def test_agents_that_die_flood_or_talk_nonsense_are_on_record_and_so_is_who_went
             # It may be the record of the flood's beginning: the rest belongs to the next one, a minute later.
             assert 0 < found["turned-away"]["times"] <= refused
             await status_with(folder, lambda status: status.agents_bus.refused == refused)
+
+    run(story)
+
+
+def test_a_gateway_that_is_killed_while_an_agent_thinks_leaves_the_question_to_the_rules_at_once() -> None:
+    async def story(folder: Path) -> None:
+        asked = asyncio.Event()
+
+        async def think(_: bytes) -> bytes:
+            asked.set()
+            await asyncio.sleep(1000.0)
+            return b""
+
+        with child(GATEWAY, folder) as (first, _):
+            await status_with(folder, lambda status: status.agents_bus.open)
+            async with client(folder) as agent, client(folder) as phases:
+                agent.serve(AGENT_DECIDE.of("adaptation"), think)
+                await is_here(phases, AGENT_DECIDE.of("adaptation"))
+                decider = AskedAgents(LINE, phases, asyncio.get_running_loop(), within_s=2.0 * LONG_S)
+                deciding = asyncio.create_task(asyncio.to_thread(decider.decide, QUESTION))
+                await asked.wait()
+                first.kill()
+                first.wait()
+                assert (await asyncio.wait_for(deciding, LONG_S)).by == "rules"
+                with gateway(folder):  # both are back by themselves
+                    await status_with(folder, lambda status: status.agents_bus.agents == ["adaptation"])
+                    await is_here(phases, AGENT_DECIDE.of("adaptation"))
 
     run(story)
 

@@ -1,5 +1,6 @@
 """Servers that do not work, in the place of a persona."""
 
+import json
 import random
 from collections.abc import Sequence
 from pathlib import Path
@@ -49,6 +50,15 @@ def flood(messages: Sequence[Message], form: Form, rng: random.Random) -> Spoken
     return Spoken("", raw=b'{"message": {"role": "assistant", "content": "' + b"a" * 20_000_000)
 
 
+def talkative(messages: Sequence[Message], form: Form, rng: random.Random) -> Spoken:
+    """400,000 letters that mean nothing, in lines as they should be, whatever it was told to be its most."""
+    words = [rng.randbytes(50).hex() + "\n" for _ in range(4_000)]
+    lines = [{"message": {"role": "assistant", "content": word}, "done": False} for word in words]
+    counts = {"prompt_eval_count": 5_000, "eval_count": 100}
+    end = {"message": {"role": "assistant", "content": ""}, "done": True, "done_reason": "stop"} | counts
+    return Spoken("", raw=b"".join(json.dumps(line).encode() + b"\n" for line in [*lines, end]))
+
+
 def recorded(name: str) -> Persona:
     """The stream in the file `name` of `recorded/`, byte for byte."""
     content = (RECORDED / name).read_bytes()
@@ -68,4 +78,5 @@ FAILURES: dict[str, Persona] = {
     "nothing": nothing,
     "garbage": garbage,
     "flood": flood,
+    "talkative": talkative,
 }

@@ -68,6 +68,6 @@ class Persona:
 
         clock, transport = asyncio.get_running_loop().time, InProcess(Engine(PERSONAS[self.name]))
         async with LanguageModel(SETTINGS, clock, transport) as model:
-            agent = Agent(question.agent, nothing, keep, model, lambda: Budget(10**9))
+            agent = Agent(question.agent, nothing, keep, model, lambda _: Budget(10**9))
             answer = await agent.answer(question)
         return Decided(answer.choice, answer.by, answer.instead)

@@ -1,6 +1,7 @@
 """Agents with the real client, the real knowledge and a stand-in server: what they answer, and what is on record."""
 
 import asyncio
+import re
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from agents.rag.stages import Asked, Retrieval
 from agents.roles import ROLES
 from gateway.core.interactions import Answer, Interaction, InteractionRefused, pack, unpack
 from gateway.core.questions import DECISIONS, Question, wrong_with
+from gateway.mailbox.port import MAX_PAYLOAD
 from gateway.supervisor.interactions import Interactions, InteractionsError
 from tests.stand_in.engine import Engine
 from tests.stand_in.in_process import InProcess
@@ -46,7 +48,7 @@ async def asked(
     clock = asyncio.get_running_loop().time
     transport = InProcess(Engine(PERSONAS[persona or "perfect"], seed=1))
     async with LanguageModel(SETTINGS, clock, transport) as model:
-        agent = Agent("adaptation", search, keep, model if persona else None, lambda: Budget(budget))
+        agent = Agent("adaptation", search, keep, model if persona else None, lambda _: Budget(budget))
         answer = await agent.answer(question)
     return answer, kept[0]
 
@@ -99,6 +101,15 @@ def test_whoever_the_model_is_there_is_an_answer_to_the_question(persona: str) -
 def test_once_the_tokens_of_a_task_are_used_up_the_rules_answer() -> None:
     answer, kept = virtually(asked(persona="perfect", budget=0))
     assert answer.by == "rules" and "spent" in answer.instead and not kept.exchanges
+
+
+def test_a_model_that_talks_without_end_is_on_record_with_the_beginning_and_how_much_it_was() -> None:
+    answer, kept = virtually(asked(persona="talkative"))
+    assert answer.by == "rules" and kept.exchanges and answer.interaction == kept.id
+    for one in kept.exchanges:
+        assert re.search(r"\[\.\.\. cut here: 404000 letters in all, SHA-256 [0-9a-f]{64}]$", one["raw"]) is not None
+        assert len(one["raw"]) > 1_000
+    assert len(pack(kept)) < MAX_PAYLOAD and unpack(pack(kept)) == kept
 
 
 def test_another_agents_question_is_refused() -> None:

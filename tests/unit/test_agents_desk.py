@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
+from gateway.cli.agents_view import as_story
 from gateway.core.audit_record import Who
 from gateway.core.controller import config_hash
 from gateway.core.decisions import ProposalList, ProposalShown
@@ -45,6 +46,7 @@ from gateway.supervisor.judging import LONGER
 from gateway.supervisor.lifecycle import Stage
 from gateway.supervisor.line_desk import LineDesk
 from tests.unit.deployer_support import FIRST, LINE, Death, FakeJudge, FakeLoop, FakeSurroundings, proposal
+from tests.unit.language_model_support import QUESTION
 from tests.unit.supervisor_support import until
 
 LONG_S = 60.0
@@ -365,7 +367,22 @@ def test_an_agent_that_is_not_in_the_table_is_not_served(tmp_path):
 
 
 def unanswered(why: str = "sysid: nobody answers") -> bytes:
-    return json.dumps({"decision": "identify.data", "why": why}).encode()
+    question = QUESTION.model_copy(update={"decision": "identify.data"}).model_dump(mode="json")
+    return json.dumps({"question": question, "why": why}).encode()
+
+
+def test_a_question_that_an_agent_left_to_the_rules_is_in_the_log_with_why(tmp_path):
+    async def story(desk: Desk) -> None:
+        await desk.opened()
+        assert Reply.model_validate_json(await desk.ask(ASK_UNANSWERED, unanswered(), "sysid")).ok
+
+    at_desk(story, tmp_path)
+    log = Interactions(tmp_path)
+    (row,) = log.newest(10)
+    assert (row.agent, row.decision, row.chosen, row.decided_by) == ("sysid", "identify.data", "lqi", "rules")
+    found = log.find(str(row.number))
+    assert found.question is not None and found.question.options == QUESTION.options
+    assert as_story(found).endswith("the rules, because sysid: nobody answers")
 
 
 def test_a_phase_that_went_on_by_the_rules_is_on_record_once_a_minute_with_how_often(tmp_path):
@@ -389,7 +406,7 @@ def test_a_phase_that_went_on_by_the_rules_is_on_record_once_a_minute_with_how_o
 
 
 @pytest.mark.parametrize(
-    "payload", [b"", b"\xff", b"[]", b'{"decision": "run.away", "why": "x"}', unanswered("x" * 100_000)]
+    "payload", [b"", b"\xff", b"[]", b'{"question": {"decision": "run.away"}, "why": "x"}', unanswered("x" * 100_000)]
 )
 def test_what_is_no_word_of_a_phase_is_refused_and_on_record(tmp_path, payload):
     async def story(desk: Desk) -> None:

@@ -28,7 +28,7 @@ from gateway.core.questions import Choice, Option, Question, wrong_with
 from gateway.core.topics import GATEWAY_PROPOSALS, GATEWAY_PROPOSE, LOOP_EVENT, LOOP_TELEMETRY
 from gateway.core.verdict import RuleFinding, Verdict
 from gateway.mailbox.inprocess import Hub, InProcessMailbox
-from gateway.mailbox.port import Counters
+from gateway.mailbox.port import Counters, Unreachable
 from gateway.supervisor import baselines
 from gateway.supervisor.configurations import FILE_NAME, Origin, begin_configurations
 from gateway.supervisor.historian import Historian
@@ -135,6 +135,44 @@ def test_each_candidate_is_proposed_once_and_the_end_says_why(tmp_path):
     again = OneProcess(tmp_path)
     again.shown = gateway.shown  # the command started anew
     assert asyncio.run(commission(LINE, again.side)).text == found.text and len(again.shown) == len(found.tried)
+
+
+class Dying:
+    """The mailbox of a gateway that dies once it has taken in a second proposal, and is back `for_s` later."""
+
+    def __init__(self, gateway, for_s, until_s=0.0):
+        self.gateway, self.for_s, self.until_s = gateway, for_s, until_s
+        self.proposals = 0
+
+    async def request(self, topic, payload, timeout_s):
+        if self.gateway.now_s < self.until_s:
+            raise Unreachable("no gateway answers: start it")
+        answer = await self.gateway.mailbox.request(topic, payload, timeout_s)
+        self.proposals += topic is GATEWAY_PROPOSE
+        if topic is GATEWAY_PROPOSE and self.proposals == 2:
+            self.until_s = self.gateway.now_s + self.for_s
+            raise Unreachable("the gateway went away")
+        return answer
+
+
+def test_a_gateway_that_dies_is_waited_for_and_the_chain_goes_on_from_its_list(tmp_path):
+    whole = asyncio.run(commission(LINE, OneProcess(tmp_path).side))
+    gateway = OneProcess(tmp_path)
+    side = LiveGate(LINE, Dying(gateway, 30.0), gateway.told.append, gateway.pause, lambda: gateway.now_s)
+    found = asyncio.run(commission(LINE, side, gateway.told.append))
+    assert found.text == whole.text and [one.rung for one in found.tried] == [one.rung for one in whole.tried]
+    assert "the gateway answers again" in gateway.told
+
+
+def test_a_gateway_that_is_gone_for_good_or_was_not_there_at_all_ends_it_with_the_reason(tmp_path):
+    gateway = OneProcess(tmp_path)
+    side = LiveGate(LINE, Dying(gateway, 1e9), gateway.told.append, gateway.pause, lambda: gateway.now_s)
+    found = asyncio.run(commission(LINE, side))
+    assert not found.reached and "went away" in found.text and len(found.tried) == 1
+    gateway = OneProcess(tmp_path)
+    side = LiveGate(LINE, Dying(gateway, 0.0, 1e9), gateway.told.append, gateway.pause, lambda: gateway.now_s)
+    assert "start it" in asyncio.run(commission(LINE, side)).text
+    assert gateway.now_s == 100.0 and not gateway.told  # nobody waits for what was never there
 
 
 def test_everything_since_the_line_has_changed_is_looked_at_however_much_others_propose(tmp_path):

@@ -194,7 +194,7 @@ async def asked(
     clock = asyncio.get_running_loop().time
     async with LanguageModel(changed, clock, InProcess(Engine(persona, seed=1))) as model:
         agent = Agent(
-            "adaptation", nothing_known, kept.keep, model, lambda: budget or Budget(200_000),
+            "adaptation", nothing_known, kept.keep, model, lambda _: budget or Budget(200_000),
             code=code(of_code, runs),
         )  # fmt: skip
         answer = await agent.answer(question)
@@ -295,7 +295,7 @@ def test_a_computation_may_take_half_of_the_time_that_is_left_and_no_more() -> N
         clock = asyncio.get_running_loop().time
         async with LanguageModel(SETTINGS, clock, InProcess(Engine(PERSONAS["perfect"]))) as model:
             agent = Agent(
-                "adaptation", nothing_known, kept.keep, model, lambda: Budget(200_000), code=code(Kept(), Slow())
+                "adaptation", nothing_known, kept.keep, model, lambda _: Budget(200_000), code=code(Kept(), Slow())
             )
             return await agent.answer(QUESTION), kept[0]
 
@@ -322,7 +322,7 @@ def test_where_the_results_do_not_fit_it_answers_without_them() -> None:
         clock = asyncio.get_running_loop().time
         async with LanguageModel(settings, clock, InProcess(Engine(PERSONAS["perfect"]))) as model:
             agent = Agent(
-                "adaptation", nothing_known, kept.keep, model, lambda: Budget(200_000), code=code(Kept(), Long())
+                "adaptation", nothing_known, kept.keep, model, lambda _: Budget(200_000), code=code(Kept(), Long())
             )
             return await agent.answer(QUESTION), kept[0]
 

@@ -45,7 +45,7 @@ async def answered(index: Index, question: Question, persona: str | None) -> tup
 
     transport = InProcess(Engine(PERSONAS[persona or "perfect"], seed=1))
     async with LanguageModel(SETTINGS, asyncio.get_running_loop().time, transport) as model:
-        agent = Agent("monitoring", index.ask, keep, model if persona else None, lambda: Budget(200_000))
+        agent = Agent("monitoring", index.ask, keep, model if persona else None, lambda _: Budget(200_000))
         return await agent.answer(question), kept[0]
 
 
