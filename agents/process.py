@@ -143,24 +143,26 @@ def _read(payload: bytes, kind: type[T]) -> T:
 def _keep(bus: Mailbox, name: AgentName, tell: Tell) -> Keep:
     """What the gateway is not there to take goes to it with the next one."""
     waiting: deque[Interaction] = deque(maxlen=MOST_WAITING)
+    sending = asyncio.Lock()
 
     async def keep(interaction: Interaction) -> None:
-        waiting.append(interaction)
-        while waiting:
-            one = waiting[0]
-            try:
-                reply = Reply.model_validate_json(await bus.request(ASK_LOG.of(name), pack(one), LOG_S))
-                why = "" if reply.ok else "; ".join([reply.text, *reply.reasons])
-            except (ValidationError, ValueError, RemoteError) as error:
-                why = str(error)
-            except Unreachable as error:
-                tell(f"interaction {one.id} is not in the log yet: {error}")
-                return
-            waiting.popleft()
-            if why:
-                tell(f"interaction {one.id} is not in the log: {why}")
-            if waiting:
-                await asyncio.sleep(1.0 / ASK_LOG.most_per_s)
+        async with sending:
+            waiting.append(interaction)
+            while waiting:
+                one = waiting[0]
+                try:
+                    reply = Reply.model_validate_json(await bus.request(ASK_LOG.of(name), pack(one), LOG_S))
+                    why = "" if reply.ok else "; ".join([reply.text, *reply.reasons])
+                except (ValidationError, ValueError, RemoteError) as error:
+                    why = str(error)
+                except Unreachable as error:
+                    tell(f"interaction {one.id} is not in the log yet: {error}")
+                    return
+                waiting.popleft()
+                if why:
+                    tell(f"interaction {one.id} is not in the log: {why}")
+                if waiting:
+                    await asyncio.sleep(1.0 / ASK_LOG.most_per_s)
 
     return keep
 

@@ -72,10 +72,11 @@ async def commission(
     """
     if why := refused_at_once(line):
         return Commissioned(False, why, [], None)
-    chain = _Chain(line, side, tell, decider, wanted_m_per_s, adaptations)
+    chain, was_there = _Chain(line, side, tell, decider, wanted_m_per_s, adaptations), False
     while True:
         try:
             await chain.read()
+            was_there = True
             step = await chain.next(most_redesigns, last_word)
             if isinstance(step, Ended):
                 return chain.ended(step)
@@ -90,7 +91,7 @@ async def commission(
             text = f"an adapted configuration is in service up to {region_speed(chain.past) or 0.0:.3g} m/s"
             return chain.ended(Ended(True, f"{text}; what was measured cannot be judged: {error}"))
         except Away as away:
-            if not chain.past or not await side.is_back():
+            if not was_there or not await side.is_back():
                 return chain.ended(Ended(False, str(away)))
         except CannotGoOn as stopped:
             return chain.ended(Ended(False, str(stopped)))

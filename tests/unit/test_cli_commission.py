@@ -138,10 +138,10 @@ def test_each_candidate_is_proposed_once_and_the_end_says_why(tmp_path):
 
 
 class Dying:
-    """The mailbox of a gateway that dies once it has taken in a second proposal, and is back `for_s` later."""
+    """The mailbox of a gateway that dies once it has taken in proposal `which`, and is back `for_s` later."""
 
-    def __init__(self, gateway, for_s, until_s=0.0):
-        self.gateway, self.for_s, self.until_s = gateway, for_s, until_s
+    def __init__(self, gateway, for_s, until_s=0.0, which=2):
+        self.gateway, self.for_s, self.until_s, self.which = gateway, for_s, until_s, which
         self.proposals = 0
 
     async def request(self, topic, payload, timeout_s):
@@ -149,16 +149,17 @@ class Dying:
             raise Unreachable("no gateway answers: start it")
         answer = await self.gateway.mailbox.request(topic, payload, timeout_s)
         self.proposals += topic is GATEWAY_PROPOSE
-        if topic is GATEWAY_PROPOSE and self.proposals == 2:
+        if topic is GATEWAY_PROPOSE and self.proposals == self.which:
             self.until_s = self.gateway.now_s + self.for_s
             raise Unreachable("the gateway went away")
         return answer
 
 
-def test_a_gateway_that_dies_is_waited_for_and_the_chain_goes_on_from_its_list(tmp_path):
+@pytest.mark.parametrize("which", [1, 2, LADDERS[Step.FIRST]])
+def test_a_gateway_that_dies_is_waited_for_and_the_chain_goes_on_from_its_list(tmp_path, which):
     whole = asyncio.run(commission(LINE, OneProcess(tmp_path).side))
     gateway = OneProcess(tmp_path)
-    side = LiveGate(LINE, Dying(gateway, 30.0), gateway.told.append, gateway.pause, lambda: gateway.now_s)
+    side = LiveGate(LINE, Dying(gateway, 30.0, which=which), gateway.told.append, gateway.pause, lambda: gateway.now_s)
     found = asyncio.run(commission(LINE, side, gateway.told.append))
     assert found.text == whole.text and [one.rung for one in found.tried] == [one.rung for one in whole.tried]
     assert "the gateway answers again" in gateway.told
