@@ -17,7 +17,7 @@ from gateway.core.messages import Reply
 from gateway.core.questions import Question, usual_choice
 from gateway.core.topics import AGENT_DECIDE, AGENT_NAMES, ASK_LOG
 from gateway.mailbox.zenoh_mailbox import ZenohMailbox
-from tests.protocol.bus_support import LINE, client, is_here, never, router, run
+from tests.protocol.bus_support import LINE, answer_of, client, is_here, never, router, run
 from tests.unit.language_model_support import QUESTION
 
 #: As `r2rgate agents` has it.
@@ -165,11 +165,11 @@ def test_a_question_for_another_agent_is_an_error_to_who_asked_and_the_process_g
             topic = AGENT_DECIDE.of("sysid")
             for payload in (b"garbage", QUESTION.model_dump_json().encode()):
                 try:
-                    await phases.request(topic, payload, 20.0)
+                    await answer_of(phases, topic, payload, 20.0)
                 except Exception as error:
                     assert ("it is no JSON" if payload == b"garbage" else "decided by adaptation") in str(error)
                 else:
                     raise AssertionError("it was answered")
-            assert "nothing here" in (await decided(phases)).instead
+            assert "nothing here" in (await answered(phases)).instead
 
     run(story)
