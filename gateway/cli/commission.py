@@ -91,7 +91,7 @@ async def commission(
             text = f"an adapted configuration is in service up to {region_speed(chain.past) or 0.0:.3g} m/s"
             return chain.ended(Ended(True, f"{text}; what was measured cannot be judged: {error}"))
         except Away as away:
-            if not was_there or not await side.is_back():
+            if not was_there or not await side.is_back(str(away)):
                 return chain.ended(Ended(False, str(away)))
         except CannotGoOn as stopped:
             return chain.ended(Ended(False, str(stopped)))

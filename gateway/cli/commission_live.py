@@ -161,9 +161,9 @@ class LiveGate:
             self._tell(f"  the gate lets it through; a person decides: r2rgate approve {proposal[:12]}")
         await self._pause(POLL_S)
 
-    async def is_back(self) -> bool:
+    async def is_back(self, why: str) -> bool:
         began_s = self._clock()
-        self._tell(f"the gateway does not answer; waiting for it, {BACK_WITHIN_S:g} s at most")
+        self._tell(f"{why}; it is waited for, {BACK_WITHIN_S:g} s at most")
         while self._clock() - began_s < BACK_WITHIN_S:
             with suppress(CannotGoOn):  # it answers before its gate is open, and before it has heard of the line
                 await self.now()

@@ -62,8 +62,8 @@ class GateSide(Protocol):
         """A while, or until it stands otherwise than now."""
         ...
 
-    async def is_back(self) -> bool:
-        """Once whoever was away answers again; False: not within a while."""
+    async def is_back(self, why: str) -> bool:
+        """Once whoever was away answers again; False: not within a while. `why` is told: it says what to start."""
         ...
 
 

@@ -183,7 +183,7 @@ class SteppedGate:
         await self.deployer.at_hand(proposal)
         return self.deployer.shown(proposal)
 
-    async def is_back(self) -> bool:
+    async def is_back(self, why: str) -> bool:
         return True  # in this process: never away
 
     async def wait_for(self, proposal: str) -> None:

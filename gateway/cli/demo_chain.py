@@ -76,8 +76,8 @@ class Measured:
     async def propose(self, payload: bytes) -> Reply:
         return await self._side.propose(payload)
 
-    async def is_back(self) -> bool:
-        return await self._side.is_back()
+    async def is_back(self, why: str) -> bool:
+        return await self._side.is_back(why)
 
     async def ready(self) -> None:
         await self.measure_kept()

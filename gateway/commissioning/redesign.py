@@ -106,7 +106,7 @@ def redesigns(
     once it is the highest that the drives hold, or `wanted_m_per_s`: on the way there it would only take the gate's
     time.
 
-    `last`: there is nothing after them, so they may use all that the gate tolerates, and `CALM_PREDICTIVE` is offered.
+    `last`: nothing comes after them, so they may use all that the gate tolerates, and `CALM_PREDICTIVE` comes on top.
     """
     shown_m_per_s = region.speed_max_m_per_s or 0.0
     speed = min(max(model.region.speed_to_m_per_s, shown_m_per_s), line.limits.speed_max_m_per_s)
