@@ -3,7 +3,7 @@
 import time
 from collections.abc import Awaitable
 from dataclasses import dataclass, field
-from math import ceil
+from math import ceil, inf
 from typing import Any, TypeVar
 
 import numpy as np
@@ -11,18 +11,21 @@ import numpy as np
 from drivers.memory import MemoryLink
 from gateway.cli.timed_law import TimedLaw
 from gateway.control.laws import make_law, untimed
-from gateway.core.controller import Controller
+from gateway.core.controller import Controller, ControllerRefused
 from gateway.core.line import Line, Recipe
-from gateway.core.messages import Arm, Command, Event, Reply
+from gateway.core.messages import Arm, Command, Deploy, Event, Keep, Reply, WatchGood
 from gateway.core.metrics import RunMetrics, run_metrics
 from gateway.core.scenario import Scenario
 from gateway.core.signals import FloatArray
 from gateway.core.states import Phase
 from gateway.core.telemetry import Frame, pack, unpack
-from gateway.loop.commands import carry_out, prepare_to_arm
+from gateway.loop.arming import not_armed, prepare_links, refusal_to_arm
+from gateway.loop.commands import carry_out
 from gateway.loop.cycle import Cycle
+from gateway.loop.deploy import NOT_DONE, Prepared, prepare, require
 from gateway.loop.machine import Machine
 from gateway.loop.pacer import Tick
+from gateway.loop.refused import Refused
 from gateway.loop.watch import Watch
 from safety.actions import Finding
 from sim_plant.plant import Plant
@@ -57,7 +60,7 @@ class SteppedLoop:
         watch = Watch(self.line, np.zeros(self.line.n))  # the memory link carries floats
         self.cycle = Cycle(
             self.line, self.config, [link], watch, lambda: self.now_s, self._record, self._announce, self._tell,
-            simulated=True, law_of=lambda config: TimedLaw(make_law(untimed(config))),
+            simulated=True, law_of=lambda config: TimedLaw(make_law(untimed(config))), budget_period_s=inf,
         )  # fmt: skip
         law = self.cycle.torque_path.law
         assert isinstance(law, TimedLaw)
@@ -79,10 +82,36 @@ class SteppedLoop:
 
     def arm(self) -> Reply:
         """As the operator's `arm`, without waiting for the drives: step on until READY."""
-        return _finish(prepare_to_arm(self.cycle)) or self.command(Arm())
+        if (refusal := refusal_to_arm(self.cycle)) is not None:
+            return refusal
+        self._release_links()
+        if reasons := _finish(prepare_links(self.cycle)):
+            self._release_links()
+            return not_armed(self.cycle, reasons)
+        return self.command(Arm())
 
     def command(self, command: Command) -> Reply:
-        return carry_out(self.cycle, command, self.now_s)
+        """Do it between two periods, with what the loop's process would prepare aside."""
+        prepared: Prepared = None
+        if isinstance(command, Deploy | Keep | WatchGood):
+            try:
+                require(self.cycle, command)
+                prepared = prepare(self.cycle, command)
+            except Refused:
+                pass  # and is refused with the same words below
+            except ControllerRefused as refused:
+                return self._not_done(NOT_DONE[type(command)], [str(refused)])
+        return carry_out(self.cycle, command, self.now_s, prepared)
+
+    def _not_done(self, text: str, reasons: list[str]) -> Reply:
+        in_service = self.cycle.configurations.in_service(self.now_s)
+        return Reply(
+            ok=False, state=self.cycle.machine.state.name, text=text, reasons=reasons, in_service=in_service
+        )  # fmt: skip
+
+    def _release_links(self) -> None:
+        for link in self.cycle.links:
+            _finish(link.release())
 
     def step(self, periods: int = 1) -> None:
         """Run control periods; each cycle runs at its due time."""

@@ -2,7 +2,6 @@
 
 from math import isfinite
 
-from drivers.port import PrepareRefused
 from gateway.core.doubts import in_words
 from gateway.core.line import Recipe
 from gateway.core.messages import (
@@ -21,24 +20,25 @@ from gateway.core.messages import (
     Stop,
 )
 from gateway.core.nearest import nearest
-from gateway.core.signals import Channel, Quality
 from gateway.core.states import OPERATORS_STOP, LoopState, Phase
 from gateway.loop import machine as machines
+from gateway.loop.arming import heard, not_ready, require_rest
 from gateway.loop.cycle import Cycle
-from gateway.loop.deploy import configure
+from gateway.loop.deploy import Prepared, configure
 from gateway.loop.judged import least, on_probation, require_judged, unjudged
-from gateway.loop.machine import STANDSTILL_M_PER_S
 from gateway.loop.refused import Refused
 from gateway.loop.setpoints import STEP_PAUSE_S
 
-SILENT_PATIENCE_S = 0.25  #: without cyclic data (a silent CANopen link reads by SDO) samples are this old at most
 
+def carry_out(cycle: Cycle, command: Command, now_s: float, prepared: Prepared = None) -> Reply:
+    """Do `command` between two periods.
 
-def carry_out(cycle: Cycle, command: Command, now_s: float) -> Reply:
-    """Do `command` between two periods. `arm` takes longer: `prepare_to_arm` goes before it."""
+    What takes longer goes before it, aside: `arming.prepare_links` for an arming, `deploy.prepare` for what changes
+    the configuration.
+    """
     configuring = isinstance(command, Configuring)
     try:
-        text = configure(cycle, command, now_s) if configuring else _do(cycle, command, now_s)
+        text = configure(cycle, command, prepared, now_s) if configuring else _do(cycle, command, now_s)
     except Refused as refusal:
         reply = Reply(ok=False, state=cycle.machine.state.name, text=str(refusal), reasons=refusal.reasons)
     else:
@@ -74,102 +74,8 @@ def _do(cycle: Cycle, command: Operating, now_s: float) -> str:
             return _abort_experiment(cycle)
 
 
-async def prepare_to_arm(cycle: Cycle) -> Reply | None:
-    """Everything that must hold before torque is possible. None when it does; periods go on meanwhile.
-
-    Touches no link unless the line is SILENT or at rest, and no sample speaks against it. Cancelled or refused, it
-    leaves every link silent and every device released.
-    """
-    try:
-        _require_rest(cycle)
-    except Refused as refusal:
-        return Reply(ok=False, state=cycle.machine.state.name, text=str(refusal))
-    reasons = not_ready(cycle)
-    if not reasons:
-        try:
-            if cycle.machine.phase is Phase.OFF:
-                await release(cycle)
-            for link in cycle.links:
-                try:
-                    await link.prepare()
-                except PrepareRefused as refusal:
-                    reasons += refusal.reasons
-        except BaseException:  # cancelled by a stop, or a link that failed: nothing stays half-way
-            await release(cycle)
-            raise
-        if reasons:
-            await release(cycle)
-    if not reasons:
-        return None
-    text = "not armed; mend what is named and arm again"
-    return Reply(ok=False, state=cycle.machine.state.name, text=text, reasons=reasons)
-
-
-async def release(cycle: Cycle) -> None:
-    """No link sends any more, and no device waits for it. One that fails keeps no other from it.
-
-    Raises the first failure, after all have been released.
-    """
-    failure: Exception | None = None
-    for link in cycle.links:
-        try:
-            await link.release()
-        except Exception as error:
-            failure = failure or error
-    if failure is not None:
-        raise failure
-
-
-def not_ready(cycle: Cycle) -> list[str]:
-    """What speaks against arming, as far as the samples tell. One that is late is no reason to send a person away."""
-    return forbidden(cycle) + unheard(cycle)
-
-
-def forbidden(cycle: Cycle) -> list[str]:
-    """What the line PLC says against arming, as far as it has been heard."""
-    inputs = cycle.inputs
-    if not _plc_heard(cycle):
-        return []
-    if inputs.plc.emergency_stop:
-        return ["the emergency stop circuit is open: release it"]
-    if not inputs.plc.permissive:
-        return ["the line PLC gives no permissive"]
-    if abs(inputs.unwind_speed.value[0]) > STANDSTILL_M_PER_S:
-        return [f"the unwinder turns at {inputs.unwind_speed.value[0]:.4f} m/s: wait for standstill"]
-    return []
-
-
-def unheard(cycle: Cycle) -> list[str]:
-    """Devices without a usable sample lately."""
-    reasons = [] if _plc_heard(cycle) else [f"the line PLC ({cycle.line.plc.name}) gives no usable answer"]
-    for cell in cycle.line.load_cells:
-        if not _heard(cycle, cycle.inputs.tension, cell.span - 1):
-            reasons.append(f"load cell {cell.name} (span {cell.span}) gives no usable value")
-    return reasons
-
-
-def _plc_heard(cycle: Cycle) -> bool:
-    # v0 comes in the same answer. A PLC that answers but lost its watchdog is not GOOD either: arming proves it anew.
-    inputs = cycle.inputs
-    return _heard(cycle, inputs.unwind_speed, 0) and inputs.plc.quality in (Quality.GOOD, Quality.STALE)
-
-
-def _heard(cycle: Cycle, channel: Channel, index: int) -> bool:
-    """Whether a usable sample came lately: within as many periods as a running line may miss, or SILENT_PATIENCE_S."""
-    age_s = cycle.clock() - channel.time_s[index]  # NaN for one that was never heard
-    return bool(age_s < max((cycle.limits.hold_periods + 1) * cycle.limits.period_s, SILENT_PATIENCE_S))
-
-
-def _require_rest(cycle: Cycle) -> None:
-    machine = cycle.machine
-    if machine.state not in (LoopState.SILENT, LoopState.STOP):
-        raise Refused(f"the line is {machine.state.name} already")
-    if machine.phase not in (Phase.SILENT, Phase.OFF):
-        raise Refused(f"the line is still {machine.phase.name.lower()}: wait until torque is off")
-
-
 def _arm(cycle: Cycle, now_s: float) -> str:
-    _require_rest(cycle)
+    require_rest(cycle)
     cycle.change(machines.to_phase(cycle.machine, Phase.ARMING, now_s, ""))
     return "watchdogs confirmed; the drives become ready"
 
@@ -200,7 +106,7 @@ def _moving_rollers(cycle: Cycle) -> list[str]:
     return [
         f"roller {i + 1} does not stand still, or its speed is not known"
         for i in range(cycle.line.n)
-        if not _heard(cycle, speed, i) or abs(speed.value[i]) > creeping
+        if not heard(cycle, speed, i) or not abs(speed.value[i]) <= creeping
     ]
 
 

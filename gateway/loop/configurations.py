@@ -8,36 +8,26 @@ still recover the line can be told in every period, of a predictive one under it
 (`safety.recoverability`). So the predictive one controls the line on top of the linear one, which stays the way back.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
-
-from gateway.control.deviation import Deviation
-from gateway.control.law import Law, Measured
-from gateway.control.reference import Steady
-from gateway.core.controller import Controller, ControllerRefused, config_hash
-from gateway.core.controller_fit import misfits
+from gateway.control.law import Law
+from gateway.core.controller import Controller
 from gateway.core.controller_laws import MpcConfig
 from gateway.core.deployment import Deployment, InService, RecoveryPrediction, Region
 from gateway.core.line import Line
 from gateway.loop.experiment import Tell
-from gateway.loop.kept import Kept, OnTop
+from gateway.loop.kept import Durable, OnTop
 from gateway.loop.setpoints import Setpoints
 from gateway.loop.torque import TorquePath
 from safety.recoverability import Recovery
 
-WARM_PERIODS = 3  #: that a law is asked before it is let near the line: first solutions take longest
-
 ROUNDING_S = 1e-6  #: a lease of twenty periods ends with the twentieth, whatever their sum is rounded to
 
-LawOf = Callable[[Controller], Law[Any]]
 
-
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Configuration:
-    """A configuration that is ready to run."""
+    """A configuration that is ready to run. Two are the same only where they are one object."""
 
     config: Controller
     hash: str
@@ -55,71 +45,35 @@ class Probation:
 
 
 class Configurations:
-    """Of a loop. `running` controls the line, or will from the next start on."""
+    """Of a loop. `running` controls the line, or will from the next start on.
+
+    What is changed here is heard by nobody else: changes are made through `Cycle`, which tells the rest of the loop.
+    """
 
     def __init__(
-        self,
-        line: Line,
-        config: Controller,
-        law_of: LawOf,
-        path_of: Callable[[Law[Any]], TorquePath],
-        setpoints: Setpoints,
-        tell: Tell | None,
+        self, line: Line, first: Configuration, path: TorquePath, setpoints: Setpoints, tell: Tell | None
     ) -> None:
-        self.running = self.good = Configuration(config, config_hash(config), law_of(config), Region())
-        self.path = path_of(self.running.law)
+        self.running = self.good = first
+        self.path = path
         self.epoch = 0  #: the last that was taken
         self.probation: Probation | None = None
         self.why = "start"
-        self.prepared: tuple[Deployment, Configuration] | None = None  #: built ahead of its command
-        self.prepared_watch: tuple[RecoveryPrediction, Recovery] | None = None
-        self.to_keep = False  #: what outlives this loop is no longer what it should be
+        self.changes = 0  #: how often what outlives this loop has changed
         self._line = line
-        self._law_of = law_of
         self._setpoints = setpoints
         self._tell = tell
         self._shaped = False
 
-    def resume(self, kept: Kept) -> None:
-        """Before the first period: the last known good of the loop that ran before."""
-        law, watch = self._law_of(kept.controller), kept.watch
-        recovery = None if watch is None else Recovery(watch, kept.controller, self._line)
-        config = Configuration(kept.controller, config_hash(kept.controller), law, kept.region, watch, recovery)
-        self.running = self.good = config
-        if (top := kept.on_top) is not None:
-            law = self._law_of(top.controller)
-            self.running = Configuration(top.controller, config_hash(top.controller), law, top.region, watch, recovery)
-        self.epoch = kept.epoch
-        self.path.take_over(law)
-
-    def candidate(self, deployment: Deployment) -> Configuration:
-        """Built and warm. Takes its time: never within a period. Raises ControllerRefused with every reason."""
-        config = deployment.controller
-        found = config_hash(config)
-        if found != deployment.hash:
-            raise ControllerRefused(f"its hash is {found[:12]}.., not {deployment.hash[:12]}..: it was altered")
-        if reasons := misfits(config, self._line):
-            raise ControllerRefused("; ".join(reasons))
-        law = self._law_of(config)
-        _warm(law, config, self._line)
-        recovery = None if deployment.watch is None else self.recovery(deployment.watch, self.good.config)
-        return Configuration(config, found, law, deployment.region, deployment.watch, recovery)
-
-    def recovery(self, watch: RecoveryPrediction, fallback: Controller) -> Recovery:
-        """Takes its time, too. Raises ControllerRefused."""
-        if watch.fallback != config_hash(fallback):
-            raise ControllerRefused(
-                f"it is watched for the fallback {watch.fallback[:12]}, but {config_hash(fallback)[:12]} is what the "
-                "line would go back to"
-            )
-        if watch.n != self._line.n or abs(watch.period_s - self._line.control.period_s) > 1e-9:
-            raise ControllerRefused("its recovery prediction is for another number of spans or another period")
-        return Recovery(watch, fallback, self._line)
+    def resume(self, running: Configuration, good: Configuration, epoch: int) -> None:
+        """Before the first period: what the loop that ran before has kept."""
+        self.running, self.good, self.epoch = running, good, epoch
+        self.path.take_over(running.law)
 
     def take(self, candidate: Configuration, deployment: Deployment, now_s: float) -> None:
         """`candidate` controls the line from now on, on probation."""
         self.running = candidate
         self.epoch = deployment.epoch
+        self.changes += 1
         self.probation = Probation(deployment.lease_s, now_s + deployment.lease_s, deployment.shaped_first)
         self.why = "deployed"
         if deployment.shaped_first and self._line.moves.shape == "ramp":
@@ -139,18 +93,29 @@ class Configurations:
         return self.good if on_top else self.running
 
     @property
-    def on_top(self) -> OnTop | None:
-        """What runs without being what the line goes back to, and not on probation."""
-        running = self.running
-        if running is self.good or self.probation is not None:
-            return None
-        return OnTop(controller=running.config, region=running.region)
+    def is_on_top(self) -> bool:
+        """Whether what runs was kept without becoming what the line goes back to."""
+        return self.running is not self.good and self.probation is None
+
+    @property
+    def durable(self) -> Durable:
+        """What a loop that starts anew is to run."""
+        running, good = self.running, self.good
+        on_top = OnTop(controller=running.config, region=running.region) if self.is_on_top else None
+        return Durable(self.epoch, good.config, good.region, good.watch, on_top)
+
+    def durable_if_kept(self, watch: RecoveryPrediction | None) -> Durable:
+        """As `durable`, were `keep` done with this watch."""
+        then, running = self.good_if_kept, self.running
+        on_top = None if then is running else OnTop(controller=running.config, region=running.region)
+        return Durable(self.epoch, then.config, then.region, watch, on_top)
 
     def keep(self, watch: RecoveryPrediction | None, recovery: Recovery | None) -> None:
         """What is on probation is kept; `watch` is for what the line goes back to from now on."""
         self.good = self.good_if_kept
         self._watch(watch, recovery)
         self.probation = None
+        self.changes += 1
         self.why = "kept"
         good = "is the last known good from now on"
         self._say("kept", good if self.running is self.good else f"is kept, with {self.good.hash[:12]} to go back to")
@@ -158,6 +123,7 @@ class Configurations:
     def watch_good(self, watch: RecoveryPrediction, recovery: Recovery) -> None:
         """The line is watched by another model. Only where nothing is on probation."""
         self._watch(watch, recovery)
+        self.changes += 1
         self._say("watched", "is watched by the model that was accepted last")
 
     def narrow(self, region: Region) -> None:
@@ -167,7 +133,7 @@ class Configurations:
         self.running = self.good if alone else replace(
             self.running, region=self.running.region.no_further(region), watch=None, recovery=None
         )  # fmt: skip
-        self.to_keep = True
+        self.changes += 1
         self._no_faster(self.running.region)
         self._say("narrowed", "is no longer known to hold: it goes no further than a first configuration")
 
@@ -180,7 +146,7 @@ class Configurations:
         """Back to the last known good; False where that runs already."""
         if self.running is self.good:
             return False
-        self.to_keep |= self.on_top is not None
+        self.changes += 1
         given_up, self.running = self.running, self.good
         self.probation = None
         self.why = f"rolled back: {reason}"
@@ -196,11 +162,15 @@ class Configurations:
         if most is not None and self._setpoints.speed_target_m_per_s > most:
             self._setpoints.speed_target_m_per_s = most
 
-    def look(self, now_s: float) -> None:
-        """Once a period, before control."""
+    def lapsed(self, now_s: float) -> str:
+        """Why what is on probation must be taken back by itself; empty: it need not."""
         probation = self.probation
-        if probation is not None and now_s > probation.until_s - ROUNDING_S:
-            self.roll_back(f"the lease of {probation.lease_s:g} s was not renewed")
+        if probation is None or now_s <= probation.until_s - ROUNDING_S:
+            return ""
+        return f"the lease of {probation.lease_s:g} s was not renewed"
+
+    def settle_moves(self) -> None:
+        """Once a period: set-points move as the line's file says again, once none is on a curve."""
         if self._shaped and self.probation is None and self._setpoints.at_rest():
             self._shaped = False
 
@@ -229,25 +199,3 @@ class Configurations:
             running = self.running
             said = f"{running.config.kind} controller {running.hash[:12]} {text}"
             self._tell(kind, said, hash=running.hash, epoch=self.epoch, last_known_good=self.good.hash, **data)
-
-
-def _warm(law: Law[Any], config: Controller, line: Line) -> None:
-    """Run it on the line's first recipe, at equilibrium. Raises ControllerRefused where it cannot be run."""
-    recipe = line.recipes[0]
-    reference = Steady(np.array(recipe.tension_n))
-    deviation = Deviation(config.feedforward, config.draw_spans, config.period_s, config.latency_s)
-    state_n = deviation.state(reference, recipe.speed_m_per_s)
-    torque_nm = deviation.torque(reference, recipe.speed_m_per_s, 0)
-    try:
-        state: Any = None
-        for _ in range(WARM_PERIODS):
-            measured = Measured(state_n[: line.n].copy(), state_n[line.n :].copy(), recipe.speed_m_per_s)
-            state = law.engage(measured, reference, torque_nm) if state is None else state
-            decision = law.ask(state, measured, reference)
-            if not np.isfinite(decision.torque_nm).all():
-                raise ControllerRefused("it gives no finite torque on the line's own set-points")
-            state = law.commit(state, decision, torque_nm)
-    except ControllerRefused:
-        raise
-    except Exception as error:  # whatever a law may raise: here it costs nothing
-        raise ControllerRefused(f"it cannot be run: {type(error).__name__}: {error}") from error

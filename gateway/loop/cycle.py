@@ -9,15 +9,19 @@ import numpy as np
 from drivers.port import Link
 from gateway.control.law import Measured
 from gateway.control.laws import make_law
-from gateway.core.controller import Controller
+from gateway.core.controller import Controller, config_hash
+from gateway.core.deployment import Deployment, Region
 from gateway.core.line import Line
 from gateway.core.signals import BoolArray, DriveRequest, DriveState, FloatArray, Inputs, Outputs, Quality
 from gateway.core.states import OPERATORS_STOP, LoopState, Phase
 from gateway.core.telemetry import Frame
 from gateway.loop import machine as machines
-from gateway.loop.configurations import Configurations, LawOf
+from gateway.loop.admission import Admission, LawOf
+from gateway.loop.configurations import Configuration, Configurations
+from gateway.loop.containment import Containment
 from gateway.loop.experiment import Experiments, Tell
 from gateway.loop.guard import Guard
+from gateway.loop.kept import Kept
 from gateway.loop.machine import Machine, Observation, Times
 from gateway.loop.pacer import Tick
 from gateway.loop.setpoints import Setpoints
@@ -64,10 +68,15 @@ class Account:
     sequence: int = 0
     skipped: int = 0  #: periods
     held: int = 0  #: periods in a row with held outputs
+    ran: int = 0  #: periods in which the line ran
 
 
 class Cycle:
-    """The loop's whole state between two periods."""
+    """The loop's whole state between two periods.
+
+    What changes in it, a phase, the controller in service, an experiment, changes through the methods here, so that
+    everything that depends on it hears of it: `change`, `deploy`, `roll_back`.
+    """
 
     def __init__(
         self,
@@ -82,7 +91,12 @@ class Cycle:
         *,
         simulated: bool = False,
         law_of: LawOf = make_law,
+        budget_period_s: float | None = None,
     ) -> None:
+        """`law_of` makes laws of configurations. `budget_period_s`: the period that what is admitted must fit (s);
+
+        None: the line's own.
+        """
         self.line = line
         self.links = links
         self.limits = envelope_limits(line)
@@ -90,15 +104,19 @@ class Cycle:
         self.inputs = Inputs(line.n)
         self.outputs = Outputs(line.n)
         self.setpoints = Setpoints(line.recipes[0])
-        self.configurations = Configurations(
-            line, config, law_of, lambda law: TorquePath(law, self.limits, line), self.setpoints, tell
-        )
-        self.torque_path = self.configurations.path
+        self.containment = Containment()
+        self.unfit = ""  #: why what the loop was given must not control the line; empty: it may
+        self._tell = tell
+        period_s = line.control.period_s if budget_period_s is None else budget_period_s
+        self.admission = Admission(line, law_of, period_s)
+        first = Configuration(config, config_hash(config), law_of(config), Region())
+        self.torque_path = TorquePath(first.law, self.limits, line)
+        self.configurations = Configurations(line, first, self.torque_path, self.setpoints, self.tell)
         self.guard = Guard(line)
         self.account = Account()
         self.watch = watch
         self.clock = clock
-        self.experiments = Experiments(self.setpoints, self.limits, clock, tell, simulated=simulated)
+        self.experiments = Experiments(self.setpoints, self.limits, clock, self.tell, simulated=simulated)
         self._record = record
         self._announce = announce
         self._times = Times(line.limits.tensioning_time_s, line.moves.stop_time_s)
@@ -109,20 +127,79 @@ class Cycle:
         self._shaped_moves = line.moves.model_copy(update={"shape": "minimum-jerk"})
 
     async def period(self, tick: Tick) -> None:
-        """Read, decide, write."""
+        """Read, decide, write. Raises only what fails second (`containment`)."""
+        try:
+            await self._run(tick)
+        except Exception as error:  # of what is not a part of its own: there is no control to rely on
+            self.containment.fail("the control period", error, Action.TORQUE_OFF)
+            self._heed_failures(tick.now_s)
+            self._write(self.torque_path.unload(self.outputs.torque_nm))
+
+    async def _run(self, tick: Tick) -> None:
         await self._read(tick)
         seen = self._check(tick)
         self._step_machine(seen, tick.now_s)
+        self._heed_failures(tick.now_s)
         before_nm = self.outputs.torque_nm
-        self.configurations.look(tick.now_s)
+        self._end_what_lapsed(tick.now_s)
         torque_nm, saturated = self._torque(seen, tick)
         self._write(torque_nm)
         self.guard.sent(torque_nm)
         cycle_s = self.clock() - tick.now_s
-        if self.machine.phase in CONTROLLED and seen.usable:  # only blocks proposals: after the commands are out
-            self._alarm(self.watch.controlled(self.inputs, self.setpoints, before_nm, saturated))
-        self.experiments.look(self.inputs, torque_nm, self.account.held, tick.due_s)
-        self._frame(tick, saturated, cycle_s)
+        self._watch_after(seen, tick, before_nm, torque_nm, saturated)
+        self.containment.run("telemetry", lambda: self._frame(tick, saturated, cycle_s), None)
+        self._heed_failures(tick.now_s)
+
+    def _watch_after(
+        self, seen: Assessment, tick: Tick, before_nm: FloatArray, torque_nm: FloatArray, saturated: bool
+    ) -> None:
+        """What only blocks proposals or ends an experiment: after the commands are out."""
+        if self.machine.phase in CONTROLLED and seen.usable:
+            watched = lambda: self.watch.controlled(self.inputs, self.setpoints, before_nm, saturated)  # noqa: E731
+            self._alarm(self.containment.run("the watch for doubts", watched, []))
+        look = lambda: self.experiments.look(self.inputs, torque_nm, self.account.held, tick.due_s)  # noqa: E731
+        self.containment.run("the experiment", look, None)
+
+    def _end_what_lapsed(self, now_s: float) -> None:
+        configurations = self.configurations
+        if why := self.containment.run("the lease", lambda: configurations.lapsed(now_s), ""):
+            self.roll_back(why)
+        configurations.settle_moves()
+
+    def _heed_failures(self, now_s: float) -> None:
+        """What has failed since is told, and stops the line."""
+        for finding in self.containment.take_findings():
+            way = machines.torque_off if finding.action is Action.TORQUE_OFF else machines.stop
+            before = self.machine.phase
+            self._move_to(way(self.machine, now_s, finding.text), [finding])
+            if self.machine.phase is before:
+                self._alarm([finding])
+
+    def resume(self, kept: Kept, say: Callable[[str], None]) -> None:
+        """Before the first period: what a loop before has kept. Raises ControllerRefused, with nothing changed."""
+        running, good = self.admission.resumed(kept, say)
+        self.configurations.resume(running, good, kept.epoch)
+
+    def deploy(self, candidate: Configuration, deployment: Deployment, now_s: float) -> None:
+        """`candidate` controls the line from the next period on, on probation. Between two periods only."""
+        self.experiments.end("another controller takes over")
+        self.unfit = ""
+        self.configurations.take(candidate, deployment, now_s)
+
+    def roll_back(self, reason: str) -> bool:
+        """Back to the last known good controller, whoever asks for it; False where that runs already.
+
+        An experiment was judged under the controller that is given up: it ends with it.
+        """
+        if not self.configurations.roll_back(reason):
+            return False
+        self.experiments.end(f"the controller was taken back: {reason}")
+        return True
+
+    def tell(self, kind: str, text: str, **data: object) -> None:
+        """An event, to whoever listens."""
+        if (tell := self._tell) is not None:
+            self.containment.run("events", lambda: tell(kind, text, **data), None)
 
     def foreseen(self, setpoint_n: FloatArray, unwind_speed_m_per_s: float | None = None) -> str:
         """What would come of these set-points (n,), or this speed, at once, as the accepted model has it; or nothing.
@@ -141,34 +218,59 @@ class Cycle:
     def change(self, machine: Machine) -> None:
         """Take over what a command decided. Between two periods only."""
         if machine.phase is Phase.ARMING:
+            self.containment.begin_anew()
             self.torque_path.lost[:] = False
             self._alarm(self.watch.armed())
         self._move_to(machine, [])
 
     async def _read(self, tick: Tick) -> None:
-        for link in self.links:
-            link.trigger(tick.now_s)
+        links = [link for link in self.links if _part(link) not in self.containment.failed]
+        for link in links:
+            self.containment.run(_part(link), lambda link=link: link.trigger(tick.now_s), None, Action.TORQUE_OFF)
         self._latched_s = self.clock()  # later than it was: it may take time to be sent on a busy computer
         deadline_s = tick.now_s + READ_SHARE * self.limits.period_s
-        for link in self.links:
-            await link.collect(self.inputs, deadline_s)
+        for link in links:
+            try:
+                await link.collect(self.inputs, deadline_s)
+            except Exception as error:  # a link promises not to: what it has left is not to be relied on
+                self.containment.fail(_part(link), error, Action.TORQUE_OFF)
+        if len(links) < len(self.links) or self.containment.failed:
+            self._miss_failed_links()
+
+    def _miss_failed_links(self) -> None:
+        """Whose samples a link that failed would have brought is not known here: none is relied on."""
+        if any(_part(link) in self.containment.failed for link in self.links):
+            for channel in (self.inputs.tension, self.inputs.speed, self.inputs.torque, self.inputs.unwind_speed):
+                for i in range(len(channel.value)):
+                    channel.miss(i)
 
     def _check(self, tick: Tick) -> Assessment:
-        phase = self.machine.phase
+        phase, run = self.machine.phase, self.containment.run
         supervision = SUPERVISION[phase]
+        jumps = run("the check for jumps", lambda: self._reject_jumps(supervision), [])
+        if phase in WITH_TORQUE:
+            self.torque_path.lost |= self.inputs.drive_state != _ENABLED
+        seen = run("the envelope", lambda: self._check_envelope(tick, supervision), None)
+        if seen is None:
+            return Assessment([], usable=False, feedback_lost=True, plc_lost=True)
+        if supervision.feedback:
+            seen.findings.extend(jumps)
+            if seen.usable:
+                seen.findings.extend(run("the check for stuck signals", lambda: self.watch.find_stuck(self.inputs), []))
+        return seen
+
+    def _reject_jumps(self, supervision: Supervision) -> list[Finding]:
         jumps = self.watch.reject_jumps(self.inputs, self.outputs.torque_nm)
         if supervision.feedback:
             self.watch.reject_unwinder(self.inputs, self.outputs.speed_request_m_per_s)
-        if phase in WITH_TORQUE:
-            self.torque_path.lost |= self.inputs.drive_state != _ENABLED
+        return jumps
+
+    def _check_envelope(self, tick: Tick, supervision: Supervision) -> Assessment:
         late, self._envelope = check_timing(self.limits, self._envelope, tick.skipped)
         seen, self._envelope = check_inputs(self.limits, self._envelope, self.inputs, supervision)
-        if supervision.feedback:
-            seen.findings.extend(jumps)
-            seen.findings.extend(self.watch.find_stuck(self.inputs) if seen.usable else ())
-        if phase is Phase.SILENT:
+        if self.machine.phase is Phase.SILENT:
             seen.findings.clear()
-        elif phase is not Phase.ARMING:
+        elif self.machine.phase is not Phase.ARMING:
             seen.findings.extend(late)
         return seen
 
@@ -204,10 +306,10 @@ class Cycle:
         if machine.phase is not Phase.RUNNING:
             self.experiments.end(f"the line left RUN: {machine.reason or machine.state.name}")
         if machine.state is LoopState.STOP and self.configurations.probation is not None:
-            self.configurations.roll_back(f"the line stopped: {machine.reason}")
+            self.roll_back(f"the line stopped: {machine.reason}")
         if machine.phase is Phase.OFF:  # a speed from before the stop is not taken up again
             self.setpoints.speed_target_m_per_s = self.setpoints.recipe.speed_m_per_s
-        self._announce(before, machine, findings)
+        self.containment.run("events", lambda: self._announce(before, machine, findings), None)
 
     def _torque(self, seen: Assessment, tick: Tick) -> tuple[FloatArray, bool]:
         """The torque (n,) to apply in this period, and whether a limit cut it."""
@@ -238,26 +340,36 @@ class Cycle:
             return self._torque(seen, tick)
 
     def _governed(self, applied_nm: FloatArray, interval_s: float, now_s: float) -> tuple[FloatArray, bool]:
-        """As `TorquePath.control`. What fails on probation, or must not go on, gives way in this very period."""
+        """The torque (n,) and whether a limit cut it. What fails on probation, or must not go on, gives way at once.
+
+        Raises LawFailed.
+        """
         configurations, path = self.configurations, self.torque_path
         measured = self._estimate()
-        try:
-            found = path.control(measured, self.setpoints, applied_nm, interval_s)
-        except Exception as failed:  # whatever a law on probation may raise
-            reason = failed.finding.text if isinstance(failed, LawFailed) else f"{type(failed).__name__}: {failed}"
-            if not configurations.roll_back(f"the law failed: {reason}"):
-                raise
+
+        def controlled() -> tuple[FloatArray, bool]:
             return path.control(measured, self.setpoints, applied_nm, interval_s)
+
+        try:
+            found = controlled()
+        except LawFailed as failed:
+            if not self.roll_back(f"the law failed: {failed.finding.text}"):
+                raise
+            return controlled()
         if self.machine.phase not in SUPERVISED:
             return found
-        findings = self.guard.against(configurations, path, measured, self.setpoints.tension_n, found)
-        if not findings:
+        guard, setpoint_n = self.guard, self.setpoints.tension_n
+        against = self.containment.run(
+            "the monitor", lambda: guard.against(configurations, path, measured, setpoint_n, found), []
+        )
+        self._heed_failures(now_s)
+        if not against:
             return found
-        if configurations.roll_back("; ".join(finding.text for finding in findings)):
-            self._alarm(findings)
-            return path.control(measured, self.setpoints, applied_nm, interval_s)
-        reason = "; ".join(finding.text for finding in findings)
-        self._move_to(machines.stop(self.machine, now_s, reason), findings)
+        reason = "; ".join(finding.text for finding in against)
+        if self.roll_back(reason):
+            self._alarm(against)
+            return controlled()
+        self._move_to(machines.stop(self.machine, now_s, reason), against)
         return found
 
     def _estimate(self) -> Measured:
@@ -269,8 +381,8 @@ class Cycle:
         moves = self._shaped_moves if self.configurations.shaped else self.line.moves
         phase = self.machine.phase
         goal = self.setpoints.speed_target_m_per_s if phase is Phase.RUNNING else 0.0
-        if self.experiments.run is not None:
-            goal = self.experiments.run.advance(self.setpoints)
+        if (run := self.experiments.run) is not None:
+            goal = self.containment.run("the experiment", lambda: run.advance(self.setpoints), 0.0)
         rate = moves.stop_rate_m_per_s2 if phase is Phase.SLOWING else moves.speed_rate_m_per_s2
         shape = moves.shape if phase is Phase.RUNNING else "ramp"  # what stops does not wait for a curve to bend
         self.setpoints.advance(moves, self.limits.period_s, goal, rate, shape)
@@ -284,7 +396,7 @@ class Cycle:
         outputs.speed_request_m_per_s = self.setpoints.speed_m_per_s
         outputs.run = phase in CONTROLLED
         for link in self.links:
-            link.write(outputs)
+            self.containment.run(_part(link), lambda link=link: link.write(outputs), None, Action.TORQUE_OFF)
 
     def _requests(self) -> Any:
         """What is asked of each drive: enabling only while ENABLING, and again only after a person has armed."""
@@ -302,7 +414,7 @@ class Cycle:
 
     def _alarm(self, findings: list[Finding]) -> None:
         if findings:
-            self._announce(self.machine, self.machine, findings)
+            self.containment.run("events", lambda: self._announce(self.machine, self.machine, findings), None)
 
     def _stays_on(self) -> BoolArray:
         """Drives (n,) that do not obey OFF. Said once, when it begins."""
@@ -320,6 +432,7 @@ class Cycle:
             quality = np.where(self.watch.stuck, _BAD, quality).astype(np.int8)
         account.skipped += tick.skipped
         account.sequence += 1
+        account.ran += self.machine.phase is Phase.RUNNING
         machine = self.machine
         asked = machine.phase is not Phase.OFF and self.setpoints.speed_m_per_s != 0.0
         self._record(
@@ -347,3 +460,8 @@ class Cycle:
                 drive_state=inputs.drive_state,
             )
         )
+
+
+def _part(link: Link) -> str:
+    """A link's name in `containment`."""
+    return f"the link {link.name}"

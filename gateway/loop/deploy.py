@@ -1,39 +1,92 @@
 """What commands about the configuration do to a cycle: each is done, or refused with every reason."""
 
-from gateway.core.controller import Controller, ControllerRefused
+from dataclasses import replace
+
 from gateway.core.deployment import Deployment, RecoveryPrediction
 from gateway.core.doubts import in_words
 from gateway.core.messages import AskConfiguration, Configuring, Deploy, Keep, Narrow, Renew, Rollback, WatchGood
 from gateway.core.states import Phase
-from gateway.loop.configurations import Configurations
+from gateway.loop.configurations import Configuration, Configurations
 from gateway.loop.cycle import Cycle
+from gateway.loop.kept import Durable
 from gateway.loop.refused import Refused
 from safety.recoverability import Recovery
+
+Prepared = Configuration | Recovery | None  #: what a command brings along, built and measured ahead
 
 CHANGEABLE = (Phase.SILENT, Phase.READY, Phase.RUNNING, Phase.HOLDING)
 
 
-def configure(cycle: Cycle, command: Configuring, now_s: float) -> str:
-    """Do `command` between two periods. Raises Refused."""
+NOT_DONE = {Deploy: "not deployed", Keep: "not kept", WatchGood: "not watched by another model"}
+
+
+def require(cycle: Cycle, command: Deploy | Keep | WatchGood) -> None:
+    """Before anything is prepared for it: that it would not be refused anyway. Raises Refused."""
     match command:
         case Deploy():
-            return _deploy(cycle, command.deployment, now_s)
+            if reasons := against(cycle, command.deployment):
+                raise Refused(NOT_DONE[Deploy], reasons)
+        case Keep():
+            _require_probation(cycle, command.epoch)
+        case WatchGood():
+            _require_nothing_on_probation(cycle.configurations)
+
+
+def durable_after(configurations: Configurations, command: Deploy | Keep | WatchGood) -> Durable:
+    """What a loop that starts anew is to run once `command` is done. One on probation leaves only its epoch."""
+    match command:
+        case Deploy():
+            return replace(configurations.durable, epoch=command.deployment.epoch)
+        case Keep():
+            return configurations.durable_if_kept(command.watch)
+        case WatchGood():
+            return replace(configurations.durable, watch=command.watch)
+
+
+def prepare(cycle: Cycle, command: Configuring) -> Prepared:
+    """Build and measure what `command` brings along. Takes its time: aside. Raises ControllerRefused."""
+    configurations, admission = cycle.configurations, cycle.admission
+    match command:
+        case Deploy():
+            return admission.admit(command.deployment, configurations.good.config)
+        case Keep() if command.watch is not None:
+            return admission.recovery(command.watch, configurations.good_if_kept.config)
+        case WatchGood():
+            return admission.recovery(command.watch, configurations.good.config)
+        case _:
+            return None
+
+
+def configure(cycle: Cycle, command: Configuring, prepared: Prepared, now_s: float) -> str:
+    """Do `command` between two periods, with what `prepare` has made of it. Raises Refused."""
+    configurations = cycle.configurations
+    match command:
+        case Deploy() | Keep() | WatchGood():
+            require(cycle, command)
+            return _change(cycle, command, prepared, now_s)
         case Renew():
             _require_probation(cycle, command.epoch)
-            cycle.configurations.renew(now_s)
+            configurations.renew(now_s)
             return f"the lease of epoch {command.epoch} begins anew"
-        case Keep():
-            return _keep(cycle, command)
-        case WatchGood():
-            return _watch_good(cycle, command)
         case Narrow():
             return _narrow(cycle, command)
         case Rollback():
-            done = cycle.configurations.roll_back(command.reason)
-            runs = f"{cycle.configurations.good.hash[:12]}, the last known good, runs"
+            done = cycle.roll_back(command.reason)
+            runs = f"{configurations.good.hash[:12]}, the last known good, runs"
             return f"{runs} again" if done else f"{runs} already"
         case AskConfiguration():
             return "what controls the line"
+
+
+def _change(cycle: Cycle, command: Deploy | Keep | WatchGood, prepared: Prepared, now_s: float) -> str:
+    match command:
+        case Deploy():
+            assert isinstance(prepared, Configuration)
+            return _deploy(cycle, command.deployment, prepared, now_s)
+        case Keep():
+            return _keep(cycle.configurations, command, _recovery(prepared))
+        case WatchGood():
+            return _watch_good(cycle.configurations, command.watch, _recovery(prepared))
 
 
 def against(cycle: Cycle, deployment: Deployment) -> list[str]:
@@ -62,42 +115,24 @@ def against(cycle: Cycle, deployment: Deployment) -> list[str]:
     return reasons
 
 
-def _deploy(cycle: Cycle, deployment: Deployment, now_s: float) -> str:
-    if reasons := against(cycle, deployment):
-        raise Refused("not deployed", reasons)
-    configurations = cycle.configurations
-    prepared, configurations.prepared = configurations.prepared, None
-    if prepared is not None and prepared[0] is deployment:
-        candidate = prepared[1]
-    else:
-        try:
-            candidate = configurations.candidate(deployment)
-        except ControllerRefused as refused:
-            raise Refused("not deployed", [str(refused)]) from refused
-    configurations.take(candidate, deployment, now_s)
+def _deploy(cycle: Cycle, deployment: Deployment, candidate: Configuration, now_s: float) -> str:
+    _require_still(candidate.recovery, cycle.configurations.good, NOT_DONE[Deploy])
+    cycle.deploy(candidate, deployment, now_s)
     return f"{candidate.config.kind} controller {candidate.hash[:12]} controls the line, on probation"
 
 
-def _keep(cycle: Cycle, command: Keep) -> str:
-    _require_probation(cycle, command.epoch)
-    configurations, watch = cycle.configurations, command.watch
-    recovery = None
-    if watch is not None:
-        recovery = _recovery(configurations, watch, configurations.good_if_kept.config, "not kept")
-    configurations.keep(watch, recovery)
+def _keep(configurations: Configurations, command: Keep, recovery: Recovery | None) -> str:
+    _require_still(recovery, configurations.good_if_kept, NOT_DONE[Keep])
+    configurations.keep(command.watch, recovery)
     good = configurations.good
     under = "" if configurations.running is good else f", with {good.hash[:12]} to go back to"
     return f"epoch {command.epoch} is kept{under}"
 
 
-def _watch_good(cycle: Cycle, command: WatchGood) -> str:
-    configurations = cycle.configurations
-    if configurations.probation is not None:
-        raise Refused(f"epoch {configurations.epoch} is on probation: it is kept by the newest model, or not")
-    good = configurations.good
-    configurations.watch_good(
-        command.watch, _recovery(configurations, command.watch, good.config, "not watched by another model")
-    )
+def _watch_good(configurations: Configurations, watch: RecoveryPrediction, recovery: Recovery | None) -> str:
+    assert recovery is not None
+    _require_still(recovery, configurations.good, NOT_DONE[WatchGood])
+    configurations.watch_good(watch, recovery)
     return f"{configurations.running.hash[:12]} is watched by the model that was accepted last"
 
 
@@ -117,15 +152,20 @@ def _narrow(cycle: Cycle, command: Narrow) -> str:
     return f"{configurations.running.hash[:12]} goes no further than a first configuration"
 
 
-def _recovery(configurations: Configurations, watch: RecoveryPrediction, fallback: Controller, not_: str) -> Recovery:
-    """Prepared ahead, or made now. Raises Refused."""
-    prepared, configurations.prepared_watch = configurations.prepared_watch, None
-    if prepared is not None and prepared[0] is watch:
-        return prepared[1]
-    try:
-        return configurations.recovery(watch, fallback)
-    except ControllerRefused as refused:
-        raise Refused(not_, [str(refused)]) from refused
+def _recovery(prepared: Prepared) -> Recovery | None:
+    return prepared if isinstance(prepared, Recovery) else None
+
+
+def _require_still(recovery: Recovery | None, good: Configuration, refused: str) -> None:
+    """What was prepared aside is for what the line goes back to now, too."""
+    if recovery is not None and recovery.fallback != good.hash:
+        raise Refused(refused, ["what the line would go back to has changed meanwhile"])
+
+
+def _require_nothing_on_probation(configurations: Configurations) -> None:
+    """For what belongs to the last known good one. Raises Refused."""
+    if configurations.probation is not None:
+        raise Refused(f"epoch {configurations.epoch} is on probation: it is kept by the newest model, or not")
 
 
 def _require_probation(cycle: Cycle, epoch: int) -> None:

@@ -1,5 +1,7 @@
 """The monitor of `safety` in the loop: what it must be told each period, and what it says of the law in service."""
 
+from math import ceil
+
 import numpy as np
 
 from gateway.control.engagement import memory
@@ -12,7 +14,7 @@ from gateway.loop.torque import TorquePath
 from safety.actions import Finding
 from safety.monitor import MonitorState, look, monitor_limits, recoverable
 
-MOST_IN_FLIGHT = 12  #: periods that a torque takes to act, at most: a latency of 0.1 s at 10 ms, and a lag
+LAG_S = 0.05  #: of the drives, for which there is room from the beginning: as much as the gate lets a model have
 
 
 class Guard:
@@ -20,11 +22,13 @@ class Guard:
         self._limits = monitor_limits(line)
         self._state = MonitorState()
         self._watched: Configuration | None = None  #: that `_state` belongs to
-        self._sent_nm: FloatArray = np.zeros((MOST_IN_FLIGHT, line.n))  #: newest first
+        # In flight: through the latency, the lag, and the period in which a torque is computed.
+        periods = 2 + ceil((line.control.latency_s + LAG_S) / line.control.period_s)
+        self._sent_nm: FloatArray = np.zeros((periods, line.n))  #: newest first
 
     def begin(self, torque_nm: FloatArray) -> None:
         """`torque_nm` (n,) has been sent for as long as anything is in flight."""
-        self._sent_nm = np.tile(torque_nm, (MOST_IN_FLIGHT, 1))
+        self._sent_nm = np.tile(torque_nm, (len(self._sent_nm), 1))
 
     def off(self) -> None:
         """Control is off: what was seen does not count any more."""
@@ -56,6 +60,7 @@ class Guard:
             findings = look(self._limits, self._state, torque_nm, cut)
         recovery = running.recovery
         if recovery is not None:
+            self._remember(recovery.depth + 1)
             remembered = memory(path.state) if recovery.fallback == running.hash else None
             findings += recoverable(recovery, measured, setpoint_n, self._sent_nm, torque_nm, remembered)
         return findings
@@ -71,6 +76,7 @@ class Guard:
         recovery = running.recovery
         if recovery is None or configurations.probation is not None or path.state is None:
             return ""
+        self._remember(recovery.depth + 1)
         remembered = memory(path.state) if recovery.fallback == running.hash else None
         in_flight, sent = self._sent_nm[1 : 1 + recovery.depth], self._sent_nm[0]
         short = recovery.shortfall_of_step(measured, setpoint_n, in_flight, sent, remembered)
@@ -78,3 +84,12 @@ class Guard:
             return ""
         # Under predictive control it is the linear law behind it that is looked at.
         return str(short) if remembered is None else short.foreseen
+
+    def _remember(self, periods: int) -> None:
+        """Keep what was sent for so long: a model may say that it acts later than the line's file does.
+
+        What was forgotten is taken to have been as the oldest that is known.
+        """
+        missing = periods - len(self._sent_nm)
+        if missing > 0:
+            self._sent_nm = np.vstack((self._sent_nm, np.tile(self._sent_nm[-1], (missing, 1))))

@@ -6,16 +6,17 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
+from drivers.cleanup import finish, finish_all
 from drivers.port import Link
 from drivers.registry import build_links, speed_steps_m_per_s
-from gateway.core.controller import Controller
+from gateway.core.controller import Controller, ControllerRefused
 from gateway.core.line import Line
 from gateway.core.signals import Outputs
 from gateway.core.states import Phase
 from gateway.core.topics import LOOP_BUSES, LOOP_COMMAND, LOOP_EVENT, LOOP_TELEMETRY
-from gateway.loop.commands import release
+from gateway.loop.arming import release_links
 from gateway.loop.cycle import Cycle
-from gateway.loop.kept import Store
+from gateway.loop.kept import Kept, Store, fingerprint
 from gateway.loop.pacer import TimerPacer, monotonic
 from gateway.loop.realtime import become_punctual, freeze_collector, stay_awake
 from gateway.loop.runner import Runner
@@ -25,6 +26,7 @@ from gateway.mailbox.paths import GATEWAY_SOCKET, LOOP_SOCKET
 from gateway.mailbox.unix import UnixMailbox
 
 RESTING_PERIODS = 5
+PERSISTED_S = 2.0  #: that a loop which ends waits for its disk
 
 
 def run_loop(
@@ -62,9 +64,7 @@ async def _main(
         store.write_given(config)
     except OSError as error:
         say(f"the gateway cannot know what this loop was given: {store.path.parent}: {error.strerror}")
-    kept = store.read(line, say)
-    if kept is not None:
-        cycle.configurations.resume(kept)
+    begin(cycle, store.read(line, say), say)
     runner = Runner(cycle, store)
     ending = asyncio.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
@@ -84,12 +84,31 @@ async def _main(
         (refused if sleepy else granted).append(sleepy or "processors stay awake")
         for sentence in ["; ".join(granted) or "no real-time help granted", *refused]:
             say(sentence)
-        await _run_until(runner, line, ending)
+        await _run_until(runner, line, ending, store)
     finally:
-        for link in links:
-            await link.close()
+        await finish_all(link.close() for link in links)
         runner.close()
         await mailbox.close()
+
+
+def begin(cycle: Cycle, kept: Kept | None, say: Callable[[str], None]) -> None:
+    """Before the first period: what runs is what the loop before has kept, or what this one is given; measured.
+
+    What cannot be used is told. A controller that takes longer than a period has for it is not armed.
+    """
+    if kept is not None:
+        try:
+            cycle.resume(kept, say)
+            return
+        except ControllerRefused as refused:
+            cycle.configurations.epoch = kept.epoch  # epochs go on
+            say(f"what was kept is not used, the configuration given is: {refused}")
+    running = cycle.configurations.running
+    try:
+        cycle.admission.measure_law(running.law, running.config)
+    except ControllerRefused as refused:
+        cycle.unfit = f"controller {running.hash[:12]}: {refused}"
+        say(f"the line cannot be armed with {cycle.unfit}")
 
 
 async def _open(links: list[Link]) -> list[str]:
@@ -103,8 +122,9 @@ async def _open(links: list[Link]) -> list[str]:
     return troubles
 
 
-async def _run_until(runner: Runner, line: Line, ending: asyncio.Event) -> None:
-    pacer = TimerPacer(line.control.period_s)
+async def _run_until(runner: Runner, line: Line, ending: asyncio.Event, store: Store | None = None) -> None:
+    """Periods until `ending`, then until the line rests. An exception ends it with torque off, and is raised."""
+    cycle, pacer = runner.cycle, TimerPacer(line.control.period_s)
     try:
         while not ending.is_set():
             await runner.period(await pacer.wait())
@@ -114,13 +134,26 @@ async def _run_until(runner: Runner, line: Line, ending: asyncio.Event) -> None:
         while resting < RESTING_PERIODS and monotonic() < deadline_s:
             await runner.period(await pacer.wait())
             resting = resting + 1 if runner.at_rest else 0
-        if runner.cycle.machine.phase is Phase.OFF:
-            await release(runner.cycle)
-    except Exception:
-        await _torque_off(runner.cycle, pacer)
+        if cycle.machine.phase is Phase.OFF:
+            await release_links(cycle)
+    except Exception as error:
+        await finish(_torque_off(cycle, pacer))
+        if store is not None:
+            _count_death(cycle, store, error)
         raise
     finally:
         pacer.close()
+    await runner.persisted(PERSISTED_S)
+    if store is not None and cycle.account.ran:
+        with suppress(OSError):
+            store.deaths.forgive(fingerprint(cycle.configurations.durable))
+
+
+def _count_death(cycle: Cycle, store: Store, error: Exception) -> None:
+    """What was on probation is gone with this process; what was kept would be started again."""
+    if cycle.configurations.probation is None:
+        with suppress(OSError):
+            store.deaths.count(fingerprint(cycle.configurations.durable), f"{type(error).__name__}: {error}")
 
 
 async def _torque_off(cycle: Cycle, pacer: TimerPacer) -> None:

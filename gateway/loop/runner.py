@@ -2,7 +2,9 @@
 
 import asyncio
 from collections import deque
+from dataclasses import dataclass
 
+from drivers.cleanup import end
 from gateway.core.controller import ControllerRefused
 from gateway.core.messages import (
     MAX_COMMAND,
@@ -11,24 +13,39 @@ from gateway.core.messages import (
     Deploy,
     Keep,
     MalformedMessage,
+    Narrow,
     Reply,
+    Rollback,
     Stop,
     WatchGood,
     parse_command,
 )
 from gateway.core.states import LoopState, Phase
+from gateway.loop.arming import forbidden, not_armed, prepare_links, refusal_to_arm, release_links, unheard
 from gateway.loop.aside import Aside
-from gateway.loop.commands import carry_out, forbidden, prepare_to_arm, release, unheard
+from gateway.loop.commands import carry_out
 from gateway.loop.cycle import SUPERVISED, Cycle
-from gateway.loop.deploy import against
-from gateway.loop.kept import OnTop, Store
+from gateway.loop.deploy import NOT_DONE, Prepared, durable_after, prepare, require
+from gateway.loop.kept import Store
 from gateway.loop.pacer import Tick
+from gateway.loop.persistence import NotPersisted, Persistence
+from gateway.loop.refused import Refused
 
-KEPT_AGAIN_S = 1.0
 HEARD_AGAIN_S = 1.0  #: for devices that were lost to tell what speaks against arming, or that nothing does
+PERSISTED_S = 1.0  #: for the disk to have what was taken back, until the answer says that it has not
 MAX_WAITING = 32  #: commands between two periods; more are refused, but for a stop
+BOUNDARY_SHARE = 0.1  #: of a period, for the commands of one boundary; what is left over waits for the next
 
 Answer = asyncio.Future[Reply]
+
+
+@dataclass(slots=True)
+class Waiting:
+    """A command that waits for its boundary, with what was prepared for it."""
+
+    command: Command
+    prepared: Prepared
+    answer: Answer
 
 
 class Runner:
@@ -36,34 +53,53 @@ class Runner:
 
     def __init__(self, cycle: Cycle, store: Store | None = None) -> None:
         self.cycle = cycle
-        self._store = store
         self._aside = Aside()
+        self._persistence = Persistence(cycle.configurations, store, self._aside, cycle.tell)
         self._configuring = asyncio.Lock()
-        self._waiting: deque[tuple[Command, Answer]] = deque()
+        self._waiting: deque[Waiting] = deque()
         self._passed = asyncio.Event()
-        self._arming: asyncio.Task[Reply | None] | None = None
-        self._keeping: asyncio.Task[None] | None = None
+        self._arming: asyncio.Task[Reply | None] | None = None  #: its proofs
+        self._armed: asyncio.Task[Reply] | None = None  #: the arming that was asked for last
+        self._stops = 0  #: that were asked for
         self._ending = False
 
     async def period(self, tick: Tick) -> None:
         """Carry out what waits, then one control period."""
         if self._ending:
-            carry_out(self.cycle, Stop(), tick.now_s)
-        while self._waiting:
-            command, answer = self._waiting.popleft()
-            reply = carry_out(self.cycle, command, tick.now_s)
-            if not answer.done():
-                answer.set_result(reply)
+            self._carry_out(Stop(), None, tick.now_s)
+        self._carry_out_waiting(tick.now_s)
         await self.cycle.period(tick)
-        if self.cycle.configurations.to_keep:
-            self._keep_anew()
+        self._persistence.look()
         self._passed.set()
         self._passed.clear()  # whoever waited goes on all the same
+
+    def _carry_out_waiting(self, now_s: float) -> None:
+        """In their order, as many as there is time for; at least one, and a stop goes first (`submit`)."""
+        cycle = self.cycle
+        until_s = cycle.clock() + BOUNDARY_SHARE * cycle.limits.period_s
+        while self._waiting:
+            waiting = self._waiting.popleft()
+            reply = self._carry_out(waiting.command, waiting.prepared, now_s)
+            if not waiting.answer.done():
+                waiting.answer.set_result(reply)
+            if cycle.clock() >= until_s:
+                return
+
+    def _carry_out(self, command: Command, prepared: Prepared, now_s: float) -> Reply:
+        """A command that fails stops the line in order, as any part of a period does."""
+        name = command.command
+        done = lambda: carry_out(self.cycle, command, now_s, prepared)  # noqa: E731
+        reply = self.cycle.containment.run(f"the command {name}", done, None)
+        return reply or self._refused(f"{name} failed within the loop, which stops the line for it")
 
     async def end(self) -> None:
         """From now on the line is being stopped, and no other command is taken. Periods must go on until it rests."""
         self._ending = True
         await self._cancel_arming()
+
+    async def persisted(self, within_s: float) -> str:
+        """Once the disk has what was decided last; else why it has not. Empty: it has."""
+        return await self._persistence.caught_up(within_s)
 
     @property
     def at_rest(self) -> bool:
@@ -81,26 +117,23 @@ class Runner:
 
     async def submit(self, command: Command) -> Reply:
         """Do `command` at the next boundary between periods; the reply says what was done, or why not."""
-        if isinstance(command, Stop):  # whatever else waits, and also into an arming
-            self._refuse_waiting_arms()
-            await self._cancel_arming()
-            return await self._at_boundary(command)
+        if isinstance(command, Stop):
+            return await self._stop(command)
         if self._ending:
             return self._refused("the loop is ending")
         if len(self._waiting) >= MAX_WAITING:
             return self._refused("too many commands at once: try again")
         match command:
-            case Arm():
-                return await self._arm(command)
-            case Deploy():
+            case Arm():  # it comes to its end, and is undone, even where nobody waits for it any more
+                if self._armed is not None and not self._armed.done():
+                    return self._refused("arming is under way")
+                self._armed = asyncio.create_task(self._arm(command))
+                return await asyncio.shield(self._armed)
+            case Deploy() | Keep() | WatchGood():
                 async with self._configuring:
-                    return await self._deploy(command)
-            case Keep():
-                async with self._configuring:
-                    return await self._keep(command)
-            case WatchGood():
-                async with self._configuring:
-                    return await self._watch_good(command)
+                    return await self._configure(command)
+            case Rollback() | Narrow():
+                return await self._take_back(command)
             case _:
                 return await self._at_boundary(command)
 
@@ -108,23 +141,34 @@ class Runner:
         """What is still being worked on aside ends by itself."""
         self._aside.close()
 
-    async def _at_boundary(self, command: Command) -> Reply:
-        answer: Answer = asyncio.get_running_loop().create_future()
-        (self._waiting.appendleft if isinstance(command, Stop) else self._waiting.append)((command, answer))
-        return await answer
+    async def _stop(self, command: Stop) -> Reply:
+        """Whatever else waits, and also into an arming, whose undoing it does not wait for."""
+        self._stops += 1
+        self._refuse_waiting_arms()
+        undone = asyncio.create_task(self._cancel_arming())
+        reply = await self._at_boundary(command)
+        await undone
+        return reply
+
+    async def _at_boundary(self, command: Command, prepared: Prepared = None) -> Reply:
+        waiting = Waiting(command, prepared, asyncio.get_running_loop().create_future())
+        (self._waiting.appendleft if isinstance(command, Stop) else self._waiting.append)(waiting)
+        return await waiting.answer
 
     async def _arm(self, command: Arm) -> Reply:
-        if self._arming is not None:
-            return self._refused("arming is under way")
         self._arming = asyncio.create_task(self._prove())
+        stops = self._stops
         try:
             await asyncio.wait([self._arming])
             if self._arming.cancelled():
                 return self._refused("not armed: it was stopped")
+            if self._stops != stops and self._arming.result() is None:  # it came when everything was proven already
+                await release_links(self.cycle)
+                return self._refused("not armed: it was stopped")
             refusal = self._arming.result()
             reply = refusal or await self._at_boundary(command)
             if refusal is None and not reply.ok:  # proven, and then stopped or refused: nothing stays active
-                await release(self.cycle)
+                await release_links(self.cycle)
         finally:  # only now: a second arming would prove, and then release, what this one has armed
             self._arming = None
         while reply.ok and self.cycle.machine.phase is Phase.ARMING:
@@ -135,127 +179,89 @@ class Runner:
             return self._refused(f"not armed: {self.cycle.machine.reason}")
         return reply.model_copy(update={"state": self.cycle.machine.state.name})
 
-    async def _deploy(self, command: Deploy) -> Reply:
-        """Build and warm what is to run, and note that its epoch is used up, while periods go on; then swap."""
-        configurations, deployment = self.cycle.configurations, command.deployment
-        await self._signals_are_there()
-        if reasons := against(self.cycle, deployment):
-            return self._refused("not deployed", reasons)
+    async def _configure(self, command: Deploy | Keep | WatchGood) -> Reply:
+        """Build, warm and measure what the command brings, and have it on the disk, while periods go on; then do it.
+
+        The disk first: after a restart the line runs what somebody was told is kept, and no epoch is used twice.
+        """
+        cycle = self.cycle
         try:
-            candidate = await self._aside.do(lambda: configurations.candidate(deployment))
+            await self._signals_are_there(command)
+            require(cycle, command)
+            prepared = await self._aside.do(lambda: prepare(cycle, command))
+            await self._signals_are_there(command)
+            return await self._persistence.write_ahead(
+                lambda: durable_after(cycle.configurations, command), lambda: self._at_boundary(command, prepared)
+            )
         except ControllerRefused as refused:
-            return self._refused("not deployed", [str(refused)])
-        good = configurations.good
-        if self._store is not None:
-            store = self._store
-            try:
-                await self._aside.do(lambda: store.write(deployment.epoch, good.config, good.region, good.watch))
-            except OSError as error:
-                return self._refused("not deployed", [f"nothing could be kept at {store.path}: {error.strerror}"])
-        await self._signals_are_there()
-        configurations.prepared = deployment, candidate
+            return self._not_done(NOT_DONE[type(command)], [str(refused)])
+        except NotPersisted as failed:
+            return self._not_done(NOT_DONE[type(command)], [str(failed)])
+        except Refused as refused:
+            return self._not_done(str(refused), refused.reasons)
+
+    def _not_done(self, text: str, reasons: list[str]) -> Reply:
+        """A refusal says what is in service, as every answer to such a command does."""
+        in_service = self.cycle.configurations.in_service(self.cycle.clock())
+        return self._refused(text, reasons).model_copy(update={"in_service": in_service})
+
+    async def _take_back(self, command: Rollback | Narrow) -> Reply:
+        """At once; the answer waits, a while, until a loop that starts anew would know it, too."""
         reply = await self._at_boundary(command)
-        if not reply.ok and self._store is not None and configurations.on_top is not None:
-            configurations.to_keep = True  # the disk is to have again what runs on
+        if reply.ok and (why := await self._persistence.caught_up(PERSISTED_S)):
+            text = f"{reply.text}; a loop that starts anew does not know it yet: {why}; it is tried again"
+            return reply.model_copy(update={"text": text})
         return reply
 
-    async def _signals_are_there(self) -> None:
+    async def _signals_are_there(self, command: Command) -> None:
         """A frame that came late must not use up what a person has approved; a line that misses more is stopped."""
         cycle = self.cycle
-        while cycle.account.held and cycle.machine.phase in SUPERVISED:
+        while isinstance(command, Deploy) and cycle.account.held and cycle.machine.phase in SUPERVISED:
             await self._passed.wait()
 
-    async def _keep(self, command: Keep) -> Reply:
-        """The disk first: after a restart the line runs what somebody was told is kept."""
-        configurations, watch = self.cycle.configurations, command.watch
-        good, then = configurations.good, configurations.good_if_kept
-        running = configurations.running
-        on_top = None if then is running else OnTop(controller=running.config, region=running.region)
-        if configurations.probation is None or configurations.epoch != command.epoch:
-            return await self._at_boundary(command)  # which refuses it
-        if watch is not None:
-            try:
-                recovery = await self._aside.do(lambda: configurations.recovery(watch, then.config))
-            except ControllerRefused as refused:
-                return self._refused("not kept", [str(refused)])
-            configurations.prepared_watch = watch, recovery
-        if self._store is None:
-            return await self._at_boundary(command)
-        store, epoch = self._store, command.epoch
-        try:
-            await self._aside.do(lambda: store.write(epoch, then.config, then.region, watch, on_top))
-            reply = await self._at_boundary(command)
-            if not reply.ok:  # rolled back meanwhile
-                await self._aside.do(lambda: store.write(epoch, good.config, good.region, good.watch))
-        except OSError as error:
-            return self._refused("not kept", [f"nothing could be kept at {store.path}: {error.strerror}"])
-        return reply
-
-    async def _watch_good(self, command: WatchGood) -> Reply:
-        """Made, and on the disk, while periods go on."""
-        configurations, watch = self.cycle.configurations, command.watch
-        good, epoch, on_top = configurations.good, configurations.epoch, configurations.on_top
-        if configurations.probation is not None:
-            return await self._at_boundary(command)  # which refuses it
-        try:
-            recovery = await self._aside.do(lambda: configurations.recovery(watch, good.config))
-            if (store := self._store) is not None:
-                await self._aside.do(lambda: store.write(epoch, good.config, good.region, watch, on_top))
-        except ControllerRefused as refused:
-            return self._refused("not watched by another model", [str(refused)])
-        except OSError as error:
-            return self._refused("not watched by another model", [f"nothing could be kept: {error.strerror}"])
-        configurations.prepared_watch = watch, recovery
-        return await self._at_boundary(command)
-
-    def _keep_anew(self) -> None:
-        """A loop that starts anew must not run what was given up. Aside, and again where the disk refuses."""
-        configurations, store = self.cycle.configurations, self._store
-        configurations.to_keep = False
-        if store is None:
-            return
-
-        async def keep() -> None:
-            async with self._configuring:
-                good, epoch, on_top = configurations.good, configurations.epoch, configurations.on_top
-                try:
-                    await self._aside.do(lambda: store.write(epoch, good.config, good.region, good.watch, on_top))
-                except OSError:
-                    await asyncio.sleep(KEPT_AGAIN_S)
-                    configurations.to_keep = True
-
-        self._keeping = asyncio.create_task(keep())
-
     async def _prove(self) -> Reply | None:
-        """As `prepare_to_arm`, for devices that have come back, too.
+        """Whatever must hold before torque is possible, also of devices that have come back. None: it holds.
+
+        Touches no link unless the line is at rest, and nothing speaks against it. Cancelled or refused, it leaves every
+        link silent and every device released.
 
         A link that commands leaves a device alone that was lost; a silent one asks for what it can. So one that has
         nothing to tell after a stop is given the chance to be heard first. What the line PLC says against arming
         needs no waiting for, and a drive that stays enabled is not left without its orders.
         """
         cycle = self.cycle
-        if cycle.machine.phase is Phase.OFF and unheard(cycle) and not forbidden(cycle) and not cycle.any_enabled():
-            try:
-                await release(cycle)
+        cycle.containment.begin_anew()
+        try:
+            if cycle.machine.phase is Phase.OFF and unheard(cycle) and not forbidden(cycle) and not cycle.any_enabled():
+                await release_links(cycle)
                 given_up_s = cycle.clock() + HEARD_AGAIN_S
                 while unheard(cycle) and cycle.clock() < given_up_s:
                     await self._passed.wait()
-            except BaseException:  # a stop, or a link that failed
-                await release(cycle)
-                raise
-        return await prepare_to_arm(cycle)
+            if (refusal := refusal_to_arm(cycle)) is not None:
+                return refusal
+            if cycle.machine.phase is Phase.OFF:
+                await release_links(cycle)
+            reasons = await prepare_links(cycle)
+        except BaseException:  # cancelled by a stop, or a link that failed: nothing stays half-way
+            if self.at_rest:
+                await release_links(cycle)
+            raise
+        if not reasons:
+            return None
+        await release_links(cycle)
+        return not_armed(cycle, reasons)
 
     async def _cancel_arming(self) -> None:
+        """Once: what the first stop has begun to undo is not cut by the second."""
         if self._arming is not None:
-            self._arming.cancel()
-            await asyncio.wait([self._arming])
+            await end(self._arming)
 
     def _refuse_waiting_arms(self) -> None:
         """An arming that has proven everything and waits for its period is stopped like one that is under way."""
-        for waiting in [waiting for waiting in self._waiting if isinstance(waiting[0], Arm)]:
+        for waiting in [waiting for waiting in self._waiting if isinstance(waiting.command, Arm)]:
             self._waiting.remove(waiting)
-            if not waiting[1].done():
-                waiting[1].set_result(self._refused("not armed: it was stopped"))
+            if not waiting.answer.done():
+                waiting.answer.set_result(self._refused("not armed: it was stopped"))
 
     def _refused(self, text: str, reasons: list[str] | None = None) -> Reply:
         return Reply(ok=False, state=self.cycle.machine.state.name, text=text, reasons=reasons or [])

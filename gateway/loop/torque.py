@@ -8,7 +8,7 @@ from gateway.control.law import Law, Measured
 from gateway.core.line import Line
 from gateway.core.signals import BoolArray, FloatArray
 from gateway.loop.setpoints import Setpoints
-from safety.actions import Finding
+from safety.actions import Action, Finding
 from safety.envelope import check_torque, limit_torque
 from safety.limits import EnvelopeLimits
 
@@ -60,10 +60,21 @@ class TorquePath:
     def control(
         self, measured: Measured, setpoints: Setpoints, applied_nm: FloatArray, interval_s: float
     ) -> tuple[FloatArray, bool]:
-        """The torque (n,) to apply, and whether a limit cut it. Raises LawFailed.
+        """The torque (n,) to apply, and whether a limit cut it. Raises LawFailed, whatever the law has raised.
 
         `applied_nm` (n,) is that of the period before. A drive that was lost gives nothing, and the law is told so.
         """
+        try:
+            return self._control(measured, setpoints, applied_nm, interval_s)
+        except LawFailed:
+            raise
+        except Exception as error:
+            text = f"the control law failed: {type(error).__name__}: {error}"
+            raise LawFailed(Finding("control law", Action.TORQUE_OFF, text)) from error
+
+    def _control(
+        self, measured: Measured, setpoints: Setpoints, applied_nm: FloatArray, interval_s: float
+    ) -> tuple[FloatArray, bool]:
         if self.any_lost():
             applied_nm = np.where(self.lost, 0.0, applied_nm)
         if self._state is None:

@@ -11,7 +11,7 @@ from gateway.core.controller import config_hash
 from gateway.core.deployment import Deployment, Region
 from gateway.core.messages import Deploy, Keep, Reply, Rollback, WatchGood, command_bytes
 from gateway.core.theta import nominal_theta
-from gateway.loop.kept import FILE, Store
+from gateway.loop.kept import FILE, Durable, OnTop, Store
 from gateway.loop.pacer import Tick
 from gateway.loop.runner import Runner
 from safety.recovery_prediction import recovery_prediction
@@ -28,12 +28,12 @@ def test_what_is_written_is_read_and_a_write_that_fails_leaves_the_one_before(tm
     assert store.read(LINE, said.append) is None and not said
     region = Region(speed_max_m_per_s=0.1)
     watch = recovery_prediction(nominal_theta(LINE), OTHER, LINE, [0.05])
-    store.write(3, OTHER, region, watch)
+    store.write(Durable(3, OTHER, region, watch))
     kept = store.read(LINE, said.append)
     assert (kept.epoch, kept.controller, kept.region, kept.watch) == (3, OTHER, region, watch) and not said
     (tmp_path / "new" / (FILE + ".part")).mkdir()
     with pytest.raises(OSError, match="directory"):
-        store.write(4, GIVEN, region, None)
+        store.write(Durable(4, GIVEN, region))
     assert store.read(LINE, said.append) == kept
 
 
@@ -47,14 +47,14 @@ def test_what_is_written_is_read_and_a_write_that_fails_leaves_the_one_before(tm
 )
 def test_a_file_that_cannot_be_used_is_told_and_the_given_configuration_runs(tmp_path, spoil, words):
     store, said = Store(tmp_path, GIVEN), []
-    store.write(3, OTHER, Region(), None)
+    store.write(Durable(3, OTHER, Region()))
     spoil(store.path)
     assert store.read(LINE, said.append) is None
     assert words in said[0] and str(store.path) in said[0]
 
 
 def test_a_file_for_another_given_configuration_or_another_line_is_not_used(tmp_path):
-    Store(tmp_path, GIVEN).write(3, OTHER, Region(), None)
+    Store(tmp_path, GIVEN).write(Durable(3, OTHER, Region()))
     said = []
     assert Store(tmp_path, OTHER).read(LINE, said.append) is None and "another configuration" in said[0]
     assert Store(tmp_path, GIVEN).read(demo_line(2), said.append) is None and "for 6 spans" in said[1]
@@ -112,7 +112,7 @@ def test_on_probation_the_disk_has_what_is_good_and_after_keeping_what_was_kept(
     kept = store.read(LINE, said.append)
     assert (kept.controller, kept.watch) == (OTHER, watch) and not said
     again = SteppedLoop(LINE, kept.controller, real_plant(), 1)
-    again.cycle.configurations.resume(kept)
+    again.cycle.resume(kept, print)
     found = again.cycle.configurations.in_service(0.0)
     assert (found.hash, found.last_known_good, found.epoch) == (config_hash(OTHER), config_hash(OTHER), 1)
     assert found.watched and not found.on_probation
@@ -132,7 +132,7 @@ def test_predictive_control_that_was_kept_runs_again_after_a_restart_with_what_i
     kept = store.read(LINE, said.append)
     assert reply.ok and (kept.controller, kept.on_top.controller, kept.epoch) == (GIVEN, PREDICTIVE, 1)
     again = SteppedLoop(LINE, GIVEN, real_plant(), 1)
-    again.cycle.configurations.resume(kept)
+    again.cycle.resume(kept, print)
     found = again.cycle.configurations.in_service(0.0)
     assert (found.hash, found.last_known_good) == (config_hash(PREDICTIVE), config_hash(GIVEN))
     assert found.watched and not found.on_probation and not said
@@ -148,14 +148,14 @@ def test_predictive_control_that_was_given_up_does_not_come_back(tmp_path):
 def test_predictive_control_stays_kept_where_its_successor_is_refused_at_the_last_moment(tmp_path):
     store = Store(tmp_path, GIVEN)
     loop, runner = predictive_kept(store)
-    checked = loop.cycle.configurations.candidate
+    checked = loop.cycle.admission.admit
 
-    def late(deployment):
-        candidate = checked(deployment)
+    def late(deployment, good):
+        candidate = checked(deployment, good)
         loop.cycle.configurations.epoch = 2  # somebody else's has come first
         return candidate
 
-    loop.cycle.configurations.candidate = late
+    loop.cycle.admission.admit = late
     (reply,) = told(runner, loop, deploy(2), until=lambda: store.read(LINE, print).on_top is not None)
     assert not reply.ok and store.read(LINE, print).on_top.controller == PREDICTIVE
 

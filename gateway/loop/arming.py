@@ -1,0 +1,101 @@
+"""Whether the line may be armed, the links' way there, and back to silence however an arming ends."""
+
+from drivers.cleanup import finish_all
+from drivers.port import PrepareRefused
+from gateway.core.messages import Reply
+from gateway.core.signals import Channel, Quality
+from gateway.core.states import LoopState, Phase
+from gateway.loop.cycle import Cycle
+from gateway.loop.machine import STANDSTILL_M_PER_S
+from gateway.loop.refused import Refused
+
+SILENT_PATIENCE_S = 0.25  #: without cyclic data (a silent CANopen link reads by SDO) samples are this old at most
+
+
+def refusal_to_arm(cycle: Cycle) -> Reply | None:
+    """Why no link may be touched for an arming: the line is not at rest, or a sample speaks against it. None: go on."""
+    try:
+        require_rest(cycle)
+    except Refused as refusal:
+        return Reply(ok=False, state=cycle.machine.state.name, text=str(refusal))
+    reasons = not_ready(cycle)
+    return not_armed(cycle, reasons) if reasons else None
+
+
+def not_armed(cycle: Cycle, reasons: list[str]) -> Reply:
+    text = "not armed; mend what is named and arm again"
+    return Reply(ok=False, state=cycle.machine.state.name, text=text, reasons=reasons)
+
+
+async def prepare_links(cycle: Cycle) -> list[str]:
+    """Prove everything that must hold before torque is possible, on links that are released; periods go on meanwhile.
+
+    Returns every reason of every link that refuses. Whoever calls releases all links where there is one, and where
+    this is cancelled or raises.
+    """
+    reasons: list[str] = []
+    for link in cycle.links:
+        try:
+            await link.prepare()
+        except PrepareRefused as refusal:
+            reasons += refusal.reasons
+    return reasons
+
+
+async def release_links(cycle: Cycle) -> None:
+    """No link sends any more, and no device waits for it: all of them at once, to the end even where this is cancelled.
+
+    One that fails keeps no other from it. Raises the first failure, after all have been released.
+    """
+    failures = await finish_all(link.release() for link in cycle.links)
+    if failures:
+        raise failures[0]
+
+
+def not_ready(cycle: Cycle) -> list[str]:
+    """What speaks against arming, as far as the samples tell. One that is late is no reason to send a person away."""
+    unfit = [cycle.unfit] if cycle.unfit else []
+    return unfit + forbidden(cycle) + unheard(cycle)
+
+
+def forbidden(cycle: Cycle) -> list[str]:
+    """What the line PLC says against arming, as far as it has been heard."""
+    inputs = cycle.inputs
+    if not plc_heard(cycle):
+        return []
+    if inputs.plc.emergency_stop:
+        return ["the emergency stop circuit is open: release it"]
+    if not inputs.plc.permissive:
+        return ["the line PLC gives no permissive"]
+    if not abs(inputs.unwind_speed.value[0]) <= STANDSTILL_M_PER_S:  # NaN does not stand still
+        return [f"the unwinder turns at {inputs.unwind_speed.value[0]:.4f} m/s: wait for standstill"]
+    return []
+
+
+def unheard(cycle: Cycle) -> list[str]:
+    """Devices without a usable sample lately."""
+    reasons = [] if plc_heard(cycle) else [f"the line PLC ({cycle.line.plc.name}) gives no usable answer"]
+    for cell in cycle.line.load_cells:
+        if not heard(cycle, cycle.inputs.tension, cell.span - 1):
+            reasons.append(f"load cell {cell.name} (span {cell.span}) gives no usable value")
+    return reasons
+
+
+def plc_heard(cycle: Cycle) -> bool:
+    # v0 comes in the same answer. A PLC that answers but lost its watchdog is not GOOD either: arming proves it anew.
+    inputs = cycle.inputs
+    return heard(cycle, inputs.unwind_speed, 0) and inputs.plc.quality in (Quality.GOOD, Quality.STALE)
+
+
+def heard(cycle: Cycle, channel: Channel, index: int) -> bool:
+    """Whether a usable sample came lately: within as many periods as a running line may miss, or SILENT_PATIENCE_S."""
+    age_s = cycle.clock() - channel.time_s[index]  # NaN for one that was never heard
+    return bool(age_s < max((cycle.limits.hold_periods + 1) * cycle.limits.period_s, SILENT_PATIENCE_S))
+
+
+def require_rest(cycle: Cycle) -> None:
+    machine = cycle.machine
+    if machine.state not in (LoopState.SILENT, LoopState.STOP):
+        raise Refused(f"the line is {machine.state.name} already")
+    if machine.phase not in (Phase.SILENT, Phase.OFF):
+        raise Refused(f"the line is still {machine.phase.name.lower()}: wait until torque is off")

@@ -1,0 +1,52 @@
+"""An exception of a part of the period is a finding, not the end of the process.
+
+The first one stops the line in order: what failed is left out from then on, everything else goes on watching. A second
+one in the same run shows that the loop cannot be relied on: it is raised, and ends the process, whose last act is to
+take torque off (`process`). Arming gives every part another chance.
+"""
+
+from collections.abc import Callable
+from typing import TypeVar
+
+from safety.actions import Action, Finding
+
+T = TypeVar("T")
+
+PART_FAILED = "part failed"  #: the rule's name
+
+
+class Containment:
+    """Of one loop. `failed`: the parts that are left out, with why."""
+
+    def __init__(self) -> None:
+        self.failed: dict[str, str] = {}
+        self._untold: list[Finding] = []
+
+    def run(self, part: str, do: Callable[[], T], otherwise: T, action: Action = Action.STOP) -> T:
+        """What `do` returns; `otherwise` where it raises, or has been left out since. Raises what fails second."""
+        if part in self.failed:
+            return otherwise
+        try:
+            return do()
+        except Exception as error:  # whatever it is
+            self.fail(part, error, action)
+            return otherwise
+
+    def fail(self, part: str, error: Exception, action: Action = Action.STOP) -> None:
+        """`part` has raised `error` and is left out from now on. Raises it again where it is the second."""
+        if self.failed:
+            raise error
+        self.failed[part] = f"{type(error).__name__}: {error}"
+        text = (
+            f"{part} failed and is left out until the line is armed: {self.failed[part]}; keep the log, and report it"
+        )
+        self._untold.append(Finding(PART_FAILED, action, text))
+
+    def take_findings(self) -> list[Finding]:
+        """What has failed since this was asked last."""
+        untold, self._untold = self._untold, []
+        return untold
+
+    def begin_anew(self) -> None:
+        """A person arms."""
+        self.failed.clear()
