@@ -26,7 +26,7 @@ from gateway.loop.kept import Kept
 from safety.recoverability import Recovery
 
 LAW_SHARE = 0.45  #: of a period, for engaging and asking a law; the samples have half of it, before
-WATCH_SHARE = 0.3  #: for the prediction; only where no solution of its own is asked for it takes its longer way
+WATCH_SHARE = 0.4  #: for the prediction, along the longer of its ways; what is left is for reading and writing
 WARM_PERIODS = 3  #: first solutions take longest: they are not measured
 MEASURED_PERIODS = 7  #: of which the median counts
 

@@ -84,7 +84,7 @@ async def _main(
         (refused if sleepy else granted).append(sleepy or "processors stay awake")
         for sentence in ["; ".join(granted) or "no real-time help granted", *refused]:
             say(sentence)
-        await _run_until(runner, line, ending, store)
+        await run_until(runner, line, ending, store)
     finally:
         await finish_all(link.close() for link in links)
         runner.close()
@@ -122,7 +122,7 @@ async def _open(links: list[Link]) -> list[str]:
     return troubles
 
 
-async def _run_until(runner: Runner, line: Line, ending: asyncio.Event, store: Store | None = None) -> None:
+async def run_until(runner: Runner, line: Line, ending: asyncio.Event, store: Store | None = None) -> None:
     """Periods until `ending`, then until the line rests. An exception ends it with torque off, and is raised."""
     cycle, pacer = runner.cycle, TimerPacer(line.control.period_s)
     try:

@@ -14,7 +14,7 @@ from gateway.core.messages import Arm, Deploy, SetSpeed, SetTension, Start, Stop
 from gateway.core.states import LoopState, Phase
 from gateway.loop.machine import Machine
 from gateway.loop.pacer import Tick
-from gateway.loop.process import _run_until
+from gateway.loop.process import run_until
 from gateway.loop.runner import MAX_WAITING, Runner
 from tests.closed_loop.conftest import start, stepped
 
@@ -192,7 +192,7 @@ def test_a_cycle_that_breaks_twice_ends_and_tells_every_drive_to_take_torque_off
         monkeypatch.setattr(loop.cycle, "_frame", broken)
         monkeypatch.setattr(MemoryLink, "trigger", lambda self, now_s: setattr(self, "_now_s", plant_s + 0.01))
         with pytest.raises(RuntimeError, match="a defect"):
-            await _run_until(told.runner, loop.line, asyncio.Event())
+            await run_until(told.runner, loop.line, asyncio.Event())
         loop.truth.sample(plant_s + 1.0)
         assert not loop.truth.world.torque_nm.any()
         enabled = loop.truth.sample(plant_s + 1.1).enabled

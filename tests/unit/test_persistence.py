@@ -1,0 +1,210 @@
+"""The loop that starts next runs what was decided last, in whatever order and whichever write fails."""
+
+import asyncio
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from gateway.cli.stepped import SteppedLoop
+from gateway.control.design import design_lqi, design_mpc, design_pid, task_of
+from gateway.core.controller import config_hash
+from gateway.core.deployment import Deployment, first_region
+from gateway.core.messages import Deploy, Keep, Narrow, Rollback, WatchGood
+from gateway.core.theta import nominal_theta
+from gateway.loop import persistence
+from gateway.loop.kept import Store
+from gateway.loop.pacer import Tick
+from gateway.loop.persistence import NOT_PERSISTED, PERSISTED
+from gateway.loop.runner import Runner
+from safety.recovery_prediction import recovery_prediction
+from tests.closed_loop.conftest import demo_line, real_plant
+
+LINE = demo_line()
+GIVEN, OTHER, PREDICTIVE = (design(task_of(LINE)) for design in (design_lqi, design_pid, design_mpc))
+WATCH = recovery_prediction(nominal_theta(LINE), GIVEN, LINE, [0.05])
+TENSION_N = np.array([28.0, 36.0, 20.0, 40.0, 24.0, 32.0])
+
+
+class Disk(Store):
+    """Refuses the writes whose numbers, from 1, are in `refused`."""
+
+    def __init__(self, folder):
+        super().__init__(folder, GIVEN)
+        self.refused, self.asked = set(), 0
+
+    def write(self, durable):
+        self.asked += 1
+        if self.asked in self.refused:
+            raise OSError(28, "No space left on device")
+        super().write(durable)
+
+
+class Story:
+    """Commands against periods; every `await` on it runs one more period."""
+
+    def __init__(self, store):
+        self.loop = SteppedLoop(LINE, GIVEN, real_plant(), 1)
+        self.loop.begin_in_production(TENSION_N, 0.05)
+        self.loop.step(5)
+        self.store, self.runner = store, Runner(self.loop.cycle, store)
+
+    async def period(self):
+        loop = self.loop
+        loop.now_s = loop.periods * LINE.control.period_s
+        await self.runner.period(Tick(loop.now_s, loop.now_s, 0))
+        loop.periods += 1
+        await asyncio.sleep(0.001)
+
+    async def ask(self, command):
+        answer = asyncio.ensure_future(self.runner.submit(command))
+        while not answer.done():
+            await self.period()
+        return answer.result()
+
+    async def until(self, holds):
+        for _ in range(20_000):
+            if holds():
+                return
+            await self.period()
+        raise AssertionError("it does not come to that")
+
+    def kinds(self):
+        return [kind for kind, _ in self.loop.told]
+
+    def on_disk(self):
+        kept = Store(self.store.path.parent, GIVEN).read(LINE, print)
+        return None if kept is None else kept.durable
+
+    def as_decided(self):
+        return self.on_disk() == self.loop.cycle.configurations.durable
+
+
+def told(store, story):
+    async def run():
+        telling = Story(store)
+        try:
+            await story(telling)
+        finally:
+            telling.runner.close()
+
+    asyncio.run(run())
+
+
+def deploy(epoch=1, controller=OTHER, **changes):
+    return Deploy(
+        deployment=Deployment(controller=controller, hash=config_hash(controller), epoch=epoch, lease_s=60.0, **changes)
+    )
+
+
+@pytest.fixture(autouse=True)
+def again_soon(monkeypatch):
+    monkeypatch.setattr(persistence, "AGAIN_S", 0.01)
+
+
+@pytest.mark.parametrize("refused", [(), (2,), (2, 3, 4)])
+def test_a_rollback_while_the_disk_takes_what_is_kept_is_what_the_next_loop_runs(tmp_path, refused):
+    """The first write from then on is that of `keep`; what follows puts right what was decided otherwise meanwhile."""
+
+    async def story(it):
+        assert (await it.ask(deploy())).ok
+        assert not await it.runner.persisted(10.0)
+        it.store.refused = {it.store.asked + number for number in refused}
+        write = it.store.write
+
+        def taken_back_meanwhile(durable):
+            write(durable)
+            if durable.controller == OTHER:
+                it.loop.cycle.roll_back("it hums")
+
+        it.store.write = taken_back_meanwhile
+        reply = await it.ask(Keep(epoch=1, watch=None))
+        assert not reply.ok and reply.in_service.hash == config_hash(GIVEN)
+        await it.until(it.as_decided)
+        assert it.on_disk().controller == GIVEN
+        assert (NOT_PERSISTED in it.kinds()) == bool(refused)
+        assert it.kinds().count(NOT_PERSISTED) == it.kinds().count(PERSISTED)  # told once, and that it is over
+
+    told(Disk(tmp_path), story)
+
+
+@pytest.mark.parametrize("command", [Keep(epoch=1, watch=None), WatchGood(watch=WATCH)])
+def test_where_the_disk_refuses_nothing_is_granted_and_it_is_not_behind(tmp_path, command):
+    async def story(it):
+        if isinstance(command, Keep):
+            assert (await it.ask(deploy())).ok
+        before = it.loop.cycle.configurations.durable
+        it.store.refused = {it.store.asked + 1}
+        reply = await it.ask(command)
+        assert not reply.ok and "nothing could be kept" in reply.reasons[0]
+        assert it.loop.cycle.configurations.durable == before
+        await it.until(it.as_decided)
+
+    told(Disk(tmp_path), story)
+
+
+def predictive_is_kept(it):
+    async def steps():
+        for command in (deploy(controller=PREDICTIVE), Keep(epoch=1, watch=WATCH)):
+            assert (await it.ask(command)).ok
+        assert it.on_disk().on_top.controller == PREDICTIVE
+
+    return steps()
+
+
+@pytest.mark.parametrize("command", [Rollback(reason="it hums"), Narrow(region=first_region(LINE))])
+def test_what_is_taken_back_is_on_the_disk_when_it_is_answered(tmp_path, command):
+    async def story(it):
+        await predictive_is_kept(it)
+        await it.ask(command)
+        assert it.as_decided()
+
+    told(Disk(tmp_path), story)
+
+
+def test_an_answer_says_that_the_next_loop_would_not_know(tmp_path, monkeypatch):
+    monkeypatch.setattr("gateway.loop.runner.PERSISTED_S", 0.05)
+
+    async def story(it):
+        await predictive_is_kept(it)
+        it.store.refused = set(range(it.store.asked + 1, it.store.asked + 100_000))
+        reply = await it.ask(Rollback(reason="it hums"))
+        assert reply.ok and "does not know it yet" in reply.text and "No space left" in reply.text
+        it.store.refused = set()
+        await it.until(it.as_decided)
+        assert it.on_disk().on_top is None and PERSISTED in it.kinds()
+
+    told(Disk(tmp_path), story)
+
+
+def test_a_deployment_that_is_not_made_leaves_what_was_kept_on_top(tmp_path):
+    """Its epoch goes to the disk first; a loop that dies between the two goes on with what was in service."""
+
+    async def story(it):
+        await predictive_is_kept(it)
+        seen = []
+        decide = it.runner.cycle.deploy
+        it.runner.cycle.deploy = lambda *given: (seen.append(it.on_disk()), decide(*given))
+        assert (await it.ask(deploy(2))).ok
+        assert (seen[0].epoch, seen[0].on_top.controller) == (2, PREDICTIVE)
+        await it.until(it.as_decided)
+        assert (it.on_disk().epoch, it.on_disk().on_top) == (2, None)  # on probation: what is good
+
+    told(Disk(tmp_path), story)
+
+
+def test_a_model_that_is_refused_at_the_boundary_is_not_on_the_disk(tmp_path):
+    async def story(it):
+        configurations = it.loop.cycle.configurations
+        write = it.store.write
+
+        def somebody_else_deploys(durable):
+            write(durable)
+            if durable.watch is not None:
+                configurations.good = configurations.running = replace(configurations.good, hash="f" * 64)
+
+        it.store.write = somebody_else_deploys
+        assert not (await it.ask(WatchGood(watch=WATCH))).ok
+        await it.until(lambda: it.on_disk() is not None and it.on_disk().watch is None)
+
+    told(Disk(tmp_path), story)
