@@ -121,6 +121,7 @@ def test_a_rollback_while_the_disk_takes_what_is_kept_is_what_the_next_loop_runs
         reply = await it.ask(Keep(epoch=1, watch=None))
         assert not reply.ok and reply.in_service.hash == config_hash(GIVEN)
         await it.until(it.as_decided)
+        assert not await it.runner.persisted(10.0)
         assert it.on_disk().controller == GIVEN
         assert (NOT_PERSISTED in it.kinds()) == bool(refused)
         assert it.kinds().count(NOT_PERSISTED) == it.kinds().count(PERSISTED)  # told once, and that it is over
@@ -172,6 +173,7 @@ def test_an_answer_says_that_the_next_loop_would_not_know(tmp_path, monkeypatch)
         assert reply.ok and "does not know it yet" in reply.text and "No space left" in reply.text
         it.store.refused = set()
         await it.until(it.as_decided)
+        assert not await it.runner.persisted(10.0)
         assert it.on_disk().on_top is None and PERSISTED in it.kinds()
 
     told(Disk(tmp_path), story)
