@@ -6,10 +6,11 @@ take torque off (`process`). Arming gives every part another chance.
 """
 
 from collections.abc import Callable
-from typing import TypeVar
+from typing import ParamSpec, TypeVar
 
 from safety.actions import Action, Finding
 
+P = ParamSpec("P")
 T = TypeVar("T")
 
 PART_FAILED = "part failed"  #: the rule's name
@@ -22,14 +23,14 @@ class Containment:
         self.failed: dict[str, str] = {}
         self._untold: list[Finding] = []
 
-    def run(self, part: str, do: Callable[[], T], otherwise: T, action: Action = Action.STOP) -> T:
+    def run(self, part: str, otherwise: T, do: Callable[P, T], *args: P.args, **named: P.kwargs) -> T:
         """What `do` returns; `otherwise` where it raises, or has been left out since. Raises what fails second."""
-        if part in self.failed:
+        if self.failed and part in self.failed:
             return otherwise
         try:
-            return do()
+            return do(*args, **named)
         except Exception as error:  # whatever it is
-            self.fail(part, error, action)
+            self.fail(part, error)
             return otherwise
 
     def fail(self, part: str, error: Exception, action: Action = Action.STOP) -> None:
@@ -44,7 +45,9 @@ class Containment:
 
     def take_findings(self) -> list[Finding]:
         """What has failed since this was asked last."""
-        untold, self._untold = self._untold, []
+        untold = self._untold
+        if untold:
+            self._untold = []
         return untold
 
     def begin_anew(self) -> None:

@@ -147,22 +147,22 @@ class Cycle:
         self.guard.sent(torque_nm)
         cycle_s = self.clock() - tick.now_s
         self._watch_after(seen, tick, before_nm, torque_nm, saturated)
-        self.containment.run("telemetry", lambda: self._frame(tick, saturated, cycle_s), None)
+        self.containment.run("telemetry", None, self._frame, tick, saturated, cycle_s)
         self._heed_failures(tick.now_s)
 
     def _watch_after(
         self, seen: Assessment, tick: Tick, before_nm: FloatArray, torque_nm: FloatArray, saturated: bool
     ) -> None:
         """What only blocks proposals or ends an experiment: after the commands are out."""
+        run = self.containment.run
         if self.machine.phase in CONTROLLED and seen.usable:
-            watched = lambda: self.watch.controlled(self.inputs, self.setpoints, before_nm, saturated)  # noqa: E731
-            self._alarm(self.containment.run("the watch for doubts", watched, []))
-        look = lambda: self.experiments.look(self.inputs, torque_nm, self.account.held, tick.due_s)  # noqa: E731
-        self.containment.run("the experiment", look, None)
+            controlled = self.watch.controlled
+            self._alarm(run("the watch for doubts", [], controlled, self.inputs, self.setpoints, before_nm, saturated))
+        run("the experiment", None, self.experiments.look, self.inputs, torque_nm, self.account.held, tick.due_s)
 
     def _end_what_lapsed(self, now_s: float) -> None:
         configurations = self.configurations
-        if why := self.containment.run("the lease", lambda: configurations.lapsed(now_s), ""):
+        if why := self.containment.run("the lease", "", configurations.lapsed, now_s):
             self.roll_back(why)
         configurations.settle_moves()
 
@@ -199,7 +199,7 @@ class Cycle:
     def tell(self, kind: str, text: str, **data: object) -> None:
         """An event, to whoever listens."""
         if (tell := self._tell) is not None:
-            self.containment.run("events", lambda: tell(kind, text, **data), None)
+            self.containment.run("events", None, tell, kind, text, **data)
 
     def foreseen(self, setpoint_n: FloatArray, unwind_speed_m_per_s: float | None = None) -> str:
         """What would come of these set-points (n,), or this speed, at once, as the accepted model has it; or nothing.
@@ -224,9 +224,12 @@ class Cycle:
         self._move_to(machine, [])
 
     async def _read(self, tick: Tick) -> None:
-        links = [link for link in self.links if _part(link) not in self.containment.failed]
+        links = self._usable_links()
         for link in links:
-            self.containment.run(_part(link), lambda link=link: link.trigger(tick.now_s), None, Action.TORQUE_OFF)
+            try:
+                link.trigger(tick.now_s)
+            except Exception as error:
+                self.containment.fail(_part(link), error, Action.TORQUE_OFF)
         self._latched_s = self.clock()  # later than it was: it may take time to be sent on a busy computer
         deadline_s = tick.now_s + READ_SHARE * self.limits.period_s
         for link in links:
@@ -234,12 +237,16 @@ class Cycle:
                 await link.collect(self.inputs, deadline_s)
             except Exception as error:  # a link promises not to: what it has left is not to be relied on
                 self.containment.fail(_part(link), error, Action.TORQUE_OFF)
-        if len(links) < len(self.links) or self.containment.failed:
+        if self.containment.failed:
             self._miss_failed_links()
+
+    def _usable_links(self) -> list[Link]:
+        failed = self.containment.failed
+        return [link for link in self.links if _part(link) not in failed] if failed else self.links
 
     def _miss_failed_links(self) -> None:
         """Whose samples a link that failed would have brought is not known here: none is relied on."""
-        if any(_part(link) in self.containment.failed for link in self.links):
+        if len(self._usable_links()) < len(self.links):
             for channel in (self.inputs.tension, self.inputs.speed, self.inputs.torque, self.inputs.unwind_speed):
                 for i in range(len(channel.value)):
                     channel.miss(i)
@@ -247,16 +254,16 @@ class Cycle:
     def _check(self, tick: Tick) -> Assessment:
         phase, run = self.machine.phase, self.containment.run
         supervision = SUPERVISION[phase]
-        jumps = run("the check for jumps", lambda: self._reject_jumps(supervision), [])
+        jumps = run("the check for jumps", [], self._reject_jumps, supervision)
         if phase in WITH_TORQUE:
             self.torque_path.lost |= self.inputs.drive_state != _ENABLED
-        seen = run("the envelope", lambda: self._check_envelope(tick, supervision), None)
+        seen = run("the envelope", None, self._check_envelope, tick, supervision)
         if seen is None:
             return Assessment([], usable=False, feedback_lost=True, plc_lost=True)
         if supervision.feedback:
             seen.findings.extend(jumps)
             if seen.usable:
-                seen.findings.extend(run("the check for stuck signals", lambda: self.watch.find_stuck(self.inputs), []))
+                seen.findings.extend(run("the check for stuck signals", [], self.watch.find_stuck, self.inputs))
         return seen
 
     def _reject_jumps(self, supervision: Supervision) -> list[Finding]:
@@ -309,7 +316,7 @@ class Cycle:
             self.roll_back(f"the line stopped: {machine.reason}")
         if machine.phase is Phase.OFF:  # a speed from before the stop is not taken up again
             self.setpoints.speed_target_m_per_s = self.setpoints.recipe.speed_m_per_s
-        self.containment.run("events", lambda: self._announce(before, machine, findings), None)
+        self.containment.run("events", None, self._announce, before, machine, findings)
 
     def _torque(self, seen: Assessment, tick: Tick) -> tuple[FloatArray, bool]:
         """The torque (n,) to apply in this period, and whether a limit cut it."""
@@ -360,7 +367,7 @@ class Cycle:
             return found
         guard, setpoint_n = self.guard, self.setpoints.tension_n
         against = self.containment.run(
-            "the monitor", lambda: guard.against(configurations, path, measured, setpoint_n, found), []
+            "the monitor", [], guard.against, configurations, path, measured, setpoint_n, found
         )
         self._heed_failures(now_s)
         if not against:
@@ -382,7 +389,7 @@ class Cycle:
         phase = self.machine.phase
         goal = self.setpoints.speed_target_m_per_s if phase is Phase.RUNNING else 0.0
         if (run := self.experiments.run) is not None:
-            goal = self.containment.run("the experiment", lambda: run.advance(self.setpoints), 0.0)
+            goal = self.containment.run("the experiment", 0.0, run.advance, self.setpoints)
         rate = moves.stop_rate_m_per_s2 if phase is Phase.SLOWING else moves.speed_rate_m_per_s2
         shape = moves.shape if phase is Phase.RUNNING else "ramp"  # what stops does not wait for a curve to bend
         self.setpoints.advance(moves, self.limits.period_s, goal, rate, shape)
@@ -395,8 +402,11 @@ class Cycle:
             self.setpoints.begin_at_speed(0.0)
         outputs.speed_request_m_per_s = self.setpoints.speed_m_per_s
         outputs.run = phase in CONTROLLED
-        for link in self.links:
-            self.containment.run(_part(link), lambda link=link: link.write(outputs), None, Action.TORQUE_OFF)
+        for link in self._usable_links():
+            try:
+                link.write(outputs)
+            except Exception as error:
+                self.containment.fail(_part(link), error, Action.TORQUE_OFF)
 
     def _requests(self) -> Any:
         """What is asked of each drive: enabling only while ENABLING, and again only after a person has armed."""
@@ -414,7 +424,7 @@ class Cycle:
 
     def _alarm(self, findings: list[Finding]) -> None:
         if findings:
-            self.containment.run("events", lambda: self._announce(self.machine, self.machine, findings), None)
+            self.containment.run("events", None, self._announce, self.machine, self.machine, findings)
 
     def _stays_on(self) -> BoolArray:
         """Drives (n,) that do not obey OFF. Said once, when it begins."""

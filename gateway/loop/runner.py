@@ -88,8 +88,8 @@ class Runner:
     def _carry_out(self, command: Command, prepared: Prepared, now_s: float) -> Reply:
         """A command that fails stops the line in order, as any part of a period does."""
         name = command.command
-        done = lambda: carry_out(self.cycle, command, now_s, prepared)  # noqa: E731
-        reply = self.cycle.containment.run(f"the command {name}", done, None)
+        run = self.cycle.containment.run
+        reply = run(f"the command {name}", None, carry_out, self.cycle, command, now_s, prepared)
         return reply or self._refused(f"{name} failed within the loop, which stops the line for it")
 
     async def end(self) -> None:
