@@ -32,7 +32,7 @@ def make_law(config: Controller) -> Law[Any]:
         case LqgConfig():
             return Lqg(config)
         case MpcConfig():
-            from gateway.control.mpc import Mpc  # 25 MB of solver, for those who use it
+            from gateway.control.mpc import Mpc  # the solver, for those who use it
 
             return Mpc(config)
         case ScheduledConfig():

@@ -3,15 +3,15 @@
 With x = [x~; torques in flight] and w = u~ + d, x_{k+1} = F x_k + G w_k. Over the horizon the states are
 X = Phi x_0 + Gamma z, z the torques w of each block and one slack per span, so that
 
-    minimise  1/2 z' P z + q' z   subject to   lower <= A z <= upper
+    minimise  1/2 z' P z + (L x_0)' z   subject to   lower <= A z + C x_0 <= upper
 
-where P and A stay as they are and q, lower, upper follow from the estimate. Rows: torque of each block; its change from
-the block before, as far as the rate goes from one block's middle to the next; and, where tension limits are looked at,
-the tensions at the end of each block, to which a span's slack is added.
+where P, L, A and C stay as they are and lower and upper follow from the estimate. Rows: torque of each block; its
+change from the block before, as far as the rate goes from one block's middle to the next; and, where tension limits are
+looked at, the deviations of the tensions at the end of each block from their set-points, to which a span's slack is
+added.
 """
 
 import numpy as np
-from scipy.sparse import csc_matrix, triu
 
 from gateway.control.observer import Estimate
 from gateway.control.sampled import Sampled
@@ -23,13 +23,14 @@ CLEAR = 0.025
 
 
 class MpcProblem:
-    """P, A and the products that give the rest. All in Nm and N."""
+    """P, L, A and C, and the limits of an estimate. All in Nm and N."""
 
     def __init__(self, config: MpcConfig) -> None:
+        """Slow: powers of the model over the horizon, a tenth of a second at 60 spans."""
         self._config = config
         n, blocks = config.n, config.blocks
         self._n = n
-        self._limited = config.weight_tension_limit > 0.0
+        self.limited = config.weight_tension_limit > 0.0  #: whether there are rows of tensions, and slack
         model = config.predictor
         F, G = Sampled(np.array(model.transition), [np.array(matrix) for matrix in model.inputs]).augmented()
         free, forced = _trajectories(F, G, blocks)  # (N_p, s, s) and (N_p, s, n blocks)
@@ -37,71 +38,84 @@ class MpcProblem:
         weight[:, : 2 * n, : 2 * n] = np.diag(config.weight_state)
         weight[-1] = config.weight_terminal  # the state at the end is in it with all that comes after
         torque = np.kron(np.diag(np.array(blocks, dtype=np.float64)), np.diag(config.weight_torque))
-        weighted = np.einsum("ksz,kst->kzt", forced, weight)
-        hessian = 2.0 * (np.einsum("kzt,kty->zy", weighted, forced) + torque)
-        self._linear: FloatArray = 2.0 * np.einsum("kzt,kts->zs", weighted, free)
+        weighted = np.swapaxes(forced, 1, 2) @ weight
+        hessian = 2.0 * ((weighted @ forced).sum(axis=0) + torque)
         ends = np.cumsum(blocks) - 1
-        self._tension_free = free[ends][:, :n].reshape(-1, F.shape[0])
         tension = forced[ends][:, :n].reshape(-1, n * len(blocks))
 
         self.torque_variables = n * len(blocks)
-        self.variables = self.torque_variables + (n if self._limited else 0)
+        self.variables = self.torque_variables + (n if self.limited else 0)
         change = np.eye(self.torque_variables) - np.eye(self.torque_variables, k=-n)
         self.torque_rows = 2 * self.torque_variables  #: the first ones of A; the others are of tensions
-        matrix = np.vstack((np.eye(self.torque_variables), change))
-        # The symmetric part: rounding makes halves differ, and the solver reads one of them.
+        # The symmetric part: rounding makes halves differ.
         hessian = 0.5 * (hessian + hessian.T)
         self.hessian: FloatArray = hessian  #: of the torques alone, (n blocks, n blocks)
-        if self._limited:
+        self.L: FloatArray = 2.0 * (weighted @ free).sum(axis=0)  #: (n blocks, s): what it is to the slack is 0
+        rows: FloatArray = np.vstack((np.eye(self.torque_variables), change))
+        if self.limited:
             hessian = _block_diagonal(hessian, 2.0 * config.weight_tension_limit * np.eye(n))
             none = np.zeros((self.torque_rows, n))
-            matrix = np.block([[matrix, none], [tension, np.tile(np.eye(n), (len(blocks), 1))]])
-        self.P = csc_matrix(triu(hessian))
-        self.A = csc_matrix(matrix)
-        self.rows = matrix.shape[0]
+            rows = np.block([[rows, none], [tension, np.tile(np.eye(n), (len(blocks), 1))]])
+        self.P: FloatArray = hessian
+        self.A: FloatArray = rows  #: begins with the unit matrix
+        self.rows = self.A.shape[0]
+        self.C: FloatArray = np.zeros((self.rows, F.shape[0]))
+        if self.limited:
+            self.C[self.torque_rows :] = free[ends][:, :n].reshape(-1, F.shape[0])
         # From the middle of a block to that of the next; the first torque follows the one sent last by a period.
         apart = np.concatenate(([1.0], 0.5 * (np.array(blocks[1:]) + np.array(blocks[:-1]))))
-        self._reach_nm: FloatArray = config.torque_rate_nm_per_s * config.period_s * np.repeat(apart, n)
+        reach_nm: FloatArray = config.torque_rate_nm_per_s * config.period_s * np.repeat(apart, n)
         self._blocks = np.repeat(np.arange(len(blocks)), blocks)
-        self._lower = np.full(self.rows, -np.inf)
-        self._upper = np.full(self.rows, np.inf)
+        # (torque, change and tension; blocks; n): the rows of A, one limit of each
+        self._lower = np.empty((self.rows // self.torque_variables, len(blocks), n))
+        self._upper = np.empty_like(self._lower)
+        self._lower[1], self._upper[1] = -reach_nm.reshape(-1, n), reach_nm.reshape(-1, n)
+        self._reach_nm: FloatArray = reach_nm[:n]
+        self._clear_n = CLEAR * (config.tension_max_n - config.tension_min_n)
 
     def gain(self) -> FloatArray:
         """K (n, 2n + n d) of w_0 = -K [x~; torques in flight]: the law where no limit is reached."""
-        gain: FloatArray = np.asarray(np.linalg.solve(self.hessian, self._linear), dtype=np.float64)
+        gain: FloatArray = np.asarray(np.linalg.solve(self.hessian, self.L), dtype=np.float64)
         return gain[: self._n]
+
+    def state(self, found: Estimate) -> FloatArray:
+        """x_0 (2n + n d,)."""
+        return np.concatenate((found.state, found.in_flight_nm.ravel()))
+
+    def limits(
+        self, found: Estimate, tension_setpoint_n: FloatArray, applied_nm: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """lower and upper (rows,) for an estimate, set-points (n,) and the torque sent last (n,).
+
+        The next call writes over them.
+        """
+        config, lower, upper = self._config, self._lower, self._upper
+        shift = found.errors.torque_nm - found.disturbance_nm  # u = w + shift
+        lower[0], upper[0] = -config.torque_nm - shift, config.torque_nm - shift
+        taken_nm = found.bump_nm  # what was taken over is added to the first torque
+        lower[0, 0] -= taken_nm
+        upper[0, 0] -= taken_nm
+        begin_nm = applied_nm - shift - taken_nm
+        lower[1, 0], upper[1, 0] = begin_nm - self._reach_nm, begin_nm + self._reach_nm
+        if self.limited:
+            # A set-point beyond what is planned for is held all the same, and a slack web is tensioned.
+            lower[2] = np.minimum(config.tension_min_n - tension_setpoint_n, -self._clear_n)
+            upper[2] = np.maximum(config.tension_max_n - tension_setpoint_n, self._clear_n)
+        return lower.reshape(-1), upper.reshape(-1)
 
     def vectors(
         self, found: Estimate, tension_setpoint_n: FloatArray, applied_nm: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """q, lower and upper for an estimate, set-points (n,) and the torque sent last (n,).
+        """q, lower and upper of the programme by itself, lower <= A z <= upper: for who knows nothing of x_0."""
+        x = self.state(found)
+        lower, upper = self.limits(found, tension_setpoint_n, applied_nm)
+        return self.linear(x), lower - self.C.dot(x), upper - self.C.dot(x)
 
-        The next call writes over them.
-        """
-        config, n, m = self._config, self._n, self.torque_variables
-        x = np.concatenate((found.state, found.in_flight_nm.ravel()))
+    def linear(self, x: FloatArray) -> FloatArray:
+        """q (variables,)."""
         q = np.zeros(self.variables)
-        q[:m] = self._linear.dot(x)
-        lower, upper = self._lower, self._upper
-        shift = found.errors.torque_nm - found.disturbance_nm  # u = w + shift
-        blocks = len(config.blocks)
-        lower[:m] = np.tile(-config.torque_nm - shift, blocks)
-        upper[:m] = np.tile(config.torque_nm - shift, blocks)
-        lower[m : 2 * m], upper[m : 2 * m] = -self._reach_nm, self._reach_nm
-        lower[m : m + n] += applied_nm - shift
-        upper[m : m + n] += applied_nm - shift
-        for bound in (lower, upper):  # what was taken over is added to the first torque
-            bound[:n] -= found.bump_nm
-            bound[m : m + n] -= found.bump_nm
-        if self._limited:
-            tension = np.tile(tension_setpoint_n, blocks) + self._tension_free.dot(x)
-            # A set-point beyond what is planned for is held all the same, and a slack web is tensioned.
-            clear_n = CLEAR * (config.tension_max_n - config.tension_min_n)
-            least = np.minimum(config.tension_min_n, tension_setpoint_n - clear_n)
-            most = np.maximum(config.tension_max_n, tension_setpoint_n + clear_n)
-            lower[2 * m :] = np.tile(least, blocks) - tension
-            upper[2 * m :] = np.tile(most, blocks) - tension
-        return q, lower, upper
+        q[: self.torque_variables] = self.L.dot(x)
+        return q
 
     def torques(self, solution: FloatArray, found: Estimate) -> FloatArray:
         """The plan (N_p, n) in Nm of a solution."""

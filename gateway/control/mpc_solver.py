@@ -1,79 +1,37 @@
-"""Solves the programmes of the model predictive controller, with no more limits than matter.
+"""What solves the programmes of the model predictive controller: DAQP, or OSQP where the configuration says so."""
 
-An optimum that keeps limits which were not asked for is the optimum with them, too. So a programme is solved without
-any limit first, which is a product with a matrix; where that breaks one, with those of torque and its rate; and where
-tensions leave theirs even so, with all. OSQP begins each from where its last solution ended.
-"""
-
-from typing import Any
-
-import numpy as np
-import osqp as _osqp  # pyright: ignore[reportMissingTypeStubs]
-from scipy.sparse import csc_matrix
+from typing import Protocol
 
 from gateway.control.mpc_problem import MpcProblem
+from gateway.core.controller_laws import MpcConfig
 from gateway.core.signals import FloatArray
 
-osqp: Any = _osqp  # it has no types
-SOLVED = int(osqp.SolverStatus.OSQP_SOLVED)
-TOLERANCE = 1e-3  #: Nm and N: as closely as OSQP keeps a limit
+# How a solution may end, beside what the solver says.
+NO_LIMIT = "no limit reached"  #: there was nothing to solve
+NO_NUMBER = "asked with what is no number"
+NOT_FINITE = "not finite"
 
 
-class MpcSolver:
-    """One for each law: it holds the solutions before, and the step sizes that OSQP has come to."""
-
-    def __init__(self, problem: MpcProblem, most_iterations: int, time_limit_s: float) -> None:
-        self._problem = problem
-        self._most_iterations = most_iterations
-        self._time_limit_s = time_limit_s
-        self._free: FloatArray = np.asarray(np.linalg.inv(-problem.hessian), dtype=np.float64)
-        self._rows: FloatArray = np.array(problem.A.toarray())[:, : problem.torque_variables]
-        self._torques: Any = None
-        self._whole: Any = None
+class MpcSolver(Protocol):
+    """One for each law: it holds where the solution before has ended."""
 
     def forget(self) -> None:
-        """Leave nothing of what was solved before: neither a start nor a step size."""
-        problem, torques, rows = self._problem, self._problem.torque_variables, self._problem.torque_rows
-        self._torques = self._new(problem.P[:torques, :torques], problem.A[:rows, :torques])
-        self._whole = self._new(problem.P, problem.A) if problem.rows > rows else None
+        """Leave nothing of what was solved before: the next solution is bit for bit that of a new solver."""
+        ...
 
-    def solve(self, q: FloatArray, lower: FloatArray, upper: FloatArray) -> tuple[FloatArray | None, str]:
-        """The solution with its slacks, None where there is none in time; and how it ended."""
-        torques, rows = self._problem.torque_variables, self._problem.torque_rows
-        solution: FloatArray = np.zeros(self._problem.variables)
-        solution[:torques] = found = self._free.dot(q[:torques])
-        if self._kept(found, lower, upper):
-            return solution, "no limit reached"
-        self._torques.update(q=q[:torques], l=lower[:rows], u=upper[:rows])
-        solved = self._torques.solve(raise_error=False)
-        if solved.info.status_val != SOLVED:
-            return None, solved.info.status
-        solution[:torques] = found = solved.x
-        if self._whole is None or self._kept(found, lower, upper, rows):
-            return solution, solved.info.status
-        left_s = self._time_limit_s - solved.info.run_time
-        if left_s <= 0.0:
-            return None, "no time for tension limits"
-        self._whole.update_settings(time_limit=left_s)
-        self._whole.update(q=q, l=lower, u=upper)
-        solved = self._whole.solve(raise_error=False)
-        return solved.x if solved.info.status_val == SOLVED else None, solved.info.status
+    def solve(self, x: FloatArray, lower: FloatArray, upper: FloatArray) -> tuple[FloatArray | None, str]:
+        """z (variables,) at x_0 within the limits of `MpcProblem.limits`, None where there is none in time; and how it
+        ended. What is returned is finite.
+        """
+        ...
 
-    def _kept(self, found: FloatArray, lower: FloatArray, upper: FloatArray, begin: int = 0) -> bool:
-        """Whether the rows from `begin` on are within their limits without any slack."""
-        reached = self._rows[begin:].dot(found)
-        return bool(
-            (reached >= lower[begin:] - TOLERANCE).all() and (reached <= upper[begin:] + TOLERANCE).all()
-        )  # fmt: skip
 
-    def _new(self, P: csc_matrix, A: csc_matrix) -> Any:
-        rows, variables = A.shape
-        solver = osqp.OSQP()
-        solver.setup(
-            csc_matrix(P), np.zeros(variables), csc_matrix(A), np.full(rows, -np.inf), np.full(rows, np.inf),
-            verbose=False, warm_starting=True, polishing=False, eps_abs=1e-3, eps_rel=1e-5, check_termination=5,
-            max_iter=self._most_iterations, time_limit=self._time_limit_s,
-            # By iterations, not by time: the same problem is solved in the same way on every computer.
-            adaptive_rho_interval=20, adaptive_rho_tolerance=3.0,
-        )  # fmt: skip
-        return solver
+def solver_of(problem: MpcProblem, config: MpcConfig) -> MpcSolver:
+    """The solver that the configuration names, set up and warmed. Raises ControllerRefused where it cannot be."""
+    if config.solver == "osqp":
+        from gateway.control.mpc_osqp import OsqpSolver  # 25 MB, for those who use it
+
+        return OsqpSolver(problem, config.most_iterations, config.time_limit_s)
+    from gateway.control.mpc_daqp import DaqpSolver
+
+    return DaqpSolver(problem, config.most_iterations, config.time_limit_s)

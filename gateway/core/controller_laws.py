@@ -16,6 +16,7 @@ CONVEX = 1e-9  #: of the greatest eigenvalue: how far below 0 the smallest may c
 Matrix = list[list[float]]
 Vector = list[float]
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
+Solver = Literal["daqp", "osqp"]
 
 
 class Feedforward(Strict):
@@ -190,6 +191,8 @@ class MpcConfig(Law):
     fallback_input: Matrix  #: (n, n d)
     most_iterations: Annotated[int, Field(ge=1, le=100_000)] = 1000
     time_limit_s: Positive  #: a solution later than this is not applied
+    #: Not written where it is the usual one: configurations from before there was a choice keep their hash.
+    solver: Annotated[Solver, Field(exclude_if=lambda value: value == "daqp")] = "daqp"
 
     @property
     def horizon(self) -> int:

@@ -6,7 +6,7 @@ variables too, and the model is rows of equations.
 
 import time
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 import osqp
@@ -18,7 +18,7 @@ from gateway.control.law import Measured
 from gateway.control.laws import ENDLESS_S
 from gateway.control.mpc import Mpc
 from gateway.control.mpc_problem import CLEAR, MpcProblem
-from gateway.control.mpc_solver import MpcSolver
+from gateway.control.mpc_solver import solver_of
 from gateway.control.reference import Steady
 from gateway.control.rollout import Setup, limited, rk4
 from gateway.control.sampled import Sampled
@@ -33,7 +33,10 @@ EXACT = 1e-9
 
 @dataclass(frozen=True)
 class Met:
-    """A problem that the loop has met: q, lower and upper of the condensed form, and the state that it begins at."""
+    """A problem that the loop has met: q, lower and upper of the condensed form, and the state that it begins at.
+
+    `lower` and `upper` are of the programme by itself, as `MpcProblem.vectors` has them.
+    """
 
     q: FloatArray
     lower: FloatArray
@@ -110,7 +113,7 @@ class Condensed:
     def prepare(self, config: MpcConfig) -> None:
         problem = MpcProblem(config)
         self._n = config.n
-        self._solver = _osqp(problem.P, problem.A, self._settings)
+        self._solver = _osqp(csc_matrix(problem.P), csc_matrix(problem.A), self._settings)
 
     def solve(self, met: Met) -> FloatArray:
         return self.whole(met)[: self._n]
@@ -121,18 +124,20 @@ class Condensed:
         return np.array(self._solver.solve(raise_error=False).x)
 
 
-class Staged:
-    """As the law does it: with no more limits than matter."""
+class OfLaw:
+    """As the law does it with one of its solvers."""
 
-    name = "law"
+    def __init__(self, name: Literal["daqp", "osqp"]) -> None:
+        self.name = name
 
     def prepare(self, config: MpcConfig) -> None:
-        self._n = config.n
-        self._solver = MpcSolver(MpcProblem(config), config.most_iterations, ENDLESS_S)
-        self._solver.forget()
+        self._problem = MpcProblem(config)
+        config = config.model_copy(update={"solver": self.name, "time_limit_s": ENDLESS_S})
+        self._n, self._solver = config.n, solver_of(self._problem, config)
 
     def solve(self, met: Met) -> FloatArray:
-        solution, status = self._solver.solve(met.q, met.lower, met.upper)
+        coming = self._problem.C.dot(met.state)
+        solution, status = self._solver.solve(met.state, met.lower + coming, met.upper + coming)
         if solution is None:
             raise RuntimeError(f"MPC has not solved it: {status}")
         return solution[: self._n]
@@ -166,9 +171,8 @@ class InteriorPoint:
 
     def prepare(self, config: MpcConfig) -> None:
         problem = MpcProblem(config)
-        whole = problem.P.toarray()
         self._n, self._fresh = config.n, True
-        self._P, self._G = whole + np.triu(whole, 1).T, np.asfortranarray(problem.A.toarray())
+        self._P, self._G = problem.P, np.asfortranarray(problem.A)
         self._solver: Any = piqp.DenseSolver()
         self._solver.settings.eps_abs = self._solver.settings.eps_rel = self._eps
 
@@ -255,7 +259,8 @@ def _osqp(P: csc_matrix, A: csc_matrix, settings: dict[str, Any]) -> Any:
 
 
 TRIED: dict[str, Solver] = {
-    "as in the law: OSQP, condensed, no more limits than matter": Staged(),
+    "as in the law: DAQP, condensed, working set kept": OfLaw("daqp"),
+    "as in the law with OSQP: condensed, no more limits than matter": OfLaw("osqp"),
     "OSQP, condensed, all limits": Condensed("osqp"),
     "OSQP, condensed, tolerance 1e-2": Condensed("osqp_loose", eps_abs=1e-2, eps_rel=1e-4),
     "OSQP, condensed, step size kept": Condensed("osqp_fixed", adaptive_rho=False),
