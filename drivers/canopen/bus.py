@@ -16,6 +16,7 @@ import can
 
 from drivers.canopen.can_errors import error_text, is_bus_off
 from drivers.canopen.wire import FAILURES, Wire, wire_of
+from drivers.cleanup import end, finish
 from gateway.core.line import CanopenBus
 
 FRAMES_PER_WAKEUP = 256  #: a flooded bus does not hold the loop
@@ -183,11 +184,13 @@ class CanBus:
         self.reopened += 1
 
     async def close(self) -> None:
-        """Stop reading and release the interface. Idempotent."""
+        """Stop reading and release the interface. Idempotent; no cancellation cuts it."""
+        await finish(self._close())
+
+    async def _close(self) -> None:
         reopening, self._reopening = self._reopening, None
         if reopening is not None:
-            reopening.cancel()
-            await asyncio.gather(reopening, return_exceptions=True)
+            await end(reopening)
         await self._release()
         self.gone = ""
 
@@ -196,7 +199,7 @@ class CanBus:
         bus, self._bus = self._bus, None
         try:
             if wire is not None:
-                await wire.close()
+                await finish(wire.close())  # or a thread would go on receiving from what is shut down
         finally:
             if bus is not None:
                 bus.shutdown()

@@ -11,6 +11,7 @@ SDO then, one transfer at a time per node: a dead one costs the others nothing.
 
 import asyncio
 from collections.abc import Callable, Sequence
+from contextlib import AsyncExitStack
 
 from drivers.canopen.bus import CanBus
 from drivers.canopen.feed import Feed
@@ -20,6 +21,8 @@ from drivers.canopen.prepare import check_nodes, configure_nodes, undo_all
 from drivers.canopen.questions import Questions
 from drivers.canopen.sdo import SdoBus, SdoFailed
 from drivers.canopen.station import ENTER_PRE_OPERATIONAL, OPERATIONAL, START, nmt_frame
+from drivers.canopen.transaction import Transaction
+from drivers.cleanup import finish, finish_all
 from drivers.port import PrepareRefused
 from gateway.core.line import CanopenBus
 from gateway.core.signals import Inputs, LinkHealth, Outputs
@@ -58,6 +61,8 @@ class CanopenLink:
         self._answered: asyncio.Future[None] | None = None
         self._heartbeat_came = asyncio.Event()
         self._prepared = False  #: the nodes wait for us: they were prepared, and not released since
+        self._unfinished: list[Transaction] = []  #: of an arming that has not come to an end: to be undone
+        self._releasing = asyncio.Lock()
 
     async def open(self) -> None:
         """Open the bus and listen. Raises OSError with what to do about it."""
@@ -66,7 +71,10 @@ class CanopenLink:
     # proving the nodes
 
     async def prepare(self) -> None:
-        """Configure all nodes and prove their watchdogs. Raises PrepareRefused; what was written is undone then."""
+        """Configure all nodes and prove their watchdogs. Raises PrepareRefused; what was written is undone then.
+
+        Where this is cancelled, `release` undoes it.
+        """
         self.silence()
         try:
             await self._bus.restore()
@@ -78,13 +86,15 @@ class CanopenLink:
         await self._leave_operational()  # a node that is stopped does not answer SDO
         if reasons := await check_nodes(self._sdo, self._nodes):
             raise PrepareRefused(reasons)
-        transactions, reasons = await configure_nodes(self._sdo, self._nodes)
+        await finish(undo_all(self._unfinished))  # of an arming that was cancelled, and that nobody has released
+        reasons = await configure_nodes(self._sdo, self._nodes, self._unfinished)
         if not reasons:
             reasons = await self._start()
         if reasons:
             for node in self._nodes:
                 self._command_nmt(ENTER_PRE_OPERATIONAL, node)
-            raise PrepareRefused(reasons + await undo_all(transactions))
+            raise PrepareRefused(reasons + await finish(undo_all(self._unfinished)))
+        self._unfinished.clear()
         for node in self._nodes:
             node.station.emergency = ""
             node.station.supervised = True
@@ -133,17 +143,26 @@ class CanopenLink:
         """The nodes leave operational: torque off, and their deadline monitoring ends without a fault.
 
         A consumer of our heartbeat is told by SDO to wait for it no more, once it has confirmed that its torque is off.
-        The watchdog of one that does not is left to fire.
+        The watchdog of one that does not is left to fire. What an arming that was cancelled has written is undone. No
+        cancellation cuts it; a node that does not answer takes the time of one transfer for each.
         """
         self.silence()
-        await self._leave_operational()
+        await finish(self._release())
+
+    async def _release(self) -> None:
+        async with self._releasing:
+            await self._leave_operational()
+            for failure in await undo_all(self._unfinished):
+                self.health.last_error = f"bus {self.name}: {failure}"
 
     async def _leave_operational(self) -> None:
         for node in self._nodes:
             self._command_nmt(ENTER_PRE_OPERATIONAL, node)
         if self._prepared:
+            failures = await finish_all(self._let_go(node) for node in self._nodes)
             self._prepared = False
-            await asyncio.gather(*(self._let_go(node) for node in self._nodes))
+            if failures:
+                raise failures[0]
 
     async def _let_go(self, node: Node) -> None:
         steps = node.release_steps()
@@ -280,8 +299,12 @@ class CanopenLink:
         self.health.last_error = reason
 
     async def close(self) -> None:
-        """Release the bus. Idempotent."""
+        """Release the bus. Idempotent; no cancellation cuts it."""
         self.silence()
-        await self._questions.close()
-        await self._bus.close()
-        await self._sdo.close()
+        await finish(self._close())
+
+    async def _close(self) -> None:
+        async with AsyncExitStack() as last_first:  # each of them, also where another fails
+            last_first.push_async_callback(self._sdo.close)
+            last_first.push_async_callback(self._bus.close)
+            last_first.push_async_callback(self._questions.close)

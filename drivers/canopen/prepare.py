@@ -38,9 +38,11 @@ async def _check(sdo: SdoBus, node: Node) -> list[str]:
         return [str(error)]
 
 
-async def configure_nodes(sdo: SdoBus, nodes: Sequence[Node]) -> tuple[list[Transaction], list[str]]:
-    """Write every node's settings and read them back; the transactions to undo, and what went wrong."""
-    transactions: list[Transaction] = []
+async def configure_nodes(sdo: SdoBus, nodes: Sequence[Node], transactions: list[Transaction]) -> list[str]:
+    """Write every node's settings and read them back; what went wrong.
+
+    What has to be undone is in `transactions`: also when this is cancelled half-way.
+    """
     reasons: list[str] = []
     for node in nodes:
         transaction = Transaction(sdo, node.station.node)
@@ -49,9 +51,13 @@ async def configure_nodes(sdo: SdoBus, nodes: Sequence[Node]) -> tuple[list[Tran
             await transaction.run(node.steps())
         except (SdoFailed, ValueError) as error:
             reasons.append(f"{node.station.name}: {error}")
-    return transactions, reasons
+    return reasons
 
 
 async def undo_all(transactions: list[Transaction]) -> list[str]:
-    """Take every transaction back, the last first; returns what could not be restored."""
-    return [failure for transaction in reversed(transactions) for failure in await transaction.undo()]
+    """Take every transaction back, the last first; returns what could not be restored. None is left then."""
+    failures: list[str] = []
+    while transactions:
+        failures += await transactions[-1].undo()
+        transactions.pop()
+    return failures

@@ -11,6 +11,7 @@ from drivers.canopen.listening import Listening
 from drivers.canopen.map_parts import CanObject, ObjectType
 from drivers.canopen.sdo import SdoBus, SdoFailed, SdoSilent
 from drivers.canopen.transaction import read_number
+from drivers.cleanup import finish
 from drivers.inspection import Number
 from gateway.core.line import CanopenBus
 
@@ -71,9 +72,14 @@ class ReadingBus:
         return data[:_LONGEST_TEXT].split(b"\0")[0].decode("ascii", "replace").strip()
 
     async def close(self) -> None:
-        """Release the interface. Idempotent."""
-        await self._bus.close()
-        await self.sdo.close()
+        """Release the interface. Idempotent; no cancellation cuts it."""
+        await finish(self._close())
+
+    async def _close(self) -> None:
+        try:
+            await self._bus.close()
+        finally:
+            await self.sdo.close()
 
     def _send(self, cob_id: int, data: bytes) -> bool:
         if not (_upload_only(cob_id, data) and self._asking):

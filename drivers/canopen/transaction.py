@@ -109,12 +109,15 @@ class Transaction:
         for step in steps:
             present = await self._sdo.upload(self._node, step.index, step.sub, BYTES[step.type])
             wanted = step.bytes_after(present)
+            # Noted before: whatever becomes of the transfer, and of this task, it may have been written.
+            self._before.append((step, present))
             try:
                 await self._sdo.download(self._node, step.index, step.sub, wanted)
             except SdoSilent:
-                self._before.append((step, present))  # it may have been written all the same
                 raise
-            self._before.append((step, present))
+            except SdoFailed:
+                self._before.pop()  # it has said that it did not take it
+                raise
             final[step.index, step.sub] = (step, wanted)
         for step, wanted in final.values():
             found = await self._sdo.upload(self._node, step.index, step.sub, len(wanted))
@@ -125,12 +128,14 @@ class Transaction:
         """Write back what was there before; returns what could not be restored. A node that is silent is left."""
         failures: list[str] = []
         while self._before:
-            step, present = self._before.pop()
+            step, present = self._before[-1]
             try:
                 await self._sdo.download(self._node, step.index, step.sub, present)
             except SdoSilent as error:
                 self._before.clear()
                 failures.append(f"{error}; the rest could not be restored")
+                break
             except SdoFailed as error:
                 failures.append(f"not restored: {error}")
+            self._before.pop()  # not before: cut here, it is written back by the next call
         return failures

@@ -44,10 +44,9 @@ async def inspect(bus: ModbusTcpBus, devices: Sequence[Wired], sample_s: float, 
     where = f"{bus.host}:{bus.port}"
     connection = ModbusConnection(bus.host, bus.port)
     progress(f"bus {bus.name}: connecting to {where}")
-    if not await connection.connect():
-        connection.close()
-        return BusFacts(bus.name, where, trouble=f"no connection to {where}")
     try:
+        if not await connection.connect():
+            return BusFacts(bus.name, where, trouble=f"no connection to {where}")
         inspectors = [_Inspector(connection, wired) for wired in devices]
         progress(f"bus {bus.name}: asking {len(devices)} devices")
         facts = {inspector.item.name: await inspector.facts() for inspector in inspectors}

@@ -7,6 +7,7 @@ counts. What `write` hands over is written with the next `trigger`, in the same 
 import asyncio
 from collections.abc import Sequence
 
+from drivers.cleanup import finish, finish_all
 from drivers.modbus.session import Session
 from drivers.modbus.unit import Unit
 from drivers.port import PrepareRefused
@@ -22,6 +23,7 @@ class ModbusLink:
         self._where = f"{host}:{port}"
         self._sessions = [Session(unit, host, port, period_s, self.health, self._on_done) for unit in units]
         self._awaited: set[Session] = set()
+        self._releasing = asyncio.Lock()
         self._complete = asyncio.Event()  #: every unit that is waited for has answered
 
     async def open(self) -> None:
@@ -33,7 +35,10 @@ class ModbusLink:
             )
 
     async def prepare(self) -> None:
-        """Check every unit; set and prove the watchdogs. Raises PrepareRefused; what was written is undone then."""
+        """Check every unit; set and prove the watchdogs. Raises PrepareRefused; what was written is undone then.
+
+        Where this is cancelled, `release` undoes it.
+        """
         self.silence()
         connected = await asyncio.gather(*(session.ensure_connected() for session in self._sessions))
         reasons = [
@@ -53,11 +58,12 @@ class ModbusLink:
         if not reasons:
             reasons = [reason for session in self._sessions for reason in session.lost_since_check()]
         if reasons:
-            for session in reversed(self._sessions):
-                reasons += await session.settings.undo()
-            raise PrepareRefused(reasons)
+            raise PrepareRefused(reasons + await finish(self._undo()))
         for session in self._sessions:
             session.activate()
+
+    async def _undo(self) -> list[str]:
+        return [failure for session in reversed(self._sessions) for failure in await session.settings.undo()]
 
     def silence(self) -> None:
         """Nothing is written from now on; reading goes on."""
@@ -65,8 +71,18 @@ class ModbusLink:
             session.unit.silence()
 
     async def release(self) -> None:
-        """Drives without torque, transport off, settings as they were: nothing is fed or waited for any more."""
-        await asyncio.gather(*(session.leave() for session in self._sessions))
+        """Drives without torque, transport off, settings as they were: nothing is fed or waited for any more.
+
+        No cancellation cuts it, and a unit that fails keeps no other from it. Raises the first failure.
+        """
+        self.silence()
+        await finish(self._release())
+
+    async def _release(self) -> None:
+        async with self._releasing:
+            failures = await finish_all(session.leave() for session in self._sessions)
+        if failures:
+            raise failures[0]
 
     def trigger(self, now_s: float) -> None:
         """Send the requests of this cycle, with the commands of the one before."""
@@ -102,6 +118,9 @@ class ModbusLink:
                 self.health.last_error = refused
 
     async def close(self) -> None:
-        """Drop the connections. Idempotent."""
-        await asyncio.gather(*(session.close() for session in self._sessions))
+        """Drop the connections. Idempotent; no cancellation cuts it."""
+        await finish(self._close())
+
+    async def _close(self) -> None:
+        await finish_all(session.close() for session in self._sessions)
         await asyncio.sleep(0)  # lets the transports release their sockets

@@ -12,6 +12,7 @@ takes a task: proofs, several requests, and what is asked beside the cycle.
 import asyncio
 from collections.abc import Callable
 
+from drivers.cleanup import end, finish_all
 from drivers.modbus.client import ModbusConnection, ModbusFailed, ModbusTimeout
 from drivers.modbus.device import ANSWERS_ALLOWED
 from drivers.modbus.looks import Looks
@@ -73,16 +74,20 @@ class Session:
     # proving the unit
 
     async def ensure_connected(self) -> bool:
-        await _cancel(self._connecting)
+        if self._connecting is not None:
+            await end(self._connecting)
         if self._connection.connected:
             return True
-        await _cancel(self._task)  # it would take the new connection for its own
+        if self._task is not None:
+            await end(self._task)  # it would take the new connection for its own
         return await self.connect()
 
     async def check(self) -> list[str]:
         """What speaks against the unit before anything is written. Reads only."""
         unit, reasons = self.unit, list[str]()
         unit.identity.void()
+        if self._checked_on != self._connection.number:
+            self.settings.forget()  # what was written, and not undone, may have been another device's
         self._checked_on = self._connection.number
         try:
             for proof in (unit.identity, unit.trust):
@@ -112,15 +117,16 @@ class Session:
     async def leave(self) -> None:
         """Tell a unit that was commanded to rest, and restore its settings: nobody will feed its watchdog any more.
 
-        Where it does not obey, or was lost, its watchdog is left as it is, and fires.
+        Where it does not obey, or was lost, its watchdog is left as it is, and fires. Every request has a deadline.
         """
+        unit = self.unit
+        unit.silence()
         # Either may carry the last command; the end of a request may begin a look, so that the task comes second.
         await self._connection.until_free()
         if self._task is not None and not self._task.done():
             await asyncio.wait([self._task])
-        unit = self.unit
-        lost, commanded = unit.dropped, unit.commanded
-        unit.silence()
+        lost, commanded = unit.was_lost, unit.owes_rest
+        unit.was_lost = unit.owes_rest = False
         if lost or not self.settings.written:
             self.settings.forget()
             return
@@ -243,7 +249,7 @@ class Session:
             numbers = await self._transact(unit.plan.read_only, [], deadline_s)
         else:
             standing.wrote = unit.commanded = True
-            numbers = await self._transact(unit.plan.read_write, payloads, deadline_s)
+            numbers = await self._transact(unit.plan.read_write, payloads, deadline_s, unit.may_write)
         return unit.take_settings(numbers, judged=active and standing.active)
 
     def _old(self) -> bool:
@@ -264,10 +270,19 @@ class Session:
         if reasons and unit.standing.active:
             unit.doubt_settings()
 
-    async def _transact(self, requests: list[Request], payloads: Payloads, deadline_s: float) -> list[list[float]]:
+    async def _transact(
+        self,
+        requests: list[Request],
+        payloads: Payloads,
+        deadline_s: float,
+        may_write: Callable[[], bool] = lambda: True,
+    ) -> list[list[float]]:
+        """Raises ModbusFailed, also where there is something to write left and it may not be written any more."""
         connection, unit = self._connection, self.unit
         answers: list[list[int]] = []
         for k, request in enumerate(requests):
+            if request.write is not None and not may_write():
+                raise ModbusFailed("silent before all of its command was written")
             if request.read is None:
                 assert request.write is not None
                 await connection.write(unit.address, request.write[0], payloads[k], deadline_s)
@@ -309,19 +324,14 @@ class Session:
         self._health.last_error = reason
 
     async def close(self) -> None:
-        """Drop the connection. Idempotent."""
+        """Drop the connection. Idempotent; no cancellation cuts it."""
         self.unit.silence()
-        await _cancel(self._task)
-        await _cancel(self._connecting)
-        self._task = self._connecting = None
-        self._connection.close()
+        try:
+            await finish_all(end(task) for task in (self._task, self._connecting) if task is not None)
+        finally:
+            self._task = self._connecting = None
+            self._connection.close()
 
 
 def _now_s() -> float:
     return asyncio.get_running_loop().time()
-
-
-async def _cancel(task: asyncio.Task[None] | None) -> None:
-    if task is not None:
-        task.cancel()
-        await asyncio.gather(task, return_exceptions=True)

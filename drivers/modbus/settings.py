@@ -23,8 +23,10 @@ class SettingsWriter:
         return bool(self._before)
 
     async def configure(self) -> list[str]:
-        """Write every setting and read it back. Returns the first that fails; `undo` takes back what was written."""
-        self._before.clear()
+        """Write every setting and read it back. Returns the first that fails; `undo` takes back what was written.
+
+        Where that was not done after an earlier call, what is restored is what stood there before that one.
+        """
         for setting in self._unit.settings:
             if reason := await self._set(setting):
                 return [reason]
@@ -35,9 +37,12 @@ class SettingsWriter:
             found = await self._read(setting)
             # What is as we want it was left behind by a gateway that could not restore it.
             left_behind = setting.off is not None and found == setting.counts
-            # Noted before: whatever becomes of the request, and of this task, it may have been written.
-            self._before.append((setting, setting.off if setting.off is not None and left_behind else found))
-            await self._write_noted(setting)
+            if any(noted is setting for noted, _ in self._before):
+                await self._write(setting, setting.counts)
+            else:
+                # Noted before: whatever becomes of the request, and of this task, it may have been written.
+                self._before.append((setting, setting.off if setting.off is not None and left_behind else found))
+                await self._write_noted(setting)
             found = await self._read(setting)
         except (ModbusFailed, ValueError) as error:
             return f"{setting.name} cannot be set: {error}"
@@ -57,11 +62,12 @@ class SettingsWriter:
         """Write back what was there before `configure`, the last first; returns what could not be restored."""
         failures: list[str] = []
         while self._before:
-            setting, before = self._before.pop()
+            setting, before = self._before[-1]
             try:
                 await self._write(setting, before)
             except (ModbusFailed, ValueError) as error:
                 failures.append(f"{setting.name} was not restored: {error}")
+            self._before.pop()  # not before: cut here, it is written back by the next call
         return failures
 
     def forget(self) -> None:

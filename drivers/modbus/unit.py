@@ -46,6 +46,8 @@ class Unit:
         self.unseen_settings = self._proof([setting.kept for setting in self.settings if setting not in self._seen])
         self.dropped = False  #: gave torque and was lost: nothing is written to it before the next `prepare`
         self.commanded = False  #: something was written since it became active
+        self.owes_rest = False  #: silent, and it was commanded before: to be told to rest
+        self.was_lost = False  #: silent, and it was dropped before: nothing is written to it
         self._rests = 0  #: that are left
         self._gives_torque = any(device.gives_torque for device in devices)
         self._writers = [device for device in devices if device.wish.write is not None]
@@ -60,11 +62,14 @@ class Unit:
         self.standing.active = True
         self.standing.missed = 0
         self.standing.distrust, self.dropped, self._rests = "", False, 0
+        self.owes_rest = self.was_lost = False
 
     def silence(self) -> None:
-        """Nothing is written from now on, and nothing of the last command is left."""
+        """Nothing is written from now on, and nothing of the last command is left but that it has to be taken back."""
         standing = self.standing
         standing.active, standing.wrote, standing.distrust, standing.refused = False, False, "", ""
+        self.owes_rest |= self.commanded
+        self.was_lost |= self.dropped
         self.dropped = self.commanded = False
         self._rests = 0
         self._payloads = None

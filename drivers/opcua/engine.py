@@ -8,6 +8,7 @@ server has not taken yet do not come to life when it goes on.
 import asyncio
 from typing import Any
 
+from drivers.cleanup import end, finish
 from drivers.opcua.messages import Answer, Outcome, Plan, Question
 from drivers.opcua.nodes import Reading
 from drivers.opcua.services import Services, statuses
@@ -71,10 +72,12 @@ class Engine:
         return Answer(question.number, Outcome.FAILED, self._connection, written, text=why)
 
     async def close(self) -> None:
-        """End the session in order, as far as the server takes part. Idempotent."""
+        """End the session in order, as far as the server takes part. Idempotent; no cancellation cuts it."""
+        await finish(self._close())
+
+    async def _close(self) -> None:
         if self._connecting is not None:
-            self._connecting.cancel()
-            await asyncio.gather(self._connecting, return_exceptions=True)
+            await end(self._connecting)
         session, self._session = self._session, None
         if session is not None:
             await session.close()

@@ -3,6 +3,7 @@
 import asyncio
 from collections.abc import Callable
 
+from drivers.cleanup import end, finish
 from drivers.opcua.engine import Engine
 from drivers.opcua.messages import Answer, Plan, Question
 
@@ -51,8 +52,11 @@ class EngineChannel:
     async def close(self) -> None:
         engine, self._engine = self._engine, None
         self.up.clear()
-        if self._task is not None:
-            self._task.cancel()
-            await asyncio.gather(self._task, return_exceptions=True)
-        if engine is not None:
-            await engine.close()
+        await finish(_close(engine, self._task))
+
+
+async def _close(engine: Engine | None, task: asyncio.Task[None] | None) -> None:
+    if task is not None:
+        await end(task)
+    if engine is not None:
+        await engine.close()

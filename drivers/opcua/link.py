@@ -8,6 +8,7 @@ at a time: while one is not answered, no other is asked, its cycle is missed and
 import asyncio
 from collections.abc import Sequence
 
+from drivers.cleanup import finish
 from drivers.opcua.channel import Channel
 from drivers.opcua.drive import Axis
 from drivers.opcua.messages import Answer, Outcome, Question
@@ -39,6 +40,9 @@ class OpcUaLink:
         self._period_s = period_s
         self._noted: dict[Device, float] = {}  #: watchdogs before a `prepare` that has not come to an end, counts
         self._noted_on = 0  #: the connection of that
+        self._to_leave: list[Axis] = []  #: that were written to before the silence, and were not released since
+        self._to_leave_on = 0  #: the connection of that
+        self._releasing = asyncio.Lock()
         self._questions_per_proof = max(1, round(PROOF_PERIOD_S / period_s))
         self._unproven = 0  #: questions of cycles since the last that asked for every proof
         self._number = 0  #: of the last question
@@ -67,7 +71,10 @@ class OpcUaLink:
             ) from error
 
     async def prepare(self) -> None:
-        """Check every device; set and prove their watchdogs. Raises PrepareRefused with every reason."""
+        """Check every device; set and prove their watchdogs. Raises PrepareRefused with every reason.
+
+        Where this is cancelled, `release` undoes what was written.
+        """
         self.silence()
         try:
             await self._ask_patiently(CONNECT_PATIENCE_S)
@@ -83,21 +90,35 @@ class OpcUaLink:
             reasons = [f"bus {self.name}: the connection was lost meanwhile; arm again"]
         if reasons:
             raise PrepareRefused(reasons)
+        self._to_leave.clear()
         for device in self._devices:
             device.activate()
 
     def silence(self) -> None:
-        """Nothing is written from now on; reading goes on."""
+        """Nothing is written from now on; reading goes on. Who was written to has to be left in order yet."""
+        commanded = [device for device in self._devices if isinstance(device, Axis) and device.may_write]
+        if commanded:
+            self._to_leave, self._to_leave_on = commanded, self._connection
         for device in self._devices:
             device.forget()
 
     async def release(self) -> None:
         """Drives that are written to take their torque off; of those that have, supervision ends without a fault.
 
-        What an arming that was cancelled has left half-way is undone.
+        What an arming that was cancelled has left half-way is undone. No cancellation cuts it; a server that does not
+        answer takes the time of one question.
         """
-        axes = [device for device in self._devices if isinstance(device, Axis) and device.may_write]
         self.silence()
+        await finish(self._release())
+
+    async def _release(self) -> None:
+        async with self._releasing:
+            await self._leave_devices()
+
+    async def _leave_devices(self) -> None:
+        axes, self._to_leave = self._to_leave, []
+        if self._to_leave_on != self._connection:  # another server may never have taken the last command
+            axes = []
         troubles = await release_axes(self._ask, axes)
         if self._noted_on == self._connection:
             troubles += await restore(self._ask, self._noted)
@@ -293,6 +314,6 @@ class OpcUaLink:
         self.health.last_error = reason
 
     async def close(self) -> None:
-        """End the engine and its connection. Idempotent."""
+        """End the engine and its connection. Idempotent; no cancellation cuts it."""
         self.silence()
         await self._channel.close()

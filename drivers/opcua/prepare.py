@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from typing import Protocol
 
+from drivers.cleanup import finish
 from drivers.opcua.amplifier import Amplifier
 from drivers.opcua.drive import Axis
 from drivers.opcua.messages import Answer
@@ -55,18 +56,26 @@ async def prepare_devices(ask: Ask, devices: Sequence[Device], noted: dict[Devic
                 reasons.append(f"{device.name}: its watchdog cannot be set: {error}")
                 break
     if reasons:
-        return reasons + await restore(ask, noted)
+        return reasons + await finish(restore(ask, noted))
     noted.clear()
     return []
 
 
 async def restore(ask: Ask, noted: dict[Device, float]) -> list[str]:
-    """Set the watchdogs to what they were; the last that was written is the first. What went wrong."""
+    """Set the watchdogs to what they were; the last that was written is the first. What went wrong.
+
+    A server that does not answer is asked once.
+    """
     reasons: list[str] = []
     for device in reversed(list(noted)):
         assert device.watchdog is not None
-        reasons += await _undo(ask, device.name, device.watchdog, noted[device])
-        del noted[device]  # not before: it may be cancelled, too
+        try:
+            reasons += await _undo(ask, device.name, device.watchdog, noted[device])
+        except NoAnswer as error:
+            reasons += [f"{left.name}: its watchdog could not be restored: {error}" for left in reversed(list(noted))]
+            noted.clear()
+            break
+        del noted[device]  # not before: cut here, the next call goes on
     return reasons
 
 
@@ -83,8 +92,5 @@ async def _set_watchdog(ask: Ask, name: str, watchdog: Watchdog) -> list[str]:
 
 
 async def _undo(ask: Ask, name: str, watchdog: Watchdog, before: float) -> list[str]:
-    try:
-        status = (await ask(((watchdog.node, before),), ())).written[0]
-    except NoAnswer as error:
-        return [f"{name}: its watchdog could not be restored: {error}"]
+    status = (await ask(((watchdog.node, before),), ())).written[0]
     return [] if is_done(status) else [f"{name}: its watchdog could not be restored: {describe(status)}"]

@@ -9,6 +9,7 @@ import socket
 from collections.abc import Callable
 from contextlib import suppress
 
+from drivers.cleanup import finish
 from drivers.opcua.messages import MAX_MESSAGE, READY, Answer, Outcome, Plan, Question, decode_answer, encode_question
 from drivers.opcua.spawner import CLOSE_TIMEOUT_S, kill_child, spawn
 
@@ -80,7 +81,7 @@ class ProcessChannel:
         self._lose(why)
 
     async def close(self) -> None:
-        """Let the worker end its session, and the spawner end it if it does not."""
+        """Let the worker end its session, and the spawner end it if it does not. No cancellation cuts it."""
         self._start_again_s = None
         self._hang_up()
         control, self._control = self._control, None
@@ -88,8 +89,7 @@ class ProcessChannel:
             control.close()
         pid, self.pid = self.pid, None
         if pid is not None:
-            await _ended_in_time(pid)
-            kill_child(pid)
+            await finish(_end_child(pid))
 
     def _begin(self, now_s: float) -> None:
         """Raises OSError; it is tried again then."""
@@ -183,6 +183,13 @@ class ProcessChannel:
             assert self._loop is not None
             self._loop.remove_reader(connection)
             connection.close()
+
+
+async def _end_child(pid: int) -> None:
+    try:
+        await _ended_in_time(pid)
+    finally:
+        kill_child(pid)
 
 
 async def _ended_in_time(pid: int) -> None:

@@ -12,6 +12,7 @@ from typing import Any
 from asyncua import ua as asyncua_ua
 from asyncua.client.client import Client
 
+from drivers.cleanup import finish
 from drivers.inspection import Progress
 from drivers.opcua.engine import Engine
 from drivers.opcua.maps import OpcUaMap
@@ -90,12 +91,11 @@ async def scan(
         return OpcUaScan(endpoint, endpoints, "it offers no anonymous session without security")
     client = _client(endpoint)
     try:
-        async with asyncio.timeout(TIMEOUT_S):
-            await client.connect()
-    except Exception as error:  # asyncua raises whatever Python does on bytes that are no answer
-        await _disconnect(client)
-        return OpcUaScan(endpoint, endpoints, f"no session: {_in_words(error)}")
-    try:
+        try:
+            async with asyncio.timeout(TIMEOUT_S):
+                await client.connect()
+        except Exception as error:  # asyncua raises whatever Python does on bytes that are no answer
+            return OpcUaScan(endpoint, endpoints, f"no session: {_in_words(error)}")
         async with asyncio.timeout(10 * TIMEOUT_S):
             namespaces = tuple(str(uri) for uri in await client.get_namespace_array())
             found, more = await _browse(client, under or "i=85", most, progress)
@@ -232,6 +232,11 @@ def _client(endpoint: str) -> Client:
 
 
 async def _disconnect(client: Client) -> None:
+    """No cancellation cuts it."""
+    await finish(_disconnect_in_time(client))
+
+
+async def _disconnect_in_time(client: Client) -> None:
     try:
         async with asyncio.timeout(1.0):
             await client.disconnect()

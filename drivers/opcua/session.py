@@ -21,6 +21,7 @@ from asyncua.crypto.uacrypto import load_certificate
 from asyncua.ua.ua_binary import nodeid_to_binary
 from cryptography import x509
 
+from drivers.cleanup import finish
 from drivers.opcua.messages import Plan
 from drivers.opcua.nodes import Node
 from drivers.opcua.services import Misfit, Request
@@ -56,10 +57,9 @@ class Session:
             await _secure(client, plan)
             await client.connect()
             return cls(client, _node_ids(plan.nodes, await client.get_namespace_array()))
-        except asyncio.CancelledError:
-            _reset(client)
-            raise
-        except Exception:
+        except BaseException as error:
+            if isinstance(error, asyncio.CancelledError):
+                _reset(client)  # nobody waits for a server now
             await _disconnect(client)
             raise
 
@@ -154,7 +154,14 @@ def _reset(client: Client) -> None:
 
 
 async def _disconnect(client: Client) -> None:
-    """Tidy up what asyncua has started for a client; it only waits for a server that is still connected."""
+    """Tidy up what asyncua has started for a client; it only waits for a server that is still connected.
+
+    No cancellation cuts it: asyncua's own tasks would go on.
+    """
+    await finish(_tidy_up(client))
+
+
+async def _tidy_up(client: Client) -> None:
     await asyncio.sleep(0)  # lets an aborted transport tell the client
     try:
         async with asyncio.timeout(CLOSE_TIMEOUT_S):
