@@ -180,6 +180,10 @@ class VirtualLine:
         """
         self.pacer.stall(periods * self.period_s)
 
+    def run(self, story: Coroutine[Any, Any, T]) -> T:
+        """Run `story` among the devices; no period runs meanwhile."""
+        return self._run(story)
+
     def pass_time(self, for_s: float) -> None:
         """The loop's process is gone: no period runs. The devices live on."""
         self._run(asyncio.sleep(for_s))
