@@ -2,6 +2,7 @@
 
 import asyncio
 import time
+from contextlib import AsyncExitStack
 from dataclasses import dataclass, replace
 from math import inf
 from pathlib import Path
@@ -159,19 +160,20 @@ class WiredLine:
             await asyncio.sleep(tick_s)
 
     async def close(self) -> None:
-        """Close every wire and end the recording. Idempotent."""
-        await self.control.close()
-        if self._proxy is not None:
-            await self._proxy.close()
-        for face in (self.modbus, self.opcua):
-            if face is not None:
-                await face.close()
+        """Close every wire and end the recording, each also where another fails or is cancelled. Idempotent."""
+        async with AsyncExitStack() as last_first:
+            last_first.callback(self.recorder.close)
+            last_first.callback(self._close_canopen)
+            for closed in (self.opcua, self.modbus, self._proxy, self.control):
+                if closed is not None:
+                    last_first.push_async_callback(closed.close)
+
+    def _close_canopen(self) -> None:
         if self.canopen is not None:
             self.canopen.detach()
         if self._bus is not None:
             self._bus.close()
             self._bus = None
-        self.recorder.close()
 
     def summary(self) -> dict[str, Any]:
         """What came of the run, as JSON."""

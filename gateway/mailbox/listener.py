@@ -73,8 +73,10 @@ class Listener:
 
     def close(self) -> None:
         self.socket.close()
-        self.path.unlink(missing_ok=True)
-        os.close(self._lock)
+        try:
+            self.path.unlink(missing_ok=True)
+        finally:
+            os.close(self._lock)
 
 
 def _private_folder(folder: Path) -> None:

@@ -111,9 +111,10 @@ class UnixMailbox:
         self._listeners.clear()
         for task in self._answering:
             task.cancel()
-        await asyncio.gather(*self._answering, return_exceptions=True)
+        # Before anything is waited for, which may be cancelled.
         for connection in (*self._accepted, *self._dialled.values()):
             connection.close()
+        await asyncio.gather(*self._answering, return_exceptions=True)
 
     def _accept(self, accepted: socket.socket) -> None:
         if len(self._accepted) >= MAX_CONNECTIONS:

@@ -42,6 +42,7 @@ class ZenohMailbox:
         self._bridge = Bridge(self.counters)
         self._presence = Presence(session, self._bridge, self._gone)
         self._closed = False
+        self._closing: asyncio.Task[None] | None = None
         self._publishers: dict[str, zenoh.Publisher] = {}
         self._served: dict[str, Served] = {}
         self._tokens: list[zenoh.LivelinessToken] = []  #: each as long as it is held
@@ -107,13 +108,19 @@ class ZenohMailbox:
                 future.exception()  # seen, also where the time was over in the same moment
 
     async def close(self) -> None:
-        """Idempotent. Requests that still wait, on either side, end as unreachable."""
-        if self._closed:
-            return
-        self._closed = True
+        """Requests that still wait, on either side, end as unreachable.
+
+        It goes on to its end where whoever waits is cancelled; called again, this waits for that end.
+        """
+        if self._closing is None:
+            self._closed = True
+            self._give_up(list(self._pending), "this side left the bus before there was an answer")
+            self._closing = asyncio.get_running_loop().create_task(self._close())
+        await asyncio.shield(self._closing)
+
+    async def _close(self) -> None:
         for served in self._served.values():
             await served.close()
-        self._give_up(list(self._pending), "this side left the bus before there was an answer")
         # Elsewhere: it waits for callbacks, and those may wait for this thread's interpreter lock.
         await asyncio.to_thread(self._end)
 

@@ -7,8 +7,10 @@ import signal
 import sys
 import time
 from collections.abc import Awaitable, Callable, Coroutine
+from contextlib import AsyncExitStack
 from pathlib import Path
 
+from drivers.cleanup import end, finish, finish_all
 from gateway.core.line import Line
 from gateway.core.people import Role
 from gateway.core.topics import GATEWAY_FOR_PERSON
@@ -73,10 +75,14 @@ async def serve(line: Line, run_folder: Path, data_folder: Path) -> None:
             works.append(_tell_whether_anybody_can_come_in(users))
         await _until_one_ends(*works, stop.wait())
     finally:
-        await served_page.stop()
-        await served_opcua.stop()
-        await mailbox.close()
-        await saying.close()
+        await finish(_close(saying.close, mailbox.close, served_opcua.stop, served_page.stop))
+
+
+async def _close(*closes: Callable[[], Awaitable[None]]) -> None:
+    """The last first; one that fails keeps no other from it."""
+    async with AsyncExitStack() as stack:
+        for close in closes:
+            stack.push_async_callback(close)
 
 
 async def _tell_whether_anybody_can_come_in(users: UsersFile) -> None:
@@ -94,10 +100,11 @@ async def _tell_whether_anybody_can_come_in(users: UsersFile) -> None:
 async def _until_one_ends(*works: Coroutine[object, object, object]) -> None:
     """What has failed is told, and the process started again."""
     tasks = [asyncio.create_task(work) for work in works]
-    done, others = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-    for task in others:
-        task.cancel()
-    await asyncio.gather(*others, return_exceptions=True)
+    done: set[asyncio.Task[object]] = set()
+    try:
+        done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+    finally:
+        await finish_all(end(task) for task in tasks if task not in done)
     for task in done:
         task.result()
 

@@ -68,7 +68,8 @@ class ModbusFace:
         server.close()
         for connection in self.connections:
             connection.abort()
-        await asyncio.gather(*(connection.lost for connection in self.connections))
+        if lost := [connection.lost for connection in self.connections]:
+            await asyncio.wait(lost)
         await server.wait_closed()
 
     def break_off(self) -> None:

@@ -4,7 +4,6 @@ import asyncio
 import logging
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import suppress
 from datetime import UTC, datetime
 from typing import Any
 
@@ -87,10 +86,11 @@ class OpcUaFace:
             return
         stack, sampler = self._stack, self._sampler
         self._stack = self._sampler = None
-        await stack.close()
         sampler.cancel()
-        with suppress(asyncio.CancelledError):
-            await sampler
+        await stack.close()
+        await asyncio.wait([sampler])
+        if not sampler.cancelled():
+            sampler.result()
 
     # One request, one instant: nothing here waits, so that nothing else acts in between.
 

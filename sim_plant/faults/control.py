@@ -57,9 +57,10 @@ class ControlServer:
             server.close()
             for writer in list(self._connections):
                 writer.transport.abort()
-            await server.wait_closed()
         if path is not None:
             path.unlink(missing_ok=True)
+        if server is not None:
+            await server.wait_closed()
 
     def answer(self, line: bytes) -> Message:
         """The answer to one line."""

@@ -72,7 +72,8 @@ class TcpProxy:
         await asyncio.gather(*self._dialling, return_exceptions=True)
         ends = [end.lost for link in self._links for end in link.ends]
         self._break_off()
-        await asyncio.gather(*ends)
+        if ends:
+            await asyncio.wait(ends)
         await server.wait_closed()
 
     def _accept(self) -> "_End":

@@ -270,6 +270,11 @@ class Registers:
     async def __aexit__(self, *_: object) -> None:
         await self.stop()
 
+    @property
+    def connected(self) -> int:
+        """Connections that are open."""
+        return len(self._writers)
+
     async def stop(self) -> None:
         assert self._server is not None
         self._server.close()

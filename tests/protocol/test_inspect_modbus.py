@@ -14,8 +14,9 @@ from drivers.modbus.maps import ModbusMap
 from drivers.modbus.scan import registers, scan, usual_float
 from drivers.wiring import Wired
 from gateway.core.line import ModbusTcpBus
-from tests.protocol.driver_support import FAULT, Registers, frame, line
+from tests.protocol.driver_support import FAULT, Registers, frame, line, until
 from tests.protocol.modbus_support import wired
+from tests.support.cutting import cut
 
 
 def quiet(text: str) -> None:
@@ -206,5 +207,23 @@ def test_registers_at_the_ends_of_what_there_is() -> None:
         _, rows = await registers("127.0.0.1", peer.port, 2, 0, 1, [3])
         by_name = {row.reading: row for row in rows}
         assert by_name["u16"].zero == 0x5202 and by_name["u16"].one is None, "nothing lies before register 0"
+
+    bench(body)
+
+
+def test_wherever_it_is_cancelled_no_connection_stays_open() -> None:
+    async def body(peer: Registers) -> None:
+        of_line = line(2, modbus_port=peer.port)
+        (bus,) = (bus for bus in of_line.buses if isinstance(bus, ModbusTcpBus))
+        cuts = 0
+        while await cut(inspect(bus, wired(of_line), 0.0, quiet), cuts + 1):
+            cuts += 1
+            await until(lambda: not peer.connected)
+        assert cuts > 10
+        cuts = 0
+        while await cut(scan("127.0.0.1", peer.port, [1, 2], {}, quiet), cuts + 1):
+            cuts += 1
+            await until(lambda: not peer.connected)
+        assert cuts >= 4
 
     bench(body)

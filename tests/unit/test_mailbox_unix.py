@@ -287,6 +287,37 @@ def test_a_closed_mailbox_leaves_no_socket_file_and_closes_twice() -> None:
     run(story)
 
 
+def test_closing_that_is_cancelled_leaves_no_connection_open() -> None:
+    async def story(folder: Path) -> None:
+        asked, tidied = asyncio.Event(), asyncio.Event()
+
+        async def slow(_: bytes) -> bytes:
+            try:
+                asked.set()
+                await asyncio.Event().wait()
+            finally:
+                await tidied.wait()  # the mailbox that is closed waits for this
+            return b""
+
+        async with mailboxes(2) as (asking, serving):
+            serving.serve(LOOP_COMMAND, slow)
+            await serving.listen(folder / "l")
+            asking.connect((LOOP_COMMAND,), folder / "l")
+            request = asyncio.create_task(asking.request(LOOP_COMMAND, b"", 5.0))
+            await asked.wait()
+            closing = asyncio.create_task(serving.close())
+            await asyncio.sleep(0)
+            closing.cancel()
+            with suppress(asyncio.CancelledError):
+                await closing
+            with pytest.raises(Unreachable, match="closed the connection"):
+                await request
+            assert not (folder / "l").exists()
+            tidied.set()
+
+    run(story)
+
+
 def test_more_connections_than_allowed_are_turned_away() -> None:
     async def story(folder: Path) -> None:
         async with mailboxes(2) as (asking, serving):

@@ -17,6 +17,7 @@ from asyncua import ua as asyncua_ua
 from asyncua.common.event_objects import DialogCondition, RefreshEndEvent, RefreshStartEvent
 from asyncua.server.event_generator import EventGenerator
 
+from drivers.cleanup import finish
 from gateway.core.decisions import ProposalShown
 from gateway.core.messages import Reply
 from gateway.operator.line_side import NoAnswer
@@ -122,7 +123,7 @@ class Dialogs:
             made = _Dialog(path, shown.proposal_hash, shown.shown or "", shown.epoch, emits)
             await self._tell(made, f"a proposal waits for a person: {shown.proposal_hash[:12]}")
         except BaseException:
-            await self._space.remove(path)
+            await finish(self._space.remove(path))
             raise
         self._open[path] = made
 
@@ -132,7 +133,7 @@ class Dialogs:
             _set(one.event, {"Retain": (False, BOOLEAN)} | _dialog_state(active=False), datetime.now(UTC))
             await self._tell(one, f"it waits no more, or is shown anew: {one.proposal[:12]}")
         finally:
-            await self._space.remove(path)
+            await finish(self._space.remove(path))
 
     async def _tell(self, one: _Dialog, message: str) -> None:
         """As an event, and as the nodes that have the same."""

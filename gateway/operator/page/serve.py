@@ -12,6 +12,8 @@ import uvicorn
 from starlette.applications import Starlette
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
+from drivers.cleanup import finish
+
 MOST_CONNECTIONS = 100
 IDLE_S = 10.0  #: of a connection without a whole request
 UNHEARD_MS = 15_000  #: that a browser takes nothing of what is sent: it is gone, and frees its place
@@ -85,6 +87,10 @@ def port_of(address: SplitResult) -> int:
     return (443 if address.scheme == "https" else 80) if address.port is None else address.port
 
 
+async def _ended(serving: asyncio.Future[None]) -> None:
+    await serving
+
+
 async def serve_on(app: Starlette, listener: socket.socket, tls: ssl.SSLContext | None = None) -> None:
     """Until it is cancelled. `app` is one of `page_app`."""
     config = uvicorn.Config(
@@ -111,7 +117,7 @@ async def serve_on(app: Starlette, listener: socket.socket, tls: ssl.SSLContext 
     except asyncio.CancelledError:
         app.state.end()
         server.should_exit = True
-        await serving
+        await finish(_ended(serving))  # a second cancellation would leave browsers connected
         raise
     finally:
         listener.close()
