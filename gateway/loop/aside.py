@@ -5,18 +5,30 @@ import os
 import sys
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from typing import TypeVar
 
 T = TypeVar("T")
 
 #: How long the thread may hold the interpreter once the loop wants it; Python's own 5 ms are half a period.
 SWITCH_S = 50e-6
+BEHIND_LOOPS = 1  #: real-time priority: below any loop's, above whatever has none
 
 
 def _stand_back() -> None:
-    """Not on the loop's processor by its priority: a thread inherits both, and would never be put off it."""
-    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+    """Off the loop's processor, behind every loop, and before all else.
+
+    A thread that holds the interpreter and has to wait for a processor keeps the loop waiting with it: on a busy
+    computer for tens of milliseconds. So it goes before what has no real-time priority, where the loop has one itself.
+    """
     os.sched_setaffinity(0, range(os.cpu_count() or 1))
+    if os.sched_getscheduler(0) == os.SCHED_OTHER:
+        return
+    try:
+        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(BEHIND_LOOPS))
+    except PermissionError:  # it was granted once: then at least not as the loop itself
+        with suppress(PermissionError):
+            os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 
 
 class Aside:
