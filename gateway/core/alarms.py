@@ -110,6 +110,13 @@ ALARMS: tuple[Alarm, ...] = (
         action="make room on the disk, or lower keep_gb in the line's file",
         after_s=30.0, gone_s=5.0,
     ),
+    Alarm(
+        "gateway-task", "medium", "a task of the gateway fails",
+        cause="a fault of this program, or of a file that it reads, which its text names",
+        consequence="what that task does is not done, or late: a change on probation may fall back, an alarm not come",
+        action="read the text; where it lasts, start the gateway anew: the line runs on. Report it with the log",
+        after_s=0.0, gone_s=5.0,
+    ),
 )  # fmt: skip
 BY_NAME = {alarm.name: alarm for alarm in ALARMS}
 

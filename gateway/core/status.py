@@ -108,6 +108,17 @@ class BusStatus(Strict):
     refused: int  #: requests of agents turned away: too many, too long, for several keys
 
 
+class TaskFaultStatus(Strict):
+    """A long task of the gateway that has raised an exception, and has not succeeded for a while since."""
+
+    task: str
+    error: str  #: name of the exception's type
+    text: str  #: of the exception
+    since_wall_s: float  #: Unix time
+    times: int  #: raised since
+    in_a_row: int  #: turns that failed one after the other; 0: the last one succeeded
+
+
 class GatewayStatus(Strict):
     format: Annotated[int, Field(ge=1, le=1)]
     site: str
@@ -128,3 +139,4 @@ class GatewayStatus(Strict):
     historian: HistorianStatus
     events: list[EventStatus]  #: the last ones, the newest at the end
     alarms: list[AlarmStatus] = []  #: what needs a look first stands first
+    task_faults: list[TaskFaultStatus] = []  #: the oldest first

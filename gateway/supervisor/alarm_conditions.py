@@ -27,6 +27,7 @@ class Conditions:
         """By alarm what is so now, in words."""
         self._hear(status)
         found = {"audit-unavailable": "" if audit.available else audit.text, "loop-lost": _loop_lost(status)}
+        found["gateway-task"] = _gateway_task(status)
         found["history-not-stored"] = "" if status.historian.storing else status.historian.text
         if status.loop.running:
             found |= {name: condition(status) for name, condition in OF_THE_LINE.items()}
@@ -48,6 +49,10 @@ def _loop_lost(status: GatewayStatus) -> str:
     """A loop that nobody has started yet is none that was lost."""
     loop = status.loop
     return "" if loop.running or loop.age_s is None else f"no telemetry for {loop.age_s:.1f} s"
+
+
+def _gateway_task(status: GatewayStatus) -> str:
+    return "; ".join(f"{fault.task}: {fault.error}: {fault.text}" for fault in status.task_faults)
 
 
 def _device_absent(status: GatewayStatus) -> str:

@@ -6,13 +6,14 @@ proposals judged, `on_the_line` carries out what is approved.
 """
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Awaitable, Callable, Mapping
 from itertools import islice
+from math import inf
 from typing import Any
 
 from gateway.core.audit_record import Who
 from gateway.core.decisions import MOST_LISTED, Decide, ProposalLine, ProposalList, ProposalShown, shown_hash
-from gateway.core.deployment import Region
+from gateway.core.deployment import InService, Region
 from gateway.core.judge_context import JudgeContext
 from gateway.core.line import Line
 from gateway.core.messages import Reply
@@ -51,6 +52,9 @@ from gateway.supervisor.proposal_inbox import Inbox
 from gateway.supervisor.proposal_records import ProposalRecords, done, refused
 from gateway.supervisor.small_changes import SmallChanges
 
+RETRY_S = 30.0  #: after what passes by its verdict could not be carried out; then twice as long each time
+MOST_RETRIES = 5  #: then it waits for a person
+
 
 class Deployer:
     """`propose`, `decide` and `roll_back` for others; `watch` a few times a second. All in one event loop."""
@@ -63,7 +67,7 @@ class Deployer:
         loop: LoopSide,
         judge: JudgeSide,
         surroundings: Surroundings,
-        take_up: Callable[[Proposal, str | None], None],
+        take_up: Callable[[Proposal, str | None], Awaitable[None]],
         clock: Callable[[], float],
         wall_clock: Callable[[], float],
         own_uid: int | None = None,
@@ -85,7 +89,10 @@ class Deployer:
         self._inbox = Inbox(line, self._records, judge, surroundings)
         self._on_the_line = OnTheLine(line, self._records, loop, surroundings, take_up, clock)
         self._small = SmallChanges(line, self._records)
-        self._looked_at: set[str] = set()  #: proposals that would pass without a person, or not
+        self._clock = clock
+        #: Of proposals that would pass without a person, or not: when that is looked at again; inf: never.
+        self._looked_at_again_s: dict[str, float] = {}
+        self._failures: dict[str, int] = {}  #: to carry out what passes without a person, by proposal
 
     @property
     def trouble(self) -> str:
@@ -125,7 +132,7 @@ class Deployer:
                         )
                     what |= {"by": SCRIPT if SCRIPT in (by, first.by) else PERSON, "first": first.name}
                 await self._records.step("approved", what, who)
-                return await self._on_the_line.carry_out(self.book.entries[entry.proposal], found, who)
+                return await self._carry_out(entry.proposal, found, who)
             except (AuditUnavailable, Unreachable, Impossible, NotTakenUp, NotKnown) as error:
                 return refused("it is not carried out", [str(error)])
 
@@ -205,7 +212,7 @@ class Deployer:
                 await self._tidy()
                 await self._approve_small()
                 await self._on_the_line.look_after()
-            except (AuditUnavailable, Unreachable, Impossible) as error:
+            except (AuditUnavailable, Unreachable, Impossible, NotTakenUp, NotKnown) as error:
                 # Without a renewal the loop falls back by itself; the next look settles it.
                 self._records.trouble = str(error)
             else:
@@ -287,9 +294,11 @@ class Deployer:
             return f"not kept yet: {self._on_the_line.unseen() or 'about to be'}"
         if entry.stage is not Stage.WAITING:
             return entry.why
-        reasons: list[str] | None = [entry.why]
-        if self._line.gate.autonomy == "approve-first" and (reasons := self._small.why_a_person(entry)) is None:
-            reasons = ["whether it passes by its verdict alone was not looked at yet"]
+        reasons = [entry.why]
+        if self._line.gate.autonomy == "approve-first":
+            by_person = self._small.why_a_person(entry)
+            not_yet = ["whether it passes by its verdict alone was not looked at yet"]
+            reasons += not_yet if by_person is None else by_person
         if self._line.gate.approvals > 1:
             first = self._first(entry)
             two = "it takes two people" if first is None else f"{first.name} has approved it, it takes another person"
@@ -314,6 +323,19 @@ class Deployer:
             f"your approval of {entry.proposal[:12]} is on record, as the first of two: it is carried out once another "
             f"person has approved it, too, before {entry.expires}"
         )
+
+    async def _carry_out(self, proposal: str, found: InService, who: Who) -> Reply:
+        """What has just been approved. Raises as `OnTheLine.carry_out`.
+
+        Where it comes to nothing before the loop is told of it, the approval counts no more, on record and at once.
+        """
+        try:
+            return await self._on_the_line.carry_out(self.book.entries[proposal], found, who)
+        except (NotTakenUp, NotKnown, Impossible) as error:
+            if self.book.entries[proposal].stage is Stage.APPROVED:
+                because = f"it was approved, and not carried out: {error}"
+                await self._records.step("approval-lapsed", {"proposal": proposal, "because": because}, GATEWAY)
+            raise
 
     def _why_not_decide(self, entry: Entry | None, decision: Decide, approver: tuple[str, ...]) -> list[str]:
         if entry is None:
@@ -350,22 +372,33 @@ class Deployer:
     async def _approve_small(self) -> None:
         """Where the line's file allows it: what is like enough to what a person approved passes by its verdict alone.
 
-        One a look, and each once: what could not be carried out waits for a person, and what was not looked at yet for
-        the next look.
+        One a look. What was not looked at yet waits for the next look; what could not be carried out is tried again,
+        `MOST_RETRIES` times, and then waits for a person.
         """
+        now_s = self._clock()
         if self._line.gate.autonomy != "approve-first" or self.book.on_the_line is not None:
             return
         for entry in self.book.entries.values():
-            if entry.stage is Stage.WAITING and entry.proposal not in self._looked_at:
+            if entry.stage is Stage.WAITING and now_s >= self._looked_at_again_s.get(entry.proposal, now_s):
                 if (reasons := self._small.why_a_person(entry)) is None:
                     continue
-                self._looked_at.add(entry.proposal)
+                self._looked_at_again_s[entry.proposal] = inf
                 if not reasons:
-                    found = await self._on_the_line.settle()
-                    what = {"proposal": entry.proposal, "by": VERDICT, "like": self.book.trusted[entry.kind]}
-                    await self._records.step("approved", what, GATEWAY)
-                    await self._on_the_line.carry_out(self.book.entries[entry.proposal], found, GATEWAY)
+                    await self._approve(entry)
                 return
+
+    async def _approve(self, entry: Entry) -> None:
+        """By its verdict alone. Raises as `OnTheLine.carry_out`."""
+        try:
+            found = await self._on_the_line.settle()
+            what = {"proposal": entry.proposal, "by": VERDICT, "like": self.book.trusted[entry.kind]}
+            await self._records.step("approved", what, GATEWAY)
+            await self._carry_out(entry.proposal, found, GATEWAY)
+        except Exception:
+            failures = self._failures[entry.proposal] = self._failures.get(entry.proposal, 0) + 1
+            if failures <= MOST_RETRIES:
+                self._looked_at_again_s[entry.proposal] = self._clock() + RETRY_S * 2.0 ** (failures - 1)
+            raise
 
 
 def _line_of(entry: Entry, why: str) -> ProposalLine:

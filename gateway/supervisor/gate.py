@@ -1,7 +1,6 @@
 """The gate of a gateway process: audit, stores, judge and deployer, and what of them is asked over the mailbox."""
 
 import asyncio
-import json
 from collections.abc import Callable, Mapping
 from importlib.metadata import version
 from pathlib import Path
@@ -9,12 +8,10 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from gateway.core.audit_record import Who
-from gateway.core.controller import Controller, ControllerRefused, config_hash, parse_controller
 from gateway.core.decisions import DECISION, QUERY, Archive, Decide, LineChanged, ListProposals, RollBackNow
 from gateway.core.line import Line
 from gateway.core.messages import Command, Deploy, Event, Keep, Reply, WatchGood, command_bytes
 from gateway.core.people import Role
-from gateway.core.proposal import GainsChange, ModelChange, Proposal
 from gateway.core.status import ChangeStatus
 from gateway.core.topics import GATEWAY_DECISION, GATEWAY_PROPOSALS, GATEWAY_PROPOSE, LOOP_COMMAND
 from gateway.mailbox.port import PEER, Mailbox, RemoteError
@@ -25,27 +22,21 @@ from gateway.supervisor.audit import Audit
 from gateway.supervisor.audit_file import AuditUnavailable
 from gateway.supervisor.book_file import CannotBegin, book_in
 from gateway.supervisor.bounded import Bounded, with_left_out
-from gateway.supervisor.configurations import Configurations, ConfigurationsError, Origin, begin_configurations
+from gateway.supervisor.configurations import Configurations, ConfigurationsError, begin_configurations
 from gateway.supervisor.deployer import Deployer
-from gateway.supervisor.deployer_sides import JudgeSide, NotTakenUp
+from gateway.supervisor.deployer_sides import JudgeSide
 from gateway.supervisor.experiments import ENDS as EXPERIMENT_ENDS
 from gateway.supervisor.in_service import InServiceView
 from gateway.supervisor.kept_audit import KeptAudit
 from gateway.supervisor.model_store import ModelsError
 from gateway.supervisor.models import Models, begin_repository
 from gateway.supervisor.peers import GATEWAY, who_of
+from gateway.supervisor.store_writer import StoreWriter
 from gateway.supervisor.surroundings import LineSurroundings
 
 LOOP_TIME_S = 2.5
 CONFIGURATION_CHANGES = ("start", "rolled-back")
 BUILD_TIME_S = 15.0  #: for what the loop builds and warms before it answers
-
-#: Files in the line's folder from which a loop takes its first configuration, and how they are read.
-STARTED_WITH: dict[str, Callable[[bytes], Controller]] = {
-    "controller.json": parse_controller,
-    "started-with.json": parse_controller,
-    "configuration.json": lambda content: parse_controller(json.dumps(json.loads(content)["controller"]).encode()),
-}
 
 
 class LoopOverMailbox:
@@ -89,6 +80,8 @@ class Gate:
         self.audit = Audit(folder, clock=clock, wall_clock=wall_clock)
         self.audit.start()
         self._stores: tuple[Configurations, Models] | None = None
+        self._writer = StoreWriter(line, folder, wall_clock)
+        self._start_recorded = False
         self._shut = "the gate is about to open"  #: why it is, while it is
         self._in_service = InServiceView(line, folder)
         self._told = ""
@@ -106,7 +99,7 @@ class Gate:
         if self.deployer is not None:
             await self.deployer.at_hand()
             await self.deployer.watch()
-            self._learn_again(self.deployer)
+            await self._learn_again(self.deployer)
         trouble = self._shut if self.deployer is None else self.deployer.trouble
         if trouble != self._told:
             self._told = trouble
@@ -142,63 +135,32 @@ class Gate:
     async def _open(self) -> None:
         """Once a record of the start is on the disk, the records before it are read."""
         try:
-            await self.audit.append("gateway-start", GATEWAY, {"version": version("r2rgate")})
+            if not self._start_recorded:
+                await self.audit.append("gateway-start", GATEWAY, {"version": version("r2rgate")})
+                self._start_recorded = True
             book = await asyncio.to_thread(book_in, self._folder)
             if self._stores is None:
-                self._stores = (
-                    begin_configurations(self._folder / configurations_store.FILE_NAME),
-                    begin_repository(self._folder / models_store.FILE_NAME),
-                )
-            self._learn(self._stores[0])
+                self._stores = await asyncio.to_thread(_stores_in, self._folder)
+            await self._writer.store_given()
         except (AuditUnavailable, CannotBegin, ConfigurationsError, ModelsError) as error:
             self._shut = str(error)
             return
         self.deployer = Deployer(
             self._line, book, KeptAudit(self._folder, self.audit), self._loop, self._judge,
-            self._around(*self._stores), self._take_up, self._clock, self._wall_clock,
+            self._around(*self._stores), self._writer.take_up, self._clock, self._wall_clock,
             roles=lambda: self.roles(),
         )  # fmt: skip
 
-    def _learn_again(self, deployer: Deployer) -> None:
+    async def _learn_again(self, deployer: Deployer) -> None:
         """A loop that was started later has been given something else."""
         runs = deployer.book.in_service
-        if self._stores is None or runs == self._learned:
+        if runs == self._learned:
             return
         try:
-            self._learn(self._stores[0])
+            await self._writer.store_given()
         except ConfigurationsError as error:
             self._note("gate", f"what the loop was started with is not stored: {error}")
         self._learned = runs
-
-    def _learn(self, configurations: Configurations) -> None:
-        """Store what the loop may have been started with: it tells only its hash."""
-        for name, read in STARTED_WITH.items():
-            try:
-                controller = read((self._folder / name).read_bytes())
-            except (OSError, ValueError, ControllerRefused):
-                continue  # the loop says what it runs; a proposal finds that it is not known here
-            known = {one.id for one in configurations.entries(self._line.site, self._line.line)}
-            if config_hash(controller) not in known:
-                origin = Origin(self._wall_clock(), GATEWAY.name, f"found as {name}, with which the loop starts")
-                configurations.store(self._line.site, self._line.line, controller, origin)
-
-    def _take_up(self, proposal: Proposal, verdict: str | None) -> None:
-        """What is about to be put into service goes into the stores. Raises NotTakenUp."""
-        assert self._stores is not None  # they are open before the gate is
-        try:
-            self._store(proposal, verdict, *self._stores)
-        except (ConfigurationsError, ModelsError) as error:
-            raise NotTakenUp(str(error)) from error
-
-    def _store(self, proposal: Proposal, verdict: str | None, configurations: Configurations, models: Models) -> None:
-        change, now_s, line = proposal.change, self._wall_clock(), self._line
-        if isinstance(change, GainsChange):
-            origin = Origin(now_s, proposal.author, proposal.reason[:400], proposal.base, proposal.model, verdict)
-            configurations.store(line.site, line.line, change.controller, origin)
-        elif isinstance(change, ModelChange):
-            entry = models.store(change.model, now_s)
-            _supersede(models, line, entry.id, now_s, f"by version {entry.version}")
-            models.mark(entry.id, "accepted", now_s, proposal.reason[:400])
 
     async def propose(self, payload: bytes, who: Who) -> Reply:
         """Take a proposal in, to be judged in the background."""
@@ -270,9 +232,9 @@ class Gate:
 
     async def _line_changed(self, deployer: Deployer, said: LineChanged, who: Who) -> Reply:
         reply = await deployer.line_changed(said.because, who)
-        if reply.ok and self._stores is not None:
+        if reply.ok:
             try:
-                _supersede(self._stores[1], self._line, deployer.book.model, self._wall_clock(), said.because)
+                await self._writer.supersede_models(deployer.book.model, said.because)
             except ModelsError as error:  # nothing is judged by it any more all the same
                 self._note("gate", f"a model is not marked as superseded: {error}")
         return reply
@@ -282,11 +244,14 @@ class Gate:
         return Reply(ok=False, state="", text="the gate is shut", reasons=[self._shut])
 
 
-def _supersede(models: Models, line: Line, but: str | None, now_s: float, why: str) -> None:
-    """Every accepted model of the line `but` this one. Raises ModelsError."""
-    for other in models.entries(line.site, line.line):
-        if other.state == "accepted" and other.id != but:
-            models.mark(other.id, "superseded", now_s, why)
+def _stores_in(folder: Path) -> tuple[Configurations, Models]:
+    """Raises ConfigurationsError and ModelsError."""
+    configurations = begin_configurations(folder / configurations_store.FILE_NAME)
+    try:
+        return configurations, begin_repository(folder / models_store.FILE_NAME)
+    except ModelsError:
+        configurations.close()
+        raise
 
 
 def _not_understood(error: ValidationError) -> bytes:

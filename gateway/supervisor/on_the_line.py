@@ -3,7 +3,7 @@
 What the loop says of itself settles what a record left open: after a restart, after an answer that did not come.
 """
 
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 
 from gateway.core.audit_record import Who
 from gateway.core.deployment import Deployment, InService, first_region
@@ -42,7 +42,7 @@ class OnTheLine:
         records: ProposalRecords,
         loop: LoopSide,
         surroundings: Surroundings,
-        take_up: Callable[[Proposal, str | None], None],
+        take_up: Callable[[Proposal, str | None], Awaitable[None]],
         clock: Callable[[], float],
     ) -> None:
         self.settled = False  #: the loop has been asked since this process began, or since it told of a change
@@ -80,7 +80,9 @@ class OnTheLine:
     async def carry_out(self, entry: Entry, found: InService, who: Who) -> Reply:
         await self._records.fetch([entry])
         proposal = self._records.proposal(entry)
-        self._take_up(proposal, entry.verdict)
+        if (other := self._records.book.on_the_line) is not None:  # a lease is not kept waiting for a store
+            raise Impossible(f"proposal {other.proposal[:12]} is {other.stage}: one change at a time")
+        await self._take_up(proposal, entry.verdict)
         if isinstance(proposal.change, GainsChange):
             return await self._deploy(entry, proposal.change, found, who)
         if isinstance(proposal.change, ExperimentChange):

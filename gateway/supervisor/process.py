@@ -7,7 +7,8 @@ import asyncio
 import signal
 import sys
 import time
-from collections.abc import Awaitable, Callable
+import traceback
+from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
 
@@ -40,6 +41,7 @@ from gateway.supervisor.persons_desk import PersonsDesk
 from gateway.supervisor.retention import retention_of
 from gateway.supervisor.service import Gateway
 from gateway.supervisor.surroundings import LineSurroundings
+from gateway.tasks.supervisor import Supervisor, TaskFault, wait
 
 EXIT_OK, EXIT_NOT_FLUSHED, EXIT_CANNOT_LISTEN, EXIT_ALREADY_RUNNING = 0, 1, 2, 3
 WATCH_S = 0.25
@@ -85,6 +87,8 @@ async def serve(
         wall_clock=wall_clock,
     )  # fmt: skip
     gateway = Gateway(line, mailbox, historian, mailbox.counters, clock, wall_clock)
+    tasks = Supervisor(lambda fault, error: _tell_fault(gateway, fault, error), clock)
+    gateway.task_faults = lambda: tasks.faults
 
     def experiments(most_s: float) -> list[tuple[Recording, float]]:
         now_s = wall_clock()
@@ -118,16 +122,17 @@ async def serve(
     line_desk = LineDesk(line, gate, data_folder, experiments, cases)
     bus = AgentsBus(line, run_folder, (desk, line_desk), gateway.note, cases, clock)
     gateway.agents_bus = bus.status
-    opening = asyncio.create_task(bus.open())
-    looking = [asyncio.create_task(_look(look, stop, watch_s)) for look in (gate.look, cases.look, alarms.keep)]
+    opening = tasks.begin("opening the agents' bus", bus.open())
+    turns = {"gate": gate.look, "agents' cases": cases.look, "alarms' file": alarms.keep}
+    looking = [asyncio.create_task(tasks.repeat(name, turn, watch_s, stop)) for name, turn in turns.items()]
     gateway.note("gateway-up", "the gateway has started")
     print(f"gateway of {line.site}/{line.line}: {run_folder / GATEWAY_SOCKET}, history {historian.path}", flush=True)
     try:
         while not stop.is_set():
-            gateway.watch()
-            alarms.look(gateway.status(), gate.audit.state())
-            bus.watch()
-            await _wait(stop, watch_s)
+            tasks.turn("watching the loop", gateway.watch)
+            tasks.turn("alarms", lambda: alarms.look(gateway.status(), gate.audit.state()))
+            tasks.turn("agents' bus", bus.watch)
+            await wait(stop, watch_s)
     finally:
         stop.set()
         await asyncio.gather(*looking)
@@ -147,16 +152,13 @@ async def serve(
     return EXIT_OK if flushed else EXIT_NOT_FLUSHED
 
 
-async def _look(look: Callable[[], Awaitable[None]], stop: asyncio.Event, watch_s: float) -> None:
-    """Beside the rest: it waits for the loop's answers, or for the disk."""
-    while not stop.is_set():
-        await look()
-        await _wait(stop, watch_s)
-
-
-async def _wait(stop: asyncio.Event, timeout_s: float) -> None:
-    try:
-        async with asyncio.timeout(timeout_s):
-            await stop.wait()
-    except TimeoutError:
-        pass
+def _tell_fault(gateway: Gateway, fault: TaskFault, error: BaseException | None) -> None:
+    """Into the history's events and, with where it was raised, into the process's log."""
+    data = {"task": fault.task, "error": fault.error, "times": fault.times}
+    if error is None:
+        gateway.note("task-mended", f"{fault.task}: works again, after {fault.times} failures", **data)
+        return
+    told = f"{fault.task}: {fault.error}: {fault.text}"
+    gateway.note("task-failed", told, **data)
+    where = "".join(traceback.format_exception(error))
+    print(f"a task of the gateway failed, and goes on: {told}\n{where}", file=sys.stderr, flush=True)

@@ -33,6 +33,7 @@ from gateway.core.status import (
     HistorianStatus,
     LimitsStatus,
     LinkStatus,
+    TaskFaultStatus,
 )
 from gateway.core.telemetry import Frame
 from gateway.core.topics import GATEWAY_COMMAND, GATEWAY_STATUS, LOOP_BUSES, LOOP_COMMAND, LOOP_EVENT, LOOP_TELEMETRY
@@ -42,6 +43,7 @@ from gateway.supervisor.peers import who_of
 from gateway.supervisor.recent import Recent
 from gateway.supervisor.status import known, loop_status, span_statuses, timing_status
 from gateway.supervisor.telemetry_sink import TelemetrySink
+from gateway.tasks.supervisor import TaskFault
 
 LOOP_TIME_S = 2.5  #: for the loop to answer a command
 ARM_TIME_S = 14.0  #: arming configures every drive and reads its watchdog back
@@ -77,6 +79,7 @@ class Gateway:
         self.change: Callable[[], ChangeStatus | None] = lambda: None  #: what the gate does to the line now
         self.agents_bus: Callable[[], BusStatus] = lambda: NO_BUS
         self.alarms: Callable[[], list[AlarmStatus]] = list
+        self.task_faults: Callable[[], list[TaskFault]] = list
         self._events: deque[EventStatus] = deque(maxlen=EVENTS_SHOWN)
         self._buses: list[BusReport] = []
         self._malformed_events = 0
@@ -153,6 +156,7 @@ class Gateway:
             historian=self._historian_status(now_s),
             events=list(self._events),
             alarms=self.alarms(),
+            task_faults=[self._fault_status(fault) for fault in self.task_faults()],
         )
 
     def _historian_status(self, now_s: float) -> HistorianStatus:
@@ -167,6 +171,13 @@ class Gateway:
             last_stored_age_s=None if health.last_stored_s is None else round(now_s - health.last_stored_s, 3),
             moved_aside=health.moved_aside,
         )
+
+    def _fault_status(self, fault: TaskFault) -> TaskFaultStatus:
+        since_wall_s = round(fault.since_s + self._wall_clock() - self._clock(), 3)
+        return TaskFaultStatus(
+            task=fault.task, error=fault.error, text=fault.text, since_wall_s=since_wall_s, times=fault.times,
+            in_a_row=fault.in_a_row,
+        )  # fmt: skip
 
     def _frame(self, payload: bytes) -> None:
         self._historian.frame(payload)

@@ -19,6 +19,7 @@ from gateway.supervisor.deployer import Deployer
 from gateway.supervisor.kept_audit import KeptAudit
 from gateway.supervisor.lifecycle import Book
 from safety.judge import judge
+from tests.unit.deployer_gateway import nothing_to_store
 from tests.unit.deployer_support import Death, FakeLoop, FakeSurroundings
 
 EXAMPLES = Path("docs/examples")
@@ -47,7 +48,7 @@ async def judged_into(folder: Path, payload: bytes) -> None:
     audit = Audit(folder, clock=lambda: loop.now_s, wall_clock=lambda: loop.now_s)
     audit.start()
     deployer = Deployer(
-        line, Book(), KeptAudit(folder, audit), loop, Judge(), AsInTheExample(loop), lambda *_: None,
+        line, Book(), KeptAudit(folder, audit), loop, Judge(), AsInTheExample(loop), nothing_to_store,
         lambda: loop.now_s, lambda: loop.now_s,
     )  # fmt: skip
     try:

@@ -34,6 +34,9 @@ TRUSTING = LINE.model_copy(
 FOUR_EYES = LINE.model_copy(update={"gate": LINE.gate.model_copy(update={"approvals": 2})})
 
 
+async def nothing_to_store(proposal, verdict) -> None: ...
+
+
 class Gateway:
     """A deployer and everything around it, in one process that can die and begin anew."""
 
@@ -46,6 +49,7 @@ class Gateway:
         self.surroundings = FakeSurroundings(self.loop)
         self.proposals = {}
         self.roles: dict[str, str] | None = None  #: of the people who may come in
+        self.take_up = nothing_to_store  #: StoreWriter.take_up of real stores, or one that fails
         self.begin()
 
     def _checked(self, kind, what) -> None:
@@ -61,8 +65,11 @@ class Gateway:
     def begin(self) -> None:
         self.judge.line = line_hash(self.line)
         book, clock = book_of(self.audit.records), self._now_s
-        args = (self.audit, self.loop, self.judge, self.surroundings, lambda proposal, verdict: None, clock, clock)
+        args = (self.audit, self.loop, self.judge, self.surroundings, self._take_up, clock, clock)
         self.deployer = Deployer(self.line, book, *args, own_uid=OPERATORS_UID, roles=lambda: self.roles)
+
+    async def _take_up(self, proposal, verdict) -> None:
+        await self.take_up(proposal, verdict)
 
     def _now_s(self) -> float:
         return self.loop.now_s

@@ -26,7 +26,7 @@ from gateway.core.doubts import WORDS, Doubt
 from gateway.core.messages import Reply
 from gateway.core.people import LEAST, ForPerson, Person
 from gateway.core.states import OPERATORS_STOP
-from gateway.core.status import GatewayStatus
+from gateway.core.status import GatewayStatus, TaskFaultStatus
 from gateway.core.topics import GATEWAY_ALARM, GATEWAY_FOR_PERSON
 from gateway.mailbox.unix import UnixMailbox
 from gateway.supervisor.alarm_conditions import OF_THE_LINE, Conditions
@@ -64,6 +64,12 @@ CASES: dict[str, tuple[GatewayStatus, str]] = {
     "history-not-stored": (
         status(historian=status().historian.model_copy(update={"storing": False, "text": "not storing: disk full"})),
         "disk full",
+    ),
+    "gateway-task": (
+        status(task_faults=[TaskFaultStatus(
+            task="gate", error="KeyError", text="'x'", since_wall_s=1.0, times=3, in_a_row=3,
+        )]),
+        "gate: KeyError: 'x'",
     ),
 }  # fmt: skip
 

@@ -198,3 +198,46 @@ def test_rubbish_on_the_socket_changes_nothing() -> None:
                 assert process.wait(10.0) == 0
 
     run(story)
+
+
+FAILING_LOOK = """
+import sys
+from pathlib import Path
+from tests.unit.supervisor_support import line_of
+from gateway.supervisor.gate import Gate
+from gateway.supervisor.process import run_gateway
+
+looks, mended = 0, Path(sys.argv[1]) / "mended"
+look = Gate.look
+
+async def failing(gate):
+    global looks
+    looks += 1
+    if not mended.exists():
+        raise KeyError(f"look {looks}")
+    await look(gate)
+
+Gate.look = failing
+sys.exit(run_gateway(line_of(), Path(sys.argv[1]), Path(sys.argv[1]) / "data"))
+"""
+
+
+def test_a_look_that_raises_is_an_alarm_and_is_taken_again() -> None:
+    async def story(folder: Path) -> None:
+        with child(FAILING_LOOK, folder) as (process, said):
+            assert said.startswith("gateway of demo/")
+            async with loop_and_client(folder) as (_, client):
+                found = await status_with(client, lambda status: any(one.in_a_row > 2 for one in status.task_faults))
+                assert [(one.task, one.error) for one in found.task_faults] == [("gate", "KeyError")]
+                assert found.task_faults[0].times > 2
+                found = await status_with(client, lambda status: bool(status.alarms))
+                assert [alarm.name for alarm in found.alarms] == ["gateway-task"]
+                assert [event.kind for event in found.events].count("task-failed") == 1
+                (folder / "mended").touch()
+                await status_with(client, lambda status: all(one.in_a_row == 0 for one in status.task_faults))
+                await status_with(client, lambda status: any("the gate is open" in one.text for one in status.events))
+            process.send_signal(signal.SIGTERM)
+            _, err = process.communicate(timeout=20)
+            assert process.returncode == 0 and err.count("Traceback") == 1 and "KeyError: 'look 1'" in err
+
+    run(story)

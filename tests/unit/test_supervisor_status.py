@@ -21,6 +21,7 @@ from gateway.mailbox.port import MAX_PAYLOAD, PEER, Counters, Peer
 from gateway.supervisor.historian import Health, Historian
 from gateway.supervisor.service import EVENTS_SHOWN, TEXT_SHOWN, Gateway
 from gateway.supervisor.status import LOST_S, WORDS
+from gateway.tasks.supervisor import TaskFault
 from tests.unit.supervisor_support import frame_of, line_of
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -323,6 +324,7 @@ def example() -> GatewayStatus:
             shelved_until_wall_s=None,
         )
     ]  # fmt: skip
+    bench.gateway.task_faults = lambda: [TaskFault("gate", "KeyError", "'x'", 97.0, 99.0, 8, 1)]
     return bench.gateway.status()
 
 

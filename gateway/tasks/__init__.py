@@ -1,0 +1,1 @@
+"""The long tasks of a process: what becomes of one that raises."""
