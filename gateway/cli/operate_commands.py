@@ -147,7 +147,7 @@ def send(command: Command, run_dir: Path | None, as_json: bool, timeout_s: float
     elif reply.ok:
         typer.echo(f"{reply.state}: {reply.text}")
     else:
-        typer.echo(f"refused ({reply.state}): {reply.text}", err=True)
+        typer.echo(f"{'refused' if reply.known else 'not known'} ({reply.state}): {reply.text}", err=True)
         for reason in reply.reasons:
             typer.echo(f"  - {reason}", err=True)
     if not reply.ok:

@@ -336,7 +336,7 @@ def _end_with(reply: Reply, as_json: bool) -> None:
     elif reply.ok:
         typer.echo(reply.text)
     else:
-        typer.echo(f"refused: {reply.text}", err=True)
+        typer.echo(f"refused: {reply.text}" if reply.known else reply.text, err=True)
         for reason in reply.reasons:
             typer.echo(f"  - {reason}", err=True)
     if not reply.ok:

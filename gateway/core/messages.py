@@ -162,6 +162,7 @@ class Reply(Strict):
     text: str  #: one sentence for a person, with what to do next where it was refused
     reasons: list[str] = []  #: every reason of a refusal
     in_service: InService | None = None  #: after a command about the configuration
+    known: bool = True  #: False: whether it was done is not known yet; the events tell it once it is
 
 
 class Event(Strict):

@@ -7,6 +7,7 @@ from gateway.core.topics import Topic
 from gateway.mailbox.port import (
     MAX_PAYLOAD,
     Counters,
+    NotSent,
     PublishHandler,
     RemoteError,
     RequestHandler,
@@ -55,7 +56,7 @@ class InProcessMailbox:
     async def request(self, topic: Topic, payload: bytes, timeout_s: float) -> bytes:
         server = self._hub.servers.get(topic.name)
         if server is None:
-            raise Unreachable(what_to_start(topic))
+            raise NotSent(what_to_start(topic))
         _check_length(topic, "request", payload)
         task = asyncio.ensure_future(server[1](payload))
         done, _ = await asyncio.wait((task,), timeout=timeout_s)

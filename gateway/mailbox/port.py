@@ -19,6 +19,10 @@ class Unreachable(Exception):
     """The other side is not there, or did not answer in time. The text says what to start."""
 
 
+class NotSent(Unreachable):
+    """Nothing was handed over, so nothing of what was asked is done. Any other `Unreachable` does not say so."""
+
+
 class RemoteError(Unreachable):
     """The other side is there, but its handler failed or there is none. The text is what it said."""
 

@@ -22,6 +22,7 @@ from gateway.mailbox.port import (
     MAX_PAYLOAD,
     PEER,
     Counters,
+    NotSent,
     PublishHandler,
     RemoteError,
     RequestHandler,
@@ -147,24 +148,24 @@ class UnixMailbox:
     def _send_request(self, topic: Topic, datagram: bytes) -> Connection:
         path = self._routes.get(topic.name)
         if path is None:
-            raise Unreachable(f"{topic.name} is connected to no path")
+            raise NotSent(f"{topic.name} is connected to no path")
         connection = self._dialled.get(path)
         if connection is not None:
             if connection.send(datagram):
                 return connection
             if connection.open:
-                raise Unreachable(f"{topic.name}: its process has stopped reading")
+                raise NotSent(f"{topic.name}: its process has stopped reading")
             # The peer was restarted since the last message, which shows on sending: dial once more.
         try:
             connection = self._dial(path)
         except BlockingIOError:
-            raise Unreachable(f"{topic.name}: nobody takes connections on {path}, its process is stuck") from None
+            raise NotSent(f"{topic.name}: nobody takes connections on {path}, its process is stuck") from None
         except PermissionError:
-            raise Unreachable(f"{path} belongs to another user: run this as the one who started it") from None
+            raise NotSent(f"{path} belongs to another user: run this as the one who started it") from None
         except OSError as error:
-            raise Unreachable(what_to_start(topic)) from error
+            raise NotSent(what_to_start(topic)) from error
         if not connection.send(datagram):
-            raise Unreachable(what_to_start(topic))
+            raise NotSent(what_to_start(topic))
         return connection
 
     def _receive(self, connection: Connection, envelope: Envelope) -> None:

@@ -55,10 +55,6 @@ class Declined(NotTold):
     """It has answered, in words: there is no such thing, or not now."""
 
 
-class NoAnswer(Reply):
-    """None came that can be read: nobody knows whether what was said was done."""
-
-
 class LineSide:
     """`watch` as a task; then read `status`, `proposals`, `records`. All in one event loop."""
 
@@ -123,7 +119,7 @@ class LineSide:
             payload = ForPerson(person=person, said=said).model_dump_json().encode()
             return Reply.model_validate_json(await self._saying.request(GATEWAY_FOR_PERSON, payload, ACT_S))
         except (Unreachable, ValidationError) as error:
-            return NoAnswer(ok=False, state="", text=str(error), reasons=[str(error)])
+            return Reply(ok=False, state="", text=str(error), reasons=[str(error)], known=False)
 
     async def at_the_door(self, happened: AtTheDoor) -> bool:
         """For the audit. False: it has to be told again later."""

@@ -22,7 +22,7 @@ from gateway.core.proposal import Proposal, canonical
 from gateway.core.recording import Recording
 from gateway.core.status import ChangeStatus
 from gateway.core.verdict import line_hash
-from gateway.mailbox.port import Unreachable
+from gateway.mailbox.port import NotSent, Unreachable
 from gateway.supervisor.audit_file import AuditUnavailable
 from gateway.supervisor.bounded import with_left_out
 from gateway.supervisor.deployer_sides import AuditSide, JudgeSide, LoopSide, NotKnown, NotTakenUp, Surroundings
@@ -49,7 +49,7 @@ from gateway.supervisor.lifecycle import (
 from gateway.supervisor.on_the_line import OnTheLine
 from gateway.supervisor.peers import GATEWAY
 from gateway.supervisor.proposal_inbox import Inbox
-from gateway.supervisor.proposal_records import ProposalRecords, done, refused
+from gateway.supervisor.proposal_records import ProposalRecords, done, not_known, refused
 from gateway.supervisor.small_changes import SmallChanges
 
 RETRY_S = 30.0  #: after what passes by its verdict could not be carried out; then twice as long each time
@@ -72,11 +72,12 @@ class Deployer:
         wall_clock: Callable[[], float],
         own_uid: int | None = None,
         roles: Callable[[], Mapping[str, Role] | None] = lambda: None,
+        note: Callable[..., None] = lambda *_, **__: None,
     ) -> None:
         """`take_up` puts into the stores what is about to be put into service; raises NotTakenUp.
 
         `own_uid`: the user that the gateway runs as; None: that of this process. `roles`: of the people who may come
-        in, None while they are not known.
+        in, None while they are not known. `note`: an event of the gateway: kind, text and data.
         """
         self.book = book
         self.book.line = line_hash(line)
@@ -87,7 +88,7 @@ class Deployer:
         self._wall_clock = wall_clock
         self._records = ProposalRecords(book, audit, wall_clock)
         self._inbox = Inbox(line, self._records, judge, surroundings)
-        self._on_the_line = OnTheLine(line, self._records, loop, surroundings, take_up, clock)
+        self._on_the_line = OnTheLine(line, self._records, loop, surroundings, take_up, clock, note)
         self._small = SmallChanges(line, self._records)
         self._clock = clock
         #: Of proposals that would pass without a person, or not: when that is looked at again; inf: never.
@@ -145,8 +146,10 @@ class Deployer:
         reason, recorded = comment or f"asked for by {who.name}", ""
         try:
             reply = await self._on_the_line.back(reason)
-        except Unreachable as error:
+        except NotSent as error:
             return refused("not confirmed", [str(error)])
+        except Unreachable as error:
+            return not_known("whether it was taken back; `r2rgate proposals` shows what runs", [str(error)])
         if left_out is None and not self._on_watch() and not self._records.one_step.locked():
             self.look_again()  # whoever says it without end holds up nothing
             return reply
@@ -162,7 +165,7 @@ class Deployer:
                 if self._on_watch():
                     reply = await self._on_the_line.roll_back(reason)
             except (Unreachable, AuditUnavailable, Impossible) as error:
-                return refused("not confirmed", [f"{error}{recorded}"])
+                return not_known("whether it was taken back; `r2rgate proposals` shows it", [f"{error}{recorded}"])
         further = ""
         if reply.in_service is not None and not given_up:
             further = "; to go further back, propose what ran before (`r2rgate configurations list`)"
@@ -184,8 +187,11 @@ class Deployer:
                 if not narrowed.ok:
                     return refused("nothing is changed", narrowed.reasons or [narrowed.text])
                 await self._records.step(LINE_CHANGED, {"because": because}, who)
-            except (AuditUnavailable, Unreachable, Impossible) as error:
+            except (NotSent, Impossible) as error:
                 return refused("nothing is changed", [str(error)])
+            except (AuditUnavailable, Unreachable) as error:
+                text = "whether the loop goes no further than a first configuration; it is not on record: say it again"
+                return not_known(text, [str(error)])
         return done(
             "from now on proposals are judged on the line's file: it must be right for the new web and parts, so write "
             "its values there and start the gateway anew where they lie beyond its tolerances. What is in service "
@@ -290,6 +296,10 @@ class Deployer:
 
     def _why(self, entry: Entry) -> str:
         """What there is to say of its stage."""
+        if entry.stage is Stage.DEPLOYING:
+            return "whether the loop has taken it is not known yet"
+        if entry.stage is Stage.KEEPING:
+            return "whether the loop has kept it is not known yet"
         if entry.stage is Stage.PROBATION:
             return f"not kept yet: {self._on_the_line.unseen() or 'about to be'}"
         if entry.stage is not Stage.WAITING:

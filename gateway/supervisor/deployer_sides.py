@@ -77,6 +77,10 @@ class Surroundings(Protocol):
         """A change is about to be put on the line."""
         ...
 
+    def change_taken(self) -> None:
+        """The loop has taken the change later than it was put: what was measured in between says nothing of it."""
+        ...
+
     def against_keeping(self) -> str:
         """What a deployment on probation has shown against itself so far; empty: nothing."""
         ...

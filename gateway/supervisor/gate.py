@@ -35,7 +35,7 @@ from gateway.supervisor.store_writer import StoreWriter
 from gateway.supervisor.surroundings import LineSurroundings
 
 LOOP_TIME_S = 2.5
-CONFIGURATION_CHANGES = ("start", "rolled-back")
+CONFIGURATION_CHANGES = ("start", "deployed", "kept", "rolled-back")
 BUILD_TIME_S = 15.0  #: for what the loop builds and warms before it answers
 
 
@@ -148,7 +148,7 @@ class Gate:
         self.deployer = Deployer(
             self._line, book, KeptAudit(self._folder, self.audit), self._loop, self._judge,
             self._around(*self._stores), self._writer.take_up, self._clock, self._wall_clock,
-            roles=lambda: self.roles(),
+            roles=lambda: self.roles(), note=self._note,
         )  # fmt: skip
 
     async def _learn_again(self, deployer: Deployer) -> None:

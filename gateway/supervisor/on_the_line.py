@@ -4,12 +4,14 @@ What the loop says of itself settles what a record left open: after a restart, a
 """
 
 from collections.abc import Awaitable, Callable
+from typing import Any
 
 from gateway.core.audit_record import Who
 from gateway.core.deployment import Deployment, InService, first_region
 from gateway.core.line import Line
 from gateway.core.messages import (
     AskConfiguration,
+    Command,
     Deploy,
     Keep,
     Narrow,
@@ -20,17 +22,22 @@ from gateway.core.messages import (
     WatchGood,
 )
 from gateway.core.proposal import ExperimentChange, GainsChange, Proposal
-from gateway.mailbox.port import RemoteError, Unreachable
+from gateway.mailbox.port import NotSent, RemoteError, Unreachable
 from gateway.supervisor.audit_file import AuditUnavailable
 from gateway.supervisor.deployer_sides import LoopSide, NotKnown, Surroundings
 from gateway.supervisor.lifecycle import Entry, Impossible, Stage, reconciled
 from gateway.supervisor.peers import GATEWAY
-from gateway.supervisor.proposal_records import ProposalRecords, done, refused
+from gateway.supervisor.proposal_records import ProposalRecords, done, not_known, refused
 
 LEASE_S = 5.0  #: of a deployment on probation; renewed every third of it
 UNHEARD_S = 10.0  #: after an experiment should be over
 LONGEST_REASON = 500  #: characters of one for the loop
+ASKED_AGAIN_S = 10.0  #: though it has told of no change: what it tells may get lost
+LATE_S = 30.0  #: for so long a loop that has not answered may still do what it was told: it builds, then waits
 MOST_SETTLING = 1000  #: records in a row from one look at the loop; more is a fault of this program
+
+
+TOLD_LATER = "`r2rgate proposals` and the events tell it once the loop has been asked"
 
 
 class OnTheLine:
@@ -44,6 +51,7 @@ class OnTheLine:
         surroundings: Surroundings,
         take_up: Callable[[Proposal, str | None], Awaitable[None]],
         clock: Callable[[], float],
+        note: Callable[..., None],
     ) -> None:
         self.settled = False  #: the loop has been asked since this process began, or since it told of a change
         self.unwatched = ""  #: why the loop does not watch by the model in service
@@ -56,12 +64,20 @@ class OnTheLine:
         self._renewed_s = clock()
         self._probation_since_s = clock()
         self._experiment: tuple[str, float] | None = None  #: that runs, and when its end is overdue
+        self._note = note
+        self._asked_s = clock()  #: what it runs
+        #: Proposals of which the loop was told something and has not answered: until when it may still do it.
+        self._unanswered: dict[str, float] = {}
+        change = records.book.on_the_line
+        if change is not None and change.stage in (Stage.DEPLOYING, Stage.KEEPING):
+            self._unanswered[change.proposal] = clock() + LATE_S  # the process before this one has told it
         #: Model and configuration by which, and for which, this process has told the loop what can be recovered.
         self._looked_after: tuple[str | None, str] | None = None
 
     async def settle(self) -> InService:
         """Ask the loop what it runs, and record until the book says so too. Raises Unreachable, AuditUnavailable."""
-        reply = await self._loop.tell(AskConfiguration())
+        reply = await self._tell(AskConfiguration())
+        self._asked_s = self._clock()
         if reply.in_service is None:
             raise RemoteError("the loop does not say what controls the line")
         found = reply.in_service
@@ -69,12 +85,45 @@ class OnTheLine:
             if (step := reconciled(self._records.book, found)) is None:
                 self.settled = True
                 return found
-            await self._records.step(*step, GATEWAY)
+            kind, what = step
+            if kind == "not-deployed" and self._clock() < self._unanswered.get(what["proposal"], 0.0):
+                return found  # it may still take it
+            await self._record_outcome(kind, what)
         raise Impossible("the book does not come to what the loop says")
+
+    async def _record_outcome(self, kind: str, what: dict[str, Any]) -> None:
+        """What the loop has said of itself; where its answer had not come, an event tells it, too."""
+        proposal = what.get("proposal", "")
+        unanswered = proposal in self._unanswered
+        await self._records.step(kind, {**what, "unanswered": True} if unanswered else what, GATEWAY)
+        if kind == "deployed":
+            self._probation_since_s = self._renewed_s = self._clock()
+            if unanswered:
+                self._surroundings.change_taken()
+                self._renewed_s -= LEASE_S  # nobody knows how much of it is left
+        if unanswered and kind != "keeping":
+            del self._unanswered[proposal]
+            because = f": {what['because']}" if what.get("because") else ""
+            epoch = f" (epoch {what['epoch']})" if "epoch" in what else ""
+            told = f"proposal {proposal[:12]} is {kind}{epoch}, though the loop's answer did not come{because}"
+            self._note("outcome", told, proposal=proposal, outcome=kind, epoch=what.get("epoch"))
+
+    async def _tell(self, command: Command) -> Reply:
+        """Raises Unreachable; then the loop is asked again what it runs."""
+        try:
+            return await self._loop.tell(command)
+        except Unreachable:
+            self.settled = False
+            raise
+
+    def _not_answered(self, proposal: str, error: Unreachable) -> None:
+        """One that has answered that it failed does not do it later."""
+        self._unanswered[proposal] = self._clock() + (0.0 if isinstance(error, RemoteError) else LATE_S)
 
     async def look_after(self) -> None:
         """Renews leases; keeps what is on probation, or takes it back. Raises as `settle`, and Impossible."""
-        if self._records.book.on_the_line is not None or not self.settled or self._to_look_after():
+        unheard = self._clock() - self._asked_s >= ASKED_AGAIN_S
+        if self._records.book.on_the_line is not None or not self.settled or unheard or self._to_look_after():
             await self._look_after(await self.settle())
 
     async def carry_out(self, entry: Entry, found: InService, who: Who) -> Reply:
@@ -86,19 +135,30 @@ class OnTheLine:
         if isinstance(proposal.change, GainsChange):
             return await self._deploy(entry, proposal.change, found, who)
         if isinstance(proposal.change, ExperimentChange):
-            await self._records.step("experiment-begins", {"proposal": entry.proposal}, who)
-            reply = await self._loop.tell(RunExperiment(experiment=proposal.change.experiment, proposal=entry.proposal))
-            if not reply.ok:
-                because = "; ".join([reply.text, *reply.reasons])[:1000]
-                await self._records.step("experiment-ends", {"proposal": entry.proposal, "because": because}, GATEWAY)
-                return reply
-            return done(f"{reply.text}; `r2rgate proposals {entry.proposal[:12]}` shows when it is done")
+            return await self._run(entry, proposal.change, who)
         await self._records.step("model-in-service", {"proposal": entry.proposal, "model": entry.changes}, who)
         return done(f"model {entry.changes[:12]} is what proposals are judged by from now on")
 
+    async def _run(self, entry: Entry, change: ExperimentChange, who: Who) -> Reply:
+        named = {"proposal": entry.proposal}
+        await self._records.step("experiment-begins", named, who)
+        try:
+            reply = await self._tell(RunExperiment(experiment=change.experiment, proposal=entry.proposal))
+        except NotSent as error:
+            await self._records.step("experiment-ends", {**named, "because": str(error)}, GATEWAY)
+            return refused("it is not run", [str(error)])
+        except Unreachable as error:
+            self._not_answered(entry.proposal, error)
+            return not_known("whether the experiment runs; its events tell", [str(error)])
+        if not reply.ok:
+            because = "; ".join([reply.text, *reply.reasons])[:1000]
+            await self._records.step("experiment-ends", {**named, "because": because}, GATEWAY)
+            return reply
+        return done(f"{reply.text}; `r2rgate proposals {entry.proposal[:12]}` shows when it is done")
+
     async def back(self, reason: str) -> Reply:
         """The loop is told, and nothing is recorded. Raises Unreachable."""
-        return await self._loop.tell(Rollback(reason=reason))
+        return await self._tell(Rollback(reason=reason))
 
     async def roll_back(self, reason: str) -> Reply:
         """Now. Raises as `settle`, and Impossible."""
@@ -108,7 +168,7 @@ class OnTheLine:
 
     async def narrow(self) -> Reply:
         """To what a first configuration is judged for. Raises as `settle`."""
-        reply = await self._loop.tell(Narrow(region=first_region(self._line)))
+        reply = await self._tell(Narrow(region=first_region(self._line)))
         await self.settle()
         return reply
 
@@ -119,7 +179,7 @@ class OnTheLine:
             if entry is None or entry.stage is not Stage.RUNNING or entry.changes != hash_:
                 return
             try:
-                await self._records.step("experiment-ends", {"proposal": entry.proposal, "because": because}, GATEWAY)
+                await self._record_outcome("experiment-ends", {"proposal": entry.proposal, "because": because})
             except AuditUnavailable as error:
                 self._records.trouble = str(error)
 
@@ -140,14 +200,27 @@ class OnTheLine:
         what = {"configuration": entry.changes, "before": found.hash, "region": verdict.region.model_dump()}
         await self._records.step("deploying", {**named, **what, "watched": watch is not None}, who)
         self._surroundings.begin_probation()
-        reply = await self._loop.tell(Deploy(deployment=deployment))
+        try:
+            reply = await self._tell(Deploy(deployment=deployment))
+        except NotSent as error:
+            await self._records.step("not-deployed", {**named, "because": str(error)}, GATEWAY)
+            return refused("it is not deployed", [str(error)])
+        except Unreachable as error:
+            self._not_answered(entry.proposal, error)
+            return not_known(f"whether it controls the line as epoch {epoch}; {TOLD_LATER}", [str(error)])
         if not reply.ok and reply.in_service is not None and reply.in_service.epoch < epoch:
             because = "; ".join([reply.text, *reply.reasons])[:1000]
             await self._records.step("not-deployed", {**named, "because": because}, GATEWAY)
             return reply
-        await self.settle()  # what the loop says it runs, read back
-        self._probation_since_s = self._renewed_s = self._clock()
+        try:
+            await self.settle()  # what the loop says it runs, read back
+        except (Unreachable, AuditUnavailable) as error:
+            self._unanswered[entry.proposal] = self._clock() + LATE_S
+            return not_known(f"it was deployed as epoch {epoch}, and is not on record; {TOLD_LATER}", [str(error)])
         now = self._records.book.entries[entry.proposal]
+        if now.stage is Stage.DEPLOYING:
+            self._unanswered[entry.proposal] = self._clock() + LATE_S
+            return not_known(f"whether it controls the line as epoch {epoch}; {TOLD_LATER}", reply.reasons)
         if now.stage is not Stage.PROBATION:
             return refused(f"it is {now.stage}", [now.why])
         unwatched = "" if watch else "; no model is accepted yet, by which the loop would see what can be recovered"
@@ -166,13 +239,15 @@ class OnTheLine:
         if entry.stage is Stage.RUNNING:
             await self._end_unheard(entry, now_s)
             return
+        if entry.stage is Stage.DEPLOYING:  # the loop has not answered, and may still take it
+            return
         if against := self._surroundings.against_keeping():
-            await self._loop.tell(Rollback(reason=against))
+            await self._tell(Rollback(reason=against))
             await self.settle()
         elif entry.stage is Stage.KEEPING or not self._unseen(now_s):
             await self._keep(entry, found)
         elif now_s - self._renewed_s >= LEASE_S / 3.0:
-            await self._loop.tell(Renew(epoch=entry.epoch or found.epoch))
+            await self._tell(Renew(epoch=entry.epoch or found.epoch))
             self._renewed_s = now_s
 
     def _goes_too_far(self, found: InService) -> bool:
@@ -198,35 +273,38 @@ class OnTheLine:
         watch = None
         try:
             watch = await self._surroundings.recovery(found.good_if_kept, found.region, self._records.book)
-            reply = await self._loop.tell(Keep(epoch=entry.epoch or found.epoch, watch=watch))
+            reply = await self._tell(Keep(epoch=entry.epoch or found.epoch, watch=watch))
             because = "" if reply.ok else "; ".join([reply.text, *reply.reasons])
         except NotKnown as error:
             because = str(error)
-        if because:
-            await self._loop.tell(Rollback(reason=f"it could not be kept: {because}"[:LONGEST_REASON]))
-        elif watch is not None:
+        except NotSent:
+            raise
+        except Unreachable as error:
+            self._not_answered(entry.proposal, error)
+            raise
+        if not because and watch is not None:
             self._looked_after = self._records.book.model, found.good_if_kept
         await self.settle()
+        # One that was told before, and whose answer did not come, may have kept it: then the second is refused.
+        if because and self._records.book.entries[entry.proposal].stage is Stage.KEEPING:
+            await self._tell(Rollback(reason=f"it could not be kept: {because}"[:LONGEST_REASON]))
+            await self.settle()
 
     async def _look_after_good(self, found: InService) -> None:
         """A model that is new in service looks after what runs, too."""
         pair = self._records.book.model, found.last_known_good
         if self._records.book.model is None or pair == self._looked_after:
             return
-        self._looked_after, self.unwatched = pair, ""  # a refusal would be the same again
+        because = ""
         try:
             watch = await self._surroundings.recovery(found.last_known_good, found.region, self._records.book)
-            if watch is None:
-                return
-            reply = await self._loop.tell(WatchGood(watch=watch))
-            because = "" if reply.ok else "; ".join([reply.text, *reply.reasons])
+            if watch is not None:
+                reply = await self._tell(WatchGood(watch=watch))
+                because = "" if reply.ok else "; ".join([reply.text, *reply.reasons])
         except NotKnown as error:
             because = str(error)
-        except Unreachable:
-            self._looked_after = None
-            raise
-        if because:
-            self.unwatched = f"the loop does not watch by the model in service: {because}"
+        self._looked_after = pair  # a refusal would be the same again; an answer that did not come is asked for again
+        self.unwatched = f"the loop does not watch by the model in service: {because}" if because else ""
 
     async def _end_unheard(self, entry: Entry, now_s: float) -> None:
         """Of an experiment whose end nobody has told: the loop was started anew, or this process."""
@@ -236,5 +314,7 @@ class OnTheLine:
             takes_s = change.experiment.duration_s if isinstance(change, ExperimentChange) else 0.0
             self._experiment = (entry.proposal, now_s + takes_s + UNHEARD_S)
         elif now_s >= self._experiment[1]:
-            what = {"proposal": entry.proposal, "because": "the loop has not told its end"}
-            await self._records.step("experiment-ends", what, GATEWAY)
+            because = "the loop has not told its end"
+            if entry.proposal in self._unanswered:
+                because = "whether it ran is not known: the loop has neither answered nor told its end"
+            await self._record_outcome("experiment-ends", {"proposal": entry.proposal, "because": because})

@@ -75,6 +75,11 @@ def refused(text: str, reasons: list[str]) -> Reply:
     return Reply(ok=False, state="", text=text, reasons=reasons)
 
 
+def not_known(text: str, reasons: list[str]) -> Reply:
+    """Whether it was done is not known yet: it was asked for, and no answer came."""
+    return Reply(ok=False, state="", text=f"not known: {text}", reasons=reasons, known=False)
+
+
 def iso(wall_s: float) -> str:
     """Unix time as ISO 8601 with zone."""
     return datetime.fromtimestamp(wall_s, UTC).isoformat(timespec="milliseconds")

@@ -37,7 +37,7 @@ from gateway.core.status import (
 )
 from gateway.core.telemetry import Frame
 from gateway.core.topics import GATEWAY_COMMAND, GATEWAY_STATUS, LOOP_BUSES, LOOP_COMMAND, LOOP_EVENT, LOOP_TELEMETRY
-from gateway.mailbox.port import PEER, Counters, Mailbox, Unreachable
+from gateway.mailbox.port import PEER, Counters, Mailbox, NotSent, Unreachable
 from gateway.supervisor.historian import Historian
 from gateway.supervisor.peers import who_of
 from gateway.supervisor.recent import Recent
@@ -215,7 +215,7 @@ class Gateway:
         """Hand a command on to the loop, and note who gave it."""
         reply = await self._pass_on(payload)
         said = payload[:1000].decode("utf-8", "replace")
-        answered = "done" if reply.ok else "refused"
+        answered = "done" if reply.ok else "refused" if reply.known else "not known"
         self.note(
             "command",
             f"{who.name}: {_in_words(payload)}: {answered}: {reply.text}",
@@ -239,10 +239,10 @@ class Gateway:
         except MalformedMessage as error:
             return Reply(ok=False, state=state, text=f"not understood: {error}", reasons=[str(error)])
         except Unreachable as error:
-            return Reply(ok=False, state=state, text=str(error), reasons=[str(error)])
+            return Reply(ok=False, state=state, text=str(error), reasons=[str(error)], known=isinstance(error, NotSent))
         except ValidationError as error:
             text = "the loop answered what is no reply; see `r2rgate status` for what it did"
-            return Reply(ok=False, state=state, text=text, reasons=[str(error)])
+            return Reply(ok=False, state=state, text=text, reasons=[str(error)], known=False)
 
 
 def _in_words(payload: bytes) -> str:

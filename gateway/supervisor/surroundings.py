@@ -107,6 +107,11 @@ class LineSurroundings:
         self._recent.forget()
         self._stood = False
 
+    def change_taken(self) -> None:
+        """What was measured until now says nothing of the change."""
+        self._recent.forget()
+        self._stood = False
+
     def against_keeping(self) -> str:
         now = self._recent.standing()
         self._stood = self._stood or now is not None

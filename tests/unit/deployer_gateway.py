@@ -50,6 +50,7 @@ class Gateway:
         self.proposals = {}
         self.roles: dict[str, str] | None = None  #: of the people who may come in
         self.take_up = nothing_to_store  #: StoreWriter.take_up of real stores, or one that fails
+        self.notes: list[tuple[str, dict]] = []
         self.begin()
 
     def _checked(self, kind, what) -> None:
@@ -66,10 +67,15 @@ class Gateway:
         self.judge.line = line_hash(self.line)
         book, clock = book_of(self.audit.records), self._now_s
         args = (self.audit, self.loop, self.judge, self.surroundings, self._take_up, clock, clock)
-        self.deployer = Deployer(self.line, book, *args, own_uid=OPERATORS_UID, roles=lambda: self.roles)
+        self.deployer = Deployer(
+            self.line, book, *args, own_uid=OPERATORS_UID, roles=lambda: self.roles, note=self._note
+        )
 
     async def _take_up(self, proposal, verdict) -> None:
         await self.take_up(proposal, verdict)
+
+    def _note(self, kind, text, **data) -> None:
+        self.notes.append((kind, data))
 
     def _now_s(self) -> float:
         return self.loop.now_s

@@ -12,7 +12,7 @@ from gateway.core.line_model import LineModel
 from gateway.core.messages import Command, Deploy, Keep, Narrow, Renew, Reply, Rollback, RunExperiment, WatchGood
 from gateway.core.proposal import GainsChange, ModelChange, Proposal, proposal_hash
 from gateway.core.verdict import RuleFinding, Verdict
-from gateway.mailbox.port import Unreachable
+from gateway.mailbox.port import NotSent, Unreachable
 from gateway.supervisor.audit_file import AuditUnavailable
 from gateway.supervisor.deployer_sides import NotKnown
 from gateway.supervisor.proposal_records import iso
@@ -106,6 +106,10 @@ class FakeLoop:
         self.why = "start"
         self.reachable = True
         self.answers = True
+        self.loses = False  #: what it is told does not come through
+        self.late_s = 0.0  #: it does what it is told so much later, and does not answer
+        self.waiting: list[tuple[float, Command]] = []
+        self.spoiled: set[str] | None = None  #: the commands that `answers`, `loses` and `late_s` are for; None: all
         self.takes = True
         self.fast = False
         self.watches: list[tuple[str, RecoveryPrediction | None]] = []  #: by command
@@ -115,16 +119,27 @@ class FakeLoop:
         if due and not self.death.after:
             raise Killed
         if not self.reachable:
-            raise Unreachable("loop not running")
+            raise NotSent("loop not running")
+        spoiled = self.spoiled is None or command.command in self.spoiled
+        no_answer = Unreachable("no answer; what was asked may have been done all the same")
+        if spoiled and self.loses:
+            raise no_answer
+        if spoiled and self.late_s:
+            self.waiting.append((self.now_s + self.late_s, command))
+            raise no_answer
         reply = self._done(command)
         if due:
             raise Killed
-        if not self.answers:
-            raise Unreachable("no answer; what was asked may have been done all the same")
+        if spoiled and not self.answers:
+            raise no_answer
         return reply
 
     def pass_time(self, seconds: float) -> None:
         self.now_s += seconds
+        due = [command for at_s, command in self.waiting if at_s <= self.now_s]
+        self.waiting = [one for one in self.waiting if one[0] > self.now_s]
+        for command in due:
+            self._done(command)
         if self.lease_end_s is not None and self.now_s >= self.lease_end_s:
             self.go_back("rolled back: the lease is over")
 
@@ -225,6 +240,8 @@ class FakeSurroundings:
         return None if book.model is None else prediction(fallback)
 
     def begin_probation(self) -> None: ...
+
+    def change_taken(self) -> None: ...
 
     def unseen(self) -> str:
         return self.hidden

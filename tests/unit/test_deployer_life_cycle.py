@@ -11,7 +11,7 @@ from gateway.core.audit_record import Who
 from gateway.core.controller import config_hash
 from gateway.core.proposal import ModelChange
 from gateway.supervisor.lifecycle import Stage, book_of
-from gateway.supervisor.on_the_line import LEASE_S
+from gateway.supervisor.on_the_line import LATE_S, LEASE_S
 from tests.unit.deployer_gateway import ANNA, BERT, FOUR_EYES, PROBATION_S, TRUSTING, Gateway
 from tests.unit.deployer_support import FIRST, LIFETIME_S, LINE, Killed, controller, hash_of, model_proposal, proposal
 
@@ -110,9 +110,32 @@ class LifeCycle(RuleBasedStateMachine):
     def the_loop_is_started_anew(self):
         self.gateway.loop.restart()
 
-    @rule(reachable=st.booleans(), answers=st.booleans())
-    def the_wire(self, reachable, answers):
-        self.gateway.loop.reachable, self.gateway.loop.answers = reachable, answers
+    @rule(reachable=st.booleans(), answers=st.booleans(), loses=st.booleans(), late_s=st.sampled_from([0.0, 1.0, 20.0]))
+    def the_wire(self, reachable, answers, loses=False, late_s=0.0):
+        loop = self.gateway.loop
+        loop.reachable, loop.answers, loop.loses, loop.late_s = reachable, answers, loses, late_s
+
+    @rule()
+    def once_all_is_well_the_book_says_what_the_loop_does_and_nothing_is_left_open(self):
+        self.the_wire(True, True)
+        self.the_disk(True)
+        self.something_shows(False)
+        self.death_is_near(0, False)
+        self._run(self.gateway.pass_time(LATE_S + PROBATION_S + 2.0 * LEASE_S))
+        loop, book = self.gateway.loop, self.gateway.deployer.book
+        said = loop.in_service()
+        assert (book.in_service, book.last_known_good, book.epoch) == (said.hash, said.last_known_good, said.epoch)
+        assert book.on_the_line is None
+
+    @invariant()
+    def what_has_become_of_a_change_is_on_record_once(self):
+        ends: dict[str, list[str]] = {}
+        for kind, what in self.gateway.audit.records:
+            if kind in ("deployed", "not-deployed", "kept", "rolled-back"):
+                ends.setdefault(what["proposal"], []).append(kind)
+        for kinds in ends.values():
+            assert len(set(kinds)) == len(kinds) and ("not-deployed" not in kinds or len(kinds) == 1)
+            assert not {"kept", "rolled-back"} <= set(kinds)
 
     @rule(available=st.booleans())
     def the_disk(self, available):

@@ -20,7 +20,6 @@ from asyncua.server.event_generator import EventGenerator
 from drivers.cleanup import finish
 from gateway.core.decisions import ProposalShown
 from gateway.core.messages import Reply
-from gateway.operator.line_side import NoAnswer
 from gateway.operator.opcua.events import MEDIUM
 from gateway.operator.opcua.instances import Declared, declared, make, make_object
 from gateway.operator.opcua.line_nodes import ROOT
@@ -161,7 +160,7 @@ class Dialogs:
         )  # fmt: skip
         if not isinstance(reply, Reply):
             return reply
-        if isinstance(reply, NoAnswer):
+        if not reply.known:
             return ua.StatusCode(ua.StatusCodes.BadTimeout)
         if not reply.ok:
             return ua.StatusCode(ua.StatusCodes.BadInvalidState)  # `Respond` has no room for the sentence

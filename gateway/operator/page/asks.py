@@ -14,7 +14,7 @@ from gateway.core.line import Line, Strict
 from gateway.core.line_past import TensionsBetween
 from gateway.core.messages import Reply
 from gateway.core.people import LEAST, Said, may, why_may_not
-from gateway.operator.line_side import Declined, LineSide, NoAnswer, NotTold
+from gateway.operator.line_side import Declined, LineSide, NotTold
 from gateway.operator.page.guard import body_of
 from gateway.operator.page.login import Door
 from gateway.operator.page.tick import line_told
@@ -120,7 +120,7 @@ def _status(reply: Reply) -> int:
     """409: the gateway refuses. 504: it did not answer, and nobody knows whether it was done."""
     if reply.ok:
         return 200
-    return 504 if isinstance(reply, NoAnswer) else 409
+    return 409 if reply.known else 504
 
 
 def _object(body: bytes) -> dict[str, Any]:
