@@ -30,10 +30,17 @@ CONNECT_TIMEOUT_S = 2.0  #: per request while connecting
 CLOSE_TIMEOUT_S = 0.5
 SESSION_TIMEOUT_MS = 30_000  #: how long a server keeps the session of an engine that was killed
 _NO_PROBES_S = 1e9  #: asyncua's own health check reads beside the cycle: the cycle itself is the check
+#: Numbers have 32 bits. asyncua counts on from ours for what it sends itself, and does not wrap: room is left for that.
+LAST_NUMBER = 2**32 - 1 - 2**16
 _TIMEOUT_HINT_MS = int(1e3 * CONNECT_TIMEOUT_S)
 
 # What goes wrong is told in answers and counted in the link's health; it does not belong on the terminal as well.
 logging.getLogger("asyncua").addHandler(logging.NullHandler())
+
+
+def next_number(number: int) -> int:
+    """The request number or handle that follows: after `LAST_NUMBER` it is 1 again, and it is never 0."""
+    return number + 1 if 0 < number < LAST_NUMBER else 1
 
 
 class Session:
@@ -77,8 +84,8 @@ class Session:
         messages: list[bytes] = []
         # asyncua's own way to send takes a tree of objects for each request, and one write.
         for request in requests:
-            protocol._request_handle += 1  # noqa: SLF001
-            protocol._request_id += 1  # noqa: SLF001
+            protocol._request_handle = next_number(protocol._request_handle)  # noqa: SLF001
+            protocol._request_id = next_number(protocol._request_id)  # noqa: SLF001
             number = protocol._request_id  # noqa: SLF001
             body = request.encode(self._token, protocol._request_handle, _TIMEOUT_HINT_MS)  # noqa: SLF001
             messages.append(protocol._connection.message_to_binary(body, request_id=number))  # noqa: SLF001

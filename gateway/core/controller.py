@@ -1,12 +1,12 @@
 """Controller configurations phi as data that can be stored, hashed and compared."""
 
 import hashlib
-import json
 from typing import Annotated
 
 from pydantic import Field, TypeAdapter, ValidationError
 from pydantic_core import ErrorDetails
 
+from gateway.core.canonical import canonical_bytes
 from gateway.core.controller_laws import MpcConfig
 from gateway.core.controller_schedule import LinearConfig, ScheduledConfig
 
@@ -21,7 +21,7 @@ class ControllerRefused(Exception):
 
 def canonical(config: Controller) -> bytes:
     """The one byte representation of a configuration, the same whoever writes it."""
-    return json.dumps(config.model_dump(mode="json"), sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
+    return canonical_bytes(config)
 
 
 def config_hash(config: Controller) -> str:

@@ -9,13 +9,13 @@ because the stream of a library's generator may change with its version, and a j
 """
 
 import hashlib
-import json
 from collections.abc import Iterator
 from typing import Annotated, Literal, Self
 
 import numpy as np
 from pydantic import Field, TypeAdapter, ValidationError, model_validator
 
+from gateway.core.canonical import canonical_bytes
 from gateway.core.line import Line, Name, NonNegative, Positive, Strict
 from gateway.core.signals import FloatArray
 
@@ -102,9 +102,7 @@ _adapter: TypeAdapter[Experiment] = TypeAdapter(Experiment)
 
 def canonical(experiment: Experiment) -> bytes:
     """The one byte representation of an experiment, the same whoever writes it."""
-    return json.dumps(
-        experiment.model_dump(mode="json"), sort_keys=True, separators=(",", ":"), allow_nan=False
-    ).encode()
+    return canonical_bytes(experiment)
 
 
 def experiment_hash(experiment: Experiment) -> str:

@@ -4,12 +4,12 @@ A file of it makes a verdict repeatable away from the line: the same context, pr
 """
 
 import hashlib
-import json
 from collections.abc import Sequence
 from typing import Annotated
 
 from pydantic import Field, ValidationError
 
+from gateway.core.canonical import canonical_bytes
 from gateway.core.controller import ControllerConfig
 from gateway.core.deployment import Region
 from gateway.core.json_problems import NotJson, document_of, problems
@@ -62,7 +62,7 @@ class JudgeContext(Strict):
 
 def canonical(context: JudgeContext) -> bytes:
     """The one byte representation of a context."""
-    return json.dumps(context.model_dump(mode="json"), sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
+    return canonical_bytes(context)
 
 
 def context_hash(context: JudgeContext) -> str:

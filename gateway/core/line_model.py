@@ -4,7 +4,6 @@ A model is known by the SHA-256 of its canonical bytes: whoever holds the file c
 """
 
 import hashlib
-import json
 from collections.abc import Iterator, Sequence
 from datetime import datetime
 from typing import Annotated, Any, Literal, Self
@@ -12,6 +11,7 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import AfterValidator, Field, ValidationError, model_validator
 
+from gateway.core.canonical import canonical_bytes
 from gateway.core.json_problems import NotJson, document_of, problems
 from gateway.core.line import Name, NonNegative, Positive, Strict
 from gateway.core.line_model_names import MOST_SPANS, UNITS, wrong_name
@@ -213,7 +213,7 @@ def _wrong_order(model: LineModel) -> Iterator[str]:
 
 def canonical(model: LineModel) -> bytes:
     """The one byte representation of a model, the same whoever writes it."""
-    return json.dumps(model.model_dump(mode="json"), sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
+    return canonical_bytes(model)
 
 
 def model_hash(model: LineModel) -> str:

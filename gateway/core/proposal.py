@@ -6,13 +6,13 @@ verdict and an approval are of those bytes and no others.
 """
 
 import hashlib
-import json
 from collections.abc import Sequence
 from datetime import datetime
 from typing import Annotated, Literal, Self
 
 from pydantic import Field, ValidationError, model_validator
 
+from gateway.core.canonical import canonical_bytes
 from gateway.core.controller import ControllerConfig
 from gateway.core.experiment import Experiment
 from gateway.core.json_problems import NotJson, document_of, problems
@@ -118,7 +118,7 @@ class Proposal(Strict):
 
 def canonical(proposal: Proposal) -> bytes:
     """The one byte representation of a proposal, the same whoever writes it."""
-    return json.dumps(proposal.model_dump(mode="json"), sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
+    return canonical_bytes(proposal)
 
 
 def proposal_hash(proposal: Proposal) -> str:

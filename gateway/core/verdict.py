@@ -1,11 +1,11 @@
 """A verdict: what every rule found of a proposal, with number, limit and margin. Accepted where every rule passes."""
 
 import hashlib
-import json
 from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
+from gateway.core.canonical import canonical_bytes
 from gateway.core.deployment import Region
 from gateway.core.line import Line, NonNegative, Strict
 from gateway.core.line_model import Digest, Instant
@@ -72,7 +72,7 @@ class Verdict(Strict):
 
 def canonical(verdict: Verdict) -> bytes:
     """The one byte representation of a verdict."""
-    return json.dumps(verdict.model_dump(mode="json"), sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
+    return canonical_bytes(verdict)
 
 
 def verdict_hash(verdict: Verdict) -> str:
@@ -82,7 +82,7 @@ def verdict_hash(verdict: Verdict) -> str:
 
 def canonical_line(line: Line) -> bytes:
     """A line's file in the one byte representation, with everything that it leaves to defaults."""
-    return json.dumps(line.model_dump(mode="json"), sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
+    return canonical_bytes(line)
 
 
 def line_hash(line: Line) -> str:

@@ -17,7 +17,8 @@ from typing import Annotated
 
 from pydantic import Field, ValidationError
 
-from gateway.core.controller import Controller, ControllerConfig, canonical, config_hash
+from gateway.core.canonical import known_hashes
+from gateway.core.controller import Controller, ControllerConfig, canonical
 from gateway.core.controller_fit import misfits
 from gateway.core.deployment import Hash, RecoveryPrediction, Region
 from gateway.core.line import Line, Strict
@@ -76,7 +77,7 @@ class Store:
         self.path = folder / FILE
         self.deaths = Deaths(folder / DEATHS)
         self._given = config
-        self._started_with = config_hash(config)
+        self._started_with, *self._formerly = known_hashes(config)
         self._content: bytes | None = None  #: of the file; None: not known
         self._last: Durable | None = None  #: that was read or written
 
@@ -100,7 +101,7 @@ class Store:
             reason = str(error).partition("\n")[0]
             say(f"{path} is not used, the configuration given is: {reason}")
             return None
-        if kept.started_with != self._started_with:
+        if kept.started_with not in (self._started_with, *self._formerly):
             say(f"{path} belongs to another configuration than the one given, which is used")
             return None
         on_top = [] if kept.on_top is None else misfits(kept.on_top.controller, line)

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import apsw
 
+from gateway.core.canonical import known_hashes
 from gateway.core.controller import Controller, ControllerRefused, canonical, config_hash, parse_controller
 from gateway.supervisor.find_version import find_version
 from gateway.supervisor.sqlite_file import FileKind, begin, open_there, rows_of, snapshot, told, transaction
@@ -263,6 +264,6 @@ def _parsed(id_: str, content: bytes) -> tuple[Controller | None, str]:
         controller = parse_controller(content)
     except ControllerRefused as refused:
         return None, f"its content cannot be read: {refused}"
-    if config_hash(controller) != id_:
+    if id_ not in known_hashes(controller):
         return None, "its content is not what was stored"
     return controller, ""

@@ -11,6 +11,7 @@ from typing import Literal, NamedTuple
 
 import apsw
 
+from gateway.core.canonical import known_hashes
 from gateway.core.line_model import LineModel, ModelRefused, canonical, model_hash, parse_model
 from gateway.supervisor.find_version import find_version
 from gateway.supervisor.model_store import KIND, ModelsError, begin_models, open_models
@@ -142,7 +143,7 @@ class Models:
 def _entry(row: _Row, marks: tuple[Mark, ...]) -> Entry:
     try:
         model, damage = parse_model(row.content), ""
-        if model_hash(model) != row.id or (model.site, model.line) != (row.site, row.line):
+        if row.id not in known_hashes(model) or (model.site, model.line) != (row.site, row.line):
             model, damage = None, "its content is not what was stored"
     except ModelRefused as refused:
         model, damage = None, f"its content cannot be read: {refused}"

@@ -6,12 +6,13 @@ from datetime import datetime
 from typing import Any
 
 from gateway.core.audit_record import Who
+from gateway.core.canonical import known_hashes
 from gateway.core.controller import config_hash
 from gateway.core.experiment import experiment_hash
 from gateway.core.judge_context import canonical as canonical_context
 from gateway.core.judge_context import context_hash
 from gateway.core.line import Line
-from gateway.core.line_model import model_hash
+from gateway.core.line_model import LineModel, model_hash
 from gateway.core.messages import Reply
 from gateway.core.packed_recording import packed
 from gateway.core.proposal import (
@@ -120,7 +121,7 @@ class Inbox:
             "proposal": hash_,
             "verdict": verdict_hash(verdict),
             "context": context_hash(context),
-            "model": None if context.model is None else model_hash(context.model),
+            "model": None if context.model is None else _id_of(context.model, self._records.book.model),
             "line": verdict.line,
             "seed": verdict.seed,
             "because": _first_reason(verdict),
@@ -140,6 +141,11 @@ class Inbox:
         except AuditUnavailable as error:
             return refused("it is no proposal", [*malformed.reasons, str(error)])
         return refused("it is no proposal", malformed.reasons)
+
+
+def _id_of(model: LineModel, in_service: str | None) -> str:
+    """As the one in service is called, where it is that one."""
+    return in_service if in_service in known_hashes(model) and in_service is not None else model_hash(model)
 
 
 def _brings(proposal: Proposal) -> str:

@@ -14,7 +14,7 @@ from gateway.core.line import Line
 from gateway.core.proposal import GainsChange, ModelChange, Proposal
 from gateway.supervisor import configurations as configurations_store
 from gateway.supervisor import models as models_store
-from gateway.supervisor.configurations import ConfigurationsError, Origin, open_configurations
+from gateway.supervisor.configurations import Configurations, ConfigurationsError, Origin, open_configurations
 from gateway.supervisor.deployer_sides import NotTakenUp
 from gateway.supervisor.model_store import ModelsError
 from gateway.supervisor.models import Models, open_repository
@@ -78,6 +78,15 @@ class StoreWriter:
                 if configurations.get(site, line, config_hash(controller)) is None:
                     origin = Origin(self._wall_clock(), GATEWAY.name, f"found as {name}, with which the loop starts")
                     configurations.store(site, line, controller, origin)
+            self._store_renamed(configurations)
+
+    def _store_renamed(self, configurations: Configurations) -> None:
+        """What was stored under a hash that was made with -0.0 is there under today's, too: the loop tells that one."""
+        site, line = self._line.site, self._line.line
+        for one in configurations.entries(site, line):
+            if one.controller is not None and configurations.get(site, line, config_hash(one.controller)) is None:
+                why = f"as version {one.version}, whose hash had been made before -0.0 was written as 0.0"
+                configurations.store(site, line, one.controller, Origin(self._wall_clock(), GATEWAY.name, why, one.id))
 
     def _supersede_models(self, but: str | None, why: str) -> None:
         with open_repository(self._models) as models:

@@ -11,7 +11,7 @@ from asyncua.common.utils import Buffer
 from asyncua.ua.ua_binary import header_from_binary, struct_from_binary
 
 from drivers.opcua.services import Request, Services
-from drivers.opcua.session import Session
+from drivers.opcua.session import LAST_NUMBER, Session
 
 
 class KeptTransport:
@@ -68,5 +68,24 @@ def test_nothing_is_asked_on_a_connection_that_is_lost() -> None:
         with pytest.raises(ConnectionError, match="connection lost"):
             session.ask(requests())
         assert transport.writes == []
+
+    asyncio.run(scene())
+
+
+def test_request_numbers_and_handles_begin_again_after_the_last_and_are_never_0() -> None:
+    async def scene() -> None:
+        session, transport = opened()
+        protocol: Any = session._client.uaclient.protocol  # noqa: SLF001
+        protocol._request_id = protocol._request_handle = LAST_NUMBER - 1  # noqa: SLF001
+        answers = session.ask(requests()) + session.ask(requests())
+        rest = Buffer(b"".join(transport.writes))
+        numbers, handles = [], []
+        for kind in 2 * [ua.WriteRequest, ua.ReadRequest]:
+            header = header_from_binary(rest)
+            sent = rest.read(header.body_size)
+            numbers.append(int.from_bytes(sent[8:12], "little"))
+            handles.append(struct_from_binary(kind, Buffer(sent[12:])).RequestHeader.RequestHandle)
+        assert numbers == handles == [LAST_NUMBER, 1, 2, 3]
+        assert len(answers) == 4 and set(protocol._callbackmap) == set(numbers)  # noqa: SLF001
 
     asyncio.run(scene())

@@ -1,0 +1,37 @@
+"""The one byte representation of data, by which hashes are made. Pure."""
+
+import hashlib
+import json
+from typing import Any
+
+from pydantic import BaseModel
+
+
+def canonical_bytes(value: Any) -> bytes:
+    """JSON of a model or of plain data: keys sorted, no spaces, ASCII, and -0.0 as 0.0, which is equal to it.
+
+    Equal models have equal bytes. Raises ValueError for NaN and infinity, TypeError and RecursionError for what is no
+    data.
+    """
+    plain = value.model_dump(mode="json") if isinstance(value, BaseModel) else value
+    return json.dumps(without_negative_zeros(plain), sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
+
+
+def without_negative_zeros(value: Any) -> Any:
+    """`value` with each -0.0 in it as 0.0; a new object, but for its leaves."""
+    if isinstance(value, dict):
+        return {key: without_negative_zeros(one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [without_negative_zeros(one) for one in value]
+    return 0.0 if isinstance(value, float) and value == 0.0 else value
+
+
+def hash_of(value: Any) -> str:
+    """SHA-256 of the canonical bytes, in hexadecimal."""
+    return hashlib.sha256(canonical_bytes(value)).hexdigest()
+
+
+def known_hashes(value: BaseModel) -> tuple[str, ...]:
+    """Its hash, and the one that it was stored under before -0.0 was written as 0.0; mostly they are the same."""
+    as_it_is = json.dumps(value.model_dump(mode="json"), sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hash_of(value), hashlib.sha256(as_it_is.encode()).hexdigest()
