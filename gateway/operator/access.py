@@ -5,7 +5,7 @@ Nothing here lets anybody in or keeps them out. What cannot be told now is told 
 
 import asyncio
 from collections import OrderedDict, deque
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -13,6 +13,7 @@ from gateway.core.access import MOST_NAMES, MOST_PLACES, CameIn, UsersNow, Wrong
 from gateway.core.people import Person, Role
 from gateway.operator.line_side import LineSide
 from gateway.operator.users import Users, UsersFile, UsersRefused
+from gateway.tasks.supervisor import Supervisor, TaskFault
 
 LOOK_S = 1.0  #: between two looks at the users' file, and at what there is to tell
 REPORT_S = 60.0  #: between two reports of wrong logins, and after which the users are told again
@@ -38,6 +39,7 @@ class Access:
         self._side = side
         self._users = users
         self._tell = tell
+        self._supervisor = Supervisor(self._tell_fault)
         self._clock = clock
         self._came: deque[CameIn] = deque(maxlen=MOST_WAITING)
         self._dropped = 0  #: of them, because too many waited
@@ -68,8 +70,14 @@ class Access:
     async def run(self) -> None:
         """Until it is cancelled."""
         async with asyncio.TaskGroup() as group:
-            group.create_task(_again(self.renew))
-            group.create_task(_again(self._tell_all))  # may wait for the gateway; who may stop the line must not
+            group.create_task(self._supervisor.repeat("looking at the users' file", self.renew, LOOK_S))
+            group.create_task(
+                self._supervisor.repeat("telling who came in", self._tell_all, LOOK_S)
+            )  # may wait for the gateway; who may stop the line must not
+
+    def _tell_fault(self, fault: TaskFault, error: BaseException | None) -> None:
+        said = "works again" if error is None else f"failed, and goes on: {fault.error}: {fault.text}"
+        self._tell(f"{fault.task} {said}")
 
     async def look(self) -> None:
         """Look at the users' file, and tell what there is to tell."""
@@ -142,9 +150,3 @@ class Access:
             else:
                 elsewhere += one.count
         self._wrong, self._elsewhere = wrong, self._elsewhere + elsewhere
-
-
-async def _again(do: Callable[[], Awaitable[None]]) -> None:
-    while True:
-        await do()
-        await asyncio.sleep(LOOK_S)

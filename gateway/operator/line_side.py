@@ -150,6 +150,8 @@ class LineSide:
                 self._troubles.pop(look.__name__, None)
             except NotTold as error:
                 self._troubles[look.__name__] = str(error)
+            except Exception as error:  # of whoever is told: shown as trouble, and the next look has its turn
+                self._troubles[look.__name__] = f"a fault of this program: {type(error).__name__}: {error}"
             await asyncio.sleep(every_s)
 
     async def _in_turn(self, topic: Topic, query: Strict) -> bytes:

@@ -114,9 +114,16 @@ class Gate:
         if event.kind not in EXPERIMENT_ENDS:
             return
         hash_, reason = str(event.data.get("hash", "")), str(event.data.get("reason", ""))
-        task = asyncio.get_running_loop().create_task(self.deployer.experiment_ended(hash_, reason))
+        task = asyncio.get_running_loop().create_task(self._experiment_ended(self.deployer, hash_, reason))
         self._telling.add(task)
         task.add_done_callback(self._telling.discard)
+
+    async def _experiment_ended(self, deployer: Deployer, hash_: str, reason: str) -> None:
+        """Where it cannot be recorded, the deployer ends it later, as one whose end nobody has told."""
+        try:
+            await deployer.experiment_ended(hash_, reason)
+        except Exception as error:
+            self._note("gate", f"the end of an experiment is not recorded yet: {type(error).__name__}: {error}")
 
     def change(self) -> ChangeStatus | None:
         """What a proposal does to the line now."""

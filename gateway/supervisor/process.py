@@ -17,6 +17,7 @@ from gateway.core.recording import Recording
 from gateway.core.topics import LOOP_COMMAND
 from gateway.mailbox.listener import AlreadyRunning, CannotListen, PathTooLong
 from gateway.mailbox.paths import GATEWAY_SOCKET, LOOP_SOCKET
+from gateway.mailbox.port import Counters
 from gateway.mailbox.unix import UnixMailbox
 from gateway.supervisor.access_desk import AccessDesk
 from gateway.supervisor.agents_bus import AgentsBus
@@ -123,6 +124,7 @@ async def serve(
     bus = AgentsBus(line, run_folder, (desk, line_desk), gateway.note, cases, clock)
     gateway.agents_bus = bus.status
     opening = tasks.begin("opening the agents' bus", bus.open())
+    handlers = _Handlers(mailbox.counters)
     turns = {"gate": gate.look, "agents' cases": cases.look, "alarms' file": alarms.keep}
     looking = [asyncio.create_task(tasks.repeat(name, turn, watch_s, stop)) for name, turn in turns.items()]
     gateway.note("gateway-up", "the gateway has started")
@@ -132,6 +134,7 @@ async def serve(
             tasks.turn("watching the loop", gateway.watch)
             tasks.turn("alarms", lambda: alarms.look(gateway.status(), gate.audit.state()))
             tasks.turn("agents' bus", bus.watch)
+            tasks.turn("handlers of messages", handlers.look)
             await wait(stop, watch_s)
     finally:
         stop.set()
@@ -150,6 +153,24 @@ async def serve(
     if not flushed:
         print("the disk did not answer in time: the last seconds of history are lost", file=sys.stderr)
     return EXIT_OK if flushed else EXIT_NOT_FLUSHED
+
+
+class HandlerFailed(Exception):
+    """A handler of a message has raised; its sender was told, or nobody was. The text has topic, type and text."""
+
+
+class _Handlers:
+    """Of a mailbox: an exception of one ends no connection, and must not be silent either."""
+
+    def __init__(self, counters: Counters) -> None:
+        self._counters = counters
+        self._seen = 0
+
+    def look(self) -> None:
+        """Raises HandlerFailed where one has raised since the last look."""
+        seen, self._seen = self._seen, self._counters.handler_errors
+        if self._seen != seen:
+            raise HandlerFailed(self._counters.last_error)
 
 
 def _tell_fault(gateway: Gateway, fault: TaskFault, error: BaseException | None) -> None:

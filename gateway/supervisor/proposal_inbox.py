@@ -110,6 +110,8 @@ class Inbox:
                 await self._records.step(kind, what, GATEWAY, blobs)
             except (AuditUnavailable, Impossible) as error:
                 self._records.trouble = str(error)  # it stays as received, and is judged again
+            except Exception as error:  # a fault of this program: as above, and said as one
+                self._records.trouble = f"a verdict could not be recorded: {type(error).__name__}: {error}"
 
     async def _judgement(self, hash_: str) -> tuple[str, dict[str, Any], dict[str, bytes]]:
         entry = self._records.book.entries[hash_]

@@ -241,3 +241,31 @@ def test_a_look_that_raises_is_an_alarm_and_is_taken_again() -> None:
             assert process.returncode == 0 and err.count("Traceback") == 1 and "KeyError: 'look 1'" in err
 
     run(story)
+
+
+FAILING_HANDLER = """
+import sys
+from pathlib import Path
+from tests.unit.supervisor_support import line_of
+from gateway.supervisor.process import run_gateway
+from gateway.supervisor.service import Gateway
+
+async def failing(gateway, payload, who):
+    raise LookupError("nothing like it")
+
+Gateway.command = failing
+sys.exit(run_gateway(line_of(), Path(sys.argv[1]), Path(sys.argv[1]) / "data"))
+"""
+
+
+def test_a_handler_that_raises_ends_no_connection_and_is_not_silent() -> None:
+    async def story(folder: Path) -> None:
+        with child(FAILING_HANDLER, folder) as (_, said):
+            assert said.startswith("gateway of demo/")
+            async with loop_and_client(folder) as (_, client):
+                with pytest.raises(RemoteError, match="LookupError"):
+                    await client.request(GATEWAY_COMMAND, b'{"command": "stop"}', 5.0)
+                found = await status_with(client, lambda status: bool(status.task_faults))
+                assert "LookupError: nothing like it" in found.task_faults[0].text
+
+    run(story)
