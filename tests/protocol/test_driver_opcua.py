@@ -3,10 +3,13 @@
 import asyncio
 from collections.abc import Awaitable, Callable, Iterator
 from math import inf, nan
+from typing import Any
 
 import pytest
 from asyncua import ua
 
+from drivers.opcua.messages import Plan
+from drivers.opcua.session import LAST_NUMBER, Session
 from drivers.port import PrepareRefused
 from gateway.core.signals import DriveRequest, DriveState, Quality
 from tests.protocol.driver_opcua_support import U32, DeviceServer, Rig, device_server, line, link_in_process
@@ -386,5 +389,31 @@ def test_release_takes_torque_off_and_ends_supervision(server: DeviceServer) -> 
         assert devices.writes == []
         await rig.link.release()  # nobody is written to: nothing to say
         assert devices.writes == []
+
+    run(server, scene)
+
+
+@pytest.mark.parametrize("begin", [LAST_NUMBER - 20, 2**32 - 21])
+def test_a_connection_outlives_the_last_of_its_request_numbers(
+    server: DeviceServer, monkeypatch: pytest.MonkeyPatch, begin: int
+) -> None:
+    opened, protocols = Session.open, []
+
+    async def open_late(plan: Plan) -> Session:
+        session = await opened(plan)
+        protocol: Any = session._client.uaclient.protocol  # noqa: SLF001
+        protocol._request_id = protocol._request_handle = begin  # noqa: SLF001
+        protocols.append(protocol)
+        return session
+
+    monkeypatch.setattr(Session, "open", open_late)
+
+    async def scene(rig: Rig) -> None:
+        await rig.until(lambda: rig.inputs.tension.good() and rig.inputs.plc.quality == Quality.GOOD)
+        for _ in range(60):
+            await rig.cycle()
+        await rig.until(lambda: rig.inputs.tension.good())
+        (protocol,) = protocols  # it was never connected again
+        assert 0 < protocol._request_id < 1000 and rig.link.health.absent == []  # noqa: SLF001
 
     run(server, scene)
