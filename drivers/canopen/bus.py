@@ -175,6 +175,8 @@ class CanBus:
             await self._reopen()
         except OSError as error:
             self.gone = str(error)
+        except Exception as error:  # of a CAN interface's own library: told, and tried again like any other
+            self.gone = f"bus {self._config.name}: {type(error).__name__}: {error}"
 
     async def _reopen(self) -> None:
         gone = self.gone

@@ -225,6 +225,9 @@ class FetchedWire:
             except FAILURES as error:
                 fetched = error
                 self._closing.wait(THREAD_POLL_S)
+            except Exception as error:  # a thread that ended would look like a bus on which nobody speaks
+                fetched = can.CanError(f"{type(error).__name__}: {error}")
+                self._closing.wait(THREAD_POLL_S)
             if fetched is not None and not self._closing.is_set():
                 self._fetched.append(fetched)
                 loop.call_soon_threadsafe(on_arrival)

@@ -311,7 +311,12 @@ class Session:
             self._connecting = asyncio.create_task(self._connect_again())
 
     async def _connect_again(self) -> None:
-        if await self.connect():
+        try:
+            connected = await self.connect()
+        except Exception as error:  # told, and tried again like any other
+            self._health.last_error = f"{self.unit.name}: {self.where}: {type(error).__name__}: {error}"
+            return
+        if connected:
             self._health.reconnects += 1
         else:
             self._health.last_error = f"{self.unit.name}: no connection to {self.where}"

@@ -77,6 +77,9 @@ class CoursesDesk:
             raise NotKnown("they are drawn of another controller alone, and while it waits for a decision")
         self._make_room(deployer)
         judged = await deployer.judged_as(entry)
+        if self._drawing is not None and self._drawing.done() and not self._drawing.cancelled():
+            drawn, self._drawing = self._drawing, None
+            drawn.result()  # what was raised is told to whoever asks next, who may ask again
         if self._drawing is None or self._drawing.done():
             work = self._draw(proposal, entry.verdict, *judged)
             self._drawing = asyncio.get_running_loop().create_task(work)

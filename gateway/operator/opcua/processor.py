@@ -4,6 +4,7 @@ Without encryption only the endpoints are told: that is how clients find out wha
 """
 
 import asyncio
+import sys
 from collections.abc import Callable
 from functools import partial
 from ipaddress import IPv4Address, IPv6Network, ip_address
@@ -127,6 +128,11 @@ class Processor(UaProcessor):
         except (ServiceError, UaStatusCodeError) as error:
             response = ua.ServiceFault()
             response.ResponseHeader.ServiceResult = ua.StatusCode(error.code)
+            self.send_response(requesthdr.RequestHandle, seqhdr, response)
+        except Exception as error:  # a fault of this program: the client is answered all the same
+            print(f"OPC UA: a request failed: {type(error).__name__}: {error}", file=sys.stderr, flush=True)
+            response = ua.ServiceFault()
+            response.ResponseHeader.ServiceResult = ua.StatusCode(ua.StatusCodes.BadInternalError)
             self.send_response(requesthdr.RequestHandle, seqhdr, response)
 
     def send_response(
