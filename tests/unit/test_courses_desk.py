@@ -4,11 +4,14 @@ import asyncio
 import json
 from collections.abc import Awaitable, Callable
 
+import pytest
+
 from gateway.core.controller import config_hash
 from gateway.core.courses import Courses, CoursesTold, DrawnCourse
 from gateway.core.messages import Reply
 from gateway.core.proposal import canonical
 from gateway.core.topics import GATEWAY_COURSES
+from gateway.mailbox.port import RemoteError
 from gateway.mailbox.unix import UnixMailbox
 from gateway.supervisor.courses_desk import MOST_KEPT, CoursesDesk
 from gateway.supervisor.judging import TIME_RULE, NoVerdict
@@ -90,6 +93,18 @@ def test_what_cannot_be_drawn_is_not_tried_again():
         assert (await drawn(ask, hash_of(one))).courses == []
         assert (await drawn(ask, hash_of(one))).courses == []
         assert len(judge.asked) == 1
+
+    told(judge, story)
+
+
+def test_a_fault_while_they_are_drawn_is_told_to_whoever_asks_next_who_may_ask_again():
+    judge = Draws(KeyError("gain"))
+
+    async def story(gateway: Gateway, ask: Ask) -> None:
+        one = await waiting(gateway)
+        with pytest.raises(RemoteError, match="KeyError"):
+            await drawn(ask, hash_of(one))
+        assert (await drawn(ask, hash_of(one))).courses == [DRAWN]
 
     told(judge, story)
 

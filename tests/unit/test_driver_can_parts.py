@@ -1,8 +1,12 @@
 """The parts of CANopen nodes without a bus: error frames, stations, maps of amplifiers and PLCs, codecs."""
 
+import asyncio
 import struct
+import threading
 from pathlib import Path
+from typing import cast
 
+import can
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -16,6 +20,7 @@ from drivers.canopen.maps import DriveMap, LoadCellMap, PlcMap
 from drivers.canopen.pdo import MalformedPdo, PdoLayout, mapping_entries
 from drivers.canopen.plc import PlcNode
 from drivers.canopen.station import ANSWERS_ALLOWED, Station
+from drivers.canopen.wire import FetchedWire
 from drivers.device_map import MAPS, MapRefused, load_map
 from gateway.core.line import LinePlc, LoadCell
 from gateway.core.signals import Inputs, Outputs, Quality
@@ -288,3 +293,32 @@ def test_layouts_round_trip(kinds: list[str], data: st.DataObject) -> None:
     assert list(layout.decode(layout.encode(numbers))) == numbers
     with pytest.raises(ValueError, match=r"."):
         layout.encode([KINDS[kinds[0]][1] + 1, *numbers[1:]])
+
+
+def test_whatever_an_interface_raises_its_thread_goes_on_and_it_is_told_as_a_failure_of_the_bus() -> None:
+    class Interface:
+        def __init__(self) -> None:
+            self.raises: list[Exception] = [RuntimeError("a fault of its library")]
+            self.messages = [can.Message(arbitration_id=0x181, data=b"\x01", is_extended_id=False)]
+
+        def recv(self, timeout: float) -> can.Message | None:
+            if self.raises:
+                raise self.raises.pop(0)
+            if self.messages:
+                return self.messages.pop()
+            threading.Event().wait(timeout)
+            return None
+
+    async def scene() -> None:
+        arrived = asyncio.Event()
+        wire = FetchedWire(cast(can.BusABC, Interface()), "test")
+        wire.read_with(arrived.set)
+        await arrived.wait()
+        with pytest.raises(can.CanError, match="RuntimeError: a fault of its library"):
+            wire.receive()
+        while (found := wire.receive()) is None:  # noqa: ASYNC110
+            await asyncio.sleep(0.001)
+        assert found == (0x181, b"\x01")
+        await wire.close()
+
+    asyncio.run(scene())
