@@ -18,7 +18,7 @@ from typing import Annotated
 from pydantic import Field, ValidationError
 
 from gateway.core.canonical import known_hashes
-from gateway.core.controller import Controller, ControllerConfig, canonical
+from gateway.core.controller import Controller, ControllerConfig, canonical, config_hash
 from gateway.core.controller_fit import misfits
 from gateway.core.deployment import Hash, RecoveryPrediction, Region
 from gateway.core.line import Line, Strict

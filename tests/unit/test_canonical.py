@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gateway.control.design import design_lqi, design_mpc, design_pid, task_of
-from gateway.core.canonical import canonical_bytes, hash_of, known_hashes
+from gateway.core.canonical import canonical_bytes, hash_of, known_hashes, without_negative_zeros
 from gateway.core.controller import canonical, config_hash, parse_controller
 from gateway.core.deployment import Region
 from gateway.core.line_model import canonical as canonical_model
@@ -114,3 +114,17 @@ def test_what_was_stored_under_an_older_hash_is_found_under_both(tmp_path, monke
 
 def _as_it_was(config) -> bytes:
     return json.dumps(config.model_dump(mode="json"), sort_keys=True, separators=(",", ":")).encode()
+
+
+LEAVES = st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False) | st.text()
+DATA = st.recursive(
+    LEAVES,
+    lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner) | st.dictionaries(st.integers(), inner),
+    max_leaves=30,
+)
+
+
+@given(DATA)
+def test_row_by_row_they_are_the_bytes_of_one_call(data):
+    whole = json.dumps(without_negative_zeros(data), sort_keys=True, separators=(",", ":"), allow_nan=False)
+    assert canonical_bytes(data) == whole.encode()
