@@ -1,12 +1,13 @@
 """SQLite as it is used here: through apsw, which can load sqlite-vec whatever this Python was built with."""
 
-import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, Protocol, cast
 
 import apsw
 import sqlite_vec  # pyright: ignore[reportMissingTypeStubs]
+
+from gateway.storage.sqlite_file import FileKind, begin, open_to_read
 
 DatabaseError = apsw.Error
 
@@ -21,14 +22,14 @@ class Database(Protocol):
     def close(self) -> None: ...
 
 
-def created(path: Path) -> Database:
-    """A new file. Raises DatabaseError."""
-    return _with_vectors(apsw.Connection(os.fspath(path)))
+def begin_database(path: Path, kind: FileKind) -> Database:
+    """A new file. Raises `kind.error`."""
+    return _with_vectors(begin(path, kind))
 
 
-def opened_for_reading(path: Path) -> Database:
-    """Raises DatabaseError."""
-    return _with_vectors(apsw.Connection(os.fspath(path), flags=apsw.SQLITE_OPEN_READONLY))
+def open_database(path: Path, kind: FileKind) -> Database:
+    """For reading. Raises `kind.error`."""
+    return _with_vectors(open_to_read(path, kind))
 
 
 def _with_vectors(connection: apsw.Connection) -> Database:

@@ -14,18 +14,18 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from agents.rag.chunks import Chunk, chunks_of
-from agents.rag.database import Database, DatabaseError, created, opened_for_reading
+from agents.rag.database import Database, DatabaseError, begin_database, open_database
 from agents.rag.documents import Document
 from agents.rag.embedder import EmbedderId, Vectors
 from agents.rag.injection import flags_in
 from agents.rag.words import stems
+from gateway.storage.sqlite_file import FileKind, Journal
 
 APPLICATION_ID = 0x52324B4E  # "R2KN"
 #: Tables of vectors: of documents, of questions that they answer, and of chunks.
 HEADS, ASKED, PASSAGES = "head_vector", "asked_vector", "vector"
-SCHEMA = 2  #: another one is no loss: the index is made anew from the documents
 
-_TABLES = """
+_TABLES = f"""
 CREATE TABLE meta (key TEXT PRIMARY KEY NOT NULL, value TEXT NOT NULL);
 CREATE TABLE document (
     id INTEGER PRIMARY KEY,
@@ -49,6 +49,7 @@ CREATE INDEX chunk_by_document ON chunk (document);
 CREATE VIRTUAL TABLE word USING fts5(
     title, keywords, asked, text, content = '', tokenize = 'unicode61 remove_diacritics 0');
 CREATE VIRTUAL TABLE word_count USING fts5vocab(word, row);
+PRAGMA application_id = {APPLICATION_ID};
 """
 _VECTORS = """
 CREATE VIRTUAL TABLE {table} USING vec0(
@@ -58,6 +59,23 @@ CREATE VIRTUAL TABLE {table} USING vec0(
 
 class IndexRefused(Exception):
     """The index cannot be used as asked; the text says why and what to do."""
+
+
+class AnothersFile(IndexRefused):
+    """What lies there is no index of this program's, and is not made anew."""
+
+
+KIND = FileKind(
+    "index",
+    APPLICATION_ID,
+    {0: "", 1: _TABLES},  # one of an earlier schema is made anew from the documents, which is no loss
+    IndexRefused,
+    absent="there is no index at {path}: make it anew",
+    damaged="To go on, make it anew",
+    anothers=AnothersFile,
+    journal=Journal.NONE,
+)
+SCHEMA = KIND.schema
 
 
 def passages_of(documents: Sequence[Document]) -> list[list[Chunk]]:
@@ -98,7 +116,8 @@ def write_index(path: Path, content: Content) -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with _only_writer(path):
-            connection = created(part)
+            _require_replaceable(path)
+            connection = begin_database(part, KIND)
             try:
                 _fill(connection, content)
             finally:
@@ -116,19 +135,25 @@ def write_index(path: Path, content: Content) -> None:
 
 def open_index(path: Path) -> Database:
     """For reading. Raises IndexRefused where there is none that this program reads."""
-    if not path.is_file():
-        raise IndexRefused(f"there is no index at {path}")
     try:
-        connection = opened_for_reading(path)
-        owner = connection.execute("PRAGMA application_id").get
-        schema = connection.execute("PRAGMA user_version").get
-        if owner != APPLICATION_ID or schema != SCHEMA:
+        connection = open_database(path, KIND)
+        if connection.execute("PRAGMA user_version").get != SCHEMA:
             connection.close()
-            raise IndexRefused(f"{path} is no index of this program, or of another version of it: make it anew")
+            raise IndexRefused(f"{path} is an index of another version of this program: make it anew")
         connection.execute("PRAGMA mmap_size = 268435456")
     except DatabaseError as error:
         raise IndexRefused(f"{path} cannot be read ({error}): make it anew") from error
     return connection
+
+
+def _require_replaceable(path: Path) -> None:
+    """Raises AnothersFile. An index of ours that is damaged, or of another version, may be made anew."""
+    try:
+        open_database(path, KIND).close()
+    except AnothersFile:
+        raise
+    except (IndexRefused, DatabaseError):
+        pass
 
 
 @contextmanager
@@ -142,9 +167,7 @@ def _only_writer(path: Path) -> Generator[None]:
 
 
 def _fill(connection: Database, content: Content) -> None:
-    connection.execute("PRAGMA journal_mode = OFF; PRAGMA synchronous = OFF")  # nobody sees it before it is whole
-    connection.execute(f"PRAGMA application_id = {APPLICATION_ID}; PRAGMA user_version = {SCHEMA}; BEGIN")
-    connection.execute(_TABLES)
+    connection.execute("BEGIN")
     totals = [0, 0, 0, 0]
     number = 0
     for k, (document, chunks) in enumerate(zip(content.documents, content.passages, strict=True), start=1):

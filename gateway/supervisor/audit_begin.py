@@ -7,12 +7,12 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from gateway.core.audit_record import NotRecordable, Who
+from gateway.storage.sqlite_file import told
 from gateway.supervisor.audit_anchor import FILE_NAME as ANCHOR
 from gateway.supervisor.audit_anchor import Anchor, sync_folder
 from gateway.supervisor.audit_file import FILE_NAME, KIND
 from gateway.supervisor.audit_verify import Verification, verify
 from gateway.supervisor.audit_writer import AuditWriter
-from gateway.supervisor.sqlite_file import told
 
 
 @dataclass(frozen=True)

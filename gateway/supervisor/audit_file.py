@@ -10,7 +10,7 @@ from typing import NamedTuple
 import apsw
 
 from gateway.core.audit_record import AuditRecord, NotRecordable, head_of, parse_record
-from gateway.supervisor.sqlite_file import FileKind, open_there, told
+from gateway.storage.sqlite_file import FileKind, open_there, told
 
 FILE_NAME = "audit.sqlite"
 APPLICATION_ID = 0x52324155  # "R2AU"

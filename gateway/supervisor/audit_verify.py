@@ -5,10 +5,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from gateway.core.audit_record import BEFORE_FIRST, AuditRecord, NotRecordable
+from gateway.storage.sqlite_file import told
 from gateway.supervisor.audit_anchor import FILE_NAME as ANCHOR
 from gateway.supervisor.audit_anchor import Anchor, AnchorDamaged, read_anchor
 from gateway.supervisor.audit_file import KIND, AuditFile, AuditUnavailable, Row
-from gateway.supervisor.sqlite_file import told
 
 MOST_AT_ONCE = 64  #: records in one commit
 MOST_BEYOND = 100  #: records that an interruption may leave beyond the anchor: a commit, and attempts to note it

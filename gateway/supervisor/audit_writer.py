@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import Any
 
 from gateway.core.audit_record import BEFORE_FIRST, AuditRecord, Who, canonical, head_of
+from gateway.storage.sqlite_file import begin, open_there, told, transaction
 from gateway.supervisor.audit_anchor import FILE_NAME as ANCHOR
 from gateway.supervisor.audit_anchor import NOTHING_YET, Anchor, AnchorDamaged, read_anchor, write_anchor
 from gateway.supervisor.audit_file import FILE_NAME, KIND, WHAT_TO_DO, AuditFile, AuditUnavailable
 from gateway.supervisor.audit_verify import against_anchor, chained
-from gateway.supervisor.sqlite_file import begin, open_there, told, transaction
 from gateway.supervisor.store import boot_id
 
 LOCK = "audit.lock"

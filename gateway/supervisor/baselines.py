@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import apsw
 
 from gateway.core.audit_record import NotRecordable, canonical_json
-from gateway.supervisor.sqlite_file import FileKind, begin, open_there, rows_of, snapshot, told, transaction
+from gateway.storage.sqlite_file import FileKind, begin, open_there, rows_of, snapshot, told, transaction
 
 FILE_NAME = "baselines.sqlite"
 APPLICATION_ID = 0x5232424C  # "R2BL"

@@ -16,8 +16,8 @@ import apsw
 
 from gateway.core.canonical import known_hashes
 from gateway.core.controller import Controller, ControllerRefused, canonical, config_hash, parse_controller
+from gateway.storage.sqlite_file import FileKind, begin, open_there, rows_of, snapshot, told, transaction
 from gateway.supervisor.find_version import find_version
-from gateway.supervisor.sqlite_file import FileKind, begin, open_there, rows_of, snapshot, told, transaction
 
 FILE_NAME = "configurations.sqlite"
 STABLE = "phi_stable"  #: the name of what held in stable operation

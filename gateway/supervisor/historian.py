@@ -1,9 +1,9 @@
 """The historian: keeps every telemetry frame and event of a line, in a thread of its own.
 
-Every FLUSH_S what is new is committed, so that a SIGKILL loses at most that and the time of one commit. Nothing here
-raises into the process or makes it wait. When the disk is full, slow or gone, or the file is damaged, the historian
-stops storing, says so in its health, keeps what is new as far as memory allows, and goes on when it can. A damaged
-file is moved aside and kept.
+Every FLUSH_S what is new is handed to the kernel, so that a SIGKILL loses at most that and the time of one write.
+Nothing here raises into the process or makes it wait. When the disk is full, slow or gone, or the file is damaged, the
+historian stops storing, says so in its health, keeps what is new as far as memory allows, and goes on when it can. A
+damaged file is moved aside and kept.
 """
 
 import threading
@@ -123,8 +123,8 @@ class Historian:
             self._turn_began_s = self._clock()
             self._turn(stopping)
             self._turn_began_s = None
-        with suppress(apsw.Error):  # what was committed lies in the write-ahead log and is found again
-            self._writer.disconnect()
+        with suppress(apsw.Error):  # what was stored lies in the log or the tail and is found again
+            self._writer.close()
 
     def _turn(self, finish: bool) -> None:
         until_s = self._clock()
@@ -136,10 +136,17 @@ class Historian:
             self._writer.store(self._new_frames, self._new_events, wall_ahead_s)
             self._stored(until_s)
             if finish or idle or self._writer.gathered_s() >= BLOB_S:
-                self._writer.pack(wall_ahead_s)
-                self._writer.expire(self._retention, self._wall_clock())
+                self._pack()
         except Exception as error:  # the thread must outlive whatever happens to the disk
             self._recover(error)
+
+    def _pack(self) -> None:
+        """Whoever holds the database for a while delays this alone: what is new lies in the tail."""
+        try:
+            self._writer.pack()
+            self._writer.expire(self._retention, self._wall_clock())
+        except apsw.BusyError as error:
+            self._health = replace(self._health, text=f"storing, beside the history: {_explain(error)}")
 
     def _stored(self, until_s: float) -> None:
         something = self._new_frames or self._new_events
@@ -186,7 +193,10 @@ def _move(queue: deque[Any], onto: list[Any]) -> None:
 
 
 def move_aside(path: Path, wall_s: float) -> Path:
-    """Rename a damaged history and its write-ahead log, never onto an older one. Returns where it lies now."""
+    """Rename a damaged history and its write-ahead log, never onto an older one. Returns where it lies now.
+
+    Its tail stays: that is sound, and goes into the next one.
+    """
     stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(wall_s))
     kept = path.with_name(f"{path.stem}-damaged-{stamp}{path.suffix}")
     number = 1

@@ -1,19 +1,26 @@
-"""Reading a history, from any process, while it is being written."""
+"""Reading a history, from any process, while it is being written.
+
+No read stays open for longer than it takes to fetch one blob: whoever walks through a history as slowly as somebody
+turns pages must not keep SQLite from beginning its log anew. A blob never changes, so that what was listed in one
+moment can be fetched one by one; what has become too old meanwhile is gone.
+"""
 
 import json
-import os
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Iterable, Sequence
 from contextlib import closing
+from dataclasses import replace
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import apsw
 import numpy as np
 from numpy.typing import NDArray
 
+from gateway.storage.sqlite_file import open_to_read, snapshot, told
 from gateway.supervisor.blobs import DamagedBlob, unpack_column, unpack_times
-from gateway.supervisor.store import PER_SPAN, SCHEMA, STORED_FIELDS
+from gateway.supervisor.store import KIND, PER_SPAN, STORED_FIELDS, packed_record
+from gateway.supervisor.tail import DamagedTail, TailRead, TailRecord, read_tail, tail_path
 
 FIELDS = ("time_s", "wall_s", *STORED_FIELDS)
 _BETWEEN_WALL = "end_s + blob.wall_ahead_s >= ? AND start_s + blob.wall_ahead_s <= ?"
@@ -21,6 +28,10 @@ _BETWEEN_WALL = "end_s + blob.wall_ahead_s >= ? AND start_s + blob.wall_ahead_s 
 
 class HistoryError(Exception):
     """The file cannot be read as asked; the text says why and what to do."""
+
+
+_KIND = replace(KIND, error=HistoryError, absent="there is no history at {path}")
+BUSY_MS = 2000
 
 
 class StoredEvent(NamedTuple):
@@ -43,18 +54,8 @@ class History:
     """`close` it, or use it as a context manager. Raises HistoryError."""
 
     def __init__(self, path: Path) -> None:
-        if not path.is_file():
-            raise HistoryError(f"there is no history at {path}")
-        try:
-            self._connection = apsw.Connection(os.fspath(path), flags=apsw.SQLITE_OPEN_READWRITE)
-            self._connection.set_busy_timeout(2000)
-            self._connection.execute("PRAGMA query_only = ON")
-            version = self._connection.pragma("user_version")
-        except apsw.Error as error:
-            raise HistoryError(f"{path} cannot be read: {error}") from error
-        if version != SCHEMA:
-            self._connection.close()
-            raise HistoryError(f"{path} has schema {version}, this program reads {SCHEMA}")
+        self._path = path
+        self._connection = open_to_read(path, _KIND, BUSY_MS)
         self.damaged: list[str] = []  #: blobs that could not be unpacked and are missing in what was read
 
     def __enter__(self) -> "History":
@@ -68,8 +69,9 @@ class History:
 
     def boots(self) -> list[str]:
         """Boots of the machine in which something was stored, the newest last."""
-        rows = self._connection.execute("SELECT boot FROM run GROUP BY boot ORDER BY max(id)")
-        return [boot for (boot,) in rows]
+        with told(self._path, _KIND):
+            rows = self._connection.execute("SELECT boot FROM run GROUP BY boot ORDER BY max(id)").fetchall()
+        return [str(boot) for (boot,) in rows]
 
     def read(
         self, start_s: float, end_s: float, fields: Sequence[str], boot: str | None = None
@@ -80,11 +82,12 @@ class History:
         span or roller. `wall_s` is Unix time. Units are those of the names.
         """
         boot = boot or next(reversed(self.boots()), "")
-        return self._read("run.boot = ? AND end_s >= ? AND start_s <= ?", (boot,), "time_s", start_s, end_s, fields)
+        where = "run.boot = ? AND end_s >= ? AND start_s <= ?"
+        return _joined(self._walk(where, (boot,), "time_s", start_s, end_s, fields, boot), fields)
 
     def read_wall(self, start_s: float, end_s: float, fields: Sequence[str]) -> dict[str, NDArray[Any]]:
         """As `read`, over all boots, between two instants of Unix time."""
-        return self._read(_BETWEEN_WALL, (), "wall_s", start_s, end_s, fields)
+        return _joined(self.walk_wall(start_s, end_s, fields), fields)
 
     def walk_wall(
         self, start_s: float, end_s: float, fields: Sequence[str]
@@ -94,73 +97,135 @@ class History:
 
     def events(self, start_s: float, end_s: float) -> list[StoredEvent]:
         """Events between two instants of Unix time, in order."""
-        rows = self._connection.execute(
-            "SELECT boot, time_s, wall_s, kind, text, data FROM event JOIN run ON run.id = event.run"
-            " WHERE wall_s BETWEEN ? AND ? ORDER BY wall_s, event.id",
-            (start_s, end_s),
-        )
-        return [
+        tail = self._tail()
+        with told(self._path, _KIND), snapshot(self._connection):
+            rows = self._connection.execute(
+                "SELECT boot, time_s, wall_s, kind, text, data FROM event JOIN run ON run.id = event.run"
+                " WHERE wall_s BETWEEN ? AND ? ORDER BY wall_s, event.id",
+                (start_s, end_s),
+            ).fetchall()
+            new = self._unpacked(tail)
+        found = [
             StoredEvent(boot, time_s, wall_s, kind, text, json.loads(data))
-            for boot, time_s, wall_s, kind, text, data in rows
+            for boot, time_s, wall_s, kind, text, data in cast("list[tuple[str, float, float, str, str, str]]", rows)
         ]
-
-    def _read(
-        self, where: str, values: tuple[Any, ...], by: str, start_s: float, end_s: float, fields: Sequence[str]
-    ) -> dict[str, NDArray[Any]]:
-        with closing(self._walk(where, values, by, start_s, end_s, fields)) as walk:
-            parts = list(walk)
-        return {name: np.concatenate([part[name] for part in parts]) for name in dict.fromkeys(("time_s", *fields))}
+        if tail is not None:
+            dated = [(one, one.time_s + record.wall_ahead_s) for record in new for one in record.events]
+            found += [
+                StoredEvent(tail.run.boot, one.time_s, wall_s, one.kind, one.text, one.data)
+                for one, wall_s in dated
+                if start_s <= wall_s <= end_s
+            ]
+        return sorted(found, key=lambda event: event.wall_s)
 
     def _walk(
-        self, where: str, values: tuple[Any, ...], by: str, start_s: float, end_s: float, fields: Sequence[str]
+        self,
+        where: str,
+        values: tuple[Any, ...],
+        by: str,
+        start_s: float,
+        end_s: float,
+        fields: Sequence[str],
+        boot: str | None = None,
     ) -> Generator[dict[str, NDArray[Any]], None, None]:
-        """The first part is empty, with the shapes of what follows."""
+        """The first part is empty, with the shapes of what follows. What lies in the tail comes last."""
         _check_fields(fields)
         wanted = dict.fromkeys(("time_s", *fields))
-        self._connection.execute("BEGIN")  # one snapshot, whatever the writer gathers meanwhile
-        try:
+        tail = self._tail()  # before the database: what is packed in between is in both, and told apart
+        if tail is not None and boot not in (None, tail.run.boot):
+            tail = None
+        with told(self._path, _KIND), snapshot(self._connection):
             blobs = self._blobs(where, (*values, start_s, end_s))
-            yield _nothing(wanted, blobs[0].spans if blobs else 0)
-            for blob in blobs:
+            columns_of_tail = [_columns(record, wanted) for record in self._unpacked(tail)]
+        parts = [
+            part for columns in columns_of_tail if len((part := _inside(columns, by, start_s, end_s, wanted))["time_s"])
+        ]
+        spans = {blob.spans for blob in blobs} | ({tail.run.spans} if tail is not None and parts else set[int]())
+        if len(spans) > 1:
+            raise HistoryError("the line's number of spans changed in this interval: read it in two parts")
+        yield _nothing(wanted, next(iter(spans), 0))
+        for blob in blobs:
+            with told(self._path, _KIND):
                 columns = self._unpack(blob, [*wanted, by])
-                if columns:
-                    inside = (columns[by] >= start_s) & (columns[by] <= end_s)
-                    yield {name: columns[name][inside] for name in wanted}
-        except apsw.Error as error:
-            raise HistoryError(f"the history cannot be read: {error}") from error
-        finally:
-            self._connection.execute("ROLLBACK")
+            if columns:
+                yield _inside(columns, by, start_s, end_s, wanted)
+        yield from parts
+
+    def _tail(self) -> TailRead | None:
+        try:
+            return read_tail(tail_path(self._path))
+        except DamagedTail as error:
+            self.damaged.append(str(error))
+            return None
+        except OSError as error:
+            raise HistoryError(f"the history's tail cannot be read: {error.strerror}") from error
+
+    def _unpacked(self, tail: TailRead | None) -> list[TailRecord]:
+        """Of a tail what does not lie in the database yet."""
+        if tail is None:
+            return []
+        done = packed_record(self._connection, tail.run_id)
+        return [record for record in tail.records if record.number > done]
 
     def _blobs(self, where: str, values: tuple[Any, ...]) -> list[_Blob]:
         sql = (
             "SELECT blob.id, frames, blob.wall_ahead_s, spans FROM blob JOIN run ON run.id = blob.run"
             f" WHERE {where} ORDER BY run.id, start_s"
         )
-        blobs = [_Blob(*row) for row in self._connection.execute(sql, values)]
-        if len({blob.spans for blob in blobs}) > 1:
-            raise HistoryError("the line's number of spans changed in this interval: read it in two parts")
-        return blobs
+        rows = self._connection.execute(sql, values).fetchall()
+        return [_Blob(*row) for row in cast("list[tuple[int, int, float, int]]", rows)]
 
     def _unpack(self, blob: _Blob, names: Sequence[str]) -> dict[str, NDArray[Any]]:
-        """The columns of a blob; none of a damaged one, which is noted."""
+        """The columns of a blob; none of one that has become too old meanwhile, or is damaged, which is noted."""
         try:
-            time_s = unpack_times(self._packed(blob, "time_s"), blob.frames)
+            wanted = dict.fromkeys(("time_s", *(name for name in names if name != "wall_s")))
+            packed = self._packed(blob, list(wanted))
+            if not packed:
+                return {}
+            time_s = unpack_times(packed["time_s"], blob.frames)
             columns: dict[str, NDArray[Any]] = {"time_s": time_s, "wall_s": time_s + blob.wall_ahead_s}
-            for name in names:
+            for name in wanted:
                 if name not in columns:
                     width = blob.spans if name in PER_SPAN else 1
-                    column = unpack_column(self._packed(blob, name), STORED_FIELDS[name], blob.frames, width)
+                    column = unpack_column(packed[name], STORED_FIELDS[name], blob.frames, width)
                     columns[name] = column if name in PER_SPAN else column.reshape(-1)
         except (DamagedBlob, apsw.CorruptError) as error:
             self.damaged.append(f"blob {blob.id}, {blob.frames} frames: {error}")
             return {}
         return columns
 
-    def _packed(self, blob: _Blob, name: str) -> bytes:
-        found = self._connection.execute("SELECT data FROM field WHERE blob = ? AND name = ?", (blob.id, name)).get
-        if not isinstance(found, bytes):
-            raise DamagedBlob(f"{name} is missing")
+    def _packed(self, blob: _Blob, names: Sequence[str]) -> dict[str, bytes]:
+        """In one read; empty where the blob is no longer there."""
+        marks = ", ".join("?" * len(names))
+        rows = self._connection.execute(
+            f"SELECT name, data FROM field WHERE blob = ? AND name IN ({marks})", (blob.id, *names)
+        ).fetchall()
+        if not rows and not self._connection.execute("SELECT count(*) FROM blob WHERE id = ?", (blob.id,)).get:
+            return {}
+        found = {str(name): data for name, data in rows if isinstance(data, bytes)}
+        if missing := [name for name in names if name not in found]:
+            raise DamagedBlob(f"{missing[0]} is missing")
         return found
+
+
+def _joined(walk: Generator[dict[str, NDArray[Any]], None, None], fields: Sequence[str]) -> dict[str, NDArray[Any]]:
+    with closing(walk):
+        parts = list(walk)
+    return {name: np.concatenate([part[name] for part in parts]) for name in dict.fromkeys(("time_s", *fields))}
+
+
+def _inside(
+    columns: dict[str, NDArray[Any]], by: str, start_s: float, end_s: float, wanted: Iterable[str]
+) -> dict[str, NDArray[Any]]:
+    inside = (columns[by] >= start_s) & (columns[by] <= end_s)
+    return {name: columns[name][inside] for name in wanted}
+
+
+def _columns(record: TailRecord, wanted: Iterable[str]) -> dict[str, NDArray[Any]]:
+    """As those of a blob."""
+    time_s = record.frames["time_s"].copy()
+    columns: dict[str, NDArray[Any]] = {"time_s": time_s, "wall_s": time_s + record.wall_ahead_s}
+    return columns | {name: record.frames[name].astype(STORED_FIELDS[name]) for name in wanted if name not in columns}
 
 
 def _check_fields(fields: Sequence[str]) -> None:

@@ -12,7 +12,7 @@ from pathlib import Path
 import apsw
 
 from gateway.core.interactions import Interaction, InteractionRefused, unpack
-from gateway.supervisor.sqlite_file import FileKind, begin, open_there, rows_of, told, transaction
+from gateway.storage.sqlite_file import FileKind, begin, open_there, rows_of, told, transaction
 
 FILE_NAME = "interactions.sqlite"
 APPLICATION_ID = 0x5232494E  # "R2IN"

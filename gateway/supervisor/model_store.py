@@ -4,7 +4,7 @@ from pathlib import Path
 
 import apsw
 
-from gateway.supervisor.sqlite_file import FileKind, begin, open_there
+from gateway.storage.sqlite_file import FileKind, begin, open_there
 
 APPLICATION_ID = 0x52324D44  # "R2MD"
 

@@ -13,9 +13,9 @@ import apsw
 
 from gateway.core.canonical import known_hashes
 from gateway.core.line_model import LineModel, ModelRefused, canonical, model_hash, parse_model
+from gateway.storage.sqlite_file import snapshot, told, transaction
 from gateway.supervisor.find_version import find_version
 from gateway.supervisor.model_store import KIND, ModelsError, begin_models, open_models
-from gateway.supervisor.sqlite_file import snapshot, told, transaction
 
 FILE_NAME = "models.sqlite"
 

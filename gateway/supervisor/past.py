@@ -8,7 +8,6 @@ from collections.abc import Callable
 from itertools import islice
 from pathlib import Path
 
-import apsw
 from pydantic import ValidationError
 
 from gateway.core.audit_record import AuditRecord, NotRecordable
@@ -18,11 +17,11 @@ from gateway.core.messages import Reply
 from gateway.core.proposal import ProposalRefused, parse_proposal
 from gateway.core.topics import GATEWAY_PAST
 from gateway.mailbox.port import MAX_PAYLOAD, Mailbox
+from gateway.storage.sqlite_file import open_to_read, told
 from gateway.supervisor.audit_file import FILE_NAME, KIND, AuditFile, AuditUnavailable, Row
 from gateway.supervisor.history import History, HistoryError
 from gateway.supervisor.past_tensions import NotTold, thinned
 from gateway.supervisor.record_words import in_a_sentence
-from gateway.supervisor.sqlite_file import told
 
 BUSY_MS = 500
 _HEAD_BYTES = 200  #: of an answer, beside its records
@@ -93,9 +92,7 @@ class _Records:
             inode = path.stat().st_ino
             if self._file is None or inode != self._inode:
                 self.close()
-                connection = apsw.Connection(str(path), flags=apsw.SQLITE_OPEN_READONLY)
-                connection.set_busy_timeout(BUSY_MS)
-                self._file, self._inode = AuditFile(self._folder, connection), inode
+                self._file, self._inode = AuditFile(self._folder, open_to_read(path, KIND, BUSY_MS)), inode
         return self._file
 
     def _told(self, file: AuditFile, asked: RecordsAfter) -> bytes:

@@ -1,15 +1,14 @@
-"""The history file of a line: its tables in SQLite, how they are opened, migrated and written. One thread at a time.
+"""The history file of a line: its tables in SQLite, and how they are written. One thread at a time.
 
 Monotonic time restarts with the machine, so every row belongs to a run of the gateway, and a run to a boot; every
-blob also carries what the wall clock was ahead of monotonic time when it was written, so that history can be dated
-and a wall clock that jumped changes no earlier row.
+blob also carries what the wall clock was ahead of monotonic time when it was written, so that history can be dated.
+A wall clock that jumps changes no earlier row; one that was seen to agree afterwards dates the whole boot
+(`dating.py`).
 
-WAL with synchronous = NORMAL: what was committed survives SIGKILL of this process; a power cut may take the last
-seconds, never the consistency of the file.
+What is new lies in a file beside it first (`tail.py`), and comes here some seconds at a time.
 """
 
 import json
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,11 +19,11 @@ from numpy.typing import NDArray
 
 from gateway.core.messages import Event
 from gateway.core.telemetry import BYTE_FIELDS, FLOAT_FIELDS
+from gateway.storage.sqlite_file import FileKind, Journal, connect
 from gateway.supervisor.blobs import pack_column, pack_times
 
-SCHEMA = 1
 APPLICATION_ID = 0x52325247  # "R2RG": no other program's SQLite file is mistaken for a history
-CHECKED_WHOLE_BYTES = 256 * 2**20  #: `check_whole` reads files up to this size, about a second
+BUSY_MS = 500
 
 #: What is kept of a frame, with the type it is kept in.
 STORED_FIELDS: dict[str, str] = {
@@ -81,12 +80,35 @@ CREATE INDEX event_by_time ON event (wall_s);
 PRAGMA application_id = {APPLICATION_ID};
 """
 
+#: Later than schema 1, and nothing that an older program needs to know: it reads and writes the file as before.
+_ADDITIONS = """
+CREATE TABLE IF NOT EXISTS packed (
+    run INTEGER PRIMARY KEY REFERENCES run,
+    record INTEGER NOT NULL         -- of the run's tail, up to this one, everything lies in blobs and events
+);
+"""
+
 #: From version k (the key) to version k + 1. Every version that was ever released stays here.
 MIGRATIONS: dict[int, str] = {0: _SCHEMA_1}
 
 
 class NotOurs(Exception):
     """The file is sound, but not one that this program may write. It is left alone."""
+
+
+KIND = FileKind(
+    "history",
+    APPLICATION_ID,
+    MIGRATIONS,
+    NotOurs,
+    absent="there is no history at {path}",
+    damaged="The gateway keeps it aside when it starts, and begins a new one",
+    journal=Journal.WRITE_AHEAD,
+    additions=_ADDITIONS,
+    gives_back=True,
+    busy_ms=BUSY_MS,
+)
+SCHEMA = KIND.schema
 
 
 @dataclass(frozen=True)
@@ -108,39 +130,15 @@ def boot_id() -> str:
 def open_store(path: Path) -> apsw.Connection:
     """Open or begin a history. Raises NotOurs, OSError, and apsw.CorruptError or NotADBError for a damaged file."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    connection = apsw.Connection(os.fspath(path))
-    try:
-        connection.set_busy_timeout(500)
-        connection.execute("PRAGMA auto_vacuum = INCREMENTAL")  # of a new file; needed before its first table
-        connection.execute("PRAGMA journal_mode = WAL")
-        connection.execute("PRAGMA synchronous = NORMAL")
-        _migrate(connection)
-    except BaseException:
-        connection.close()
-        raise
-    return connection
+    return connect(path, KIND)
 
 
-def check_whole(connection: apsw.Connection, path: Path) -> None:
-    """Find damage before it is written upon. Raises apsw.CorruptError."""
-    if path.stat().st_size > CHECKED_WHOLE_BYTES:
-        return
-    found = connection.execute("PRAGMA quick_check(1)").get
-    if found != "ok":
-        raise apsw.CorruptError(str(found))
-
-
-def _migrate(connection: apsw.Connection) -> None:
-    version = connection.pragma("user_version")
-    owner = connection.pragma("application_id")
-    if version and owner != APPLICATION_ID:
-        raise NotOurs(f"it belongs to another program (application id {owner:#x})")
-    if version > SCHEMA:
-        raise NotOurs(f"it has schema {version}, this program writes {SCHEMA}: update r2rgate, or move the file away")
-    for step in range(version, SCHEMA):
-        with connection:
-            connection.execute(MIGRATIONS[step])
-            connection.execute(f"PRAGMA user_version = {step + 1}")
+def find_run(connection: apsw.Connection, run_id: int, run: Run) -> int:
+    """The number of a run in this file: `run_id`, where it is that one here, too; else it is begun."""
+    found = connection.execute(
+        "SELECT 1 FROM run WHERE id = ? AND boot = ? AND started_s = ?", (run_id, run.boot, run.started_s)
+    ).get
+    return run_id if found else insert_run(connection, run)
 
 
 def insert_run(connection: apsw.Connection, run: Run) -> int:
@@ -164,6 +162,21 @@ def insert_blob(connection: apsw.Connection, run_id: int, frames: NDArray[np.voi
         "INSERT INTO field (blob, name, data) VALUES (?, ?, ?)", [(blob_id, "time_s", pack_times(time_s)), *columns]
     )
     return blob_id
+
+
+def mark_packed(connection: apsw.Connection, run_id: int, record: int) -> None:
+    """Of this run's tail everything up to `record` lies in blobs and events."""
+    connection.execute(
+        "INSERT INTO packed (run, record) VALUES (?1, ?2) ON CONFLICT (run) DO UPDATE SET record = ?2",
+        (run_id, record),
+    )
+
+
+def packed_record(connection: apsw.Connection, run_id: int) -> int:
+    """The last record of this run's tail that lies in blobs and events; 0: none, also in a file of an older program."""
+    if not connection.execute("SELECT count(*) FROM sqlite_schema WHERE name = 'packed'").get:
+        return 0
+    return connection.execute("SELECT record FROM packed WHERE run = ?", (run_id,)).get or 0
 
 
 def delete_blobs(connection: apsw.Connection, blob_ids: Sequence[int]) -> None:

@@ -1,11 +1,13 @@
-"""Writes frames and events into the history file: first as small blobs, at once, then gathered into large ones.
+"""Writes frames and events of a line: at once into the history's tail, and from there, some seconds at a time, into
+its database.
 
-A reader needs to know nothing of this: blobs of any length lie side by side, and each frame is in exactly one.
-Every method may raise apsw.Error, OSError, store.NotOurs or DiskFull; what it was given is then not stored.
+A reader finds each frame exactly once, wherever it lies. Methods may raise apsw.Error, OSError, store.NotOurs or
+DiskFull; what `store` was given is then not stored, and what waits in the tail waits on.
 """
 
 import os
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import apsw
@@ -13,20 +15,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gateway.core.messages import Event
-from gateway.core.telemetry import frame_dtype
+from gateway.storage.sqlite_file import LOG_BYTES
 from gateway.supervisor.retention import Retention, expire
 from gateway.supervisor.store import (
     Run,
-    check_whole,
-    delete_blobs,
+    find_run,
     insert_blob,
     insert_events,
     insert_run,
+    mark_packed,
     open_store,
+    packed_record,
 )
+from gateway.supervisor.tail import DamagedTail, Tail, TailRecord, read_tail, table_of, tail_path
 
-BLOB_S = 10.0
+BLOB_S = 20.0  #: of frames in a blob: before the kernel writes the tail to the disk, and small columns share a page
 MAX_BLOB_FRAMES = 20_000
+MAX_TAIL_BYTES = 32 * 2**20  #: of frames in the tail, where they cannot be packed
+REDATED_S = 0.5  #: a wall clock that moves by more between two stores begins a new blob
+MOST_LOG_BYTES = 4 * LOG_BYTES  #: beyond it somebody has kept a read open: it is copied back and cut
 
 
 class DiskFull(Exception):
@@ -38,58 +45,79 @@ class Writer:
         self.path = path
         self._run = run
         self._reserve_bytes = reserve_bytes
-        self._dtype = frame_dtype(run.spans)
         self._connection: apsw.Connection | None = None
         self._inode: int | None = None
         self._run_id = 0
-        self._gathered: list[bytes] = []  # stored, in the blobs `_small`
-        self._small: list[int] = []
+        self._tail: Tail | None = None
+        self._gathered: list[TailRecord] = []  # what lies in the tail
+        self._gathered_bytes = 0
+        self._last_record = 0
 
     def store(self, frames: Sequence[bytes], events: Sequence[Event], wall_ahead_s: float) -> None:
-        """Commit what is new, in one transaction."""
-        connection = self._ready()
+        """Into the tail: from now on no kill takes it."""
+        self._ready()
         if not frames and not events:
             return
-        blobs: list[int] = []
-        with connection:
-            for start in range(0, len(frames), MAX_BLOB_FRAMES):
-                part = self._table(frames[start : start + MAX_BLOB_FRAMES])
-                blobs.append(insert_blob(connection, self._run_id, part, wall_ahead_s))
-            insert_events(connection, self._run_id, events, wall_ahead_s)
-        self._gathered += frames
-        self._small += blobs
+        if self._gathered_bytes > MAX_TAIL_BYTES:
+            self.pack()
+        record = TailRecord(self._last_record + 1, wall_ahead_s, table_of(frames, self._run.spans), [*events])
+        self._begun_tail().append(record)
+        self._last_record = record.number
+        self._gathered.append(record)
+        self._gathered_bytes += record.frames.nbytes
 
     def gathered_s(self) -> float:
-        """From the first to the last frame that lies in small blobs."""
-        if not self._gathered:
-            return 0.0
-        first, last = self._table((self._gathered[0], self._gathered[-1]))["time_s"]
-        return float(last - first)
+        """From the first to the last frame in the tail."""
+        parts = [record.frames for record in self._gathered if len(record.frames)]
+        return float(parts[-1]["time_s"][-1] - parts[0]["time_s"][0]) if parts else 0.0
 
-    def pack(self, wall_ahead_s: float) -> None:
-        """Replace the small blobs by one, in one transaction."""
-        if len(self._small) > 1 and len(self._gathered) <= MAX_BLOB_FRAMES:
-            connection = self._ready()
-            with connection:
-                delete_blobs(connection, self._small)
-                insert_blob(connection, self._run_id, self._table(self._gathered), wall_ahead_s)
-        self._forget()
+    def pack(self) -> None:
+        """Move what lies in the tail into the database, in one transaction."""
+        self._pack_into(self._ready())
 
     def expire(self, retention: Retention, wall_s: float) -> None:
         """Delete some of what is too old or too much."""
         expire(self._ready(), retention, wall_s)
 
     def disconnect(self) -> None:
-        """Close the file, whatever state it is in; the next `store` opens it again."""
+        """Close the file, whatever state it is in; the next `store` opens it again. The tail stays."""
         connection, self._connection = self._connection, None
-        self._forget()
         if connection is not None:
             connection.close()
+
+    def close(self) -> None:
+        """For good. What could not be packed stays in the tail, and is found by whoever writes next."""
+        if self._tail is not None:
+            self._tail.close()
+        self.disconnect()
+
+    def _pack_into(self, connection: apsw.Connection) -> None:
+        if not self._gathered:
+            return
+        with connection:
+            _insert(connection, self._run_id, self._gathered)
+        self._gathered, self._gathered_bytes = [], 0
+        tail, self._tail = self._tail, None
+        if tail is not None:
+            tail.remove()
+        self._cut_log(connection)
+
+    def _cut_log(self, connection: apsw.Connection) -> None:
+        """A log that a reader has let grow is copied back, as far as readers allow, and cut."""
+        with suppress(FileNotFoundError, apsw.BusyError):
+            if self.path.with_name(self.path.name + "-wal").stat().st_size > MOST_LOG_BYTES:
+                connection.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()
+
+    def _begun_tail(self) -> Tail:
+        if self._tail is None:
+            self._tail = Tail(tail_path(self.path), self._run_id, self._run)
+        return self._tail
 
     def _ready(self) -> apsw.Connection:
         if self._connection is not None and not self._still_there():
             # Somebody moved, replaced or deleted the file. It gets what is its own, which SQLite leaves out when it
             # closes a file that has moved, but must not swallow what comes.
+            self._pack_into(self._connection)
             self._connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
             self.disconnect()
         connection = self._connection or self._connect()
@@ -103,9 +131,7 @@ class Writer:
         try:
             inode = self.path.stat().st_ino
             if inode != self._inode:
-                check_whole(connection, self.path)
-                with connection:
-                    self._run_id = insert_run(connection, self._run)
+                self._begin_in(connection)
                 self._inode = inode
         except BaseException:
             connection.close()
@@ -113,14 +139,68 @@ class Writer:
         self._connection = connection
         return connection
 
+    def _begin_in(self, connection: apsw.Connection) -> None:
+        """In a file that this writer has not written yet: a run, and what lies in a tail beside it.
+
+        The tail is that of a process that was killed; or this one's own, where the file before was damaged or is gone.
+        """
+        if self._tail is None:
+            _pack_left(connection, tail_path(self.path))
+        with connection:
+            self._run_id = insert_run(connection, self._run)
+            if self._gathered:
+                _insert(connection, self._run_id, self._gathered)
+        self._gathered, self._gathered_bytes = [], 0
+        tail, self._tail = self._tail, None
+        if tail is not None:
+            tail.remove()
+
     def _still_there(self) -> bool:
         try:
             return self.path.stat().st_ino == self._inode
         except FileNotFoundError:
             return False
 
-    def _forget(self) -> None:
-        self._gathered, self._small = [], []
 
-    def _table(self, frames: Sequence[bytes]) -> NDArray[np.void]:
-        return np.frombuffer(b"".join(frames), self._dtype)
+def _pack_left(connection: apsw.Connection, path: Path) -> None:
+    """What a process that was killed has left; a tail that cannot be read is kept aside."""
+    if not path.exists():
+        return
+    try:
+        found = read_tail(path)
+    except DamagedTail:
+        path.replace(path.with_name(path.name + "-damaged"))
+        return
+    if found is not None:
+        with connection:
+            run_id = find_run(connection, found.run_id, found.run)
+            done = packed_record(connection, run_id)
+            _insert(connection, run_id, [record for record in found.records if record.number > done])
+    path.unlink()
+
+
+def _insert(connection: apsw.Connection, run_id: int, records: Sequence[TailRecord]) -> None:
+    """As blobs and events, within a transaction."""
+    for frames, wall_ahead_s in _blobs(records):
+        insert_blob(connection, run_id, frames, wall_ahead_s)
+    for record in records:
+        insert_events(connection, run_id, record.events, record.wall_ahead_s)
+    if records:
+        mark_packed(connection, run_id, records[-1].number)
+
+
+def _blobs(records: Sequence[TailRecord]) -> list[tuple[NDArray[np.void], float]]:
+    """Frames as they are gathered, each with what the wall clock was ahead; a new one where that has jumped."""
+    found: list[tuple[list[NDArray[np.void]], float]] = []
+    for record in records:
+        if not len(record.frames):
+            continue
+        if not found or abs(found[-1][1] - record.wall_ahead_s) > REDATED_S:
+            found.append(([], record.wall_ahead_s))
+        found[-1][0].append(record.frames)
+    whole = [(np.concatenate(parts), ahead_s) for parts, ahead_s in found]
+    return [
+        (frames[start : start + MAX_BLOB_FRAMES], ahead_s)
+        for frames, ahead_s in whole
+        for start in range(0, len(frames), MAX_BLOB_FRAMES)
+    ]

@@ -17,7 +17,8 @@ import numpy as np
 import pytest
 
 from gateway.core.audit_record import BEFORE_FIRST, NotRecordable, Who, head_of
-from gateway.supervisor import audit_writer, sqlite_file
+from gateway.storage import sqlite_file
+from gateway.supervisor import audit_writer
 from gateway.supervisor.audit import Audit
 from gateway.supervisor.audit_anchor import FILE_NAME as ANCHOR
 from gateway.supervisor.audit_anchor import Anchor, read_anchor, write_anchor

@@ -85,7 +85,7 @@ def test_gathering_keeps_each_frame_once_and_takes_less_room(tmp_path: Path) -> 
     for start in range(0, 2000, 50):
         writer.store([frame_of(k, k * 0.01) for k in range(start, start + 50)], [], WALL_AHEAD_S)
         if writer.gathered_s() >= 9.5:
-            writer.pack(WALL_AHEAD_S)
+            writer.pack()
     writer.disconnect()
     connection = open_store(tmp_path / "h")
     lengths = [frames for (frames,) in connection.execute("SELECT frames FROM blob ORDER BY start_s")]
@@ -200,8 +200,8 @@ def open_store_of(folder: Path) -> store.apsw.Connection:
 def test_an_old_history_is_migrated_step_by_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     writer = writer_of(tmp_path / "h")
     writer.store([frame_of(1, 1.0)], [Event(time_s=1.0, kind="k", text="kept")], WALL_AHEAD_S)
+    writer.pack()
     writer.disconnect()
-    monkeypatch.setattr(store, "SCHEMA", 3)
     monkeypatch.setitem(store.MIGRATIONS, 1, "ALTER TABLE event ADD COLUMN severity INTEGER DEFAULT 0")
     monkeypatch.setitem(store.MIGRATIONS, 2, "CREATE TABLE extra (id INTEGER PRIMARY KEY)")
     connection = open_store(tmp_path / "h")
@@ -213,11 +213,10 @@ def test_an_old_history_is_migrated_step_by_step(tmp_path: Path, monkeypatch: py
 
 def test_a_migration_that_fails_changes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     open_store(tmp_path / "h").close()
-    monkeypatch.setattr(store, "SCHEMA", 2)
     monkeypatch.setitem(store.MIGRATIONS, 1, "CREATE TABLE extra (id INTEGER); SELECT no_such_column FROM extra")
     with pytest.raises(store.apsw.SQLError):
         open_store(tmp_path / "h")
-    monkeypatch.setattr(store, "SCHEMA", 1)
+    monkeypatch.delitem(store.MIGRATIONS, 1)
     connection = open_store(tmp_path / "h")
     assert connection.pragma("user_version") == 1
     assert connection.execute("SELECT count(*) FROM sqlite_schema WHERE name = 'extra'").get == 0
@@ -227,6 +226,7 @@ def test_a_migration_that_fails_changes_nothing(tmp_path: Path, monkeypatch: pyt
 def test_event_data_is_json_in_the_file(tmp_path: Path) -> None:
     writer = writer_of(tmp_path / "h")
     writer.store([], [Event(time_s=1.0, kind="k", text="Ä", data={"a": [1, None, "ß"]})], 0.0)
+    writer.pack()
     writer.disconnect()
     connection = open_store(tmp_path / "h")
     ((text, data),) = connection.execute("SELECT text, data FROM event")

@@ -94,6 +94,7 @@ def test_a_blob_that_does_not_unpack_is_left_out_and_named(tmp_path: Path) -> No
     writer = writer_of(tmp_path / "h")
     for start in (0, 10, 20):
         writer.store([frame_of(k, float(k)) for k in range(start, start + 10)], [], 0.0)
+        writer.pack()
     writer.disconnect()
     connection = sqlite3.connect(tmp_path / "h")
     connection.execute("UPDATE field SET data = substr(data, 1, 20) WHERE blob = 2 AND name = 'tension_n'")

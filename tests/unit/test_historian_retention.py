@@ -22,7 +22,7 @@ def written(path: Path, blobs: int, every_s: float, frames: int = 20) -> None:
         begin_s = (k + 1) * every_s
         rows = [frame_of(k * frames + j, begin_s - (frames - 1 - j) * 0.01) for j in range(frames)]
         writer.store(rows, [Event(time_s=begin_s, kind="state", text=f"event {k}")], WALL_AHEAD_S)
-        writer.pack(WALL_AHEAD_S)
+        writer.pack()
     writer.disconnect()
 
 

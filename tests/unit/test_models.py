@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 from gateway.core.line_model import canonical, model_hash
-from gateway.supervisor import model_store, sqlite_file
+from gateway.storage import sqlite_file
+from gateway.supervisor import model_store
 from gateway.supervisor.model_store import APPLICATION_ID, SCHEMA, ModelsError
 from gateway.supervisor.models import Models, begin_repository, open_repository
 from gateway.supervisor.store import open_store

@@ -1,14 +1,15 @@
 """A versioned SQLite file of this program: opened, recognised as ours, checked, migrated; what SQLite says, in words.
 
-A rollback journal and `synchronous = EXTRA`: what was said to be stored survives a kill and a power cut, a reader needs
-no file beside it, and a damaged page takes along nothing but itself. For what is stored some times a day, so that the
-time of a commit (1.7 ms at the median, measured; with a write-ahead log 0.5 ms) does not matter.
+There is no other way to open one. Whose file it is is asked before anything is written to it: what belongs to somebody
+else is left as it is, to the byte. How it is written is part of what the file is (`Journal`).
 """
 
 import os
+import struct
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from enum import Enum
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,23 @@ import apsw
 
 BUSY_MS = 5000
 CHECKED_WHOLE_BYTES = 256 * 2**20  #: files up to this size are checked whole when they are opened, about a second
+_HEADER = struct.Struct(">16s44xI4xI")  # of an SQLite file: what it is, user_version, application_id
+_MAGIC = b"SQLite format 3\0"
+LOG_BYTES = 4 * 2**20  #: a write-ahead log is cut to it whenever it begins anew; SQLite copies it back from this size
+
+
+class Journal(Enum):
+    """What makes a change whole, as pragmas."""
+
+    #: A rollback journal: what was said to be stored survives a kill and a power cut, a reader needs no file beside it,
+    #: and a damaged page takes along nothing but itself. For what is stored some times a day, so that the time of a
+    #: commit (1.7 ms at the median, measured; with a write-ahead log 0.5 ms) does not matter.
+    ROLLBACK = "PRAGMA synchronous = EXTRA; PRAGMA foreign_keys = ON"
+    #: A write-ahead log: readers and the writer never wait for one another, what was committed survives a kill; a power
+    #: cut may take the last minute, never the consistency of the file. For what is stored all the time.
+    WRITE_AHEAD = f"PRAGMA journal_mode = WAL; PRAGMA synchronous = NORMAL; PRAGMA journal_size_limit = {LOG_BYTES}"
+    #: For a file that nobody sees before it is whole, and that is made anew rather than repaired.
+    NONE = "PRAGMA journal_mode = OFF; PRAGMA synchronous = OFF"
 
 
 @dataclass(frozen=True)
@@ -29,6 +47,11 @@ class FileKind:
     absent: str  #: what to do where there is none yet
     damaged: str  #: what to do with a damaged one
     undone: str = "nothing was stored"
+    anothers: type[Exception] | None = None  #: raised for the file of another program; None: `error`
+    journal: Journal = Journal.ROLLBACK
+    additions: str = ""  #: IF NOT EXISTS: tables that older programs of the same schema need not know
+    gives_back: bool = False  #: free pages can be given back to the disk; of a file that is begun
+    busy_ms: int = BUSY_MS
 
     @property
     def schema(self) -> int:
@@ -37,10 +60,9 @@ class FileKind:
 
 def open_there(path: Path, kind: FileKind) -> apsw.Connection:
     """Open a file that is there; one of an older schema is brought up to date. Raises `kind.error`."""
+    _require_there(path, kind)
     with told(path, kind):
-        if not path.is_file() or not path.stat().st_size:
-            raise kind.error(kind.absent.format(path=path))
-    return _opened(path, kind, apsw.SQLITE_OPEN_READWRITE)  # SQLite reads only where it may not write
+        return connect(path, kind, apsw.SQLITE_OPEN_READWRITE)  # SQLite reads only where it may not write
 
 
 def begin(path: Path, kind: FileKind) -> apsw.Connection:
@@ -49,53 +71,108 @@ def begin(path: Path, kind: FileKind) -> apsw.Connection:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise kind.error(f"a folder for {path} cannot be made: {error.strerror}; name another") from error
-    return _opened(path, kind, apsw.SQLITE_OPEN_READWRITE | apsw.SQLITE_OPEN_CREATE)
-
-
-def _opened(path: Path, kind: FileKind, flags: int) -> apsw.Connection:
     with told(path, kind):
-        connection = apsw.Connection(os.fspath(path), flags=flags)
+        return connect(path, kind)
+
+
+def open_to_read(path: Path, kind: FileKind, busy_ms: int | None = None) -> apsw.Connection:
+    """Open a file that is there, never to write to it: an older schema stays. Raises `kind.error`.
+
+    It is not checked whole: for whoever asks often.
+    """
+    _require_there(path, kind)
+    with told(path, kind):
+        _require_not_anothers(path, kind)
+        connection = apsw.Connection(os.fspath(path), flags=apsw.SQLITE_OPEN_READWRITE)
         try:
-            connection.set_busy_timeout(BUSY_MS)
+            connection.set_busy_timeout(kind.busy_ms if busy_ms is None else busy_ms)
+            connection.execute("PRAGMA query_only = ON")
             _require_ours(connection, path, kind)
-            if path.stat().st_size <= CHECKED_WHOLE_BYTES:
-                found = connection.execute("PRAGMA quick_check(1)").get
-                if found != "ok":
-                    raise apsw.CorruptError(str(found))
-            connection.execute("PRAGMA synchronous = EXTRA")
-            connection.execute("PRAGMA foreign_keys = ON")
-            _migrate(connection, kind)
         except BaseException:
             connection.close()
             raise
     return connection
 
 
+def connect(
+    path: Path, kind: FileKind, flags: int = apsw.SQLITE_OPEN_READWRITE | apsw.SQLITE_OPEN_CREATE
+) -> apsw.Connection:
+    """As `begin`, for whoever tells damage from a full disk: raises apsw.Error and OSError as they are."""
+    _require_not_anothers(path, kind)
+    connection = apsw.Connection(os.fspath(path), flags=flags)
+    try:
+        connection.set_busy_timeout(kind.busy_ms)
+        _require_ours(connection, path, kind)
+        check_whole(connection, path)
+        if kind.gives_back:
+            connection.execute("PRAGMA auto_vacuum = INCREMENTAL")  # before the first table, or without effect
+        connection.execute(kind.journal.value).fetchall()
+        _migrate(connection, kind)
+    except BaseException:
+        connection.close()
+        raise
+    return connection
+
+
+def check_whole(connection: apsw.Connection, path: Path) -> None:
+    """Find damage before it is written upon, in a file that is not too large for it. Raises apsw.CorruptError."""
+    if path.stat().st_size > CHECKED_WHOLE_BYTES:
+        return
+    found = connection.execute("PRAGMA quick_check(1)").get
+    if found != "ok":
+        raise apsw.CorruptError(str(found))
+
+
+def _require_there(path: Path, kind: FileKind) -> None:
+    with told(path, kind):
+        if not path.is_file() or not path.stat().st_size:
+            raise kind.error(kind.absent.format(path=path))
+
+
+def _require_not_anothers(path: Path, kind: FileKind) -> None:
+    """Refuse what says so in its first bytes without having SQLite open it, which may bring its journal to an end."""
+    if not path.is_file():
+        return
+    with path.open("rb") as stream:
+        head = stream.read(_HEADER.size)
+    if len(head) < _HEADER.size:
+        return
+    magic, version, owner = _HEADER.unpack(head)
+    if magic == _MAGIC and owner != kind.application_id and (version or owner):
+        raise _anothers(path, kind, owner)
+
+
 def _require_ours(connection: apsw.Connection, path: Path, kind: FileKind) -> None:
-    """Before anything is written to it."""
+    """Before anything is written to it. A version and an owner may lie in a log that was not copied back yet."""
     version = connection.pragma("user_version")
     owner = connection.pragma("application_id")
     tables = connection.execute("SELECT count(*) FROM sqlite_schema").get
     if owner != kind.application_id and (version or owner or tables):
-        raise kind.error(
-            f"{path} is no {kind.name}: it belongs to another program (application id {owner:#x}). It was left "
-            "as it is; name another folder"
-        )
+        raise _anothers(path, kind, owner)
     if version > kind.schema:
         raise kind.error(
             f"{path} has schema {version}, this program knows {kind.schema}: update r2rgate, or use another file"
         )
 
 
+def _anothers(path: Path, kind: FileKind, owner: int) -> Exception:
+    return (kind.anothers or kind.error)(
+        f"{path} is no {kind.name}: it belongs to another program (application id {owner:#x}). It was left as it is; "
+        "name another folder"
+    )
+
+
 def _migrate(connection: apsw.Connection, kind: FileKind) -> None:
     """To today's schema, in one transaction."""
-    if connection.pragma("user_version") == kind.schema:
+    if connection.pragma("user_version") == kind.schema and not kind.additions:
         return
     with transaction(connection):
         version = int(connection.pragma("user_version"))  # again: another process may have been first
         for step in range(version, kind.schema):
             connection.execute(kind.migrations[step])
-        connection.execute(f"PRAGMA user_version = {kind.schema}")
+        if version != kind.schema:
+            connection.execute(f"PRAGMA user_version = {kind.schema}")
+        connection.execute(kind.additions)
 
 
 @contextmanager
