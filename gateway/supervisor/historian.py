@@ -19,6 +19,7 @@ import apsw
 
 from gateway.core.line import History
 from gateway.core.messages import Event
+from gateway.core.steady_clock import SteadyClock
 from gateway.core.telemetry import frame_dtype
 from gateway.supervisor.retention import Retention, retention_of
 from gateway.supervisor.store import NotOurs, Run, boot_id
@@ -65,6 +66,7 @@ class Historian:
         self._wall_clock = wall_clock
         now_s = clock()
         run = Run(boot_id(), now_s, wall_clock() - now_s, site, line, spans)
+        self._steady = SteadyClock(clock, wall_clock, run.boot)
         self._writer = Writer(self.path, run, reserve_bytes)  # the thread's own
         self._max_frames = MAX_WAITING_BYTES // frame_dtype(spans).itemsize
         # Between the two threads: append and popleft are atomic, the health is replaced as a whole by the historian's
@@ -128,6 +130,7 @@ class Historian:
 
     def _turn(self, finish: bool) -> None:
         until_s = self._clock()
+        self._steady.look()
         _move(self._frames, self._new_frames)
         _move(self._events, self._new_events)
         idle = not self._new_frames
@@ -144,7 +147,9 @@ class Historian:
         """Whoever holds the database for a while delays this alone: what is new lies in the tail."""
         try:
             self._writer.pack()
-            self._writer.expire(self._retention, self._wall_clock())
+            if self._steady.agreed_ahead_s is not None:
+                self._writer.date(self._steady.agreed_ahead_s)
+            self._writer.expire(self._retention, self._clock())
         except apsw.BusyError as error:
             self._health = replace(self._health, text=f"storing, beside the history: {_explain(error)}")
 

@@ -1,16 +1,27 @@
-"""How long telemetry and events are kept, and how large the history may become: the oldest goes first."""
+"""How long telemetry and events are kept, and how large the history may become: the oldest goes first.
 
-from dataclasses import dataclass
+Age is what the monotonic clocks of this boot and the ones after it add up to; the time between boots counts only
+where wall clocks were seen to agree (`dating.py`). A clock that was set deletes nothing by itself, and as even one that
+agrees may be wrong, no more than a day of telemetry and a day of events go in an hour. What is too much goes by its
+order.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import cast
 
 import apsw
 
 from gateway.core.line import History
+from gateway.supervisor.dating import ends_of_boots
 from gateway.supervisor.store import delete_blobs
 
 DAY_S = 86_400.0
-BLOBS_AT_ONCE = 30  #: five minutes of history a turn, every ten seconds: it catches up, and no turn takes long
+TURN_S = 3_600.0  #: in which no more than a day goes by its age: a backlog of a year takes two weeks
+BLOBS_AT_ONCE = 30  #: ten minutes of history every twenty seconds: it catches up, and no turn takes long
 EVENTS_AT_ONCE = 1000
 PAGES_AT_ONCE = 2000  #: given back to the disk
+SPARE_PAGES = 128  #: and a twentieth of the file: used again by what comes; giving them back would move the newest
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,32 +35,85 @@ def retention_of(history: History) -> Retention:
     return Retention(history.keep_days * DAY_S, history.keep_events_days * DAY_S, round(history.keep_gb * 1e9))
 
 
-def expire(connection: apsw.Connection, retention: Retention, wall_s: float) -> int:
+@dataclass
+class _DayATurn:
+    """How much recorded time may still go in this turn."""
+
+    left_s: float = DAY_S
+    last: tuple[str, float] | None = None  #: boot and monotonic time up to which it went
+
+    def allows(self, boot: str, until_s: float) -> bool:
+        """Whether the next, which ends then, may go; it counts as gone."""
+        step_s = until_s - self.last[1] if self.last is not None and self.last[0] == boot else 0.0
+        if step_s > self.left_s:
+            return False
+        self.left_s -= max(0.0, step_s)
+        self.last = boot, until_s
+        return True
+
+
+@dataclass
+class Allowance:
+    """Of one gateway: what may go by its age until the turn is over."""
+
+    began_s: float | None = None  #: monotonic
+    telemetry: _DayATurn = field(default_factory=_DayATurn)
+    events: _DayATurn = field(default_factory=_DayATurn)
+
+    def look(self, now_s: float) -> None:
+        """Begin a turn when it is time."""
+        if self.began_s is None or now_s - self.began_s >= TURN_S:
+            self.began_s, self.telemetry, self.events = now_s, _DayATurn(), _DayATurn()
+
+
+def expire(connection: apsw.Connection, retention: Retention, allowance: Allowance, boot: str, now_s: float) -> int:
     """Delete some of what is too old or too much, in one transaction. Returns how many blobs went.
 
-    Space is used again by what comes; what is more than that is given back to the disk.
+    `now_s`: monotonic, of this boot. Space is used again by what comes; what is much more is given back to the disk.
     """
-    old: list[int] = []
-    with connection:
-        old = _oldest(connection, retention, wall_s)
-        delete_blobs(connection, old)
-        connection.execute(
-            "DELETE FROM event WHERE id IN (SELECT id FROM event WHERE wall_s < ? ORDER BY id LIMIT ?)",
-            (wall_s - retention.events_s, EVENTS_AT_ONCE),
-        )
-    connection.execute(f"PRAGMA incremental_vacuum({PAGES_AT_ONCE})").fetchall()
-    return len(old)
+    allowance.look(now_s)
+    ends = ends_of_boots(connection, boot, now_s)
+    oldest = _oldest(connection, "blob", "end_s", BLOBS_AT_ONCE)
+    blobs = _too_old(oldest, ends, retention.telemetry_s, allowance.telemetry)
+    if not blobs and used_bytes(connection) > retention.most_bytes:
+        blobs = [blob for blob, _, _ in oldest]
+    events = _too_old(
+        _oldest(connection, "event", "time_s", EVENTS_AT_ONCE), ends, retention.events_s, allowance.events
+    )
+    if blobs or events:
+        with connection:
+            delete_blobs(connection, blobs)
+            connection.executemany("DELETE FROM event WHERE id = ?", [(event,) for event in events])
+    _give_back(connection)
+    return len(blobs)
 
 
-def _oldest(connection: apsw.Connection, retention: Retention, wall_s: float) -> list[int]:
-    """Blobs that go now."""
+def _oldest(connection: apsw.Connection, table: str, time: str, most: int) -> Sequence[tuple[int, str, float]]:
+    """In the order in which they were stored: number, boot, and when it ended."""
     rows = connection.execute(
-        "SELECT id FROM blob WHERE end_s + wall_ahead_s < ? ORDER BY id LIMIT ?",
-        (wall_s - retention.telemetry_s, BLOBS_AT_ONCE),
+        f"SELECT {table}.id, boot, {time} FROM {table} JOIN run ON run.id = {table}.run ORDER BY {table}.id LIMIT ?",
+        (most,),
     ).fetchall()
-    if not rows and used_bytes(connection) > retention.most_bytes:
-        rows = connection.execute("SELECT id FROM blob ORDER BY id LIMIT ?", (BLOBS_AT_ONCE,)).fetchall()
-    return [int(str(blob_id)) for (blob_id,) in rows]
+    return cast("list[tuple[int, str, float]]", rows)
+
+
+def _too_old(
+    oldest: Sequence[tuple[int, str, float]], ends: Mapping[str, float], keep_s: float, turn: _DayATurn
+) -> list[int]:
+    """The first ones of them."""
+    found: list[int] = []
+    for number, boot, time_s in oldest:
+        if boot not in ends or ends[boot] - time_s <= keep_s or not turn.allows(boot, time_s):
+            break
+        found.append(number)
+    return found
+
+
+def _give_back(connection: apsw.Connection) -> None:
+    spare = max(SPARE_PAGES, connection.pragma("page_count") // 20)
+    free = connection.pragma("freelist_count")
+    if free > spare:
+        connection.execute(f"PRAGMA incremental_vacuum({min(free - spare, PAGES_AT_ONCE)})").fetchall()
 
 
 def used_bytes(connection: apsw.Connection) -> int:

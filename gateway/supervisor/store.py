@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from gateway.core.messages import Event
 from gateway.core.telemetry import BYTE_FIELDS, FLOAT_FIELDS
 from gateway.storage.sqlite_file import FileKind, Journal, connect
+from gateway.supervisor import dating
 from gateway.supervisor.blobs import pack_column, pack_times
 
 APPLICATION_ID = 0x52325247  # "R2RG": no other program's SQLite file is mistaken for a history
@@ -81,12 +82,12 @@ PRAGMA application_id = {APPLICATION_ID};
 """
 
 #: Later than schema 1, and nothing that an older program needs to know: it reads and writes the file as before.
-_ADDITIONS = """
+_ADDITIONS = f"""
 CREATE TABLE IF NOT EXISTS packed (
     run INTEGER PRIMARY KEY REFERENCES run,
     record INTEGER NOT NULL         -- of the run's tail, up to this one, everything lies in blobs and events
 );
-"""
+{dating.TABLE}"""
 
 #: From version k (the key) to version k + 1. Every version that was ever released stays here.
 MIGRATIONS: dict[int, str] = {0: _SCHEMA_1}
@@ -146,7 +147,9 @@ def insert_run(connection: apsw.Connection, run: Run) -> int:
         "INSERT INTO run (boot, started_s, wall_ahead_s, site, line, spans) VALUES (?, ?, ?, ?, ?, ?)",
         (run.boot, run.started_s, run.wall_ahead_s, run.site, run.line, run.spans),
     )
-    return connection.last_insert_rowid()
+    run_id = connection.last_insert_rowid()
+    dating.note_seen(connection, run.boot, run.started_s)
+    return run_id
 
 
 def insert_blob(connection: apsw.Connection, run_id: int, frames: NDArray[np.void], wall_ahead_s: float) -> int:

@@ -15,8 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gateway.core.messages import Event
+from gateway.core.steady_clock import JUMP_S
 from gateway.storage.sqlite_file import LOG_BYTES
-from gateway.supervisor.retention import Retention, expire
+from gateway.supervisor.dating import note_agreed, note_seen, redate
+from gateway.supervisor.retention import Allowance, Retention, expire
 from gateway.supervisor.store import (
     Run,
     find_run,
@@ -32,7 +34,6 @@ from gateway.supervisor.tail import DamagedTail, Tail, TailRecord, read_tail, ta
 BLOB_S = 20.0  #: of frames in a blob: before the kernel writes the tail to the disk, and small columns share a page
 MAX_BLOB_FRAMES = 20_000
 MAX_TAIL_BYTES = 32 * 2**20  #: of frames in the tail, where they cannot be packed
-REDATED_S = 0.5  #: a wall clock that moves by more between two stores begins a new blob
 MOST_LOG_BYTES = 4 * LOG_BYTES  #: beyond it somebody has kept a read open: it is copied back and cut
 
 
@@ -52,6 +53,8 @@ class Writer:
         self._gathered: list[TailRecord] = []  # what lies in the tail
         self._gathered_bytes = 0
         self._last_record = 0
+        self._agreed_ahead_s: float | None = None  # by which all of this boot is dated
+        self._allowance = Allowance()
 
     def store(self, frames: Sequence[bytes], events: Sequence[Event], wall_ahead_s: float) -> None:
         """Into the tail: from now on no kill takes it."""
@@ -63,6 +66,8 @@ class Writer:
         record = TailRecord(self._last_record + 1, wall_ahead_s, table_of(frames, self._run.spans), [*events])
         self._begun_tail().append(record)
         self._last_record = record.number
+        if self._agreed_ahead_s is not None and abs(wall_ahead_s - self._agreed_ahead_s) > JUMP_S:
+            self._agreed_ahead_s = None
         self._gathered.append(record)
         self._gathered_bytes += record.frames.nbytes
 
@@ -75,15 +80,31 @@ class Writer:
         """Move what lies in the tail into the database, in one transaction."""
         self._pack_into(self._ready())
 
-    def expire(self, retention: Retention, wall_s: float) -> None:
-        """Delete some of what is too old or too much."""
-        expire(self._ready(), retention, wall_s)
+    def date(self, ahead_s: float) -> None:
+        """The wall clock has been seen to agree: what this boot has stored is dated by it, some of it each time."""
+        connection = self._ready()
+        if self._agreed_ahead_s == ahead_s:
+            return
+        with connection:
+            note_agreed(connection, self._run.boot, ahead_s)
+            more = redate(connection, self._run.boot, ahead_s)
+        if not more:
+            self._agreed_ahead_s = ahead_s
+
+    def expire(self, retention: Retention, now_s: float) -> None:
+        """Delete some of what is too old or too much; `now_s` is monotonic."""
+        expire(self._ready(), retention, self._allowance, self._run.boot, now_s)
 
     def disconnect(self) -> None:
         """Close the file, whatever state it is in; the next `store` opens it again. The tail stays."""
         connection, self._connection = self._connection, None
         if connection is not None:
             connection.close()
+
+    def _last_s(self) -> float | None:
+        """Of the newest frame in the tail, monotonic."""
+        parts = [record.frames for record in self._gathered if len(record.frames)]
+        return float(parts[-1]["time_s"][-1]) if parts else None
 
     def close(self) -> None:
         """For good. What could not be packed stays in the tail, and is found by whoever writes next."""
@@ -96,6 +117,8 @@ class Writer:
             return
         with connection:
             _insert(connection, self._run_id, self._gathered)
+            if (last_s := self._last_s()) is not None:
+                note_seen(connection, self._run.boot, last_s)
         self._gathered, self._gathered_bytes = [], 0
         tail, self._tail = self._tail, None
         if tail is not None:
@@ -132,7 +155,7 @@ class Writer:
             inode = self.path.stat().st_ino
             if inode != self._inode:
                 self._begin_in(connection)
-                self._inode = inode
+                self._inode, self._agreed_ahead_s = inode, None
         except BaseException:
             connection.close()
             raise
@@ -195,7 +218,7 @@ def _blobs(records: Sequence[TailRecord]) -> list[tuple[NDArray[np.void], float]
     for record in records:
         if not len(record.frames):
             continue
-        if not found or abs(found[-1][1] - record.wall_ahead_s) > REDATED_S:
+        if not found or abs(found[-1][1] - record.wall_ahead_s) > JUMP_S:
             found.append(([], record.wall_ahead_s))
         found[-1][0].append(record.frames)
     whole = [(np.concatenate(parts), ahead_s) for parts, ahead_s in found]
