@@ -20,6 +20,7 @@ from gateway.core.line import Line
 from gateway.core.messages import Reply, parse_command
 from gateway.core.recording import Recording, recording_of
 from gateway.core.states import Phase
+from gateway.core.steady_clock import SteadyClock
 from gateway.core.telemetry import Frame, frame_dtype, unpack
 from gateway.core.topics import GATEWAY_DECISION, LOOP_COMMAND
 from gateway.core.verdict import Verdict
@@ -32,6 +33,7 @@ from gateway.supervisor.judging import LARGEST_SEED
 from gateway.supervisor.lifecycle import Stage
 from gateway.supervisor.models import Models
 from gateway.supervisor.recent import Recent
+from gateway.supervisor.store import boot_id
 from gateway.supervisor.surroundings import LineSurroundings
 from safety.judge import failed, judge
 
@@ -99,7 +101,7 @@ class SteppedGate:
         self._mailboxes[0].serve(LOOP_COMMAND, self._answer)
         self._gate = Gate(
             self.line, self._mailboxes[1], folder, SteppedJudge(loop, seed), self._around, _unnoted,
-            lambda: loop.now_s, lambda: self.wall_s,
+            lambda: self.wall_s, lambda: self.wall_s,  # of one boot, however often the loop is started anew
         )  # fmt: skip
 
     async def __aenter__(self) -> "SteppedGate":
@@ -251,7 +253,13 @@ class SteppedGate:
     def _around(self, configurations: Configurations, models: Models) -> LineSurroundings:
         self._configurations, self._models = configurations, models
         return LineSurroundings(
-            self.line, self._newest, self._recent, self._kept, configurations, models, lambda: self.wall_s
+            self.line,
+            self._newest,
+            self._recent,
+            self._kept,
+            configurations,
+            models,
+            SteadyClock(lambda: self.wall_s, lambda: self.wall_s, boot_id()),
         )
 
     def _newest(self) -> Frame | None:

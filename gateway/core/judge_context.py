@@ -5,6 +5,7 @@ A file of it makes a verdict repeatable away from the line: the same context, pr
 
 import hashlib
 from collections.abc import Sequence
+from datetime import UTC, datetime, timedelta
 from typing import Annotated
 
 from pydantic import Field, ValidationError
@@ -15,6 +16,7 @@ from gateway.core.deployment import Region
 from gateway.core.json_problems import NotJson, document_of, problems
 from gateway.core.line import NonNegative, Positive, Strict
 from gateway.core.line_model import Digest, Instant, LineModel
+from gateway.core.steady_clock import JUMP_S
 
 
 class ContextRefused(Exception):
@@ -58,6 +60,19 @@ class JudgeContext(Strict):
     data: Annotated[list[DataReference], Field(max_length=64)] = []  #: recent, on which the model must hold
     latency_s: NonNegative | None = None  #: measured, from a sample to its torque; null: the line's file
     decided: Annotated[list[Digest], Field(max_length=4096)] = []  #: proposals that were decided: none is twice
+
+
+def dated(context: JudgeContext, now_s: float) -> JudgeContext:
+    """The same under a clock that says `now_s`, Unix time: what it dates is as long ago as before."""
+    shift = datetime.fromtimestamp(now_s, UTC) - datetime.fromisoformat(context.now)
+    if abs(shift.total_seconds()) <= JUMP_S:
+        return context
+    data = [one.model_copy(update={"recorded": _shifted(one.recorded, shift)}) for one in context.data]
+    return context.model_copy(update={"now": _shifted(context.now, shift), "data": data})
+
+
+def _shifted(instant: str, shift: timedelta) -> str:
+    return (datetime.fromisoformat(instant) + shift).isoformat(timespec="milliseconds")
 
 
 def canonical(context: JudgeContext) -> bytes:

@@ -22,7 +22,7 @@ class Moment:
     """When something was, by both clocks."""
 
     wall_s: float  #: Unix time
-    boot: str = ""  #: monotonic times compare within one; empty: not on record
+    boot: str = ""  #: monotonic times compare within one; empty: not on record, and the wall clock is all there is
     monotonic_s: float = 0.0
     agreed: bool = False  #: the wall clock was seen to agree
 
@@ -60,6 +60,9 @@ class SteadyClock:
     def age(self, moment: Moment) -> Age:
         """How long ago it was."""
         now = self.now()
+        if not moment.boot:
+            by_wall_s = max(0.0, now.wall_s - moment.wall_s)
+            return Age(by_wall_s, by_wall_s)
         if moment.boot == self.boot:
             age_s = max(0.0, now.monotonic_s - moment.monotonic_s)
             return Age(age_s, age_s)

@@ -1,9 +1,11 @@
 """What the audit of a folder says of proposals: the book that a gate begins with."""
 
 from pathlib import Path
+from typing import Any
 
 from pydantic import TypeAdapter
 
+from gateway.core.audit_record import AuditRecord
 from gateway.supervisor.audit_file import AuditFile, AuditUnavailable
 from gateway.supervisor.audit_writer import NOT_DONE
 from gateway.supervisor.lifecycle import Book, Impossible, book_of
@@ -24,8 +26,14 @@ def book_in(folder: Path) -> Book:
         for record in records:
             if record.kind == NOT_DONE:
                 not_done |= _SEQUENCES.validate_python(record.what["sequences"])
-        return book_of((record.kind, record.what) for record in records if record.sequence not in not_done)
+        return book_of((record.kind, _what(record)) for record in records if record.sequence not in not_done)
     except AuditUnavailable as error:
         raise CannotBegin(str(error)) from error
     except (Impossible, ValueError, KeyError) as error:
         raise CannotBegin(f"the records of the audit do not fit together: {error}; `r2rgate audit verify`") from error
+
+
+def _what(record: AuditRecord) -> dict[str, Any]:
+    """Records of earlier versions do not say in themselves of which boot their time is, and nobody knows its clock."""
+    clock = {"boot": record.boot, "monotonic_s": record.monotonic_s, "agreed": False}
+    return {"clock": clock, **record.what}

@@ -21,6 +21,7 @@ from gateway.core.people import Role
 from gateway.core.proposal import Proposal, canonical
 from gateway.core.recording import Recording
 from gateway.core.status import ChangeStatus
+from gateway.core.steady_clock import SteadyClock
 from gateway.core.verdict import line_hash
 from gateway.mailbox.port import NotSent, Unreachable
 from gateway.supervisor.audit_file import AuditUnavailable
@@ -51,6 +52,7 @@ from gateway.supervisor.peers import GATEWAY
 from gateway.supervisor.proposal_inbox import Inbox
 from gateway.supervisor.proposal_records import ProposalRecords, done, not_known, refused
 from gateway.supervisor.small_changes import SmallChanges
+from gateway.supervisor.store import boot_id
 
 RETRY_S = 30.0  #: after what passes by its verdict could not be carried out; then twice as long each time
 MOST_RETRIES = 5  #: then it waits for a person
@@ -85,8 +87,8 @@ class Deployer:
         self._own_uid = os.getuid() if own_uid is None else own_uid
         self._line = line
         self._surroundings = surroundings
-        self._wall_clock = wall_clock
-        self._records = ProposalRecords(book, audit, wall_clock)
+        clocks = SteadyClock(clock, wall_clock, boot_id())
+        self._records = ProposalRecords(book, audit, clocks)
         self._inbox = Inbox(line, self._records, judge, surroundings)
         self._on_the_line = OnTheLine(line, self._records, loop, surroundings, take_up, clock, note)
         self._small = SmallChanges(line, self._records)
@@ -352,7 +354,7 @@ class Deployer:
             return [f"there is no proposal {decision.proposal[:12]}: `r2rgate proposals` lists them"]
         if entry.stage is not Stage.WAITING:
             return [f"proposal {entry.proposal[:12]} is {entry.stage}{f': {entry.why}' if entry.why else ''}"]
-        if self._wall_clock() >= entry.expires_s:
+        if self._has_expired(entry):
             return [f"it has expired at {entry.expires}"]
         if because := self.book.why_outdated(entry):
             return [because]
@@ -367,9 +369,8 @@ class Deployer:
 
     async def _tidy(self) -> None:
         """What is left over: of time, of a gateway that ended before it could go on, of an audit that was not there."""
-        now_s = self._wall_clock()
         for entry in self.book.undecided:
-            if now_s >= entry.expires_s:
+            if self._has_expired(entry):
                 what = {"proposal": entry.proposal, "because": f"nobody decided until {entry.expires}"}
                 await self._records.step("expired", what, GATEWAY)
             elif because := self.book.why_outdated(entry):
@@ -378,6 +379,14 @@ class Deployer:
                 because = "it was approved, and not carried out: decide again"
                 await self._records.step("approval-lapsed", {"proposal": entry.proposal, "because": because}, GATEWAY)
         self._inbox.judge_again()
+
+    def _has_expired(self, entry: Entry) -> bool:
+        """It stands for as long as it did when it came, and no longer than the line's file allows."""
+        now_s = self._records.now_for(entry)
+        if now_s is None or entry.received is None:
+            return True  # no record of this program is without
+        stands_s = min(entry.expires_s - entry.received.wall_s, self._line.gate.expiry_max_s)
+        return now_s - entry.received.wall_s >= stands_s
 
     async def _approve_small(self) -> None:
         """Where the line's file allows it: what is like enough to what a person approved passes by its verdict alone.

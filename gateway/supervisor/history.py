@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from gateway.storage.sqlite_file import open_to_read, snapshot, told
 from gateway.supervisor.blobs import DamagedBlob, unpack_column, unpack_times
+from gateway.supervisor.dating import agreed_ahead
 from gateway.supervisor.store import KIND, PER_SPAN, STORED_FIELDS, packed_record
 from gateway.supervisor.tail import DamagedTail, TailRead, TailRecord, read_tail, tail_path
 
@@ -94,6 +95,11 @@ class History:
     ) -> Generator[dict[str, NDArray[Any]], None, None]:
         """As `read_wall`, in parts of some seconds, the oldest first: never more than one of them in memory."""
         return self._walk(_BETWEEN_WALL, (), "wall_s", start_s, end_s, fields)
+
+    def agreed_ahead(self) -> dict[str, float]:
+        """By boot, what its wall clock was ahead of its monotonic one, where it was seen to agree with it."""
+        with told(self._path, _KIND):
+            return agreed_ahead(self._connection)
 
     def events(self, start_s: float, end_s: float) -> list[StoredEvent]:
         """Events between two instants of Unix time, in order."""

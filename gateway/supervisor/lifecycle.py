@@ -12,6 +12,7 @@ from typing import Any
 
 from gateway.core.deployment import InService, Region
 from gateway.core.proposal import Kind
+from gateway.core.steady_clock import Moment
 from gateway.supervisor.four_eyes import APPROVED_ONCE, FirstApproval, first_of
 
 
@@ -88,6 +89,7 @@ class Entry:
     by_person: bool = False  #: approved by one, not by its verdict alone
     first: FirstApproval | None = None  #: while it waits for a second one
     since_s: float | None = None  #: Unix time at which it came to its stage
+    received: Moment | None = None  #: None: its record does not say
     region: Region | None = None  #: of a configuration that has been deployed: for what it was judged
 
 
@@ -103,11 +105,17 @@ class Book:
     model: str | None = None
     #: Hash of the line's file as this process has read it, which no record tells; None: nobody asks.
     line: str | None = field(default=None, compare=False)
-    changed_s: float | None = None  #: Unix time at which how the line is controlled has changed last
+    changed: Moment | None = None  #: when how the line is controlled has changed last
     line_changed_s: float | None = None  #: Unix time at which somebody said last that the line itself has changed
+    line_changed: Moment | None = None  #: the same
     before_change: int = 0  #: proposals that there were then: they say nothing of the line as it is now
     #: By kind the proposal that a person approved last, and that went well; empty after anything was rolled back.
     trusted: dict[str, str] = field(default_factory=dict[str, str])
+
+    @property
+    def changed_s(self) -> float | None:
+        """Unix time of `changed`, as the wall clock said then."""
+        return None if self.changed is None else self.changed.wall_s
 
     @property
     def on_the_line(self) -> Entry | None:
@@ -205,6 +213,7 @@ class Book:
                 kind=what["change"],
                 expires_s=float(what["expires_s"]),
                 since_s=_at(what),
+                received=moment_of(what),
             )
             return
         entry = self.entries[proposal]
@@ -230,7 +239,7 @@ class Book:
 
     def _in_service(self, kind: str, entry: Entry, what: Mapping[str, Any]) -> None:
         if kind in ("deployed", "rolled-back") and "at_s" in what:
-            self.changed_s = float(what["at_s"])
+            self.changed = moment_of(what)
         if kind == "deploying":
             self.epoch = int(what["epoch"])
         elif kind == "not-deployed":
@@ -261,7 +270,7 @@ class Book:
             self.entries[entry.proposal] = replace(
                 entry, stage=Stage.SUPERSEDED, why=f"the line has changed: {what['because']}", since_s=_at(what)
             )
-        self.line_changed_s, self.before_change = _at(what), len(self.entries)
+        self.line_changed_s, self.line_changed, self.before_change = _at(what), moment_of(what), len(self.entries)
 
     def explains(self, configuration: str, epoch: int) -> bool:
         """Whether the records say how the line may have come to this configuration, at this epoch of the loop."""
@@ -271,6 +280,23 @@ class Book:
 
 def _at(what: Mapping[str, Any]) -> float | None:
     return float(what["at_s"]) if "at_s" in what else None
+
+
+def moment_of(what: Mapping[str, Any]) -> Moment | None:
+    """When a record was made, as far as it says; `clock` is what `clock_fields` has written into it."""
+    if "at_s" not in what:
+        return None
+    clock = what.get("clock", {})
+    return Moment(
+        float(what["at_s"]), str(clock.get("boot", "")), float(clock.get("monotonic_s", 0.0)),
+        bool(clock.get("agreed", False)),
+    )  # fmt: skip
+
+
+def clock_fields(moment: Moment) -> dict[str, Any]:
+    """What a record says of its time."""
+    clock = {"boot": moment.boot, "monotonic_s": moment.monotonic_s, "agreed": moment.agreed}
+    return {"at_s": moment.wall_s, "clock": clock}
 
 
 def _region(what: Mapping[str, Any]) -> Region:

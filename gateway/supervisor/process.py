@@ -14,6 +14,7 @@ from typing import Protocol
 
 from gateway.core.line import Line
 from gateway.core.recording import Recording
+from gateway.core.steady_clock import SteadyClock
 from gateway.core.topics import LOOP_COMMAND
 from gateway.mailbox.listener import AlreadyRunning, CannotListen, PathTooLong
 from gateway.mailbox.paths import GATEWAY_SOCKET, LOOP_SOCKET
@@ -29,7 +30,7 @@ from gateway.supervisor.configurations import Configurations
 from gateway.supervisor.courses_desk import CoursesDesk
 from gateway.supervisor.deployer_sides import JudgeSide
 from gateway.supervisor.dry_runs import DryRuns
-from gateway.supervisor.experiments import MOST_EXPERIMENTS, newest_experiments
+from gateway.supervisor.experiments import MOST_EXPERIMENTS, recent_experiments
 from gateway.supervisor.gate import Gate
 from gateway.supervisor.historian import Historian
 from gateway.supervisor.history import HistoryError
@@ -41,6 +42,7 @@ from gateway.supervisor.past import Past
 from gateway.supervisor.persons_desk import PersonsDesk
 from gateway.supervisor.retention import retention_of
 from gateway.supervisor.service import Gateway
+from gateway.supervisor.store import boot_id
 from gateway.supervisor.surroundings import LineSurroundings
 from gateway.tasks.supervisor import Supervisor, TaskFault, wait
 
@@ -90,16 +92,16 @@ async def serve(
     gateway = Gateway(line, mailbox, historian, mailbox.counters, clock, wall_clock)
     tasks = Supervisor(lambda fault, error: _tell_fault(gateway, fault, error), clock)
     gateway.task_faults = lambda: tasks.faults
+    clocks = SteadyClock(clock, wall_clock, boot_id())
 
     def experiments(most_s: float) -> list[tuple[Recording, float]]:
-        now_s = wall_clock()
         try:
-            return newest_experiments(historian.path, now_s - most_s, now_s + 1.0, MOST_EXPERIMENTS)
+            return recent_experiments(historian.path, most_s, clocks, MOST_EXPERIMENTS)
         except HistoryError:
             return []  # there is no history yet
 
     def around(configurations: Configurations, models: Models) -> LineSurroundings:
-        return LineSurroundings(line, gateway.newest, gateway.recent, experiments, configurations, models, wall_clock)
+        return LineSurroundings(line, gateway.newest, gateway.recent, experiments, configurations, models, clocks)
 
     # First the socket, whose lock makes this the only instance; only then is the history touched.
     await mailbox.listen(run_folder / GATEWAY_SOCKET)

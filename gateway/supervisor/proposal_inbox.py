@@ -10,7 +10,7 @@ from gateway.core.canonical import known_hashes
 from gateway.core.controller import config_hash
 from gateway.core.experiment import experiment_hash
 from gateway.core.judge_context import canonical as canonical_context
-from gateway.core.judge_context import context_hash
+from gateway.core.judge_context import context_hash, dated
 from gateway.core.line import Line
 from gateway.core.line_model import LineModel, model_hash
 from gateway.core.messages import Reply
@@ -118,6 +118,8 @@ class Inbox:
         await self._records.fetch([entry])
         proposal = self._records.proposal(entry)
         context, recordings = await self._surroundings.context(self._records.book)
+        if (now_s := self._records.now_for(entry)) is not None:
+            context = dated(context, now_s)
         verdict = await self._judge.judge(canonical(proposal), context, recordings)
         what = {
             "proposal": hash_,

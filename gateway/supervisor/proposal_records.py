@@ -1,7 +1,7 @@
 """The records of what becomes of proposals: each step is stored before it counts, with what lies beside it."""
 
 import asyncio
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from datetime import UTC, datetime
 from typing import Any
 
@@ -9,21 +9,22 @@ from gateway.core.audit_record import Who
 from gateway.core.judge_context import JudgeContext
 from gateway.core.messages import Reply
 from gateway.core.proposal import Proposal
+from gateway.core.steady_clock import SteadyClock
 from gateway.core.verdict import Verdict
 from gateway.supervisor.audit_file import AuditUnavailable
 from gateway.supervisor.deployer_sides import AuditSide
-from gateway.supervisor.lifecycle import Book, Entry, Impossible
+from gateway.supervisor.lifecycle import Book, Entry, Impossible, clock_fields
 
 
 class ProposalRecords:
     """`book` is what the audit says."""
 
-    def __init__(self, book: Book, audit: AuditSide, wall_clock: Callable[[], float]) -> None:
+    def __init__(self, book: Book, audit: AuditSide, clock: SteadyClock) -> None:
         self.book = book
         self.one_step = asyncio.Lock()  #: for whoever takes steps that rest on one another
         self.trouble = ""  #: why the last step, or the last look at the line, came to nothing
         self._audit = audit
-        self._wall_clock = wall_clock
+        self._clock = clock
 
     async def step(
         self, kind: str, what: Mapping[str, Any], who: Who, blobs: Mapping[str, bytes] | None = None
@@ -31,9 +32,14 @@ class ProposalRecords:
         """A record, on the disk before the book knows of it. Raises Impossible, AuditUnavailable."""
         if reason := self.book.why_not(kind, what):
             raise Impossible(reason)
-        what = {**what, "at_s": self._wall_clock()}
+        what = {**what, **clock_fields(self._clock.now())}
         await self._audit.append(kind, who, what, blobs)
         self.book.apply(kind, what)
+
+    def now_for(self, entry: Entry) -> float | None:
+        """Unix time now by the clock as it was when the proposal came, wherever that has been set to since."""
+        received = entry.received
+        return None if received is None else received.wall_s + self._clock.age(received).least_s
 
     async def note(self, kind: str, who: Who, what: Mapping[str, Any]) -> None:
         """A record that is no step of a proposal. Raises AuditUnavailable."""

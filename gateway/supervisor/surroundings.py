@@ -13,6 +13,7 @@ from gateway.core.line_model import LineModel, theta_of
 from gateway.core.proposal import ExperimentChange, GainsChange, Proposal
 from gateway.core.recording import Recording
 from gateway.core.states import LoopState
+from gateway.core.steady_clock import SteadyClock
 from gateway.core.telemetry import Frame
 from gateway.supervisor.configurations import STABLE, Configurations, ConfigurationsError
 from gateway.supervisor.deployer_sides import NotKnown
@@ -39,29 +40,32 @@ class LineSurroundings:
         experiments: Callable[[float], list[tuple[Recording, float]]],
         configurations: Configurations,
         models: Models,
-        wall_clock: Callable[[], float],
+        clock: SteadyClock,
     ) -> None:
         self._line = line
         self._newest = newest
         self._recent = recent
-        self._experiments = experiments  #: of so many seconds, the newest first; it may block
+        #: Of so many seconds, the newest first, each with the Unix time of its end by the clock of now; it may block.
+        self._experiments = experiments
         self._configurations = configurations
         self._models = models
-        self._wall_clock = wall_clock
+        self._clock = clock
         self._before: Standing | None = None  #: how the line stood before the change
         self._stood = False  #: since the change, so that it could be measured
 
     async def context(self, book: Book) -> tuple[JudgeContext, list[Recording]]:
         """Of a line that runs once it stands, or in some seconds as it is then. Raises NotKnown."""
         await self._stands()
-        now_s = self._wall_clock()
         found = await asyncio.to_thread(self._experiments, self._line.gate.data_max_age_s)
-        found = [one for one in found if book.line_changed_s is None or one[1] > book.line_changed_s]
+        now_s = self._clock.now().wall_s
+        if book.line_changed is not None:
+            changed_s = now_s - self._clock.age(book.line_changed).least_s
+            found = [one for one in found if one[1] > changed_s]
         baseline, baseline_region = self._baseline(book)
         return JudgeContext(
             format=1,
             now=iso(now_s),
-            state=self._state(book, now_s),
+            state=self._state(book),
             in_service=self._controller(book.in_service),
             region=book.judged_for,
             baseline=baseline,
@@ -123,7 +127,7 @@ class LineSurroundings:
             return f"it has controlled the line for {ran_s:.0f} s of {probation_s:g} s"
         return "" if self._stood else f"the line has not stood for {LEAST_STANDING_S:g} s in a row"
 
-    def _state(self, book: Book, now_s: float) -> LineState:
+    def _state(self, book: Book) -> LineState:
         frame, change = self._newest(), book.on_the_line
         if frame is None:
             raise NotKnown("the loop has not told how the line stands: start it, then propose again")
@@ -136,7 +140,7 @@ class LineSurroundings:
             experiment=running,
             on_probation=change is not None and not running,
             doubts=in_words(frame.doubts),
-            since_change_s=None if book.changed_s is None else max(0.0, now_s - book.changed_s),
+            since_change_s=None if book.changed is None else self._clock.age(book.changed).least_s,
         )
 
     def _controller(self, hash_: str | None) -> Controller:

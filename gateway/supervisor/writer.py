@@ -85,6 +85,7 @@ class Writer:
         connection = self._ready()
         if self._agreed_ahead_s == ahead_s:
             return
+        more = True
         with connection:
             note_agreed(connection, self._run.boot, ahead_s)
             more = redate(connection, self._run.boot, ahead_s)

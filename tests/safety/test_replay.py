@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+from datetime import datetime
 from pathlib import Path
 
 from typer.testing import CliRunner
@@ -49,7 +50,7 @@ async def judged_into(folder: Path, payload: bytes) -> None:
     audit.start()
     deployer = Deployer(
         line, Book(), KeptAudit(folder, audit), loop, Judge(), AsInTheExample(loop), nothing_to_store,
-        lambda: loop.now_s, lambda: loop.now_s,
+        lambda: loop.now_s, datetime.fromisoformat(context.now).timestamp,
     )  # fmt: skip
     try:
         assert (await deployer.propose(payload, Who(name="anna"))).ok

@@ -48,6 +48,7 @@ class Gateway:
         self.judge = FakeJudge()
         self.surroundings = FakeSurroundings(self.loop)
         self.proposals = {}
+        self.wall_ahead_s = 0.0
         self.roles: dict[str, str] | None = None  #: of the people who may come in
         self.take_up = nothing_to_store  #: StoreWriter.take_up of real stores, or one that fails
         self.notes: list[tuple[str, dict]] = []
@@ -66,7 +67,7 @@ class Gateway:
     def begin(self) -> None:
         self.judge.line = line_hash(self.line)
         book, clock = book_of(self.audit.records), self._now_s
-        args = (self.audit, self.loop, self.judge, self.surroundings, self._take_up, clock, clock)
+        args = (self.audit, self.loop, self.judge, self.surroundings, self._take_up, clock, self._wall_s)
         self.deployer = Deployer(
             self.line, book, *args, own_uid=OPERATORS_UID, roles=lambda: self.roles, note=self._note
         )
@@ -79,6 +80,9 @@ class Gateway:
 
     def _now_s(self) -> float:
         return self.loop.now_s
+
+    def _wall_s(self) -> float:
+        return self.loop.now_s + self.wall_ahead_s
 
     async def propose(self, one):
         self.proposals[hash_of(one)] = one

@@ -9,6 +9,7 @@ import pytest
 from gateway.core.controller import config_hash
 from gateway.core.deployment import Region
 from gateway.core.states import LoopState, Phase
+from gateway.core.steady_clock import SteadyClock
 from gateway.core.telemetry import Frame
 from gateway.supervisor.configurations import STABLE, Origin, begin_configurations
 from gateway.supervisor.lifecycle import Book, Entry, Stage
@@ -53,7 +54,14 @@ def baseline(tmp_path: Path, storage):
     """Of a context: which configuration, and as far as what."""
     with begin_repository(tmp_path / "models.sqlite") as models:
         recent = Recent(LINE.n, LINE.control.period_s)
-        args = (lambda: STOOD, recent, lambda age_s: [], storage, models, lambda: 1000.0)
+        args = (
+            lambda: STOOD,
+            recent,
+            lambda age_s: [],
+            storage,
+            models,
+            SteadyClock(lambda: 1000.0, lambda: 1000.0, "boot"),
+        )
         surroundings = LineSurroundings(LINE, *args)
 
         def asked(book: Book):

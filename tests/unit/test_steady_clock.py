@@ -69,7 +69,7 @@ def test_over_a_boot_a_wall_clock_counts_that_agreed_then_and_agrees_now() -> No
     clocks.passes(AGREES_AFTER_S)
     assert clocks.steady.age(before) == Age(86_400.0 + 605.0, 86_400.0 + 605.0)
     assert clocks.steady.age(Moment(TRUE_S - 86_400.0, "other", 3000.0, agreed=False)) == Age(605.0, inf)
-    assert clocks.steady.age(Moment(TRUE_S - 86_400.0)) == Age(605.0, inf)  # of a record that says no more
+    assert clocks.steady.age(Moment(TRUE_S - 86_400.0)) == Age(87_005.0, 87_005.0)  # there is nothing else to go by
 
 
 def test_what_seems_to_have_been_later_than_the_start_of_this_boot_is_as_old_as_that_at_least() -> None:
