@@ -7,7 +7,7 @@ PARALLEL := --numprocesses auto --maxprocesses 4 --dist loadfile
 export PYTHONDONTWRITEBYTECODE :=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup run test test-long coverage system-test check types lint format bench bench-stepped bench-wire bench-processes bench-cycle bench-engage bench-monitor bench-control bench-identify bench-faults bench-fuzz bench-soak bench-gate bench-lifecycle bench-audit bench-kill bench-gate-live bench-agents-live bench-operator bench-knowledge bench-agents minilm mutate lock clean
+.PHONY: help setup run test test-long coverage system-test check types lint format bench bench-stepped bench-wire bench-processes bench-cycle bench-engage bench-history bench-trials bench-mpc bench-loop-states bench-loop-kill bench-monitor bench-control bench-identify bench-faults bench-fuzz bench-soak bench-gate bench-lifecycle bench-audit bench-kill bench-gate-live bench-agents-live bench-operator bench-knowledge bench-agents minilm mutate lock clean
 
 help: ## this list
 	@echo "r2rgate: make TARGET"
@@ -113,6 +113,9 @@ bench-gate: setup ## proposals of every way of going wrong, judged by the gate a
 
 bench-lifecycle: setup ## the life of a proposal in any order of everything, 10,000 sequences (about 15 min; ARGS="--sequences 1000")
 	@$(PY) -m tests.bench.lifecycle $(ARGS)
+
+bench-history: setup ## bytes to the disk for each byte of data, the log beside readers (about 2 min; ARGS="--minutes 10 --real-time")
+	@$(PY) -m tests.bench.history $(ARGS)
 
 bench-knowledge: setup ## how well notes are found, and how fast; with MiniLM where it is installed (ARGS="--questions FILE")
 	@$(PY) -m tests.bench.knowledge $(ARGS)

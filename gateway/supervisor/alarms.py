@@ -36,6 +36,7 @@ from gateway.supervisor.audit import AuditState
 from gateway.supervisor.audit_file import AuditUnavailable
 from gateway.supervisor.peers import who_of
 from gateway.supervisor.proposal_records import done, iso, refused
+from gateway.supervisor.store import boot_id
 
 FILE_NAME = "alarms.json"
 MOST_BYTES = 65_536
@@ -49,6 +50,8 @@ class _File(Strict):
     format: Annotated[int, Field(ge=1, le=1)]
     acknowledged: dict[AlarmName, str]
     shelved_until_wall_s: dict[AlarmName, float]
+    boot: str = ""  #: of the monotonic times; files of earlier versions do not say
+    shelved_until_s: dict[AlarmName, float] = {}  #: monotonic
 
 
 class Alarms:
@@ -69,6 +72,7 @@ class Alarms:
         self._note = note
         self._clock = clock
         self._wall_clock = wall_clock
+        self._boot = boot_id()
         self._conditions = Conditions()
         self._states = AlarmStates(clock(), self._read())
         self._written: _File | None = None
@@ -165,8 +169,11 @@ class Alarms:
                 found = _File.model_validate_json(stream.read(MOST_BYTES))
         except (OSError, ValidationError):
             return Kept()
-        now_s = self._wall_clock()
-        return Kept(dict(found.acknowledged), {name: at - now_s for name, at in found.shelved_until_wall_s.items()})
+        if found.boot == self._boot:
+            now_s, until_s = self._clock(), found.shelved_until_s
+        else:  # a wall clock that was set brings alarms back too early, or hides them for no longer than the longest
+            now_s, until_s = self._wall_clock(), found.shelved_until_wall_s
+        return Kept(dict(found.acknowledged), {name: at_s - now_s for name, at_s in until_s.items()})
 
     async def keep(self) -> None:
         """Write down what has changed since the last time: a few times a second, and at the end."""
@@ -177,8 +184,11 @@ class Alarms:
         async with self._writing:
             now_s, wall_s = self._clock(), self._wall_clock()
             kept = self._states.kept(now_s)
-            until_s = {name: round(wall_s + left_s, 0) for name, left_s in kept.shelved_s.items()}
-            new = _File(format=1, acknowledged=kept.acknowledged, shelved_until_wall_s=until_s)
+            new = _File(
+                format=1, acknowledged=kept.acknowledged, boot=self._boot,
+                shelved_until_wall_s={name: round(wall_s + left_s, 0) for name, left_s in kept.shelved_s.items()},
+                shelved_until_s={name: round(now_s + left_s, 1) for name, left_s in kept.shelved_s.items()},
+            )  # fmt: skip
             if new == self._written:
                 return ""
             try:

@@ -304,7 +304,7 @@ class Desk:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self.now_s = 1000.0
+        self.now_s, self.wall_ahead_s = 1000.0, 1_700_000_000.0
         self.records = list[tuple[str, str, Mapping[str, Any]]]()
         self.notes = list[tuple[str, str]]()
         self.audit_open = True
@@ -314,7 +314,7 @@ class Desk:
         self.mailbox = UnixMailbox()
         self.alarms = Alarms(
             self.mailbox, self.folder, self.append, lambda kind, text: self.notes.append((kind, text)),
-            lambda: self.now_s, lambda: self.now_s + 1_700_000_000.0,
+            lambda: self.now_s, lambda: self.now_s + self.wall_ahead_s,
         )  # fmt: skip
         PersonsDesk(self.mailbox, self._none, self._none, self.alarms.say, self.append, lambda: 0.0)
 
@@ -471,7 +471,20 @@ def test_a_gateway_that_begins_anew_knows_what_was_seen_and_shelved(desk: Desk) 
     desk.look(status(buses=[bus(["a"])], spans=[span(1, quality="BAD")]))
     told = {one.name: one for one in desk.listed()}
     assert told["device-absent"].acknowledged and not told["load-cell"].acknowledged
-    assert told["load-cell"].shelved_until_wall_s == 1_700_001_600.0
+    assert abs((told["load-cell"].shelved_until_wall_s or 0.0) - 1_700_001_600.0) < 1.0
+
+
+@pytest.mark.parametrize("jump_s", [1e9, -1e9, 3600.0, -3600.0])
+def test_a_clock_that_is_set_while_the_gateway_is_down_keeps_what_is_shelved_as_long_as_it_was_to_be(
+    desk: Desk, jump_s: float
+) -> None:
+    desk.ask(ShelveAlarm(alarm="load-cell", for_s=600.0, because="being mended"))
+    desk.wall_ahead_s += jump_s
+    desk.begin()
+    for passed_s, shelved in ((590.0, True), (20.0, False)):
+        desk.now_s += passed_s
+        desk.look(status(spans=[span(1, quality="BAD")]))
+        assert any(one.shelved_until_wall_s for one in desk.listed()) == shelved
 
 
 @pytest.mark.parametrize(
