@@ -129,7 +129,7 @@ def main() -> None:
     parser.add_argument("--real-time", action="store_true", help="so that the kernel may write the tail meanwhile")
     asked = parser.parse_args()
     if asked.part:
-        with tempfile.TemporaryDirectory(dir=".") as name:  # on the disk of the project: /tmp may be memory
+        with tempfile.TemporaryDirectory(dir=".") as name:  # not /tmp, which may be memory
             folder, minutes = Path(name), asked.minutes
             beside = asked.part == "readers"
             found = (
