@@ -34,6 +34,6 @@ def book_in(folder: Path) -> Book:
 
 
 def _what(record: AuditRecord) -> dict[str, Any]:
-    """Records of earlier versions do not say in themselves of which boot their time is, and nobody knows its clock."""
+    """With its time, which earlier versions left to the record; whether the wall clock agreed then, nobody knows."""
     clock = {"boot": record.boot, "monotonic_s": record.monotonic_s, "agreed": False}
-    return {"clock": clock, **record.what}
+    return {"at_s": record.wall_s, "clock": clock, **record.what}

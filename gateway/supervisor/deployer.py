@@ -384,7 +384,7 @@ class Deployer:
         """It stands for as long as it did when it came, and no longer than the line's file allows."""
         now_s = self._records.now_for(entry)
         if now_s is None or entry.received is None:
-            return True  # no record of this program is without
+            return True  # a record without a time is none that this program writes
         stands_s = min(entry.expires_s - entry.received.wall_s, self._line.gate.expiry_max_s)
         return now_s - entry.received.wall_s >= stands_s
 

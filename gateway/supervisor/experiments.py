@@ -20,7 +20,7 @@ def newest_experiments(path: Path, begin_s: float, until_s: float, most: int) ->
     left out. Raises HistoryError where there is no history.
     """
     with History(path) as history:
-        ends = [event for event in history.events(begin_s, until_s) if event.kind in ENDS]
+        ends = history.events(begin_s, until_s, ENDS)
     found: list[tuple[Recording, float]] = []
     for event in reversed(ends):
         if len(found) < most and (one := _recording(path, event)) is not None:
@@ -35,7 +35,7 @@ def recent_experiments(path: Path, most_s: float, clocks: SteadyClock, most: int
     """
     with History(path) as history:
         ahead_s = history.agreed_ahead()
-        ends = [event for event in history.events(-inf, inf) if event.kind in ENDS]
+        ends = history.events(-inf, inf, ENDS)
     found: list[tuple[Recording, float]] = []
     for event in sorted(ends, key=lambda one: clocks.age(_moment(one, ahead_s)).most_s):
         age_s = clocks.age(_moment(event, ahead_s)).most_s

@@ -101,14 +101,15 @@ class History:
         with told(self._path, _KIND):
             return agreed_ahead(self._connection)
 
-    def events(self, start_s: float, end_s: float) -> list[StoredEvent]:
-        """Events between two instants of Unix time, in order."""
+    def events(self, start_s: float, end_s: float, kinds: Sequence[str] = ()) -> list[StoredEvent]:
+        """Events between two instants of Unix time, in order; of these kinds, or of all."""
         tail = self._tail()
         with told(self._path, _KIND), snapshot(self._connection):
             rows = self._connection.execute(
                 "SELECT boot, time_s, wall_s, kind, text, data FROM event JOIN run ON run.id = event.run"
-                " WHERE wall_s BETWEEN ? AND ? ORDER BY wall_s, event.id",
-                (start_s, end_s),
+                " WHERE wall_s BETWEEN ? AND ? AND (? OR kind IN (SELECT value FROM json_each(?)))"
+                " ORDER BY wall_s, event.id",
+                (start_s, end_s, not kinds, json.dumps(kinds)),
             ).fetchall()
             new = self._unpacked(tail)
         found = [
@@ -120,7 +121,7 @@ class History:
             found += [
                 StoredEvent(tail.run.boot, one.time_s, wall_s, one.kind, one.text, one.data)
                 for one, wall_s in dated
-                if start_s <= wall_s <= end_s
+                if start_s <= wall_s <= end_s and (not kinds or one.kind in kinds)
             ]
         return sorted(found, key=lambda event: event.wall_s)
 

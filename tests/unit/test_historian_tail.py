@@ -199,3 +199,17 @@ def test_the_log_shrinks_again_after_another_program_held_a_read_open(tmp_path: 
     assert wal_of(path) <= MOST_LOG_BYTES / 4
     assert len(sequences(path)) == first + 1000
     writer.close()
+
+
+def test_events_of_a_kind_are_found_in_the_database_and_in_the_tail(tmp_path: Path) -> None:
+    writer = writer_of(tmp_path / "h")
+    for first in (0.0, 10.0):
+        events = [Event(time_s=first + k, kind=kind, text=kind) for k, kind in enumerate(("alarm", "state", "end"))]
+        writer.store([], events, 0.0)
+        if not first:
+            writer.pack()
+    with History(tmp_path / "h") as history:
+        assert [event.time_s for event in history.events(0.0, 100.0, ("state", "end"))] == [1.0, 2.0, 11.0, 12.0]
+        assert history.events(0.0, 100.0, ("none",)) == []
+        assert len(history.events(0.0, 100.0)) == 6
+    writer.close()
