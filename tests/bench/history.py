@@ -102,7 +102,8 @@ def _beside_readers(folder: Path, minutes: int) -> dict[str, float]:
     line.runs(2)
     with History(line.path) as history:
         walk = history.walk_wall(0.0, 1e9, ["tension_n"])
-        next(walk), next(walk)
+        next(walk)
+        next(walk)
         beside_ours = line.runs(minutes)
         walk.close()
     other = apsw.Connection(str(line.path))
