@@ -81,8 +81,11 @@ class Surroundings(Protocol):
         """The loop has taken the change later than it was put: what was measured in between says nothing of it."""
         ...
 
-    def against_keeping(self) -> str:
-        """What a deployment on probation has shown against itself so far; empty: nothing."""
+    def against_keeping(self, now_s: float) -> str:
+        """Look at a deployment on probation, at a monotonic time: why it must go back; empty: nothing that was seen.
+
+        It goes back, too, where too little of it was to be seen for too long.
+        """
         ...
 
     def unseen(self) -> str:

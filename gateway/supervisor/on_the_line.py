@@ -241,7 +241,7 @@ class OnTheLine:
             return
         if entry.stage is Stage.DEPLOYING:  # the loop has not answered, and may still take it
             return
-        if against := self._surroundings.against_keeping():
+        if against := self._surroundings.against_keeping(now_s):
             await self._tell(Rollback(reason=against))
             await self.settle()
         elif entry.stage is Stage.KEEPING or not self._unseen(now_s):
@@ -262,9 +262,8 @@ class OnTheLine:
 
     def _unseen(self, now_s: float) -> str:
         since_s, probation_s = now_s - self._probation_since_s, self._line.gate.probation_s
-        if since_s < probation_s:
-            return f"it has been watched for {since_s:.0f} s of {probation_s:g} s"
-        return self._surroundings.unseen()
+        watched = "" if since_s >= probation_s else f"it has been watched for {since_s:.0f} s of {probation_s:g} s"
+        return self._surroundings.unseen() or watched
 
     async def _keep(self, entry: Entry, found: InService) -> None:
         """What cannot be kept is taken back."""

@@ -8,10 +8,11 @@ from numpy.typing import NDArray
 from gateway.core.signals import FloatArray, Quality
 from gateway.core.states import LoopState
 from gateway.core.telemetry import frame_dtype
-from safety.probation import Standing, standing
+from safety.probation import LEAST_TENSION, Standing, standing
 
 SETTLE_S = 3.0  #: after the last move of a set-point
 WINDOW_S = 2.0
+STANDING_S = SETTLE_S + WINDOW_S
 
 
 class Recent:
@@ -20,13 +21,19 @@ class Recent:
     def __init__(self, spans: int, period_s: float) -> None:
         self._dtype = frame_dtype(spans)
         self._period_s = period_s
-        self._frames: deque[bytes] = deque(maxlen=round((SETTLE_S + WINDOW_S) / period_s))
+        self._window = round(WINDOW_S / period_s)  #: periods
+        self._frames: deque[bytes] = deque(maxlen=round(STANDING_S / period_s))
         self._ran = 0  #: frames
 
     @property
     def ran_s(self) -> float:
         """How long the line has run, all in all, since the last `forget`."""
         return self._ran * self._period_s
+
+    @property
+    def newest_s(self) -> float | None:
+        """When the newest frame was due (monotonic); None: none has come since the last `forget`."""
+        return float(np.frombuffer(self._frames[-1], self._dtype)["time_s"][0]) if self._frames else None
 
     def take(self, payload: bytes) -> None:
         """A well-formed frame."""
@@ -43,21 +50,47 @@ class Recent:
         return self._standing() is not None
 
     def standing(self) -> Standing | None:
-        """How the line stands; None: it moves, or has not stood for long enough."""
+        """How the line stands; None: it moves, or has not stood for long enough.
+
+        Periods of which no frame came, and tensions that are not GOOD, are not seen: a value that a device no longer
+        tells stays in the frames, and so does a torque while the outputs are held.
+        """
         frames = self._standing()
         if frames is None:
             return None
-        last = frames[-round(WINDOW_S / self._period_s) :]
-        measured: FloatArray = np.where(last["tension_quality"] == Quality.GOOD, last["tension_n"], np.nan)
-        return standing(measured, _floats(last, "tension_setpoint_n"), _floats(last, "torque_nm"))
+        row = self._window - 1 - self._periods_before_newest(frames)
+        frames, row = frames[row >= 0], row[row >= 0]
+        good = frames["tension_quality"] == Quality.GOOD
+        asked_anew = (frames["held"] == 0)[:, np.newaxis]
+        tension, setpoint, torque = (
+            self._in_rows(row, np.where(usable, _floats(frames, name), np.nan))
+            for name, usable in (("tension_n", good), ("tension_setpoint_n", True), ("torque_nm", asked_anew))
+        )
+        return standing(tension, setpoint, torque)
 
     def _standing(self) -> NDArray[np.void] | None:
         if len(self._frames) < (self._frames.maxlen or 0):
             return None
         frames = np.frombuffer(b"".join(self._frames), self._dtype)
+        before = self._periods_before_newest(frames)
+        kept = (before >= 0) & (before < len(frames))
+        if not kept.mean() >= LEAST_TENSION:  # of some seconds hardly anything is known
+            return None
+        frames = frames[kept]
+        # What is no number is not 0: it moves.
         moved = np.ptp(frames["tension_setpoint_n"], axis=0).any() or np.ptp(frames["speed_setpoint_m_per_s"])
         ran = (frames["state"] == LoopState.RUN).all()
         return frames if ran and not moved else None
+
+    def _periods_before_newest(self, frames: NDArray[np.void]) -> NDArray[np.int64]:
+        """Of each frame (k,). Frames may be lost, and a loop may skip periods."""
+        return np.rint((frames["time_s"][-1] - frames["time_s"]) / self._period_s).astype(np.int64)
+
+    def _in_rows(self, row: NDArray[np.int64], values: FloatArray) -> FloatArray:
+        """One row for each period of the window: NaN where no frame came."""
+        found: FloatArray = np.full((self._window, values.shape[1]), np.nan)
+        found[row] = values
+        return found
 
 
 def _floats(frames: NDArray[np.void], name: str) -> FloatArray:

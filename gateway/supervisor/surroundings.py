@@ -3,6 +3,8 @@
 import asyncio
 from collections.abc import Callable
 
+import numpy as np
+
 from gateway.core.controller import Controller
 from gateway.core.deployment import RecoveryPrediction, Region
 from gateway.core.differences import of_controllers, of_experiment, of_models
@@ -21,11 +23,11 @@ from gateway.supervisor.lifecycle import Book, Stage
 from gateway.supervisor.model_store import ModelsError
 from gateway.supervisor.models import Models
 from gateway.supervisor.proposal_records import iso
-from gateway.supervisor.recent import SETTLE_S, WINDOW_S, Recent
-from safety.probation import Standing, against
+from gateway.supervisor.recent import STANDING_S, WINDOW_S, Recent
+from safety.probation import Standing, look_at
+from safety.trial import Trial
 
-LEAST_STANDING_S = SETTLE_S + WINDOW_S
-PATIENCE_S, LOOK_S = LEAST_STANDING_S + 1.0, 0.1
+PATIENCE_S, LOOK_S = STANDING_S + 1.0, 0.1
 NODES = (0.1, 0.5, 1.0)  #: of the fastest speed: where recovery is predicted
 
 
@@ -51,7 +53,9 @@ class LineSurroundings:
         self._models = models
         self._clock = clock
         self._before: Standing | None = None  #: how the line stood before the change
-        self._stood = False  #: since the change, so that it could be measured
+        self._trial = self._new_trial()
+        #: Of the line's file: what is told of the others is not looked at, and not missed.
+        self._measured = np.array([span.control == "tension" for span in line.spans])
 
     async def context(self, book: Book) -> tuple[JudgeContext, list[Recording]]:
         """Of a line that runs once it stands, or in some seconds as it is then. Raises NotKnown."""
@@ -109,23 +113,29 @@ class LineSurroundings:
         """From now on the line is measured against how it has stood until now."""
         self._before = self._recent.standing()
         self._recent.forget()
-        self._stood = False
+        self._trial = self._new_trial()
 
     def change_taken(self) -> None:
         """What was measured until now says nothing of the change."""
         self._recent.forget()
-        self._stood = False
+        self._trial = self._new_trial()
 
-    def against_keeping(self) -> str:
+    def against_keeping(self, now_s: float) -> str:
         now = self._recent.standing()
-        self._stood = self._stood or now is not None
-        return "" if now is None else against(now, self._before, self._line.gate)
+        found = None if now is None else look_at(now, self._before, self._line.gate, self._measured)
+        return self._trial.look(found, self._recent.newest_s, now_s)
 
     def unseen(self) -> str:
         probation_s, ran_s = self._line.gate.probation_s, self._recent.ran_s
-        if ran_s < probation_s:
-            return f"it has controlled the line for {ran_s:.0f} s of {probation_s:g} s"
-        return "" if self._stood else f"the line has not stood for {LEAST_STANDING_S:g} s in a row"
+        ran = f"it has controlled the line for {ran_s:.0f} s of {probation_s:g} s" if ran_s < probation_s else ""
+        if self._trial.blind:
+            return "; ".join(filter(None, (ran, self._trial.missing())))
+        if ran:
+            return ran
+        return self._trial.missing() if self._trial.stood else f"the line has not stood for {STANDING_S:g} s in a row"
+
+    def _new_trial(self) -> Trial:
+        return Trial(self._line.gate.probation_s, WINDOW_S)
 
     def _state(self, book: Book) -> LineState:
         frame, change = self._newest(), book.on_the_line

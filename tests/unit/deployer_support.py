@@ -246,7 +246,7 @@ class FakeSurroundings:
     def unseen(self) -> str:
         return self.hidden
 
-    def against_keeping(self) -> str:
+    def against_keeping(self, now_s: float) -> str:
         return self.against
 
 
