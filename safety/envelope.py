@@ -199,8 +199,8 @@ def _beyond(counts: Sequence[int], limits: EnvelopeLimits) -> list[int]:
 
 def _outside_band(limits: EnvelopeLimits, inputs: Inputs, supervision: Supervision) -> list[bool]:
     low, high = limits.tension_min_n if supervision.tension_floor else -inf, limits.tension_max_n
-    # A channel that was never heard is NaN, neither above nor below, and of no GOOD quality.
-    return [tension_n > high or tension_n < low for tension_n in inputs.tension.value.tolist()]
+    # A channel that was never heard is NaN, and of no GOOD quality: it is not counted. GOOD and no number is outside.
+    return [not low <= tension_n <= high for tension_n in inputs.tension.value.tolist()]
 
 
 def _out_of_band(limits: EnvelopeLimits, span: int, inputs: Inputs) -> Finding:
@@ -232,7 +232,7 @@ def _too_fast(limits: EnvelopeLimits, inputs: Inputs, supervision: Supervision) 
     if not supervision.feedback:
         return [False] * inputs.n
     limit = _roller_limit(limits, supervision)
-    return [abs(speed) > limit for speed in inputs.speed.value.tolist()]
+    return [not abs(speed) <= limit for speed in inputs.speed.value.tolist()]  # NaN and GOOD: nobody knows how fast
 
 
 def _speed_findings(limits: EnvelopeLimits, state: EnvelopeState, inputs: Inputs) -> list[Finding]:
@@ -247,7 +247,7 @@ def _speed_findings(limits: EnvelopeLimits, state: EnvelopeState, inputs: Inputs
         for i in _beyond(state.fast, limits)
     ]
     speed, greatest = inputs.unwind_speed.value.item(0), limits.unwinder_overspeed * limits.speed_max_m_per_s
-    if abs(speed) > greatest and inputs.unwind_speed.good():
+    if not abs(speed) <= greatest and inputs.unwind_speed.good():
         text = f"the unwinder runs at {speed:.4f} m/s, allowed is {limits.speed_max_m_per_s:g} m/s"
         findings.append(Finding("overspeed", Action.STOP, text))
     return findings

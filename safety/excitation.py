@@ -6,6 +6,7 @@ Quiet data pass almost any model: its errors hide behind the noise, and an integ
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime
+from math import isfinite
 
 import numpy as np
 
@@ -40,10 +41,10 @@ def recent(context: JudgeContext, recordings: Sequence[Recording], most_s: float
 
 
 def excited_parts(recording: Recording, noise: Noise | None = None) -> list[Excited]:
-    """Of one recording, the latest first."""
+    """Of one recording, the latest first. Where a speed, or a tension that moves, is no number: none."""
     least_n = MOVING * (noise or Noise()).tension_n
     found = [Excited(part, float(part.unwind_speed_m_per_s.mean()), _movement_n(part)) for part in _parts(recording)]
-    return [part for part in reversed(found) if part.movement_n >= least_n]
+    return [part for part in reversed(found) if part.movement_n >= least_n and isfinite(part.speed_m_per_s)]
 
 
 def newest(parts: Sequence[Excited], most_s: float = MOST_S) -> list[Excited]:

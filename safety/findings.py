@@ -1,6 +1,6 @@
 """Findings of rules, in words and numbers."""
 
-from math import isfinite
+from math import inf, isfinite
 
 from gateway.core.line_problem import printable
 from gateway.core.verdict import RuleFinding
@@ -14,13 +14,13 @@ def told(rule: str, passed: bool, text: str) -> RuleFinding:
 
 
 def at_least(rule: str, value: float, limit: float, unit: str, text: str) -> RuleFinding:
-    """Passed where `value` is at `limit` or above; never by a value that is no number."""
-    return _of_number(rule, value >= limit, value, limit, value - limit, unit, text)
+    """Passed where `value` is at `limit` or above; never by one that is no number, or without end: none was seen."""
+    return _of_number(rule, limit <= value < inf, value, limit, value - limit, unit, text)
 
 
 def at_most(rule: str, value: float, limit: float, unit: str, text: str) -> RuleFinding:
-    """Passed where `value` is at `limit` or below; never by a value that is no number."""
-    return _of_number(rule, value <= limit, value, limit, limit - value, unit, text)
+    """Passed where `value` is at `limit` or below; never by one that is no number, or without end: none was seen."""
+    return _of_number(rule, -inf < value <= limit, value, limit, limit - value, unit, text)
 
 
 def _of_number(rule: str, passed: bool, value: float, limit: float, margin: float, unit: str, text: str) -> RuleFinding:

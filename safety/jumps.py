@@ -89,7 +89,9 @@ def reject_jumps(
         state.speed_m_per_s[:] = speed.value
         return []
     good = speed.quality == _GOOD
-    jumped = good & (change > _reach(limits, state, inputs, torques_nm))
+    # Where nobody knows how far it can have come, it has jumped; without an earlier sample nothing has.
+    first = np.isnan(state.speed_m_per_s)
+    jumped = good & ~first & ~(change <= _reach(limits, state, inputs, torques_nm))
     findings: list[Finding] = []
     if jumped.any():
         again = jumped & (state.period - state.jumped <= limits.memory_periods)

@@ -37,7 +37,10 @@ def in_small(case: Case) -> dict[str, Rollouts]:
 
 
 def fails_in_small(case: Case) -> bool:
-    """Whether a programme is refused for its small moves: then what takes it many seconds decides nothing."""
+    """Whether a programme is refused for its small moves: then what takes it many seconds decides nothing.
+
+    What is no number is refused. Where no corner is held there are no moves, and rule `corners` has refused it.
+    """
     if not isinstance(case.controller, MpcConfig):
         return False
     return case.once(_fails_in_small)

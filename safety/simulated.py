@@ -80,11 +80,17 @@ def held(thetas: Sequence[Theta], one: CornerCourse, torque_nm: float) -> list[T
 
 
 def _needed_nm(theta: Theta, asked: FloatArray) -> float:
-    """The greatest torque at equilibria, each a row (1 + n,): the unwinder's speed, and set-points."""
+    """The greatest torque at equilibria, each a row (1 + n,): the unwinder's speed, and set-points.
+
+    0 where it is no number, so that the plant is not left out.
+    """
     needed = 0.0
     for row in asked:
         tension = row[1:]
         speed = reference_speeds(theta.web, tension, float(row[0]))
         torque = equilibrium_torque(theta.web, tension, speed) + theta.coulomb_nm * np.sign(speed)
-        needed = max(needed, float(np.abs(torque).max()))
+        most = float(np.abs(torque).max())
+        if np.isnan(most):  # simulated, it is refused; left out, nobody would look at it
+            return 0.0
+        needed = max(needed, most)
     return needed

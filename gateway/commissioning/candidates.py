@@ -159,7 +159,8 @@ def fastest_m_per_s(line: Line, model: LineModel | None) -> float:
             equilibrium_torque(web, tension, reference_speeds(web, tension, speed))
             for tension in (np.array(recipe.tension_n) for recipe in line.recipes)
         ]
-        if max(float(np.abs(torque).max()) for torque in torques) + coulomb_nm <= HELD * line.limits.torque_nm:
+        # Each by itself: Python's maximum passes over what is no number, where it does not come first.
+        if all(np.abs(torque).max() + coulomb_nm <= HELD * line.limits.torque_nm for torque in torques):
             return speed
     return most / GRID
 

@@ -84,7 +84,7 @@ class Convergence(Strict):
 
     @property
     def converged(self) -> bool:
-        return all(one.converged for one in self.spans.values())
+        return bool(self.spans) and all(one.converged for one in self.spans.values())  # of none nothing is known
 
     @property
     def settled(self) -> bool:
@@ -93,8 +93,8 @@ class Convergence(Strict):
 
     @property
     def gains(self) -> bool:
-        """A newer model would lead to another design."""
-        return abs(self.gap) >= SIGNIFICANT
+        """A newer model would lead to another design; so it would where the gap is no number."""
+        return not abs(self.gap) < SIGNIFICANT
 
     @property
     def follows(self) -> Follows:
@@ -208,13 +208,16 @@ def _figures(line: Line, recording: Recording, tension_n: FloatArray) -> dict[st
         )
         found = np.maximum(found, one)
     lowest = np.min([setpoint[end - 1] for _, end in windows], axis=0)
+    measured = [i for i, span in enumerate(line.spans) if span.control == "tension"]
+    if not np.isfinite(found[:2, measured]).all():
+        raise NotOffered("a tension is no number, or runs away, in the line's recording or on its model")
     rmse, overshoot, settling = found.tolist()
     return {
         str(i + 1): SpanFigures(
             rmse_n=rmse[i], overshoot_pct=overshoot[i], settling_s=settling[i] if isfinite(settling[i]) else None,
             setpoint_n=float(lowest[i]),
         )
-        for i, span in enumerate(line.spans) if span.control == "tension"
+        for i in measured
     }  # fmt: skip
 
 

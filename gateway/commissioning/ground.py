@@ -125,7 +125,7 @@ def _can_be_held(model: WebModel, scenario: Scenario, torque_nm: float) -> bool:
     for tension_n, speed_m_per_s in ends:
         tension = np.array(tension_n)
         speeds = reference_speeds(model, tension, speed_m_per_s)
-        if np.abs(equilibrium_torque(model, tension, speeds)).max() >= torque_nm:
+        if not np.abs(equilibrium_torque(model, tension, speeds)).max() < torque_nm:  # what is no number holds nothing
             return False
     return True
 

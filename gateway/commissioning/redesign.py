@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import takewhile
-from math import inf
+from math import inf, isnan
 
 import numpy as np
 
@@ -148,8 +148,12 @@ def _worth(
     for law, config in designed:
         figures = predicted(config, line, model, judged, lasting_s)
         figures_known = figures if known is judged else predicted(config, line, model, known, lasting_s)
-        if all(no_worse(line, figures_known[name], before_known[name], of_tolerance) for name in before_known):
+        if before_known and all(
+            no_worse(line, figures_known[name], before_known[name], of_tolerance) for name in before_known
+        ):
             whole = sum(ratio(figures[name].rmse_n, before[name].rmse_n) for name in before)
+            if isnan(whole):  # beyond what it is compared in: nothing can be sorted by it
+                continue
             found.append((whole, Offer(law, config, judged.speed_max_m_per_s, figures, before)))
     return [offer for _, offer in sorted(found, key=lambda each: each[0])]
 

@@ -1,6 +1,7 @@
 """From tuned candidates to the one that is offered: the score S = w . metrics (eq. performance_score), and why."""
 
 from collections.abc import Mapping, Sequence
+from math import inf, isnan
 
 from gateway.commissioning.records import Trial
 from gateway.core.line import NonNegative, Positive, Priorities, Strict
@@ -64,8 +65,8 @@ def performance_of(trial: Trial, compute_s: float) -> Performance | None:
 
 
 def ranked(candidates: Sequence[Candidate]) -> list[Candidate]:
-    """C* first (argmin S); what has no score comes last."""
-    return sorted(candidates, key=lambda one: (one.score is None, one.score or 0.0))
+    """C* first (argmin S); what has no score, or one that is no number, comes last."""
+    return sorted(candidates, key=lambda one: inf if one.score is None or isnan(one.score) else one.score)
 
 
 def explanation(candidates: Sequence[Candidate], chosen: str = "", by: str = "") -> list[str]:

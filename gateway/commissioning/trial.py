@@ -49,14 +49,16 @@ def trial_of(config: Controller, ground: Ground, runs: Sequence[Rollouts]) -> Tr
     settling_s = max((_greatest(metrics.settling_s) for metrics in quiet), default=0.0)
     found = margins(config, ground.task)
     stable = found.spectral_radius < 1.0
+    cost_n2s = sum(_cost(run, course, spans, period_s) for run, course in both) if held else inf
     return Trial(
-        cost_n2s=sum(_cost(run, course, spans, period_s) for run, course in both) if held else None,
+        cost_n2s=cost_n2s if isfinite(cost_n2s) else None,
         rmse_n={s.name: _bounded(m.rmse_n) for s, m in zip(ground.scenarios, alone, strict=True)},
         settling_s=settling_s if isfinite(settling_s) else None,
         watched_s=max((period_s * (course.periods - course.changed) for course in ground.courses), default=0.0),
-        overshoot_pct=_bounded(max((_greatest(metrics.overshoot_pct) for metrics in quiet), default=0.0)),
-        tension_min_n=_bounded(min(_least(run.tension_min_n[:, spans]) for run in runs)),
-        tension_max_n=_bounded(max(_greatest(run.tension_max_n[:, spans]) for run in runs)),
+        # Of numpy: Python's own extremes pass over what is no number, where it does not come first.
+        overshoot_pct=_bounded(float(np.max([_greatest(metrics.overshoot_pct) for metrics in quiet], initial=0.0))),
+        tension_min_n=-_bounded(-float(np.min([_least(run.tension_min_n[:, spans]) for run in runs]))),
+        tension_max_n=_bounded(float(np.max([_greatest(run.tension_max_n[:, spans]) for run in runs]))),
         effort_n2m2s=_bounded(float(np.mean([metrics.effort_n2m2s for metrics in alone])), 1e12),
         robustness_n=max(_greatest(np.abs(run.tension_n - run.tension_n[:1])[..., spans]) for run in runs)
         if held
@@ -70,17 +72,20 @@ def trial_of(config: Controller, ground: Ground, runs: Sequence[Rollouts]) -> Tr
 
 
 def reasons_against(trial: Trial, ground: Ground) -> list[str]:
-    """Why a candidate must not be offered: stability, delay, tension limits. Torque the loop limits itself."""
+    """Why a candidate must not be offered: stability, delay, tension limits. Torque the loop limits itself.
+
+    A figure that is no number speaks against it.
+    """
     found: list[str] = []
     limits, least_s = ground.task.limits, ground.least_margin_s
     if not trial.decay_per_s > 0.0:
         return ["the loop is unstable"]
-    if trial.delay_margin_s < least_s:
+    if not trial.delay_margin_s >= least_s:
         found.append(f"it stands {1e3 * trial.delay_margin_s:.1f} ms more delay, less than {1e3 * least_s:g} ms")
     found += trial.weak
-    if trial.cost_n2s is None:
+    if trial.cost_n2s is None or not isfinite(trial.cost_n2s):
         found.append("a line within the tolerances runs away")
-    elif trial.tension_min_n < limits.tension_min_n or trial.tension_max_n > limits.tension_max_n:
+    elif not (limits.tension_min_n <= trial.tension_min_n and trial.tension_max_n <= limits.tension_max_n):
         found.append(
             f"within the tolerances tension goes from {trial.tension_min_n:.1f} to {trial.tension_max_n:.1f} N, "
             f"the limits are {limits.tension_min_n:g} and {limits.tension_max_n:g} N"
@@ -144,5 +149,5 @@ def _greatest(values: FloatArray) -> float:
 
 
 def _bounded(value: float, most: float = RUNAWAY_N) -> float:
-    """What has run away as a number that can be written down."""
+    """What has run away as a number that can be written down; what is none is the greatest."""
     return float(np.clip(np.nan_to_num(value, nan=most, posinf=inf, neginf=-inf), -most, most))

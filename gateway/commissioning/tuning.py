@@ -6,6 +6,7 @@ proposed is designed, simulated and validated here; it is accepted only where it
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from math import inf
 from typing import Protocol
 from warnings import catch_warnings
 
@@ -86,6 +87,11 @@ def tune(
     return Tuned(tuple(done), converged=False)
 
 
+def _cost(trial: Trial | None) -> float:
+    """J; infinite where there is none."""
+    return inf if trial is None or trial.cost_n2s is None else trial.cost_n2s
+
+
 def attempted(
     architecture: Architecture, ground: Ground, suggestion: Suggestion, history: Sequence[Attempt]
 ) -> Attempt:
@@ -107,5 +113,5 @@ def attempted(
         return attempt(None, f"its figures cannot be computed: {error}", accepted=False)
     against = "; ".join(reasons_against(trial, ground))
     best = best_of(history)
-    better = best is None or (trial.cost_n2s or 0.0) < (best.cost_n2s or 0.0)
+    better = best is None or _cost(trial) < _cost(best.trial)  # one that is no number is less than none
     return attempt(trial, against, accepted=not against and better)

@@ -91,7 +91,7 @@ def _plant_by_plant(
 
 def _check(config: Controller, plants: Plants, course: Course, setup: Setup) -> None:
     wrong: list[str] = []
-    if abs(config.period_s - setup.period_s) > 1e-12:
+    if not abs(config.period_s - setup.period_s) <= 1e-12:
         wrong.append(f"the law's period is {config.period_s:g} s, the loop's {setup.period_s:g} s")
     if config.n != plants.n or course.tension_n.shape != (course.periods, plants.n):
         wrong.append(f"law, plants and course have {config.n}, {plants.n} and {course.tension_n.shape[1]} spans")
@@ -102,7 +102,7 @@ def _check(config: Controller, plants: Plants, course: Course, setup: Setup) -> 
         wrong.append(f"the course has {course.periods} periods and a tail of {course.tail}")
     if not 0.0 <= setup.late_share <= 1.0:
         wrong.append(f"a share of {setup.late_share:g} of the commands is late; allowed: 0 to 1")
-    if abs(setup.delay_steps * setup.step_s - setup.latency_s) > 1e-9:
+    if not abs(setup.delay_steps * setup.step_s - setup.latency_s) <= 1e-9:
         wrong.append(f"a latency of {setup.latency_s:g} s is no whole number of steps of {setup.step_s:g} s")
     if plants.effects is not None:
         wrong += _wrong_effects(plants.effects, (plants.count, plants.n))

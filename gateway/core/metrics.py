@@ -31,15 +31,20 @@ def rmse_per_span_n(tension_n: FloatArray, setpoint_n: FloatArray) -> FloatArray
 def settling_time_paper_s(time_s: FloatArray, tension_n: FloatArray, setpoint_n: FloatArray) -> float:
     """Eq. settling_time: from the start of the run until ||y - y_inf|| stays within 2 % of ||y_inf||; inf: never."""
     final = setpoint_n[-1]
-    outside = np.linalg.norm(tension_n - final, axis=1) > BAND * np.linalg.norm(final)
+    outside = ~(np.linalg.norm(tension_n - final, axis=1) <= BAND * np.linalg.norm(final))  # what is no number, too
     return _since(time_s, outside) + float(time_s[0])
 
 
 def settling_time_s(time_s: FloatArray, tension_n: FloatArray, setpoint_n: FloatArray, changed_s: float) -> FloatArray:
-    """Per span (n,), from the change at `changed_s` until it stays within 2 % of its set-point; inf: never."""
+    """Per span (n,), from the change at `changed_s` until it stays within 2 % of its set-point; inf: never.
+
+    What is no number is outside, and where there is no sample after the change nothing has settled.
+    """
     after = time_s >= changed_s
     final = setpoint_n[-1]
-    outside = np.abs(tension_n[after] - final) > BAND * final
+    if not after.any():
+        return np.full(len(final), inf)
+    outside = ~(np.abs(tension_n[after] - final) <= BAND * final)
     return np.array([_since(time_s[after], column) for column in outside.T])
 
 

@@ -47,7 +47,7 @@ def _beyond(name: str, old: Part, new: Part, share: float) -> str:
         if before.shape != after.shape:
             return f"{name} is {after.shape} in place of {before.shape}"
         change = relative(before, after)
-        return f"{name} differs by {change:.1%}, allowed: {share:.1%}" if change > share + SAME else ""
+        return f"{name} differs by {change:.1%}, allowed: {share:.1%}" if not change <= share + SAME else ""
     same = old is not None and new is not None and not isinstance(old, np.ndarray) and old == new
     return "" if same or old is new else f"{name} is {str(new)[:60]} in place of {str(old)[:60]}"
 
@@ -73,7 +73,7 @@ def _further(approved: Experiment, new: Experiment) -> list[str]:
     found = [
         f"{name} is {after:g} {unit}, in the approved {before:g}".replace("  ", " ")
         for name, before, after, unit in compared
-        if after > before
+        if not after <= before
     ]
     if any(speed not in of_speed[0] for speed in of_speed[1]):
         found.append(f"it goes to speeds {of_speed[1]} m/s, the approved to {of_speed[0]}")

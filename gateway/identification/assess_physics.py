@@ -59,7 +59,7 @@ def assess_physics(recording: Recording, line: Line, fits: Sequence[EquationFit]
     free = [fit for fit in fits if not _of(fit).channels() & suspects]
     still = [fit for fit in free if not moving(fit) and should_move(fit) and fit.explained < EXPLAINED]
     judged = [fit for fit in free if moving(fit) or fit.explained > SURE]
-    bad = {_of(fit) for fit in judged if fit.explained < EXPLAINED or _backwards(fit)}
+    bad = {_of(fit) for fit in judged if not fit.explained >= EXPLAINED or _backwards(fit)}  # NaN explains nothing
     swaps, left = _swaps(recording, line, bad | {_of(fit) for fit in still})
     found = [*swaps, *(_still(fit) for fit in still if _of(fit) in left)]
     frozen = {finding.where for finding in found}
@@ -148,7 +148,7 @@ def _trial(
         value, deviation, least, most = log_ratio(fit, line)
         margin = 1.96 * deviation + log(RANGE_MARGIN)
         worst = min(worst, fit.explained)
-        if fit.explained < EXPLAINED or not least - margin < value < most + margin:
+        if not fit.explained >= EXPLAINED or not least - margin < value < most + margin:
             return None
     return worst, pair, swapped, touched & bad
 

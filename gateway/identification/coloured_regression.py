@@ -1,5 +1,7 @@
 """Least squares of rows whose errors are a moving average of the first order, with a prior on one coefficient."""
 
+from math import inf, isnan
+
 import numpy as np
 from scipy.signal import lfilter
 
@@ -7,6 +9,11 @@ from gateway.core.signals import FloatArray
 
 COLOURS = (0.0, 0.1, 0.2, 0.3, 0.45, 0.6, 0.75, 0.85, 0.9, 0.94, 0.97, 0.98, 0.99, 0.995)
 VAGUE_S = 0.1  #: standard deviation of the prior of a span's leads: what nothing is known of stays near 0
+
+
+def least_known(cost: float) -> float:
+    """The cost, to be minimised: infinite where it is no number."""
+    return inf if isnan(cost) else float(cost)
 
 
 class Solved:
@@ -17,7 +24,8 @@ class Solved:
     ) -> None:
         self.y, self.table, self.weak = y, table, weak
         colours = COLOURS if colour is None else (colour,)
-        self.cost, self.colour = min((self._at(c)[2], c) for c in colours)
+        # What is no number is never the least: of tuples it would be, where it comes first.
+        self.cost, self.colour = min((least_known(self._at(c)[2]), c) for c in colours)
         self.solution, self.rows, _ = self._at(self.colour)
         self.p = table[0].shape[1]
         self.coefficients = self.solution[: self.p]

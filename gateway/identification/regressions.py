@@ -186,7 +186,8 @@ def fit_span(
     if sought:  # first both together, which is a shift of the tension, coarsely
         step = 0.5 * stretches[0].data.period_s
         shifts = step * np.arange(-np.floor(reach / step), np.floor(reach / step) + 1)
-        lead = min((Solved(y, table(np.full(2, d))[0], weak, 0.9).cost, abs(d), d) for d in shifts)[2] * np.ones(2)
+        tried = ((Solved(y, table(np.full(2, d))[0], weak, 0.9).cost, abs(d), d) for d in shifts)
+        lead = min(tried)[2] * np.ones(2)  # `Solved` has no cost that is no number
     found = Solved(y, table(lead)[0], weak, colour)
     prior = np.eye(2) / VAGUE_S**2
     for _ in range(2 if sought else 0):  # the leads are found for a colour, and the colour for leads
@@ -228,6 +229,7 @@ def _best_delay(
         delays.append((nearest - reach + j + part) * period_s - latency_s)
         costs.append(target @ target - along**2 / np.maximum(power, 1e-300))
     delay, cost = np.concatenate(delays), np.maximum(np.concatenate(costs), 1e-300)
+    cost = np.where(np.isnan(cost), np.inf, cost)  # `argmin` would choose what is no number
     likely = -0.5 * len(target) * np.log(cost / cost.min())
     inside = delay[likely > -0.5 * 1.96**2]
     deviation = max(float(inside.max() - inside.min()), period_s / _FINE) / (2.0 * 1.96)

@@ -6,7 +6,7 @@ that explains nothing costs the volume of prior that it excludes. Held-out likel
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from math import inf, sqrt
+from math import inf, isnan, sqrt
 
 import numpy as np
 
@@ -102,7 +102,7 @@ def choose(
     own = prior(replace(best.structure, per_roller=True))
     start = own.parameters.logs(best.fitted.parameters.theta(best.fitted.logs))
     candidates.append(_candidate(fit_stretches(best.fitted.stretches, own, best.fitted.noise, start=start), held))
-    candidates.sort(key=lambda candidate: -candidate.evidence)
+    candidates.sort(key=lambda candidate: -_known(candidate.evidence))
     chosen = _fewest(candidates)
     return Choice(candidates, chosen, _cautions(candidates, chosen, stretches, held or []))
 
@@ -113,13 +113,13 @@ def decided(choice: Choice, stretches: list[Stretch], held_out: list[Stretch]) -
     Evidence needs no data held back, and a part of them may be too little: rollers that are each some per cent off
     are taken for alike, whose radius is then wrong by more than they differ. `held_out` is what the part left out.
     """
-    best = max(candidate.evidence for candidate in choice.candidates)
+    best = max(_known(candidate.evidence) for candidate in choice.candidates)
     fits = {
         candidate.structure: fit_stretches(
             stretches, candidate.fitted.prior, candidate.fitted.noise, start=candidate.fitted.logs
         )
         for candidate in choice.candidates
-        if candidate is choice.chosen or candidate.evidence >= best - OPEN
+        if candidate is choice.chosen or _known(candidate.evidence) >= best - OPEN
     }
     chosen = _fewest(choice.candidates, {structure: fitted.evidence for structure, fitted in fits.items()})
     fitted = fits[chosen.structure]
@@ -133,7 +133,12 @@ def decided(choice: Choice, stretches: list[Stretch], held_out: list[Stretch]) -
 
 def _one_each(candidates: Sequence[Candidate]) -> list[Candidate]:
     """Of one structure from different beginnings the one with more evidence."""
-    return list({one.structure: one for one in sorted(candidates, key=lambda one: one.evidence)}.values())
+    return list({one.structure: one for one in sorted(candidates, key=lambda one: _known(one.evidence))}.values())
+
+
+def _known(evidence: float) -> float:
+    """The least where it is no number: neither sorting nor a maximum would say so."""
+    return -inf if isnan(evidence) else evidence
 
 
 def _candidate(fitted: Fit, held: list[Stretch] | None) -> Candidate:
@@ -149,7 +154,8 @@ def _fewest(candidates: list[Candidate], from_all: Mapping[Structure, float] | N
 
     `from_all`: the evidence of those that it is between, from all data.
     """
-    evidence = {one.structure: one.evidence for one in candidates} if from_all is None else from_all
+    given = {one.structure: one.evidence for one in candidates} if from_all is None else from_all
+    evidence = {structure: _known(one) for structure, one in given.items()}
     near = [one for one in candidates if evidence.get(one.structure, -inf) >= max(evidence.values()) - ENOUGH]
     return min(near, key=lambda one: (one.fitted.parameters.size, -evidence[one.structure]))
 

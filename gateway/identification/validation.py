@@ -116,7 +116,7 @@ def _judged(outputs: list[Output], normalised: float, together: float) -> tuple[
     low, high = NORMALISED
     if not low <= normalised <= high:
         findings.append(f"normalised innovation squared is {normalised:.2f}, {low} to {high} is valid")
-    loud = [output for output in outputs if output.normalised > EACH[1]]
+    loud = [output for output in outputs if not output.normalised <= EACH[1]]  # what is no number, too
     quiet = [output for output in outputs if output.normalised < EACH[0]]
     for word, some in (("larger", loud), ("smaller", quiet)):
         if some:
@@ -158,7 +158,7 @@ def _judge_noise(
             float((one.log_likelihood - predict(theta, as_expected, one.stretch).log_likelihood).sum())
             for one in predicted
         )
-        if gain > _INSISTS:
+        if not gain <= _INSISTS:
             findings.append(f"noise of {name.split('_')[0]} came out as {found:.2g} {unit}, {wanted:.2g} was expected")
             advice.append(
                 "the fit makes up for a wrong structure by noise, or a sensor is not what its data sheet says"

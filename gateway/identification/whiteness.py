@@ -52,7 +52,8 @@ def strongest_line(white: FloatArray, period_s: float, risk: float = 0.001) -> L
     if samples < 2 * LAGS:
         return None
     power = np.square(np.abs(np.fft.rfft(white - white.mean(axis=0), axis=0)))[1 : (samples - 1) // 2 + 1]
-    share = power / power.sum(axis=0)
+    whole = power.sum(axis=0)
+    share = np.divide(power, whole, out=np.zeros_like(power), where=whole > 0.0)  # of nothing, or NaN, no line
     row, output = (int(at) for at in np.unravel_index(int(np.argmax(share)), share.shape))
     greatest, ordinates = float(share[row, output]), len(share)
     if log(m * ordinates) + (ordinates - 1) * np.log1p(-greatest) > log(risk) or row == 0:

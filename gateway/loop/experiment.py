@@ -77,8 +77,11 @@ class ExperimentRun:
         if held:
             return ""
         away_n = np.abs(inputs.tension.value - self._base_n)
-        if np.count_nonzero(away_n > abort.deviation_n):
-            i = int(np.nanargmax(away_n))
+        beyond = ~(away_n <= abort.deviation_n)  # where it is no number, too
+        if np.count_nonzero(beyond):  # a span without a load cell never told anything: it is not missed
+            beyond &= (self._limits.measured > 0.0) | ~np.isnan(away_n)
+        if np.count_nonzero(beyond):
+            i = int(np.argmax(np.where(beyond, away_n, -np.inf)))  # what is no number goes first
             return (
                 f"the tension of span {i + 1} is {away_n[i]:.1f} N away from {self._base_n[i]:g} N, "
                 f"allowed: {abort.deviation_n:g} N"

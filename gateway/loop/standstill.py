@@ -26,9 +26,9 @@ class Standstill:
     def look(self, inputs: Inputs, asked: bool) -> bool:
         """Once a period. `asked`: a speed is wanted."""
         known = not asked and inputs.unwind_speed.good() and inputs.speed.good()
-        fastest = (
-            max(abs(inputs.unwind_speed.value.item(0)), float(np.abs(inputs.speed.value).max())) if known else np.inf
-        )
+        unwind, rollers = inputs.unwind_speed.value, inputs.speed.value
+        # Of numpy: Python's own maximum passes over what is no number; that does not stand.
+        fastest = float(np.abs(np.concatenate((unwind, rollers))).max()) if known else np.inf
         most = MOVES_M_PER_S if self._stands else machines.STANDSTILL_M_PER_S
         self._still = self._still + 1 if fastest <= most else 0
         self._stands = self._still * self._period_s >= STILL_S

@@ -41,6 +41,8 @@ def of_model(case: Case, model: LineModel, name: str = RULE) -> list[RuleFinding
     found = foretold_of(case, model, noise, MOST_S)
     names = channels(found[0].predicted.stretch)
     late_s, spread_s = lateness(theta_of(model), found)
+    if np.isnan([late_s, spread_s]).any():  # a channel that tells nothing is endless, not this
+        return [told(name, False, "the model's predictions run away, so that no channel can be compared with them")]
     known = np.flatnonzero(SURE * spread_s <= most_s)
     if not len(known):
         return [told(name, False, "the data do not tell whether channels are aligned: a longer or larger experiment")]
@@ -68,7 +70,7 @@ def lateness(theta: Theta, found: list[Foretold]) -> tuple[FloatArray, FloatArra
         gradient = gradient + (shown * white).sum(axis=(2, 3))
     with np.errstate(divide="ignore", invalid="ignore"):
         late, spread = gradient / information, 1.0 / np.sqrt(information)
-    late = np.where(information > 0.0, late, 0.0)
+    late = np.where(information == 0.0, 0.0, late)  # what is no number stays so
     more = (gradient * late).argmax(axis=0)[np.newaxis]
     return np.take_along_axis(late, more, axis=0)[0], np.take_along_axis(spread, more, axis=0)[0]
 

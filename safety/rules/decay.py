@@ -55,6 +55,8 @@ def decay_per_s(config: Controller, case: Case, theta: Theta, speed_m_per_s: flo
     if not np.isfinite(loop).all():
         return -np.inf
     radius = float(np.abs(np.linalg.eigvals(loop)).max())
+    if not radius < np.inf:  # numbers near the greatest there are: a minimum over plants would pass over NaN
+        return -np.inf
     return -log(max(radius, 1e-300)) / task.period_s
 
 

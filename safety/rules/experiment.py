@@ -58,9 +58,9 @@ def check_corners(case: Case) -> list[RuleFinding]:
         kept = kept[:CORNERS_MPC]
     found = rollouts(case.line, case.context.in_service, kept, asked, case.stress_noise, case.seed)
     lowest, highest = float(found.tension_min_n.min()), float(found.tension_max_n.max())
-    deviation = max(
-        float((case.tension_n - found.tension_min_n).max()), float((found.tension_max_n - case.tension_n).max())
-    )
+    # Of numpy: Python's own maximum passes over what is no number, where it does not come first.
+    away_n = np.maximum(case.tension_n - found.tension_min_n, found.tension_max_n - case.tension_n)
+    deviation = float(away_n.max())
     limits, abort_n = case.line.limits, case.experiment.abort.deviation_n
     fastest, envelope = float(found.roller_speed_max_m_per_s.max()), envelope_limits(case.line)
     # The monitor watches it, too, with what noise adds.

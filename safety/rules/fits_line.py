@@ -23,12 +23,12 @@ def _wrong(case: Case) -> Iterator[str]:
     line, config = case.line, case.controller
     if config.n != line.n:
         yield f"the controller is for {config.n} spans; allowed: {line.n}, as the line has"
-    if abs(config.period_s - line.control.period_s) > 1e-9:
+    if not abs(config.period_s - line.control.period_s) <= 1e-9:  # a number that is none does not fit
         yield (
             f"the controller's period is {config.period_s:g} s; allowed: that of the loop, {line.control.period_s:g} s"
         )
     most_s = PERIODS_OFF * line.control.period_s
-    if abs(config.latency_s - case.latency_s) > most_s + 1e-9:
+    if not abs(config.latency_s - case.latency_s) <= most_s + 1e-9:
         yield (
             f"the controller counts on a latency of {config.latency_s:g} s; allowed: within {most_s:g} s of the line's "
             f"{case.latency_s:g} s"
@@ -47,5 +47,5 @@ def _wrong_plan(case: Case, config: MpcConfig) -> Iterator[str]:
         ("torque_rate_nm_per_s", config.torque_rate_nm_per_s, limits.torque_rate_nm_per_s, "Nm/s"),
         ("tension_max_n", config.tension_max_n, limits.tension_max_n, "N"),
     ):
-        if planned > most * (1.0 + 1e-9):
+        if not planned <= most * (1.0 + 1e-9):
             yield f"the controller plans with {name} {planned:g} {unit}; allowed: up to the line's {most:g} {unit}"

@@ -54,7 +54,7 @@ def _wrong_time(case: Case) -> Iterator[str]:
         yield f"it has expired: expires is {proposal.expires}, now is {case.context.now}"
     if created > now:
         yield f"it comes from the future: created is {proposal.created}, now is {case.context.now}: look at the clocks"
-    if (expires - created).total_seconds() > most_s:
+    if not (expires - created).total_seconds() <= most_s:
         yield (
             f"it would stand for {(expires - created).total_seconds():g} s; allowed: gate.expiry_max_s, {most_s:g} s"
         )

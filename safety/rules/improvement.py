@@ -2,6 +2,8 @@
 baseline, so that many small steps do not walk away.
 """
 
+from math import inf, isnan
+
 from gateway.core.deployment import Region
 from gateway.core.line import Gate
 from gateway.core.verdict import RuleFinding
@@ -82,5 +84,6 @@ def _worst(
 
 
 def _excess(value: float, limit: float) -> float:
-    """By how much it is too large; where both have no end, not at all."""
-    return 0.0 if value == limit else value - limit
+    """By how much it is too large; where both have no end, not at all. What is no number is the worst there is."""
+    excess = 0.0 if value == limit else value - limit
+    return inf if isnan(excess) else excess

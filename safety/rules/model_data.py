@@ -21,7 +21,7 @@ def check(case: Case) -> list[RuleFinding]:
         ))]  # fmt: skip
     region, fastest = case.model.region, max(part.speed_m_per_s for part in case.excited)
     near = fastest + max(SAME_SPEED * fastest, SAME_M_PER_S)
-    if region.speed_to_m_per_s > near:
+    if not region.speed_to_m_per_s <= near:
         text = f"the model says that it was made up to {region.speed_to_m_per_s:.3g} m/s; the data go to {fastest:.3g}"
         return [*found, told(RULE, False, f"{text} m/s")]
     return [*found, told(RULE, True, f"{len(case.excited)} parts of recordings tell, up to {fastest:.3g} m/s")]

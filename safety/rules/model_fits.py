@@ -29,7 +29,7 @@ def _wrong_names(case: Case, model: LineModel) -> Iterator[str]:
         yield f"the model is of {model.site}/{model.line}; allowed: this line, {line.site}/{line.line}"
     if model.n != line.n:
         yield f"the model has {model.n} spans; allowed: {line.n}, as the line"
-    if abs(model.data.period_s - line.control.period_s) > 1e-9:
+    if not abs(model.data.period_s - line.control.period_s) <= 1e-9:
         yield f"the model's data have a period of {model.data.period_s:g} s; allowed: {line.control.period_s:g} s"
 
 
@@ -55,13 +55,13 @@ def _out_of_tolerance(case: Case, model: LineModel) -> Iterator[str]:
 def _wrong_rest(case: Case, model: LineModel) -> Iterator[str]:
     line, given = case.line, model.parameters
     most_nm = COULOMB_SHARE * line.limits.torque_nm
-    if max(given.coulomb_nm) > most_nm:
+    if not all(one <= most_nm for one in given.coulomb_nm):
         yield f"Coulomb friction is {max(given.coulomb_nm):.3g} Nm; allowed: up to {most_nm:g} Nm"
-    if given.torque_lag_s > LONGEST_LAG_S:
+    if not given.torque_lag_s <= LONGEST_LAG_S:
         yield f"the torque's lag is {given.torque_lag_s:g} s; allowed: up to {LONGEST_LAG_S:g} s"
     known_s = line.control.latency_s if case.context.latency_s is None else case.context.latency_s
     near_s = PERIODS_LATE * line.control.period_s
-    if abs(given.latency_s - known_s) > near_s + 1e-9:
+    if not abs(given.latency_s - known_s) <= near_s + 1e-9:
         yield f"the latency is {given.latency_s:g} s; allowed: within {near_s:g} s of {known_s:g} s"
     if (given.tension_before_n, given.tension_after_n) != (line.web.tension_before_n, line.web.tension_after_n):
         yield (

@@ -12,7 +12,7 @@ and P the precision of the tolerances in the line's file:
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from math import log, sqrt
+from math import inf, isfinite, isnan, log, sqrt
 
 import numpy as np
 
@@ -63,6 +63,8 @@ def check_sureness(case: Case) -> list[RuleFinding]:
     look, names, covariance = look_at(case), *stated(case.model)
     information, gradient = derivatives(look, names)
     scale = max(normalised(look.found), 1.0)  # what the noise does not explain is noise as well
+    if not isfinite(scale):  # divided by it, any shift would be none
+        return [told(SHIFT, False, "the model's predictions of the data run away: they say nothing of its numbers")]
     supported = np.linalg.inv(information / scale + prior_precision(case.line, names))
     step = -supported @ gradient / scale
     shift = float(step @ np.linalg.solve(covariance + supported, step))
@@ -94,7 +96,8 @@ def check_noise(case: Case) -> list[RuleFinding]:
         for name in vars(look.noise)
         for way, factor in (("larger", NOISE_FACTOR), ("smaller", 1.0 / NOISE_FACTOR))
     }
-    (name, way), gain = max(gains.items(), key=lambda each: each[1])
+    # What is no number is the greatest: a maximum would pass over it.
+    (name, way), gain = max(gains.items(), key=lambda each: inf if isnan(each[1]) else each[1])
     text = (
         f"with noise.{name} {NOISE_FACTOR:g} times {way} than {getattr(look.noise, name):.3g} the data are likelier by "
         f"{gain:.3g} in the logarithm; allowed: up to {INSISTS:g}"

@@ -48,9 +48,10 @@ def _safe(case: Case) -> RuleFinding:
     torque = rate = 0.0
     for course in improvement_courses(judged_of(case)).values():
         run = simulate(case.controller, plants_of_thetas([case.believed]), course, free)
-        torque = max(torque, float(run.torque_max_nm.max()))
-        rate = max(rate, float(run.torque_step_max_nm.max()) / period_s)
-    share = max(torque / limits.torque_nm, rate / limits.torque_rate_nm_per_s)
+        # Of numpy: Python's own maximum passes over what is no number.
+        torque = float(np.maximum(torque, run.torque_max_nm.max()))
+        rate = float(np.maximum(rate, run.torque_step_max_nm.max() / period_s))
+    share = float(np.maximum(torque / limits.torque_nm, rate / limits.torque_rate_nm_per_s))
     text = (
         f"C_safe: the law asks for up to {torque:.1f} Nm and {rate:.0f} Nm/s; allowed: {limits.torque_nm:g} Nm and "
         f"{limits.torque_rate_nm_per_s:g} Nm/s"

@@ -57,7 +57,7 @@ def check(case: Case) -> list[RuleFinding]:
     if programme.fails_in_small(case):
         return [told(RULE, False, "not looked at: it is refused for its small moves already")]
     found, limits = steps_let(case), envelope_limits(case.line)
-    if not all(np.isfinite(list(found.share.values()))):
+    if not found.share or not all(np.isfinite(list(found.share.values()))):
         return [told(RULE, False, _too_quick(case, "no step at all"))]
     alone = [share for name, share in found.share.items() if SLOW_ALONE in name]
     single = case.tension_step_n * min(alone, default=1.0)
@@ -156,7 +156,9 @@ def _looks(case: Case) -> tuple[Fastest, Fastest]:
 
 
 def _greatest(found: Rollouts) -> float:
-    return float(found.roller_speed_max_m_per_s.max())
+    """Infinite where one is no number: a maximum over courses would pass over it."""
+    greatest = float(found.roller_speed_max_m_per_s.max())
+    return np.inf if np.isnan(greatest) else greatest
 
 
 def _too_quick(case: Case, what: str) -> str:

@@ -30,7 +30,9 @@ def of_model(case: Case, model: LineModel, name: str = RULE) -> list[RuleFinding
     if not case.excited:
         return [told(name, False, _asks_for_data(case))]
     found = foretold_of(case, model, noise)
-    return [_at_speed(case, speed, of, name) for speed, of in by_speed(found)]
+    return [_at_speed(case, speed, of, name) for speed, of in by_speed(found)] or [
+        told(name, False, "no data were seen")
+    ]
 
 
 def _at_speed(case: Case, speed: float, found: list[Foretold], name: str) -> RuleFinding:

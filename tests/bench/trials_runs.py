@@ -23,7 +23,7 @@ from gateway.core.line import Line
 from gateway.core.messages import Command, Reply
 from gateway.core.proposal import GainsChange, Proposal, canonical, proposal_hash
 from gateway.core.recording import Recording
-from gateway.core.signals import Inputs
+from gateway.core.signals import Inputs, Quality
 from gateway.core.states import Phase
 from gateway.core.telemetry import Frame, unpack
 from gateway.core.verdict import line_hash
@@ -69,7 +69,7 @@ class LateLink(MemoryLink):
                 channel.value[i], channel.time_s[i] = value[i], time_s[i]
                 channel.miss(int(i))
         if late[1]:
-            inputs.plc.quality = 1
+            inputs.plc.quality = Quality.STALE
 
 
 class Around(LineSurroundings):
@@ -142,15 +142,14 @@ def draw_bad(line: Line, seed: int) -> tuple[Case, str, Controller, Truth]:
     law = ("lqi", "lqg", "pid", "lqr")[int(generator.integers(4))]
     kinds = QUIET if generator.uniform() < 0.75 else KINDS
     kind, severity = kinds[int(generator.integers(len(kinds)))], float(generator.uniform())
-    least, most = 0.0, 1.0
-    for left in reversed(range(TRIES)):
+    least, most, tries = 0.0, 1.0, 1
+    while True:
         config = _spoilt(case, law, kind, severity, np.random.default_rng([seed, 5]))
         truth = truth_of(case, config)
-        if not left or (truth.share >= BAD and truth.share != np.inf):
-            break
+        if tries == TRIES or (truth.share >= BAD and truth.share != np.inf):
+            return case, kind, config, truth
         least, most = (least, severity) if truth.share == np.inf else (severity, most)
-        severity = 0.5 * (least + most)
-    return case, kind, config, truth
+        severity, tries = 0.5 * (least + most), tries + 1
 
 
 def _spoilt(case: Case, law: str, kind: str, severity: float, generator: np.random.Generator) -> Controller:
@@ -192,10 +191,13 @@ def _spoilt(case: Case, law: str, kind: str, severity: float, generator: np.rand
     return config.model_copy(update={name: gain.tolist() for name, gain in gains.items()})
 
 
-def truth_of(case: Case, config: Controller) -> Truth:
-    """Alone on the line, on wires on which nothing is late; nobody looks after it."""
+def truth_of(case: Case, config: Controller, late: float = 0.0) -> Truth:
+    """Alone on the line, where a share of answers is late; nobody looks after it."""
     line, period_s = case.line, case.line.control.period_s
     loop = SteppedLoop(line, config, case.plant, case.seed)
+    if late:
+        loop.cycle.links[0] = LateLink(line, loop.truth, late, np.random.default_rng([case.seed, 6]))
+        loop.cycle.limits = replace(loop.cycle.limits, hold_periods=NEVER)
     loop.begin_in_production(TENSION_N, SPEED_M_PER_S)
     while loop.periods * period_s < ALONE_S:
         loop.step(round(1.0 / period_s))
@@ -261,11 +263,11 @@ class TrialRun:
         assert not misfits(self._config, self._line)
         await self._deployer.watch()
         await self._pass_time(BEFORE_S)
-        for refused in range(MOST_REFUSED + 1):
-            entry = await self._propose(refused)
-            if entry.stage is not Stage.NOT_DEPLOYED or not self._runs():
-                break
+        refused, entry = 0, await self._propose(0)
+        while entry.stage is Stage.NOT_DEPLOYED and refused < MOST_REFUSED and self._runs():
             await self._pass_time(LOOK_S)
+            refused += 1
+            entry = await self._propose(refused)
         began_s = self._loop.now_s
         while self._loop.now_s < lasting_s and entry.stage is Stage.PROBATION and self._runs():
             await self._pass_time(LOOK_S)

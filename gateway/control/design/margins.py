@@ -43,12 +43,13 @@ def margins(config: Controller, task: DesignTask) -> Margins:
     nodes = config.speed_m_per_s
     speeds = [*nodes, *(0.5 * (low + high) for low, high in pairwise(nodes))]
     each = [_margins(law_at(config, v), replace(task, unwind_speed_m_per_s=v)) for v in speeds]
+    # Of numpy: Python's own extremes pass over what is no number, where it does not come first.
     return Margins(
-        spectral_radius=max(found.spectral_radius for found in each),
-        decay_per_s=min(found.decay_per_s for found in each),
-        delay_margin_s=min(found.delay_margin_s for found in each),
-        chatter_nm=max(found.chatter_nm for found in each),
-        noise_floor_n=max(found.noise_floor_n for found in each),
+        spectral_radius=float(np.max([found.spectral_radius for found in each])),
+        decay_per_s=float(np.min([found.decay_per_s for found in each])),
+        delay_margin_s=float(np.min([found.delay_margin_s for found in each])),
+        chatter_nm=float(np.max([found.chatter_nm for found in each])),
+        noise_floor_n=float(np.max([found.noise_floor_n for found in each])),
     )
 
 
@@ -75,7 +76,7 @@ def require_margin(found: Margins, least_s: float = LEAST_DELAY_MARGIN_S) -> Non
     """Raises DesignRefused for a loop that may not be offered."""
     if not found.spectral_radius < 1.0:
         raise DesignRefused(f"the loop is unstable: its spectral radius is {found.spectral_radius:.4f}")
-    if found.delay_margin_s < least_s:
+    if not found.delay_margin_s >= least_s:
         raise DesignRefused(
             f"the loop stands only {1e3 * found.delay_margin_s:.1f} ms more delay, at least {1e3 * least_s:g} ms are "
             f"needed: more weight on torque, a slower disturbance estimate, or less latency"

@@ -191,7 +191,7 @@ def _torque_reasons(task: DesignTask) -> list[str]:
     return [
         f"roller {i + 1} needs {torque[i]:.1f} Nm to keep {speed:g} m/s, the limit is {task.limits.torque_nm:g} Nm: "
         f"a greater torque limit, or a lower speed"
-        for i in np.flatnonzero(np.abs(torque) >= task.limits.torque_nm)
+        for i in np.flatnonzero(~(np.abs(torque) < task.limits.torque_nm))  # what is no number holds nothing
     ]
 
 
