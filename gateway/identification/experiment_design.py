@@ -53,7 +53,7 @@ class Wanted:
         return self.strong if name in STRONG else self.rest
 
     def missed(self, widths: Mapping[str, float]) -> dict[str, float]:
-        return {name: width for name, width in widths.items() if width > self.of(name)}
+        return {name: width for name, width in widths.items() if not width <= self.of(name)}  # what is no number, too
 
     def text(self) -> str:
         return f"{percent(self.strong)} of EA/L, R/J and f/J, {percent(self.rest)} of the rest"
@@ -229,11 +229,12 @@ class _Drawing:
     def lack(self, told: Sequence[_Told], amplitude_n: float, duration_s: float) -> float:
         """The widest interval, in units of what is wanted of it: 1 or less is enough."""
         every = [self.widths(one, amplitude_n, duration_s) for one in told]
-        return max(width / self.wanted.of(name) for widths in every for name, width in widths.items())
+        # Of numpy: Python's own maximum passes over what is no number, where it does not come first.
+        return float(np.max([width / self.wanted.of(name) for widths in every for name, width in widths.items()]))
 
     def least_amplitude(self, told: Sequence[_Told], most_n: float, duration_s: float = PREFERRED_S) -> float:
         """On its grid; infinity where the greatest is not enough."""
-        if self.lack(told, most_n, duration_s) > 1.0:
+        if not self.lack(told, most_n, duration_s) <= 1.0:
             return inf
         low, high = 0, round(most_n / GRID_N)  # too little, enough
         while high - low > 1:

@@ -89,10 +89,10 @@ class Foresight:
     def needs_nm(self, speed_m_per_s: float) -> float:
         """The greatest torque that a line within the tolerances takes at a speed."""
         speeds = [reference_speeds(model, self.base_n, speed_m_per_s) for model in self.models]
-        return max(
-            float(np.abs(equilibrium_torque(model, self.base_n, speed)).max())
-            for model, speed in zip(self.models, speeds, strict=True)
-        )
+        torques = [
+            equilibrium_torque(model, self.base_n, speed) for model, speed in zip(self.models, speeds, strict=True)
+        ]
+        return float(np.abs(torques).max())
 
     @property
     def needs_change_n(self) -> float:
