@@ -19,7 +19,10 @@ from pymodbus.client import AsyncModbusTcpClient
 from pymodbus.exceptions import ConnectionException, ModbusException
 from pymodbus.pdu import ModbusPDU
 
+from drivers.receive_buffer import ReceiveBuffer
+
 CONNECT_TIMEOUT_S = 0.5
+RECEIVE_BYTES = 2048  #: at a time; a frame has 260 at most, and pymodbus keeps 516
 
 _HEAD = struct.Struct(">HHHB")  #: of a frame: transaction, protocol (0), bytes from the unit on, unit
 _EXCEPTION = 0x80  #: in a function code
@@ -86,7 +89,12 @@ class ModbusConnection:
             self._host, port=self._port, timeout=CONNECT_TIMEOUT_S, retries=0, reconnect_delay=0
         )
         self._receive_with(self._client)
-        return await self._client.connect()
+        if not await self._client.connect():
+            return False
+        transport = self._client.ctx.transport
+        if isinstance(transport, asyncio.Transport):
+            transport.set_protocol(ReceiveBuffer(self._client.ctx, RECEIVE_BYTES))
+        return True
 
     def close(self) -> None:
         """Drop the connection at once, and with it what the other side has not taken yet. Idempotent."""

@@ -39,6 +39,8 @@ class ProcessChannel:
         self._priority = max(1, loop_priority - _PRIORITY_BELOW_LOOP)
         self._control: socket.socket | None = None  #: to the spawner
         self._socket: socket.socket | None = None  #: to the worker
+        # One that stays: room for a whole message, asked for and given back each cycle, leaves the heap in pieces.
+        self._received = memoryview(bytearray(MAX_MESSAGE))
         self._loop: asyncio.AbstractEventLoop | None = None
         self._generation = 0
         self._started_s = 0.0
@@ -138,16 +140,16 @@ class ProcessChannel:
             if self._socket is None:
                 return
             try:
-                message = self._socket.recv(MAX_MESSAGE)
+                length = self._socket.recv_into(self._received)
             except BlockingIOError:
                 return
             except OSError as error:
                 self._lose(f"the OPC UA process is gone: {error}")
                 return
-            if not message:
+            if not length:
                 self._lose("the OPC UA process has ended")
                 return
-            self._on_message(message)
+            self._on_message(bytes(self._received[:length]))
 
     def _on_message(self, message: bytes) -> None:
         try:

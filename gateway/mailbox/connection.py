@@ -35,8 +35,16 @@ def dial(path: Path) -> socket.socket:
     return connecting
 
 
+def receive_buffer() -> memoryview:
+    """Room for one datagram of any connection in this thread. One octet more tells one that is too long."""
+    return memoryview(bytearray(MAX_DATAGRAM + 1))
+
+
 class Connection:
-    """Owns a connected, non-blocking socket until `close`. `receive` gets every well-formed envelope."""
+    """Owns a connected, non-blocking socket until `close`. `receive` gets every well-formed envelope.
+
+    `buffer`: see `receive_buffer`; what is received is copied out of it at once, so that all may share one.
+    """
 
     __slots__ = (
         "_buffer",
@@ -60,6 +68,7 @@ class Connection:
         counters: Counters,
         receive: Callable[["Connection", Envelope], None],
         closed: Callable[["Connection"], None],
+        buffer: memoryview,
     ) -> None:
         connected.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
         pid, uid, _ = _UCRED.unpack(connected.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _UCRED.size))
@@ -71,7 +80,7 @@ class Connection:
         self._counters = counters
         self._receive = receive
         self._closed = closed
-        self._buffer = bytearray(MAX_DATAGRAM + 1)
+        self._buffer = buffer
         self._in_window = 0
         self._window_end_s = 0.0
         self._resume: asyncio.TimerHandle | None = None
@@ -115,7 +124,7 @@ class Connection:
             if length == 0:
                 self.close()
                 return
-            self._take(bytes(memoryview(self._buffer)[:length]))
+            self._take(bytes(self._buffer[:length]))
             if not self.open or self._too_many():
                 return
 

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from gateway.core.topics import Topic
 from gateway.mailbox.codec import Envelope, Kind, MalformedEnvelope, encode
-from gateway.mailbox.connection import Connection, dial
+from gateway.mailbox.connection import Connection, dial, receive_buffer
 from gateway.mailbox.listener import Listener, accept_all, check_path
 from gateway.mailbox.port import (
     MAX_PAYLOAD,
@@ -49,6 +49,7 @@ class UnixMailbox:
         self._servers: dict[str, RequestHandler] = {}
         self._answering: set[asyncio.Task[None]] = set()
         self._ids = count(1)
+        self._buffer = receive_buffer()
 
     async def listen(self, path: Path) -> None:
         """Take connections on `path`. Raises PathTooLong, AlreadyRunning, CannotListen (see `listener`)."""
@@ -122,10 +123,13 @@ class UnixMailbox:
             self.counters.refused += 1
             accepted.close()
             return
-        self._accepted.add(Connection(accepted, self.counters, self._receive, self._accepted.discard))
+        self._accepted.add(self._connection(accepted, self._accepted.discard))
+
+    def _connection(self, connected: socket.socket, closed: Callable[[Connection], None]) -> Connection:
+        return Connection(connected, self.counters, self._receive, closed, self._buffer)
 
     def _dial(self, path: Path) -> Connection:
-        connection = Connection(dial(path), self.counters, self._receive, partial(self._lost, path))
+        connection = self._connection(dial(path), partial(self._lost, path))
         self._dialled[path] = connection
         self.counters.connects += 1
         return connection

@@ -5,6 +5,7 @@ import os
 import signal
 import socket
 import stat
+import tracemalloc
 from collections.abc import AsyncIterator, Callable, Coroutine
 from contextlib import asynccontextmanager, suppress
 from pathlib import Path
@@ -18,6 +19,8 @@ from gateway.mailbox.listener import AlreadyRunning, CannotListen, PathTooLong
 from gateway.mailbox.port import MAX_PAYLOAD, PEER, Peer, RemoteError, Unreachable
 from gateway.mailbox.unix import MAX_CONNECTIONS, MAX_IN_FLIGHT, RECONNECT_S, UnixMailbox
 from tests.unit.supervisor_support import child, short_folder, until
+
+CROWD = 10
 
 
 class Clock:
@@ -437,5 +440,28 @@ def test_a_living_socket_of_a_program_that_takes_no_lock_is_refused_too() -> Non
                 with pytest.raises(AlreadyRunning, match="no lock"):
                     await mailbox.listen(folder / "g")
             await mailbox.listen(folder / "g")
+
+    run(story)
+
+
+def test_connections_share_the_room_for_what_they_receive() -> None:
+    """A longest message fits; connections by the dozen need not each hold room for one."""
+
+    async def story(folder: Path) -> None:
+        async with mailboxes(1 + CROWD) as (server, *clients):
+            server.serve(LOOP_COMMAND, echo)
+            await server.listen(folder / "loop.sock")
+            tracemalloc.start()
+            try:
+                before_bytes, _ = tracemalloc.get_traced_memory()
+                for number, client in enumerate(clients):
+                    client.connect({LOOP_COMMAND}, folder / "loop.sock")
+                    word = str(number).encode()
+                    assert await client.request(LOOP_COMMAND, word, 5.0) == word
+                held_bytes = tracemalloc.get_traced_memory()[0] - before_bytes
+            finally:
+                tracemalloc.stop()
+            assert held_bytes < MAX_PAYLOAD
+            assert await clients[0].request(LOOP_COMMAND, bytes(MAX_PAYLOAD), 5.0) == bytes(MAX_PAYLOAD)
 
     run(story)
