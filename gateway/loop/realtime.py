@@ -50,6 +50,11 @@ def stay_awake() -> str:
 
 
 def freeze_collector() -> None:
-    """Take everything that lives after start-up out of garbage collection: a pause of 43 ms becomes none."""
+    """Take everything that lives after start-up out of garbage collection: a pause of 43 ms becomes none.
+
+    What is made from now on is collected. The collection after freezing finds next to nothing, and notes so: without
+    it, all generations are looked at only once a quarter of what was frozen has been added, some 26,000 objects.
+    """
     gc.collect()
     gc.freeze()
+    gc.collect()

@@ -70,6 +70,7 @@ async def serve(line: Line, run_folder: Path, data_folder: Path) -> None:
         print(f"operator of {line.site}/{line.line}: {', '.join(way.name for way in ways)}", flush=True)
         gc.collect()
         gc.freeze()  # half a million nodes and references that stay: to look through them takes 0.15 s each time
+        gc.collect()  # else all generations are looked at only once a quarter of that has been added
         works = [side.watch(), access.run(), page.keep(), opcua.keep()]
         if line.operator.anonymous == "none":
             works.append(_tell_whether_anybody_can_come_in(users))
