@@ -190,7 +190,7 @@ class Session:
                 numbers = self.unit.plan.decode_bytes((answer,))
                 outcome = self.unit.take_settings(numbers, judged=self._judged and self.unit.standing.active)
             except ValueError as error:
-                outcome = error
+                outcome = error.with_traceback(None)  # which holds this frame, which holds the error
         else:
             outcome = answer
         self._conclude(outcome)
@@ -201,7 +201,7 @@ class Session:
         try:
             outcome = await self._ask(payloads, self._deadline_s)
         except (ModbusFailed, ValueError) as error:
-            outcome = error
+            outcome = error.with_traceback(None)  # as above
         except BaseException:
             self._on_done(self)
             raise

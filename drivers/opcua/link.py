@@ -158,11 +158,11 @@ class OpcUaLink:
     async def collect(self, inputs: Inputs, deadline_s: float) -> None:
         """What has come by `deadline_s`."""
         if self._open and not self._complete.is_set():
+            over = asyncio.get_running_loop().call_at(deadline_s, self._complete.set)
             try:
-                async with asyncio.timeout_at(deadline_s):
-                    await self._complete.wait()
-            except TimeoutError:
-                pass
+                await self._complete.wait()
+            finally:
+                over.cancel()
         self._open = 0
         absent: list[str] = []
         for device in self._devices:

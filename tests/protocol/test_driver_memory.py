@@ -1,8 +1,10 @@
 """How much room the drivers ask for to receive a cycle's few bytes, and what a missed deadline leaves behind."""
 
 import asyncio
+import gc
 import socket
 import threading
+import time
 import tracemalloc
 from collections.abc import Callable, Coroutine, Iterator
 from contextlib import contextmanager, suppress
@@ -11,10 +13,14 @@ from typing import Any
 import pytest
 
 from drivers.modbus.client import ModbusConnection, ModbusFailed
+from drivers.modbus.link import ModbusLink
+from drivers.opcua.link import OpcUaLink
 from drivers.opcua.messages import Answer, Outcome, Plan, Question
 from drivers.opcua.process import ProcessChannel
 from drivers.receive_buffer import ReceiveBuffer
-from tests.protocol.driver_support import until
+from gateway.core.signals import Inputs
+from tests.protocol.driver_support import Registers, cycle, frame, until
+from tests.protocol.modbus_support import bench as modbus_bench
 
 CYCLES = 20
 FEW_BYTES = 16_384  #: what a handful of cycles may need at once; asyncio alone asks for 262,144 a receipt
@@ -147,3 +153,87 @@ async def _ask(channel: ProcessChannel, answers: list[Answer]) -> None:
     deadline_s = asyncio.get_running_loop().time() + 5.0
     assert channel.ask(Question(number, 0, deadline_s, deadline_s, False, (), ()))
     await until(lambda: len(answers) == number)
+
+
+@contextmanager
+def garbage() -> Iterator[list[object]]:
+    """What only a collection of cycles finds of the time within; complete after it."""
+    found: list[object] = []
+    gc.collect()
+    gc.disable()
+    try:
+        yield found
+        gc.set_debug(gc.DEBUG_SAVEALL)
+        gc.collect()
+        found += gc.garbage
+    finally:
+        gc.set_debug(0)
+        gc.garbage.clear()
+        gc.enable()
+
+
+def test_an_exchange_that_fails_leaves_no_garbage() -> None:
+    """The error must not stay in a frame that it went through: it holds that frame. It comes each cycle."""
+
+    async def body(link: ModbusLink, peer: Registers) -> None:
+        async def mute(head: bytes, unit: int, pdu: bytes) -> list[bytes]:
+            return []
+
+        async def refuse(head: bytes, unit: int, pdu: bytes) -> list[bytes]:
+            return [frame(head, unit, bytes((pdu[0] | 0x80, 2)))]
+
+        inputs = Inputs(2)
+        peer.script = mute
+        while not link.health.reconnects:
+            await cycle(link, inputs)
+            await asyncio.sleep(0)  # a cycle without a connection waits for nothing
+        peer.script = refuse  # what proves the devices on a new connection: exchanges of several requests
+        await cycle(link, inputs)
+        with garbage() as found:
+            refused = link.health.malformed
+            while link.health.malformed < refused + CYCLES:
+                await cycle(link, inputs)
+                await asyncio.sleep(0)
+        assert not [one for one in found if isinstance(one, ModbusFailed)]
+
+    modbus_bench(body)
+
+
+class Mute:
+    """A `drivers.opcua.channel.Channel` that takes questions and answers none."""
+
+    def __init__(self) -> None:
+        self.up = asyncio.Event()
+        self.asked = 0
+
+    def start(self, on_answer: Callable[[Answer], None], on_lost: Callable[[str], None]) -> None: ...
+
+    def tend(self, now_s: float) -> None: ...
+
+    def give_up(self, why: str) -> None: ...
+
+    def ask(self, question: Question) -> bool:
+        self.asked += 1
+        return True
+
+    async def close(self) -> None: ...
+
+
+def test_a_cycle_of_opcua_that_is_not_answered_ends_at_its_deadline_and_leaves_no_garbage() -> None:
+    async def story() -> None:
+        channel, inputs = Mute(), Inputs(2)
+        link = OpcUaLink("server", "opc.tcp://127.0.0.1:1", [], channel, 0.01)
+        loop = asyncio.get_running_loop()
+        with garbage() as found:
+            link.trigger(loop.time())
+            deadline_s = loop.time() + 0.01
+            await link.collect(inputs, deadline_s)
+            assert channel.asked == 1 and loop.time() >= deadline_s - loop_resolution_s()
+        assert not found
+
+    run(story)
+
+
+def loop_resolution_s() -> float:
+    """How much too early a timer of an event loop may be."""
+    return time.get_clock_info("monotonic").resolution + 1e-3
