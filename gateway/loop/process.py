@@ -17,6 +17,7 @@ from gateway.core.topics import LOOP_BUSES, LOOP_COMMAND, LOOP_EVENT, LOOP_TELEM
 from gateway.loop.arming import release_links
 from gateway.loop.cycle import Cycle
 from gateway.loop.kept import Kept, Store, fingerprint
+from gateway.loop.memory import RestCollector
 from gateway.loop.pacer import TimerPacer, monotonic
 from gateway.loop.realtime import become_punctual, freeze_collector, stay_awake
 from gateway.loop.runner import Runner
@@ -125,9 +126,11 @@ async def _open(links: list[Link]) -> list[str]:
 async def run_until(runner: Runner, line: Line, ending: asyncio.Event, store: Store | None = None) -> None:
     """Periods until `ending`, then until the line rests. An exception ends it with torque off, and is raised."""
     cycle, pacer = runner.cycle, TimerPacer(line.control.period_s)
+    collector = RestCollector()
     try:
         while not ending.is_set():
             await runner.period(await pacer.wait())
+            collector.note_phase(runner.cycle.machine.phase)
         await runner.end()
         deadline_s = monotonic() + line.longest_stop_s
         resting = 0  # periods; what is handed over acts with the next, and the drives say so with the one after
