@@ -91,7 +91,7 @@ bench-faults: $(VENV)/.compiled ## every fault 200 times in virtual time, 5 time
 bench-fuzz: setup ## a million hostile frames through each decoder (ARGS="--frames 100000")
 	@$(PY) -m tests.bench.fuzz $(ARGS)
 
-bench-soak: $(VENV)/.compiled ## an hour of a line on three wires, with something going wrong each minute (ARGS="--minutes 10")
+bench-soak: $(VENV)/.compiled ## an hour of a line on three wires, with something going wrong each minute (ARGS="--storm --minutes 10")
 	@$(PY) -m tests.bench.soak $(ARGS)
 
 bench-audit: setup ## the audit: a thousand kills of its writer, ten thousand damages (about 15 min)
