@@ -59,7 +59,7 @@ class DaqpSolver:
         reached = self._reached.dot(x)
         np.subtract(lower, reached, out=self._lower)
         np.subtract(upper, reached, out=self._upper)
-        if self._lower.max() <= TOLERANCE and self._upper.min() >= -TOLERANCE:  # neither is true of nan
+        if np.maximum.reduce(self._lower) <= TOLERANCE and np.minimum.reduce(self._upper) >= -TOLERANCE:  # not of nan
             solution = np.zeros(len(self._scale))
             solution[: self._torques] = reached[: self._torques]
             return solution, NO_LIMIT

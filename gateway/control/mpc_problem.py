@@ -71,6 +71,8 @@ class MpcProblem:
         self._upper = np.empty_like(self._lower)
         self._lower[1], self._upper[1] = -reach_nm.reshape(-1, n), reach_nm.reshape(-1, n)
         self._reach_nm: FloatArray = reach_nm[:n]
+        self._limits = (self._lower.reshape(-1), self._upper.reshape(-1))  # the same numbers
+        self._setpoints = b""  #: that the limits of tensions belong to: they move rarely
         self._clear_n = CLEAR * (config.tension_max_n - config.tension_min_n)
 
     def gain(self) -> FloatArray:
@@ -92,16 +94,16 @@ class MpcProblem:
         config, lower, upper = self._config, self._lower, self._upper
         shift = found.errors.torque_nm - found.disturbance_nm  # u = w + shift
         lower[0], upper[0] = -config.torque_nm - shift, config.torque_nm - shift
-        taken_nm = found.bump_nm  # what was taken over is added to the first torque
-        lower[0, 0] -= taken_nm
-        upper[0, 0] -= taken_nm
-        begin_nm = applied_nm - shift - taken_nm
+        first = shift + found.bump_nm  # what was taken over is added to the first torque
+        lower[0, 0], upper[0, 0] = -config.torque_nm - first, config.torque_nm - first
+        begin_nm = applied_nm - first
         lower[1, 0], upper[1, 0] = begin_nm - self._reach_nm, begin_nm + self._reach_nm
-        if self.limited:
+        if self.limited and (setpoints := tension_setpoint_n.tobytes()) != self._setpoints:
             # A set-point beyond what is planned for is held all the same, and a slack web is tensioned.
             lower[2] = np.minimum(config.tension_min_n - tension_setpoint_n, -self._clear_n)
             upper[2] = np.maximum(config.tension_max_n - tension_setpoint_n, self._clear_n)
-        return lower.reshape(-1), upper.reshape(-1)
+            self._setpoints = setpoints
+        return self._limits
 
     def vectors(
         self, found: Estimate, tension_setpoint_n: FloatArray, applied_nm: FloatArray

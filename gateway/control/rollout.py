@@ -80,12 +80,13 @@ def simulate_slowly(
 def _plant_by_plant(
     config: Controller, plants: Plants, course: Course, setup: Setup, line_of: LineOf, *, record: bool
 ) -> Rollouts:
-    """A plant that has run away is left at once."""
+    """A plant that has run away is left at once. One law engages on each: it keeps nothing of the plant before."""
+    law = make_law(untimed(config))
     drawn = (*setup.draw(course.periods, plants.n), setup.late(course.periods, plants.n))
     stepped = np.empty((plants.count, course.periods * setup.substeps, 2 * plants.n))
     torques = np.empty((plants.count, course.periods, plants.n))
     for b in range(plants.count):
-        stepped[b], torques[b] = run_plant(make_law(untimed(config)), plants, b, course, setup, drawn, line_of)
+        stepped[b], torques[b] = run_plant(law, plants, b, course, setup, drawn, line_of)
     return rollouts_of(stepped, torques, course, setup, record=record)
 
 

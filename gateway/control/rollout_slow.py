@@ -64,11 +64,11 @@ def run_plant(
     line = line_of(plants, index, setup, states[index], applied)
     delay = delay_steps(plants, setup)[index]
     acting = [applied] * (delay // setup.substeps + 2)
-    quanta = np.array([setup.tension_step_n] * n + [setup.speed_step_m_per_s] * n)
+    on_grid = Grid(np.array([setup.tension_step_n] * n + [setup.speed_step_m_per_s] * n))
     stepped, sent = np.full((course.periods * setup.substeps, 2 * n), np.nan), np.full((course.periods, n), np.nan)
     memory = None
     for k, unwind in enumerate(course.unwind_speed_m_per_s.tolist()):
-        seen = quantised(line.state[: 2 * n] + samples[k], quanta)
+        seen = on_grid.nearest(line.state[: 2 * n] + samples[k])
         measured, reference = Measured(seen[:n], seen[n:], unwind), Steady(course.tension_n[k])
         if memory is None:
             memory = law.engage(measured, reference, applied)
@@ -150,7 +150,17 @@ def limited(setup: Setup, asked_nm: FloatArray, before_nm: FloatArray) -> FloatA
     return np.minimum(np.maximum(held, before_nm - reach), before_nm + reach)
 
 
-def quantised(values: FloatArray, steps: FloatArray) -> FloatArray:
-    """`values` on a grid of `steps`; where that is 0, as they are."""
-    fine = steps == 0.0
-    return np.where(fine, values, np.round(values / np.where(fine, 1.0, steps)) * steps)
+class Grid:
+    """A grid of `steps`; where that is 0, none."""
+
+    def __init__(self, steps: FloatArray) -> None:
+        self._fine = steps == 0.0
+        self._steps = np.where(self._fine, 1.0, steps)
+        self._none, self._any = bool(self._fine.all()), bool(self._fine.any())
+
+    def nearest(self, values: FloatArray) -> FloatArray:
+        """`values` on the grid; where there is none, as they are."""
+        if self._none:
+            return values
+        there = np.rint(values / self._steps) * self._steps
+        return np.where(self._fine, values, there) if self._any else there
