@@ -386,7 +386,7 @@ class Deployer:
         if now_s is None or entry.received is None:
             return True  # a record without a time is none that this program writes
         stands_s = min(entry.expires_s - entry.received.wall_s, self._line.gate.expiry_max_s)
-        return now_s - entry.received.wall_s >= stands_s
+        return not now_s - entry.received.wall_s < stands_s  # a time that is no number has gone by
 
     async def _approve_small(self) -> None:
         """Where the line's file allows it: what is like enough to what a person approved passes by its verdict alone.
