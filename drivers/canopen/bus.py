@@ -16,8 +16,8 @@ import can
 
 from drivers.canopen.can_errors import error_text, is_bus_off
 from drivers.canopen.wire import FAILURES, Wire, wire_of
-from drivers.cleanup import end, finish
 from gateway.core.line import CanopenBus
+from gateway.tasks.cleanup import end, finish
 
 FRAMES_PER_WAKEUP = 256  #: a flooded bus does not hold the loop
 MOST_FRAMES_WAITING = 4096  #: several times what a socket's buffer holds

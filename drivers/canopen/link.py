@@ -22,10 +22,10 @@ from drivers.canopen.questions import Questions
 from drivers.canopen.sdo import SdoBus, SdoFailed
 from drivers.canopen.station import ENTER_PRE_OPERATIONAL, OPERATIONAL, START, nmt_frame
 from drivers.canopen.transaction import Transaction
-from drivers.cleanup import finish, finish_all
 from drivers.port import PrepareRefused
 from gateway.core.line import CanopenBus
 from gateway.core.signals import Inputs, LinkHealth, Outputs
+from gateway.tasks.cleanup import finish, finish_all
 
 SYNC, EMERGENCY = 0x080, 0x080  #: COB-IDs, the last of node 0
 START_HEARTBEATS = 3  #: producer times within which a started node must say that it is operational

@@ -11,9 +11,9 @@ from drivers.canopen.listening import Listening
 from drivers.canopen.map_parts import CanObject, ObjectType
 from drivers.canopen.sdo import SdoBus, SdoFailed, SdoSilent
 from drivers.canopen.transaction import read_number
-from drivers.cleanup import finish
 from drivers.inspection import Number
 from gateway.core.line import CanopenBus
+from gateway.tasks.cleanup import finish
 
 _REQUEST = 0x600  #: COB-ID of node 0
 #: What an SDO client may say to upload (CiA 301, 7.2.4.3): begin, next segment with either toggle, abort.

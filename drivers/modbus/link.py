@@ -7,11 +7,11 @@ counts. What `write` hands over is written with the next `trigger`, in the same 
 import asyncio
 from collections.abc import Sequence
 
-from drivers.cleanup import finish, finish_all
 from drivers.modbus.session import Session
 from drivers.modbus.unit import Unit
 from drivers.port import PrepareRefused
 from gateway.core.signals import Inputs, LinkHealth, Outputs
+from gateway.tasks.cleanup import finish, finish_all
 
 
 class ModbusLink:

@@ -12,7 +12,6 @@ takes a task: proofs, several requests, and what is asked beside the cycle.
 import asyncio
 from collections.abc import Callable
 
-from drivers.cleanup import end, finish_all
 from drivers.modbus.client import ModbusConnection, ModbusFailed, ModbusTimeout
 from drivers.modbus.device import ANSWERS_ALLOWED
 from drivers.modbus.looks import Looks
@@ -20,6 +19,7 @@ from drivers.modbus.plan import Request
 from drivers.modbus.settings import REQUEST_TIMEOUT_S, SettingsWriter
 from drivers.modbus.unit import Payloads, Unit
 from gateway.core.signals import Inputs, LinkHealth
+from gateway.tasks.cleanup import end, finish_all
 
 EXCHANGE_SHARE = 0.8  #: of a period; what has not come by then leaves room for the next request
 LEAVE_TIMEOUT_S = 0.2

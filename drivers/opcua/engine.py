@@ -8,11 +8,11 @@ server has not taken yet do not come to life when it goes on.
 import asyncio
 from typing import Any
 
-from drivers.cleanup import end, finish
 from drivers.opcua.messages import Answer, Outcome, Plan, Question
 from drivers.opcua.nodes import Reading
 from drivers.opcua.services import Services, statuses
 from drivers.opcua.session import Session
+from gateway.tasks.cleanup import end, finish
 
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.1, 2.0  #: between attempts to connect
 

@@ -3,9 +3,9 @@
 import asyncio
 from collections.abc import Callable
 
-from drivers.cleanup import end, finish
 from drivers.opcua.engine import Engine
 from drivers.opcua.messages import Answer, Plan, Question
+from gateway.tasks.cleanup import end, finish
 
 
 class EngineChannel:

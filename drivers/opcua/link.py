@@ -8,7 +8,6 @@ at a time: while one is not answered, no other is asked, its cycle is missed and
 import asyncio
 from collections.abc import Sequence
 
-from drivers.cleanup import finish
 from drivers.opcua.channel import Channel
 from drivers.opcua.drive import Axis
 from drivers.opcua.messages import Answer, Outcome, Question
@@ -19,6 +18,7 @@ from drivers.opcua.release import release_axes
 from drivers.opcua.status import BAD_TRANSACTION_FAILED, is_done
 from drivers.port import PrepareRefused
 from gateway.core.signals import Inputs, LinkHealth, Outputs
+from gateway.tasks.cleanup import finish
 
 ANSWER_TIMEOUT_S = 0.3  #: without an answer the connection is dropped
 PREPARE_TIMEOUT_S = 0.5  #: per question

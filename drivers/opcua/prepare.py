@@ -3,13 +3,13 @@
 from collections.abc import Sequence
 from typing import Protocol
 
-from drivers.cleanup import finish
 from drivers.opcua.amplifier import Amplifier
 from drivers.opcua.drive import Axis
 from drivers.opcua.messages import Answer
 from drivers.opcua.plc import Plc
 from drivers.opcua.proof import Watchdog
 from drivers.opcua.status import describe, is_done
+from gateway.tasks.cleanup import finish
 
 Device = Axis | Amplifier | Plc
 

@@ -9,9 +9,9 @@ import socket
 from collections.abc import Callable
 from contextlib import suppress
 
-from drivers.cleanup import finish
 from drivers.opcua.messages import MAX_MESSAGE, READY, Answer, Outcome, Plan, Question, decode_answer, encode_question
 from drivers.opcua.spawner import CLOSE_TIMEOUT_S, kill_child, spawn
+from gateway.tasks.cleanup import finish
 
 START_TIMEOUT_S = 30.0  #: until a process that has not said that it is ready is ended
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.1, 10.0  #: between a process's end and the next start

@@ -12,13 +12,13 @@ from typing import Any
 from asyncua import ua as asyncua_ua
 from asyncua.client.client import Client
 
-from drivers.cleanup import finish
 from drivers.inspection import Progress
 from drivers.opcua.engine import Engine
 from drivers.opcua.maps import OpcUaMap
 from drivers.opcua.messages import Outcome, Plan, Question
 from drivers.opcua.nodes import Node
 from drivers.opcua.status import describe
+from gateway.tasks.cleanup import finish
 
 ua: Any = asyncua_ua  #: what it declares of its values and what they are differ
 

@@ -21,10 +21,10 @@ from asyncua.crypto.uacrypto import load_certificate
 from asyncua.ua.ua_binary import nodeid_to_binary
 from cryptography import x509
 
-from drivers.cleanup import finish
 from drivers.opcua.messages import Plan
 from drivers.opcua.nodes import Node
 from drivers.opcua.services import Misfit, Request
+from gateway.tasks.cleanup import finish
 
 CONNECT_TIMEOUT_S = 2.0  #: per request while connecting
 CLOSE_TIMEOUT_S = 0.5

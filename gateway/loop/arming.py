@@ -1,6 +1,5 @@
 """Whether the line may be armed, the links' way there, and back to silence however an arming ends."""
 
-from drivers.cleanup import finish_all
 from drivers.port import PrepareRefused
 from gateway.core.messages import Reply
 from gateway.core.signals import Channel, Quality
@@ -8,6 +7,7 @@ from gateway.core.states import LoopState, Phase
 from gateway.loop.cycle import Cycle
 from gateway.loop.machine import STANDSTILL_M_PER_S
 from gateway.loop.refused import Refused
+from gateway.tasks.cleanup import finish_all
 
 SILENT_PATIENCE_S = 0.25  #: without cyclic data (a silent CANopen link reads by SDO) samples are this old at most
 

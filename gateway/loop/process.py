@@ -6,7 +6,6 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
-from drivers.cleanup import finish, finish_all
 from drivers.port import Link
 from drivers.registry import build_links, speed_steps_m_per_s
 from gateway.core.controller import Controller, ControllerRefused
@@ -25,6 +24,7 @@ from gateway.loop.voice import Voice
 from gateway.loop.watch import Watch
 from gateway.mailbox.paths import GATEWAY_SOCKET, LOOP_SOCKET
 from gateway.mailbox.unix import UnixMailbox
+from gateway.tasks.cleanup import finish, finish_all
 
 RESTING_PERIODS = 5
 PERSISTED_S = 2.0  #: that a loop which ends waits for its disk

@@ -4,7 +4,6 @@ import asyncio
 from collections import deque
 from dataclasses import dataclass
 
-from drivers.cleanup import end
 from gateway.core.controller import ControllerRefused
 from gateway.core.messages import (
     MAX_COMMAND,
@@ -30,6 +29,7 @@ from gateway.loop.kept import Store
 from gateway.loop.pacer import Tick
 from gateway.loop.persistence import NotPersisted, Persistence
 from gateway.loop.refused import Refused
+from gateway.tasks.cleanup import end
 
 HEARD_AGAIN_S = 1.0  #: for devices that were lost to tell what speaks against arming, or that nothing does
 PERSISTED_S = 1.0  #: for the disk to have what was taken back, until the answer says that it has not

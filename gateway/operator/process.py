@@ -10,7 +10,6 @@ from collections.abc import Awaitable, Callable, Coroutine
 from contextlib import AsyncExitStack
 from pathlib import Path
 
-from drivers.cleanup import end, finish, finish_all
 from gateway.core.line import Line
 from gateway.core.people import Role
 from gateway.core.topics import GATEWAY_FOR_PERSON
@@ -23,6 +22,7 @@ from gateway.operator.opcua.trust import CERTIFICATE, PRIVATE_KEY, pki_folder
 from gateway.operator.page.app import page_app
 from gateway.operator.users import FILE_NAME, UsersFile, UsersRefused
 from gateway.operator.ways import OpcUaWay, PageWay, Way
+from gateway.tasks.cleanup import end, finish, finish_all
 
 EXIT_OK, EXIT_CANNOT_SERVE = 0, 2
 USERS_S = 2.0  #: between two looks whether there are any

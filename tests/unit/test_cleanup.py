@@ -6,7 +6,7 @@ import weakref
 
 import pytest
 
-from drivers.cleanup import end, finish, finish_all
+from gateway.tasks.cleanup import end, finish, finish_all
 
 
 class Work:

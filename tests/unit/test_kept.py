@@ -11,7 +11,7 @@ from gateway.core.controller import config_hash
 from gateway.core.deployment import Deployment, Region
 from gateway.core.messages import Deploy, Keep, Reply, Rollback, WatchGood, command_bytes
 from gateway.core.theta import nominal_theta
-from gateway.loop.kept import FILE, Durable, OnTop, Store
+from gateway.loop.kept import FILE, Durable, Store
 from gateway.loop.pacer import Tick
 from gateway.loop.runner import Runner
 from safety.recovery_prediction import recovery_prediction

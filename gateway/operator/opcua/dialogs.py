@@ -17,7 +17,6 @@ from asyncua import ua as asyncua_ua
 from asyncua.common.event_objects import DialogCondition, RefreshEndEvent, RefreshStartEvent
 from asyncua.server.event_generator import EventGenerator
 
-from drivers.cleanup import finish
 from gateway.core.decisions import ProposalShown
 from gateway.core.messages import Reply
 from gateway.operator.opcua.events import MEDIUM
@@ -27,6 +26,7 @@ from gateway.operator.opcua.methods import Asked, Input, argument, wrong
 from gateway.operator.opcua.proposal_nodes import FOLDER as PROPOSALS
 from gateway.operator.opcua.session import OWNS
 from gateway.operator.opcua.space import BOOLEAN, GOOD, STRING, UINT32, Space
+from gateway.tasks.cleanup import finish
 
 FOLDER = f"{ROOT}.Dialogs"
 APPROVE, REJECT = 0, 1  #: as `Respond` has them

@@ -12,7 +12,7 @@ import uvicorn
 from starlette.applications import Starlette
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from drivers.cleanup import finish
+from gateway.tasks.cleanup import finish
 
 MOST_CONNECTIONS = 100
 IDLE_S = 10.0  #: of a connection without a whole request
