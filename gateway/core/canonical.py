@@ -3,7 +3,7 @@
 import hashlib
 import json
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, cast
 
 from pydantic import BaseModel
 
@@ -22,16 +22,18 @@ def canonical_bytes(value: Any) -> bytes:
 
 def _written(value: Any) -> Iterator[str]:
     """The pieces, of which none is more than one row of numbers."""
-    if isinstance(value, dict) and value and all(type(key) is str for key in value):
+    table = cast("dict[Any, Any]", value) if isinstance(value, dict) else {}
+    rows = cast("list[Any]", value) if isinstance(value, list) else []
+    if table and all(type(key) is str for key in table):
         before = "{"
-        for key in sorted(value):
+        for key in sorted(table):
             yield f"{before}{json.dumps(key)}:"
-            yield from _written(value[key])
+            yield from _written(table[key])
             before = ","
         yield "}"
-    elif isinstance(value, list) and any(isinstance(one, list | dict) for one in value):
+    elif any(isinstance(one, list | dict) for one in rows):
         before = "["
-        for one in value:
+        for one in rows:
             yield before
             yield from _written(one)
             before = ","
@@ -43,9 +45,9 @@ def _written(value: Any) -> Iterator[str]:
 def without_negative_zeros(value: Any) -> Any:
     """`value` with each -0.0 in it as 0.0; a new object, but for its leaves."""
     if isinstance(value, dict):
-        return {key: without_negative_zeros(one) for key, one in value.items()}
+        return {key: without_negative_zeros(one) for key, one in cast("dict[Any, Any]", value).items()}
     if isinstance(value, list | tuple):
-        return [without_negative_zeros(one) for one in value]
+        return [without_negative_zeros(one) for one in cast("list[Any]", value)]
     return 0.0 if isinstance(value, float) and value == 0.0 else value
 
 
