@@ -76,6 +76,9 @@ bench-processes: $(VENV)/.compiled ## processes killed in mid-run, judged by the
 bench-control: setup ## every law under every tier beside the oracle (about an hour and a half; ARGS="--parts a,c --seeds 3 --tiers A,B")
 	@$(PY) -m tests.bench.control $(ARGS)
 
+bench-mpc: setup ## predictive control's solver: steps, takeovers and verdicts, beside OSQP and an exact solution (about 10 min; ARGS="--spans 6,20")
+	@$(PY) -m tests.bench.mpc $(ARGS)
+
 bench-monitor: setup ## unsafe configurations forced in, healthy ones left alone (about 15 min; ARGS="--unsafe 50 --healthy 100")
 	@$(PY) -m tests.bench.monitor $(ARGS)
 

@@ -42,7 +42,7 @@ class DesignResult(Strict):
     explanation: list[str]
 
 
-LIBRARIES = ("r2rgate", "numpy", "scipy", "numba", "osqp")
+LIBRARIES = ("r2rgate", "numpy", "scipy", "numba", "daqp", "osqp")
 
 
 def result_of(line: Line, found: Design, seed: int, model: LineModel | None = None) -> DesignResult:

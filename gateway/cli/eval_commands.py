@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 UNSAFE, FAILED = 1, 3  #: exit codes
 OFF = "off"
-LIBRARIES = ("r2rgate", "numpy", "scipy", "osqp", "numba", "ollama")
+LIBRARIES = ("r2rgate", "numpy", "scipy", "daqp", "osqp", "numba", "ollama")
 
 
 def evaluate(

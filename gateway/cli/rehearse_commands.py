@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from sim_plant.plant import Plant
 
 UNSAFE = 1  #: exit code
-LIBRARIES = ("r2rgate", "numpy", "scipy", "osqp", "numba")
+LIBRARIES = ("r2rgate", "numpy", "scipy", "daqp", "osqp", "numba")
 
 
 def rehearse(

@@ -5,6 +5,7 @@ import osqp
 import pytest
 from scipy.sparse import csc_matrix
 
+from gateway.control import mpc_daqp
 from gateway.control.design import DesignLimits, DesignTask, design_mpc
 from gateway.control.law import Measured
 from gateway.control.laws import make_law, untimed
@@ -14,6 +15,7 @@ from gateway.control.mpc_solver import solver_of
 from gateway.control.reference import Steady
 from gateway.core.controller import ControllerRefused, canonical, config_hash, parse_controller
 from gateway.core.web_model import equilibrium_torque, reference_speeds
+from tests.independent.programme import exact
 from tests.unit.control_support import model
 
 LIMITS = DesignLimits(60.0, 1000.0, 2.0, 60.0, 0.1)
@@ -57,29 +59,12 @@ def course(law, generator, periods=30):
     return np.array(found)
 
 
-def exact(problem, q, lower, upper, solution):
-    """The programme's only solution, with the proof of it: `solution` may say which rows are active, and no more."""
-    rows = problem.A @ solution
-    below, above = rows - lower < 1e-6, upper - rows < 1e-6
-    active = np.flatnonzero(below | above)
-    C, limits = problem.A[active], np.where(below, lower, upper)[active]
-    system = np.block([[problem.P, C.T], [C, np.zeros((len(active), len(active)))]])
-    asked = np.concatenate((-q, limits))
-    found = np.linalg.solve(system, asked)
-    found += np.linalg.solve(system, asked - system @ found)
-    z, pushes = found[: len(q)], found[len(q) :]
-    rows = problem.A @ z
-    assert np.maximum(lower - rows, rows - upper).max() < 1e-6  # it keeps its limits
-    assert (pushes[below[active]] < 1e-9).all() and (pushes[above[active]] > -1e-9).all()  # none that holds it back
-    return z
-
-
 @pytest.mark.parametrize(("n", "draw"), [(3, ()), (6, ()), (6, (2,)), (9, ()), (20, ())])
 def test_the_solution_is_exact(n, draw):
     law, generator = make_law(config_of(n, draw)), np.random.default_rng(n)
     for _ in range(100):
         decision, (q, lower, upper) = asked(law, generator)
-        theirs = exact(law.problem, q, lower, upper, decision.solution)
+        theirs = exact(law.problem.P, q, law.problem.A, lower, upper, decision.solution)
         assert np.abs(decision.solution - theirs).max() < 1e-5
 
 
@@ -116,6 +101,19 @@ def test_what_was_solved_before_changes_nothing(solver):
         course(used, np.random.default_rng(seed))
     again, fresh = (course(law, np.random.default_rng(11)) for law in (used, make_law(config)))
     assert again.tobytes() == fresh.tobytes()
+
+
+def test_taking_over_sets_nothing_up(monkeypatch):
+    """It is called inside a control period: all that is slow is in the constructor."""
+    law, generator = make_law(config_of()), np.random.default_rng(1)
+    course(law, generator, 5)
+
+    def never(*_, **__):
+        raise AssertionError("a solver is set up inside a period")
+
+    monkeypatch.setattr(mpc_daqp.daqp, "Model", never)
+    monkeypatch.setattr(osqp, "OSQP", never)
+    assert np.isfinite(course(law, generator, 5)).all()
 
 
 def test_a_second_loop_does_not_disturb_the_first():
