@@ -213,3 +213,25 @@ def test_events_of_a_kind_are_found_in_the_database_and_in_the_tail(tmp_path: Pa
         assert history.events(0.0, 100.0, ("none",)) == []
         assert len(history.events(0.0, 100.0)) == 6
     writer.close()
+
+
+def test_while_another_program_holds_the_database_the_tail_takes_so_much_and_no_more(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "h"
+    writer = writer_of(path)
+    writer.store(frames(0, 10), [], WALL_AHEAD_S)
+    monkeypatch.setattr("gateway.supervisor.writer.MAX_TAIL_BYTES", 25 * len(frames(0, 1)[0]))
+    other = apsw.Connection(str(path))
+    other.execute("BEGIN IMMEDIATE")
+    for first in (10, 20):
+        writer.store(frames(first, 10), [], WALL_AHEAD_S)
+    for refused in (writer.pack, lambda: writer.store(frames(30, 10), [], WALL_AHEAD_S)):
+        with pytest.raises(apsw.BusyError):
+            refused()
+    assert sequences(path) == list(range(30))
+    other.execute("ROLLBACK")
+    other.close()
+    writer.store(frames(30, 10), [], WALL_AHEAD_S)
+    writer.close()
+    assert sequences(path) == list(range(40))
