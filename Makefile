@@ -82,7 +82,7 @@ bench-mpc: setup ## predictive control's solver: steps, takeovers and verdicts, 
 bench-monitor: setup ## unsafe configurations forced in, healthy ones left alone (about 15 min; ARGS="--unsafe 50 --healthy 100")
 	@$(PY) -m tests.bench.monitor $(ARGS)
 
-bench-trials: setup ## trials of good and bad configurations with 1 % late answers (about 25 min; ARGS="--bad 20 --good 20")
+bench-trials: setup ## trials of good and bad configurations with 1 % late answers (about 35 min; ARGS="--bad 20 --good 20")
 	@$(PY) -m tests.bench.trials $(ARGS)
 
 bench-identify: setup ## what a line learns of itself from 5 s, against truths never seen (ARGS="--parts a,c --friction 10")
