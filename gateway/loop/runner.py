@@ -54,7 +54,8 @@ class Runner:
     def __init__(self, cycle: Cycle, store: Store | None = None) -> None:
         self.cycle = cycle
         self._aside = Aside()
-        self._persistence = Persistence(cycle.configurations, store, self._aside, cycle.tell)
+        self._disk = Aside()  # of its own: what is taken back does not wait for what is being built
+        self._persistence = Persistence(cycle.configurations, store, self._disk, cycle.tell)
         self._configuring = asyncio.Lock()
         self._waiting: deque[Waiting] = deque()
         self._passed = asyncio.Event()
@@ -140,6 +141,7 @@ class Runner:
     def close(self) -> None:
         """What is still being worked on aside ends by itself."""
         self._aside.close()
+        self._disk.close()
 
     async def _stop(self, command: Stop) -> Reply:
         """Whatever else waits, and also into an arming, whose undoing it does not wait for."""
