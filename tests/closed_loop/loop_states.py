@@ -1,0 +1,541 @@
+"""The loop's states in any order of commands, faults, cancellations, cuts and deaths, against a model of them.
+
+After every period it is asked what runs under what. A sequence that breaks an invariant is shrunk by hypothesis. The
+invariants, each with the place that asks it:
+
+- What is in service, what would be gone back to, the epoch and what watches are the model's (`_service`).
+- An experiment runs only in RUNNING, and only under the configuration and region it was begun under (`_experiment`).
+- Nothing is on probation in STOP, nor past its lease (`_probation`).
+- In RUNNING and HOLDING the speed aimed at lies within the region of what runs, and the speed asked for does not rise
+  beyond it but in a judged experiment (`_speed`).
+- There is torque only in phases with torque, and limit, rate and enabling at the drives are kept (`_torque`).
+- At rest, with no arming under way and none that came through since, every link is released (`_links`).
+- The first exception of a part ends in STOP and never ends the process; only a second one does (`_failures`).
+- The disk has what was decided last within a bounded time of being able to (`_disk`).
+- What a process finds that starts after a death is what was decided last, or what was under way (`Model.begin_anew`).
+- Every command is answered (`teardown`), every epoch used once (`Model.carried_out`).
+"""
+
+import shutil
+import tempfile
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, initialize, precondition, rule
+
+from gateway.control.design import design_lqg, design_lqr, design_mpc, design_pid, task_of
+from gateway.core.controller import config_hash
+from gateway.core.deployment import Deployment, RecoveryPrediction, Region
+from gateway.core.experiment import Abort, Experiment, Leg
+from gateway.core.messages import (
+    AbortExperiment,
+    Arm,
+    Command,
+    Deploy,
+    Hold,
+    Keep,
+    Narrow,
+    Renew,
+    Reply,
+    Rollback,
+    RunExperiment,
+    SelectRecipe,
+    SetSpeed,
+    SetTension,
+    Start,
+    Stop,
+    WatchGood,
+)
+from gateway.core.states import LoopState, Phase
+from gateway.core.theta import nominal_theta
+from gateway.loop.cycle import SUPERVISED, WITH_TORQUE
+from gateway.loop.kept import FILE, Kept
+from safety.recovery_prediction import recovery_prediction
+from tests.closed_loop.loop_model import Law, Model, runs_of, watch_key
+from tests.closed_loop.loop_world import BREAKABLE, GIVEN, LINE, PERIOD_S, Ask, Broken, Life
+
+TASK = task_of(LINE)
+LAWS = {
+    "given": GIVEN,
+    "lqg": design_lqg(TASK),
+    "pid": design_pid(TASK),
+    "lqr": design_lqr(TASK),
+    "mpc": design_mpc(TASK),
+}
+BY_HASH = {config_hash(config): config for config in LAWS.values()}
+REGIONS = (
+    Region(),
+    Region(speed_max_m_per_s=0.06, tension_step_max_n=3.0, speed_step_max_m_per_s=0.02),
+    Region(speed_max_m_per_s=0.04, tension_step_max_n=1.0, speed_step_max_m_per_s=0.005),
+)
+LEASES_S = (0.05, 0.2, 5.0)
+ANSWERED_PERIODS = 400  #: within which every command is answered, arming and slow disks included
+ARMING_PERIODS = 200  #: that an arming takes at most until its links are released
+FOLLOWS_PERIODS = 8  #: until the disk has what was decided last
+FOLLOWS_AGAIN_PERIODS = 115  #: the same, after a write that failed
+RATE_NM = LINE.limits.torque_rate_nm_per_s * PERIOD_S
+LIGHT = ("torque-limit", "torque-rate", "torque-not-enabled")  #: a web may go slack where a test takes its drives
+
+
+@cache
+def watch_for(hash_: str, kind: str) -> RecoveryPrediction:
+    """`kind` "long": with more torques in flight than the line's own file has any room for."""
+    theta = nominal_theta(LINE)
+    if kind == "long":
+        theta = replace(theta, torque_lag_s=0.12)
+    return recovery_prediction(theta, BY_HASH[hash_], LINE, [0.03])
+
+
+def experiment(speed_m_per_s: float | None, amplitude_n: float, duration_s: float) -> Experiment:
+    return Experiment(
+        format=1, name="try", amplitude_n=[amplitude_n] * LINE.n, dwell_s=0.1,
+        legs=[Leg(duration_s=duration_s, speed_m_per_s=speed_m_per_s)],
+        abort=Abort(deviation_n=15.0, saturated_share=1.0, reversal_share=1.0),
+    )  # fmt: skip
+
+
+OPERATORS = (
+    Start(),
+    Hold(),
+    AbortExperiment(),
+    SetTension(span=1, tension_n=29.0),
+    SetTension(span=2, tension_n=34.0),
+    SetTension(span=1, tension_n=28.5, step=True),
+    SetSpeed(speed_m_per_s=0.035),
+    SetSpeed(speed_m_per_s=0.05),
+    SetSpeed(speed_m_per_s=0.1),
+    SetSpeed(speed_m_per_s=0.032, step=True),
+    *(SelectRecipe(name=recipe.name) for recipe in LINE.recipes),
+)
+periods = st.integers(0, 4)
+turns = st.integers(0, 6)
+kinds_of_watch = st.sampled_from(["none", "none", "usual", "long", "other"])
+
+
+class LoopStates(RuleBasedStateMachine):
+    """The loop's process on a folder, and what the model says of it."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.folder = Path(tempfile.mkdtemp(prefix="r2r-loop-states-"))
+        self.life: Life | None = None
+        self.passed = 0  #: periods, of all lives
+        self.wrong: AssertionError | None = None  #: what the model has found within a period
+
+    @initialize(production=st.sampled_from([True, True, True, False]))
+    def begin(self, production):
+        given = Law(config_hash(GIVEN))
+        self.model = Model(given, given)
+        self._begin_life(production)
+
+    def teardown(self) -> None:
+        try:
+            if self.life is not None and not self.life.over and not self.life.ending.is_set():
+                self._answered()
+        finally:
+            if self.life is not None:
+                self.life.close()
+            shutil.rmtree(self.folder)
+
+    # the line's people, and the gateway
+
+    @rule(
+        epoch=st.sampled_from([1, 1, 1, 1, 0, 2]),
+        name=st.sampled_from(sorted(LAWS)),
+        region=st.sampled_from(REGIONS),
+        lease_s=st.sampled_from(LEASES_S),
+        watch=kinds_of_watch,
+        shaped=st.booleans(),
+        then=periods,
+        after=turns,
+    )
+    def deploy(self, epoch, name, region, lease_s, watch, shaped, then, after):
+        self._order(self._deploy(epoch, name, region, lease_s, watch, shaped), then, after)
+
+    @rule(then=periods, after=turns, off=st.sampled_from([0, 0, 0, 1]), watch=kinds_of_watch)
+    def keep(self, then, after, off, watch):
+        found = self._watch(self.model.good_if_kept.hash, watch)
+        self._order(Keep(epoch=max(self.model.epoch + off, 1), watch=found), then, after)
+
+    @rule(then=periods, after=turns)
+    def renew(self, then, after):
+        self._order(Renew(epoch=max(self.model.epoch, 1)), then, after)
+
+    @rule(then=periods, after=turns, kind=st.sampled_from(["usual", "long", "other"]))
+    def watch_good(self, then, after, kind):
+        watch = self._watch(self.model.good.hash, kind)
+        assert watch is not None
+        self._order(WatchGood(watch=watch), then, after)
+
+    @rule(then=periods, after=turns, region=st.sampled_from(REGIONS[1:]))
+    def narrow(self, then, after, region):
+        self._order(Narrow(region=region), then, after)
+
+    @rule(then=periods, after=turns)
+    def roll_back(self, then, after):
+        self._order(Rollback(reason="a person"), then, after)
+
+    @rule(then=periods, after=turns, command=st.sampled_from(OPERATORS))
+    def operate(self, then, after, command):
+        self._order(command, then, after)
+
+    @rule(then=periods, after=turns, stops=st.integers(1, 2), between=turns)
+    def stop(self, then, after, stops, between):
+        for _ in range(stops):
+            self._order(Stop(), 0, between)
+        self._pass(then, after)
+
+    @rule(then=periods, after=turns, prepare=st.sampled_from([0, 0, 3, 8]), release=st.sampled_from([0, 0, 2, 5]))
+    def arm(self, then, after, prepare, release):
+        self._alive().prepare_periods, self.life.release_periods = prepare, release
+        self._order(Arm(), then, after)
+
+    @rule(then=periods, speed=st.sampled_from([None, None, 0.04, 0.1]), step_n=st.sampled_from([0.4, 1.4]),
+          judged=st.booleans(), duration_s=st.sampled_from([0.3, 2.0]))  # fmt: skip
+    def begin_experiment(self, then, speed, step_n, judged, duration_s):
+        proposal = "a" * 64 if judged else None
+        self._order(RunExperiment(experiment=experiment(speed, step_n, duration_s), proposal=proposal), then, 3)
+
+    @precondition(lambda self: self.life is not None and self.life.cycle.machine.phase is Phase.RUNNING)
+    @rule(name=st.sampled_from(["lqg", "mpc"]), kept=st.booleans(), lease_s=st.sampled_from(LEASES_S),
+          region=st.sampled_from(REGIONS))  # fmt: skip
+    def an_experiment_under_another_controller(self, name, kept, lease_s, region):
+        """Most of the rest is trouble, through which few experiments would come."""
+        if self.model.until_s is None:
+            self._answer(self._deploy(1, name, region, lease_s, "none", False))
+        if kept:
+            self._answer(Keep(epoch=max(self.model.epoch, 1)))
+        self._answer(RunExperiment(experiment=experiment(None, 0.4, 2.0), proposal="a" * 64))
+
+    # what goes wrong
+
+    @rule(number=st.integers(0, 3), then=periods, after=turns)
+    def somebody_goes_away(self, number, then, after):
+        asks = [ask for ask in self._alive().asks if not ask.task.done()]
+        if asks:
+            gone = asks[number % len(asks)]
+            gone.task.cancel()
+            gone.left = self.passed
+        self._pass(then, after)
+
+    @rule(part=st.sampled_from(BREAKABLE), times=st.sampled_from([1, 1, 2]), then=periods)
+    def a_part_raises(self, part, times, then):
+        self._alive().broken[part] = times
+        self._pass(1 + then)
+
+    @rule(how=st.sampled_from(["raises", "nan"]), then=periods)
+    def the_law_fails(self, how, then):
+        law = self._alive().cycle.configurations.running.law
+        ask = law.ask
+
+        def fails(*given):
+            law.ask = ask
+            if how == "raises":
+                raise Broken("no solution")
+            decision = ask(*given)
+            decision.torque_nm = decision.torque_nm * np.nan
+            return decision
+
+        law.ask = fails
+        self._pass(1 + then)
+
+    @rule(refused=st.integers(1, 4), passing=st.integers(0, 3))
+    def the_disk_refuses(self, refused, passing):
+        self._alive()
+        self.life.disk.refused, self.life.disk.passing = refused, passing
+
+    @rule(full=st.booleans())
+    def the_disk_is_full(self, full):
+        self._alive().disk.refused = (1 << 30) if full else 0
+
+    @rule(before=st.sampled_from([0, 1, 4]), after=st.sampled_from([0, 1, 4]))
+    def the_disk_is_slow(self, before, after):
+        self._alive()
+        self.life.disk.slow_before, self.life.disk.slow_after = before, after
+
+    @rule(
+        what=st.sampled_from(["blind", "late", "jump", "drive", "permissive", "emergency stop", "mended"]), then=periods
+    )
+    def the_line_fails(self, what, then):
+        life = self._alive()
+        truth = life.loop.truth
+        match what:
+            case "blind":
+                life.blind = 12
+            case "late":
+                life.blind = 1
+            case "jump":
+                life.jump_n = 40.0
+            case "drive":
+                truth.take_off(0, life.loop.now_s)
+            case "permissive":
+                truth.plc.permissive = False
+            case "emergency stop":
+                truth.plc.emergency_stop = True
+            case _:
+                truth.plc.permissive, truth.plc.emergency_stop, life.blind = True, False, 0
+        self._pass(then)
+
+    @rule(count=st.sampled_from([1, 2, 5, 12, 30]))
+    def time_passes(self, count):
+        self._pass(count)
+
+    @rule(phase=st.sampled_from([Phase.READY, Phase.RUNNING, Phase.OFF]))
+    def the_line_comes_to(self, phase):
+        """If it is on its way there."""
+        for _ in range(250):
+            ways = (Phase.ARMING, Phase.ENABLING, Phase.TENSIONING, Phase.SLOWING, Phase.UNLOADING)
+            if self._alive().cycle.machine.phase is phase or self.life.cycle.machine.phase not in ways:
+                return
+            self._pass(1)
+
+    @rule(production=st.booleans())
+    def the_process_is_killed(self, production):
+        self._alive()
+        self._next_life(production)
+
+    @rule(after=st.integers(0, 4))
+    def the_process_will_die_within_a_write(self, after):
+        self._alive().disk.dies_after = after
+
+    @rule(wait=st.booleans())
+    def the_loop_is_ended(self, wait):
+        life = self._alive()
+        life.ending.set()
+        for _ in range(400 if wait else 1):
+            self._pass(1)
+            if self.life is not life:
+                return
+
+    # one period
+
+    def _pass(self, count: int, after: int = 3) -> None:
+        life = self._alive()
+        for _ in range(count):
+            speed = life.cycle.setpoints.speed_m_per_s
+            life.period()
+            self._note_under_way()
+            self.passed += 1
+            if self.wrong is not None:
+                raise self.wrong
+            if life.over:
+                self._next_life(production=False)
+                return
+            if life.ran and not life.failed:
+                self._check(life, speed)
+        life.turn(after)
+        if life.over:
+            self._next_life(production=False)
+
+    def _check(self, life: Life, speed_before: float) -> None:
+        self._service(life)
+        self._experiment(life)
+        self._probation(life)
+        self._speed(life, speed_before)
+        self._torque(life)
+        self._links(life)
+        self._failures(life)
+        self._disk(life)
+
+    def _service(self, life: Life) -> None:
+        configurations, model = life.cycle.configurations, self.model
+        found = configurations.in_service(life.loop.now_s)
+        expected = (model.running.hash, model.good.hash, model.epoch, model.until_s is not None, model.running.region)
+        seen = (found.hash, found.last_known_good, found.epoch, found.on_probation, found.region)
+        assert seen == expected, f"in service {seen}, by the model {expected}"
+        assert configurations.good.region == model.good.region
+        assert watch_key(configurations.good.watch) == model.watch
+
+    def _experiment(self, life: Life) -> None:
+        run, model = life.cycle.experiments.run, self.model
+        if run is None:
+            model.experiment = None
+            return
+        assert model.experiment is not None, "an experiment that nobody has begun, or that was ended, runs"
+        assert life.cycle.machine.phase is Phase.RUNNING, f"an experiment runs in {life.cycle.machine.phase.name}"
+        running = life.cycle.configurations.running
+        under = (running.hash, running.region)
+        assert under == (model.experiment.under.hash, model.experiment.under.region), (
+            "an experiment goes on under a controller or a region that it was not begun under"
+        )
+        assert run.done <= run.periods
+
+    def _probation(self, life: Life) -> None:
+        on = life.cycle.configurations.probation is not None
+        assert not (on and life.cycle.machine.state is LoopState.STOP), "on probation in STOP"
+        late = on and life.loop.now_s > self.model.until_s + 1e-6
+        assert not late, f"on probation at {life.loop.now_s:g} s, its lease has ended at {self.model.until_s:g} s"
+
+    def _speed(self, life: Life, before: float) -> None:
+        cycle, most = life.cycle, self.model.running.region.speed_max_m_per_s
+        if most is None or cycle.machine.phase not in SUPERVISED:
+            return
+        setpoints, run = cycle.setpoints, cycle.experiments.run
+        assert setpoints.speed_target_m_per_s <= most + 1e-12, "the line shall run faster than what runs was judged for"
+        if run is None or not self.model.experiment.judged:
+            assert setpoints.speed_m_per_s <= max(most, before) + 1e-12, "faster than what runs was judged for"
+
+    def _torque(self, life: Life) -> None:
+        phase = life.cycle.machine.phase
+        torque_nm = life.cycle.outputs.torque_nm
+        assert phase in WITH_TORQUE or not torque_nm.any(), f"torque in {phase.name}"
+        seen = life.loop.truth.recorder.unsafe_events
+        unsafe = {kind: seen.get(kind, 0) for kind in LIGHT}
+        assert not any(unsafe.values()), f"at the drives: {unsafe}"
+
+    def _links(self, life: Life) -> None:
+        arming = any(isinstance(ask.command, Arm) and not self._is_over(ask) for ask in life.asks)
+        if arming or life.armed_since_prepared or not life.runner.at_rest:
+            self.quiet_links = 0
+            return
+        self.quiet_links += 1
+        if self.quiet_links > 2:
+            active = [link.name for link in life.links if link.active]
+            assert not active, f"{', '.join(active)} active though nothing is armed"
+
+    def _is_over(self, ask: Ask) -> bool:
+        """An arming comes to its end also where nobody waits for it any more."""
+        return ask.answered or (ask.left is not None and self.passed > ask.left + ARMING_PERIODS)
+
+    def _failures(self, life: Life) -> None:
+        cycle, raised = life.cycle, life.raised
+        assert len(cycle.containment.failed) <= len(raised), f"failed without being broken: {cycle.containment.failed}"
+        if raised and raised[-1] not in ("events", "telemetry"):
+            stopping = cycle.machine.state in (LoopState.STOP, LoopState.SILENT)
+            assert stopping, f"{raised[-1]} has raised, and the line is {cycle.machine.phase.name}"
+
+    def _disk(self, life: Life) -> None:
+        """The store's file is looked at only once it must be right: a look takes longer than a period."""
+        disk, model = life.disk, self.model
+        state = (model.durable, disk.refusals, disk.refused, disk.slow_before, disk.slow_after)
+        waits = any(not ask.task.done() for ask in life.asks)
+        if state != self.disk_state or waits or disk.refused or not life.aside.idle:
+            self.disk_state, self.quiet = state, 0
+            return
+        self.quiet += 1
+        slow = 4 * (disk.slow_before + disk.slow_after)
+        if self.quiet == slow + (FOLLOWS_AGAIN_PERIODS if self.had_refusals != disk.refusals else FOLLOWS_PERIODS):
+            self.had_refusals = disk.refusals
+            self._require_disk(life)
+
+    def _require_disk(self, life: Life) -> None:
+        found = self._on_disk()
+        assert found == self.model.durable, f"on the disk {found}; decided {self.model.durable}"
+        self.model.settled()
+        life.asks[:] = [ask for ask in life.asks if not self._is_over(ask)]
+
+    # lives
+
+    def _on_disk(self):
+        path, given = self.folder / FILE, Law(config_hash(GIVEN))
+        if not path.exists():
+            return Model(given, given).durable
+        return runs_of(Kept.model_validate_json(path.read_bytes()).durable)
+
+    def _begin_life(self, production: bool) -> None:
+        self.life = Life(self.folder, self._carried_out, self._rolled_back)
+        self.disk_state, self.quiet, self.had_refusals, self.quiet_links = None, 0, 0, 0
+        found = runs_of(self.life.cycle.configurations.durable)
+        self.model.begin_anew(found)
+        if production:
+            self.life.begin_in_production()
+        self._pass(2)
+
+    def _next_life(self, production: bool) -> None:
+        life, self.life = self.life, None
+        assert life is not None
+        if life.task.done():
+            self._judge_end(life)
+        life.close()
+        self._begin_life(production)
+
+    def _judge_end(self, life: Life) -> None:
+        error = life.task.exception()
+        if error is None:
+            assert life.ending.is_set()
+            active = [link.name for link in life.links if link.active]
+            assert not (life.runner.at_rest and active), f"ended in order with {', '.join(active)} active"
+            if life.cycle.account.ran:
+                self.model.ends.pop(self.model.durable.key, None)
+            return
+        assert isinstance(error, Broken), f"the process has ended by {type(error).__name__}: {error}"
+        assert len(life.raised) >= 2, f"the first exception, of {life.raised}, has ended the process"
+        if life.cycle.configurations.probation is None:
+            self.model.ends[self.model.durable.key] += 1
+
+    def _alive(self) -> Life:
+        assert self.life is not None
+        return self.life
+
+    # commands
+
+    def _carried_out(self, command: Command, reply: Reply, now_s: float) -> None:
+        self._judged(lambda: self.model.carried_out(command, reply, now_s))
+
+    def _rolled_back(self) -> None:
+        self._judged(self.model.rolled_back)
+
+    def _judged(self, judge) -> None:
+        """Within the loop, which would take what is raised for a fault of its own."""
+        try:
+            judge()
+        except AssertionError as wrong:
+            self.wrong = self.wrong or wrong
+
+    def _note_under_way(self) -> None:
+        if self.life is not None:
+            self.model.under_way([ask.command for ask in self.life.asks if not ask.answered])
+
+    def _order(self, command: Command, then: int, after: int) -> Ask:
+        life = self._alive()
+        ask = life.order(command)
+        self._note_under_way()
+        life.turn(after)
+        self._pass(then)
+        return ask
+
+    def _answer(self, command: Command) -> None:
+        """Waits for it, a while."""
+        life, ask = self._alive(), self._order(command, 0, 3)
+        for _ in range(30):
+            if ask.task.done() or self.life is not life:
+                return
+            self._pass(1)
+
+    def _answered(self) -> None:
+        life = self._alive()
+        life.disk.refused = 0
+        life.disk.dies_after = None
+        for _ in range(ANSWERED_PERIODS):
+            if all(ask.task.done() for ask in life.asks):
+                return
+            self._pass(1)
+            if self.life is not life:
+                return
+        waiting = [ask.command for ask in life.asks if not ask.task.done()]
+        raise AssertionError(f"not answered within {ANSWERED_PERIODS} periods: {waiting}")
+
+    def _deploy(self, epoch: int, name: str, region: Region, lease_s: float, watch: str, shaped: bool) -> Deploy:
+        config, number = LAWS[name], self.model.epoch + epoch
+        return Deploy(
+            deployment=Deployment(
+                controller=config, hash=config_hash(config), epoch=max(number, 1), lease_s=lease_s, region=region,
+                shaped_first=shaped, watch=self._watch(self.model.good.hash, watch),
+            )
+        )  # fmt: skip
+
+    @staticmethod
+    def _watch(fallback: str, kind: str) -> RecoveryPrediction | None:
+        if kind == "none":
+            return None
+        if kind == "other":
+            fallback = next(hash_ for name, hash_ in HASHES.items() if hash_ != fallback and name != "mpc")
+        if fallback == HASHES["mpc"]:
+            return None
+        return watch_for(fallback, "usual" if kind == "other" else kind)
+
+
+HASHES = {name: config_hash(config) for name, config in LAWS.items()}
