@@ -162,7 +162,11 @@ class Cycle:
 
     def _end_what_lapsed(self, now_s: float) -> None:
         configurations = self.configurations
-        if why := self.containment.run("the lease", "", configurations.lapsed, now_s):
+        # Where it cannot be told whether the lease has ended, it has: a silent line is not stopped, so not taken back.
+        why = self.containment.run(
+            "the lease", "whether its lease has ended cannot be told", configurations.lapsed, now_s
+        )
+        if why and configurations.probation is not None:
             self.roll_back(why)
         configurations.settle_moves()
 

@@ -12,6 +12,7 @@ from gateway.core.messages import Deploy, Keep, Rollback, RunExperiment, Stop, W
 from gateway.core.states import Phase
 from gateway.core.theta import nominal_theta
 from safety.recovery_prediction import recovery_prediction
+from tests.closed_loop.conftest import stepped
 from tests.closed_loop.test_deploy import GOOD, LINE, deployment, producing
 from tests.closed_loop.test_experiment import asked
 
@@ -121,3 +122,18 @@ def test_what_was_prepared_for_another_way_back_is_not_taken():
     reply = loop.command(WatchGood(watch=watch))
     assert not reply.ok and "meanwhile" in reply.reasons[0]
     assert configurations.good.recovery is None
+
+
+def test_a_lease_that_cannot_be_looked_at_has_ended_also_on_a_line_that_nothing_stops(monkeypatch):
+    loop = stepped()
+    loop.step(3)
+    assert loop.command(deployment(lease_s=60.0)).ok
+
+    def broken(_):
+        raise RuntimeError("a defect")
+
+    monkeypatch.setattr(loop.cycle.configurations, "lapsed", broken)
+    loop.step(1)
+    found = loop.cycle.configurations
+    assert loop.cycle.machine.phase is Phase.SILENT
+    assert found.probation is None and found.running is found.good
