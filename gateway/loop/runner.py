@@ -25,7 +25,7 @@ from gateway.loop.aside import Aside
 from gateway.loop.commands import carry_out
 from gateway.loop.cycle import SUPERVISED, Cycle
 from gateway.loop.deploy import NOT_DONE, Prepared, durable_after, prepare, require
-from gateway.loop.kept import Store
+from gateway.loop.kept import Durable, Store
 from gateway.loop.pacer import Tick
 from gateway.loop.persistence import NotPersisted, Persistence
 from gateway.loop.refused import Refused
@@ -187,14 +187,17 @@ class Runner:
         The disk first: after a restart the line runs what somebody was told is kept, and no epoch is used twice.
         """
         cycle = self.cycle
+
+        def ahead() -> Durable:
+            require(cycle, command)  # what it was prepared for may have been taken back since
+            return durable_after(cycle.configurations, command)
+
         try:
             await self._signals_are_there(command)
             require(cycle, command)
             prepared = await self._aside.do(lambda: prepare(cycle, command))
             await self._signals_are_there(command)
-            return await self._persistence.write_ahead(
-                lambda: durable_after(cycle.configurations, command), lambda: self._at_boundary(command, prepared)
-            )
+            return await self._persistence.write_ahead(ahead, lambda: self._at_boundary(command, prepared))
         except ControllerRefused as refused:
             return self._not_done(NOT_DONE[type(command)], [str(refused)])
         except NotPersisted as failed:

@@ -1,6 +1,7 @@
 """The loop that starts next runs what was decided last, in whatever order and whichever write fails."""
 
 import asyncio
+import threading
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +13,8 @@ from gateway.core.controller import config_hash
 from gateway.core.deployment import Deployment, first_region
 from gateway.core.messages import Deploy, Keep, Narrow, Rollback, WatchGood
 from gateway.core.theta import nominal_theta
-from gateway.loop import persistence
+from gateway.loop import persistence, runner
+from gateway.loop.deploy import prepare
 from gateway.loop.kept import Store
 from gateway.loop.pacer import Tick
 from gateway.loop.persistence import NOT_PERSISTED, PERSISTED
@@ -210,3 +212,35 @@ def test_a_model_that_is_refused_at_the_boundary_is_not_on_the_disk(tmp_path):
         await it.until(lambda: it.on_disk() is not None and it.on_disk().watch is None)
 
     told(Disk(tmp_path), story)
+
+
+def test_a_keep_that_was_rolled_back_while_it_was_prepared_writes_nothing(tmp_path, monkeypatch):
+    """It would write its own watch beside a configuration that this is not for."""
+    begun, go_on = threading.Event(), threading.Event()
+
+    def slow(cycle, command):
+        found = prepare(cycle, command)
+        if isinstance(command, Keep):
+            begun.set()
+            assert go_on.wait(30.0)
+        return found
+
+    async def story():
+        told = Story(Disk(tmp_path))
+        change = Deployment(controller=OTHER, hash=config_hash(OTHER), epoch=1, lease_s=60.0)
+        assert (await told.ask(Deploy(deployment=change))).ok
+        await told.until(told.as_decided)
+        monkeypatch.setattr(runner, "prepare", slow)
+        watch = recovery_prediction(nominal_theta(LINE), OTHER, LINE, [0.05])
+        keep = asyncio.ensure_future(told.runner.submit(Keep(epoch=1, watch=watch)))
+        await told.until(begun.is_set)
+        assert (await told.ask(Rollback(reason="it hums"))).ok
+        written, write = [], told.store.write
+        monkeypatch.setattr(told.store, "write", lambda durable: written.append(durable) or write(durable))
+        go_on.set()
+        await told.until(keep.done)
+        await told.until(told.as_decided)
+        assert not keep.result().ok and not any(durable.watch for durable in written)
+        told.runner.close()
+
+    asyncio.run(story())
