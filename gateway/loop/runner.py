@@ -57,6 +57,7 @@ class Runner:
         self._disk = Aside()  # of its own: what is taken back does not wait for what is being built
         self._persistence = Persistence(cycle.configurations, store, self._disk, cycle.tell)
         self._configuring = asyncio.Lock()
+        self._configurings: set[asyncio.Task[Reply]] = set()  #: asyncio itself keeps tasks only weakly
         self._waiting: deque[Waiting] = deque()
         self._passed = asyncio.Event()
         self._arming: asyncio.Task[Reply | None] | None = None  #: its proofs
@@ -130,9 +131,11 @@ class Runner:
                     return self._refused("arming is under way")
                 self._armed = asyncio.create_task(self._arm(command))
                 return await asyncio.shield(self._armed)
-            case Deploy() | Keep() | WatchGood():
-                async with self._configuring:
-                    return await self._configure(command)
+            case Deploy() | Keep() | WatchGood():  # what is written ahead is decided, whoever waits for it
+                configuring = asyncio.create_task(self._configure_next(command))
+                self._configurings.add(configuring)
+                configuring.add_done_callback(self._configurings.discard)
+                return await asyncio.shield(configuring)
             case Rollback() | Narrow():
                 return await self._take_back(command)
             case _:
@@ -180,6 +183,10 @@ class Runner:
         if self.cycle.machine.state is not LoopState.READY:
             return self._refused(f"not armed: {self.cycle.machine.reason}")
         return reply.model_copy(update={"state": self.cycle.machine.state.name})
+
+    async def _configure_next(self, command: Deploy | Keep | WatchGood) -> Reply:
+        async with self._configuring:
+            return await self._configure(command)
 
     async def _configure(self, command: Deploy | Keep | WatchGood) -> Reply:
         """Build, warm and measure what the command brings, and have it on the disk, while periods go on; then do it.

@@ -244,3 +244,41 @@ def test_a_keep_that_was_rolled_back_while_it_was_prepared_writes_nothing(tmp_pa
         told.runner.close()
 
     asyncio.run(story())
+
+
+def test_whoever_deploys_and_goes_away_leaves_no_epoch_that_could_be_used_twice(tmp_path, monkeypatch):
+    """What was written ahead stays on the disk until it is decided, whoever waits for it."""
+    begun, go_on = threading.Event(), threading.Event()
+
+    async def story():
+        told = Story(Disk(tmp_path))
+        written, write = [], told.store.write
+
+        def slow(durable):
+            begun.set()
+            assert go_on.wait(30.0)
+            write(durable)
+            written.append(durable.epoch)
+
+        monkeypatch.setattr(told.store, "write", slow)
+        change = Deployment(controller=OTHER, hash=config_hash(OTHER), epoch=1, lease_s=60.0)
+        asked = asyncio.ensure_future(told.runner.submit(Deploy(deployment=change)))
+        await told.until(begun.is_set)
+        await told.period()
+        go_on.set()
+        for _ in range(10_000):
+            if written:
+                break
+            await asyncio.sleep(0.001)
+        for _ in range(5):
+            await asyncio.sleep(0)  # it waits for its period
+        asked.cancel()
+        for _ in range(50):
+            await asyncio.sleep(0.001)  # of no period: whoever would write now has the time to
+        assert written == [1]
+        await told.until(lambda: told.loop.cycle.configurations.epoch == 1)
+        await told.until(told.as_decided)
+        assert set(written) == {1}
+        told.runner.close()
+
+    asyncio.run(story())
