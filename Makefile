@@ -123,6 +123,12 @@ bench-lifecycle: setup ## the life of a proposal in any order of everything, 10,
 bench-history: setup ## bytes to the disk for each byte of data, the log beside readers (about 2 min; ARGS="--minutes 10 --real-time")
 	@$(PY) -m tests.bench.history $(ARGS)
 
+bench-loop-states: setup ## the loop's states in any order of everything, 20,000 sequences, and its old faults put back (about 15 min; ARGS="--sequences 1000")
+	@$(PY) -m tests.bench.loop_states $(ARGS)
+
+bench-loop-kill: setup ## the loop's process killed a thousand times at the writes of its configuration (ARGS="--kills 100")
+	@$(PY) -m tests.bench.loop_kill $(ARGS)
+
 bench-knowledge: setup ## how well notes are found, and how fast; with MiniLM where it is installed (ARGS="--questions FILE")
 	@$(PY) -m tests.bench.knowledge $(ARGS)
 

@@ -7,6 +7,8 @@ decided last; what was decided before, until the disk has had the time to follow
 from collections import Counter
 from dataclasses import dataclass, field, replace
 
+from pydantic import TypeAdapter
+
 from gateway.core.controller import config_hash
 from gateway.core.controller_laws import MpcConfig
 from gateway.core.deployment import RecoveryPrediction, Region
@@ -63,6 +65,9 @@ class Runs:
     def key(self) -> tuple[str, str | None, Watch]:
         """What can end a process: the configurations and what watches them."""
         return (self.good.hash, self.top and self.top.hash, self.watch)
+
+
+RUNS = TypeAdapter(Runs)
 
 
 def runs_of(durable: Durable) -> Runs:
@@ -125,9 +130,9 @@ class Model:
         match command:
             case Deploy():
                 return replace(self.durable, epoch=command.deployment.epoch)
-            case WatchGood():
+            case WatchGood() if self.until_s is None:
                 return replace(self.durable, watch=watch_key(command.watch))
-            case Keep():
+            case Keep() if self.until_s is not None:
                 top = self.running if self.stays_on_top else None
                 return Runs(self.epoch, self.good_if_kept, watch_key(command.watch), top)
             case _:

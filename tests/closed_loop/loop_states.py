@@ -16,6 +16,7 @@ invariants, each with the place that asks it:
 - Every command is answered (`teardown`), every epoch used once (`Model.carried_out`).
 """
 
+import asyncio
 import shutil
 import tempfile
 from dataclasses import replace
@@ -135,6 +136,7 @@ class LoopStates(RuleBasedStateMachine):
         try:
             if self.life is not None and not self.life.over and not self.life.ending.is_set():
                 self._answered()
+                self._caught_up()
         finally:
             if self.life is not None:
                 self.life.close()
@@ -199,16 +201,54 @@ class LoopStates(RuleBasedStateMachine):
         proposal = "a" * 64 if judged else None
         self._order(RunExperiment(experiment=experiment(speed, step_n, duration_s), proposal=proposal), then, 3)
 
+    # what seldom comes of the rest, most of which is trouble
+
     @precondition(lambda self: self.life is not None and self.life.cycle.machine.phase is Phase.RUNNING)
-    @rule(name=st.sampled_from(["lqg", "mpc"]), kept=st.booleans(), lease_s=st.sampled_from(LEASES_S),
-          region=st.sampled_from(REGIONS))  # fmt: skip
-    def an_experiment_under_another_controller(self, name, kept, lease_s, region):
-        """Most of the rest is trouble, through which few experiments would come."""
+    @rule(
+        name=st.sampled_from(["lqg", "mpc"]),
+        kept=st.booleans(),
+        lease_s=st.sampled_from([0.2, 0.4, 5.0]),
+        region=st.sampled_from(REGIONS),
+        end=st.sampled_from(["a person", "the law", "time", "nothing"]),
+    )
+    def an_experiment_under_another_controller(self, name, kept, lease_s, region, end):
+        self._mend()
         if self.model.until_s is None:
             self._answer(self._deploy(1, name, region, lease_s, "none", False))
         if kept:
             self._answer(Keep(epoch=max(self.model.epoch, 1)))
         self._answer(RunExperiment(experiment=experiment(None, 0.4, 2.0), proposal="a" * 64))
+        match end:
+            case "a person":
+                self.roll_back(2, 3)
+            case "the law":
+                self.the_law_fails("raises", 2)
+            case "time":
+                self._pass(45)
+            case _:
+                pass
+
+    @rule(before=st.integers(0, 12), between=periods, release=st.sampled_from([2, 5]), after=turns)
+    def two_stops_into_an_arming(self, before, between, release, after):
+        if not self._alive().runner.at_rest:
+            return
+        self.arm(before, after, 4, release)
+        self._order(Stop(), between, after)
+        self._order(Stop(), release + 1, after)
+        self._pass(8)
+
+    @rule(slow=st.integers(0, 4), between=periods, refused=st.integers(1, 2))
+    def a_rollback_against_a_keep(self, slow, between, refused):
+        self._mend()
+        if self.model.until_s is None:
+            self._answer(self._deploy(1, "pid", REGIONS[0], 5.0, "none", False))
+        disk = self._alive().disk
+        disk.slow_after = slow
+        keep = self._order(Keep(epoch=max(self.model.epoch, 1)), 0, 3)
+        self._order(Rollback(reason="a person"), between, 3)
+        disk.refused = refused
+        while not keep.task.done() and not self._alive().over and self.life.disk is disk:
+            self._pass(1)
 
     # what goes wrong
 
@@ -279,7 +319,7 @@ class LoopStates(RuleBasedStateMachine):
                 truth.plc.permissive, truth.plc.emergency_stop, life.blind = True, False, 0
         self._pass(then)
 
-    @rule(count=st.sampled_from([1, 2, 5, 12, 30]))
+    @rule(count=st.sampled_from([1, 2, 5, 12, 30, 130]))
     def time_passes(self, count):
         self._pass(count)
 
@@ -462,7 +502,7 @@ class LoopStates(RuleBasedStateMachine):
                 self.model.ends.pop(self.model.durable.key, None)
             return
         assert isinstance(error, Broken), f"the process has ended by {type(error).__name__}: {error}"
-        assert len(life.raised) >= 2, f"the first exception, of {life.raised}, has ended the process"
+        assert len(life.led_to_it) >= 2, f"the first exception, of {life.led_to_it}, has ended the process"
         if life.cycle.configurations.probation is None:
             self.model.ends[self.model.durable.key] += 1
 
@@ -492,10 +532,19 @@ class LoopStates(RuleBasedStateMachine):
     def _order(self, command: Command, then: int, after: int) -> Ask:
         life = self._alive()
         ask = life.order(command)
+        ask.task.add_done_callback(lambda task: self._answer_came(life, command, task))
         self._note_under_way()
         life.turn(after)
         self._pass(then)
         return ask
+
+    def _answer_came(self, life: Life, command: Command, task: asyncio.Task[Reply]) -> None:
+        """Whoever has taken something back is told once a loop that starts anew would know it, or that it would not."""
+        if life is not self.life or task.cancelled() or not isinstance(command, Rollback | Narrow):
+            return
+        reply = task.result()
+        if reply.ok and "does not know it yet" not in reply.text:
+            self.model.settled()
 
     def _answer(self, command: Command) -> None:
         """Waits for it, a while."""
@@ -517,6 +566,24 @@ class LoopStates(RuleBasedStateMachine):
                 return
         waiting = [ask.command for ask in life.asks if not ask.task.done()]
         raise AssertionError(f"not answered within {ANSWERED_PERIODS} periods: {waiting}")
+
+    def _caught_up(self) -> None:
+        """The disk takes writes again: it comes to what was decided."""
+        for _ in range(FOLLOWS_AGAIN_PERIODS):
+            life = self._alive()
+            if life.over or life.ending.is_set() or self._on_disk() == self.model.durable:
+                return
+            self._pass(1)
+        found = self._on_disk()
+        assert found == self.model.durable, f"on the disk {found}; decided {self.model.durable}"
+
+    def _mend(self) -> None:
+        """Whatever was going to go wrong does not any more."""
+        life = self._alive()
+        disk, truth = life.disk, life.loop.truth
+        disk.refused, disk.passing, disk.dies_after, disk.slow_before, disk.slow_after = 0, 0, None, 0, 0
+        truth.plc.permissive, truth.plc.emergency_stop, life.blind = True, False, 0
+        life.broken.clear()
 
     def _deploy(self, epoch: int, name: str, region: Region, lease_s: float, watch: str, shaped: bool) -> Deploy:
         config, number = LAWS[name], self.model.epoch + epoch

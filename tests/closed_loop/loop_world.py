@@ -18,8 +18,7 @@ import numpy as np
 from gateway.cli.stepped import SteppedLoop
 from gateway.control.design import design_lqi, task_of
 from gateway.core.line import Line
-from gateway.core.messages import Command, Reply
-from gateway.core.states import Phase
+from gateway.core.messages import Arm, Command, Reply
 from gateway.loop import deaths, kept, process, runner
 from gateway.loop.kept import Store
 from gateway.loop.pacer import Tick
@@ -262,6 +261,7 @@ class Life:
     broken: dict[str, int] = field(default_factory=dict[str, int])  #: how often a part will raise
     ran: bool = False  #: a period has come to its end since `period` was called
     failed: bool = False  #: a period has raised: the process is about to end
+    led_to_it: list[str] = field(default_factory=list[str])  #: what had raised then
     blind: int = 0  #: periods without load cells
     jump_n: float = 0.0  #: of the next sample
 
@@ -328,8 +328,6 @@ class Life:
             after = self.pacer.waiting
             if self.task.done() or (after is not None and not after.done()):
                 break
-        if self.cycle.machine.phase not in (Phase.SILENT, Phase.OFF):
-            self.armed_since_prepared = True
         await _turns(turns)
 
     @property
@@ -369,7 +367,7 @@ class Life:
             try:
                 await period(tick)
             except Exception:
-                self.failed = True
+                self.failed, self.led_to_it = True, list(self.raised)
                 raise
             self.ran = True
 
@@ -378,6 +376,8 @@ class Life:
     def _carry_out(self, cycle: object, command: Command, now_s: float, prepared: object = None) -> Reply:
         self.raise_if_broken("command")
         reply = _carry_out(cycle, command, now_s, prepared)
+        if isinstance(command, Arm) and reply.ok:
+            self.armed_since_prepared = True
         self.carried_out(command, reply, now_s)
         return reply
 
