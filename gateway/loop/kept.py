@@ -70,6 +70,11 @@ def fingerprint(durable: Durable) -> str:
     return sha256(b"".join(sha256(part).digest() for part in parts)).hexdigest()
 
 
+def _good(durable: Durable | None) -> tuple[Controller, RecoveryPrediction | None] | None:
+    """What is gone back to, and what watches it."""
+    return None if durable is None else (durable.controller, durable.watch)
+
+
 class Store:
     """The file in `folder`, for a loop that was started with `config`."""
 
@@ -80,6 +85,8 @@ class Store:
         self._started_with, *self._formerly = known_hashes(config)
         self._content: bytes | None = None  #: of the file; None: not known
         self._last: Durable | None = None  #: that was read or written
+        #: In `BEFORE`. Who goes back to it has taken back what came after, which is nothing to go back to.
+        self._before: Durable | None = None
 
     def read(self, line: Line, say: Callable[[str], None]) -> Kept | None:
         """What the loop is to run, or None: what it is given. A file that is not used is told, with why."""
@@ -155,8 +162,9 @@ class Store:
             return
         self._content = None
         last = self._last
-        if last is not None and (last.controller, last.watch) != (durable.controller, durable.watch):
+        if last is not None and _good(durable) not in (_good(last), _good(self._before)):
             self._write(self.path.with_name(BEFORE), self._content_of(replace(last, on_top=None)))
+            self._before = last
         self._write(self.path, content)
         self._content, self._last = content, durable
 

@@ -15,7 +15,7 @@ from gateway.core.messages import Deploy, Keep, Narrow, Rollback, WatchGood
 from gateway.core.theta import nominal_theta
 from gateway.loop import persistence, runner
 from gateway.loop.deploy import prepare
-from gateway.loop.kept import Store
+from gateway.loop.kept import Durable, Store, fingerprint
 from gateway.loop.pacer import Tick
 from gateway.loop.persistence import NOT_PERSISTED, PERSISTED
 from gateway.loop.runner import Runner
@@ -282,3 +282,15 @@ def test_whoever_deploys_and_goes_away_leaves_no_epoch_that_could_be_used_twice(
         told.runner.close()
 
     asyncio.run(story())
+
+
+def test_what_was_taken_back_is_nothing_to_go_back_to_either(tmp_path):
+    """A `keep` that is written ahead and rolled back meanwhile must not come again when the good one ends processes."""
+    store = Store(tmp_path, GIVEN)
+    good = Durable(0, GIVEN, first_region(LINE))
+    for durable in (good, replace(good, epoch=1), replace(good, epoch=1, controller=OTHER), replace(good, epoch=1)):
+        store.write(durable)
+    for _ in range(2):
+        store.deaths.count(fingerprint(good), "a defect")
+    kept = Store(tmp_path, GIVEN).read(LINE, print)
+    assert kept is not None and kept.controller == GIVEN
