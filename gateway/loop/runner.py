@@ -242,7 +242,8 @@ class Runner:
         needs no waiting for, and a drive that stays enabled is not left without its orders.
         """
         cycle = self.cycle
-        cycle.containment.begin_anew()
+        if self.at_rest:  # who asks while the line still stops gives no part that failed another chance
+            cycle.containment.begin_anew()
         try:
             if cycle.machine.phase is Phase.OFF and unheard(cycle) and not forbidden(cycle) and not cycle.any_enabled():
                 await release_links(cycle)

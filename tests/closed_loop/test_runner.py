@@ -253,3 +253,24 @@ def test_a_deployment_waits_for_a_late_frame_and_not_for_a_cell_that_is_gone(mis
         assert deployed or "the line is unloading" in reply.reasons[0]
 
     asyncio.run(story())
+
+
+def test_an_arming_that_is_refused_while_the_line_stops_gives_what_failed_no_other_chance(monkeypatch):
+    async def story():
+        told = Story(start(stepped()))
+        cycle = told.loop.cycle
+
+        asked = []
+
+        def broken(*_):
+            asked.append(1)
+            raise RuntimeError("a defect")
+
+        monkeypatch.setattr(cycle.watch, "controlled", broken)
+        await told.periods(1)
+        assert cycle.machine.state is LoopState.STOP and not told.runner.at_rest
+        assert not (await told.until(told.order(Arm()))).ok
+        await told.periods(3)
+        assert cycle.containment.failed and len(asked) == 1
+
+    asyncio.run(story())
