@@ -1,12 +1,13 @@
 """What is let near a period: built, run and measured aside, and refused with the figure where it takes too long.
 
 A period of a running line has no time for anything that nobody has measured. So a law is engaged and asked here, at
-rest and where limits are reached, and so is the prediction that watches it, along both of its ways; what the slowest
-of each takes must fit the share of a period that is theirs.
+rest and where limits are reached, and so is the prediction that watches it, along both of its ways; what they take
+together must fit the share of a period that is left for control.
 """
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from math import inf
 from statistics import median
 from typing import Any
@@ -25,8 +26,11 @@ from gateway.loop.configurations import Configuration
 from gateway.loop.kept import Kept
 from safety.recoverability import Recovery
 
-LAW_SHARE = 0.45  #: of a period, for engaging and asking a law; the samples have half of it, before
-WATCH_SHARE = 0.4  #: for the prediction, along the longer of its ways; what is left is for reading and writing
+#: Of every period, for the law and the prediction that watches it: samples may take half of it, and writing the rest.
+SHARE = 0.45
+#: Of the one period in which the monitor takes a law back, and the one before takes over: samples that came late are
+#: then in time for nothing, but no period is skipped.
+TAKEN_BACK_SHARE = 0.85
 WARM_PERIODS = 3  #: first solutions take longest: they are not measured
 MEASURED_PERIODS = 7  #: of which the median counts
 
@@ -46,7 +50,7 @@ class Admission:
         self._period_s = period_s
         self._measured = MEASURED_PERIODS if period_s < inf else 1
 
-    def admit(self, deployment: Deployment, good: Controller) -> Configuration:
+    def admit(self, deployment: Deployment, good: Configuration) -> Configuration:
         """What `deployment` brings, ready to run; `good` is what the line would go back to.
 
         Raises ControllerRefused with every reason.
@@ -57,45 +61,75 @@ class Admission:
             raise ControllerRefused(f"its hash is {found[:12]}.., not {deployment.hash[:12]}..: it was altered")
         if reasons := misfits(config, self._line):
             raise ControllerRefused("; ".join(reasons))
-        law = self._ready(config)
-        recovery = None if deployment.watch is None else self.recovery(deployment.watch, good)
-        return Configuration(config, found, law, deployment.region, deployment.watch, recovery)
+        law = self._law_of(config)
+        law_s = self._law_s(law, config)
+        recovery, watch_s = None, 0.0
+        if deployment.watch is not None:
+            recovery, watch_s = self._recovery(deployment.watch, good.config)
+        self._require_time(law_s, watch_s, good.law_s)
+        return Configuration(config, found, law, deployment.region, deployment.watch, recovery, law_s)
+
+    def recovery(self, watch: RecoveryPrediction, fallback: Controller, law_s: float) -> Recovery:
+        """Whether `fallback` would recover the line, to be asked in each period beside a law that takes `law_s`.
+
+        Raises ControllerRefused.
+        """
+        recovery, watch_s = self._recovery(watch, fallback)
+        self._require_time(law_s, watch_s)
+        return recovery
+
+    def measured(self, given: Configuration) -> Configuration:
+        """`given`, as it was measured; one that cannot be run, or takes too long, is unfit."""
+        try:
+            law_s = self._law_s(given.law, given.config)
+            self._require_time(law_s)
+        except ControllerRefused as refused:
+            return replace(given, unfit=str(refused))
+        return replace(given, law_s=law_s)
 
     def resumed(self, kept: Kept, say: Callable[[str], None]) -> tuple[Configuration, Configuration]:
         """What runs and what is gone back to, of what a loop before has kept. Raises ControllerRefused.
 
-        A prediction that cannot be used any more is left out, and told.
+        A prediction that cannot be used any more is left out, and so is the controller on top; either is told.
         """
         config, watch, recovery = kept.controller, kept.watch, None
+        law = self._law_of(config)
+        law_s = self._law_s(law, config)
+        self._require_time(law_s)
+        top = self._resumed_top(kept, law_s, say)
         if watch is not None:
             try:
-                recovery = self.recovery(watch, config)
+                recovery = self.recovery(watch, config, law_s if top is None else top.law_s)
             except ControllerRefused as refused:
                 say(f"nobody looks whether the line could be recovered: {refused}")
                 watch = None
-        good = Configuration(config, config_hash(config), self._ready(config), kept.region, watch, recovery)
+        good = Configuration(config, config_hash(config), law, kept.region, watch, recovery, law_s)
+        return (good if top is None else replace(top, watch=watch, recovery=recovery)), good
+
+    def _resumed_top(self, kept: Kept, good_s: float, say: Callable[[str], None]) -> Configuration | None:
         if (top := kept.on_top) is None:
-            return good, good
-        law = self._ready(top.controller)
-        return Configuration(top.controller, config_hash(top.controller), law, top.region, watch, recovery), good
-
-    def _ready(self, config: Controller) -> Law[Any]:
-        law = self._law_of(config)
-        self.measure_law(law, config)
-        return law
-
-    def measure_law(self, law: Law[Any], config: Controller) -> None:
-        """Run `law` of `config` as a period would. Raises ControllerRefused where that fails, or takes too long."""
+            return None
+        config = top.controller
         try:
-            took_s = max(_law_s(law, *situation, self._measured) for situation in _situations(config, self._line))
+            law = self._law_of(config)
+            law_s = self._law_s(law, config)
+            self._require_time(law_s, 0.0, good_s)
+        except ControllerRefused as refused:
+            say(f"{config.kind} controller {config_hash(config)[:12]} is not used, what it stands on is: {refused}")
+            return None
+        return Configuration(config, config_hash(config), law, top.region, law_s=law_s)
+
+    def _law_s(self, law: Law[Any], config: Controller) -> float:
+        """What a period of `law` takes, in processor seconds. Raises ControllerRefused where it cannot be run."""
+        try:
+            return max(_law_s(law, *situation, self._measured) for situation in _situations(config, self._line))
         except ControllerRefused:
             raise
         except Exception as error:  # whatever a law may raise: here it costs nothing
             raise ControllerRefused(f"it cannot be run: {type(error).__name__}: {error}") from error
-        self._require_share(took_s, LAW_SHARE, "its torques take")
 
-    def recovery(self, watch: RecoveryPrediction, fallback: Controller) -> Recovery:
-        """Whether `fallback` would recover the line, to be asked in each period. Raises ControllerRefused."""
+    def _recovery(self, watch: RecoveryPrediction, fallback: Controller) -> tuple[Recovery, float]:
+        """Made, and what a look of it takes, in processor seconds."""
         if watch.fallback != config_hash(fallback):
             raise ControllerRefused(
                 f"it is watched for the fallback {watch.fallback[:12]}, but {config_hash(fallback)[:12]} is what the "
@@ -106,20 +140,22 @@ class Admission:
         try:
             recovery = Recovery(watch, fallback, self._line)
             situations = _situations(fallback, self._line)
-            took_s = max(_recovery_s(recovery, *situation, self._measured) for situation in situations)
+            return recovery, max(_look_s(recovery, *situation, self._measured) for situation in situations)
         except Exception as error:  # of a prediction that fits its format and not its fallback
-            raise ControllerRefused(
-                f"its recovery prediction cannot be used: {type(error).__name__}: {error}"
-            ) from error
-        self._require_share(took_s, WATCH_SHARE, "its recovery prediction takes")
-        return recovery
+            reason = f"{type(error).__name__}: {error}"
+            raise ControllerRefused(f"its recovery prediction cannot be used: {reason}") from error
 
-    def _require_share(self, took_s: float, share: float, what: str) -> None:
-        allowed_s = share * self._period_s
-        if not took_s <= allowed_s:
+    def _require_time(self, law_s: float, watch_s: float = 0.0, good_s: float = 0.0) -> None:
+        """Every period has law and prediction in it, the one in which the law is taken back also the good one."""
+        taken = f"its law takes {1e3 * law_s:.3g} ms of each period of {1e3 * self._period_s:g} ms"
+        if watch_s:
+            taken += f", its recovery prediction {1e3 * watch_s:.3g} ms"
+        if not law_s + watch_s <= SHARE * self._period_s:
+            raise ControllerRefused(f"{taken}, on this computer; allowed: {1e3 * SHARE * self._period_s:.3g} ms")
+        if not law_s + watch_s + good_s <= TAKEN_BACK_SHARE * self._period_s:
             raise ControllerRefused(
-                f"{what} {1e3 * took_s:.3g} ms of a period of {1e3 * self._period_s:g} ms on this computer; "
-                f"allowed: {1e3 * allowed_s:.3g} ms"
+                f"{taken}, and what the line would go back to {1e3 * good_s:.3g} ms; allowed: "
+                f"{1e3 * TAKEN_BACK_SHARE * self._period_s:.3g} ms in all"
             )
 
 
@@ -164,9 +200,7 @@ def _ask(law: Law[Any], state: Any, measured: Measured, reference: Steady, torqu
     return law.commit(state, decision, torque_nm)
 
 
-def _recovery_s(
-    recovery: Recovery, measured: Measured, reference: Steady, torque_nm: FloatArray, periods: int
-) -> float:
+def _look_s(recovery: Recovery, measured: Measured, reference: Steady, torque_nm: FloatArray, periods: int) -> float:
     """What one look takes, in processor seconds; away from the set-points torques are cut, and it goes step by step."""
     in_flight_nm = np.tile(torque_nm, (recovery.depth, 1))
     setpoint_n = reference.tension_n

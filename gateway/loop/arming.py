@@ -54,7 +54,8 @@ async def release_links(cycle: Cycle) -> None:
 
 def not_ready(cycle: Cycle) -> list[str]:
     """What speaks against arming, as far as the samples tell. One that is late is no reason to send a person away."""
-    unfit = [cycle.unfit] if cycle.unfit else []
+    running = cycle.configurations.running
+    unfit = [f"controller {running.hash[:12]}: {running.unfit}"] if running.unfit else []
     return unfit + forbidden(cycle) + unheard(cycle)
 
 

@@ -35,6 +35,8 @@ class Configuration:
     region: Region
     watch: RecoveryPrediction | None = None
     recovery: Recovery | None = None  #: what `watch` has been made into
+    law_s: float = 0.0  #: that a period of the law takes, in processor seconds, as it was measured
+    unfit: str = ""  #: why it must not control the line; empty: it may
 
 
 @dataclass(slots=True)

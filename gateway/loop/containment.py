@@ -14,6 +14,7 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 PART_FAILED = "part failed"  #: the rule's name
+OUTSIDE = ("the link ", "the command ", "events", "telemetry")  #: how parts begin that no configuration is in
 
 
 class Containment:
@@ -49,6 +50,11 @@ class Containment:
         if untold:
             self._untold = []
         return untold
+
+    @property
+    def speaks_of_configuration(self) -> bool:
+        """Whether something has failed that a configuration or its model is in."""
+        return any(not part.startswith(OUTSIDE) for part in self.failed)
 
     def begin_anew(self) -> None:
         """A person arms."""

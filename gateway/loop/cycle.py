@@ -105,7 +105,6 @@ class Cycle:
         self.outputs = Outputs(line.n)
         self.setpoints = Setpoints(line.recipes[0])
         self.containment = Containment()
-        self.unfit = ""  #: why what the loop was given must not control the line; empty: it may
         self._tell = tell
         period_s = line.control.period_s if budget_period_s is None else budget_period_s
         self.admission = Admission(line, law_of, period_s)
@@ -179,25 +178,40 @@ class Cycle:
             if self.machine.phase is before:
                 self._alarm([finding])
 
+    def measure_given(self) -> str:
+        """Before the first period: measure what the loop was given. Returns why it must not control the line, if so."""
+        configurations = self.configurations
+        configurations.running = configurations.good = self.admission.measured(configurations.running)
+        return configurations.running.unfit
+
     def resume(self, kept: Kept, say: Callable[[str], None]) -> None:
         """Before the first period: what a loop before has kept. Raises ControllerRefused, with nothing changed."""
         running, good = self.admission.resumed(kept, say)
         self.configurations.resume(running, good, kept.epoch)
 
+    def go_no_further(self, kept: Kept) -> None:
+        """Before the first period: what the loop was given takes the place of what was kept, within its limits."""
+        configurations = self.configurations
+        given = configurations.running
+        configurations.running = configurations.good = replace(given, region=given.region.no_further(kept.region))
+        configurations.epoch = kept.epoch  # epochs go on
+
     def deploy(self, candidate: Configuration, deployment: Deployment, now_s: float) -> None:
         """`candidate` controls the line from the next period on, on probation. Between two periods only."""
         self.experiments.end("another controller takes over")
-        self.unfit = ""
         self.configurations.take(candidate, deployment, now_s)
 
     def roll_back(self, reason: str) -> bool:
         """Back to the last known good controller, whoever asks for it; False where that runs already.
 
-        An experiment was judged under the controller that is given up: it ends with it.
+        An experiment was judged under the controller that is given up: it ends with it. Where the one that is gone back
+        to must not control the line, torque goes off in order.
         """
         if not self.configurations.roll_back(reason):
             return False
         self.experiments.end(f"the controller was taken back: {reason}")
+        if (unfit := self.configurations.running.unfit) and self.machine.phase in CONTROLLED:
+            self._move_to(machines.torque_off(self.machine, self.clock(), f"{reason}; {unfit}"), [])
         return True
 
     def tell(self, kind: str, text: str, **data: object) -> None:
@@ -366,7 +380,7 @@ class Cycle:
         except LawFailed as failed:
             if not self.roll_back(f"the law failed: {failed.finding.text}"):
                 raise
-            return controlled()
+            return self._after_roll_back(controlled)
         if self.machine.phase not in SUPERVISED:
             return found
         guard, setpoint_n = self.guard, self.setpoints.tension_n
@@ -379,9 +393,15 @@ class Cycle:
         reason = "; ".join(finding.text for finding in against)
         if self.roll_back(reason):
             self._alarm(against)
-            return controlled()
+            return self._after_roll_back(controlled)
         self._move_to(machines.stop(self.machine, now_s, reason), against)
         return found
+
+    def _after_roll_back(self, controlled: Callable[[], tuple[FloatArray, bool]]) -> tuple[FloatArray, bool]:
+        """What the last known good asks for; on the way to zero where it must not control the line."""
+        if self.machine.phase not in CONTROLLED:
+            return self.torque_path.unload(self.outputs.torque_nm), False
+        return controlled()
 
     def _estimate(self) -> Measured:
         # The measured values as they are: a law that wants an observer brings its own.

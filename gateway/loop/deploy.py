@@ -48,11 +48,11 @@ def prepare(cycle: Cycle, command: Configuring) -> Prepared:
     configurations, admission = cycle.configurations, cycle.admission
     match command:
         case Deploy():
-            return admission.admit(command.deployment, configurations.good.config)
+            return admission.admit(command.deployment, configurations.good)
         case Keep() if command.watch is not None:
-            return admission.recovery(command.watch, configurations.good_if_kept.config)
+            return admission.recovery(command.watch, configurations.good_if_kept.config, configurations.running.law_s)
         case WatchGood():
-            return admission.recovery(command.watch, configurations.good.config)
+            return admission.recovery(command.watch, configurations.good.config, configurations.running.law_s)
         case _:
             return None
 

@@ -5,7 +5,8 @@ a loop that starts anew starts with what was kept. The file belongs to the confi
 an engineer who gives it another one gets that.
 
 What has ended the loop by an exception twice in a row is not started a third time (`deaths`): the loop goes back to
-the last known good without the one on top, then to the good one before, then to what it is given.
+the last known good without the one on top, then without the model that watches it, then to the good one before, then to
+what it is given.
 """
 
 import os
@@ -70,11 +71,6 @@ def fingerprint(durable: Durable) -> str:
     return sha256(b"".join(sha256(part).digest() for part in parts)).hexdigest()
 
 
-def _good(durable: Durable | None) -> tuple[Controller, RecoveryPrediction | None] | None:
-    """What is gone back to, and what watches it."""
-    return None if durable is None else (durable.controller, durable.watch)
-
-
 class Store:
     """The file in `folder`, for a loop that was started with `config`."""
 
@@ -84,16 +80,15 @@ class Store:
         self._given = config
         self._started_with, *self._formerly = known_hashes(config)
         self._content: bytes | None = None  #: of the file; None: not known
-        self._last: Durable | None = None  #: that was read or written
-        #: In `BEFORE`. Who goes back to it has taken back what came after, which is nothing to go back to.
-        self._before: Durable | None = None
+        self.last: Durable | None = None  #: that was read or written: what a loop that starts now would run
+        self._good: Durable | None = None  #: that was decided last
 
     def read(self, line: Line, say: Callable[[str], None]) -> Kept | None:
         """What the loop is to run, or None: what it is given. A file that is not used is told, with why."""
         kept = self._usable(self.path, line, say)
         if kept is None:
             return None
-        self._last = kept.durable
+        self.last = self._good = kept.durable
         found = self._that_lives(kept, line, say)
         if found is not kept:
             self._set_aside(found, say)
@@ -130,16 +125,18 @@ class Store:
         yield kept
         if kept.on_top is not None:
             yield kept.model_copy(update={"on_top": None})
+        if kept.watch is not None:
+            yield kept.model_copy(update={"on_top": None, "watch": None})
         if (before := self._usable(self.path.with_name(BEFORE), line, say)) is not None:
             yield before.model_copy(update={"epoch": kept.epoch, "region": before.region.no_further(kept.region)})
 
     def _set_aside(self, found: Kept, say: Callable[[str], None]) -> None:
         aside = self.path.with_name(SET_ASIDE)
         why = self.deaths.last_reason
-        self._last = None  # it is nothing to go back to
+        self._good = None  # it is nothing to go back to
         try:
             self._write(aside, self.path.read_bytes().rstrip(b"\n"))
-            self.write(found.durable)
+            self.settle(found.durable)
         except OSError as error:
             say(f"{self.path} could not be set aside: {error.strerror}")
         running = found.controller if found.on_top is None else found.on_top.controller
@@ -161,12 +158,16 @@ class Store:
         if content == self._content:
             return
         self._content = None
-        last = self._last
-        if last is not None and _good(durable) not in (_good(last), _good(self._before)):
-            self._write(self.path.with_name(BEFORE), self._content_of(replace(last, on_top=None)))
-            self._before = last
         self._write(self.path, content)
-        self._content, self._last = content, durable
+        self._content, self.last = content, durable
+
+    def settle(self, durable: Durable) -> None:
+        """As `write`, of what is decided: the good one that it has replaced lies beside it from then on."""
+        self.write(durable)
+        good = self._good
+        if good is not None and good.controller != durable.controller:
+            self._write(self.path.with_name(BEFORE), self._content_of(replace(good, on_top=None)))
+        self._good = durable
 
     def _content_of(self, durable: Durable) -> bytes:
         kept = Kept(

@@ -87,7 +87,7 @@ class Persistence:
             async with self._deciding:
                 changes, durable = self._configurations.changes, self._configurations.durable
                 try:
-                    await self._aside.do(lambda durable=durable: store.write(durable))
+                    await self._aside.do(lambda durable=durable: store.settle(durable))
                 except Exception as error:  # whatever it is, it is told and tried again
                     self._say_failed(f"{store.path}: {type(error).__name__}: {error}")
                 else:

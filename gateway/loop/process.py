@@ -102,14 +102,10 @@ def begin(cycle: Cycle, kept: Kept | None, say: Callable[[str], None]) -> None:
             cycle.resume(kept, say)
             return
         except ControllerRefused as refused:
-            cycle.configurations.epoch = kept.epoch  # epochs go on
-            say(f"what was kept is not used, the configuration given is: {refused}")
-    running = cycle.configurations.running
-    try:
-        cycle.admission.measure_law(running.law, running.config)
-    except ControllerRefused as refused:
-        cycle.unfit = f"controller {running.hash[:12]}: {refused}"
-        say(f"the line cannot be armed with {cycle.unfit}")
+            say(f"what was kept is not used, the configuration given is, no further: {refused}")
+            cycle.go_no_further(kept)
+    if unfit := cycle.measure_given():
+        say(f"the line cannot be armed with the controller given: {unfit}")
 
 
 async def _open(links: list[Link]) -> list[str]:
@@ -125,7 +121,7 @@ async def _open(links: list[Link]) -> list[str]:
 
 async def run_until(runner: Runner, line: Line, ending: asyncio.Event, store: Store | None = None) -> None:
     """Periods until `ending`, then until the line rests. An exception ends it with torque off, and is raised."""
-    cycle, pacer = runner.cycle, TimerPacer(line.control.period_s)
+    pacer = TimerPacer(line.control.period_s)
     collector = RestCollector()
     try:
         while not ending.is_set():
@@ -137,30 +133,44 @@ async def run_until(runner: Runner, line: Line, ending: asyncio.Event, store: St
         while resting < RESTING_PERIODS and monotonic() < deadline_s:
             await runner.period(await pacer.wait())
             resting = resting + 1 if runner.at_rest else 0
-        if cycle.machine.phase is Phase.OFF:
-            await release_links(cycle)
-    except Exception as error:
-        await finish(_torque_off(cycle, pacer))
-        if store is not None:
-            _count_death(cycle, store, error)
+    except BaseException as error:
+        await finish(_torque_off(runner.cycle, pacer))
+        await finish(runner.over(PERSISTED_S))
+        if store is not None and isinstance(error, Exception):
+            _count_death(runner.cycle, store, error)
         raise
+    else:
+        await _come_to_rest(runner, store)
     finally:
         pacer.close()
-    await runner.persisted(PERSISTED_S)
-    if store is not None and cycle.account.ran:
-        with suppress(OSError):
-            store.deaths.forgive(fingerprint(cycle.configurations.durable))
+
+
+async def _come_to_rest(runner: Runner, store: Store | None) -> None:
+    """After the last period of an orderly end: devices released, the disk as it was decided."""
+    cycle = runner.cycle
+    try:
+        if cycle.machine.phase is Phase.OFF:
+            await release_links(cycle)
+    finally:
+        await runner.over(PERSISTED_S)
+        if store is not None and cycle.account.ran:
+            with suppress(OSError):
+                store.deaths.forgive(fingerprint(cycle.configurations.durable))
 
 
 def _count_death(cycle: Cycle, store: Store, error: Exception) -> None:
-    """What was on probation is gone with this process; what was kept would be started again."""
-    if cycle.configurations.probation is None:
+    """Of what a loop that starts anew would run: what was on probation is gone with this process.
+
+    A failing link or command says nothing of a configuration, and nor does one that has never run the line.
+    """
+    if cycle.configurations.probation is None and cycle.account.ran and cycle.containment.speaks_of_configuration:
         with suppress(OSError):
-            store.deaths.count(fingerprint(cycle.configurations.durable), f"{type(error).__name__}: {error}")
+            died = store.last or cycle.configurations.durable
+            store.deaths.count(fingerprint(died), f"{type(error).__name__}: {error}")
 
 
 async def _torque_off(cycle: Cycle, pacer: TimerPacer) -> None:
-    """The last thing a broken loop does: tell every drive to take torque off. Their watchdogs stand behind it."""
+    """The last thing a broken loop does: tell all drives at once to take torque off. Watchdogs stand behind it."""
     for link in cycle.links:
         with suppress(Exception):
             link.write(Outputs(cycle.line.n))
@@ -168,4 +178,4 @@ async def _torque_off(cycle: Cycle, pacer: TimerPacer) -> None:
     for link in cycle.links:
         with suppress(Exception):
             link.trigger(tick.now_s)
-            await link.release()
+    await finish_all(link.release() for link in cycle.links)

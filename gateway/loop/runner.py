@@ -64,6 +64,7 @@ class Runner:
         self._armed: asyncio.Task[Reply] | None = None  #: the arming that was asked for last
         self._stops = 0  #: that were asked for
         self._ending = False
+        self._over = False  #: there will be no boundary any more
 
     async def period(self, tick: Tick) -> None:
         """Carry out what waits, then one control period."""
@@ -97,7 +98,18 @@ class Runner:
     async def end(self) -> None:
         """From now on the line is being stopped, and no other command is taken. Periods must go on until it rests."""
         self._ending = True
+        self._stops += 1
+        self._refuse_waiting_arms()
         await self._cancel_arming()
+
+    async def over(self, within_s: float) -> None:
+        """The last period is over: nothing is decided any more, and the disk has what was, if it takes it in time."""
+        self._over = True
+        while self._waiting:
+            answer = self._waiting.popleft().answer
+            if not answer.done():
+                answer.set_result(self._refused("the loop is ending"))
+        await self.persisted(within_s)
 
     async def persisted(self, within_s: float) -> str:
         """Once the disk has what was decided last; else why it has not. Empty: it has."""
@@ -156,6 +168,8 @@ class Runner:
         return reply
 
     async def _at_boundary(self, command: Command, prepared: Prepared = None) -> Reply:
+        if self._over:
+            return self._refused("the loop is ending")
         waiting = Waiting(command, prepared, asyncio.get_running_loop().create_future())
         (self._waiting.appendleft if isinstance(command, Stop) else self._waiting.append)(waiting)
         return await waiting.answer

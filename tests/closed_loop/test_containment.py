@@ -6,15 +6,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from drivers.memory import MemoryLink
 from gateway.cli.stepped import SteppedLoop
-from gateway.control.design import design_lqi, task_of
+from gateway.control.design import design_lqi, design_mpc, task_of
 from gateway.core.deployment import Region
-from gateway.core.messages import AskConfiguration, SetSpeed, WatchGood
+from gateway.core.messages import Arm, AskConfiguration, SetSpeed, WatchGood
 from gateway.core.states import LoopState, Phase
 from gateway.core.theta import nominal_theta
 from gateway.loop import process
 from gateway.loop.containment import PART_FAILED
-from gateway.loop.kept import BEFORE, SET_ASIDE, Durable, Store
+from gateway.loop.kept import SET_ASIDE, Durable, OnTop, Store, fingerprint
 from gateway.loop.pacer import Tick
 from gateway.loop.runner import Runner
 from safety.recovery_prediction import recovery_prediction
@@ -52,6 +53,7 @@ def at_line(loop, name):
         "experiment": (loop.cycle.experiments, "look"),
         "telemetry": (loop.cycle, "_record"),
         "rest": (loop.cycle, "_estimate"),
+        "law": (loop.cycle.torque_path.law, "ask"),
         "link": (loop.cycle.links[0], "trigger"),
     }[name]
 
@@ -181,10 +183,76 @@ def test_what_has_ended_the_loop_twice_is_set_aside_for_what_ran_before(tmp_path
         assert running.watch == watch and not said
     running, said = one_life(Store(tmp_path, given), line, monkeypatch, breaks=[])
     assert running.watch is None and running.region == judged
-    assert (tmp_path / SET_ASIDE).exists() and (tmp_path / BEFORE).exists()
+    assert (tmp_path / SET_ASIDE).exists()
     assert "2 times in a row" in said[0] and "a defect" in said[0]
     kept = Store(tmp_path, given).read(line, said.append)
     assert (kept.epoch, kept.watch) == (4, None)
+
+
+def test_what_was_taken_back_in_the_period_that_ends_the_loop_does_not_come_back(tmp_path, monkeypatch):
+    """The law on top fails, and then two watchers: what runs next is what it stood on."""
+    line = demo_line()
+    given, top = design_lqi(task_of(line)), design_mpc(task_of(line))
+    on_top = OnTop(controller=top, region=Region())
+    Store(tmp_path, given).write(Durable(3, given, Region(), None, on_top))
+    running, _ = one_life(Store(tmp_path, given), line, monkeypatch, breaks=["law", "monitor", "doubts", "telemetry"])
+    assert running.config == given
+    running, _ = one_life(Store(tmp_path, given), line, monkeypatch, breaks=[])
+    assert running.config == given
+
+
+def test_failing_links_and_commands_say_nothing_of_a_configuration(tmp_path, monkeypatch):
+    line = demo_line()
+    given = design_lqi(task_of(line))
+    Store(tmp_path, given).write(Durable(3, given, Region()))
+    for _ in range(3):
+        one_life(Store(tmp_path, given), line, monkeypatch, breaks=["link", "telemetry"])
+    assert not Store(tmp_path, given).deaths.too_often(fingerprint(Durable(3, given, Region())))
+
+
+def test_a_loop_that_is_told_to_end_arms_nothing_that_was_proven():
+    async def story():
+        loop = SteppedLoop(demo_line(), design_lqi(task_of(demo_line())), real_plant(), 1)
+        runner = Runner(loop.cycle)
+        for _ in range(3):
+            loop.now_s = loop.periods * loop.line.control.period_s
+            await runner.period(Tick(loop.now_s, loop.now_s, 0))
+            loop.periods += 1
+        arming = asyncio.ensure_future(runner.submit(Arm()))
+        for _ in range(20):  # it is proven, and waits for its period
+            await asyncio.sleep(0)
+        await runner.end()
+        await runner.period(Tick(loop.now_s, loop.now_s, 0))
+        assert not (await arming).ok and loop.cycle.machine.phase is Phase.SILENT
+        runner.close()
+
+    asyncio.run(story())
+
+
+def test_the_last_act_reaches_every_link_at_once(monkeypatch):
+    """One that takes its time to be released keeps the zero from no other."""
+
+    class Held(MemoryLink):
+        async def release(self):
+            await asyncio.sleep(0.05)
+            others.append(bool(told.count("trigger") >= 2))
+
+        def trigger(self, now_s):
+            told.append("trigger")
+
+    async def story():
+        loop = producing()
+        loop.cycle.links[:] = [Held(loop.line, loop.truth), Held(loop.line, loop.truth)]
+        monkeypatch.setattr(process, "TimerPacer", lambda period_s: SteppedPacer(loop))
+        runner = Runner(loop.cycle)
+        monkeypatch.setattr(runner, "period", broken)
+        with pytest.raises(RuntimeError):
+            await process.run_until(runner, loop.line, asyncio.Event())
+        runner.close()
+
+    told, others = [], []
+    asyncio.run(story())
+    assert others == [True, True]
 
 
 def test_an_orderly_end_after_a_run_forgives(tmp_path, monkeypatch):

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from gateway.cli.stepped import SteppedLoop
-from gateway.control.design import design_lqi, design_mpc, design_pid, task_of
+from gateway.control.design import design_lqg, design_lqi, design_mpc, design_pid, task_of
 from gateway.core.controller import config_hash
 from gateway.core.deployment import Deployment, first_region
 from gateway.core.messages import Deploy, Keep, Narrow, Rollback, WatchGood
 from gateway.core.theta import nominal_theta
 from gateway.loop import persistence, runner
 from gateway.loop.deploy import prepare
-from gateway.loop.kept import Durable, Store, fingerprint
+from gateway.loop.kept import BEFORE, Kept, Store
 from gateway.loop.pacer import Tick
 from gateway.loop.persistence import NOT_PERSISTED, PERSISTED
 from gateway.loop.runner import Runner
@@ -23,7 +23,7 @@ from safety.recovery_prediction import recovery_prediction
 from tests.closed_loop.conftest import demo_line, real_plant
 
 LINE = demo_line()
-GIVEN, OTHER, PREDICTIVE = (design(task_of(LINE)) for design in (design_lqi, design_pid, design_mpc))
+GIVEN, OTHER, THIRD, PREDICTIVE = (design(task_of(LINE)) for design in (design_lqi, design_pid, design_lqg, design_mpc))
 WATCH = recovery_prediction(nominal_theta(LINE), GIVEN, LINE, [0.05])
 TENSION_N = np.array([28.0, 36.0, 20.0, 40.0, 24.0, 32.0])
 
@@ -193,6 +193,48 @@ def test_a_deployment_that_is_not_made_leaves_what_was_kept_on_top(tmp_path):
         assert (seen[0].epoch, seen[0].on_top.controller) == (2, PREDICTIVE)
         await it.until(it.as_decided)
         assert (it.on_disk().epoch, it.on_disk().on_top) == (2, None)  # on probation: what is good
+
+    told(Disk(tmp_path), story)
+
+
+def test_a_keep_that_is_written_ahead_while_the_loop_ends_is_not_what_the_next_one_runs(tmp_path):
+    async def story(it):
+        assert (await it.ask(deploy())).ok
+        assert not await it.runner.persisted(10.0)
+        write, written = it.store.write, threading.Event()
+
+        def hangs(durable):
+            if durable.controller == OTHER:
+                written.wait(10.0)
+            write(durable)
+
+        it.store.write = hangs
+        keep = asyncio.ensure_future(it.runner.submit(Keep(epoch=1, watch=None)))
+        await it.period()
+        await it.runner.end()
+        await it.until(lambda: it.runner.at_rest)
+        over = asyncio.ensure_future(it.runner.over(10.0))
+        await asyncio.sleep(0)
+        written.set()
+        await over
+        assert not (await keep).ok
+        assert it.on_disk().controller == GIVEN and it.as_decided()
+
+    told(Disk(tmp_path), story)
+
+
+def test_beside_the_file_lies_the_good_one_that_was_in_service_before_and_no_other(tmp_path):
+    async def story(it):
+        before = it.store.path.with_name(BEFORE)
+        for epoch, controller in ((1, OTHER), (2, THIRD)):
+            assert (await it.ask(deploy(epoch, controller))).ok
+            assert (await it.ask(Keep(epoch=epoch, watch=None))).ok
+            assert not await it.runner.persisted(10.0)
+        assert Kept.model_validate_json(before.read_bytes()).controller == OTHER
+        watch = recovery_prediction(nominal_theta(LINE), THIRD, LINE, [0.05])
+        assert (await it.ask(WatchGood(watch=watch))).ok
+        assert not await it.runner.persisted(10.0)
+        assert Kept.model_validate_json(before.read_bytes()).controller == OTHER
 
     told(Disk(tmp_path), story)
 
