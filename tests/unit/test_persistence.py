@@ -15,7 +15,7 @@ from gateway.core.messages import Deploy, Keep, Narrow, Rollback, WatchGood
 from gateway.core.theta import nominal_theta
 from gateway.loop import persistence, runner
 from gateway.loop.deploy import prepare
-from gateway.loop.kept import BEFORE, Kept, Store
+from gateway.loop.kept import BEFORE, Durable, Kept, Store, fingerprint
 from gateway.loop.pacer import Tick
 from gateway.loop.persistence import NOT_PERSISTED, PERSISTED
 from gateway.loop.runner import Runner
