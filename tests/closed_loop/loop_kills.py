@@ -52,18 +52,19 @@ def _site(folder: Path, kills: int, rng: random.Random, tally: Tally, advance: C
     arguments = [sys.executable, "-m", "tests.closed_loop.loop_victim", str(folder)]
     forks = subprocess.Popen(arguments, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     assert forks.stdin is not None and forks.stdout is not None
-    given = Law(config_hash(GIVEN))
+    given, notes = Law(config_hash(GIVEN)), folder / NOTES
     model = Model(given, given)
     try:
         for number in range(kills + 1):
-            (folder / NOTES).unlink(missing_ok=True)
+            before = notes.read_text() if notes.exists() else ""
+            notes.unlink(missing_ok=True)
             place = PLACES[tally.kills % len(PLACES)]
             # The last one only shows what the one before has left.
             count, place = (rng.randint(1, MOST_TIMES), place) if number < kills else (1, "asked")
             forks.stdin.write(f"{rng.randrange(1 << 30)} {count} {place}\n")
             forks.stdin.flush()
             tally.ended += forks.stdout.readline() != "killed\n"
-            _replay(model, folder / NOTES, tally)
+            _replay(model, notes, before, tally)
             if number < kills:
                 tally.kills += 1
                 tally.under_way += len(set(model.may)) > 1
@@ -74,17 +75,18 @@ def _site(folder: Path, kills: int, rng: random.Random, tally: Tally, advance: C
         forks.wait(20.0)
 
 
-def _judge(model: Model, found: Runs, tally: Tally) -> None:
+def _judge(model: Model, found: Runs, before: str, tally: Tally) -> None:
+    """`before`: the notes of the life that left it."""
     try:
         model.begin_anew(found)
     except AssertionError as wrong:
         tally.wrong += 1
-        tally.problems.append(str(wrong)[:1000])
+        tally.problems.append(f"{wrong}; after {before}")
         model.may, model.epochs = [found], {}
         model.begin_anew(found)
 
 
-def _replay(model: Model, notes: Path, tally: Tally) -> None:
+def _replay(model: Model, notes: Path, before: str, tally: Tally) -> None:
     asked: list[Order] = []
     for line in notes.read_text().splitlines():
         note = json.loads(line)
@@ -109,5 +111,5 @@ def _replay(model: Model, notes: Path, tally: Tally) -> None:
             case "dies":
                 tally.places[note["place"]] += 1
             case _:
-                _judge(model, RUNS.validate_python(note["runs"]), tally)
+                _judge(model, RUNS.validate_python(note["runs"]), before, tally)
         model.under_way([order.command() for order in asked])

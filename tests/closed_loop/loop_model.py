@@ -177,10 +177,13 @@ class Model:
         assert given.epoch == self.epoch + 1, f"epoch {given.epoch} after {self.epoch}"
         assert given.epoch not in self.epochs, f"epoch {given.epoch} is used twice"
         self.epochs[given.epoch] = given.hash
+        before = replace(self.durable, epoch=given.epoch)
         self.epoch = given.epoch
         self.running, self.other = _law(given.controller, given.region), True
         self.lease_s, self.until_s = given.lease_s, now_s + given.lease_s
-        self.may = [self.durable]
+        # What was kept on top until now is given up with this, and stays on the disk until that follows: nobody has
+        # taken it back, and it is what runs where the deployment is not done after all.
+        self.may = [before, self.durable]
 
     def _narrow(self, region: Region) -> None:
         assert self.until_s is None, "narrowed on probation"

@@ -478,8 +478,12 @@ class LoopStates(RuleBasedStateMachine):
     def _begin_life(self, production: bool) -> None:
         self.life = Life(self.folder, self._carried_out, self._rolled_back)
         self.disk_state, self.quiet, self.had_refusals, self.quiet_links = None, 0, 0, 0
-        found = runs_of(self.life.cycle.configurations.durable)
-        self.model.begin_anew(found)
+        try:
+            self.model.begin_anew(runs_of(self.life.cycle.configurations.durable))
+        except AssertionError:  # nothing that comes later is to be told in its place
+            self.life.close()
+            self.life = None
+            raise
         if production:
             self.life.begin_in_production()
         self._pass(2)
