@@ -346,7 +346,7 @@ def test_a_number_that_moves_by_itself_is_no_echo() -> None:
 
 async def cancelled_prepare(rig: Rig) -> None:
     """Cancelled while the first watchdog is being written, which is done all the same."""
-    rig.link.silence()
+    await rig.link.release()
     rig.channel.devices.set("Axis1.Watchdog", 250)
     rig.channel.devices.set("Axis2.Watchdog", 0)
     rig.channel.devices.set("Axis1.Statusword", 0x0250)
