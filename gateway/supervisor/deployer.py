@@ -59,7 +59,9 @@ MOST_RETRIES = 5  #: then it waits for a person
 
 
 class Deployer:
-    """`propose`, `decide` and `roll_back` for others; `watch` a few times a second. All in one event loop."""
+    """`propose`, `decide` and `roll_back` for others; `hold` and `watch` a few times a second, neither of which waits
+    for the other. All in one event loop.
+    """
 
     def __init__(
         self,
@@ -208,8 +210,15 @@ class Deployer:
         """The loop has told that an experiment is over; `because` empty: complete."""
         await self._on_the_line.experiment_ended(hash_, because)
 
+    async def hold(self) -> None:
+        """What is on probation has its lease renewed, or goes back: whatever the audit and `watch` wait for."""
+        try:
+            await self._on_the_line.hold()
+        except Unreachable as error:
+            self._records.trouble = str(error)  # the next `watch` asks the loop
+
     async def watch(self) -> None:
-        """Proposals expire, leases are renewed, what is on probation is kept or left to fall back.
+        """Proposals expire, what is on probation is kept or left to fall back.
 
         After a start it goes on from what the records and the loop say.
         """
@@ -221,7 +230,7 @@ class Deployer:
                 await self._approve_small()
                 await self._on_the_line.look_after()
             except (AuditUnavailable, Unreachable, Impossible, NotTakenUp, NotKnown) as error:
-                # Without a renewal the loop falls back by itself; the next look settles it.
+                # What nobody holds the loop takes back by itself; the next look settles it.
                 self._records.trouble = str(error)
             else:
                 self._records.trouble = self._on_the_line.unwatched

@@ -53,7 +53,7 @@ class LoopOverMailbox:
 
 
 class Gate:
-    """`look` a few times a second, `close` at the end. It opens as soon as audit and stores are there."""
+    """`look` and `hold` a few times a second, `close` at the end. It opens as soon as audit and stores are there."""
 
     def __init__(
         self,
@@ -104,6 +104,11 @@ class Gate:
         if trouble != self._told:
             self._told = trouble
             self._note("gate", f"the gate waits: {trouble}" if trouble else "the gate is open")
+
+    async def hold(self) -> None:
+        """The lease of what is on probation, however long a look takes."""
+        if self.deployer is not None:
+            await self.deployer.hold()
 
     def hear(self, event: Event) -> None:
         """What the loop tells: that an experiment is over, or that it runs something else, is for the records."""

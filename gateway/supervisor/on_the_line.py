@@ -41,7 +41,7 @@ TOLD_LATER = "`r2rgate proposals` and the events tell it once the loop has been 
 
 
 class OnTheLine:
-    """Its steps are taken one at a time: whoever calls holds the records' lock, but for `experiment_ended`."""
+    """Its steps are taken one at a time: whoever calls holds the records' lock, but for `experiment_ended`, `hold`."""
 
     def __init__(
         self,
@@ -120,8 +120,25 @@ class OnTheLine:
         """One that has answered that it failed does not do it later."""
         self._unanswered[proposal] = self._clock() + (0.0 if isinstance(error, RemoteError) else LATE_S)
 
+    async def hold(self) -> None:
+        """Look at what is on probation, and renew its lease or take it back. Raises Unreachable.
+
+        It needs no record and no lock: a lease is over sooner than a disk that hangs is given up. What the loop says
+        afterwards is recorded by `settle`.
+        """
+        entry, now_s = self._records.book.on_the_line, self._clock()
+        if entry is None or entry.stage not in (Stage.PROBATION, Stage.KEEPING):
+            return
+        if against := self._surroundings.against_keeping(now_s):
+            await self.back(against)
+            self.settled = False
+        elif now_s - self._renewed_s >= LEASE_S / 3.0 and entry.epoch is not None:
+            reply = await self._tell(Renew(epoch=entry.epoch))
+            self._renewed_s = now_s
+            self.settled = self.settled and reply.ok  # one that is refused is kept by now, or has gone back
+
     async def look_after(self) -> None:
-        """Renews leases; keeps what is on probation, or takes it back. Raises as `settle`, and Impossible."""
+        """Keeps what is on probation; ends what is over. Raises as `settle`, and Impossible."""
         unheard = self._clock() - self._asked_s >= ASKED_AGAIN_S
         if self._records.book.on_the_line is not None or not self.settled or unheard or self._to_look_after():
             await self._look_after(await self.settle())
@@ -242,13 +259,9 @@ class OnTheLine:
         if entry.stage is Stage.DEPLOYING:  # the loop has not answered, and may still take it
             return
         if against := self._surroundings.against_keeping(now_s):
-            await self._tell(Rollback(reason=against))
-            await self.settle()
+            await self.roll_back(against)
         elif entry.stage is Stage.KEEPING or not self._unseen(now_s):
             await self._keep(entry, found)
-        elif now_s - self._renewed_s >= LEASE_S / 3.0:
-            await self._tell(Renew(epoch=entry.epoch or found.epoch))
-            self._renewed_s = now_s
 
     def _goes_too_far(self, found: InService) -> bool:
         """For a line that has changed, and of which nothing has been learned since."""

@@ -127,7 +127,7 @@ async def serve(
     gateway.agents_bus = bus.status
     opening = tasks.begin("opening the agents' bus", bus.open())
     handlers = _Handlers(mailbox.counters)
-    turns = {"gate": gate.look, "agents' cases": cases.look, "alarms' file": alarms.keep}
+    turns = {"gate": gate.look, "lease": gate.hold, "agents' cases": cases.look, "alarms' file": alarms.keep}
     looking = [asyncio.create_task(tasks.repeat(name, turn, watch_s, stop)) for name, turn in turns.items()]
     gateway.note("gateway-up", "the gateway has started")
     print(f"gateway of {line.site}/{line.line}: {run_folder / GATEWAY_SOCKET}, history {historian.path}", flush=True)

@@ -305,6 +305,7 @@ class TrialRun:
             for frame in self._loop.frames[self._seen :]:
                 self._recent.take(frame)
             self._seen = len(self._loop.frames)
+            await self._deployer.hold()
             await self._deployer.watch()
 
 

@@ -105,7 +105,12 @@ class Gateway:
         """With the deployer looking twice a second."""
         for _ in range(round(2 * seconds)):
             self.loop.pass_time(0.5)
-            await self.deployer.watch()
+            await self.look()
+
+    async def look(self) -> None:
+        """One turn of each."""
+        await self.deployer.hold()
+        await self.deployer.watch()
 
 
 def run(test):

@@ -1,5 +1,8 @@
 """A change on probation: it is kept, stays, or goes back to what was good."""
 
+import asyncio
+import contextlib
+
 from gateway.core.controller import config_hash
 from gateway.core.line_model import model_hash
 from gateway.supervisor.lifecycle import Stage
@@ -20,6 +23,47 @@ async def test_an_audit_that_fails_on_probation_leaves_the_line_on_what_was_good
     await gateway.deployer.watch()
     assert gateway.stage(one) is Stage.ROLLED_BACK
     assert gateway.deployer.book.in_service == gateway.loop.runs == config_hash(FIRST)
+
+
+@contextlib.asynccontextmanager
+async def disk_that_hangs(gateway):
+    """While it does, a proposal has come in and waits for its record, with the lock of all steps."""
+    append, hangs = gateway.audit.append, asyncio.Event()
+
+    async def hang(*record):
+        await hangs.wait()
+        await append(*record)
+
+    gateway.audit.append = hang
+    one = proposal(7, gateway.loop.runs, gateway.loop.now_s)
+    coming_in = asyncio.create_task(gateway.propose(one))
+    await asyncio.sleep(0)
+    yield
+    hangs.set()
+    await coming_in
+    gateway.audit.append = append
+
+
+@run
+async def test_a_disk_that_hangs_for_longer_than_a_lease_takes_nothing_back_that_is_good():
+    gateway, one = await deployed()
+    runs = gateway.loop.runs
+    async with disk_that_hangs(gateway):
+        await gateway.pass_time(3.0 * LEASE_S)
+        assert gateway.loop.runs == runs and gateway.loop.lease_end_s is not None
+    await gateway.pass_time(PROBATION_S)
+    assert gateway.stage(one) is Stage.KEPT
+
+
+@run
+async def test_a_disk_that_hangs_leaves_nothing_on_the_line_that_must_go_back():
+    gateway, one = await deployed()
+    async with disk_that_hangs(gateway):
+        gateway.surroundings.against = "tension 3 swings"
+        await gateway.pass_time(0.5)
+        assert gateway.loop.runs == config_hash(FIRST)
+    await gateway.pass_time(0.5)
+    assert gateway.stage(one) is Stage.ROLLED_BACK and "swings" in gateway.deployer.book.entries[hash_of(one)].why
 
 
 @run

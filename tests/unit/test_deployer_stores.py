@@ -42,7 +42,7 @@ async def look(gateway: Gateway, seconds: float) -> None:
     for _ in range(round(2.0 * seconds)):
         gateway.loop.pass_time(0.5)
         await gateway.deployer.at_hand()
-        await gateway.deployer.watch()
+        await gateway.look()
 
 
 def approvals(gateway: Gateway, one) -> list[str]:

@@ -34,7 +34,7 @@ class Telemetry:
             self._gateway.loop.pass_time(LOOK_S)
             if self.told:
                 self._tell()
-            await self._gateway.deployer.watch()
+            await self._gateway.look()
 
     def _tell(self) -> None:
         count = round(LOOK_S / PERIOD_S)
