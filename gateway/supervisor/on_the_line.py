@@ -19,12 +19,12 @@ from gateway.core.messages import (
     Reply,
     Rollback,
     RunExperiment,
-    WatchGood,
 )
 from gateway.core.proposal import ExperimentChange, GainsChange, Proposal
 from gateway.mailbox.port import NotSent, RemoteError, Unreachable
 from gateway.supervisor.audit_file import AuditUnavailable
 from gateway.supervisor.deployer_sides import LoopSide, NotKnown, Surroundings
+from gateway.supervisor.good_watch import GoodWatch
 from gateway.supervisor.lifecycle import Entry, Impossible, Stage, reconciled
 from gateway.supervisor.peers import GATEWAY
 from gateway.supervisor.proposal_records import ProposalRecords, done, not_known, refused
@@ -54,7 +54,6 @@ class OnTheLine:
         note: Callable[..., None],
     ) -> None:
         self.settled = False  #: the loop has been asked since this process began, or since it told of a change
-        self.unwatched = ""  #: why the loop does not watch by the model in service
         self._line = line
         self._records = records
         self._loop = loop
@@ -71,8 +70,12 @@ class OnTheLine:
         change = records.book.on_the_line
         if change is not None and change.stage in (Stage.DEPLOYING, Stage.KEEPING):
             self._unanswered[change.proposal] = clock() + LATE_S  # the process before this one has told it
-        #: Model and configuration by which, and for which, this process has told the loop what can be recovered.
-        self._looked_after: tuple[str | None, str] | None = None
+        self._good_watch = GoodWatch(records.book, surroundings, self._tell, clock)
+
+    @property
+    def unwatched(self) -> str:
+        """Why the loop does not watch by the model in service; empty: it does, or there is none."""
+        return self._good_watch.unwatched
 
     async def settle(self) -> InService:
         """Ask the loop what it runs, and record until the book says so too. Raises Unreachable, AuditUnavailable."""
@@ -140,7 +143,7 @@ class OnTheLine:
     async def look_after(self) -> None:
         """Keeps what is on probation; ends what is over. Raises as `settle`, and Impossible."""
         unheard = self._clock() - self._asked_s >= ASKED_AGAIN_S
-        if self._records.book.on_the_line is not None or not self.settled or unheard or self._to_look_after():
+        if self._records.book.on_the_line is not None or not self.settled or unheard or self._good_watch.is_due():
             await self._look_after(await self.settle())
 
     async def carry_out(self, entry: Entry, found: InService, who: Who) -> Reply:
@@ -251,7 +254,7 @@ class OnTheLine:
         if entry is None:
             if self._goes_too_far(found):  # a loop that was started anew before its disk knew
                 await self.narrow()
-            await self._look_after_good(found)
+            await self._good_watch.look(found)
             return
         if entry.stage is Stage.RUNNING:
             await self._end_unheard(entry, now_s)
@@ -268,10 +271,6 @@ class OnTheLine:
         book = self._records.book
         changed = book.line_changed_s is not None and book.model is None
         return changed and not found.on_probation and not found.region.within(first_region(self._line))
-
-    def _to_look_after(self) -> bool:
-        book = self._records.book
-        return book.model is not None and (book.model, book.last_known_good) != self._looked_after
 
     def _unseen(self, now_s: float) -> str:
         since_s, probation_s = now_s - self._probation_since_s, self._line.gate.probation_s
@@ -295,28 +294,12 @@ class OnTheLine:
             self._not_answered(entry.proposal, error)
             raise
         if not because and watch is not None:
-            self._looked_after = self._records.book.model, found.good_if_kept
+            self._good_watch.taken(found.good_if_kept)
         await self.settle()
         # One that was told before, and whose answer did not come, may have kept it: then the second is refused.
         if because and self._records.book.entries[entry.proposal].stage is Stage.KEEPING:
             await self._tell(Rollback(reason=f"it could not be kept: {because}"[:LONGEST_REASON]))
             await self.settle()
-
-    async def _look_after_good(self, found: InService) -> None:
-        """A model that is new in service looks after what runs, too."""
-        pair = self._records.book.model, found.last_known_good
-        if self._records.book.model is None or pair == self._looked_after:
-            return
-        because = ""
-        try:
-            watch = await self._surroundings.recovery(found.last_known_good, found.region, self._records.book)
-            if watch is not None:
-                reply = await self._tell(WatchGood(watch=watch))
-                because = "" if reply.ok else "; ".join([reply.text, *reply.reasons])
-        except NotKnown as error:
-            because = str(error)
-        self._looked_after = pair  # a refusal would be the same again; an answer that did not come is asked for again
-        self.unwatched = f"the loop does not watch by the model in service: {because}" if because else ""
 
     async def _end_unheard(self, entry: Entry, now_s: float) -> None:
         """Of an experiment whose end nobody has told: the loop was started anew, or this process."""

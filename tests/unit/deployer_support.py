@@ -113,6 +113,8 @@ class FakeLoop:
         self.takes = True
         self.fast = False
         self.watches: list[tuple[str, RecoveryPrediction | None]] = []  #: by command
+        self.watched = self.good_watched = False
+        self.watch_refusal = ""  #: why it does not take a watch of what is good
 
     async def tell(self, command: Command) -> Reply:
         due = self.death.due()
@@ -152,16 +154,18 @@ class FakeLoop:
             hash=self.runs, kind="lqi", epoch=self.epoch, on_probation=probation,
             lease_left_s=self.lease_end_s - self.now_s if probation else None, last_known_good=self.good,
             good_if_kept=self.good if self.runs in self.predictive else self.runs,
-            region=self.region, watched=False, why=self.why,
+            region=self.region, watched=self.watched, why=self.why,
         )  # fmt: skip
 
     def go_back(self, why: str) -> None:
         self.runs, self.region, self.lease_end_s, self.why = self.good, self.good_region, None, why
+        self.watched = self.good_watched
 
     def _narrowed(self, region: Region) -> tuple[bool, str]:
         if self.lease_end_s is not None or self.fast:
             return False, "the line shall run at 1 m/s"
         self.region, self.good_region = (one.no_further(region) for one in (self.region, self.good_region))
+        self.watched = self.good_watched = False
         return True, "narrowed"
 
     def _deployed(self, deployment: Deployment) -> tuple[bool, str]:
@@ -169,7 +173,7 @@ class FakeLoop:
         if not self.takes or deployment.epoch != self.epoch + 1 or self.lease_end_s is not None:
             return False, "not its successor, or not now"
         self.runs, self.epoch, self.why = deployment.hash, deployment.epoch, "deployed"
-        self.region = deployment.region
+        self.region, self.watched = deployment.region, deployment.watch is not None
         self.lease_end_s = self.now_s + deployment.lease_s
         self.lease_s = deployment.lease_s
         return True, "deployed"
@@ -190,6 +194,10 @@ class FakeLoop:
             self.good = self.in_service().good_if_kept
             self.good_region = self.region
             self.lease_end_s, self.why = None, "kept"
+            self.watched = self.good_watched = command.watch is not None
+        elif isinstance(command, WatchGood):
+            ok, text = not self.watch_refusal, self.watch_refusal
+            self.watched = self.good_watched = ok or self.watched
         elif isinstance(command, Rollback):
             self.go_back(f"rolled back: {command.reason}")
         elif isinstance(command, RunExperiment):

@@ -6,7 +6,8 @@ import contextlib
 from gateway.core.controller import config_hash
 from gateway.core.line_model import model_hash
 from gateway.supervisor.lifecycle import Stage
-from gateway.supervisor.on_the_line import LEASE_S
+from gateway.supervisor.on_the_line import ASKED_AGAIN_S, LEASE_S
+from gateway.supervisor.patience import LONGEST_WAIT_S
 from tests.unit.deployer_gateway import ANNA, PROBATION_S, deployed, run, started
 from tests.unit.deployer_support import FIRST, LINE, controller, hash_of, proposal
 from tests.unit.model_support import model as fitted
@@ -99,6 +100,46 @@ async def test_what_has_not_shown_enough_stays_on_probation_and_says_so():
     assert gateway.stage(one) is Stage.KEPT and gateway.deployer.change() is None
 
 
+def accept_model(gateway) -> None:
+    accepted = fitted(LINE.n, site=LINE.site, line=LINE.line)
+    gateway.surroundings.models[model_hash(accepted)] = accepted
+    gateway.deployer.book.model = model_hash(accepted)
+
+
+@run
+async def test_a_watch_that_was_refused_is_asked_for_again_later_each_time_and_told_as_one_trouble():
+    gateway = await started()
+    accept_model(gateway)
+    gateway.loop.watch_refusal = "no space left on device"
+    await gateway.pass_time(1.0)
+    said = gateway.deployer.trouble
+    assert "no space left on device" in said
+    gateway.loop.watch_refusal = "it takes 1.3 ms"
+    await gateway.pass_time(2.0 * LONGEST_WAIT_S)
+    tries = len(gateway.loop.watches)
+    assert 5 < tries < 10 and gateway.deployer.trouble == said
+    await gateway.pass_time(3.0 * LONGEST_WAIT_S)
+    assert len(gateway.loop.watches) - tries in (2, 3)
+    gateway.loop.watch_refusal = ""
+    await gateway.pass_time(LONGEST_WAIT_S)
+    assert gateway.loop.watched and gateway.deployer.trouble == ""
+    tries = len(gateway.loop.watches)
+    await gateway.pass_time(LONGEST_WAIT_S)
+    assert len(gateway.loop.watches) == tries
+
+
+@run
+async def test_a_loop_that_has_left_its_watch_out_is_told_again():
+    gateway = await started()
+    accept_model(gateway)
+    await gateway.pass_time(1.0)
+    assert gateway.loop.watched
+    gateway.loop.good_watched = False  # of what it kept before it cannot use it any more
+    gateway.loop.restart()
+    await gateway.pass_time(2.0 * ASKED_AGAIN_S)
+    assert gateway.loop.watched and len(gateway.loop.watches) == 2
+
+
 @run
 async def test_without_a_model_nothing_is_watched_with_one_the_fallback_is():
     gateway, _ = await deployed()
@@ -106,9 +147,7 @@ async def test_without_a_model_nothing_is_watched_with_one_the_fallback_is():
     assert gateway.loop.watches == [("deploy", None), ("keep", None)]
     # A model is accepted: what runs is looked after, once; then a change by its fallback, and by itself when kept.
     gateway.loop.watches.clear()
-    accepted = fitted(LINE.n, site=LINE.site, line=LINE.line)
-    gateway.surroundings.models[model_hash(accepted)] = accepted
-    gateway.deployer.book.model = model_hash(accepted)
+    accept_model(gateway)
     await gateway.pass_time(2.0)
     assert [(what, watch.fallback) for what, watch in gateway.loop.watches] == [("watch-good", gateway.loop.good)]
     before = gateway.loop.good
