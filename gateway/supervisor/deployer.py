@@ -21,7 +21,7 @@ from gateway.core.people import Role
 from gateway.core.proposal import Proposal, canonical
 from gateway.core.recording import Recording
 from gateway.core.status import ChangeStatus
-from gateway.core.steady_clock import SteadyClock
+from gateway.core.steady_clock import AGREES_AFTER_S, SteadyClock
 from gateway.core.verdict import line_hash
 from gateway.mailbox.port import NotSent, Unreachable
 from gateway.supervisor.audit_file import AuditUnavailable
@@ -315,7 +315,7 @@ class Deployer:
             return f"not kept yet: {self._on_the_line.unseen() or 'about to be'}"
         if entry.stage is not Stage.WAITING:
             return entry.why
-        reasons = [entry.why]
+        reasons = [entry.why, self._why_not_recent(entry)]
         if self._line.gate.autonomy == "approve-first":
             by_person = self._small.why_a_person(entry)
             not_yet = ["whether it passes by its verdict alone was not looked at yet"]
@@ -363,8 +363,8 @@ class Deployer:
             return [f"there is no proposal {decision.proposal[:12]}: `r2rgate proposals` lists them"]
         if entry.stage is not Stage.WAITING:
             return [f"proposal {entry.proposal[:12]} is {entry.stage}{f': {entry.why}' if entry.why else ''}"]
-        if self._has_expired(entry):
-            return [f"it has expired at {entry.expires}"]
+        if (decision.approve or self._has_expired(entry)) and (because := self._why_not_recent(entry)):
+            return [because]
         if because := self.book.why_outdated(entry):
             return [because]
         if decision.revision not in (None, self.book.epoch):
@@ -390,12 +390,26 @@ class Deployer:
         self._inbox.judge_again()
 
     def _has_expired(self, entry: Entry) -> bool:
-        """It stands for as long as it did when it came, and no longer than the line's file allows."""
-        now_s = self._records.now_for(entry)
-        if now_s is None or entry.received is None:
-            return True  # a record without a time is none that this program writes
-        stands_s = min(entry.expires_s - entry.received.wall_s, self._line.gate.expiry_max_s)
-        return not now_s - entry.received.wall_s < stands_s  # a time that is no number has gone by
+        """For certain: then it is on record. A time that is no number has gone by."""
+        return not self._records.age(entry).least_s < self._stands_s(entry)
+
+    def _why_not_recent(self, entry: Entry) -> str:
+        """Why it may not be approved: it has expired, or may have. Empty: it stands for certain."""
+        if self._records.age(entry).most_s < self._stands_s(entry):
+            return ""
+        if self._has_expired(entry):
+            return f"it has expired at {entry.expires}"
+        return (
+            f"whether it has expired, at {entry.expires}, is not known: it came before this computer was started, and "
+            f"the clock was not seen to agree then, or is not yet ({AGREES_AFTER_S / 60.0:g} min after a start): wait, "
+            "or propose it again"
+        )
+
+    def _stands_s(self, entry: Entry) -> float:
+        """From when it came: as long as it was to stand then, and no longer than the line's file allows."""
+        if entry.received is None:
+            return 0.0
+        return min(entry.expires_s - entry.received.wall_s, self._line.gate.expiry_max_s)
 
     async def _approve_small(self) -> None:
         """Where the line's file allows it: what is like enough to what a person approved passes by its verdict alone.
@@ -408,7 +422,7 @@ class Deployer:
             return
         for entry in self.book.entries.values():
             if entry.stage is Stage.WAITING and now_s >= self._looked_at_again_s.get(entry.proposal, now_s):
-                if (reasons := self._small.why_a_person(entry)) is None:
+                if self._why_not_recent(entry) or (reasons := self._small.why_a_person(entry)) is None:
                     continue
                 self._looked_at_again_s[entry.proposal] = inf
                 if not reasons:

@@ -3,13 +3,14 @@
 import asyncio
 from collections.abc import Iterable, Mapping
 from datetime import UTC, datetime
+from math import inf
 from typing import Any
 
 from gateway.core.audit_record import Who
 from gateway.core.judge_context import JudgeContext
 from gateway.core.messages import Reply
 from gateway.core.proposal import Proposal
-from gateway.core.steady_clock import SteadyClock
+from gateway.core.steady_clock import Age, SteadyClock
 from gateway.core.verdict import Verdict
 from gateway.supervisor.audit_file import AuditUnavailable
 from gateway.supervisor.deployer_sides import AuditSide
@@ -37,9 +38,16 @@ class ProposalRecords:
         self.book.apply(kind, what)
 
     def now_for(self, entry: Entry) -> float | None:
-        """Unix time now by the clock as it was when the proposal came, wherever that has been set to since."""
+        """Unix time now by the clock as it was when the proposal came, wherever that has been set to since.
+
+        The earliest that it can be: where it came before this boot of the machine, it may be later.
+        """
         received = entry.received
         return None if received is None else received.wall_s + self._clock.age(received).least_s
+
+    def age(self, entry: Entry) -> Age:
+        """How long ago the proposal came. A record without a time is none that this program writes: for ever ago."""
+        return Age(inf, inf) if entry.received is None else self._clock.age(entry.received)
 
     async def note(self, kind: str, who: Who, what: Mapping[str, Any]) -> None:
         """A record that is no step of a proposal. Raises AuditUnavailable."""

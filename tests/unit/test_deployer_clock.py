@@ -16,8 +16,8 @@ from gateway.supervisor.lifecycle import Book, Stage, clock_fields, moment_of
 from gateway.supervisor.models import begin_repository
 from gateway.supervisor.recent import Recent
 from gateway.supervisor.surroundings import LineSurroundings
-from tests.unit.deployer_gateway import Gateway, run, started
-from tests.unit.deployer_support import FIRST, LIFETIME_S, LINE, controller, proposal
+from tests.unit.deployer_gateway import PROBATION_S, TRUSTING, Gateway, run, started
+from tests.unit.deployer_support import FIRST, LIFETIME_S, LINE, controller, hash_of, proposal
 from tests.unit.supervisor_support import frame_of
 from tests.unit.test_baseline_held import STOOD
 from tests.unit.test_historian import writer_of
@@ -60,6 +60,80 @@ async def test_a_proposal_can_be_approved_after_the_clock_was_set_forward():
     await gateway.pass_time(1.0)
     assert (await gateway.decide(one)).ok
     assert gateway.stage(one) is Stage.PROBATION
+
+
+async def waits_over_a_boot(monkeypatch, seen_s: float, away_s: float, lifetime_s: float = LIFETIME_S):
+    """A proposal that came when the clock had been seen for `seen_s`; the machine starts again `away_s` later."""
+    gateway = Gateway()
+    gateway.wall_ahead_s = TRUE_S
+    gateway.begin()
+    await gateway.pass_time(seen_s)
+    one = proposal(1, config_hash(FIRST), gateway.loop.now_s + TRUE_S, lifetime_s=lifetime_s)
+    assert (await gateway.propose(one)).ok
+    start_again(monkeypatch, gateway, away_s)
+    await gateway.pass_time(1.0)
+    return gateway, one
+
+
+def start_again(monkeypatch, gateway: Gateway, away_s: float) -> None:
+    monkeypatch.setattr("gateway.supervisor.deployer.boot_id", lambda: "another boot")
+    gateway.wall_ahead_s += gateway.loop.now_s + away_s
+    gateway.loop.now_s = 0.0
+    gateway.begin()
+
+
+def test_what_may_have_expired_while_the_machine_was_off_is_not_approved_and_expires_once_that_is_certain(monkeypatch):
+    @run
+    async def stands():
+        gateway, one = await waits_over_a_boot(monkeypatch, AGREES_AFTER_S, 3.0 * 86_400.0)
+        reply = await gateway.decide(one)
+        assert not reply.ok and "not known" in reply.reasons[0] and gateway.loop.epoch == 0
+        view = gateway.deployer.shown(hash_of(one))
+        assert not isinstance(view, str) and "not known" in view.why and gateway.stage(one) is Stage.WAITING
+        await gateway.pass_time(AGREES_AFTER_S)
+        assert gateway.stage(one) is Stage.EXPIRED
+
+    stands()
+
+
+def test_what_came_under_a_clock_that_nobody_saw_agree_is_never_approved_after_a_boot_and_can_be_rejected(monkeypatch):
+    @run
+    async def stands():
+        gateway, one = await waits_over_a_boot(monkeypatch, 10.0, 60.0, 5.0 * AGREES_AFTER_S)
+        await gateway.pass_time(2.0 * AGREES_AFTER_S)
+        assert not (await gateway.decide(one)).ok and gateway.stage(one) is Stage.WAITING
+        assert (await gateway.decide(one, approve=False)).ok
+
+    stands()
+
+
+def test_what_stands_still_is_approved_once_the_clock_was_seen_to_agree(monkeypatch):
+    @run
+    async def stands():
+        gateway, one = await waits_over_a_boot(monkeypatch, AGREES_AFTER_S, 60.0, 5.0 * AGREES_AFTER_S)
+        assert not (await gateway.decide(one)).ok
+        await gateway.pass_time(AGREES_AFTER_S)
+        assert (await gateway.decide(one)).ok and gateway.stage(one) is Stage.PROBATION
+
+    stands()
+
+
+def test_what_may_have_expired_does_not_pass_by_its_verdict(monkeypatch):
+    @run
+    async def stands():
+        gateway = await started(TRUSTING)
+        one = proposal(1, config_hash(FIRST), gateway.loop.now_s)
+        await gateway.propose(one)
+        assert (await gateway.decide(one)).ok
+        await gateway.pass_time(PROBATION_S + 1.0)
+        assert gateway.stage(one) is Stage.KEPT
+        small = proposal(2, gateway.loop.runs, gateway.loop.now_s)
+        await gateway.propose(small)
+        start_again(monkeypatch, gateway, 60.0)
+        await gateway.pass_time(10.0)
+        assert gateway.stage(small) is Stage.WAITING and gateway.loop.epoch == 1
+
+    stands()
 
 
 def test_the_record_of_a_step_says_by_which_clock() -> None:
