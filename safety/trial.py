@@ -9,11 +9,12 @@ running, nothing is missed: it stays on probation until there is something to se
 from dataclasses import dataclass
 from math import inf
 
-from safety.probation import Look
+from safety.probation import Look, Unseen
 
 LOOKED_SHARE = 1.0 / 3.0  #: of probation: covered by good looks, at least
 SILENT_S = 1.0  #: without telemetry for longer nothing of the line is seen
 LONGEST_S = 1.0  #: from one look to the next, as far as it counts
+MOST_NAMED = 3  #: of what was not seen; a line may have dozens of spans
 
 
 @dataclass
@@ -70,4 +71,10 @@ def _blind(found: Look | None, newest_s: float | None, now_s: float) -> str:
         return "no telemetry has come from the loop"
     if not now_s - newest_s <= SILENT_S:  # nor where either is no time at all
         return f"the newest telemetry is {now_s - newest_s:.1f} s old"
-    return "; ".join(map(str, found.unseen)) if found is not None else ""
+    return _named(found.unseen) if found is not None else ""
+
+
+def _named(unseen: tuple[Unseen, ...]) -> str:
+    """The first, and how many more; empty: nothing was unseen."""
+    more = len(unseen) - MOST_NAMED
+    return "; ".join([*map(str, unseen[:MOST_NAMED]), *([f"and {more} more"] if more > 0 else [])])

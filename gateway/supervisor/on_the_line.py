@@ -177,8 +177,8 @@ class OnTheLine:
         return done(f"{reply.text}; `r2rgate proposals {entry.proposal[:12]}` shows when it is done")
 
     async def back(self, reason: str) -> Reply:
-        """The loop is told, and nothing is recorded. Raises Unreachable."""
-        return await self._tell(Rollback(reason=reason))
+        """The loop is told, and nothing is recorded. Raises Unreachable. A reason that is too long is cut."""
+        return await self._tell(Rollback(reason=reason[:LONGEST_REASON]))
 
     async def roll_back(self, reason: str) -> Reply:
         """Now. Raises as `settle`, and Impossible."""
@@ -298,8 +298,7 @@ class OnTheLine:
         await self.settle()
         # One that was told before, and whose answer did not come, may have kept it: then the second is refused.
         if because and self._records.book.entries[entry.proposal].stage is Stage.KEEPING:
-            await self._tell(Rollback(reason=f"it could not be kept: {because}"[:LONGEST_REASON]))
-            await self.settle()
+            await self.roll_back(f"it could not be kept: {because}")
 
     async def _end_unheard(self, entry: Entry, now_s: float) -> None:
         """Of an experiment whose end nobody has told: the loop was started anew, or this process."""

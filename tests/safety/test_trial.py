@@ -53,6 +53,13 @@ def test_looks_that_see_too_little_never_keep_it_and_take_it_back_after_as_long_
     )
 
 
+@pytest.mark.parametrize(("spans", "more"), [(3, ""), (4, "; and 1 more"), (40, "; and 37 more")])
+def test_of_many_spans_that_were_not_seen_the_first_are_named(spans: int, more: str) -> None:
+    unseen = tuple(Unseen("tension", i + 1, 0.4, LEAST_TENSION) for i in range(spans))
+    said, _ = looked(begun(), Look("", unseen), 10.0 * PROBATION_S)
+    assert said.endswith(f"{'; '.join(map(str, unseen[:3]))}{more}") and len(said) < 300
+
+
 def test_it_is_kept_on_a_look_that_was_good_not_on_one_that_was_blind() -> None:
     trial = begun()
     _, now_s = looked(trial, GOOD, 20.0)

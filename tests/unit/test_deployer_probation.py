@@ -86,6 +86,16 @@ async def test_what_speaks_against_it_on_probation_takes_it_back():
 
 
 @run
+async def test_a_reason_that_is_longer_than_the_loop_takes_takes_it_back_all_the_same():
+    gateway, one = await deployed()
+    gateway.surroundings.against = "tension 3 swings; " * 100
+    await gateway.pass_time(1.0)
+    assert gateway.stage(one) is Stage.ROLLED_BACK
+    gateway, one = await deployed()
+    assert (await gateway.deployer.roll_back("it hums, " * 100, ANNA)).ok and gateway.stage(one) is Stage.ROLLED_BACK
+
+
+@run
 async def test_what_has_not_shown_enough_stays_on_probation_and_says_so():
     gateway, one = await deployed()
     gateway.surroundings.hidden = "the line has not stood for 5 s in a row"
