@@ -1,8 +1,9 @@
 """When a change that is under watch may be kept, and when nobody has seen enough of it. Pure; time is an argument.
 
 It is kept on looks that were good and no others: together they cover a third of probation, and the newest is one of
-them. A look at too few samples counts neither for it nor against it. Looks that stay so for as long as probation lasts
-take it back: what was in service before was tried on a line that could be seen. Where the line moves, or stands without
+them. A look at too few samples counts neither for it nor against it. Once such looks have lasted for as long as
+probation, all in all and not in a row, they take it back: what was in service before was tried on a line that could be
+seen, and one that is hardly seen now and then must come to an end, too. Where the line moves, or stands without
 running, nothing is missed: it stays on probation until there is something to see.
 """
 
@@ -25,7 +26,7 @@ class Trial:
     window_s: float  #: that a look covers
 
     looked_s: float = 0.0  #: covered by good looks
-    blind_s: float = 0.0  #: in which the line could have been looked at, and too little was seen
+    blind_s: float = 0.0  #: in which the line could have been looked at, and too little was seen; all in all
     stood: bool = False  #: the line has, for long enough to be looked at
     blind: str = ""  #: why too little was seen with the newest look; empty: enough was
     _covered_until_s: float = -inf

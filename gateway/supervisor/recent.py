@@ -1,4 +1,8 @@
-"""The last seconds of telemetry, as far as the line ran and its set-points stood."""
+"""The last seconds of telemetry, as far as the line ran and its set-points stood.
+
+Frames may be lost. Whether the line moves is decided by those that came; whether enough was seen of it is another
+question, which `Standing` answers by its shares, down to none.
+"""
 
 from collections import deque
 
@@ -22,7 +26,9 @@ class Recent:
         self._dtype = frame_dtype(spans)
         self._period_s = period_s
         self._window = round(WINDOW_S / period_s)  #: periods
-        self._frames: deque[bytes] = deque(maxlen=round(STANDING_S / period_s))
+        self._periods = round(STANDING_S / period_s)
+        self._frames: deque[bytes] = deque(maxlen=self._periods)
+        self._first_s: float | None = None  #: when the first frame since the last `forget` was due
         self._ran = 0  #: frames
 
     @property
@@ -38,19 +44,24 @@ class Recent:
     def take(self, payload: bytes) -> None:
         """A well-formed frame."""
         self._frames.append(payload)
-        self._ran += np.frombuffer(payload, self._dtype)["state"][0] == LoopState.RUN
+        frame = np.frombuffer(payload, self._dtype)[0]
+        self._ran += frame["state"] == LoopState.RUN
+        if self._first_s is None or frame["time_s"] < self._first_s:
+            self._first_s = float(frame["time_s"])
 
     def forget(self) -> None:
         """What was before says nothing of what is now."""
         self._frames.clear()
+        self._first_s = None
         self._ran = 0
 
     def stands(self) -> bool:
-        """Whether set-points and speed have stood since some seconds, in RUN."""
-        return self._standing() is not None
+        """Whether set-points and speed have stood since some seconds, in RUN, as most of the frames have it."""
+        frames = self._standing()
+        return frames is not None and len(frames) >= LEAST_TENSION * self._periods
 
     def standing(self) -> Standing | None:
-        """How the line stands; None: it moves, or has not stood for long enough.
+        """How the line stands, however much of it was seen; None: it moves, or has not stood for long enough.
 
         Periods of which no frame came, and tensions that are not GOOD, are not seen: a value that a device no longer
         tells stays in the frames, and so does a torque while the outputs are held.
@@ -69,14 +80,15 @@ class Recent:
         return standing(tension, setpoint, torque)
 
     def _standing(self) -> NDArray[np.void] | None:
-        if len(self._frames) < (self._frames.maxlen or 0):
+        """The frames of the last seconds, where none of them moves."""
+        if not self._frames or self._first_s is None:
             return None
         frames = np.frombuffer(b"".join(self._frames), self._dtype)
-        before = self._periods_before_newest(frames)
-        kept = (before >= 0) & (before < len(frames))
-        if not kept.mean() >= LEAST_TENSION:  # of some seconds hardly anything is known
+        passed = (frames["time_s"][-1] - self._first_s) / self._period_s + 1.0  # periods
+        if not round(passed) >= self._periods:
             return None
-        frames = frames[kept]
+        before = self._periods_before_newest(frames)
+        frames = frames[(before >= 0) & (before < self._periods)]
         # What is no number is not 0: it moves.
         moved = np.ptp(frames["tension_setpoint_n"], axis=0).any() or np.ptp(frames["speed_setpoint_m_per_s"])
         ran = (frames["state"] == LoopState.RUN).all()

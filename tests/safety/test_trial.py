@@ -101,6 +101,14 @@ def test_a_long_while_without_a_look_is_not_held_against_it() -> None:
     assert trial.blind_s == 1.0
 
 
+def test_looks_that_saw_too_little_add_up_over_the_whole_trial() -> None:
+    trial, now_s, said, looks = begun(), 0.0, "", 0
+    while not said and looks < 10_000:
+        looks, now_s = looks + 1, now_s + EVERY_S
+        said = trial.look(BLIND if looks % 4 == 0 else None, now_s, now_s)
+    assert "too little was seen" in said and looks == 4.0 * PROBATION_S / EVERY_S
+
+
 @given(st.lists(st.sampled_from([GOOD, BLIND, None]), min_size=1, max_size=400))
 def test_whatever_is_seen_it_is_kept_on_good_looks_alone(looks: list[Look | None]) -> None:
     trial, now_s = begun(), 0.0

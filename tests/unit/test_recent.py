@@ -80,9 +80,24 @@ def test_frames_that_were_lost_were_not_seen(lost: float, good: bool) -> None:
     assert look(np.delete(rows, gone)).good is good
 
 
-def test_a_line_of_which_hardly_a_frame_came_does_not_stand() -> None:
-    recent = taken(frames(swing_n=0.0, count=3 * FRAMES)[::2])
-    assert not recent.stands() and recent.standing() is None
+@pytest.mark.parametrize("every", [2, 10, 90, 400])
+def test_a_line_of_which_hardly_a_frame_came_is_not_said_to_stand_nor_to_move(every: int) -> None:
+    recent = taken(frames(swing_n=0.0, count=3 * FRAMES)[::every])
+    assert not recent.stands()
+    now = recent.standing()
+    assert now is not None and (now.tension_seen <= 1.0 / every + 1.0 / WINDOW).all()
+    assert len(look_at(now, None, LINE.gate, EACH).unseen) >= np.count_nonzero(EACH)
+
+
+def test_a_move_is_seen_in_the_frames_that_came() -> None:
+    rows = frames(swing_n=0.0, count=3 * FRAMES)
+    rows["tension_setpoint_n"][-100:] += 1.0
+    assert taken(rows[::10]).standing() is None
+
+
+def test_before_it_was_looked_at_for_long_enough_nothing_is_said() -> None:
+    rows = frames(swing_n=0.0, count=FRAMES)
+    assert taken(rows[:-1]).standing() is None and taken(np.delete(rows, slice(1, -1))).standing() is not None
 
 
 def test_lost_frames_do_not_make_two_changes_one() -> None:

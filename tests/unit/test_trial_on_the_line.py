@@ -23,6 +23,7 @@ class Telemetry:
         self.swing_n = 0.0  #: of one tension
         self.late = 0.0  #: share of the samples of its load cell
         self.told = True
+        self.lost = 0.0  #: share of the frames
         self._gateway, self._random = gateway, np.random.default_rng(3)
         self._recent = Recent(N, PERIOD_S)
         real = LineSurroundings(LINE, lambda: None, self._recent, lambda _: [], None, None, lambda: 0.0)  # type: ignore[arg-type]
@@ -43,7 +44,7 @@ class Telemetry:
         rows["tension_setpoint_n"] = rows["tension_n"] = 30.0
         rows["tension_n"][:, CELL] += self.swing_n * np.sin(2.0 * np.pi * time_s)
         rows["tension_quality"][self._random.uniform(size=count) < self.late, CELL] = Quality.STALE
-        for row in rows:
+        for row in rows[self._random.uniform(size=count) >= self.lost]:
             self._recent.take(row.tobytes())
 
 
@@ -93,6 +94,27 @@ async def test_a_trial_that_is_hardly_seen_says_so_and_goes_back():
     await telemetry.pass_time(PROBATION_S)
     assert gateway.stage(one) is Stage.ROLLED_BACK
     assert "too little was seen" in why(gateway, one) and "span 2" in why(gateway, one)
+
+
+@pytest.mark.parametrize("lost", [0.25, 0.32, 0.9])
+def test_a_trial_of_which_frames_are_lost_goes_back_and_does_not_stay_without_end(lost: float) -> None:
+    @run
+    async def hardly_seen() -> None:
+        gateway, one, telemetry = await on_trial()
+        telemetry.lost, telemetry.swing_n = lost, 12.0
+        await telemetry.pass_time(3.0 * PROBATION_S)
+        assert gateway.stage(one) is Stage.ROLLED_BACK and gateway.loop.runs == config_hash(FIRST)
+
+    hardly_seen()
+
+
+@run
+async def test_a_trial_that_is_hardly_seen_now_and_then_comes_to_an_end():
+    gateway, one, telemetry = await on_trial()
+    for _ in range(40):
+        telemetry.late = 1.0 - telemetry.late  # five seconds so, five seconds so
+        await telemetry.pass_time(5.0)
+    assert gateway.stage(one) in (Stage.ROLLED_BACK, Stage.KEPT)
 
 
 @run
