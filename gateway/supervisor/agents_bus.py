@@ -13,6 +13,7 @@ from gateway.mailbox.bus import BusUnavailable, open_router
 from gateway.mailbox.port import Mailbox
 from gateway.mailbox.zenoh_mailbox import ZenohMailbox
 from gateway.supervisor.agents_cases import AgentsCases
+from gateway.supervisor.patience import Patience
 
 MOST_EVENTS_PER_S = 0.1  #: of each kind: whoever comes and goes all the time, or floods, does not flood the history
 
@@ -24,7 +25,7 @@ class Desk(Protocol):
 
 
 class AgentsBus:
-    """`open` it once, `watch` a few times a second, `close` at the end. Without it the gateway does all else."""
+    """`keep_open` and `watch` a few times a second, `close` at the end. Without it the gateway does all else."""
 
     def __init__(
         self, line: Line, run_folder: Path, desks: Sequence[Desk], note: Callable[..., None], cases: AgentsCases,
@@ -37,6 +38,7 @@ class AgentsBus:
         self._cases = cases
         self._clock = clock
         self._mailbox: ZenohMailbox | None = None
+        self._opening = Patience(clock)
         self._text = "it is about to be opened"
         self._agents: set[AgentName] = set()
         self._told_agents: set[AgentName] = set()
@@ -44,8 +46,13 @@ class AgentsBus:
         self._of_agents = Allowance(MOST_EVENTS_PER_S)
         self._of_refused = Allowance(MOST_EVENTS_PER_S)
 
-    async def open(self) -> None:
-        """Never raises: a gateway without the bus is better than none."""
+    async def keep_open(self) -> None:
+        """Open it, where it is not open and it is time to try; what stands in its way is told once."""
+        if self._mailbox is None and self._opening.is_due():
+            await self._open()
+
+    async def _open(self) -> None:
+        """What cannot be opened raises nothing: a gateway without the bus is better than none."""
         mailbox: ZenohMailbox | None = None
         open_to, trouble = self._line.network, ""
         try:
@@ -62,8 +69,9 @@ class AgentsBus:
             for agent in AGENT_NAMES:
                 mailbox.watch(AGENT_DECIDE.of(agent), partial(self._seen, agent))
         except Exception as error:  # whatever it is
-            self._text = f"it could not be opened: {error}"
-            self._note("agents-bus", f"the agents' bus is closed: {error}")
+            self._text = f"it could not be opened, and is tried again: {error}"
+            if self._opening.failed():
+                self._note("agents-bus", f"the agents' bus is closed: {error}")
             if mailbox is not None:
                 await mailbox.close()
             return

@@ -30,6 +30,7 @@ from gateway.supervisor.in_service import InServiceView
 from gateway.supervisor.kept_audit import KeptAudit
 from gateway.supervisor.model_store import ModelsError
 from gateway.supervisor.models import Models, begin_repository
+from gateway.supervisor.patience import Patience
 from gateway.supervisor.peers import GATEWAY, who_of
 from gateway.supervisor.store_writer import StoreWriter
 from gateway.supervisor.surroundings import LineSurroundings
@@ -86,7 +87,9 @@ class Gate:
         self._in_service = InServiceView(line, folder)
         self._told = ""
         self._refusals = Bounded(clock)
-        self._learned: str | None = None  #: what ran when `_learn` looked last
+        self._learned: str | None = None  #: what ran when the stores were told last, or should have been
+        self._to_learn = False
+        self._learning = Patience(clock)
         self._telling: set[asyncio.Task[None]] = set()
         mailbox.serve(GATEWAY_PROPOSE, self._answer_propose)
         mailbox.serve(GATEWAY_PROPOSALS, self.answer_query)
@@ -166,13 +169,20 @@ class Gate:
     async def _learn_again(self, deployer: Deployer) -> None:
         """A loop that was started later has been given something else."""
         runs = deployer.book.in_service
-        if runs == self._learned:
+        if runs != self._learned:
+            self._learned, self._to_learn = runs, True
+            self._learning.begin_anew()
+        if not self._to_learn or not self._learning.is_due():
             return
         try:
             await self._writer.store_given()
         except ConfigurationsError as error:
-            self._note("gate", f"what the loop was started with is not stored: {error}")
-        self._learned = runs
+            if self._learning.failed():
+                self._note("gate", f"what the loop was started with is not stored, and is tried again: {error}")
+            return
+        self._to_learn = False
+        if self._learning.succeeded():
+            self._note("gate", "what the loop was started with is stored now")
 
     async def propose(self, payload: bytes, who: Who) -> Reply:
         """Take a proposal in, to be judged in the background."""

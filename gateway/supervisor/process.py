@@ -125,9 +125,14 @@ async def serve(
     line_desk = LineDesk(line, gate, data_folder, experiments, cases)
     bus = AgentsBus(line, run_folder, (desk, line_desk), gateway.note, cases, clock)
     gateway.agents_bus = bus.status
-    opening = tasks.begin("opening the agents' bus", bus.open())
     handlers = _Handlers(mailbox.counters)
-    turns = {"gate": gate.look, "lease": gate.hold, "agents' cases": cases.look, "alarms' file": alarms.keep}
+    turns = {
+        "gate": gate.look,
+        "lease": gate.hold,
+        "agents' cases": cases.look,
+        "alarms' file": alarms.keep,
+        "opening the agents' bus": bus.keep_open,
+    }
     looking = [asyncio.create_task(tasks.repeat(name, turn, watch_s, stop)) for name, turn in turns.items()]
     gateway.note("gateway-up", "the gateway has started")
     print(f"gateway of {line.site}/{line.line}: {run_folder / GATEWAY_SOCKET}, history {historian.path}", flush=True)
@@ -142,7 +147,6 @@ async def serve(
         stop.set()
         await asyncio.gather(*looking)
         await alarms.keep()
-        await opening
         await bus.close()
         await courses.close()
         await dry_runs.close()
