@@ -146,14 +146,18 @@ async def serve(
     finally:
         stop.set()
         await asyncio.gather(*looking)
-        await alarms.keep()
-        await bus.close()
-        await courses.close()
-        await dry_runs.close()
-        await past.close()
-        await gate.close()
-        await judge.close()
-        await mailbox.close()
+        await tasks.end(
+            {
+                "alarms' file": alarms.keep,
+                "closing the agents' bus": bus.close,
+                "closing courses": courses.close,
+                "closing dry runs": dry_runs.close,
+                "closing the past": past.close,
+                "closing the gate": gate.close,
+                "closing the judge": judge.close,
+                "closing the mailbox": mailbox.close,
+            }
+        )
         gateway.note("gateway-down", "the gateway has been stopped")
         flushed = await asyncio.to_thread(historian.close)
     if not flushed:

@@ -4,16 +4,20 @@ A long task is a turn that is taken again and again (`repeat`, `turn`), or work 
 (`begin`). What a turn raises is a fault of the task until it has succeeded again for `STEADY_S`; each type of exception
 is told once a fault, so a turn that fails four times a second fills no log. A turn that fails is taken again, later
 each time, up to `LONGEST_WAIT_S`: what cannot go on stays a fault, and is never silent. Cancellation passes.
+
+A turn of `repeat` that takes longer than `LONGEST_TURN_S` is a fault, `TakesLong`, while it goes on: it is told, not
+cancelled, for nobody knows what it has done by then.
 """
 
 import asyncio
 import time
-from collections.abc import Awaitable, Callable, Coroutine
+from collections.abc import Awaitable, Callable, Coroutine, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 LONGEST_WAIT_S = 1.0  #: between two turns that fail: leases of 5 s are renewed by such a turn
 STEADY_S = 10.0  #: without an exception, then it is no fault any more: what comes and goes does not flicker
+LONGEST_TURN_S = 60.0  #: longer than a loop that builds, a store that is locked and an audit that hangs together
 LONGEST_TEXT = 300  #: characters of an exception's text
 
 
@@ -35,12 +39,19 @@ class TaskFault:
 Tell = Callable[[TaskFault, BaseException | None], None]
 
 
+class TakesLong(Exception):
+    """A turn has not come to its end for too long; the text says for how long."""
+
+
 class Supervisor:
     """Of all long tasks of one event loop. `tell` must not raise."""
 
-    def __init__(self, tell: Tell, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self, tell: Tell, clock: Callable[[], float] = time.monotonic, longest_turn_s: float = LONGEST_TURN_S
+    ) -> None:
         self._tell = tell
         self._clock = clock
+        self._longest_turn_s = longest_turn_s
         self._faults: dict[str, TaskFault] = {}
         self._begun: set[asyncio.Task[None]] = set()
 
@@ -55,12 +66,15 @@ class Supervisor:
         """Take `turn` again and again, `every_s` apart, until `stop` is set or this is cancelled."""
         stop = asyncio.Event() if stop is None else stop
         while not stop.is_set():
+            late = asyncio.get_running_loop().call_later(self._longest_turn_s, self._takes_long, task)
             try:
                 await turn()
             except Exception as error:
                 self.failed(task, error)
             else:
                 self.succeeded(task)
+            finally:
+                late.cancel()
             await wait(stop, self.wait_s(task, every_s))
 
     def turn(self, task: str, turn: Callable[[], object]) -> None:
@@ -78,6 +92,11 @@ class Supervisor:
         self._begun.add(begun)
         begun.add_done_callback(self._begun.discard)
         return begun
+
+    async def end(self, steps: Mapping[str, Callable[[], Awaitable[object]]]) -> None:
+        """Take each step in turn, whatever those before it raised; that is told."""
+        for task, step in steps.items():
+            await self._once(task, step())
 
     async def close(self) -> None:
         """Cancel what was begun and is not done, and wait until it is."""
@@ -115,7 +134,10 @@ class Supervisor:
         in_a_row = 0 if fault is None else fault.in_a_row
         return every_s if in_a_row < 2 else max(every_s, min(every_s * 2.0 ** min(in_a_row - 1, 16), LONGEST_WAIT_S))
 
-    async def _once(self, task: str, work: Coroutine[Any, Any, object]) -> None:
+    def _takes_long(self, task: str) -> None:
+        self.failed(task, TakesLong(f"a turn has not come to its end for {self._longest_turn_s:g} s, and goes on"))
+
+    async def _once(self, task: str, work: Awaitable[object]) -> None:
         try:
             await work
         except Exception as error:

@@ -101,6 +101,25 @@ def test_from_start_to_sigterm_everything_is_kept() -> None:
     run(story)
 
 
+def test_an_end_of_which_a_step_fails_takes_the_others_all_the_same() -> None:
+    breaks = "async def fails(self):\n    raise RuntimeError('gone')\n\nAgentsBus.close = fails\n"
+    program = GATEWAY.replace("sys.exit", f"from gateway.supervisor.agents_bus import AgentsBus\n{breaks}sys.exit")
+
+    async def story(folder: Path) -> None:
+        with child(program, folder) as (process, said):
+            assert said.startswith("gateway of demo/")
+            process.terminate()
+            assert process.wait(20.0) == 0
+        with History(folder / "data" / "history.sqlite") as history:
+            events = history.events(0.0, 1e12)
+        told = [event.data.get("task") for event in events if event.kind == "task-failed"]
+        assert told == ["closing the agents' bus"]
+        assert events[-1].kind == "gateway-down"
+        assert not (folder / "gateway.sock").exists()
+
+    run(story)
+
+
 def test_a_second_instance_ends_with_3_and_a_sentence_and_touches_nothing() -> None:
     async def story(folder: Path) -> None:
         with gateway(folder) as process:

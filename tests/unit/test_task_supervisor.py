@@ -4,16 +4,19 @@ import asyncio
 
 import pytest
 
-from gateway.tasks.supervisor import LONGEST_WAIT_S, STEADY_S, Supervisor, TaskFault
+from gateway.tasks.supervisor import LONGEST_TURN_S, LONGEST_WAIT_S, STEADY_S, Supervisor, TaskFault
 
 
 class Bench:
-    def __init__(self) -> None:
+    def __init__(self, longest_turn_s: float = LONGEST_TURN_S) -> None:
         self.now_s = 0.0
         self.told: list[tuple[str, str]] = []
-        self.supervisor = Supervisor(self._tell, lambda: self.now_s)
+        self.heard: asyncio.Event | None = None
+        self.supervisor = Supervisor(self._tell, lambda: self.now_s, longest_turn_s)
 
     def _tell(self, fault: TaskFault, error: BaseException | None) -> None:
+        if self.heard is not None:
+            self.heard.set()
         self.told.append((fault.task, "mended" if error is None else type(error).__name__))
 
     def turn(self, error: Exception | None = None) -> None:
@@ -90,6 +93,45 @@ def test_cancellation_passes_and_is_no_fault() -> None:
 
     asyncio.run(story())
     assert bench.told == [] and bench.supervisor.faults == []
+
+
+def test_a_turn_that_takes_long_is_told_while_it_goes_on_and_is_not_cancelled() -> None:
+    bench = Bench(longest_turn_s=0.0)
+
+    async def story() -> None:
+        told, go_on = asyncio.Event(), asyncio.Event()
+        bench.heard = told
+
+        async def turn() -> None:
+            await go_on.wait()
+
+        stop = asyncio.Event()
+        repeated = asyncio.create_task(bench.supervisor.repeat("look", turn, 0.0, stop))
+        await told.wait()
+        (fault,) = bench.supervisor.faults
+        assert fault.error == "TakesLong" and "goes on" in fault.text and not repeated.done()
+        stop.set()
+        go_on.set()
+        await repeated
+
+    asyncio.run(story())
+    assert bench.told == [("look", "TakesLong")]
+
+
+def test_every_step_of_an_end_is_taken_whatever_the_one_before_raised() -> None:
+    bench, done = Bench(), []
+
+    def step(name: str, error: Exception | None = None):
+        async def taken() -> None:
+            done.append(name)
+            if error is not None:
+                raise error
+
+        return taken
+
+    steps = {"bus": step("bus", OSError("gone")), "gate": step("gate", KeyError("x")), "disk": step("disk")}
+    asyncio.run(bench.supervisor.end(steps))
+    assert done == list(steps) and bench.told == [("bus", "OSError"), ("gate", "KeyError")]
 
 
 def test_work_that_nobody_awaits_is_told_too_and_is_cancelled_at_the_end() -> None:
