@@ -27,7 +27,7 @@ PUT_TOGETHER = {
     ("7 are needed", "7: this counts neither for it nor against it; 7"): (
         "the load cell of span 3 has told 40% of its samples, 80% are needed",
         "of torque 3 10% of the changes were seen, 25% are needed",
-        "the load cell of span 3 has told 40% of its samples, 80% are needed: this counts neither for it nor against it",
+        "the newest telemetry is 2.0 s old: this counts neither for it nor against it",
         "too little was seen of it for 60 s: the newest telemetry is 2.0 s old",
     ),
     ("7 7 7 7 7, allowed: 7 7", "is off by", "swings by", "chatters by"): (
