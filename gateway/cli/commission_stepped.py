@@ -209,6 +209,7 @@ class SteppedGate:
                 self._recent.take(self._by_gates_clock(frame))
             self._seen_frames = len(self.loop.frames)
             await self._hear()
+            await self._gate.hold()
             await self._gate.look()
         if ran and not self._runs:
             raise CannotGoOn(f"the line has stopped: {self.loop.cycle.machine.reason}")
