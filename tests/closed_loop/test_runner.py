@@ -132,6 +132,51 @@ def test_a_stop_while_devices_are_given_time_to_come_back_leaves_every_link_rele
     asyncio.run(story())
 
 
+async def turns(count):
+    for _ in range(count):
+        await asyncio.sleep(0)
+
+
+class SlowLink(MemoryLink):
+    """Takes so many turns of the event loop to be prepared, and to be released."""
+
+    def __init__(self, loop, prepares, releases):
+        super().__init__(loop.line, loop.truth)
+        self.prepares, self.releases = prepares, releases
+        self.active = self.released = False
+
+    async def prepare(self):
+        await turns(self.prepares)
+        self.active = True
+
+    async def release(self):
+        await turns(self.releases)
+        self.active, self.released = False, True
+
+
+@pytest.mark.parametrize("stops", [1, 2, 3])
+def test_however_many_stops_come_into_an_arming_every_link_is_released(stops):
+    """The first begins to undo it, which takes its time; the others cut nothing of that."""
+
+    async def story():
+        told = Story(stepped())
+        await told.periods(3)
+        links = [SlowLink(told.loop, *takes) for takes in ((0, 9), (0, 30), (999, 5))]
+        told.loop.cycle.links[:] = links
+        arming = told.order(Arm())
+        await turns(10)
+        assert links[0].active and links[1].active
+        asked = []
+        for _ in range(stops):
+            asked.append(told.order(Stop()))
+            await turns(4)
+        assert all([(await told.until(stop)).ok for stop in asked])
+        assert "stopped" in (await told.until(arming)).text
+        assert all(link.released and not link.active for link in links)
+
+    asyncio.run(story())
+
+
 def test_arm_answers_when_the_drives_are_ready_and_not_before():
     async def story():
         told = Story(stepped())
