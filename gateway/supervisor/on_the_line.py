@@ -31,6 +31,7 @@ from gateway.supervisor.proposal_records import ProposalRecords, done, not_known
 
 LEASE_S = 5.0  #: of a deployment on probation; renewed every third of it
 UNHEARD_S = 10.0  #: after an experiment should be over
+UNRECORDED_S = 60.0  #: a disk that hangs for less takes back nothing that is good; a full one does, as an audit must
 LONGEST_REASON = 500  #: characters of one for the loop
 ASKED_AGAIN_S = 10.0  #: though it has told of no change: what it tells may get lost
 LATE_S = 30.0  #: for so long a loop that has not answered may still do what it was told: it builds, then waits
@@ -62,6 +63,7 @@ class OnTheLine:
         self._clock = clock
         self._renewed_s = clock()
         self._probation_since_s = clock()
+        self._followed_s = clock()  #: it was looked after last, and whatever was to be recorded was
         self._experiment: tuple[str, float] | None = None  #: that runs, and when its end is overdue
         self._note = note
         self._asked_s = clock()  #: what it runs
@@ -100,7 +102,7 @@ class OnTheLine:
         unanswered = proposal in self._unanswered
         await self._records.step(kind, {**what, "unanswered": True} if unanswered else what, GATEWAY)
         if kind == "deployed":
-            self._probation_since_s = self._renewed_s = self._clock()
+            self._probation_since_s = self._renewed_s = self._followed_s = self._clock()
             if unanswered:
                 self._surroundings.change_taken()
                 self._renewed_s -= LEASE_S  # nobody knows how much of it is left
@@ -127,7 +129,7 @@ class OnTheLine:
         """Look at what is on probation, and renew its lease or take it back. Raises Unreachable.
 
         It needs no record and no lock: a lease is over sooner than a disk that hangs is given up. What the loop says
-        afterwards is recorded by `settle`.
+        afterwards is recorded by `settle`. Where nothing can be recorded for `UNRECORDED_S`, it is left to fall back.
         """
         entry, now_s = self._records.book.on_the_line, self._clock()
         if entry is None or entry.stage not in (Stage.PROBATION, Stage.KEEPING):
@@ -135,7 +137,11 @@ class OnTheLine:
         if against := self._surroundings.against_keeping(now_s):
             await self.back(against)
             self.settled = False
-        elif now_s - self._renewed_s >= LEASE_S / 3.0 and entry.epoch is not None:
+        elif (
+            now_s - self._renewed_s >= LEASE_S / 3.0
+            and now_s - self._followed_s < UNRECORDED_S
+            and entry.epoch is not None
+        ):
             reply = await self._tell(Renew(epoch=entry.epoch))
             self._renewed_s = now_s
             self.settled = self.settled and reply.ok  # one that is refused is kept by now, or has gone back
@@ -145,6 +151,7 @@ class OnTheLine:
         unheard = self._clock() - self._asked_s >= ASKED_AGAIN_S
         if self._records.book.on_the_line is not None or not self.settled or unheard or self._good_watch.is_due():
             await self._look_after(await self.settle())
+        self._followed_s = self._clock()
 
     async def carry_out(self, entry: Entry, found: InService, who: Who) -> Reply:
         await self._records.fetch([entry])

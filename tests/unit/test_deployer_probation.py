@@ -6,7 +6,7 @@ import contextlib
 from gateway.core.controller import config_hash
 from gateway.core.line_model import model_hash
 from gateway.supervisor.lifecycle import Stage
-from gateway.supervisor.on_the_line import ASKED_AGAIN_S, LEASE_S
+from gateway.supervisor.on_the_line import ASKED_AGAIN_S, LEASE_S, UNRECORDED_S
 from gateway.supervisor.patience import LONGEST_WAIT_S
 from tests.unit.deployer_gateway import ANNA, PROBATION_S, deployed, run, started
 from tests.unit.deployer_support import FIRST, LINE, controller, hash_of, proposal
@@ -19,7 +19,8 @@ async def test_an_audit_that_fails_on_probation_leaves_the_line_on_what_was_good
     gateway.audit.available = False
     await gateway.pass_time(PROBATION_S + 2 * LEASE_S)
     assert gateway.loop.good == config_hash(FIRST)
-    gateway.loop.pass_time(LEASE_S)
+    await gateway.pass_time(UNRECORDED_S)
+    assert gateway.loop.runs == config_hash(FIRST)
     gateway.audit.available = True
     await gateway.deployer.watch()
     assert gateway.stage(one) is Stage.ROLLED_BACK
