@@ -56,7 +56,7 @@ from gateway.loop.cycle import SUPERVISED, WITH_TORQUE
 from gateway.loop.kept import FILE, Kept
 from safety.recovery_prediction import recovery_prediction
 from tests.closed_loop.loop_model import Law, Model, runs_of, watch_key
-from tests.closed_loop.loop_world import BREAKABLE, GIVEN, LINE, PERIOD_S, Ask, Broken, Life
+from tests.closed_loop.loop_world import BREAKABLE, GIVEN, LINE, PARTS, PERIOD_S, Ask, Broken, Life
 
 TASK = task_of(LINE)
 LAWS = {
@@ -507,7 +507,9 @@ class LoopStates(RuleBasedStateMachine):
             return
         assert isinstance(error, Broken), f"the process has ended by {type(error).__name__}: {error}"
         assert len(life.led_to_it) >= 2, f"the first exception, of {life.led_to_it}, has ended the process"
-        if life.cycle.configurations.probation is None:
+        # A failing link, command, event or frame says nothing of a configuration, nor does a line that has never run.
+        of_configuration = life.led_to_it[0] in PARTS and life.cycle.account.ran
+        if of_configuration and life.cycle.configurations.probation is None:
             self.model.ends[self.model.durable.key] += 1
 
     def _alive(self) -> Life:
