@@ -40,17 +40,17 @@ def foretold_of(case: Case, model: LineModel, noise: Noise, most_s: float = MOST
     """
     theta, whose = theta_of(model), model_hash(model)
     return [
-        _kept(_Asked((whose, part.recording.digest()), theta, noise, part)) for part in newest(case.excited, most_s)
+        _kept(_Asked((whose, part.recording.digest()), noise, theta, part)) for part in newest(case.excited, most_s)
     ]
 
 
 @dataclass(frozen=True)
 class _Asked:
-    """Equal where model and numbers are."""
+    """Equal where model, noise and numbers are."""
 
-    key: tuple[str, str]
+    key: tuple[str, str]  #: hash of the model, digest of the numbers
+    noise: Noise
     theta: Theta = field(compare=False)
-    noise: Noise = field(compare=False)
     part: Excited = field(compare=False)
 
 

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from gateway.control.prediction import gains_of, imagined, innovations, predict, stretch_of, whitened
-from gateway.core.line_model import theta_of
+from gateway.core.line_model import noise_of, theta_of
 from gateway.core.theta import Noise
+from safety import predicting
 from safety.excitation import excited_parts, newest, recent, same_speed
 from safety.findings import at_least, at_most, told
 from safety.predicting import Foretold, foretold, with_swings
@@ -210,6 +211,14 @@ def test_alignment_looks_at_the_newest_data_only(of, case, monkeypatch):
     monkeypatch.setattr(alignment, "foretold_of", foretold_of)
     alignment.of_model(case, of.model)
     assert asked == [alignment.MOST_S]
+
+
+def test_what_is_kept_of_a_prediction_is_of_the_noise_that_is_asked_for(of, case):
+    own = noise_of(of.model)
+    other = replace(own, tension_n=2.0 * own.tension_n)
+    calm, loud = (predicting.normalised(predicting.foretold_of(case, of.model, noise)) for noise in (own, other))
+    assert loud < 0.9 * calm
+    assert predicting.normalised(predicting.foretold_of(case, of.model, own)) == calm
 
 
 @pytest.mark.parametrize(("latency_s", "same"), [(0.004, True), (0.01, False), (0.02, False)])
