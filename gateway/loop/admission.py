@@ -48,7 +48,7 @@ class Admission:
         self._line = line
         self._law_of = law_of
         self._period_s = period_s
-        self._measured = MEASURED_PERIODS if period_s < inf else 1
+        self._periods = MEASURED_PERIODS if period_s < inf else 1
 
     def admit(self, deployment: Deployment, good: Configuration) -> Configuration:
         """What `deployment` brings, ready to run; `good` is what the line would go back to.
@@ -122,7 +122,7 @@ class Admission:
     def _law_s(self, law: Law[Any], config: Controller) -> float:
         """What a period of `law` takes, in processor seconds. Raises ControllerRefused where it cannot be run."""
         try:
-            return max(_law_s(law, *situation, self._measured) for situation in _situations(config, self._line))
+            return max(_law_s(law, *situation, self._periods) for situation in _situations(config, self._line))
         except ControllerRefused:
             raise
         except Exception as error:  # whatever a law may raise: here it costs nothing
@@ -140,7 +140,7 @@ class Admission:
         try:
             recovery = Recovery(watch, fallback, self._line)
             situations = _situations(fallback, self._line)
-            return recovery, max(_look_s(recovery, *situation, self._measured) for situation in situations)
+            return recovery, max(_look_s(recovery, *situation, self._periods) for situation in situations)
         except Exception as error:  # of a prediction that fits its format and not its fallback
             reason = f"{type(error).__name__}: {error}"
             raise ControllerRefused(f"its recovery prediction cannot be used: {reason}") from error
@@ -151,11 +151,14 @@ class Admission:
         if watch_s:
             taken += f", its recovery prediction {1e3 * watch_s:.3g} ms"
         if not law_s + watch_s <= SHARE * self._period_s:
-            raise ControllerRefused(f"{taken}, on this computer; allowed: {1e3 * SHARE * self._period_s:.3g} ms")
+            raise ControllerRefused(
+                f"{taken}, on this computer; allowed: {1e3 * SHARE * self._period_s:.3g} ms: a simpler law, a longer "
+                "control.period_s, or a faster computer"
+            )
         if not law_s + watch_s + good_s <= TAKEN_BACK_SHARE * self._period_s:
             raise ControllerRefused(
                 f"{taken}, and what the line would go back to {1e3 * good_s:.3g} ms; allowed: "
-                f"{1e3 * TAKEN_BACK_SHARE * self._period_s:.3g} ms in all"
+                f"{1e3 * TAKEN_BACK_SHARE * self._period_s:.3g} ms in all: a simpler law, or a longer control.period_s"
             )
 
 

@@ -6,6 +6,7 @@ take torque off (`process`). Arming gives every part another chance.
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import ParamSpec, TypeVar
 
 from safety.actions import Action, Finding
@@ -14,7 +15,14 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 PART_FAILED = "part failed"  #: the rule's name
-OUTSIDE = ("the link ", "the command ", "events", "telemetry")  #: how parts begin that no configuration is in
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """A part of the period, by the name that is told."""
+
+    name: str
+    of_configuration: bool = True  #: a controller or a model is in it: what fails says something of them
 
 
 class Containment:
@@ -22,11 +30,12 @@ class Containment:
 
     def __init__(self) -> None:
         self.failed: dict[str, str] = {}
+        self.speaks_of_configuration = False  #: something has failed that a configuration or its model is in
         self._untold: list[Finding] = []
 
-    def run(self, part: str, otherwise: T, do: Callable[P, T], *args: P.args, **named: P.kwargs) -> T:
+    def run(self, part: Part, otherwise: T, do: Callable[P, T], *args: P.args, **named: P.kwargs) -> T:
         """What `do` returns; `otherwise` where it raises, or has been left out since. Raises what fails second."""
-        if self.failed and part in self.failed:
+        if self.failed and part.name in self.failed:
             return otherwise
         try:
             return do(*args, **named)
@@ -34,14 +43,13 @@ class Containment:
             self.fail(part, error)
             return otherwise
 
-    def fail(self, part: str, error: Exception, action: Action = Action.STOP) -> None:
+    def fail(self, part: Part, error: Exception, action: Action = Action.STOP) -> None:
         """`part` has raised `error` and is left out from now on. Raises it again where it is the second."""
         if self.failed:
             raise error
-        self.failed[part] = f"{type(error).__name__}: {error}"
-        text = (
-            f"{part} failed and is left out until the line is armed: {self.failed[part]}; keep the log, and report it"
-        )
+        self.failed[part.name] = found = f"{type(error).__name__}: {error}"
+        self.speaks_of_configuration |= part.of_configuration
+        text = f"{part.name} failed and is left out until the line is armed: {found}; keep the log, and report it"
         self._untold.append(Finding(PART_FAILED, action, text))
 
     def take_findings(self) -> list[Finding]:
@@ -51,11 +59,7 @@ class Containment:
             self._untold = []
         return untold
 
-    @property
-    def speaks_of_configuration(self) -> bool:
-        """Whether something has failed that a configuration or its model is in."""
-        return any(not part.startswith(OUTSIDE) for part in self.failed)
-
     def begin_anew(self) -> None:
         """A person arms."""
         self.failed.clear()
+        self.speaks_of_configuration = False

@@ -18,7 +18,7 @@ from gateway.core.telemetry import Frame
 from gateway.loop import machine as machines
 from gateway.loop.admission import Admission, LawOf
 from gateway.loop.configurations import Configuration, Configurations
-from gateway.loop.containment import Containment
+from gateway.loop.containment import Containment, Part
 from gateway.loop.experiment import Experiments, Tell
 from gateway.loop.guard import Guard
 from gateway.loop.kept import Kept
@@ -59,6 +59,12 @@ SUPERVISION = {
     Phase.UNLOADING: NOTHING,
     Phase.OFF: NOTHING,
 }
+
+PERIOD, ENVELOPE = Part("the control period"), Part("the envelope")
+JUMPS, STUCK = Part("the check for jumps"), Part("the check for stuck signals")
+LEASE, MONITOR, DOUBTS = Part("the lease"), Part("the monitor"), Part("the watch for doubts")
+EXPERIMENT = Part("the experiment")
+TELEMETRY, EVENTS = Part("telemetry", of_configuration=False), Part("events", of_configuration=False)
 
 
 @dataclass(slots=True)
@@ -130,7 +136,7 @@ class Cycle:
         try:
             await self._run(tick)
         except Exception as error:  # of what is not a part of its own: there is no control to rely on
-            self.containment.fail("the control period", error, Action.TORQUE_OFF)
+            self.containment.fail(PERIOD, error, Action.TORQUE_OFF)
             self._heed_failures(tick.now_s)
             self._write(self.torque_path.unload(self.outputs.torque_nm))
 
@@ -146,7 +152,7 @@ class Cycle:
         self.guard.sent(torque_nm)
         cycle_s = self.clock() - tick.now_s
         self._watch_after(seen, tick, before_nm, torque_nm, saturated)
-        self.containment.run("telemetry", None, self._frame, tick, saturated, cycle_s)
+        self.containment.run(TELEMETRY, None, self._frame, tick, saturated, cycle_s)
         self._heed_failures(tick.now_s)
 
     def _watch_after(
@@ -156,15 +162,13 @@ class Cycle:
         run = self.containment.run
         if self.machine.phase in CONTROLLED and seen.usable:
             controlled = self.watch.controlled
-            self._alarm(run("the watch for doubts", [], controlled, self.inputs, self.setpoints, before_nm, saturated))
-        run("the experiment", None, self.experiments.look, self.inputs, torque_nm, self.account.held, tick.due_s)
+            self._alarm(run(DOUBTS, [], controlled, self.inputs, self.setpoints, before_nm, saturated))
+        run(EXPERIMENT, None, self.experiments.look, self.inputs, torque_nm, self.account.held, tick.due_s)
 
     def _end_what_lapsed(self, now_s: float) -> None:
         configurations = self.configurations
         # Where it cannot be told whether the lease has ended, it has: a silent line is not stopped, so not taken back.
-        why = self.containment.run(
-            "the lease", "whether its lease has ended cannot be told", configurations.lapsed, now_s
-        )
+        why = self.containment.run(LEASE, "whether its lease has ended cannot be told", configurations.lapsed, now_s)
         if why and configurations.probation is not None:
             self.roll_back(why)
         configurations.settle_moves()
@@ -217,7 +221,7 @@ class Cycle:
     def tell(self, kind: str, text: str, **data: object) -> None:
         """An event, to whoever listens."""
         if (tell := self._tell) is not None:
-            self.containment.run("events", None, tell, kind, text, **data)
+            self.containment.run(EVENTS, None, tell, kind, text, **data)
 
     def foreseen(self, setpoint_n: FloatArray, unwind_speed_m_per_s: float | None = None) -> str:
         """What would come of these set-points (n,), or this speed, at once, as the accepted model has it; or nothing.
@@ -260,7 +264,7 @@ class Cycle:
 
     def _usable_links(self) -> list[Link]:
         failed = self.containment.failed
-        return [link for link in self.links if _part(link) not in failed] if failed else self.links
+        return [link for link in self.links if _part(link).name not in failed] if failed else self.links
 
     def _miss_failed_links(self) -> None:
         """Whose samples a link that failed would have brought is not known here: none is relied on."""
@@ -272,16 +276,16 @@ class Cycle:
     def _check(self, tick: Tick) -> Assessment:
         phase, run = self.machine.phase, self.containment.run
         supervision = SUPERVISION[phase]
-        jumps = run("the check for jumps", [], self._reject_jumps, supervision)
+        jumps = run(JUMPS, [], self._reject_jumps, supervision)
         if phase in WITH_TORQUE:
             self.torque_path.lost |= self.inputs.drive_state != _ENABLED
-        seen = run("the envelope", None, self._check_envelope, tick, supervision)
+        seen = run(ENVELOPE, None, self._check_envelope, tick, supervision)
         if seen is None:
             return Assessment([], usable=False, feedback_lost=True, plc_lost=True)
         if supervision.feedback:
             seen.findings.extend(jumps)
             if seen.usable:
-                seen.findings.extend(run("the check for stuck signals", [], self.watch.find_stuck, self.inputs))
+                seen.findings.extend(run(STUCK, [], self.watch.find_stuck, self.inputs))
         return seen
 
     def _reject_jumps(self, supervision: Supervision) -> list[Finding]:
@@ -334,7 +338,7 @@ class Cycle:
             self.roll_back(f"the line stopped: {machine.reason}")
         if machine.phase is Phase.OFF:  # a speed from before the stop is not taken up again
             self.setpoints.speed_target_m_per_s = self.setpoints.recipe.speed_m_per_s
-        self.containment.run("events", None, self._announce, before, machine, findings)
+        self.containment.run(EVENTS, None, self._announce, before, machine, findings)
 
     def _torque(self, seen: Assessment, tick: Tick) -> tuple[FloatArray, bool]:
         """The torque (n,) to apply in this period, and whether a limit cut it."""
@@ -384,9 +388,7 @@ class Cycle:
         if self.machine.phase not in SUPERVISED:
             return found
         guard, setpoint_n = self.guard, self.setpoints.tension_n
-        against = self.containment.run(
-            "the monitor", [], guard.against, configurations, path, measured, setpoint_n, found
-        )
+        against = self.containment.run(MONITOR, [], guard.against, configurations, path, measured, setpoint_n, found)
         self._heed_failures(now_s)
         if not against:
             return found
@@ -413,7 +415,7 @@ class Cycle:
         phase = self.machine.phase
         goal = self.setpoints.speed_target_m_per_s if phase is Phase.RUNNING else 0.0
         if (run := self.experiments.run) is not None:
-            goal = self.containment.run("the experiment", 0.0, run.advance, self.setpoints)
+            goal = self.containment.run(EXPERIMENT, 0.0, run.advance, self.setpoints)
         rate = moves.stop_rate_m_per_s2 if phase is Phase.SLOWING else moves.speed_rate_m_per_s2
         shape = moves.shape if phase is Phase.RUNNING else "ramp"  # what stops does not wait for a curve to bend
         self.setpoints.advance(moves, self.limits.period_s, goal, rate, shape)
@@ -448,7 +450,7 @@ class Cycle:
 
     def _alarm(self, findings: list[Finding]) -> None:
         if findings:
-            self.containment.run("events", None, self._announce, self.machine, self.machine, findings)
+            self.containment.run(EVENTS, None, self._announce, self.machine, self.machine, findings)
 
     def _stays_on(self) -> BoolArray:
         """Drives (n,) that do not obey OFF. Said once, when it begins."""
@@ -496,6 +498,5 @@ class Cycle:
         )
 
 
-def _part(link: Link) -> str:
-    """A link's name in `containment`."""
-    return f"the link {link.name}"
+def _part(link: Link) -> Part:
+    return Part(f"the link {link.name}", of_configuration=False)

@@ -89,7 +89,7 @@ class Store:
         if kept is None:
             return None
         self.last = self._good = kept.durable
-        found = self._that_lives(kept, line, say)
+        found = self._first_that_may_run(kept, line, say)
         if found is not kept:
             self._set_aside(found, say)
         return found
@@ -112,7 +112,7 @@ class Store:
             return None
         return kept
 
-    def _that_lives(self, kept: Kept, line: Line, say: Callable[[str], None]) -> Kept:
+    def _first_that_may_run(self, kept: Kept, line: Line, say: Callable[[str], None]) -> Kept:
         """The first of what there is to go back to that has not ended the loop too often; at the end what is given."""
         for candidate in self._ways_back(kept, line, say):
             if not self.deaths.too_often(fingerprint(candidate.durable)):

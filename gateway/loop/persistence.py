@@ -39,6 +39,7 @@ class Persistence:
         self._agreed = configurations.changes  #: the change up to which the disk has been compared
         self._following: asyncio.Task[None] | None = None
         self._failed = ""  #: why the disk is behind; empty: no write has failed
+        self._untold: list[tuple[str, str, dict[str, str]]] = []  #: kinds, texts and data of events
 
     @property
     def behind(self) -> bool:
@@ -46,7 +47,14 @@ class Persistence:
         return self._agreed != self._configurations.changes
 
     def look(self) -> None:
-        """After each period: bring the disk up to what was decided, aside."""
+        """After each period: tell what has become of the disk, and bring it up to what was decided, aside."""
+        untold, self._untold = self._untold, []
+        for kind, text, data in untold:  # here, where an exception of whoever listens is a part's that fails
+            if self._tell is not None:
+                self._tell(kind, text, **data)
+        self._begin_to_follow()
+
+    def _begin_to_follow(self) -> None:
         if self._store is not None and self.behind and (self._following is None or self._following.done()):
             self._following = asyncio.create_task(self._follow())
 
@@ -69,13 +77,13 @@ class Persistence:
 
     async def caught_up(self, within_s: float) -> str:
         """Once the disk has what was decided last; after `within_s` why it has not, empty where it has."""
-        self.look()
+        self._begin_to_follow()
         if self._store is None or self._following is None:
             return ""
         with suppress(TimeoutError):
             async with asyncio.timeout(within_s):
                 while self.behind:
-                    self.look()
+                    self._begin_to_follow()
                     await asyncio.wait([self._following])
         return (self._failed or "the disk takes its time") if self.behind else ""
 
@@ -97,12 +105,15 @@ class Persistence:
                 await asyncio.sleep(AGAIN_S)
 
     def _say_failed(self, failed: str) -> None:
-        if not self._failed and self._tell is not None:
-            text = f"what was decided last is not on the disk, a loop that starts anew would not know it: {failed}"
-            self._tell(NOT_PERSISTED, text, error=failed)
+        if not self._failed:
+            text = (
+                "what was decided last is not on the disk, a loop that starts anew would not know it; free some space, "
+                f"or let the disk be written; it is tried again every {AGAIN_S:g} s: {failed}"
+            )
+            self._untold.append((NOT_PERSISTED, text, {"error": failed}))
         self._failed = failed
 
     def _say_persisted(self) -> None:
-        if self._failed and self._tell is not None:
-            self._tell(PERSISTED, "what was decided last is on the disk")
+        if self._failed:
+            self._untold.append((PERSISTED, "what was decided last is on the disk", {}))
         self._failed = ""

@@ -23,6 +23,7 @@ from gateway.core.states import LoopState, Phase
 from gateway.loop.arming import forbidden, not_armed, prepare_links, refusal_to_arm, release_links, unheard
 from gateway.loop.aside import Aside
 from gateway.loop.commands import carry_out
+from gateway.loop.containment import Part
 from gateway.loop.cycle import SUPERVISED, Cycle
 from gateway.loop.deploy import NOT_DONE, Prepared, durable_after, prepare, require
 from gateway.loop.kept import Durable, Store
@@ -92,7 +93,9 @@ class Runner:
         """A command that fails stops the line in order, as any part of a period does."""
         name = command.command
         run = self.cycle.containment.run
-        reply = run(f"the command {name}", None, carry_out, self.cycle, command, now_s, prepared)
+        reply = run(
+            Part(f"the command {name}", of_configuration=False), None, carry_out, self.cycle, command, now_s, prepared
+        )
         return reply or self._refused(f"{name} failed within the loop, which stops the line for it")
 
     async def end(self) -> None:

@@ -178,11 +178,15 @@ class Gate:
             await self._writer.store_given()
         except ConfigurationsError as error:
             if self._learning.failed():
-                self._note("gate", f"what the loop was started with is not stored, and is tried again: {error}")
+                self._note(
+                    "gate",
+                    f"what the loop was started with is not stored, and is tried again: {error}",
+                    code="given-not-stored",
+                )
             return
         self._to_learn = False
         if self._learning.succeeded():
-            self._note("gate", "what the loop was started with is stored now")
+            self._note("gate", "what the loop was started with is stored now", code="given-stored")
 
     async def propose(self, payload: bytes, who: Who) -> Reply:
         """Take a proposal in, to be judged in the background."""

@@ -38,7 +38,7 @@ def collected(share, times):
 def test_what_is_late_stays_as_it_was_told_before_and_is_stale() -> None:
     link, inputs = collected(0.0, 2)
     assert inputs.tension.good() and inputs.speed.good() and inputs.plc.quality == Quality.GOOD and link.late == 0
-    link._share = 1.0  # noqa: SLF001
+    link.share = 1.0
     link.trigger(0.02)
     asyncio.run(link.collect(inputs, 0.02))
     assert link.late == 2 + LINE.n

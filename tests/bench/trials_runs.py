@@ -54,14 +54,14 @@ class LateLink(MemoryLink):
 
     def __init__(self, line: Line, plant: MemoryPlant, share: float, generator: np.random.Generator) -> None:
         super().__init__(line, plant)
-        self._share, self._generator = share, generator
+        self.share, self._generator = share, generator
         self.late = self.answers = 0
 
     async def collect(self, inputs: Inputs, deadline_s: float) -> None:
         channels = (inputs.tension, inputs.speed, inputs.torque, inputs.unwind_speed)
         before = [(one.value.copy(), one.time_s.copy()) for one in channels]
         await super().collect(inputs, deadline_s)
-        late = self._generator.uniform(size=2 + inputs.n) < self._share  # load cells, PLC, drives
+        late = self._generator.uniform(size=2 + inputs.n) < self.share  # load cells, PLC, drives
         self.late, self.answers = self.late + int(late.sum()), self.answers + len(late)
         of_channel = (np.full(inputs.n, late[0]), late[2:], late[2:], late[1:2])
         for channel, (value, time_s), which in zip(channels, before, of_channel, strict=True):

@@ -132,7 +132,6 @@ def test_what_was_seen_speaks_against_it_beside_what_was_not() -> None:
     tension_n[:, 2] = np.nan
     found = look_at(standing(tension_n, setpoint_n, torque_nm), None, GATE, MEASURED)
     assert found.against.startswith("tension 2") and found.unseen == (Unseen("tension", 3, 0.0, LEAST_TENSION),)
-    assert str(found.unseen[0]) == "the load cell of span 3 has told 0% of its samples, 80% are needed"
 
 
 def test_a_span_without_a_load_cell_is_not_missed_and_what_only_indicates_does_not_count() -> None:

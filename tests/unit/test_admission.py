@@ -63,13 +63,14 @@ def test_a_law_that_takes_longer_than_its_share_is_refused_with_the_figure(what)
 
 
 def test_a_prediction_that_takes_longer_than_its_share_is_refused_along_its_longer_way(monkeypatch):
-    step_by_step = getattr(Recovery, "_step_by_step")  # noqa: B009
+    shortfall = Recovery.shortfall
 
-    def slow(*given):
-        busy(0.03)
-        return step_by_step(*given)
+    def slow_away_from_set_points(self, measured, setpoint_n, *given):
+        if np.abs(measured.tension_n - setpoint_n).max() > 1.0:
+            busy(0.03)
+        return shortfall(self, measured, setpoint_n, *given)
 
-    monkeypatch.setattr(Recovery, "_step_by_step", slow)
+    monkeypatch.setattr(Recovery, "shortfall", slow_away_from_set_points)
     with pytest.raises(ControllerRefused, match=r"its recovery prediction 3\d.* ms"):
         Admission(LINE, make_law, 0.05).recovery(WATCH, GIVEN, 0.0)
 

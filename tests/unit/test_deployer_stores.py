@@ -139,7 +139,7 @@ def test_a_store_that_a_backup_holds_for_five_seconds_ends_nothing_and_holds_up_
             await asyncio.sleep(0.01)
             turns += 1
         await looking
-        assert turns > 100  # others had their turn all the while
+        assert turns > 10  # others had their turn in these 5 s: where the event loop waits for the lock, one or two
         assert "configurations.sqlite" in gateway.deployer.trouble and gateway.stage(two) is Stage.WAITING
         backup.execute("ROLLBACK")
         backup.close()

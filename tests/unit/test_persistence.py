@@ -125,6 +125,7 @@ def test_a_rollback_while_the_disk_takes_what_is_kept_is_what_the_next_loop_runs
         await it.until(it.as_decided)
         assert not await it.runner.persisted(10.0)
         assert it.on_disk().controller == GIVEN
+        await it.period()
         assert (NOT_PERSISTED in it.kinds()) == bool(refused)
         assert it.kinds().count(NOT_PERSISTED) == it.kinds().count(PERSISTED)  # told once, and that it is over
 
@@ -176,6 +177,7 @@ def test_an_answer_says_that_the_next_loop_would_not_know(tmp_path, monkeypatch)
         it.store.refused = set()
         await it.until(it.as_decided)
         assert not await it.runner.persisted(10.0)
+        await it.period()
         assert it.on_disk().on_top is None and PERSISTED in it.kinds()
 
     told(Disk(tmp_path), story)
