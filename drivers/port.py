@@ -9,17 +9,19 @@ What `write` hands over acts at the devices with the next `trigger` (a SYNC, or 
 transaction), so the latency from sample to torque is one period on every wire.
 """
 
+from collections.abc import Sequence
 from typing import Protocol
 
+from gateway.core.finding import Finding
 from gateway.core.signals import Inputs, LinkHealth, Outputs
 
 
 class PrepareRefused(Exception):
     """A device cannot be trusted with torque. `reasons` name device, what was found, and what to do."""
 
-    def __init__(self, reasons: list[str]) -> None:
-        super().__init__("; ".join(reasons))
-        self.reasons = reasons
+    def __init__(self, reasons: Sequence[str | Finding]) -> None:
+        super().__init__("; ".join(map(str, reasons)))
+        self.reasons = list(reasons)
 
 
 class Link(Protocol):

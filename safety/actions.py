@@ -1,7 +1,12 @@
 """What the loop does about a finding, in order of severity; the most severe wins. Each says what clears it."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import IntEnum
+
+from gateway.core import finding as data
+from gateway.core.finding import Value
+from gateway.wording.catalogue import sentence
 
 
 class Action(IntEnum):
@@ -17,9 +22,20 @@ class Action(IntEnum):
 class Finding:
     """One rule that is not met, with the measured numbers and what to do next."""
 
-    rule: str
+    rule: str  #: its code, where `parameters` are there
     action: Action
     text: str
+    parameters: Mapping[str, Value] | None = None  #: None: it is told in words only
+
+    def as_data(self) -> data.Finding | None:
+        """Code and parameters; None where it is told in words only."""
+        return None if self.parameters is None else data.Finding(code=self.rule, parameters=dict(self.parameters))
+
+
+def found(code: str, action: Action, **parameters: float | str) -> Finding:
+    """A finding of the catalogue, by its code; numbers in SI, the unit in the name."""
+    coded = data.finding(code, **parameters)
+    return Finding(code, action, sentence(coded), coded.parameters)
 
 
 def most_severe(findings: list[Finding]) -> Action:

@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, TypeAdapter
 
+from gateway.core.finding import Finding
 from gateway.core.line import Strict
 
 Priority = Literal["high", "medium", "low"]
@@ -118,6 +119,7 @@ ALARMS: tuple[Alarm, ...] = (
         after_s=0.0, gone_s=5.0,
     ),
 )  # fmt: skip
+STOPPED = "line-stopped"
 BY_NAME = {alarm.name: alarm for alarm in ALARMS}
 
 
@@ -128,6 +130,7 @@ class AlarmStatus(Strict):
     priority: Priority
     means: str
     text: str  #: with the measured values, as they were when it came
+    findings: list[Finding] = []  #: what the text says, as far as it is data
     cause: str
     consequence: str
     action: str

@@ -8,6 +8,7 @@ from pydantic import Field, TypeAdapter, ValidationError
 
 from gateway.core.deployment import Deployment, Epoch, Hash, InService, RecoveryPrediction, Region
 from gateway.core.experiment import Experiment, experiment_hash
+from gateway.core.finding import Finding
 from gateway.core.line import Strict
 
 
@@ -161,6 +162,7 @@ class Reply(Strict):
     state: str  #: the loop's state after the command
     text: str  #: one sentence for a person, with what to do next where it was refused
     reasons: list[str] = []  #: every reason of a refusal
+    findings: list[Finding] = []  #: those of them that are data
     in_service: InService | None = None  #: after a command about the configuration
     known: bool = True  #: False: whether it was done is not known yet; the events tell it once it is
 
@@ -171,6 +173,7 @@ class Event(Strict):
     time_s: float  #: monotonic
     kind: str
     text: str
+    findings: list[Finding] = []  #: what led to it, as far as it is data
     data: dict[str, Any] = {}
 
 

@@ -5,6 +5,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from gateway.core.alarms import AlarmStatus
+from gateway.core.finding import Finding
 from gateway.core.line import Strict
 from gateway.core.messages import BusReport
 from gateway.core.proposal import Kind
@@ -81,6 +82,7 @@ class EventStatus(Strict):
     wall_s: float  #: Unix time
     kind: str
     text: str
+    findings: list[Finding] = []  #: what led to it, as far as it is data
 
 
 class LimitsStatus(Strict):

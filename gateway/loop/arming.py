@@ -1,12 +1,13 @@
 """Whether the line may be armed, the links' way there, and back to silence however an arming ends."""
 
 from drivers.port import PrepareRefused
+from gateway.core.finding import Finding
 from gateway.core.messages import Reply
 from gateway.core.signals import Channel, Quality
 from gateway.core.states import LoopState, Phase
 from gateway.loop.cycle import Cycle
 from gateway.loop.machine import STANDSTILL_M_PER_S
-from gateway.loop.refused import Refused
+from gateway.loop.refused import Refused, coded, said
 from gateway.tasks.cleanup import finish_all
 
 SILENT_PATIENCE_S = 0.25  #: without cyclic data (a silent CANopen link reads by SDO) samples are this old at most
@@ -17,23 +18,24 @@ def refusal_to_arm(cycle: Cycle) -> Reply | None:
     try:
         require_rest(cycle)
     except Refused as refusal:
-        return Reply(ok=False, state=cycle.machine.state.name, text=str(refusal))
+        return Reply(ok=False, state=cycle.machine.state.name, text=str(refusal), findings=refusal.findings)
     reasons = not_ready(cycle)
     return not_armed(cycle, reasons) if reasons else None
 
 
-def not_armed(cycle: Cycle, reasons: list[str]) -> Reply:
+def not_armed(cycle: Cycle, reasons: list[str | Finding]) -> Reply:
     text = "not armed; mend what is named and arm again"
-    return Reply(ok=False, state=cycle.machine.state.name, text=text, reasons=reasons)
+    state = cycle.machine.state.name
+    return Reply(ok=False, state=state, text=text, reasons=said(reasons), findings=coded(reasons))
 
 
-async def prepare_links(cycle: Cycle) -> list[str]:
+async def prepare_links(cycle: Cycle) -> list[str | Finding]:
     """Prove everything that must hold before torque is possible, on links that are released; periods go on meanwhile.
 
     Returns every reason of every link that refuses. Whoever calls releases all links where there is one, and where
     this is cancelled or raises.
     """
-    reasons: list[str] = []
+    reasons: list[str | Finding] = []
     for link in cycle.links:
         try:
             await link.prepare()
@@ -52,14 +54,14 @@ async def release_links(cycle: Cycle) -> None:
         raise failures[0]
 
 
-def not_ready(cycle: Cycle) -> list[str]:
+def not_ready(cycle: Cycle) -> list[str | Finding]:
     """What speaks against arming, as far as the samples tell. One that is late is no reason to send a person away."""
     running = cycle.configurations.running
-    unfit = [f"controller {running.hash[:12]}: {running.unfit}"] if running.unfit else []
+    unfit: list[str | Finding] = [f"controller {running.hash[:12]}: {running.unfit}"] if running.unfit else []
     return unfit + forbidden(cycle) + unheard(cycle)
 
 
-def forbidden(cycle: Cycle) -> list[str]:
+def forbidden(cycle: Cycle) -> list[str | Finding]:
     """What the line PLC says against arming, as far as it has been heard."""
     inputs = cycle.inputs
     if not plc_heard(cycle):
@@ -73,9 +75,11 @@ def forbidden(cycle: Cycle) -> list[str]:
     return []
 
 
-def unheard(cycle: Cycle) -> list[str]:
+def unheard(cycle: Cycle) -> list[str | Finding]:
     """Devices without a usable sample lately."""
-    reasons = [] if plc_heard(cycle) else [f"the line PLC ({cycle.line.plc.name}) gives no usable answer"]
+    reasons: list[str | Finding] = (
+        [] if plc_heard(cycle) else [f"the line PLC ({cycle.line.plc.name}) gives no usable answer"]
+    )
     for cell in cycle.line.load_cells:
         if not heard(cycle, cycle.inputs.tension, cell.span - 1):
             reasons.append(f"load cell {cell.name} (span {cell.span}) gives no usable value")

@@ -40,7 +40,10 @@ def carry_out(cycle: Cycle, command: Command, now_s: float, prepared: Prepared =
     try:
         text = configure(cycle, command, prepared, now_s) if configuring else _do(cycle, command, now_s)
     except Refused as refusal:
-        reply = Reply(ok=False, state=cycle.machine.state.name, text=str(refusal), reasons=refusal.reasons)
+        reply = Reply(
+            ok=False, state=cycle.machine.state.name, text=str(refusal), reasons=refusal.reasons,
+            findings=refusal.findings,
+        )  # fmt: skip
     else:
         reply = Reply(ok=True, state=cycle.machine.state.name, text=text)
     if configuring:

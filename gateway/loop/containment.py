@@ -9,12 +9,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ParamSpec, TypeVar
 
-from safety.actions import Action, Finding
+from safety.actions import Action, Finding, found
 
 P = ParamSpec("P")
 T = TypeVar("T")
 
-PART_FAILED = "part failed"  #: the rule's name
+PART_FAILED = "part-failed"  #: the code
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,10 +47,9 @@ class Containment:
         """`part` has raised `error` and is left out from now on. Raises it again where it is the second."""
         if self.failed:
             raise error
-        self.failed[part.name] = found = f"{type(error).__name__}: {error}"
+        self.failed[part.name] = raised = f"{type(error).__name__}: {error}"
         self.speaks_of_configuration |= part.of_configuration
-        text = f"{part.name} failed and is left out until the line is armed: {found}; keep the log, and report it"
-        self._untold.append(Finding(PART_FAILED, action, text))
+        self._untold.append(found(PART_FAILED, action, part=part.name, error=raised))
 
     def take_findings(self) -> list[Finding]:
         """What has failed since this was asked last."""

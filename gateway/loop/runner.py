@@ -2,9 +2,11 @@
 
 import asyncio
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from gateway.core.controller import ControllerRefused
+from gateway.core.finding import Finding
 from gateway.core.messages import (
     MAX_COMMAND,
     Arm,
@@ -29,7 +31,7 @@ from gateway.loop.deploy import NOT_DONE, Prepared, durable_after, prepare, requ
 from gateway.loop.kept import Durable, Store
 from gateway.loop.pacer import Tick
 from gateway.loop.persistence import NotPersisted, Persistence
-from gateway.loop.refused import Refused
+from gateway.loop.refused import Refused, coded, said
 from gateway.tasks.cleanup import end
 
 HEARD_AGAIN_S = 1.0  #: for devices that were lost to tell what speaks against arming, or that nothing does
@@ -293,5 +295,6 @@ class Runner:
             if not waiting.answer.done():
                 waiting.answer.set_result(self._refused("not armed: it was stopped"))
 
-    def _refused(self, text: str, reasons: list[str] | None = None) -> Reply:
-        return Reply(ok=False, state=self.cycle.machine.state.name, text=text, reasons=reasons or [])
+    def _refused(self, text: str, reasons: Sequence[str | Finding] = ()) -> Reply:
+        state = self.cycle.machine.state.name
+        return Reply(ok=False, state=state, text=text, reasons=said(reasons), findings=coded(reasons))

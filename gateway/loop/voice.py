@@ -1,5 +1,7 @@
 """What the loop says to the gateway: a frame a period, events, and how its buses fare. Never blocks, never waits."""
 
+from collections.abc import Sequence
+
 from drivers.port import Link
 from gateway.core.messages import BUS_REPORTS, BusReport, Event
 from gateway.core.telemetry import Frame, pack
@@ -24,22 +26,23 @@ class Voice:
         if frame.sequence % self._report_every == 0:
             self._mailbox.publish(LOOP_BUSES, BUS_REPORTS.dump_json([_report(link) for link in self._links]))
 
-    def tell(self, kind: str, text: str, **data: object) -> None:
+    def tell(self, kind: str, text: str, *, findings: Sequence[Finding] = (), **data: object) -> None:
         """An event."""
-        event = Event(time_s=monotonic(), kind=kind, text=text, data=data)
+        coded = [found for finding in findings if (found := finding.as_data()) is not None]
+        event = Event(time_s=monotonic(), kind=kind, text=text, findings=coded, data=data)
         self._mailbox.publish(LOOP_EVENT, event.model_dump_json().encode())
 
     def announce(self, before: Machine, after: Machine, findings: list[Finding]) -> None:
         """A change of phase with what led to it and what the buses say; or an alarm within a phase."""
         rules = [finding.rule for finding in findings]
         if after.phase is before.phase:
-            self.tell("alarm", "; ".join(finding.text for finding in findings), rules=rules)
+            self.tell("alarm", "; ".join(finding.text for finding in findings), findings=findings, rules=rules)
             return
         text = f"{before.phase.name} to {after.phase.name}" + (f": {after.reason}" if after.reason else "")
         troubles = [f"{link.name}: {link.health.last_error}" for link in self._links if link.health.last_error]
         if findings and troubles:
             text += f" [{'; '.join(troubles)}]"
-        self.tell("state", text, state=after.state.name, rules=rules)
+        self.tell("state", text, findings=findings, state=after.state.name, rules=rules)
 
 
 def _report(link: Link) -> BusReport:

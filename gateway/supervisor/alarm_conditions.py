@@ -6,6 +6,7 @@ Where the loop is gone nothing is known of the line: then only what says that ho
 from collections.abc import Callable
 
 from gateway.core.doubts import WORDS, Doubt
+from gateway.core.finding import Finding
 from gateway.core.states import OPERATORS_STOP
 from gateway.core.status import GatewayStatus, SpanStatus
 from gateway.supervisor.audit import AuditState
@@ -22,6 +23,7 @@ class Conditions:
 
     def __init__(self) -> None:
         self._told = ""  #: with the last change of state
+        self.stopped_by: list[Finding] = []  #: what led to the last change of state, as far as it is data
 
     def look(self, status: GatewayStatus, audit: AuditState) -> dict[str, str]:
         """By alarm what is so now, in words."""
@@ -38,6 +40,7 @@ class Conditions:
         newest = next((event for event in reversed(status.events) if event.kind == "state"), None)
         if newest is not None:
             self._told = newest.text.partition(": ")[2]
+            self.stopped_by = newest.findings
 
     def _line_stopped(self, status: GatewayStatus) -> str:
         if status.loop.state != "STOP" or self._told.startswith(OPERATORS_STOP):

@@ -16,6 +16,7 @@ from gateway.core.alarms import (
     ALARM_SAID,
     ALARMS,
     BY_NAME,
+    STOPPED,
     AcknowledgeAlarm,
     Alarm,
     AlarmName,
@@ -152,6 +153,7 @@ class Alarms:
         since_s = live.since_s if live is not None else shelved.since_s if shelved is not None else self._clock()
         return AlarmStatus(
             name=alarm.name, priority=alarm.priority, means=alarm.means, text="" if live is None else live.text,
+            findings=self._conditions.stopped_by if alarm.name == STOPPED and live is not None else [],
             cause=alarm.cause, consequence=alarm.consequence, action=alarm.action,
             active=live is not None and ended_s is None,
             acknowledged=live is None or bool(live.acknowledged_by),

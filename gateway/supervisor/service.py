@@ -50,6 +50,7 @@ ARM_TIME_S = 14.0  #: arming configures every drive and reads its watchdog back
 WALL_CLOCK_JUMP_S = 0.5  #: between two looks; less is a clock that is being disciplined
 EVENTS_SHOWN = 20
 NO_BUS = BusStatus(open=False, text="it is about to be opened", agents=[], refused=0)
+FINDINGS_SHOWN = 8  #: of an event in the status
 TEXT_SHOWN = 300  #: characters of an event's text in the status; the history keeps all
 
 
@@ -203,7 +204,10 @@ class Gateway:
         self._historian.event(event)
         wall_s = event.time_s + self._wall_clock() - self._clock()
         if isfinite(wall_s):
-            self._events.append(EventStatus(wall_s=round(wall_s, 3), kind=event.kind, text=event.text[:TEXT_SHOWN]))
+            shown = event.findings[:FINDINGS_SHOWN]
+            self._events.append(
+                EventStatus(wall_s=round(wall_s, 3), kind=event.kind, text=event.text[:TEXT_SHOWN], findings=shown)
+            )
 
     async def _answer_status(self, _: bytes) -> bytes:
         return self.status().model_dump_json().encode()

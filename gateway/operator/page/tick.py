@@ -5,9 +5,11 @@ What counts as abnormal is said here, in one place; the page only paints it.
 
 from typing import Any
 
+from gateway.core.alarms import AlarmStatus
 from gateway.core.decisions import ProposalList
 from gateway.core.line import Line
-from gateway.core.status import GatewayStatus, LimitsStatus, SpanStatus
+from gateway.core.status import EventStatus, GatewayStatus, LimitsStatus, SpanStatus
+from gateway.wording.catalogue import languages, sentences
 
 DRIVES_THAT_FAIL = frozenset({"ABSENT", "STOPPING", "FAULT", "STO"})
 IN_MOTION = frozenset({"RUN", "HOLD"})  #: states in which tensions are controlled
@@ -60,11 +62,17 @@ def tick_of(status: GatewayStatus, proposals: ProposalList | None, revision: int
         "buses": [bus.model_dump() for bus in status.buses],
         "agents": status.agents_bus.model_dump(),
         "historian": status.historian.model_dump(include={"storing", "text", "frames_lost", "events_lost"}),
-        "events": [event.model_dump() for event in status.events[-20:]],
-        "alarms": [alarm.model_dump() for alarm in status.alarms],
+        "events": [_told(event) for event in status.events[-20:]],
+        "alarms": [_told(alarm) for alarm in status.alarms],
         "revision": revision,
         "waiting": [one.proposal for one in proposals.proposals if one.stage == "waiting"] if proposals else [],
     }
+
+
+def _told(one: EventStatus | AlarmStatus) -> dict[str, Any]:
+    """With what was found in the other languages, where it is data: `said`, by language."""
+    said = {language: sentences(one.findings, language) for language in languages()[1:]} if one.findings else {}
+    return {**one.model_dump(), "said": said}
 
 
 def abnormal(span: SpanStatus, limits: LimitsStatus, moving: bool) -> tuple[str, str]:

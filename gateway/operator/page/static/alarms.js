@@ -1,7 +1,7 @@
 // Alarms: what is wrong, why, what follows, what to do; seen, or out of the way for a while.
 import { $, coded, h, replaced, setText } from "./dom.js";
 import { confirmed } from "./dialog.js";
-import { translated } from "./sentences.js";
+import { toldOf } from "./sentences.js";
 import { time, word } from "./words.js";
 
 const SHELF_S = 1800, ORDER = ["high", "medium", "low"];
@@ -39,7 +39,7 @@ export class Alarms {
     const seen = one.acknowledged ? word("alarms.seen-by", { name: one.acknowledged_by }) : word("alarms.unseen");
     return h("li", { class: `alarm ${bad ? one.priority : "over"}` },
       h("p", {}, h("b", { class: bad ? "tag" : "tag over" }, `${bad ? "▲ " : ""}${word(`priority.${one.priority}`)}`), " ", h("b", {}, said(one, "means"))),
-      translated("p", one.text),
+      toldOf("p", one),
       h("p", { class: "muted" }, `${time(one.since_wall_s, true)}, ${state}, ${seen}`, one.first_out && `, ${word("alarms.first")}`),
       h("p", {}, h("b", {}, word("alarms.action")), " ", coded("span", said(one, "action"))),
       h("details", {}, h("summary", { "data-focus": `why-${one.name}` }, word("alarms.why")),

@@ -44,5 +44,5 @@ function parts({ buses, agents, historian }) {
 
 function events({ events }) {
   return h("section", { class: "panel" }, h("h2", {}, word("health.events")),
-    events.length ? h("ol", { class: "plain records" }, [...events].reverse().map((event) => h("li", {}, h("span", { class: "muted" }, time(event.wall_s)), " ", coded("span", event.text)))) : h("p", {}, word("health.no-events")));
+    events.length ? h("ol", { class: "plain records" }, [...events].reverse().map((event) => h("li", {}, h("span", { class: "muted" }, time(event.wall_s)), " ", coded("span", event.said?.[document.documentElement.lang] ?? event.text)))) : h("p", {}, word("health.no-events")));
 }

@@ -19,6 +19,12 @@ export function translated(tag, text, attributes = {}) {
   return said == null ? english(tag, text, attributes) : h(tag, { title: text, ...attributes }, said);
 }
 
+// An event or an alarm: what was found in it is said in the page's language by whoever serves the page.
+export function toldOf(tag, { text, said }, attributes = {}) {
+  const mine = said?.[document.documentElement.lang];
+  return mine ? h(tag, { title: text, ...attributes }, mine) : translated(tag, text, attributes);
+}
+
 // One sentence, or several with semicolons between them; a sentence may have semicolons, too. Null: not in the catalogue.
 export function sentence(text) {
   const pieces = text.split("; "), said = Array(pieces.length + 1).fill(null); // what is said of the pieces from each on
