@@ -26,6 +26,7 @@ from gateway.core.decisions import (
     RollBackNow,
     shown_hash,
 )
+from gateway.core.finding import Finding
 from gateway.core.line import Line
 from gateway.core.line_past import PAST_QUERY, RecordsAfter, RecordsTold, RecordTold, TensionsBetween, TensionsTold
 from gateway.core.messages import Reply
@@ -46,6 +47,7 @@ from gateway.mailbox.unix import UnixMailbox
 from gateway.operator.line_side import TOPICS, LineSide
 from gateway.operator.page.app import page_app
 from gateway.operator.page.serve import serve_page
+from gateway.wording.catalogue import sentence
 from tests.unit.supervisor_support import line_of, short_folder
 
 EXAMPLES = Path("docs/examples")
@@ -102,6 +104,7 @@ class FakeGateway:
     def __init__(self, line: Line, mailbox: Mailbox) -> None:
         self.line = line
         self.said: list[ForPerson] = []
+        self.against: list[Finding] = []  #: what speaks against whatever is said
         self.alarms: list[AlarmStatus] = []
         self.state = "RUN"
         self.epoch = 3
@@ -291,6 +294,9 @@ class FakeGateway:
         said = asked.said
         if reason := why_may_not(asked.person, said.command):
             return Reply(ok=False, state=self.state, text=reason, reasons=[reason])
+        if self.against:
+            reasons = [sentence(one) for one in self.against]
+            return Reply(ok=False, state=self.state, text="not armed", reasons=reasons, findings=self.against)
         if isinstance(said, Decide):
             return self._decided(said, asked.person.name)
         if isinstance(said, AcknowledgeAlarm):

@@ -5,7 +5,9 @@ import asyncio
 import pytest
 
 from gateway.core.decisions import Decide
+from gateway.core.finding import finding
 from gateway.core.people import LEAST, ROLES, Person, Role, may
+from gateway.wording.catalogue import sentence
 from tests.operator.fake_line import alarm
 from tests.unit.page_support import page
 from tests.unit.supervisor_support import until
@@ -158,5 +160,18 @@ def test_an_alarm_is_acknowledged_and_shelved_in_a_persons_name():
             await there.say("shelve", alarm="device-absent", for_s=60.0, because="fitter is there")
             (one,) = there.gateway.alarms
             assert one.acknowledged_by == "operator" and one.shelved_until_wall_s is not None
+
+    asyncio.run(story())
+
+
+def test_what_speaks_against_it_is_told_with_its_sentence_in_the_other_languages():
+    async def story() -> None:
+        async with page() as there:
+            there.gateway.against = [finding("part-failed", part="the lease", error="ValueError: 1.5")]
+            await there.log_in("operator")
+            told = (await there.say("arm")).json()
+            (english,) = told["reasons"]
+            assert told["said"]["de"][english] == sentence(there.gateway.against[0], "de") != english
+            assert told["findings"] == [there.gateway.against[0].model_dump()]
 
     asyncio.run(story())

@@ -6,15 +6,17 @@ import json
 import pytest
 
 from gateway.core.experiment import Experiment
+from gateway.core.finding import finding
 from gateway.core.proposal import ExperimentChange
 from gateway.core.signals import DriveState, Quality
-from gateway.core.status import GatewayStatus
+from gateway.core.status import EventStatus, GatewayStatus
 from gateway.core.verdict import RuleFinding
 from gateway.operator.page.tick import DRIVES_THAT_FAIL, IN_MOTION, OFF_SHARE, abnormal, line_told, tick_of
 from gateway.operator.page.told import TWO_SIDED, proposal_told, used
 from gateway.supervisor import alarm_conditions
+from gateway.wording.catalogue import sentence
 from safety.rules import model_residuals, validity
-from tests.operator.fake_line import ASKED
+from tests.operator.fake_line import ASKED, alarm
 from tests.unit.page_support import page
 from tests.unit.supervisor_support import line_of
 
@@ -195,3 +197,14 @@ def test_courses_come_once_they_are_drawn():
             assert (await there.browser.get(f"/api/courses/{there.gateway.hash}")).status_code == 503
 
     asyncio.run(story())
+
+
+def test_events_and_alarms_that_are_data_are_told_in_every_language():
+    found = finding("part-failed", part="the lease", error="ValueError: 1.5")
+    status = status_of()
+    event = EventStatus(wall_s=1.0, kind="state", text=f"RUNNING to SLOWING: {sentence(found)}", findings=[found])
+    stopped = alarm("line-stopped").model_copy(update={"findings": [found]})
+    tick = tick_of(status.model_copy(update={"events": [event], "alarms": [stopped]}), None, 0)
+    assert [one["said"] for one in (*tick["events"], *tick["alarms"])] == [{"de": sentence(found, "de")}] * 2
+    plain = event.model_copy(update={"findings": []})
+    assert tick_of(status.model_copy(update={"events": [plain]}), None, 0)["events"][0]["said"] == {}

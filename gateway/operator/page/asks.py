@@ -19,6 +19,7 @@ from gateway.operator.page.guard import body_of
 from gateway.operator.page.login import Door
 from gateway.operator.page.tick import line_told
 from gateway.operator.page.told import proposal_told
+from gateway.wording.catalogue import languages, sentence
 
 _SAID: TypeAdapter[Said] = TypeAdapter(Annotated[Said, Field(discriminator="command")])
 
@@ -111,9 +112,17 @@ class Asks:
         if reason := why_may_not(person, said.command):
             # The gateway refuses it as well, and its audit has to know that it was tried.
             reply = await self._side.say(person, said)
-            return JSONResponse({**reply.model_dump(exclude={"in_service"}), "ok": False, "text": reason}, 403)
+            return JSONResponse({**_told(reply), "ok": False, "text": reason}, 403)
         reply = await self._side.say(person, said)
-        return JSONResponse(reply.model_dump(exclude={"in_service"}), _status(reply))
+        return JSONResponse(_told(reply), _status(reply))
+
+
+def _told(reply: Reply) -> dict[str, Any]:
+    """With what each finding's sentence is in the other languages: `said`, by language, then by the English one."""
+    said = {
+        language: {sentence(one): sentence(one, language) for one in reply.findings} for language in languages()[1:]
+    }
+    return {**reply.model_dump(exclude={"in_service"}), "said": said if reply.findings else {}}
 
 
 def _status(reply: Reply) -> int:

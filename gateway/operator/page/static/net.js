@@ -5,10 +5,11 @@ import { word } from "./words.js";
 const WITHIN_MS = 25000, SILENT_MS = 5000, AGAIN_MS = 1000;
 
 export class Refused extends Error {
-  constructor(status, text, reasons) {
+  constructor(status, text, reasons, said = {}) {
     super(text);
     this.status = status;
     this.reasons = reasons;
+    this.said = said; // by language, sentences by the English ones
   }
 
   // Nobody has said whether it was done.
@@ -34,7 +35,7 @@ export async function ask(path, body, within_ms = WITHIN_MS) {
     throw new Refused(0, word("net.away"), []);
   }
   found = parsed(found) ?? { text: answer.statusText };
-  if (!answer.ok) throw new Refused(answer.status, found.text ?? answer.statusText, found.reasons ?? []);
+  if (!answer.ok) throw new Refused(answer.status, found.text ?? answer.statusText, found.reasons ?? [], found.said);
   return found;
 }
 

@@ -13,8 +13,9 @@ export const notDone = (what) => put("alert", [h("p", {}, h("b", {}, word(`reply
 export function reply(answer, stop = false) {
   const refused = answer instanceof Refused;
   const text = refused ? answer.message : answer.text;
-  const said = answer.status === 0 ? h("span", {}, text) : coded("span", text);
-  const reasons = (answer.reasons ?? []).filter((reason) => reason !== text);
+  const there = answer.said?.[document.documentElement.lang] ?? {}, mine = (sentence) => there[sentence] ?? sentence;
+  const said = answer.status === 0 ? h("span", {}, text) : coded("span", mine(text));
+  const reasons = (answer.reasons ?? []).filter((reason) => reason !== text).map(mine);
   if (refused && answer.unknown) {
     const then = stop ? word("reply.emergency") : word("reply.look-first");
     return put("alert", [h("p", {}, h("b", {}, word("reply.unknown"), " ", then), " ", said)]);
