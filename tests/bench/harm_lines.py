@@ -1,8 +1,8 @@
 """Lines of every size that a line may have: a 0.1 N foil, a 10 kN laminator, 0.1 to 10 m/s, 2 to 10 spans.
 
 A line is drawn by what has no dimension, then given its size: strain at the working tension, how fast a span swings on
-its rollers, how much of the torque friction takes at full speed. What the gateway's file says of it is off by up to half
-of the tolerances that the file names. A function of its seed alone.
+its rollers, how much of the torque friction takes at full speed. What the gateway's file says of it is off by up to
+half of the tolerances that the file names. A function of its seed alone.
 """
 
 from dataclasses import dataclass

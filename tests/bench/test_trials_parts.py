@@ -4,9 +4,12 @@ import asyncio
 from types import SimpleNamespace
 
 import numpy as np
+import pytest
 
 from gateway.core.signals import Inputs, Quality
-from tests.bench.trials_runs import LateLink, stops
+from gateway.supervisor.lifecycle import Stage
+from tests.bench.trials import LONGEST_S
+from tests.bench.trials_runs import LateLink, TrialRun, draw_bad, draw_good, stops
 from tests.closed_loop.recorded import demonstration_line
 
 LINE = demonstration_line()
@@ -57,3 +60,11 @@ def test_a_share_of_the_answers_is_late_each_by_itself_and_all_load_cells_togeth
 def test_stops_are_counted_once_for_each_run_of_periods_without_a_sample() -> None:
     held = [0, 1, 2, 0, 1, 2, 3, 4, 0, 1, 2, 3]
     assert stops([SimpleNamespace(held=one) for one in held], 3) == 2
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("draw", "stage"), [(draw_good, Stage.KEPT), (draw_bad, Stage.ROLLED_BACK)])
+def test_a_trial_runs_to_its_end_through_the_gateways_own_deployer(draw, stage) -> None:
+    case, _, config, _ = draw(LINE, 7_100_003)
+    trial = asyncio.run(TrialRun(case, config, 0.01, envelope=False).run(LONGEST_S))
+    assert trial.stage is stage, trial.why

@@ -78,17 +78,21 @@ class Around(LineSurroundings):
     def __init__(self, loop: SteppedLoop, recent: Recent, good: Controller) -> None:
         nothing: Any = None
         super().__init__(loop.line, lambda: None, recent, lambda _: [], nothing, nothing, lambda: loop.now_s)
-        self._good = good
+        self._good, self._loop = good, loop
 
     async def context(self, book: Book) -> tuple[JudgeContext, list[Recording]]:
         state = LineState(state="RUN", tension_n=TENSION_N.tolist(), speed_m_per_s=SPEED_M_PER_S)
-        return JudgeContext(format=1, now=iso(self._wall_clock()), state=state, in_service=self._good), []
+        return JudgeContext(format=1, now=iso(self._loop.now_s), state=state, in_service=self._good), []
 
     def difference(self, proposal: Proposal, book: Book) -> list[str]:
         return ["a trial"]
 
     async def recovery(self, fallback: str, region: Region, book: Book) -> RecoveryPrediction | None:
         return None
+
+
+async def _take_up_nothing(*_: object) -> None:
+    """There are no models in a trial."""
 
 
 @dataclass
@@ -251,7 +255,7 @@ class TrialRun:
         self._judge.region, self._judge.line = Region(), line_hash(case.line)
         around = Around(self._loop, self._recent, case.good)
         self._deployer = Deployer(
-            case.line, book_of([]), self._audit, LoopSide(self._loop), self._judge, around, lambda *_: None,
+            case.line, book_of([]), self._audit, LoopSide(self._loop), self._judge, around, _take_up_nothing,
             self._clock, self._clock, own_uid=0,
         )  # fmt: skip
 

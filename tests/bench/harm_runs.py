@@ -1,0 +1,206 @@
+"""What may hurt by itself, one fault and one healthy life at a time, on a drawn line in stepped time.
+
+The recorder at the simulated devices judges, and the truth of the simulated web; never what the loop says of itself.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from math import inf
+
+import numpy as np
+
+from gateway.cli.stepped import SteppedLoop
+from gateway.control.design import DesignRefused, design_lqi, task_of
+from gateway.core.controller import Controller
+from gateway.core.messages import Command, Hold, SetSpeed, SetTension, Start, Stop
+from gateway.core.states import LoopState, Phase
+from safety.actions import Action
+from sim_plant.faults.parse import parse_fault
+from sim_plant.faults.stepped import injector_of
+from tests.bench.harm_lines import Drawn, drawn
+
+STANDS = 0.01  #: of the top speed: what is slower stands
+AT_MOST_S = 40.0  #: that is waited for a line to come to rest
+NEVER_S = inf
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of one injection, or of one healthy life. Times in s from the injection."""
+
+    row: str
+    seed: int
+    unsafe: dict[str, int]  #: events at the recorder, but those that the fault itself is
+    code: str  #: the first rule that was told; empty: none was
+    found_s: float  #: until then; NEVER_S: it was not
+    rest_s: float  #: until every roller and the unwinder stand and no torque is given; NEVER_S: they do not
+    fastest: float  #: speed of a roller afterwards, over the line's top speed
+    note: str = ""
+
+
+class NotStarted(Exception):
+    """A healthy line that did not come to production: the text says why."""
+
+
+@cache
+def configuration(seed: int) -> Controller:
+    """The design for what the line's file says. Raises DesignRefused."""
+    return design_lqi(task_of(drawn(seed).line))
+
+
+def drawable(seed: int) -> bool:
+    """Whether there is a controller for the line of this seed, and a torque that holds it at full speed."""
+    try:
+        configuration(seed)
+    except DesignRefused:
+        return False
+    return True
+
+
+def begun(seed: int, speed_share: float) -> SteppedLoop:
+    """In production at the recipe's tensions, at a share of the top speed."""
+    found = drawn(seed)
+    loop = SteppedLoop(found.line, configuration(seed), found.plant, seed)
+    tension_n = np.array(found.line.recipes[0].tension_n)
+    loop.begin_in_production(tension_n, speed_share * found.line.limits.speed_max_m_per_s)
+    loop.step(round(2.0 / found.line.control.period_s))
+    if loop.cycle.machine.phase is not Phase.RUNNING:
+        raise NotStarted(loop.cycle.machine.reason)
+    return loop
+
+
+def threaded(seed: int) -> SteppedLoop:
+    """Slack and silent."""
+    found = drawn(seed)
+    loop = SteppedLoop(found.line, configuration(seed), found.plant, seed)
+    loop.step(3)
+    return loop
+
+
+def ordered(loop: SteppedLoop, command: Command, phase: Phase, within_s: float) -> str:
+    """Give a command and wait for a phase. Empty, or why it is not reached."""
+    reply = loop.command(command)
+    if not reply.ok:
+        return "; ".join([reply.text, *reply.reasons])
+    if loop.step_until(phase, within_s):
+        return ""
+    return loop.cycle.machine.reason or f"still {loop.cycle.machine.phase.name} after {within_s:g} s"
+
+
+def armed(loop: SteppedLoop) -> str:
+    reply = loop.arm()
+    if not reply.ok:
+        return "; ".join([reply.text, *reply.reasons])
+    return "" if loop.step_until(Phase.READY, 2.0) else loop.cycle.machine.reason
+
+
+class Watched:
+    """A loop from the injection on."""
+
+    def __init__(self, row: str, seed: int, loop: SteppedLoop, faults: list[str]) -> None:
+        self.row, self.seed, self.loop = row, seed, loop
+        self.top_m_per_s = loop.line.limits.speed_max_m_per_s
+        self._alarms, self._transitions = len(loop.alarms), len(loop.transitions)
+        self.begin_s, self.fastest = loop.now_s, 0.0
+        self._unsafe = dict(loop.truth.recorder.unsafe_events)
+        for fault in faults:
+            injector_of(loop.truth).add(parse_fault(fault), loop.truth.world.now_s)
+
+    def step_until(self, done: Callable[[], bool], within_s: float) -> float:
+        """The time from the injection when it is so; NEVER_S: not within that time."""
+        loop = self.loop
+        while loop.now_s - self.begin_s < within_s:
+            loop.step()
+            speed = float(np.abs(loop.truth.world.speed_m_per_s).max())
+            self.fastest = max(self.fastest, speed / self.top_m_per_s)
+            if done():
+                return loop.now_s - self.begin_s
+        return NEVER_S
+
+    def rests(self) -> bool:
+        world = self.loop.truth.world
+        slow = STANDS * self.top_m_per_s
+        stands = np.abs(world.speed_m_per_s).max() <= slow and abs(world.unwind_speed_m_per_s) <= slow
+        return bool(stands) and not self.loop.cycle.outputs.torque_nm.any()
+
+    def first(self) -> tuple[str, float]:
+        """The first rule that was told since, and when."""
+        told = [
+            (at_s, finding.rule) for at_s, finding in self.loop.alarms[self._alarms :] if finding.action > Action.NONE
+        ]
+        told += [
+            (at_s, reason.partition(":")[0][:60]) for at_s, phase, reason in self.loop.transitions[self._transitions :]
+            if phase in (Phase.SLOWING, Phase.UNLOADING, Phase.OFF)
+        ]  # fmt: skip
+        if not told:
+            return "", NEVER_S
+        at_s, code = min(told)
+        return code, at_s - self.begin_s
+
+    def outcome(self, rest_s: float, spared: tuple[str, ...] = (), note: str = "") -> Outcome:
+        """`spared`: kinds of unsafe events that the fault itself is."""
+        code, found_s = self.first()
+        now = self.loop.truth.recorder.unsafe_events
+        unsafe = {kind: count - self._unsafe.get(kind, 0) for kind, count in now.items() if kind not in spared}
+        note = note or self.loop.cycle.machine.reason
+        return Outcome(
+            self.row, self.seed, {kind: count for kind, count in unsafe.items() if count}, code, found_s, rest_s,
+            self.fastest, note[:300],
+        )  # fmt: skip
+
+
+def at_start(row: str, seed: int, broken: list[int]) -> Outcome:
+    """Armed and started with the web missing in these spans, from 1."""
+    loop = threaded(seed)
+    watched = Watched(row, seed, loop, [f"web {span} web-break" for span in broken])
+    loop.step(3)
+    for refused in (armed(loop), "" if loop.cycle.machine.phase is not Phase.READY else started(loop)):
+        if refused:
+            return watched.outcome(0.0, ("tension-band",), refused)
+    rest_s = watched.step_until(
+        lambda: loop.cycle.machine.state is LoopState.STOP and watched.rests(),
+        2.0 * loop.line.longest_stop_s + AT_MOST_S,
+    )
+    return watched.outcome(rest_s, ("tension-band",))
+
+
+def started(loop: SteppedLoop) -> str:
+    reply = loop.command(Start())
+    return "" if reply.ok else "; ".join([reply.text, *reply.reasons])
+
+
+def in_production(row: str, seed: int, fault: Callable[[Drawn, np.random.Generator], str], within_s: float,
+                  spared: tuple[str, ...] = ()) -> Outcome:  # fmt: skip
+    """A fault at a random speed and phase; watched until the line rests, or for `within_s`."""
+    dice = np.random.default_rng([seed, 33])
+    loop = begun(seed, float(dice.uniform(0.1, 0.9)))
+    loop.step(int(dice.integers(1, 100)))
+    watched = Watched(row, seed, loop, [fault(drawn(seed), dice)])
+    rest_s = watched.step_until(lambda: loop.cycle.machine.state is LoopState.STOP and watched.rests(), within_s)
+    return watched.outcome(rest_s, spared)
+
+
+def healthy(row: str, seed: int) -> Outcome:
+    """A start, a grade change, a change of speed, a hold, a stop: nothing may be found."""
+    loop, dice = threaded(seed), np.random.default_rng([seed, 34])
+    line = loop.line
+    watched = Watched(row, seed, loop, [])
+    way_s = line.limits.speed_max_m_per_s / line.moves.speed_rate_m_per_s2
+    refused = armed(loop)
+    refused = refused or ordered(loop, Start(), Phase.RUNNING, line.limits.tensioning_time_s + 10.0)
+    if not refused:
+        loop.step(round(way_s / line.control.period_s))
+        for span, value in enumerate(line.recipes[0].tension_n, start=1):
+            loop.command(SetTension(span=span, tension_n=value * float(dice.uniform(0.85, 1.15))))
+        loop.command(SetSpeed(speed_m_per_s=float(dice.uniform(0.1, 0.9)) * line.limits.speed_max_m_per_s))
+        loop.step(round((way_s + 3.0) / line.control.period_s))
+        refused = ordered(loop, Hold(), Phase.HOLDING, 1.0)
+    if not refused:
+        loop.step(round(1.0 / line.control.period_s))
+        code, found_s = watched.first()
+        refused = code and f"{code}: after {found_s:.2f} s"
+    loop.command(Stop())
+    rest_s = watched.step_until(watched.rests, loop.now_s + line.longest_stop_s + AT_MOST_S)
+    found = watched.outcome(rest_s, note=refused)
+    return Outcome(row, seed, found.unsafe, refused.partition(":")[0][:60], 0.0, rest_s, found.fastest, refused)
