@@ -121,7 +121,11 @@ class LifeCycle(RuleBasedStateMachine):
         self.the_disk(True)
         self.something_shows(False)
         self.death_is_near(0, False)
-        self._run(self.gateway.pass_time(LATE_S + PROBATION_S + 2.0 * LEASE_S))
+        entries = self.gateway.deployer.book.entries.values()
+        for _ in range(1 + sum(entry.stage is Stage.WAITING for entry in entries)):  # small ones follow each other
+            self._run(self.gateway.pass_time(LATE_S + PROBATION_S + 2.0 * LEASE_S))
+            if self.gateway.deployer.book.on_the_line is None:
+                break
         loop, book = self.gateway.loop, self.gateway.deployer.book
         said = loop.in_service()
         assert (book.in_service, book.last_known_good, book.epoch) == (said.hash, said.last_known_good, said.epoch)
