@@ -22,6 +22,8 @@ from dataclasses import dataclass
 from itertools import zip_longest
 from math import inf
 
+from pydantic import ValidationError
+
 from gateway.control.design import DesignRefused
 from gateway.core.controller import Controller, config_hash
 from gateway.core.line import Line
@@ -41,9 +43,14 @@ Drawn = tuple[Case, str, Controller, Truth]
 
 @dataclass
 class Left:
-    """Out of the draw, though bad where nothing is late: outputs that are held slow an integral down."""
+    """Out of the draw.
+
+    Bad where nothing is late, and not here: outputs that are held slow an integral down. Or such that no proposal can
+    say it: it is refused as it is read.
+    """
 
     bad_on_punctual_wires_only: int = 0
+    no_configuration: int = 0
 
 
 def drawn(line: Line, first_seed: int, count: int, good: bool, late: float, left: Left) -> Iterator[Drawn]:
@@ -54,6 +61,9 @@ def drawn(line: Line, first_seed: int, count: int, good: bool, late: float, left
         try:
             case, kind, config, truth = (draw_good if good else draw_bad)(line, seed)
         except DesignRefused:
+            continue
+        if not _can_be_said(config):
+            left.no_configuration += 1
             continue
         if config_hash(config) == config_hash(case.good):
             continue
@@ -69,6 +79,14 @@ def drawn(line: Line, first_seed: int, count: int, good: bool, late: float, left
             continue
         found[how] += 1
         yield case, kind, config, truth
+
+
+def _can_be_said(config: Controller) -> bool:
+    try:
+        type(config).model_validate(config.model_dump())
+    except ValidationError:
+        return False
+    return True
 
 
 def main() -> None:
@@ -101,6 +119,7 @@ def main() -> None:
             print(f"  {k}: {stages}, {time.perf_counter() - began_s:.0f} s", flush=True)
     figures(bench, trials)
     bench.figure("left_out_bad_on_punctual_wires_only", left.bad_on_punctual_wires_only, "", asked.bad)
+    bench.figure("left_out_no_configuration", left.no_configuration, "", asked.bad)
     bench.finish()
 
 
