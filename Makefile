@@ -7,7 +7,7 @@ PARALLEL := --numprocesses auto --maxprocesses 4 --dist loadfile
 export PYTHONDONTWRITEBYTECODE :=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup run test test-long coverage system-test check types lint format bench bench-stepped bench-wire bench-processes bench-cycle bench-engage bench-history bench-trials bench-mpc bench-loop-states bench-loop-kill bench-monitor bench-control bench-identify bench-faults bench-fuzz bench-soak bench-gate bench-lifecycle bench-audit bench-kill bench-gate-live bench-agents-live bench-operator bench-knowledge bench-agents minilm mutate lock clean
+.PHONY: help setup run test test-long coverage system-test check types lint format bench bench-stepped bench-wire bench-processes bench-cycle bench-engage bench-history bench-trials bench-mpc bench-loop-states bench-loop-kill bench-monitor bench-control bench-identify bench-faults bench-fuzz bench-soak bench-gate bench-lifecycle bench-audit bench-kill bench-gate-live bench-agents-live bench-operator bench-harm bench-knowledge bench-agents minilm mutate lock clean
 
 help: ## this list
 	@echo "r2rgate: make TARGET"
@@ -128,6 +128,9 @@ bench-loop-states: setup ## the loop's states in any order of everything, 20,000
 
 bench-loop-kill: setup ## the loop's process killed a thousand times at the writes of its configuration (ARGS="--kills 100")
 	@$(PY) -m tests.bench.loop_kill $(ARGS)
+
+bench-harm: $(VENV)/.compiled ## what may hurt by itself, on drawn lines of every size: no web, breaks, torn values; healthy lives beside (ARGS="--draws 20 --healthy 50")
+	@$(PY) -m tests.bench.harm $(ARGS)
 
 bench-knowledge: setup ## how well notes are found, and how fast; with MiniLM where it is installed (ARGS="--questions FILE")
 	@$(PY) -m tests.bench.knowledge $(ARGS)

@@ -20,7 +20,7 @@ class PrepareRefused(Exception):
     """A device cannot be trusted with torque. `reasons` name device, what was found, and what to do."""
 
     def __init__(self, reasons: Sequence[str | Finding]) -> None:
-        super().__init__("; ".join(map(str, reasons)))
+        super().__init__("; ".join(reason if isinstance(reason, str) else reason.code for reason in reasons))
         self.reasons = list(reasons)
 
 

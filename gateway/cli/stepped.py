@@ -48,6 +48,7 @@ class SteppedLoop:
     seed: int = 0
     frames: list[bytes] = field(default_factory=list[bytes])
     transitions: list[tuple[float, Phase, str]] = field(default_factory=list[tuple[float, Phase, str]])
+    stopped_by: list[tuple[float, Finding]] = field(default_factory=list[tuple[float, Finding]])  #: led to a transition
     alarms: list[tuple[float, Finding]] = field(default_factory=list[tuple[float, Finding]])
     told: list[tuple[str, str]] = field(default_factory=list[tuple[str, str]])  #: kind and text
     events: list[Event] = field(default_factory=list[Event])  #: the same with their data
@@ -144,6 +145,7 @@ class SteppedLoop:
             self.alarms += [(self.now_s, finding) for finding in findings]
         else:
             self.transitions.append((self.now_s, after.phase, after.reason))
+            self.stopped_by += [(self.now_s, finding) for finding in findings]
 
 
 @dataclass(frozen=True)

@@ -16,11 +16,6 @@ class Refused(Exception):
         self.findings = coded(told)
 
 
-def refused_for(found: Finding) -> Refused:
-    """A refusal of one finding: its sentence is the text."""
-    return Refused(sentence(found), [found])
-
-
 def said(reasons: Iterable[str | Finding]) -> list[str]:
     """Reasons as sentences."""
     return [reason if isinstance(reason, str) else sentence(reason) for reason in reasons]

@@ -19,6 +19,7 @@ class Voice:
         self._mailbox = mailbox
         self._links = links
         self._report_every = max(1, round(REPORT_EVERY_S / period_s))  # periods
+        self._led_here: Sequence[Finding] = ()  #: what led to the state that the loop is in
 
     def record(self, frame: Frame) -> None:
         """A period's telemetry, and now and then the buses."""
@@ -33,7 +34,10 @@ class Voice:
         self._mailbox.publish(LOOP_EVENT, event.model_dump_json().encode())
 
     def announce(self, before: Machine, after: Machine, findings: list[Finding]) -> None:
-        """A change of phase with what led to it and what the buses say; or an alarm within a phase."""
+        """A change of phase with what led to it and what the buses say; or an alarm within a phase.
+
+        On the way of a stop to its end every event has what led to it: who looks later reads the newest.
+        """
         rules = [finding.rule for finding in findings]
         if after.phase is before.phase:
             self.tell("alarm", "; ".join(finding.text for finding in findings), findings=findings, rules=rules)
@@ -42,7 +46,9 @@ class Voice:
         troubles = [f"{link.name}: {link.health.last_error}" for link in self._links if link.health.last_error]
         if findings and troubles:
             text += f" [{'; '.join(troubles)}]"
-        self.tell("state", text, findings=findings, state=after.state.name, rules=rules)
+        if after.state is not before.state:
+            self._led_here = findings
+        self.tell("state", text, findings=findings or self._led_here, state=after.state.name, rules=rules)
 
 
 def _report(link: Link) -> BusReport:

@@ -6,6 +6,7 @@ half of the tolerances that the file names. A function of its seed alone.
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -62,8 +63,9 @@ def draw_size(seed: int) -> Size:
     )  # fmt: skip
 
 
+@lru_cache(maxsize=8)
 def drawn(seed: int) -> Drawn:
-    """A line of a size of its own, threaded and slack at the start."""
+    """A line of a size of its own, threaded and slack at the start. Its file may be one that `check` refuses."""
     size, dice = draw_size(seed), np.random.default_rng([seed, 32])
     return Drawn(size, _line(size, dice), _plant(size, dice), seed)
 

@@ -4,8 +4,8 @@ The recorder at the simulated devices judges, and the truth of the simulated web
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import cache
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from math import inf
 
 import numpy as np
@@ -13,9 +13,9 @@ import numpy as np
 from gateway.cli.stepped import SteppedLoop
 from gateway.control.design import DesignRefused, design_lqi, task_of
 from gateway.core.controller import Controller
+from gateway.core.line_checks import RULES
 from gateway.core.messages import Command, Hold, SetSpeed, SetTension, Start, Stop
 from gateway.core.states import LoopState, Phase
-from safety.actions import Action
 from sim_plant.faults.parse import parse_fault
 from sim_plant.faults.stepped import injector_of
 from tests.bench.harm_lines import Drawn, drawn
@@ -43,14 +43,17 @@ class NotStarted(Exception):
     """A healthy line that did not come to production: the text says why."""
 
 
-@cache
+@lru_cache(maxsize=8)
 def configuration(seed: int) -> Controller:
     """The design for what the line's file says. Raises DesignRefused."""
     return design_lqi(task_of(drawn(seed).line))
 
 
 def drawable(seed: int) -> bool:
-    """Whether there is a controller for the line of this seed, and a torque that holds it at full speed."""
+    """Whether `check` takes the file of this seed's line, and there is a controller for it."""
+    line = drawn(seed).line
+    if any(list(rule.check(line)) for rule in RULES):
+        return False
     try:
         configuration(seed)
     except DesignRefused:
@@ -101,7 +104,7 @@ class Watched:
     def __init__(self, row: str, seed: int, loop: SteppedLoop, faults: list[str]) -> None:
         self.row, self.seed, self.loop = row, seed, loop
         self.top_m_per_s = loop.line.limits.speed_max_m_per_s
-        self._alarms, self._transitions = len(loop.alarms), len(loop.transitions)
+        self._alarms, self._stopped_by = len(loop.alarms), len(loop.stopped_by)
         self.begin_s, self.fastest = loop.now_s, 0.0
         self._unsafe = dict(loop.truth.recorder.unsafe_events)
         for fault in faults:
@@ -125,18 +128,12 @@ class Watched:
         return bool(stands) and not self.loop.cycle.outputs.torque_nm.any()
 
     def first(self) -> tuple[str, float]:
-        """The first rule that was told since, and when."""
-        told = [
-            (at_s, finding.rule) for at_s, finding in self.loop.alarms[self._alarms :] if finding.action > Action.NONE
-        ]
-        told += [
-            (at_s, reason.partition(":")[0][:60]) for at_s, phase, reason in self.loop.transitions[self._transitions :]
-            if phase in (Phase.SLOWING, Phase.UNLOADING, Phase.OFF)
-        ]  # fmt: skip
-        if not told:
+        """The first rule that was told since, and when; one that only warns counts, too."""
+        since = [*self.loop.alarms[self._alarms :], *self.loop.stopped_by[self._stopped_by :]]
+        if not since:
             return "", NEVER_S
-        at_s, code = min(told)
-        return code, at_s - self.begin_s
+        at_s, finding = min(since, key=lambda told: (told[0], -told[1].action))
+        return finding.rule, at_s - self.begin_s
 
     def outcome(self, rest_s: float, spared: tuple[str, ...] = (), note: str = "") -> Outcome:
         """`spared`: kinds of unsafe events that the fault itself is."""
@@ -155,9 +152,8 @@ def at_start(row: str, seed: int, broken: list[int]) -> Outcome:
     loop = threaded(seed)
     watched = Watched(row, seed, loop, [f"web {span} web-break" for span in broken])
     loop.step(3)
-    for refused in (armed(loop), "" if loop.cycle.machine.phase is not Phase.READY else started(loop)):
-        if refused:
-            return watched.outcome(0.0, ("tension-band",), refused)
+    if refused := armed(loop) or started(loop):
+        return watched.outcome(0.0, ("tension-band",), refused)
     rest_s = watched.step_until(
         lambda: loop.cycle.machine.state is LoopState.STOP and watched.rests(),
         2.0 * loop.line.longest_stop_s + AT_MOST_S,
@@ -198,9 +194,9 @@ def healthy(row: str, seed: int) -> Outcome:
         refused = ordered(loop, Hold(), Phase.HOLDING, 1.0)
     if not refused:
         loop.step(round(1.0 / line.control.period_s))
-        code, found_s = watched.first()
-        refused = code and f"{code}: after {found_s:.2f} s"
+    watched_code, _ = watched.first()  # before the stop, which is wanted
     loop.command(Stop())
     rest_s = watched.step_until(watched.rests, loop.now_s + line.longest_stop_s + AT_MOST_S)
     found = watched.outcome(rest_s, note=refused)
-    return Outcome(row, seed, found.unsafe, refused.partition(":")[0][:60], 0.0, rest_s, found.fastest, refused)
+    code = watched_code or ("refused" if refused else "")
+    return replace(found, code=code, rest_s=rest_s)

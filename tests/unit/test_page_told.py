@@ -201,10 +201,18 @@ def test_courses_come_once_they_are_drawn():
 
 def test_events_and_alarms_that_are_data_are_told_in_every_language():
     found = finding("part-failed", part="the lease", error="ValueError: 1.5")
-    status = status_of()
-    event = EventStatus(wall_s=1.0, kind="state", text=f"RUNNING to SLOWING: {sentence(found)}", findings=[found])
-    stopped = alarm("line-stopped").model_copy(update={"findings": [found]})
-    tick = tick_of(status.model_copy(update={"events": [event], "alarms": [stopped]}), None, 0)
-    assert [one["said"] for one in (*tick["events"], *tick["alarms"])] == [{"de": sentence(found, "de")}] * 2
-    plain = event.model_copy(update={"findings": []})
-    assert tick_of(status.model_copy(update={"events": [plain]}), None, 0)["events"][0]["said"] == {}
+    english, german = sentence(found), sentence(found, "de")
+
+    def said(text, findings):
+        event = EventStatus(wall_s=1.0, kind="state", text=text, findings=findings)
+        stopped = alarm("line-stopped").model_copy(update={"text": text, "findings": findings})
+        tick = tick_of(status_of().model_copy(update={"events": [event], "alarms": [stopped]}), None, 0)
+        told, also = (one["said"] for one in (*tick["events"], *tick["alarms"]))
+        assert told == also
+        return told
+
+    assert said(english, [found]) == {"de": german}
+    assert said(f"RUNNING to SLOWING: {english}", [found]) == {"de": f"RUNNING to SLOWING: {german}"}
+    assert said(f"tension 1 is 0.5 N; {english}", [found]) == {"de": f"tension 1 is 0.5 N; {german}"}
+    assert said(f"{english}; tension 1 is 0.5 N", [found]) == {}  # not whole at its end: nothing is left out
+    assert said(english, []) == {}

@@ -70,8 +70,11 @@ def tick_of(status: GatewayStatus, proposals: ProposalList | None, revision: int
 
 
 def _told(one: EventStatus | AlarmStatus) -> dict[str, Any]:
-    """With what was found in the other languages, where it is data: `said`, by language."""
-    said = {language: sentences(one.findings, language) for language in languages()[1:]} if one.findings else {}
+    """With its text in the other languages, `said`, where what was found is data and stands whole at its end."""
+    found, said = sentences(one.findings), dict[str, str]()
+    if found and one.text.endswith(found):
+        before = one.text.removesuffix(found)
+        said = {language: before + sentences(one.findings, language) for language in languages()[1:]}
     return {**one.model_dump(), "said": said}
 
 
