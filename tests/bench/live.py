@@ -149,8 +149,10 @@ class LiveLine:
         raise LineStalls(f"not started in {STARTS} tries: {'; '.join(self.stops)}")
 
     def _run_once(self) -> list[str]:
-        """Why it did not come to run; nothing when it did."""
-        for command in (Arm(), Start()):
+        """Why it did not come to run; nothing when it did, or went on running."""
+        status = self.status()
+        runs = status is not None and status.loop.state == "RUN"
+        for command in () if runs else (Arm(), Start()):
             reply = self.order(command)
             if not reply.ok:
                 return [f"{command.command}: {'; '.join([reply.text, *reply.reasons])}"]
