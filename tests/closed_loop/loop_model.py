@@ -132,6 +132,8 @@ class Model:
                 return replace(self.durable, epoch=command.deployment.epoch)
             case WatchGood() if self.until_s is None:
                 return replace(self.durable, watch=watch_key(command.watch))
+            case Narrow() if self.until_s is None:  # done, and then what would have told it has ended the process
+                return self._narrowed(command.region)
             case Keep() if self.until_s is not None:
                 top = self.running if self.stays_on_top else None
                 return Runs(self.epoch, self.good_if_kept, watch_key(command.watch), top)
@@ -184,6 +186,13 @@ class Model:
         # What was kept on top until now is given up with this, and stays on the disk until that follows: nobody has
         # taken it back, and it is what runs where the deployment is not done after all.
         self.may = [before, self.durable]
+
+    def _narrowed(self, region: Region) -> Runs:
+        def within(law: Law) -> Law:
+            return replace(law, region=narrower(law.region, region))
+
+        top = within(self.running) if self.durable.top is not None else None
+        return Runs(self.epoch, within(self.good), None, top)
 
     def _narrow(self, region: Region) -> None:
         assert self.until_s is None, "narrowed on probation"
