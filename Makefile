@@ -7,7 +7,7 @@ PARALLEL := --numprocesses auto --maxprocesses 4 --dist loadfile
 export PYTHONDONTWRITEBYTECODE :=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup run test test-long coverage system-test check types lint format bench bench-stepped bench-wire bench-processes bench-cycle bench-engage bench-history bench-trials bench-mpc bench-loop-states bench-loop-kill bench-monitor bench-control bench-identify bench-faults bench-fuzz bench-soak bench-gate bench-lifecycle bench-audit bench-kill bench-gate-live bench-agents-live bench-operator bench-harm bench-knowledge bench-agents minilm mutate lock clean
+.PHONY: help setup run test test-long test-long-realtime test-long-rest coverage test-realtime test-rest system-test check types lint format bench bench-stepped bench-wire bench-processes bench-cycle bench-engage bench-history bench-trials bench-mpc bench-loop-states bench-loop-kill bench-monitor bench-control bench-identify bench-faults bench-fuzz bench-soak bench-gate bench-lifecycle bench-audit bench-kill bench-gate-live bench-agents-live bench-operator bench-harm bench-intrusions bench-knowledge bench-agents minilm mutate lock clean
 
 help: ## this list
 	@echo "r2rgate: make TARGET"
@@ -24,15 +24,23 @@ $(VENV)/.compiled: $(VENV)/.ready gateway/cli/compiled.py $(wildcard gateway/con
 	@$(PY) -m gateway.cli.compiled > out/compiled.txt 2>&1 || { cat out/compiled.txt; exit 1; }
 	@touch $@
 
-run: $(VENV)/.compiled ## set up, then the demonstration: a line adapted through the gate, in real time (about 5 min; ARGS="--quick"; STAY=1 to play with)
+run: $(VENV)/.compiled ## set up, then the demonstration: a line adapted through the gate, in real time (about 7 min; ARGS="--quick"; STAY=1 to play with)
 	@exec $(RUN) demo $(if $(STAY),--stay) $(ARGS)
 
-test: $(VENV)/.compiled ## set up, then all tests but the long ones: those about time itself alone, the others on every core
+test: test-realtime test-rest ## set up, then all tests but the long ones: those about time itself alone, the others on every core
+
+test-realtime: $(VENV)/.compiled ## those of them that are about time itself, one after the other (about 12 min)
 	@$(PY) -m pytest -m "realtime and not long" $(ARGS) || [ $$? -eq 5 ]  # 5: none of them was asked for
+
+test-rest: $(VENV)/.compiled ## the others of them, on every core
 	@$(PY) -m pytest -m "not realtime and not long" $(PARALLEL) $(ARGS) || [ $$? -eq 5 ]
 
-test-long: $(VENV)/.compiled ## the demonstration, whole chains through the gate, comparisons with other libraries (about 5 min)
+test-long: test-long-realtime test-long-rest ## set up, then the long ones: the demonstration, whole chains through the gate, comparisons with other libraries (about 5 min)
+
+test-long-realtime: $(VENV)/.compiled ## those of them that are about time itself, one after the other
 	@$(PY) -m pytest -m "long and realtime" $(ARGS) || [ $$? -eq 5 ]
+
+test-long-rest: $(VENV)/.compiled ## the others of them, on every core
 	@$(PY) -m pytest -m "long and not realtime" $(PARALLEL) $(ARGS) || [ $$? -eq 5 ]
 
 system-test: $(VENV)/.compiled ## a real CAN kernel and foreign protocol stacks; as root, installs Debian and npm packages (about 9 min)
@@ -109,6 +117,9 @@ bench-gate-live: $(VENV)/.compiled ## the gate on a running line: rollback, swap
 
 bench-agents-live: $(VENV)/.compiled ## agents that die, hang, flood or lie beside a running line (about 30 min; ARGS="--rounds 1")
 	@$(PY) -m tests.bench.agents_live $(ARGS)
+
+bench-intrusions: $(VENV)/.compiled ## intruders of the line's own user at sockets, files, audit and bus of a line that runs (about 25 min; goes on where it was with ARGS="--go-on"; ARGS="--families flood,steal")
+	@$(PY) -m tests.bench.intrusions $(ARGS)
 
 bench-operator: $(VENV)/.compiled ## the OPC UA server flooded beside a running line, what it costs, the page in Chromium; as root (about 14 min; ARGS="--rounds 1 --seconds 7")
 	@$(PY) -m tests.system.needs

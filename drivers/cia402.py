@@ -83,6 +83,14 @@ def power_state(statusword: int) -> PowerState:
     return _POWER_STATE[statusword & 0x7F] or PowerState.FAULT
 
 
+def is_barred(statusword: int) -> bool:
+    """Whether the power stage is off and needs an order to be switched on again: switch on disabled, or fault.
+
+    Neither is a fault reaction, in which torque may go on, nor "not ready", nor what the profile does not know.
+    """
+    return statusword & 0x4F in (0x40, 0x08)
+
+
 def drive_state(state: PowerState) -> DriveState:
     """The same in the gateway's words (safe torque off is not in the statusword)."""
     return _DRIVE_STATE[state]

@@ -10,6 +10,7 @@ from math import isfinite
 from typing import NamedTuple
 
 from drivers.cia402 import PowerState
+from drivers.map_fields import Bit
 
 SAMPLE_PAUSE_S = 0.05  #: between two readings of a load cell
 LEAST_SAMPLES = 3
@@ -48,6 +49,9 @@ class DriveFacts(NamedTuple):
     error: str  #: its own word for a fault
     rated_torque_nm: Number | None  #: None: the map knows no such object
     max_torque_nm: Number | None  #: None: the line sets it, or the map knows none
+    supplied: bool | None = None  #: its power stage, as its statusword says; None: its map does not know where
+    mode: Number | None = None  #: of operation, as it displays it; None: it does not
+    mode_wanted: int | None = None  #: that arming sets; None: it has but one mode
 
 
 class CellFacts(NamedTuple):
@@ -64,6 +68,7 @@ class PlcFacts(NamedTuple):
     emergency_stop: bool = False  #: the circuit is open
     running: bool = False
     watchdog_tripped: bool = False
+    local: bool = False
     speed_m_per_s: Number = Number(None, "not read")
 
 
@@ -131,3 +136,10 @@ def _cell_facts(samples: Sequence[CellSample]) -> CellFacts:
     counters = {sample.counter for sample in samples}
     moves = None if None in counters else len(counters) > 1
     return CellFacts(tuple(value for value in good if isfinite(value)), troubles[-1] if troubles else "", moves)
+
+
+def is_supplied(voltage_enabled: Bit | None, statusword: Number) -> bool | None:
+    """Whether the power stage is supplied, as the statusword says; None where that is not known."""
+    if voltage_enabled is None or statusword.value is None:
+        return None
+    return voltage_enabled.is_set(int(statusword.value))

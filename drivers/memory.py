@@ -1,5 +1,6 @@
 """All devices of a line in memory: the driver port for stepped time, without wires, threads or waiting."""
 
+from collections.abc import Mapping, Set
 from math import isfinite
 from typing import Protocol
 
@@ -36,6 +37,8 @@ class MemorySample(Protocol):
     def running(self) -> bool: ...
     @property
     def enabled(self) -> BoolArray: ...
+    @property
+    def local(self) -> bool: ...
 
 
 class MemoryPlant(Protocol):
@@ -45,21 +48,28 @@ class MemoryPlant(Protocol):
     def apply(
         self, torque_nm: FloatArray, enable: BoolArray, speed_request_m_per_s: float, run: bool, now_s: float
     ) -> None: ...
+    def warn(self, on: bool, now_s: float) -> None: ...
 
 
 class MemoryLink:
     """A `drivers.port.Link` that carries every device of `line`. Spans without a load cell stay MISSING."""
 
     name = "memory"
+    watched: Set[str] = frozenset()  #: nothing can be late in memory: there is no watchdog
 
     def __init__(self, line: Line, plant: MemoryPlant) -> None:
         self.health = LinkHealth()
+        self.serials: Mapping[str, str] = {}  #: in memory nothing has a number
         self._plant = plant
         self._active = False
+        self._warns = False
         self._now_s = 0.0
         self._capacity_n = np.full(line.n, np.nan)  #: NaN where there is no load cell
         for cell in line.load_cells:
             self._capacity_n[cell.span - 1] = cell.capacity_n
+        self._gear = np.ones(line.n)  #: the plant knows rollers, a drive its motor
+        for drive in line.drives:
+            self._gear[drive.roller - 1] = drive.gear
         self._without_cell = np.isnan(self._capacity_n)
         self._idle_state = np.full(line.n, DriveState.OFF, dtype=np.int8)  #: of a drive that is not enabled
 
@@ -67,6 +77,8 @@ class MemoryLink:
 
     async def prepare(self) -> None:
         self._active = True
+
+    def withhold(self, devices: Set[str]) -> None: ...
 
     def silence(self) -> None:
         self._active = False
@@ -88,7 +100,7 @@ class MemoryLink:
         else:
             self._put_believed(inputs.tension, sample.tension_n, believed, now_s)
         _put_all(inputs.speed, sample.speed_m_per_s, now_s)
-        _put_all(inputs.torque, sample.torque_nm, now_s)
+        _put_all(inputs.torque, sample.torque_nm / self._gear, now_s)
         inputs.unwind_speed.put(0, sample.unwind_speed_m_per_s, now_s)
         inputs.drive_state[:] = np.where(sample.enabled, _STATE_ENABLED, self._idle_state)
         plc = inputs.plc
@@ -97,6 +109,7 @@ class MemoryLink:
         plc.permissive = sample.permissive
         plc.emergency_stop = sample.emergency_stop
         plc.running = sample.running
+        plc.local = sample.local
 
     def _put_believed(self, tension: Channel, value_n: FloatArray, believed: BoolArray, now_s: float) -> None:
         tension.value[believed] = value_n[believed]
@@ -115,7 +128,12 @@ class MemoryLink:
         request = outputs.drive_request
         enable = request == _ENABLE
         self._idle_state[:] = np.where(request == _OFF, _STATE_OFF, _STATE_READY)
-        self._plant.apply(outputs.torque_nm, enable, outputs.speed_request_m_per_s, outputs.run, self._now_s)
+        if outputs.warning != self._warns:
+            self._warns = outputs.warning
+            self._plant.warn(self._warns, self._now_s)
+        self._plant.apply(
+            outputs.torque_nm * self._gear, enable, outputs.speed_request_m_per_s, outputs.run, self._now_s
+        )
 
     async def close(self) -> None:
         self._active = False

@@ -9,7 +9,7 @@ What `write` hands over acts at the devices with the next `trigger` (a SYNC, or 
 transaction), so the latency from sample to torque is one period on every wire.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence, Set
 from typing import Protocol
 
 from gateway.core.finding import Finding
@@ -30,6 +30,16 @@ class Link(Protocol):
     name: str
     health: LinkHealth
 
+    @property
+    def serials(self) -> Mapping[str, str]:
+        """Serial numbers of devices by name, as `prepare` has read them. One that tells none has no entry."""
+        ...
+
+    @property
+    def watched(self) -> Set[str]:
+        """Names of the devices whose communication watchdogs this link feeds."""
+        ...
+
     async def open(self) -> None:
         """Open the transport. Sends nothing that changes a device. Raises OSError with what to do about it."""
         ...
@@ -38,6 +48,13 @@ class Link(Protocol):
         """Configure the devices and prove their communication watchdogs: set, read back, within bound.
 
         After it returns the link is active. Raises PrepareRefused with every reason, and stays silent then.
+        """
+        ...
+
+    def withhold(self, devices: Set[str]) -> None:
+        """Send nothing from now on that feeds the watchdogs of `devices`, nor of those that share a feed with them.
+
+        Reading goes on. An empty set feeds all again; so do `prepare` and `silence`.
         """
         ...
 

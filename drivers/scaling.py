@@ -25,3 +25,8 @@ def speed_step(kind: str, unit: str, scale: float, radius_m: float) -> float:
 def torque_per_count(unit: str, scale: float, rated_torque_nm: float) -> float:
     """Nm per count. "rated torque" is a multiple of the drive's rated torque (CiA 402: per mille of it)."""
     return scale * rated_torque_nm if unit == "rated torque" else si_per_count(unit, scale)
+
+
+def torque_step(kind: str, unit: str, scale: float, rated_torque_nm: float) -> float:
+    """Nm that a number of type `kind` moves by at least; 0 for a float, which has no such steps."""
+    return 0.0 if kind in _FLOATS else torque_per_count(unit, scale, rated_torque_nm)

@@ -15,7 +15,10 @@ class Action(IntEnum):
     NONE = 0
     HOLD_OUTPUTS = 1  #: the torques of the period before stay; cleared by the next complete set of samples
     STOP = 2  #: controlled stop, then torque off; latched, cleared by `arm`
-    TORQUE_OFF = 3  #: torque ramps to zero at once and comes off; latched, cleared by `arm`
+    BRAKE = (
+        3  #: what turns is braked on its own speed, where the drives can; then torque off; latched, cleared by `arm`
+    )
+    TORQUE_OFF = 4  #: torque ramps to zero at once and comes off; latched, cleared by `arm`
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from gateway.control.design import DesignTask, task_on
-from gateway.control.judged_courses import NEAR_M_PER_S
+from gateway.control.judged_courses import near_m_per_s
 from gateway.core.controller import Controller
 from gateway.core.experiment import Experiment
 from gateway.core.judge_context import JudgeContext
@@ -17,7 +17,7 @@ from gateway.core.line_model import LineModel, noise_of, theta_of
 from gateway.core.proposal import ExperimentChange, GainsChange, ModelChange, Proposal
 from gateway.core.recording import Recording
 from gateway.core.signals import FloatArray
-from gateway.core.theta import Noise, Theta, nominal_theta
+from gateway.core.theta import Noise, Theta, expected_noise, nominal_theta
 from safety.believed import corners_of_model, prior_corners
 from safety.excitation import Excited, excited_parts, recent
 
@@ -89,7 +89,8 @@ class Case:
     def noise(self) -> Noise:
         """The accepted model's; what is expected of any line where it says nothing."""
         model = self.context.model
-        return Noise() if model is None else noise_of(model) or Noise()
+        expected = expected_noise(self.line)
+        return expected if model is None else noise_of(model) or expected
 
     @cached_property
     def stress_noise(self) -> Noise:
@@ -98,7 +99,7 @@ class Case:
         Chatter grows with it. Seconds of data tell a noise to some 5 %, and over a tail of 1.5 s the root mean square
         itself is known to 6 %: at 1.1 a law passed whose chatter on its plant was 5.07 Nm.
         """
-        expected, own = Noise(), self.noise
+        expected, own = expected_noise(self.line), self.noise
         return Noise(
             NOISIER * max(expected.tension_n, own.tension_n),
             NOISIER * max(expected.speed_m_per_s, own.speed_m_per_s),
@@ -120,7 +121,7 @@ class Case:
     @cached_property
     def excited(self) -> list[Excited]:
         """The parts of the recent recordings in which every measured tension moves, each at one speed."""
-        return [part for recording in self.data for part in excited_parts(recording)]
+        return [part for recording in self.data for part in excited_parts(recording, self.line)]
 
     @cached_property
     def tension_n(self) -> FloatArray:
@@ -152,7 +153,7 @@ class Case:
             return min(self.line.gate.first_speed_max_m_per_s, self.line.limits.speed_max_m_per_s)
         # Without data the model rule refuses; the others still tell what they find at the speed of now.
         wanted = self.validated_m_per_s or self.context.state.speed_m_per_s or self.line.gate.first_speed_max_m_per_s
-        return min(wanted + NEAR_M_PER_S, self.line.limits.speed_max_m_per_s)
+        return min(wanted + near_m_per_s(self.line), self.line.limits.speed_max_m_per_s)
 
     @cached_property
     def tension_step_n(self) -> float:

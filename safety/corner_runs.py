@@ -7,6 +7,7 @@ from gateway.control.rollout import Course, Rollouts, simulate
 from gateway.core.controller import Controller
 from gateway.core.controller_laws import MpcConfig
 from gateway.core.line import Line
+from gateway.core.line_limits import torque_limits_nm
 from gateway.core.theta import Noise, Theta
 from safety.case import Case
 from safety.simulated import held, judged_of, plants_under_stress, setup_of, stressed
@@ -17,7 +18,9 @@ def courses_of(case: Case) -> CornerCourses:
     return case.once(_courses_of)
 
 
-def courses_through(case: Case, judged: Judged, lasting_s: float = 2.5, tail_s: float = 1.5) -> CornerCourses:
+def courses_through(
+    case: Case, judged: Judged, lasting_s: float | None = None, tail_s: float | None = None
+) -> CornerCourses:
     """Those of the proposed law's kind, for other steps and lasting otherwise."""
     courses = programme_courses if isinstance(case.controller, MpcConfig) else corner_courses
     return courses(judged, lasting_s, tail_s)
@@ -48,7 +51,7 @@ def _courses_of(case: Case) -> CornerCourses:
 def _corners_held(case: Case) -> dict[str, list[Theta]]:
     plants = [stressed(theta, case.line.gate) for theta in case.corners]
     courses = courses_of(case)
-    return {name: held(plants, one, case.line.limits.torque_nm) for name, one in courses.items()}
+    return {name: held(plants, one, torque_limits_nm(case.line)) for name, one in courses.items()}
 
 
 def _in_largest_steps(case: Case) -> dict[str, Rollouts]:

@@ -16,14 +16,16 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from gateway.core.line import Line
+from gateway.core.line_scales import line_scales
 from gateway.core.signals import FloatArray
 from gateway.core.web_model import WebModel, equilibrium_torque, nominal_model
 
-BLOCK_S = 1.0  #: averages are taken over blocks of this length
+BLOCK_MOMENTS = 50.0  #: that averages are taken over
 WINDOW_BLOCKS = 10  #: of the moving average, and of the reference
-SETTLE_S = 5.0  #: after a set-point moved, until the reference begins
-DRIFT_N = 2.0  #: a change that is told. Ten seconds of the benchmark's disturbance move the average by 0.4 N (1 sigma)
-DRIFT_ALONE_N = 3.0  #: the same for cell 1
+SETTLE_MOMENTS = 250.0  #: after a set-point moved, until the reference begins
+#: A change that is told, in small tensions. Ten seconds of the benchmark's disturbance move the average by 0.4.
+DRIFT = 2.0
+DRIFT_ALONE = 3.0  #: the same for cell 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,12 +34,14 @@ class DriftLimits:
     measured: FloatArray  #: (n,), 1.0 where a load cell measures the span
     block_periods: int
     settle_periods: int
+    small_n: float  #: a tension that is small on this line
 
 
 def drift_limits(line: Line) -> DriftLimits:
-    period_s = line.control.period_s
+    scales = line_scales(line)
     measured = np.array([1.0 if span.control == "tension" else 0.0 for span in line.spans])
-    return DriftLimits(nominal_model(line), measured, round(BLOCK_S / period_s), round(SETTLE_S / period_s))
+    block_periods, settle_periods = scales.periods(BLOCK_MOMENTS), scales.periods(SETTLE_MOMENTS)
+    return DriftLimits(nominal_model(line), measured, block_periods, settle_periods, scales.tension_n)
 
 
 @dataclass(slots=True)
@@ -92,16 +96,17 @@ def _judge(limits: DriftLimits, state: DriftState) -> None:
         state.drift_n = np.zeros(limits.model.n)
         return
     change_n = (average_nm - state.reference_nm) / limits.model.radius_m
-    state.drift_n = drift_of(change_n) * limits.measured
+    state.drift_n = drift_of(change_n, limits.small_n) * limits.measured
 
 
-def drift_of(change_n: FloatArray) -> FloatArray:
+def drift_of(change_n: FloatArray, small_n: float) -> FloatArray:
     """Which cells (n,) drift by how much (N), from the change of rho_i / R_i (n,) since the reference; 0: none told."""
+    told_n, told_alone_n = DRIFT * small_n, DRIFT_ALONE * small_n
     drift_n = np.zeros(len(change_n))
     before, after = change_n[:-1], -change_n[1:]
-    agree = (np.minimum(before, after) > DRIFT_N) | (np.maximum(before, after) < -DRIFT_N)
+    agree = (np.minimum(before, after) > told_n) | (np.maximum(before, after) < -told_n)
     drift_n[1:] = np.where(agree, 0.5 * (before + after), 0.0)
     # What cell 2 explains of roller 1 is not cell 1's.
     alone = -change_n[0] + (drift_n[1] if len(change_n) > 1 else 0.0)
-    drift_n[0] = alone if abs(alone) > DRIFT_ALONE_N else 0.0
+    drift_n[0] = alone if abs(alone) > told_alone_n else 0.0
     return drift_n

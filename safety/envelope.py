@@ -10,12 +10,11 @@ from math import inf, isfinite
 
 import numpy as np
 
-from gateway.core.signals import Channel, DriveState, FloatArray, Inputs, Quality
-from safety.actions import Action, Finding
+from gateway.core.signals import BoolArray, Channel, DriveState, FloatArray, Inputs, Quality
+from safety.actions import Action, Finding, found
 from safety.limits import EnvelopeLimits
 
-PARTING_M_PER_S = 0.001  #: by which the roller behind a break runs ahead; ten times a good encoder's noise
-PARTING = 0.03  #: the same as a fraction of the speed; an elastic web stretches by less
+PARTING = 0.03  #: share of the speed by which the roller behind a break runs ahead; an elastic web stretches by less
 MOST_COUNTED = 100  #: periods outside a limit; counts of more say nothing new
 _GOOD = int(Quality.GOOD)  # plain integers compare several times as fast as members of an enum
 
@@ -82,7 +81,7 @@ def check_inputs(
     findings += _plc_findings(limits, after, inputs)
     findings += _drive_findings(inputs, supervision)
     findings += [_out_of_band(limits, i, inputs) for i in _beyond(after.outside, limits)]
-    findings += _speed_findings(limits, after, inputs)
+    findings += _speed_findings(limits, after, inputs, supervision)
     feedback_lost = after.missing >= limits.hold_periods
     return Assessment(findings, not missing, feedback_lost, plc_lost), after
 
@@ -200,31 +199,49 @@ def _beyond(counts: Sequence[int], limits: EnvelopeLimits) -> list[int]:
 def _outside_band(limits: EnvelopeLimits, inputs: Inputs, supervision: Supervision) -> list[bool]:
     low, high = limits.tension_min_n if supervision.tension_floor else -inf, limits.tension_max_n
     # A channel that was never heard is NaN, and of no GOOD quality: it is not counted. GOOD and no number is outside.
-    return [not low <= tension_n <= high for tension_n in inputs.tension.value.tolist()]
+    if isinstance(low, float) and isinstance(high, float):
+        return [not low <= tension_n <= high for tension_n in inputs.tension.value.tolist()]
+    within: list[bool] = ((low <= inputs.tension.value) & (inputs.tension.value <= high)).tolist()
+    return [not each for each in within]
 
 
 def _out_of_band(limits: EnvelopeLimits, span: int, inputs: Inputs) -> Finding:
     # Over-tension: the law itself relieves it best, while the line slows down. Slack or a broken web: a tension loop
-    # would only spin its roller up.
+    # would only spin its roller up, and a heavy one would coast: all are braked on one ramp (`braking`).
     tension_n = float(inputs.tension.value[span])
-    text = f"tension {span + 1} is {tension_n:.2f} N, allowed is {limits.tension_min_n:g} to {limits.tension_max_n:g} N"
-    if tension_n > limits.tension_max_n:
+    low, high = limit_of(limits.tension_min_n, span), limit_of(limits.tension_max_n, span)
+    text = f"tension {span + 1} is {tension_n:.2f} N, allowed is {low:g} to {high:g} N"
+    if tension_n > high:
         return Finding("tension band", Action.STOP, text)
-    if _rollers_part(span, inputs):
+    if _rollers_part(limits, span, inputs):
         text += f", and roller {span + 1} runs away from the one before: the web has broken"
-        return Finding("web break", Action.TORQUE_OFF, text)
-    return Finding("slack", Action.TORQUE_OFF, text)
+        return Finding("web break", Action.BRAKE, text)
+    return Finding("slack", Action.BRAKE, text)
 
 
-def _rollers_part(span: int, inputs: Inputs) -> bool:
+def limit_of(limit: float | FloatArray, span: int) -> float:
+    """Of a span (from 0), where limits may be one for all or (n,)."""
+    return float(limit[span]) if isinstance(limit, np.ndarray) else limit
+
+
+def _rollers_part(limits: EnvelopeLimits, span: int, inputs: Inputs) -> bool:
     """Whether the rollers at both ends of a span (from 0) say, too, that nothing holds them together."""
-    before = inputs.speed.value[span - 1] if span else inputs.unwind_speed.value[0]
-    return float(inputs.speed.value[span] - before) > max(PARTING_M_PER_S, PARTING * abs(float(before)))
+    unwind_m_per_s = inputs.unwind_speed.value.item(0)
+    return bool(parted(inputs.speed.value, unwind_m_per_s, limits.parting_m_per_s)[span])
+
+
+def parted(speed_m_per_s: FloatArray, unwind_m_per_s: float, least_m_per_s: float) -> BoolArray:
+    """Spans (n,) whose rollers run apart: the one behind is faster than any web between them would let it be.
+
+    `least_m_per_s`: by which it must be, however slow they are.
+    """
+    before = np.concatenate(((unwind_m_per_s,), speed_m_per_s[:-1]))
+    return speed_m_per_s - before > np.maximum(least_m_per_s, PARTING * np.abs(before))
 
 
 def _roller_limit(limits: EnvelopeLimits, supervision: Supervision) -> float:
     if supervision.standstill:
-        return limits.standstill_overspeed * limits.speed_max_m_per_s
+        return min(limits.tensioning_speed_m_per_s, limits.speed_max_m_per_s)
     return limits.roller_speed_m_per_s
 
 
@@ -235,17 +252,23 @@ def _too_fast(limits: EnvelopeLimits, inputs: Inputs, supervision: Supervision) 
     return [not abs(speed) <= limit for speed in inputs.speed.value.tolist()]  # NaN and GOOD: nobody knows how fast
 
 
-def _speed_findings(limits: EnvelopeLimits, state: EnvelopeState, inputs: Inputs) -> list[Finding]:
+def _fast_roller(limits: EnvelopeLimits, supervision: Supervision, i: int, speed: float) -> Finding:
+    if supervision.standstill:
+        allowed = _roller_limit(limits, supervision)
+        values = {"roller": i + 1, "speed_m_per_s": speed, "allowed_m_per_s": allowed}
+        return found("tensioning-roller-speed", Action.TORQUE_OFF, **values)
+    text = (
+        f"roller {i + 1} runs at {speed:.3f} m/s, the line's greatest speed is {limits.speed_max_m_per_s:g} m/s: "
+        "is the web threaded and whole?"
+    )
+    return Finding("roller speed", Action.TORQUE_OFF, text)
+
+
+def _speed_findings(
+    limits: EnvelopeLimits, state: EnvelopeState, inputs: Inputs, supervision: Supervision
+) -> list[Finding]:
     # A roller that runs away has no web to pull: torque off. An unwinder that is too fast is slowed down.
-    findings = [
-        Finding(
-            "roller speed",
-            Action.TORQUE_OFF,
-            f"roller {i + 1} runs at {inputs.speed.value[i]:.3f} m/s, the line's greatest speed is "
-            f"{limits.speed_max_m_per_s:g} m/s: is the web threaded and whole?",
-        )
-        for i in _beyond(state.fast, limits)
-    ]
+    findings = [_fast_roller(limits, supervision, i, float(inputs.speed.value[i])) for i in _beyond(state.fast, limits)]
     speed, greatest = inputs.unwind_speed.value.item(0), limits.unwinder_overspeed * limits.speed_max_m_per_s
     if not abs(speed) <= greatest and inputs.unwind_speed.good():
         text = f"the unwinder runs at {speed:.4f} m/s, allowed is {limits.speed_max_m_per_s:g} m/s"

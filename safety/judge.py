@@ -19,7 +19,7 @@ from gateway.core.judge_context import JudgeContext, context_hash
 from gateway.core.line import Line
 from gateway.core.proposal import Proposal, ProposalRefused, parse_proposal, proposal_hash
 from gateway.core.recording import Recording
-from gateway.core.theta import Noise, nominal_theta
+from gateway.core.theta import expected_noise, nominal_theta
 from gateway.core.verdict import RuleFinding, ScenarioFigures, Verdict, line_hash
 from safety.case import Case
 from safety.findings import told
@@ -69,7 +69,7 @@ def warm_up(line: Line) -> None:
     config = design_lqi(task_of(line))
     plants = plants_under_stress([nominal_theta(line)], line.gate, 0)
     course = course_through(line.control.period_s, [(0.1, np.array(line.recipes[0].tension_n), 0.01)])
-    simulate(config, plants, course, setup_of(line, Noise(), 0, line.gate.stress_late_share))
+    simulate(config, plants, course, setup_of(line, expected_noise(line), 0, line.gate.stress_late_share))
     _predict_standing(line)
 
 
@@ -90,7 +90,7 @@ def _predict_standing(line: Line) -> None:
     round_ = nominal_theta(line)
     with suppress(Unpredictable):  # then no verdict predicts either
         for theta in (round_, replace(round_, eccentricity=np.full(n, 0.001))):
-            predict(theta, Noise(), stretch_of(standing))
+            predict(theta, expected_noise(line), stretch_of(standing))
 
 
 def _asked(rule: Rule, case: Case) -> list[RuleFinding]:

@@ -14,12 +14,14 @@ from math import isnan
 import numpy as np
 
 from gateway.core.line import Line
+from gateway.core.line_scales import line_scales
 from gateway.core.signals import CountArray, FloatArray, Inputs, Quality
 from safety.actions import Action, Finding
+from safety.rejections import Impossible
 
-NOISE_M_PER_S = 0.002  #: of two speed samples together, well above any usable encoder's
-MEMORY_S = 1.0  #: a second jump within this time is no coincidence
+MEMORY_MOMENTS = 50.0  #: a second jump within so long is no coincidence
 UNWINDER_MARGIN = 0.15  #: of the line's greatest speed: noise of v0, and how far it overshoots its request
+UNWINDER_SPEED = ("unwinder speed", 0)  #: its channel and number, as it is told
 _GOOD = int(Quality.GOOD)
 
 
@@ -30,7 +32,7 @@ class JumpLimits:
     radius_m: FloatArray
     radius_per_inertia: FloatArray  #: R/J, 1/(kg m)
     friction_rate_per_s: FloatArray  #: f/J
-    noise_m_per_s: FloatArray  #: two counts of the drive's speed included
+    noise_m_per_s: FloatArray  #: of two samples together, well above any usable encoder's; two counts included
     tension_max_n: float
     unwinder_m_per_s: float
     period_s: float
@@ -39,7 +41,7 @@ class JumpLimits:
 
 def jump_limits(line: Line, speed_steps_m_per_s: FloatArray) -> JumpLimits:
     """What the rollers of `line` can do. `speed_steps_m_per_s` (n,) is what a count of each drive's speed is worth."""
-    rollers, period_s = line.rollers, line.control.period_s
+    rollers, period_s, scales = line.rollers, line.control.period_s, line_scales(line)
     radius = np.array([r.radius_m.value * (1 + r.radius_m.tolerance) for r in rollers])
     inertia = np.array([r.inertia_kg_m2.value * (1 - r.inertia_kg_m2.tolerance) for r in rollers])
     friction = np.array([r.friction_nms_per_rad.value * (1 + r.friction_nms_per_rad.tolerance) for r in rollers])
@@ -47,11 +49,11 @@ def jump_limits(line: Line, speed_steps_m_per_s: FloatArray) -> JumpLimits:
         radius_m=radius,
         radius_per_inertia=radius / inertia,
         friction_rate_per_s=friction / inertia,
-        noise_m_per_s=NOISE_M_PER_S + 2.0 * speed_steps_m_per_s,
+        noise_m_per_s=scales.speed_m_per_s + 2.0 * speed_steps_m_per_s,
         tension_max_n=line.limits.tension_max_n,
         unwinder_m_per_s=UNWINDER_MARGIN * line.limits.speed_max_m_per_s,
         period_s=period_s,
-        memory_periods=round(MEMORY_S / period_s),
+        memory_periods=scales.periods(MEMORY_MOMENTS),
     )
 
 
@@ -67,6 +69,9 @@ class JumpState:
     believed: CountArray = field(default_factory=lambda: np.zeros(0, np.int64))
     jumped: CountArray = field(default_factory=lambda: np.zeros(0, np.int64))
     unwind_speed_m_per_s: float = np.nan
+    unwind_doubted_m_per_s: float = np.nan  #: the last one that fell away from its request; NaN: it keeps to it
+    unwind_confirmed: bool = False  #: what was not believed was true, as this period's sample says
+    rejected: list[Impossible] = field(default_factory=list[Impossible])  #: since they were taken in
 
 
 def reject_jumps(
@@ -91,14 +96,17 @@ def reject_jumps(
     good = speed.quality == _GOOD
     # Where nobody knows how far it can have come, it has jumped; without an earlier sample nothing has.
     first = np.isnan(state.speed_m_per_s)
-    jumped = good & ~first & ~(change <= _reach(limits, state, inputs, torques_nm))
+    reach = _reach(limits, state, inputs, torques_nm)
+    jumped = good & ~first & ~(change <= reach)
     findings: list[Finding] = []
     if jumped.any():
         again = jumped & (state.period - state.jumped <= limits.memory_periods)
         findings = [_second(inputs, state, int(i)) for i in np.flatnonzero(again)]
-        for i in np.flatnonzero(jumped):
-            speed.reject(int(i))
-            speed.value[i] = state.speed_m_per_s[i]
+        for i in np.flatnonzero(jumped).tolist():
+            speed.reject(i)
+            last, far = state.speed_m_per_s.item(i), reach.item(i)
+            state.rejected.append(Impossible("speed", i + 1, speed.value.item(i), last - far, last + far, "m/s"))
+            speed.value[i] = last
         state.jumped[jumped] = state.period
         good = good & ~jumped
     state.believed[good] = state.period
@@ -118,24 +126,33 @@ def _reach(limits: JumpLimits, state: JumpState, inputs: Inputs, torques_nm: Seq
 
 
 def reject_unwinder(limits: JumpLimits, state: JumpState, inputs: Inputs, request_m_per_s: float) -> None:
-    """Mark a v0 as BAD that lies neither between standstill, its last value and its request, nor near them.
+    """Mark a v0 as BAD that has gone neither near its request nor stayed near its last value.
 
-    It may step: a PLC without a ramp does. While it is not asked for anything it may be moved by hand, so that this is
-    for a line under control.
+    It may step: a PLC without a ramp does. Towards its request that is believed at once; away from it, as where the
+    transport is stopped by another, only what the next sample confirms, and nothing beyond standstill. While it is not
+    asked for anything it may be moved by hand, so that this is for a line under control.
     """
+    state.unwind_confirmed = False
     unwind = inputs.unwind_speed
     if not unwind.good():
         return
-    value, last = unwind.value.item(0), state.unwind_speed_m_per_s
+    value, last, margin = unwind.value.item(0), state.unwind_speed_m_per_s, limits.unwinder_m_per_s
     if isnan(last):
         last = value
-    low = min(0.0, last, request_m_per_s) - limits.unwinder_m_per_s
-    high = max(0.0, last, request_m_per_s) + limits.unwinder_m_per_s
-    if low <= value <= high:
-        state.unwind_speed_m_per_s = value
+    near = min(last, request_m_per_s) - margin, max(last, request_m_per_s) + margin
+    if not near[0] <= value <= near[1]:
+        doubted, state.unwind_doubted_m_per_s = state.unwind_doubted_m_per_s, value
+        possible = min(near[0], -margin) <= value <= max(near[1], margin)
+        # The next sample is near it, or has gone on; NaN, where there is none before, is neither.
+        state.unwind_confirmed = possible and (abs(value - doubted) <= margin or abs(value) < abs(doubted))
+        if not state.unwind_confirmed:
+            unwind.reject(0)
+            unwind.value[0] = last
+            state.rejected.append(Impossible(*UNWINDER_SPEED, value, *near, "m/s", confirmable=possible))
+            return
     else:
-        unwind.reject(0)
-        unwind.value[0] = last
+        state.unwind_doubted_m_per_s = np.nan
+    state.unwind_speed_m_per_s = value
 
 
 def _second(inputs: Inputs, state: JumpState, i: int) -> Finding:

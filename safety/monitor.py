@@ -11,11 +11,12 @@ import numpy as np
 
 from gateway.control.deviation import Measured
 from gateway.core.line import Line
+from gateway.core.line_scales import line_scales
 from gateway.core.signals import BoolArray, FloatArray
 from safety.actions import Action, Finding
 from safety.recoverability import Recovery
 
-WINDOW_S = 0.5
+WINDOW_MOMENTS = 25.0
 REVERSAL_SHARE_OF_STEP = 0.5  #: of the most that a torque may change by in a period: moves of more count
 REVERSALS = 0.3  #: share of the window's periods in which a drive turns round: it chatters
 CUT = 0.5  #: share of the window's periods in which a torque is cut
@@ -32,7 +33,7 @@ class MonitorLimits:
 
 def monitor_limits(line: Line) -> MonitorLimits:
     period_s = line.control.period_s
-    window = max(10, round(WINDOW_S / period_s))
+    window = max(10, line_scales(line).periods(WINDOW_MOMENTS))
     reversal_nm = REVERSAL_SHARE_OF_STEP * line.limits.torque_rate_nm_per_s * period_s
     return MonitorLimits(line.n, reversal_nm, window, ceil(REVERSALS * window), ceil(CUT * window))
 

@@ -7,11 +7,12 @@ from functools import lru_cache
 import numpy as np
 
 from gateway.control.prediction import Predicted, Stretch, predict, stretch_of
+from gateway.core.line import Line
 from gateway.core.line_model import LineModel, model_hash, theta_of
 from gateway.core.signals import FloatArray
 from gateway.core.theta import Noise, Theta
 from safety.case import Case
-from safety.excitation import MOST_S, Excited, newest, same_speed
+from safety.excitation import MOST, Excited, newest, same_speed
 
 KEPT = 12  #: parts of predictions, of a megabyte each
 
@@ -33,15 +34,14 @@ def foretold(theta: Theta, noise: Noise, parts: Sequence[Excited]) -> list[Foret
     return found
 
 
-def foretold_of(case: Case, model: LineModel, noise: Noise, most_s: float = MOST_S) -> list[Foretold]:
+def foretold_of(case: Case, model: LineModel, noise: Noise, most: float = MOST) -> list[Foretold]:
     """The newest excited parts of the case by a model with its noise. Raises Unpredictable.
 
     Several rules ask for it, and one proposal after another about the same model and data: it is kept.
     """
     theta, whose = theta_of(model), model_hash(model)
-    return [
-        _kept(_Asked((whose, part.recording.digest()), noise, theta, part)) for part in newest(case.excited, most_s)
-    ]
+    parts = newest(case.excited, case.line, most)
+    return [_kept(_Asked((whose, part.recording.digest()), noise, theta, part)) for part in parts]
 
 
 @dataclass(frozen=True)
@@ -79,11 +79,11 @@ def normalised_by_output(found: Sequence[Foretold]) -> tuple[list[str], FloatArr
     return found[0].predicted.stretch.names, np.where(np.isfinite(each), each, np.inf)
 
 
-def by_speed(found: Sequence[Foretold]) -> list[tuple[float, list[Foretold]]]:
+def by_speed(found: Sequence[Foretold], line: Line) -> list[tuple[float, list[Foretold]]]:
     """By ascending speed, parts at one speed together."""
     groups: list[tuple[float, list[Foretold]]] = []
     for one in sorted(found, key=lambda each: each.part.speed_m_per_s):
-        if groups and same_speed(one.part.speed_m_per_s, groups[-1][0]):
+        if groups and same_speed(one.part.speed_m_per_s, groups[-1][0], line):
             groups[-1][1].append(one)
         else:
             groups.append((one.part.speed_m_per_s, [one]))

@@ -12,21 +12,23 @@ from gateway.control.judged_courses import CornerCourses, programme_courses
 from gateway.control.mpc_linear import unconstrained
 from gateway.control.rollout import Rollouts, simulate
 from gateway.core.controller_laws import MpcConfig
+from gateway.core.line_limits import tension_bands_n
+from gateway.core.line_scales import line_scales
 from safety.case import Case
 from safety.corner_runs import corners_held
 from safety.simulated import judged_of, plants_under_stress, setup_of
 
 WHOLE = 4  #: corners: those on which the law without limits does worst in small moves
-LASTING_S, TAIL_S = 2.0, 0.6  #: of changes that the programme makes, and their tail
-SMALL_STEP_N, SMALL_STEP_M_PER_S = 1.0, 0.002  #: in which no limit is reached
+LASTING, TAIL = 100.0, 30.0  #: moments that changes last which the programme makes, and their tail
 
 
 def small_courses(case: Case) -> CornerCourses:
-    judged = judged_of(case)
+    """In steps that are small on this line, so that no limit is reached."""
+    judged, scales = judged_of(case), line_scales(case.line)
     small = replace(
         judged,
-        tension_step_n=min(judged.tension_step_n, SMALL_STEP_N),
-        speed_step_m_per_s=min(judged.speed_step_m_per_s, SMALL_STEP_M_PER_S),
+        tension_step_n=min(judged.tension_step_n, scales.tension_n),
+        speed_step_m_per_s=min(judged.speed_step_m_per_s, scales.speed_m_per_s),
     )
     return programme_courses(small)
 
@@ -71,10 +73,10 @@ def in_courses(case: Case, courses: CornerCourses) -> dict[str, Rollouts]:
 
 
 def _fails_in_small(case: Case) -> bool:
-    limits, gate, spans = case.line.limits, case.line.gate, case.tension_spans
+    (low, high), gate, spans = tension_bands_n(case.line), case.line.gate, case.tension_spans
     return not all(
-        found.tension_min_n.min() >= limits.tension_min_n
-        and found.tension_max_n.max() <= limits.tension_max_n
+        (found.tension_min_n >= low).all()
+        and (found.tension_max_n <= high).all()
         and found.tail_swing_n[:, spans].max() <= gate.tail_oscillation_max_n
         and found.tail_error_n[:, spans].max() <= gate.tail_error_max_n
         and found.chatter_nm.max() <= gate.chatter_max_nm
@@ -83,7 +85,8 @@ def _fails_in_small(case: Case) -> bool:
 
 
 def _by_itself(case: Case) -> dict[str, Rollouts]:
-    return in_courses(case, programme_courses(judged_of(case), LASTING_S, TAIL_S))
+    moment_s = line_scales(case.line).moment_s
+    return in_courses(case, programme_courses(judged_of(case), LASTING * moment_s, TAIL * moment_s))
 
 
 def _in_small(case: Case) -> dict[str, Rollouts]:

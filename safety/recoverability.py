@@ -26,6 +26,7 @@ from gateway.core.controller_laws import MpcConfig
 from gateway.core.controller_schedule import LinearConfig, ScheduledConfig, law_at
 from gateway.core.deployment import RecoveryPrediction
 from gateway.core.line import Line
+from gateway.core.line_limits import tension_bands_n, torque_limits_nm
 from gateway.core.signals import FloatArray
 from safety.limits import envelope_limits
 from safety.recovery_ways import ClosedLoop, closed_loop
@@ -80,10 +81,11 @@ class Recovery:
         self._period_s = watch.period_s
         self._margin_n = watch.margin_n
         limits = line.limits
-        self._low_n, self._high_n = limits.tension_min_n, limits.tension_max_n
+        self._low_n, self._high_n = tension_bands_n(line)
         self._envelope = envelope_limits(line)
         self._fastest = self._envelope.roller_speed_watched_m_per_s
-        self._torque_nm = limits.torque_nm * (1.0 + EXCUSED)
+        self._torque_nm = torque_limits_nm(line) * (1.0 + EXCUSED)
+        self._torques_nm = self._torque_nm[:, None]
         self._step_nm = limits.torque_rate_nm_per_s * watch.period_s
         self._draw = [i for i, span in enumerate(line.spans) if span.control == "draw"]
         self._each: NDArray[np.int64] = np.arange(self.periods + 1, dtype=np.int64)
@@ -172,7 +174,7 @@ class Recovery:
         """Whether torques (n, k) at the looks, after `before_nm` (n,), keep limit and rate. Most periods they do."""
         change_nm = np.abs(asked_nm - np.concatenate((before_nm[:, None], asked_nm[:, :-1]), axis=1))
         return bool(
-            np.abs(asked_nm).max() <= self._torque_nm and (change_nm <= self._steps_nm[: len(change_nm[0])]).all()
+            (np.abs(asked_nm) <= self._torques_nm).all() and (change_nm <= self._steps_nm[: len(change_nm[0])]).all()
         )
 
     def _step_by_step(

@@ -7,12 +7,13 @@ from gateway.control.design.task import feedforward_of
 from gateway.core.controller import Controller, config_hash
 from gateway.core.deployment import RecoveryNode, RecoveryPrediction
 from gateway.core.line import Line
+from gateway.core.line_scales import line_scales
 from gateway.core.signals import FloatArray
 from gateway.core.theta import Theta
 from gateway.core.web_model import linearise, reference_speeds
 
-HORIZON_S = 0.6
-MARGIN_N = 6.0  #: 2 N let 11 of 272 unsafe configurations out under stress effects, 4 N one, 6 N none
+#: In small tensions. Where that is 1 N, 2 let 11 of 272 unsafe configurations out under stress effects, 4 one, 6 none.
+MARGIN = 6.0
 SIGNIFICANT = 1e-9  #: of the greatest entry: smaller ones are 0
 
 
@@ -21,13 +22,15 @@ def recovery_prediction(
     fallback: Controller,
     line: Line,
     speeds_m_per_s: list[float],
-    horizon_s: float = HORIZON_S,
-    margin_n: float = MARGIN_N,
+    horizon_s: float | None = None,
+    margin_n: float | None = None,
 ) -> RecoveryPrediction:
     """What the loop needs to see whether `fallback` would still recover the line, of which `theta` is believed.
 
-    One node per speed (ascending), at the first recipe's tensions. The lag of the drives counts as dead time.
+    One node per speed (ascending), at the first recipe's tensions. The lag of the drives counts as dead time. Where no
+    horizon and margin are given, they are as the line is large.
     """
+    scales = line_scales(line)
     period_s, model = line.control.period_s, theta.web
     tension_n = np.array(line.recipes[0].tension_n)
     nodes: list[RecoveryNode] = []
@@ -44,8 +47,8 @@ def recovery_prediction(
     return RecoveryPrediction(
         fallback=config_hash(fallback),
         period_s=period_s,
-        horizon_s=horizon_s,
-        margin_n=margin_n,
+        horizon_s=scales.response_s if horizon_s is None else horizon_s,
+        margin_n=MARGIN * scales.tension_n if margin_n is None else margin_n,
         model=feedforward_of(model),
         coulomb_nm=theta.coulomb_nm.tolist(),
         nodes=nodes,

@@ -9,12 +9,13 @@ from gateway.control.judged_courses import CornerCourse, Judged
 from gateway.control.rollout import Course, Plants, Setup, plants_of_thetas
 from gateway.core.deployment import Region
 from gateway.core.line import Gate, Line
+from gateway.core.line_limits import has_own_torques, torque_limits_nm
+from gateway.core.line_scales import longest_step_of, runaway_n
 from gateway.core.signals import FloatArray
 from gateway.core.theta import Noise, Theta
 from gateway.core.web_model import equilibrium_torque, reference_speeds
 from safety.case import Case
 
-LONGEST_STEP_S = 0.005  #: of the integration; latencies are rounded up to whole ones
 HOLDABLE = 0.95  #: of the torque limit, at equilibrium: beyond it nobody could bring the line back
 
 
@@ -50,15 +51,21 @@ def plants_out_of_round(thetas: Sequence[Theta], gate: Gate, seed: int) -> Plant
     return plants_of_thetas(thetas, gate.stress_eccentricity, phases)
 
 
-def setup_of(line: Line, noise: Noise, seed: int, late_share: float, longest_step_s: float = LONGEST_STEP_S) -> Setup:
-    """The loop of the line; latencies are those of the plants, rounded up to whole steps of the integration."""
+def setup_of(line: Line, noise: Noise, seed: int, late_share: float, longest_step_s: float | None = None) -> Setup:
+    """The loop of the line; latencies are those of the plants, rounded up to whole steps of the integration.
+
+    No step is longer than `longest_step_s`; without it as long as the line lets it be.
+    """
+    if longest_step_s is None:
+        longest_step_s = longest_step_of(line)
     period_s, limits = line.control.period_s, line.limits
     return Setup(
         period_s=period_s,
         latency_s=0.0,
         substeps=max(1, round(np.ceil(period_s / longest_step_s - 1e-9))),
-        torque_nm=limits.torque_nm,
+        torque_nm=torque_limits_nm(line) if has_own_torques(line) else limits.torque_nm,
         torque_rate_nm_per_s=limits.torque_rate_nm_per_s,
+        runaway_n=runaway_n(line),
         tension_noise_n=noise.tension_n,
         speed_noise_m_per_s=noise.speed_m_per_s,
         acceleration_m_per_s1_5=noise.acceleration_m_per_s1_5,
@@ -67,21 +74,23 @@ def setup_of(line: Line, noise: Noise, seed: int, late_share: float, longest_ste
     )
 
 
-def holdable(thetas: Sequence[Theta], course: Course, torque_nm: float) -> list[Theta]:
+def holdable(thetas: Sequence[Theta], course: Course, torque_nm: float | FloatArray) -> list[Theta]:
     """Those that the torque holds wherever the course stands: beyond that no controller can, and none is to blame."""
     ends = [0, *(course.changes[1:] - 1).tolist()]
     asked = np.unique(np.column_stack([course.unwind_speed_m_per_s[ends], course.tension_n[ends]]), axis=0)
-    return [theta for theta in thetas if _needed_nm(theta, asked) <= HOLDABLE * torque_nm]
+    greatest = float(np.max(torque_nm))
+    return [theta for theta in thetas if _needed_nm(theta, asked, greatest / torque_nm) <= HOLDABLE * greatest]
 
 
-def held(thetas: Sequence[Theta], one: CornerCourse, torque_nm: float) -> list[Theta]:
+def held(thetas: Sequence[Theta], one: CornerCourse, torque_nm: float | FloatArray) -> list[Theta]:
     """Those that a course is for and that the torque holds; where there are none of both, one that it holds."""
     return holdable(one.of(thetas), one.course, torque_nm) or holdable(thetas, one.course, torque_nm)[:1]
 
 
-def _needed_nm(theta: Theta, asked: FloatArray) -> float:
+def _needed_nm(theta: Theta, asked: FloatArray, share: float | FloatArray) -> float:
     """The greatest torque at equilibria, each a row (1 + n,): the unwinder's speed, and set-points.
 
+    `share` (n,): times what each drive's torque counts, where drives differ.
     0 where it is no number, so that the plant is not left out.
     """
     needed = 0.0
@@ -89,7 +98,7 @@ def _needed_nm(theta: Theta, asked: FloatArray) -> float:
         tension = row[1:]
         speed = reference_speeds(theta.web, tension, float(row[0]))
         torque = equilibrium_torque(theta.web, tension, speed) + theta.coulomb_nm * np.sign(speed)
-        most = float(np.abs(torque).max())
+        most = float(np.abs(torque * share).max())
         if np.isnan(most):  # simulated, it is refused; left out, nobody would look at it
             return 0.0
         needed = max(needed, most)

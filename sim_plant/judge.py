@@ -11,8 +11,10 @@ torque-rate         between two SYNCs (or two commands, where these act at once)
 torque-not-enabled  a drive gives torque while it is neither enabled nor in its quick stop ramp; so also after its
                     watchdog, a fault or STO.
 tension-band        the true tension of a supervised span leaves [tension_min_n, tension_max_n]. A span is
-                    supervised once it has stayed inside for 0.2 s with every drive enabled, until a drive is taken
-                    off torque on purpose (by command, quick stop or NMT).
+                    supervised once it has stayed inside for 0.2 s with every drive enabled and two of them, or the
+                    only one, giving torque: one that pulls while all others are free, as where a wiring is proved,
+                    holds no web in a band. It is so until a drive is taken off torque on purpose (by command, quick
+                    stop or NMT).
 
 What follows when a drive has been taken off torque by its own protection (watchdog, fault, STO) is told apart as
 tension-after-trip: the price of stopping, not the failure to.
@@ -31,6 +33,7 @@ from sim_plant.plant import Plant, RecorderLimits
 
 _SUPERVISED_AFTER = round(0.2 * STEPS_PER_S)  #: steps inside the band
 _ZERO_TORQUE_NM = 1e-9
+_GIVES_SHARE = 1e-3  #: of the torque limit; less is no torque but what is left of one
 _MOST_FOUND = 256  #: events of one piece of trace that are described; the rest is only counted
 
 
@@ -223,6 +226,10 @@ def _judge_rows(rows, bounds, enabled, may_give_torque, tripped, asked_too_much,
     n = inside_steps.size
     number = 0
     for row in range(rows.shape[0]):
+        giving = 0
+        for i in range(n):
+            giving += abs(rows[row, 2 * n + i]) >= _GIVES_SHARE * torque_max
+        held = giving >= min(2, n)
         for i in range(n):
             tension, torque = rows[row, i], abs(rows[row, 2 * n + i])
             inside = tension_min <= tension <= tension_max
@@ -232,7 +239,7 @@ def _judge_rows(rows, bounds, enabled, may_give_torque, tripped, asked_too_much,
                 else:
                     number = _begin(tension_kind, i, tension, row, number, going_on, counts, found)
             else:
-                inside_steps[i] = inside_steps[i] + 1 if inside and all_enabled else 0
+                inside_steps[i] = inside_steps[i] + held if inside and all_enabled else 0
 
             if torque <= torque_max:
                 going_on[_TORQUE_LIMIT, i] = going_on[_TORQUE_LIMIT, i] and asked_too_much[i]

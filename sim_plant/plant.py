@@ -1,6 +1,7 @@
 """PLANT.toml: the truth of a simulated line. Strict, frozen, SI; every mistake is named at once."""
 
 import difflib
+import os
 import tomllib
 from collections.abc import Sequence
 from math import isfinite
@@ -132,14 +133,28 @@ class Plant(Strict):
         )
 
 
+MOST_BYTES = 1_000_000  #: of a file
+
+
 def load_plant(path: Path | str) -> Plant:
     """The plant of a file. Raises PlantRefused with every reason, OSError when the file cannot be read."""
     path = Path(path)
     try:
-        document = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        document = tomllib.loads(_text_of(path))
+    except (ValueError, RecursionError) as error:
         raise PlantRefused(path, [f"not a TOML file: {error}"]) from error
     return plant_of(document, path)
+
+
+def _text_of(path: Path) -> str:
+    """The text of a regular file of at most `MOST_BYTES`. Raises OSError, ValueError."""
+    if not path.is_file() and os.path.exists(path) and not path.is_dir():  # a pipe would be waited for
+        raise ValueError("it is a pipe, a socket or a device")
+    with path.open("rb") as stream:
+        content = stream.read(MOST_BYTES + 1)
+    if len(content) > MOST_BYTES:
+        raise ValueError(f"it has more than {MOST_BYTES / 1e6:g} MB")
+    return content.decode("utf-8-sig")
 
 
 def plant_of(document: dict[str, Any], path: Path = Path("PLANT.toml")) -> Plant:

@@ -84,10 +84,11 @@ class RecordingWriter:
         self._trace.close()
 
 
-def read_recording(folder: Path | str) -> Recording:
+def read_recording(folder: Path | str, *, events: bool = True) -> Recording:
     """What a folder holds, also while it is being written or after its writer was killed.
 
-    Raises RecordingUnreadable for another format, OSError when the files are not there.
+    `events`: with those, of which there may be many, or without. Raises RecordingUnreadable for another format, OSError
+    when the files are not there.
     """
     folder = Path(folder)
     content = (folder / TRACE_FILE).read_bytes()
@@ -100,7 +101,7 @@ def read_recording(folder: Path | str) -> Recording:
         raise RecordingUnreadable(f"{folder / TRACE_FILE} is no trace of format {FORMAT}")
     spans = int(header["spans"])
     steps, rows = _read_blocks(blocks, 3 * spans + 1)
-    return recording_of(spans, steps, rows, _read_events(folder / EVENTS_FILE))
+    return recording_of(spans, steps, rows, _read_events(folder / EVENTS_FILE) if events else [])
 
 
 def _read_blocks(content: bytes, width: int) -> tuple[FloatArray, FloatArray]:

@@ -31,13 +31,14 @@ class Sample:
     emergency_stop: bool
     running: bool
     enabled: BoolArray  #: per drive
+    local: bool = False  #: the line is switched to local operation
 
 
 class SteppedLine:
     """World and devices on perfect wires with a fixed latency. All times are world time in seconds.
 
-    `world`, `recorder`, `plc`, `amplifier` and `encoders` (one per drive) are there for whoever plays the plant's
-    side, or judges.
+    `world`, `recorder`, `plc`, `amplifier`, `encoders`, `torque_share`, `direction` and `powered` (one per drive) are
+    there for whoever plays the plant's side, or judges.
     """
 
     def __init__(self, plant: Plant, seed: int, latency_s: float) -> None:
@@ -54,6 +55,9 @@ class SteppedLine:
         self._torque_rate_nm_per_s = drives.torque_rate_nm_per_s or inf
         self._enabled = np.zeros(plant.spans, dtype=np.bool_)
         self._blocked = np.zeros(plant.spans, dtype=np.bool_)  #: left by themselves, and not told off since
+        self.torque_share = np.ones(plant.spans)  #: torque given per torque asked for
+        self.direction = np.ones(plant.spans)  #: -1: the motor turns its roller backwards
+        self.powered = np.ones(plant.spans, dtype=np.bool_)  #: a drive without power cannot be enabled
         self._underway: deque[tuple[float, FloatArray, BoolArray]] = deque()
         self._arrival = self.world.timer(self._arrive)
         self._life = 0
@@ -85,12 +89,13 @@ class SteppedLine:
         return Sample(
             self.amplifier.tensions_n(now_s),
             self._speeds_m_per_s(),
-            self.world.torque_nm.copy(),
+            self.direction * self.world.torque_nm,
             plc.unwind_speed_m_per_s,
             plc.permissive,
             plc.emergency_stop,
             plc.running,
             self._enabled.copy(),
+            plc.local,
         )
 
     def apply(
@@ -111,6 +116,10 @@ class SteppedLine:
         else:
             self._arrival.due_s = self._underway[0][0]
 
+    def warn(self, on: bool, now_s: float) -> None:
+        """Lamp and horn."""
+        self.plc.warn(on, now_s)
+
     def take_off(self, index: int, now_s: float) -> None:
         """Drive `index` (from 0) takes torque off by itself, as by a short safe torque off.
 
@@ -126,9 +135,11 @@ class SteppedLine:
     def _speeds_m_per_s(self) -> FloatArray:
         shown = self.world.measure_speeds_m_per_s()
         if all(encoder.healthy for encoder in self.encoders):
-            return shown
+            return self.direction * shown
         steps = self.world.steps
-        return np.array([encoder.shown(float(v), steps) for encoder, v in zip(self.encoders, shown, strict=True)])
+        return self.direction * np.array(
+            [encoder.shown(float(v), steps) for encoder, v in zip(self.encoders, shown, strict=True)]
+        )
 
     def _command_plc(self, speed_request_m_per_s: float, run: bool, now_s: float) -> None:
         self._life = (self._life + 1) & 0xFFFF
@@ -137,9 +148,10 @@ class SteppedLine:
     def _arrive(self, now_s: float) -> None:
         _, torque_nm, enable = self._underway.popleft()
         self._arrival.due_s = self._underway[0][0] if self._underway else inf
-        possible = np.minimum(np.maximum(torque_nm, -self._max_torque_nm), self._max_torque_nm)
+        asked_nm = self.torque_share * self.direction * torque_nm
+        possible = np.minimum(np.maximum(asked_nm, -self._max_torque_nm), self._max_torque_nm)
         self._blocked &= enable
-        enable = enable & ~self._blocked
+        enable = enable & ~self._blocked & self.powered
         possible[~enable] = 0.0
         self._set_enabled(enable, now_s)
         self._give(possible)

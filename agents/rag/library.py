@@ -25,11 +25,14 @@ from agents.rag.index_file import (
     passages_of,
     write_index,
 )
-from agents.rag.notes import parse_note
+from agents.rag.notes import NoteRefused, parse_note
 from agents.rag.read_files import FilesRead, Refused, read_files, stamp_of
+from gateway.core.line_problem import printable
+from gateway.files import NotText, read_text
 
 NOTES = Path(__file__).parent.parent / "knowledge"
 INDEX, ADDED = "index.sqlite", "documents"  #: in the folder
+MOST_NOTE_BYTES = 1_000_000
 BATCH = 32  #: texts that are embedded at a time
 
 
@@ -45,9 +48,24 @@ class Opened:
 
 @cache
 def program_notes() -> tuple[Document, ...]:
-    """Those written for this program."""
-    files = sorted(NOTES.glob("*/*.md"))
-    return tuple(of_note(parse_note(file.stem, file.read_text(encoding="utf-8"))) for file in files)
+    """Those written for this program that can be read."""
+    return notes_in(NOTES)[0]
+
+
+def notes_in(folder: Path) -> tuple[tuple[Document, ...], list[Refused]]:
+    """The notes one folder deep in `folder`, and those that are none, with why."""
+    documents, refused = list[Document](), list[Refused]()
+    for file in sorted(folder.glob("*/*.md")):
+        name = printable(file.relative_to(folder).as_posix())
+        try:
+            documents.append(of_note(parse_note(file.stem, read_text(file, MOST_NOTE_BYTES))))
+        except NoteRefused as error:
+            refused.append(Refused(name, "; ".join(error.reasons)))
+        except OSError as error:
+            refused.append(Refused(name, f"cannot be read: {error.strerror}"))
+        except NotText as error:
+            refused.append(Refused(name, str(error)))
+    return tuple(documents), refused
 
 
 def add_files(folder: Path, paths: Sequence[Path], tier: Tier) -> FilesRead:
@@ -126,7 +144,8 @@ def _gathered(
     of_line = [one for one in kept if one.origin == "line"] if generated is None else list(map(of_generated, generated))
     whole = consistent([*program_notes(), *read.documents, *of_line])
     passages = passages_of(whole.documents)
-    return _Gathered(whole.documents, passages, state + made_of, vectors, read.refused, whole.left_out)
+    refused = [*notes_in(NOTES)[1], *read.refused]
+    return _Gathered(whole.documents, passages, state + made_of, vectors, refused, whole.left_out)
 
 
 def _open_usable(path: Path) -> Index | None:
@@ -163,9 +182,17 @@ async def _embedded(texts: Sequence[str], embedder: Embedder, known: dict[str, V
 def _state(folder: Path, tier: Tier) -> str:
     """Of what the index is made of, without what is generated."""
     files = sorted(file for file in (folder / ADDED).rglob("*") if file.is_file())
-    added = [f"{file.relative_to(folder)} {stamp_of(file)}" for file in files]
-    notes = [f"{file.name} {stamp_of(file)}" for file in sorted(NOTES.glob("*/*.md"))]
+    added = [f"{file.relative_to(folder)} {_stamp_there(file)}" for file in files]
+    notes = [f"{file.name} {_stamp_there(file)}" for file in sorted(NOTES.glob("*/*.md"))]
     return _hash(str(tier), *notes, *added)
+
+
+def _stamp_there(file: Path) -> str:
+    """Of a file that cannot be looked at, or is gone meanwhile, always the same."""
+    try:
+        return stamp_of(file)
+    except OSError:
+        return "unreadable"
 
 
 def _hash(*texts: str) -> str:

@@ -23,6 +23,8 @@ from pydantic import Field, ValidationError, model_validator
 from gateway.core.json_problems import problems
 from gateway.core.line import Fraction, Strict
 from gateway.core.questions import Decision
+from gateway.core.toml_places import line_of, places
+from gateway.core.toml_syntax import syntax_problem
 
 FaultClass = Literal["material", "mechanical", "sensor", "environment", "process", "drive"]
 Words = Annotated[str, Field(min_length=1, max_length=300)]
@@ -93,13 +95,24 @@ def parse_note(name: str, content: str) -> Note:
     if begin or not found or not ended:
         raise NoteRefused(name, [f"it does not begin with a head between two lines of {FENCE}"])
     try:
-        note = Note(name, Head.model_validate(tomllib.loads(head)), text.strip())
-    except tomllib.TOMLDecodeError as error:
-        raise NoteRefused(name, [f"its head is no TOML: {error}"]) from error
+        document = tomllib.loads(head)
+    except (ValueError, RecursionError) as error:
+        wrong = syntax_problem(error, head, name)
+        raise NoteRefused(name, [f"line {wrong.line + 1}: its head: {wrong.wrong}"]) from error
+    try:
+        note = Note(name, Head.model_validate(document), text.strip())
     except ValidationError as error:
-        raise NoteRefused(name, problems(error, Head)) from error
+        raise NoteRefused(name, _mistakes(error, head)) from error
     if not note.text:
         raise NoteRefused(name, ["it has a head and no text"])
     if note.head.kind == "failure" and tuple(note.parts) != PARTS:
         raise NoteRefused(name, [f"its headings are {', '.join(note.parts) or 'none'}; allowed: {', '.join(PARTS)}"])
     return note
+
+
+def _mistakes(error: ValidationError, head: str) -> list[str]:
+    """Each with its line in the note; the head begins on the second."""
+    where = places(head)
+    lines = [line_of(where, one["loc"]) + 1 for one in error.errors(include_url=False)]
+    words = problems(error, Head)
+    return [f"line {line}: {one}" for line, one in zip(lines, words, strict=False)] + words[len(lines) :]

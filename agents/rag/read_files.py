@@ -14,6 +14,7 @@ from agents.rag.pdf import text_of_pdf
 from agents.rag.tables import text_of_csv
 from gateway.core.line_problem import printable
 from gateway.core.nearest import nearest
+from gateway.files import read_bytes, what_is_there
 
 MOST_BYTES = 50_000_000  #: of a file
 MOST_LETTERS = 5_000_000  #: of its text, some 2,000 pages
@@ -70,10 +71,15 @@ def _files(paths: Sequence[Path]) -> Iterator[tuple[str, Path]]:
         if path.is_dir():
             for file in sorted(path.rglob("*")):
                 name = file.relative_to(path)
-                if file.is_file() and not any(part.startswith(".") for part in name.parts):
+                if not _is_folder(file) and not any(part.startswith(".") for part in name.parts):
                     yield name.as_posix(), file
         else:
             yield path.name, path
+
+
+def _is_folder(file: Path) -> bool:
+    """Whether it is gone into. A folder with the name of a document is told, as is what is no file at all."""
+    return file.is_dir() and (file.suffix.lower() not in _READERS or any(file.iterdir()))
 
 
 def _document(name: str, file: Path, tier: Tier) -> Document:
@@ -86,6 +92,8 @@ def _document(name: str, file: Path, tier: Tier) -> Document:
             f"files that end in {file.suffix or 'nothing'} are not read; allowed: {', '.join(_READERS)}"
             + (f"; the nearest is {like}" if like else "")
         )
+    if wrong := what_is_there(file):
+        raise FileRefused(wrong)
     size = file.stat().st_size
     if size > MOST_BYTES:
         raise FileRefused(f"has {size / 1e6:.0f} MB; allowed: {MOST_BYTES / 1e6:.0f}. Add the part that is needed")
@@ -135,7 +143,7 @@ def _plain(name: str, title: str, text: str, tier: Tier) -> Document:
 
 
 def _text(file: Path) -> str:
-    content = file.read_bytes()
+    content = read_bytes(file, MOST_BYTES)
     if b"\0" in content[:_BYTES_LOOKED_AT]:
         raise FileRefused("is no text but binary, whatever its name says")
     try:

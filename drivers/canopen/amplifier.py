@@ -67,7 +67,9 @@ class AmplifierNode:
             self._answers.setdefault(cob_id, _Answer()).cells.append(cell)
             self._cells.append(cell)
         self.answers = tuple(self._answers)
-        self.station = Station(", ".join(item.name for item in cells), node, device.heartbeat, frames=len(self.answers))
+        names = ", ".join(item.name for item in cells)
+        frames = len(self.answers)
+        self.station = Station(names, node, device.heartbeat, frames=frames, classes=device.emergency)
         self._silent = _Answer(self._cells)
         self._read_s = 0.0  #: when the last reading by SDO was asked for
         self._boot_ups = -1  #: of the station, when it was last found to be what its map says

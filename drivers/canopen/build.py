@@ -13,6 +13,7 @@ from drivers.canopen.plc import PlcNode
 from drivers.port import Link
 from drivers.wiring import Wired
 from gateway.core.line import CanopenBus, Drive, Line, LinePlc, LoadCell
+from gateway.core.line_limits import motor_radius_m, motor_torque_limit_nm
 
 
 def build(line: Line, devices: Sequence[Wired]) -> tuple[list[Link], list[str]]:
@@ -48,12 +49,14 @@ def build(line: Line, devices: Sequence[Wired]) -> tuple[list[Link], list[str]]:
 def _drive_node(line: Line, drive: Drive, device: DriveMap) -> DriveNode:
     """Raises ValueError when the line asks for what the drive cannot do."""
     limits = line.limits
-    settings = DriveSettings(drive.address, drive.rated_torque_nm, limits.torque_nm, limits.watchdog_s)
+    settings = DriveSettings(
+        drive.address, drive.rated_torque_nm, motor_torque_limit_nm(line, drive), limits.watchdog_s
+    )
     watchdog_counts(device.watchdog, limits.watchdog_s)
     check_target_range(device, settings)
     if device.objects.max_torque is not None and device.objects.max_torque.writable:
         torque_limit_counts(device, settings)
-    radius_m = line.rollers[drive.roller - 1].radius_m.value
+    radius_m = motor_radius_m(line, drive)
     return DriveNode(drive.name, drive.roller - 1, device, settings, radius_m)
 
 

@@ -69,6 +69,8 @@ class Feed:
         station = node.station
         if not station.fed:
             return True
+        if station.withheld:  # nor is it told to take its torque off: its watchdog has to do it
+            return station.listens_to is None
         if not station.dropped:
             self._judge(node, now_s)
         sent = not station.dropped and self._send_command(node, outputs, now_s)

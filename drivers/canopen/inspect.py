@@ -29,6 +29,7 @@ from drivers.inspection import (
     Progress,
     ReadCell,
     WatchdogFacts,
+    is_supplied,
     sample_cells,
 )
 from drivers.scaling import si_per_count, torque_per_count
@@ -161,8 +162,18 @@ class _Inspector:
                 error=await self._error() if power in _FAULTS else "",
                 rated_torque_nm=rated,
                 max_torque_nm=maximum,
+                supplied=is_supplied(device.voltage_enabled, status),
+                mode=await self._mode(device),
+                mode_wanted=device.cyclic_torque_mode,
             ),
         )
+
+    async def _mode(self, device: DriveMap) -> Number | None:
+        """None where nobody said that it displays its mode, and it does not."""
+        if (entry := device.mode_displayed) is None:
+            return None
+        found = await self._number(entry)
+        return None if found.value is None and device.objects.mode_displayed is None else found
 
     async def _error(self) -> str:
         code = await self._number(_ERROR_CODE)
@@ -191,6 +202,7 @@ class _Inspector:
                 emergency_stop=read.emergency_stop.is_set(word),
                 running=read.running.is_set(word),
                 watchdog_tripped=read.watchdog_tripped.is_set(word),
+                local=read.local is not None and read.local.is_set(word),
                 speed_m_per_s=speed.scaled(si_per_count(read.speed.unit, read.speed.scale)),
             )
         return replace(

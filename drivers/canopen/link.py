@@ -10,7 +10,7 @@ SDO then, one transfer at a time per node: a dead one costs the others nothing.
 """
 
 import asyncio
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence, Set
 from contextlib import AsyncExitStack
 
 from drivers.canopen.bus import CanBus
@@ -96,7 +96,7 @@ class CanopenLink:
             raise PrepareRefused(reasons + await finish(undo_all(self._unfinished)))
         self._unfinished.clear()
         for node in self._nodes:
-            node.station.emergency = ""
+            node.station.recover()
             node.station.supervised = True
         self._questions.stop()  # what a silent link asked for must not come among the answers to SYNC
         self._active = self._prepared = True
@@ -129,6 +129,21 @@ class CanopenLink:
 
     def _on_altered(self, node: Node, trouble: str) -> None:
         self._feed.drop(node, trouble)
+
+    @property
+    def serials(self) -> Mapping[str, str]:
+        """An amplifier's is that of each load cell on it: its station is called by all of them."""
+        stations = [node.station for node in self._nodes if node.station.serial]
+        return {name: station.serial for station in stations for name in station.name.split(", ")}
+
+    @property
+    def watched(self) -> Set[str]:
+        return {node.station.name for node in self._nodes if node.station.fed}
+
+    def withhold(self, devices: Set[str]) -> None:
+        """Drives that listen to our heartbeat share it: withheld from one, it is withheld from all."""
+        for node in self._nodes:
+            node.station.withheld = node.station.name in devices
 
     def silence(self) -> None:
         """Nothing is sent from now on that changes a node. What the nodes said is forgotten with it."""
@@ -291,8 +306,8 @@ class CanopenLink:
         except ValueError as error:
             self._discard(f"{node.station.name}: {error}")
             return
-        if node.station.emergency:
-            self.health.last_error = f"{node.station.name}: {node.station.emergency}"
+        if node.station.emergency_told:
+            self.health.last_error = f"{node.station.name}: {node.station.emergency_told}"
 
     def _discard(self, reason: str) -> None:
         self.health.malformed += 1

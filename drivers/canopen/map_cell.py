@@ -11,6 +11,7 @@ from drivers.canopen.map_parts import (
     Index,
     ObjectType,
     Pdo,
+    emergency_problems,
     heartbeat_problems,
     size_problems,
 )
@@ -128,4 +129,5 @@ class LoadCellMap(CanMap):
         if (healthy := objects.healthy) is not None:
             problems += type_problems("objects.healthy", healthy.type, UNSIGNED)
             problems += bit_problems("objects.healthy", healthy.bit, healthy.type)
+        problems += emergency_problems(self.emergency)
         return refuse_together(self, problems + heartbeat_problems(self.heartbeat))

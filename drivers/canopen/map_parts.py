@@ -75,6 +75,19 @@ class CanIdentity(Strict):
     product_code: Annotated[int, Field(ge=0, le=0xFFFFFFFF)]
 
 
+EmergencyCode = Annotated[int, Field(ge=0x0100, le=0xFFFF)]
+
+
+class EmergencyClasses(Strict):
+    """Error codes of emergency messages whose class is known: a code, its group (0x4200) or its class (0x4000).
+
+    Of all others the statusword decides, or bit 0 of the error register where there is none.
+    """
+
+    faults: list[EmergencyCode] = []  #: torque goes off, whatever else the device says
+    warnings: list[EmergencyCode] = []  #: told, and nothing else
+
+
 class CanMap(Strict):
     """What every CANopen device type states."""
 
@@ -83,6 +96,7 @@ class CanMap(Strict):
     description: str
     identity: CanIdentity
     heartbeat: HeartbeatObject
+    emergency: EmergencyClasses = EmergencyClasses()
 
 
 class Pdo(Strict):
@@ -128,6 +142,11 @@ def heartbeat_problems(heartbeat: HeartbeatObject) -> list[str]:
     if not low <= heartbeat.value <= high:
         problems.append(f"heartbeat.value: {heartbeat.value} is outside heartbeat.range [{low}, {high}]")
     return problems
+
+
+def emergency_problems(emergency: EmergencyClasses) -> list[str]:
+    both = sorted(set(emergency.faults) & set(emergency.warnings))
+    return [f"emergency: {code:04X}h is among faults and warnings" for code in both]
 
 
 def watchdog_problems(watchdog: Watchdog) -> list[str]:

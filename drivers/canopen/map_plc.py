@@ -11,6 +11,7 @@ from drivers.canopen.map_parts import (
     Pdo,
     Watchdog,
     WebSpeedObject,
+    emergency_problems,
     heartbeat_problems,
     pdo_problems,
     place_problems,
@@ -27,6 +28,7 @@ class PlcRead(Strict):
     emergency_stop: Bit  #: yes: the emergency stop circuit is open
     running: Bit
     watchdog_tripped: Bit
+    local: Bit | None = None  #: yes: the line is not started from elsewhere
     speed: WebSpeedObject
     life_echo: CanObject
 
@@ -34,6 +36,7 @@ class PlcRead(Strict):
 class PlcWrite(Strict):
     command: CanObject
     run: Bit
+    warning: Bit | None = None  #: lamp and horn before anything moves
     speed: WebSpeedObject
     life: CanObject
 
@@ -72,10 +75,14 @@ class PlcMap(CanMap):
         for key in ("read.life_echo", "write.life"):
             problems += type_problems(key, objects[key].type, ("u16", "u32"))
         problems += bit_problems("write.run", self.write.run.bit, self.write.command.type)
-        for name in ("permissive", "emergency_stop", "running", "watchdog_tripped"):
-            problems += bit_problems(f"read.{name}", read[name].bit, self.read.status.type)
+        if self.write.warning is not None:
+            problems += bit_problems("write.warning", self.write.warning.bit, self.write.command.type)
+        for name in ("permissive", "emergency_stop", "running", "watchdog_tripped", "local"):
+            if read[name] is not None:
+                problems += bit_problems(f"read.{name}", read[name].bit, self.read.status.type)
         problems += range_problems("read.speed", self.read.speed.range)
         problems += range_problems("write.speed", self.write.speed.range)
         if self.watchdog.kind != "receive-pdo":
             problems.append(f"watchdog.kind: {self.watchdog.kind!r}; allowed: 'receive-pdo', the life counter's")
+        problems += emergency_problems(self.emergency)
         return refuse_together(self, problems + watchdog_problems(self.watchdog) + heartbeat_problems(self.heartbeat))

@@ -1,11 +1,13 @@
 """What the link asks of a node, whatever its role: a drive, a load-cell amplifier, a line PLC."""
 
+from collections.abc import Sequence
 from typing import Protocol
 
 from drivers.canopen.map_parts import CanIdentity
 from drivers.canopen.sdo import SdoBus
 from drivers.canopen.station import Station
 from drivers.canopen.transaction import Step
+from gateway.core.finding import Finding
 from gateway.core.signals import Inputs, Outputs
 
 
@@ -76,7 +78,7 @@ class Node(Protocol):
         """
         ...
 
-    async def check(self, sdo: SdoBus) -> list[str]:
+    async def check(self, sdo: SdoBus) -> Sequence[str | Finding]:
         """What speaks against the node, before anything is written. Reads only. Raises SdoFailed."""
         ...
 

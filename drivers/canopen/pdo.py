@@ -27,6 +27,7 @@ class DriveSample(NamedTuple):
     speed_m_per_s: float
     torque_nm: float
     safe_torque_off: bool | None  #: None: not in this PDO
+    mode: int | None = None  #: of operation, as displayed; None: not in this PDO
 
 
 def mapping_entries(objects: Sequence[CanObject]) -> list[int]:
@@ -76,6 +77,7 @@ class PdoCodec:
         self._torque_at = names.index("torque")
         self._sto = objects.safe_torque_off if "safe_torque_off" in names else None
         self._sto_at = names.index("safe_torque_off") if self._sto else 0
+        self._mode_at = names.index("mode_displayed") if "mode_displayed" in names else None
         self._receive = PdoLayout(device.objects_of(device.receive_pdo))
         names = device.receive_pdo.objects
         self._command = [device.cyclic_torque_mode if name == "mode" else 0 for name in names]
@@ -90,7 +92,8 @@ class PdoCodec:
         if not (isfinite(speed) and isfinite(torque)):
             raise MalformedPdo(f"speed {speed} or torque {torque} is not finite")
         sto = None if self._sto is None else self._sto.is_set(fields[self._sto_at])
-        return DriveSample(fields[self._statusword_at], speed, torque, sto)
+        mode = None if self._mode_at is None else fields[self._mode_at]
+        return DriveSample(fields[self._statusword_at], speed, torque, sto, mode)
 
     def encode(self, controlword: int, torque_nm: float) -> bytes:
         """The receive PDO. Raises ValueError for a torque that is not finite or does not fit the object."""

@@ -31,7 +31,9 @@ class PlcNode:
     """Raises ValueError when the line asks for a watchdog that it cannot do."""
 
     def __init__(self, device: PlcMap, plc: LinePlc, watchdog_s: float) -> None:
-        self.station = Station(plc.name, plc.address, device.heartbeat, watchdog=device.watchdog)
+        self.station = Station(
+            plc.name, plc.address, device.heartbeat, watchdog=device.watchdog, classes=device.emergency
+        )
         self.identity = device.identity
         self._device = device
         self._steps = plc_steps(device, plc.address, watchdog_s)
@@ -90,7 +92,7 @@ class PlcNode:
         if status is None or self.absent(now_s):
             self._miss(inputs)
             return []
-        if self._life.stands_still(status.echo, moving=active and self._commanded and not self.station.dropped):
+        if self._life.stands_still(status.echo, moving=active and self._commanded and self._is_fed()):
             self._miss(inputs)
             return [f"{self.station.name}: answers, but its echo of the life counter stands still"]
         time_s = now_s if active else self._read_s
@@ -101,9 +103,14 @@ class PlcNode:
         plc.permissive = read.permissive.is_set(word)
         plc.emergency_stop = read.emergency_stop.is_set(word)
         plc.running = read.running.is_set(word)
-        if read.watchdog_tripped.is_set(word):
+        plc.local = read.local is not None and read.local.is_set(word)
+        plc.tripped = read.watchdog_tripped.is_set(word)
+        if plc.tripped:
             troubles.append(f"{self.station.name}: its command watchdog has tripped")
         return troubles + self._fill_speed(inputs, status.speed, time_s)
+
+    def _is_fed(self) -> bool:
+        return not self.station.dropped and not self.station.withheld
 
     def _fill_speed(self, inputs: Inputs, counts: float, time_s: float) -> list[str]:
         speed = self._device.read.speed
@@ -146,8 +153,10 @@ class PlcNode:
         low, high = write.speed.range
         if not low <= counts * write.speed.scale <= high:
             raise ValueError(f"speed request {speed_m_per_s} m/s is outside [{low:g}, {high:g}] {write.speed.unit}")
-        run = outputs.run != write.run.inverted
-        return {"command": run << write.run.bit, "speed": counts if write.speed.type == "f32" else round(counts)}
+        command = write.run.word(outputs.run)
+        if write.warning is not None:
+            command |= write.warning.word(outputs.warning)
+        return {"command": command, "speed": counts if write.speed.type == "f32" else round(counts)}
 
     # by SDO
 

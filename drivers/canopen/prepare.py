@@ -7,7 +7,12 @@ from drivers.canopen.map_parts import CanIdentity
 from drivers.canopen.node import Node
 from drivers.canopen.sdo import SdoBus, SdoFailed, SdoSilent
 from drivers.canopen.transaction import Transaction
+from gateway.core.finding import Finding, finding
 
+WAKING_S = 5.0  #: that a node whose heartbeat is there is waited for until its SDO server answers
+HEARTBEAT_AWAITED_S = 1.0  #: that a node that was heard, and is silent now, is waited for
+ASKED_AGAIN_S = 0.25
+SERIAL_READINGS = 2  #: an abort may be of the moment
 _IDENTITY = 0x1018
 
 
@@ -23,17 +28,66 @@ async def check_identity(sdo: SdoBus, node: int, wanted: CanIdentity) -> list[st
     ]
 
 
-async def check_nodes(sdo: SdoBus, nodes: Sequence[Node]) -> list[str]:
+async def read_serial(sdo: SdoBus, node: int) -> str:
+    """The serial number (1018h:04), which not every node has; empty where it has none. Raises SdoSilent.
+
+    Nodes without one abort in their own ways. One that has told it before and aborts twice counts as exchanged.
+    """
+    for _ in range(SERIAL_READINGS):
+        try:
+            number = int.from_bytes(await sdo.upload(node, _IDENTITY, 4, 4), "little")
+        except SdoSilent:
+            raise
+        except SdoFailed:
+            continue
+        return f"{number:#x}" if number else ""
+    return ""
+
+
+async def check_nodes(sdo: SdoBus, nodes: Sequence[Node]) -> list[str | Finding]:
     """What speaks against the nodes, before anything is written, each with its name. Reads only."""
-    found = await asyncio.gather(*(_check(sdo, node) for node in nodes))
-    return [f"{node.station.name}: {line}" for node, lines in zip(nodes, found, strict=True) for line in lines]
+    found = await asyncio.gather(*(_check_awake(sdo, node) for node in nodes))
+    return [reason for reasons in found for reason in reasons]
 
 
-async def _check(sdo: SdoBus, node: Node) -> list[str]:
+async def _check_awake(sdo: SdoBus, node: Node) -> list[str | Finding]:
+    """The same of one. A node that was just switched on may send heartbeats before its SDO server answers."""
+    station, now_s = node.station, asyncio.get_running_loop().time
+    began_s = now_s()
+    while True:
+        heartbeats = station.heartbeats
+        try:
+            reasons = await _check(sdo, node)
+            return [reason if isinstance(reason, Finding) else f"{station.name}: {reason}" for reason in reasons]
+        except SdoSilent:
+            pass
+        if not await _is_alive(node, heartbeats):
+            hint = "check its power, node number, bit rate and wiring"
+            return [f"{station.name}: node {station.node} does not answer; {hint}"]
+        waited_s = now_s() - began_s
+        if waited_s >= WAKING_S:
+            return [finding("sdo-silent", device=station.name, state=station.state_name, waited_s=waited_s)]
+        await asyncio.sleep(ASKED_AGAIN_S)
+
+
+async def _is_alive(node: Node, heartbeats: int) -> bool:
+    """Whether it has sent a heartbeat since it had sent so many, or does so before long. One never heard does not."""
+    station, now_s = node.station, asyncio.get_running_loop().time
+    until_s = now_s() + (HEARTBEAT_AWAITED_S if station.nmt_state is not None else 0.0)
+    while station.heartbeats == heartbeats and now_s() < until_s:  # noqa: ASYNC110 (a station does no I/O)
+        await asyncio.sleep(station.heartbeat_s)
+    return station.heartbeats != heartbeats
+
+
+async def _check(sdo: SdoBus, node: Node) -> Sequence[str | Finding]:
+    """Raises SdoSilent."""
     try:
-        return await check_identity(sdo, node.station.node, node.identity) or await node.check(sdo)
+        if reasons := await check_identity(sdo, node.station.node, node.identity):
+            return reasons
+        node.station.serial = await read_serial(sdo, node.station.node)
+        return await node.check(sdo)
     except SdoSilent:
-        return [f"node {node.station.node} does not answer; check its power, node number, bit rate and wiring"]
+        raise
     except SdoFailed as error:
         return [str(error)]
 

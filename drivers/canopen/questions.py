@@ -30,11 +30,14 @@ class Questions:
         self._guarded = [(node, node.watchdog) for node in nodes if node.watchdog is not None]
         self._turn = 0  #: of `_guarded`, whose watchdog is read next
         self._verify_s = float("-inf")  #: when
+        self._keeps_free: Node | None = None  #: for its watchdog: it is asked nothing else before
         self._verifying: asyncio.Task[None] | None = None
 
     def ask(self, node: Node, now_s: float, *, active: bool) -> None:
         """Ask for what no PDO brings, if it is time for it. `active`: the link commands the nodes."""
-        if node.station.node not in self._tasks and node.reading_due(now_s, active=active):
+        if node is self._keeps_free or node.station.node in self._tasks:
+            return
+        if node.reading_due(now_s, active=active):
             self._start(node, self._read(node, now_s, silent=not active))
 
     def verify(self, now_s: float) -> None:
@@ -47,8 +50,10 @@ class Questions:
         node, watchdog = self._guarded[self._turn]
         if not node.station.distrust:
             if node.station.node in self._tasks:
-                return  # it is asked something else: in the next cycle
+                self._keeps_free = node  # it is asked something else: once that is over
+                return
             self._verifying = self._start(node, self._verify(node, watchdog))
+        self._keeps_free = None
         self._turn = (self._turn + 1) % len(self._guarded)
         self._verify_s = now_s + VERIFY_S / len(self._guarded)
 
@@ -73,6 +78,7 @@ class Questions:
         self._tasks.clear()
         self._stopped.clear()
         self._verify_s = float("-inf")
+        self._keeps_free = None
 
     async def close(self) -> None:
         self.stop()

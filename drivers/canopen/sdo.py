@@ -34,9 +34,15 @@ _ABORT = 0x80
 _COMMAND, _EXPEDITED, _SIZED = 0xE0, 0x02, 0x01
 _TIMED_OUT, _NO_SEGMENTS = (code.to_bytes(4, "little") for code in (0x05040000, 0x08000000))
 
+_NO_OBJECT = (0x06020000, 0x06090011)  #: abort codes: no such object, no such sub-index
+
 
 class SdoFailed(Exception):
     """A transfer that did not take place: no answer, or an abort. The text names object and cause."""
+
+
+class SdoNoObject(SdoFailed):
+    """The device says that it has no such object."""
 
 
 class SdoSilent(SdoFailed):
@@ -149,7 +155,7 @@ class SdoBus:
         answered, of_index, of_sub, found = _TRANSFER.unpack(await asyncio.shield(answer))
         if answered == _ABORT:
             (code,) = struct.unpack("<I", found)
-            raise SdoFailed(f"object {index:04X}h sub {sub}: the device aborted: {canopen.SdoAbortedError(code)}")
+            raise _aborted(index, sub, canopen.SdoAbortedError(code))
         if (of_index, of_sub) != (index, sub):
             raise SdoSilent(f"object {index:04X}h sub {sub}: answered was object {of_index:04X}h sub {of_sub}")
         return answered, found
@@ -168,7 +174,7 @@ class SdoBus:
         try:
             return await asyncio.shield(work)
         except canopen.SdoAbortedError as error:
-            raise SdoFailed(f"object {index:04X}h sub {sub}: the device aborted: {error}") from error
+            raise _aborted(index, sub, error) from error
         except canopen.SdoCommunicationError as error:
             raise SdoSilent(f"object {index:04X}h sub {sub}: {error}") from error
 
@@ -194,3 +200,8 @@ class SdoBus:
         threads, self._threads = self._threads, None
         if threads is not None:
             threads.shutdown()
+
+
+def _aborted(index: int, sub: int, error: canopen.SdoAbortedError) -> SdoFailed:
+    kind = SdoNoObject if error.code in _NO_OBJECT else SdoFailed
+    return kind(f"object {index:04X}h sub {sub}: the device aborted: {error}")

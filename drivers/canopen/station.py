@@ -2,19 +2,19 @@
 
 import struct
 
-from canopen.emcy import EmcyError
-
-from drivers.canopen.map_parts import HeartbeatObject, Watchdog
+from drivers.canopen.emergencies import Emergency, EmergencyClass, class_of
+from drivers.canopen.map_parts import EmergencyClasses, HeartbeatObject, Watchdog
 from drivers.scaling import si_per_count
 
 HEARTBEATS_ALLOWED = 1.5  #: producer times without a heartbeat until a node that the line depends on counts as lost
 HEARTBEATS_ALLOWED_AT_REST = 3.0  #: the same while nothing moves by it
+STATUSWORDS_AWAITED = 2  #: until an emergency is a warning: the first one may have been taken before it
 ANSWERS_ALLOWED = 3  #: SYNCs in a row without an answer until a node counts as absent
 
 BOOT_UP, STOPPED, OPERATIONAL, PRE_OPERATIONAL = 0x00, 0x04, 0x05, 0x7F
 START, ENTER_PRE_OPERATIONAL = 0x01, 0x80  #: NMT commands
 _NMT = 0x000  #: COB-ID
-_NMT_NAMES = {STOPPED: "stopped", OPERATIONAL: "operational", PRE_OPERATIONAL: "pre-operational"}
+_NMT_NAMES = {BOOT_UP: "boot-up", STOPPED: "stopped", OPERATIONAL: "operational", PRE_OPERATIONAL: "pre-operational"}
 _EMCY = struct.Struct("<HB5s")
 
 
@@ -24,13 +24,21 @@ def nmt_frame(command: int, node: int) -> tuple[int, bytes]:
 
 
 class Station:
-    """One node. `frames` are the PDOs that it sends with every SYNC.
+    """One node. `frames` are the PDOs that it sends with every SYNC; with `has_statusword` its statusword says whether
 
-    `distrust` is why it is not relied on until the next `prepare`, empty while there is no reason.
+    it is in fault. `distrust` is why it is not relied on until the next `prepare`, empty while there is no reason.
     """
 
     def __init__(
-        self, name: str, node: int, heartbeat: HeartbeatObject, frames: int = 1, watchdog: Watchdog | None = None
+        self,
+        name: str,
+        node: int,
+        heartbeat: HeartbeatObject,
+        frames: int = 1,
+        watchdog: Watchdog | None = None,
+        *,
+        classes: EmergencyClasses | None = None,
+        has_statusword: bool = False,
     ) -> None:
         self.name = name
         self.node = node
@@ -43,10 +51,18 @@ class Station:
         self.nmt_state: int | None = None
         self.heard_s: float | None = None
         self.boot_ups = 0
+        self.heartbeats = 0  #: heard, boot-ups among them
         self.supervised = False  #: must stay operational
-        self.emergency = ""
+        self.emergency = ""  #: of the class fault
+        self.warning: Emergency | None = None  #: of the class warning
+        self._classes = EmergencyClasses() if classes is None else classes
+        self._has_statusword = has_statusword
+        self.undecided: Emergency | None = None  #: its statusword has to say what it means
+        self._statuswords = 0  #: since
         self.distrust = ""
         self.dropped = False  #: was lost while supervised: not fed any more, so that its own watchdog can fire
+        self.withheld = False  #: not fed, to see its watchdog fire
+        self.serial = ""  #: number, as it was read last; empty: it tells none
         self.missed = 0  #: SYNCs in a row that it did not answer in full
         self.awaited = False  #: its answer to the present SYNC is waited for
         self._frames = frames
@@ -71,6 +87,7 @@ class Station:
             raise ValueError(f"a heartbeat has 1 byte, this one {len(data)}")
         self.nmt_state = data[0] & 0x7F
         self.heard_s = now_s
+        self.heartbeats += 1
         self.boot_ups += self.nmt_state == BOOT_UP
         if not self.supervised or self.dropped:
             return
@@ -87,9 +104,43 @@ class Station:
         """An EMCY message; code 00xxh takes the last one back. Raises ValueError for a wrong length."""
         if len(data) != _EMCY.size:
             raise ValueError(f"an EMCY has 8 bytes, this one {len(data)}")
-        code, register, rest = _EMCY.unpack(data)
-        text = EmcyError(code, register, rest, 0.0).get_desc()
-        self.emergency = f"EMCY {code:04X}h {text}".rstrip() + f", error register {register:02X}h" if code >> 8 else ""
+        emergency = Emergency(*_EMCY.unpack(data))
+        self.undecided, self._statuswords = None, 0
+        if not emergency.code >> 8:
+            self.emergency, self.warning = "", None
+            return
+        match class_of(emergency, self._classes, has_statusword=self._has_statusword):
+            case EmergencyClass.FAULT:
+                self.emergency = emergency.text
+            case EmergencyClass.WARNING:
+                self.warning = emergency
+            case EmergencyClass.AS_STATUSWORD:
+                self.undecided = emergency
+
+    def on_statusword(self, *, in_fault: bool) -> None:
+        """What its statusword says of an emergency that it has sent."""
+        if self.undecided is None:
+            return
+        self._statuswords += 1
+        if in_fault:
+            self.emergency, self.undecided = self.undecided.text, None
+        elif self._statuswords >= STATUSWORDS_AWAITED:
+            self.warning, self.undecided = self.undecided, None
+
+    @property
+    def emergency_told(self) -> str:
+        """What its last emergency message said, whatever it means; empty where that is over."""
+        said = self.undecided or self.warning
+        return self.emergency or (said.text if said is not None else "")
+
+    @property
+    def state_name(self) -> str:
+        """Its NMT state as it said it last, in words; empty where it has not."""
+        return "" if self.nmt_state is None else _NMT_NAMES.get(self.nmt_state, f"{self.nmt_state:#x}")
+
+    def recover(self) -> None:
+        """What it told in emergency messages is over."""
+        self.emergency, self.warning, self.undecided = "", None, None
 
     # the cycle
 
@@ -132,5 +183,6 @@ class Station:
         self.supervised = False
         self.missed = 0
         self.distrust = ""
-        self.dropped = False
+        self.dropped = self.withheld = False
+        self.undecided = None
         self._came = 0

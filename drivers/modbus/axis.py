@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from math import floor
 
-from drivers.cia402 import DISABLE_VOLTAGE, drive_state, power_state
+from drivers.cia402 import DISABLE_VOLTAGE, PowerState, drive_state, power_state
 from drivers.modbus.device import (
     WATCHDOG_OFF,
     Check,
@@ -19,12 +19,14 @@ from drivers.modbus.frozen import FrozenAnswers
 from drivers.modbus.maps import DriveMap, Register
 from drivers.modbus.plan import Wish
 from drivers.modbus.registers import Field, RegisterBlock
+from drivers.mode_display import ModeDisplay
 from drivers.power_stage import PowerStage
 from drivers.scaling import speed_per_count, torque_per_count
-from gateway.core.line import Drive, Limits
-from gateway.core.signals import DriveState, Inputs, Outputs
+from gateway.core.line import Drive
+from gateway.core.signals import DriveCondition, DriveState, Inputs, Outputs
 
 _LARGEST = {"i16": 2**15 - 1, "i32": 2**31 - 1, "f32": 3.4e38}  #: counts of a target torque, either way
+_WARNS = int(DriveCondition.WARNS)
 _RATED_TORQUE_TOLERANCE = 1e-3  #: of the line's figure; more would scale every torque wrongly
 
 
@@ -39,8 +41,8 @@ class AxisSettings:
     radius_m: float  #: nominal, of its roller
 
 
-def axis_settings(drive: Drive, limits: Limits, radius_m: float) -> AxisSettings:
-    return AxisSettings(drive.channel, drive.rated_torque_nm, limits.torque_nm, limits.watchdog_s, radius_m)
+def axis_settings(drive: Drive, torque_nm: float, watchdog_s: float, radius_m: float) -> AxisSettings:
+    return AxisSettings(drive.channel, drive.rated_torque_nm, torque_nm, watchdog_s, radius_m)
 
 
 class Axis:
@@ -64,15 +66,19 @@ class Axis:
         self._whole_counts = target.type != "f32"
         self._most_nm = _LARGEST[target.type] / self._counts_per_nm  #: either way
         fields = [self._read_field(entry) for entry in (read.statusword, read.speed, read.torque)]
-        self._sto_at = self._error_at = -1
+        self._sto_at = self._error_at = self._mode_at = -1
         if read.safe_torque_off is not None:
             self._sto_at = _place(fields, self._read_field(read.safe_torque_off))
         if read.error_code is not None:
             self._error_at = _place(fields, self._read_field(read.error_code))
+        self._mode: ModeDisplay | None = None
+        if (displayed := read.mode_displayed) is not None and device.torque_mode is not None:
+            self._mode_at = _place(fields, self._read_field(displayed))
+            self._mode = ModeDisplay(device.torque_mode, at_rest=displayed.shown == "always", certain=True)
         self._write = self._block((write.controlword, write.target_torque), write_offset)
         self.wish = Wish(name, fields, device.word_order, (self._write.address, self._write.count))
         self.proofs = self._what_must_hold()
-        self.stage = PowerStage(device.follows_command)
+        self.stage = PowerStage(device.follows_command, device.voltage_enabled)
         self._state = DriveState.ABSENT
         self._commanded_nm = 0.0
         self._frozen = FrozenAnswers(self._torque_scale)
@@ -162,14 +168,29 @@ class Axis:
         # One that disobeys is shown as it is: whoever reads FAULT takes torque for off.
         self._state = DriveState.FAULT if standing.distrust and not self.stage.disobeys else says
         inputs.drive_state[index] = self._state
+        inputs.power_barred[index] = self.stage.barred
+        self._tell_condition(inputs, numbers)
         if says is not DriveState.FAULT:
             self._told = ""
             return []
         return self._fault_told_once(numbers)
 
+    def _tell_condition(self, inputs: Inputs, numbers: Sequence[float]) -> None:
+        """What it says beside its state, and the code of what it warns of."""
+        index, stage, condition = self._index, self.stage, self.stage.condition
+        if self._mode is not None:
+            enabled = stage.power is PowerState.OPERATION_ENABLED
+            self._mode.on_mode(int(numbers[self._mode_at]), enabled=enabled)
+            condition |= self._mode.condition(enabled=enabled)
+            inputs.drive_mode[index] = int(numbers[self._mode_at])
+        inputs.drive_condition[index] = condition
+        coded = self._error_at >= 0 and condition & _WARNS and stage.state is not DriveState.FAULT
+        inputs.drive_warning[index] = int(numbers[self._error_at]) if coded else 0
+
     def _miss(self, inputs: Inputs, standing: Standing) -> None:
         inputs.speed.miss(self._index)
         inputs.torque.miss(self._index)
+        inputs.power_barred[self._index] = False
         self._state = self._state_unheard(standing)
         inputs.drive_state[self._index] = self._state
 
@@ -217,6 +238,8 @@ class Axis:
 
     def forget(self) -> None:
         self.stage.forget()
+        if self._mode is not None:
+            self._mode.forget()
         self._frozen.forget()
         self._commanded_nm = 0.0
         self._told = ""

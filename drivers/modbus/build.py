@@ -12,6 +12,7 @@ from drivers.modbus.unit import Unit
 from drivers.port import Link
 from drivers.wiring import Wired
 from gateway.core.line import Drive, Line, LinePlc, LoadCell, ModbusTcpBus
+from gateway.core.line_limits import motor_radius_m, motor_torque_limit_nm
 
 Place = tuple[str, int]  #: host and port
 Seat = tuple[Place, int, str]  #: with the unit identifier and what shares it: a family, or a device type
@@ -81,9 +82,10 @@ def _devices(line: Line, wired: Sequence[Wired]) -> list[Device]:
 
 
 def _axis(line: Line, drive: Drive, device: DriveMap) -> Axis:
-    radius_m = line.rollers[drive.roller - 1].radius_m.value
+    radius_m = motor_radius_m(line, drive)
     try:
-        return Axis(drive.name, drive.roller - 1, device, axis_settings(drive, line.limits, radius_m))
+        torque_nm, watchdog_s = motor_torque_limit_nm(line, drive), line.limits.watchdog_s
+        return Axis(drive.name, drive.roller - 1, device, axis_settings(drive, torque_nm, watchdog_s, radius_m))
     except ValueError as error:
         raise ValueError(f"{drive.name}: {error}") from error
 

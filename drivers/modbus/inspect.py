@@ -16,6 +16,7 @@ from drivers.inspection import (
     Progress,
     ReadCell,
     WatchdogFacts,
+    is_supplied,
     sample_cells,
 )
 from drivers.map_fields import Bit
@@ -138,6 +139,9 @@ class _Inspector:
                 error=await self._error(read.error_code, offset) if power in _FAULTS else "",
                 rated_torque_nm=rated,
                 max_torque_nm=maximum,
+                supplied=is_supplied(device.voltage_enabled, status),
+                mode=None if (entry := read.mode_displayed) is None else await self._number(entry, offset),
+                mode_wanted=device.torque_mode,
             ),
         )
 
@@ -171,6 +175,7 @@ class _Inspector:
                 emergency_stop=read.emergency_stop.is_set(word),
                 running=read.running.is_set(word),
                 watchdog_tripped=read.watchdog_tripped.is_set(word),
+                local=read.local is not None and read.local.is_set(word),
                 speed_m_per_s=speed.scaled(si_per_count(read.speed.unit, read.speed.scale)),
             )
         return replace(facts, plc=plc, watchdog=await self._watchdog(device.watchdog))

@@ -5,7 +5,7 @@ counts. What `write` hands over is written with the next `trigger`, in the same 
 """
 
 import asyncio
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence, Set
 
 from drivers.modbus.session import Session
 from drivers.modbus.unit import Unit
@@ -64,6 +64,21 @@ class ModbusLink:
 
     async def _undo(self) -> list[str]:
         return [failure for session in reversed(self._sessions) for failure in await session.settings.undo()]
+
+    @property
+    def serials(self) -> Mapping[str, str]:
+        """None: no register of it is common to devices."""
+        return {}
+
+    @property
+    def watched(self) -> Set[str]:
+        return {device.name for session in self._sessions for device in session.unit.devices if device.wish.write}
+
+    def withhold(self, devices: Set[str]) -> None:
+        """A unit is written whole or not at all."""
+        for session in self._sessions:
+            unit = session.unit
+            unit.withheld = any(device.name in devices for device in unit.devices)
 
     def silence(self) -> None:
         """Nothing is written from now on; reading goes on."""

@@ -5,12 +5,15 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from drivers.map_fields import (
+    UNSEEN_POWER,
     Bit,
     Format,
     Range,
     SpeedUnit,
     TensionUnit,
     TimeUnit,
+    TorqueAccuracy,
+    TorqueFilter,
     TorqueUnit,
     WebSpeedUnit,
     refuse_together,
@@ -25,6 +28,7 @@ from drivers.map_rules import (
     registers_of,
     type_problems,
 )
+from gateway.core.drive_tells import INVERTER_ACCURACY, TORQUE_FILTER_S
 from gateway.core.line import Name, Positive, Strict
 
 MAX_READ_REGISTERS = 125
@@ -143,6 +147,7 @@ class PlcRead(Strict):
     emergency_stop: Bit  #: yes: the emergency stop circuit is open
     running: Bit
     watchdog_tripped: Bit
+    local: Bit | None = None  #: yes: the line is not started from elsewhere
     speed: SpeedRegister
     life_echo: Register
 
@@ -150,6 +155,7 @@ class PlcRead(Strict):
 class PlcWrite(Strict):
     command: Register
     run: Bit
+    warning: Bit | None = None  #: lamp and horn before anything moves
     speed: SpeedRegister
     life: Register
 
@@ -186,8 +192,11 @@ def _plc_type_problems(device: PlcMap) -> list[str]:
     problems += type_problems("write.command", write.command.type, UNSIGNED)
     problems += type_problems("write.life", write.life.type, UNSIGNED)
     problems += bit_problems("write.run", write.run.bit, write.command.type)
-    for name in ("permissive", "emergency_stop", "running", "watchdog_tripped"):
-        problems += bit_problems(f"read.{name}", getattr(read, name).bit, read.status.type)
+    if write.warning is not None:
+        problems += bit_problems("write.warning", write.warning.bit, write.command.type)
+    for name in ("permissive", "emergency_stop", "running", "watchdog_tripped", "local"):
+        if (entry := getattr(read, name)) is not None:
+            problems += bit_problems(f"read.{name}", entry.bit, read.status.type)
     return problems
 
 
@@ -217,12 +226,17 @@ class MaxTorque(ReadTorque):
     writable: bool  #: true: set to the line's limit; false: the drive's own, which must allow the line's limit
 
 
+class ModeRegister(Register):
+    shown: Literal["always", "enabled"] = "always"  #: "enabled": it displays 0 as long as it is not enabled
+
+
 class DriveRead(Strict):
     statusword: Register
     speed: RollerSpeed
     torque: ReadTorque
     safe_torque_off: FlagRegister | None = None
-    error_code: ErrorCode | None = None  #: of a fault
+    error_code: ErrorCode | None = None  #: of a fault, or of a warning
+    mode_displayed: ModeRegister | None = None  #: its mode of operation, where it has several
 
 
 class DriveWrite(Strict):
@@ -242,6 +256,10 @@ class DriveMap(ModbusMap):
     role: Literal["drive"]
     device_id: RegisterCheck
     follows_command: Bit | None = None  #: of the statusword: the target torque is followed, not ignored
+    voltage_enabled: Bit | None = None  #: of the statusword: the power stage is supplied, whether it is on or off
+    torque_mode: int | None = None  #: what `read.mode_displayed` shows while torques are followed
+    torque_accuracy: TorqueAccuracy = INVERTER_ACCURACY
+    torque_filter_s: TorqueFilter = TORQUE_FILTER_S
     read: DriveRead
     write: DriveWrite
     axes: Axes | None = None
@@ -254,6 +272,21 @@ class DriveMap(ModbusMap):
     def speed(self) -> RollerSpeed:
         """The roller's."""
         return self.read.speed
+
+    @property
+    def unseen(self) -> list[str]:
+        """What its answers do not tell, as far as this map says, each with the key that would."""
+        return [] if self.voltage_enabled is not None else [UNSEEN_POWER]
+
+    @property
+    def torques(self) -> tuple[ReadTorque, ReadTorque]:
+        """What it reports, and what it is asked for."""
+        return self.read.torque, self.write.target_torque
+
+    @property
+    def mode(self) -> int | None:
+        """The mode of operation in which torques are followed; None: it has but one."""
+        return self.torque_mode
 
     @model_validator(mode="after")
     def _layout(self) -> "DriveMap":
@@ -300,8 +333,13 @@ def _drive_type_problems(device: DriveMap) -> list[str]:
         problems += [
             f"read.error_code.texts: {key!r} is no number" for key in read.error_code.texts if not _is_number(key)
         ]
-    if device.follows_command is not None:
-        problems += bit_problems("follows_command", device.follows_command.bit, "u16")
+    for key, bit in (("follows_command", device.follows_command), ("voltage_enabled", device.voltage_enabled)):
+        if bit is not None:
+            problems += bit_problems(key, bit.bit, "u16")
+    if (read.mode_displayed is None) != (device.torque_mode is None):
+        problems.append("torque_mode: goes with read.mode_displayed; allowed: both or none")
+    if read.mode_displayed is not None:
+        problems += type_problems("read.mode_displayed", read.mode_displayed.type, ("u16", "i16"))
     rated = device.rated_torque
     if rated is not None and rated.unit == "rated torque":
         problems.append("rated_torque.unit: 'rated torque' of itself says nothing; allowed: Nm, mNm")

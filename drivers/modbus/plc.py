@@ -58,14 +58,16 @@ class Plc:
         low, high = write.speed.range
         if not low <= counts * write.speed.scale <= high:
             raise ValueError(f"speed request {speed_m_per_s} m/s is outside [{low:g}, {high:g}] {write.speed.unit}")
-        return self._encode(outputs.run, counts)
+        return self._encode(outputs.run, outputs.warning, counts)
 
     def rest(self) -> list[int]:
-        return self._encode(False, 0.0)
+        return self._encode(False, False, 0.0)
 
-    def _encode(self, run: bool, speed_counts: float) -> list[int]:
+    def _encode(self, run: bool, warning: bool, speed_counts: float) -> list[int]:
         write = self._device.write
-        word = (run != write.run.inverted) << write.run.bit
+        word = write.run.word(run)
+        if write.warning is not None:
+            word |= write.warning.word(warning)
         speed = speed_counts if write.speed.type == "f32" else round(speed_counts)
         return self._write.encode((word, speed, self._life.next()))
 
@@ -85,7 +87,9 @@ class Plc:
         plc.permissive = read.permissive.is_set(status)
         plc.emergency_stop = read.emergency_stop.is_set(status)
         plc.running = read.running.is_set(status)
-        troubles = [f"{self.name}: its command watchdog has tripped"] if read.watchdog_tripped.is_set(status) else []
+        plc.local = read.local is not None and read.local.is_set(status)
+        plc.tripped = read.watchdog_tripped.is_set(status)
+        troubles = [f"{self.name}: its command watchdog has tripped"] if plc.tripped else []
         low, high = read.speed.range
         if low <= speed * read.speed.scale <= high:
             inputs.unwind_speed.put(0, speed * self._read_speed_scale, time_s)

@@ -46,6 +46,7 @@ class Unit:
         self.unseen_settings = self._proof([setting.kept for setting in self.settings if setting not in self._seen])
         self.dropped = False  #: gave torque and was lost: nothing is written to it before the next `prepare`
         self.commanded = False  #: something was written since it became active
+        self.withheld = False  #: nothing is written to it, to see its watchdogs fire
         self.owes_rest = False  #: silent, and it was commanded before: to be told to rest
         self.was_lost = False  #: silent, and it was dropped before: nothing is written to it
         self._rests = 0  #: that are left
@@ -70,7 +71,7 @@ class Unit:
         standing.active, standing.wrote, standing.distrust, standing.refused = False, False, "", ""
         self.owes_rest |= self.commanded
         self.was_lost |= self.dropped
-        self.dropped = self.commanded = False
+        self.dropped = self.commanded = self.withheld = False
         self._rests = 0
         self._payloads = None
         for device in self.devices:
@@ -88,7 +89,7 @@ class Unit:
         self._payloads = None
         standing = self.standing
         standing.refused = ""
-        if not standing.active or self.dropped or not self._writers:
+        if not standing.active or self.dropped or self.withheld or not self._writers:
             return ""
         registers: list[list[int]] = []
         for device in self._writers:
@@ -115,8 +116,8 @@ class Unit:
             raise ModbusFailed("its identity is not proven on this connection")
 
     def take_rest(self) -> Payloads | None:
-        """What is written now to a unit that has not kept its settings, a few times."""
-        if not self._rests:
+        """What is written now to a unit that has not kept its settings, a few times. Nothing while it is withheld."""
+        if not self._rests or self.withheld:
             return None
         self._rests -= 1
         return self.rest_payloads()

@@ -15,6 +15,7 @@ from drivers.opcua.process import ProcessChannel
 from drivers.port import Link
 from drivers.wiring import Wired
 from gateway.core.line import Drive, Line, LinePlc, LoadCell, OpcUaBus
+from gateway.core.line_limits import motor_radius_m, motor_torque_limit_nm
 
 
 def build(line: Line, devices: Sequence[Wired]) -> tuple[list[Link], list[str]]:
@@ -92,7 +93,7 @@ class _Server:
             address=drive.address,
             channel=drive.channel,
             rated_torque_nm=drive.rated_torque_nm,
-            torque_limit_nm=limits.torque_nm,
+            torque_limit_nm=motor_torque_limit_nm(self._line, drive),
             watchdog_s=limits.watchdog_s,
-            radius_m=self._line.rollers[drive.roller - 1].radius_m.value,
+            radius_m=motor_radius_m(self._line, drive),
         )

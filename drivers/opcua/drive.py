@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 from drivers.cia402 import DISABLE_VOLTAGE, PowerState, power_state
 from drivers.life import LifeCounter
+from drivers.mode_display import ModeDisplay
 from drivers.opcua.maps import DriveMap
 from drivers.opcua.nodes import DeviceNodes, NodeTable, Reading, to_type
 from drivers.opcua.proof import ANSWERS_ALLOWED, Proof, Watchdog
@@ -17,8 +18,9 @@ from drivers.opcua.source_time import STANDS_STILL, SourceTime
 from drivers.opcua.status import describe, is_done
 from drivers.power_stage import PowerStage
 from drivers.scaling import speed_per_count, torque_per_count
-from gateway.core.signals import Channel, DriveState, Inputs, Outputs
+from gateway.core.signals import Channel, DriveCondition, DriveState, Inputs, Outputs
 
+_WARNS = int(DriveCondition.WARNS)
 _RATED_TORQUE_TOLERANCE = 1e-3  #: of the line's figure; more would scale every torque wrongly
 _TORQUE_ON = (PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE, PowerState.FAULT_REACTION)
 _TORQUE_OFF = (
@@ -52,7 +54,7 @@ class Axis:
 
     def __init__(self, device: DriveMap, settings: AxisSettings, table: NodeTable) -> None:
         self.name = settings.name
-        self.stage = PowerStage(device.follows_command)
+        self.stage = PowerStage(device.follows_command, device.voltage_enabled)
         self.missed = ANSWERS_ALLOWED  #: cycles in a row without a usable answer; nothing was heard yet
         self.active = False  #: the link is not silent
         self.distrust = ""
@@ -70,8 +72,13 @@ class Axis:
         self._target_type = target.type
         self.statusword = nodes.place(entries.statusword, entries.statusword.type)
         self._sto, self._error_code = entries.safe_torque_off, entries.error_code
-        optional = [entry for entry in (entries.safe_torque_off, entries.error_code) if entry is not None]
-        cyclic = [entries.statusword, speed, torque, *optional]
+        self._mode: ModeDisplay | None = None
+        displayed = entries.mode_displayed
+        if displayed is not None and device.torque_mode is not None:
+            self._mode = ModeDisplay(device.torque_mode, at_rest=displayed.shown == "always", certain=True)
+        optional = {"sto": entries.safe_torque_off, "mode": displayed, "error": entries.error_code}
+        self._optional = {name: entry for name, entry in optional.items() if entry is not None}  #: in their order
+        cyclic = [entries.statusword, speed, torque, *self._optional.values()]
         self.reads = tuple(nodes.place(entry, entry.type) for entry in cyclic)  #: each cycle
         command = (entries.controlword, target, entries.life)
         self._command_nodes = tuple(nodes.place(entry, entry.type) for entry in command)
@@ -169,11 +176,11 @@ class Axis:
             self.missed += 1
             inputs.speed.reject(index)
             inputs.torque.reject(index)
-            inputs.drive_state[index] = self.state
+            inputs.drive_state[index], inputs.power_barred[index] = self.state, False
             return [f"{self.name}: statusword: {statusword.trouble}"]
         self.missed = 0
         troubles = [f"{self.name}: {self.distrust}"] if self.distrust else []
-        troubles += self._hear(int(statusword.value), optional)
+        troubles += self._hear(inputs, int(statusword.value), optional)
         for channel, what, reading, si_per_count, is_old in (
             (inputs.speed, "speed", speed, self._m_per_s_per_count, old_speed),
             (inputs.torque, "torque", torque, self._nm_per_count, old_torque),
@@ -183,26 +190,44 @@ class Axis:
                 troubles.append(f"{self.name}: {what}: {STANDS_STILL}")
             else:
                 troubles.append(self._put(channel, what, reading, si_per_count, time_s))
-        inputs.drive_state[index] = self.state
+        inputs.drive_state[index], inputs.power_barred[index] = self.state, self.stage.barred
         return [trouble for trouble in troubles if trouble]
 
     def _miss(self, inputs: Inputs) -> None:
         self.missed += 1
         inputs.speed.miss(self._index)
         inputs.torque.miss(self._index)
-        inputs.drive_state[self._index] = self.state
+        inputs.drive_state[self._index], inputs.power_barred[self._index] = self.state, False
 
-    def _hear(self, statusword: int, optional: list[Reading]) -> list[str]:
+    def _hear(self, inputs: Inputs, statusword: int, optional: list[Reading]) -> list[str]:
         troubles: list[str] = []
+        said = dict(zip(self._optional, optional, strict=True))
         safe_torque_off: bool | None = None
         if self._sto is not None:
-            found = optional[0]
+            found = said["sto"]
             safe_torque_off = self._sto.is_set(found.value) if found.good else None
             troubles += [] if found.good else [f"{self.name}: safe torque off: {found.trouble}"]
         self.stage.on_statusword(statusword, safe_torque_off)
-        if self._error_code is not None and self.stage.state == DriveState.FAULT:
-            found = optional[-1]
-            troubles.append(f"{self.name}: fault {int(found.value):04X}h" if found.good else f"{self.name}: fault")
+        error = said.get("error")
+        if error is not None and self.stage.state == DriveState.FAULT:
+            troubles.append(f"{self.name}: fault {int(error.value):04X}h" if error.good else f"{self.name}: fault")
+        return troubles + self._tell_condition(inputs, said.get("mode"), error)
+
+    def _tell_condition(self, inputs: Inputs, mode: Reading | None, error: Reading | None) -> list[str]:
+        """What it says beside its state, and the code of what it warns of; returns what cannot be read."""
+        index, condition, troubles = self._index, self.stage.condition, list[str]()
+        if self._mode is not None and mode is not None:
+            enabled = self.stage.power is PowerState.OPERATION_ENABLED
+            if mode.good:
+                self._mode.on_mode(int(mode.value), enabled=enabled)
+                inputs.drive_mode[index] = int(mode.value)
+            else:
+                self._mode.on_refusal()
+                troubles.append(f"{self.name}: mode of operation: {mode.trouble}")
+            condition |= self._mode.condition(enabled=enabled)
+        inputs.drive_condition[index] = condition
+        coded = error is not None and error.good and condition & _WARNS and self.stage.state != DriveState.FAULT
+        inputs.drive_warning[index] = int(error.value) if coded and error is not None else 0
         return troubles
 
     def _put(self, channel: Channel, what: str, reading: Reading, si_per_count: float, time_s: float) -> str:
@@ -225,6 +250,8 @@ class Axis:
         """Nothing that was true of the drive before counts any more, except that it was heard."""
         self.active = False
         self.stage.forget()
+        if self._mode is not None:
+            self._mode.forget()
         self.distrust = ""
         self._refused = False
         self._command = None

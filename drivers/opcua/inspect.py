@@ -16,6 +16,7 @@ from drivers.inspection import (
     Progress,
     ReadCell,
     WatchdogFacts,
+    is_supplied,
     sample_cells,
 )
 from drivers.opcua.engine import Engine
@@ -146,7 +147,18 @@ class _Inspector:
             rated_nm = rated.value or rated_nm  # "rated torque" is the drive's own, whatever the line's file says
         entry = nodes.max_torque
         maximum = (await self._number(server, entry)).scaled(torque_per_count(entry.unit, entry.scale, rated_nm))
-        drive_facts = DriveFacts(status, power, sto, error, rated, maximum)
+        displayed = nodes.mode_displayed
+        drive_facts = DriveFacts(
+            status,
+            power,
+            sto,
+            error,
+            rated,
+            maximum,
+            supplied=is_supplied(device.voltage_enabled, status),
+            mode=None if displayed is None else await self._number(server, displayed),
+            mode_wanted=device.torque_mode,
+        )
         return replace(facts, drive=drive_facts, watchdog=await self._watchdog(server, device.watchdog))
 
     async def _watchdog(self, server: _Server, entry: WatchdogNode) -> WatchdogFacts:
@@ -157,6 +169,7 @@ class _Inspector:
     async def _ask_plc(self, server: _Server, facts: DeviceFacts, device: PlcMap) -> DeviceFacts:
         read = device.read
         flags = (read.permissive, read.emergency_stop, read.running, read.watchdog_tripped)
+        flags = flags if read.local is None else (*flags, read.local)
         found = [await self._number(server, flag) for flag in flags]
         troubles = [number.trouble for number in found if number.trouble]
         plc = PlcFacts(troubles[0] if troubles else "")
@@ -168,6 +181,7 @@ class _Inspector:
                 emergency_stop=_is_set(read.emergency_stop, found[1]),
                 running=_is_set(read.running, found[2]),
                 watchdog_tripped=_is_set(read.watchdog_tripped, found[3]),
+                local=read.local is not None and _is_set(read.local, found[4]),
                 speed_m_per_s=speed.scaled(si_per_count(read.speed.unit, read.speed.scale)),
             )
         return replace(facts, plc=plc, watchdog=await self._watchdog(server, device.watchdog))
@@ -207,7 +221,7 @@ def _read_entries(device: OpcUaMap) -> list[NodeRef]:
         entries.append(device.watchdog)
     elif isinstance(device, PlcMap):
         read = device.read
-        entries += [read.permissive, read.emergency_stop, read.running, read.watchdog_tripped, read.speed]
+        entries += [read.permissive, read.emergency_stop, read.running, read.watchdog_tripped, read.local, read.speed]
         entries.append(device.watchdog)
     elif isinstance(device, LoadCellMap):
         entries += [device.channel_count, device.sample_counter, device.healthy]

@@ -6,12 +6,13 @@ at a time: while one is not answered, no other is asked, its cycle is missed and
 """
 
 import asyncio
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence, Set
 
 from drivers.opcua.channel import Channel
 from drivers.opcua.drive import Axis
 from drivers.opcua.messages import Answer, Outcome, Question
 from drivers.opcua.nodes import Reading
+from drivers.opcua.plc import Plc
 from drivers.opcua.prepare import Device, NoAnswer, prepare_devices, restore
 from drivers.opcua.proof import ANSWERS_ALLOWED
 from drivers.opcua.release import release_axes
@@ -43,6 +44,7 @@ class OpcUaLink:
         self._to_leave: list[Axis] = []  #: that were written to before the silence, and were not released since
         self._to_leave_on = 0  #: the connection of that
         self._releasing = asyncio.Lock()
+        self._withheld: Set[str] = frozenset()  #: not written to, to see their watchdogs fire
         self._questions_per_proof = max(1, round(PROOF_PERIOD_S / period_s))
         self._unproven = 0  #: questions of cycles since the last that asked for every proof
         self._number = 0  #: of the last question
@@ -94,11 +96,24 @@ class OpcUaLink:
         for device in self._devices:
             device.activate()
 
+    @property
+    def serials(self) -> Mapping[str, str]:
+        """None: numbers are read of devices, and these are texts."""
+        return {}
+
+    @property
+    def watched(self) -> Set[str]:
+        return {device.name for device in self._devices if isinstance(device, Axis | Plc)}
+
+    def withhold(self, devices: Set[str]) -> None:
+        self._withheld = devices
+
     def silence(self) -> None:
         """Nothing is written from now on; reading goes on. Who was written to has to be left in order yet."""
         commanded = [device for device in self._devices if isinstance(device, Axis) and device.may_write]
         if commanded:
             self._to_leave, self._to_leave_on = commanded, self._connection
+        self._withheld = frozenset()
         for device in self._devices:
             device.forget()
 
@@ -135,7 +150,7 @@ class OpcUaLink:
         self._sent_s = now_s
         self._open = 0
         self._readings.clear()
-        writes = [device.take_writes() for device in self._devices]  # sent now or never
+        writes = [self._writes_of(device) for device in self._devices]  # sent now or never
         self._channel.tend(now_s)
         if self._asked is not None:
             if now_s > self._asked.deadline_s + HUNG_S:
@@ -154,6 +169,11 @@ class OpcUaLink:
             self._unproven = 0 if proves_all else self._unproven + 1
             self._open = self._cyclic = self._number
             self._complete.clear()
+
+    def _writes_of(self, device: Device) -> list[tuple[int, float]]:
+        """One that is withheld is not told to take its torque off either: its watchdog has to do it."""
+        writes = device.take_writes()
+        return [] if device.name in self._withheld else writes
 
     async def collect(self, inputs: Inputs, deadline_s: float) -> None:
         """What has come by `deadline_s`."""
@@ -176,7 +196,7 @@ class OpcUaLink:
     def write(self, outputs: Outputs) -> None:
         """What the next question writes."""
         for device in self._devices:
-            if device.active:
+            if device.active and device.name not in self._withheld:
                 try:
                     device.command(outputs)
                 except ValueError as error:

@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from drivers.map_fields import (
+    UNSEEN_POWER,
     Bit,
     Bits,
     Format,
@@ -17,11 +18,14 @@ from drivers.map_fields import (
     SpeedUnit,
     TensionUnit,
     TimeUnit,
+    TorqueAccuracy,
+    TorqueFilter,
     TorqueUnit,
     WebSpeedUnit,
     refuse_together,
 )
 from drivers.map_rules import bit_problems, fit_problems, range_problems
+from gateway.core.drive_tells import INVERTER_ACCURACY, TORQUE_FILTER_S
 from gateway.core.line import Name, Positive, Strict
 
 NumberType = Literal["u8", "i8", "u16", "i16", "u32", "i32", "f32", "f64"]
@@ -138,12 +142,18 @@ class OpcUaMap(Strict):
     identity: Identity
 
 
+class ModeNode(NodeRef):
+    type: Literal["i8", "u8", "i16", "u16", "i32"] = "i8"
+    shown: Literal["always", "enabled"] = "always"  #: "enabled": it displays 0 as long as it is not enabled
+
+
 class DriveNodes(Strict):
     statusword: Count
     speed: Speed
     torque: Torque
     safe_torque_off: Flag | None = None
-    error_code: Count | None = None
+    error_code: Count | None = None  #: of a fault, or of a warning
+    mode_displayed: ModeNode | None = None  #: its mode of operation, where it has several
     rated_torque: Torque | None = None  #: compared with the line's file when it is there
     max_torque: Torque
     controlword: Count
@@ -155,6 +165,10 @@ class DriveMap(OpcUaMap):
     role: Literal["drive"]
     source_time: SourceTimeKind = "sample"
     follows_command: Bit | None = None  #: of the statusword: the target torque is followed, not ignored
+    voltage_enabled: Bit | None = None  #: of the statusword: the power stage is supplied, whether it is on or off
+    torque_mode: int | None = None  #: what `nodes.mode_displayed` shows while torques are followed
+    torque_accuracy: TorqueAccuracy = INVERTER_ACCURACY
+    torque_filter_s: TorqueFilter = TORQUE_FILTER_S
     nodes: DriveNodes
     watchdog: WatchdogNode
 
@@ -163,12 +177,30 @@ class DriveMap(OpcUaMap):
         """The roller's."""
         return self.nodes.speed
 
+    @property
+    def unseen(self) -> list[str]:
+        """What its answers do not tell, as far as this map says, each with the key that would."""
+        return [] if self.voltage_enabled is not None else [UNSEEN_POWER]
+
+    @property
+    def torques(self) -> tuple[Torque, Torque]:
+        """What it reports, and what it is asked for."""
+        return self.nodes.torque, self.nodes.target_torque
+
+    @property
+    def mode(self) -> int | None:
+        """The mode of operation in which torques are followed; None: it has but one."""
+        return self.torque_mode
+
     @model_validator(mode="after")
     def _layout(self) -> "DriveMap":
         problems = _twice_problems({"identity": self.identity, "watchdog": self.watchdog} | _named("nodes", self.nodes))
         problems += self.watchdog.problems()
-        if self.follows_command is not None:
-            problems += bit_problems("follows_command", self.follows_command.bit, self.nodes.statusword.type)
+        for key, bit in (("follows_command", self.follows_command), ("voltage_enabled", self.voltage_enabled)):
+            if bit is not None:
+                problems += bit_problems(key, bit.bit, self.nodes.statusword.type)
+        if (self.nodes.mode_displayed is None) != (self.torque_mode is None):
+            problems.append("torque_mode: goes with nodes.mode_displayed; allowed: both or none")
         rated = self.nodes.rated_torque
         if rated is not None and rated.unit == "rated torque":
             problems.append("nodes.rated_torque.unit: 'rated torque' of itself says nothing; allowed: Nm, mNm")
@@ -212,12 +244,14 @@ class PlcRead(Strict):
     emergency_stop: Flag  #: yes: the emergency stop circuit is open
     running: Flag
     watchdog_tripped: Flag
+    local: Flag | None = None  #: yes: the line is not started from elsewhere
     speed: WebSpeed
     life_echo: Count
 
 
 class PlcWrite(Strict):
     run: Switch
+    warning: Switch | None = None  #: lamp and horn before anything moves
     speed: WebSpeed
     life: Count
 

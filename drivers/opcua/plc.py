@@ -17,8 +17,6 @@ from drivers.scaling import si_per_count
 from gateway.core.line import LinePlc
 from gateway.core.signals import Inputs, Outputs, Quality
 
-_FLAGS = 4  #: readings ahead of speed and echo
-
 
 class Plc:
     """`refusal` is why it is not written to until the next `prepare`, empty while there is no reason."""
@@ -36,15 +34,19 @@ class Plc:
         read, write = device.read, device.write
         self._read_m_per_s_per_count = si_per_count(read.speed.unit, read.speed.scale)
         self._write_m_per_s_per_count = si_per_count(write.speed.unit, write.speed.scale)
-        flags = (read.permissive, read.emergency_stop, read.running, read.watchdog_tripped)
-        self.reads = tuple(nodes.place(entry, entry.type) for entry in (*flags, read.speed, read.life_echo))
+        self._flags = (read.permissive, read.emergency_stop, read.running, read.watchdog_tripped)
+        if read.local is not None:
+            self._flags = (*self._flags, read.local)
+        self.reads = tuple(nodes.place(entry, entry.type) for entry in (*self._flags, read.speed, read.life_echo))
         self._command_nodes = (
             nodes.place(write.run, "bool"),
             nodes.place(write.speed, write.speed.type),
             nodes.place(write.life, write.life.type),
         )
+        self._warning_nodes = () if write.warning is None else (nodes.place(write.warning, "bool"),)
         self._life = LifeCounter()
         self._command: tuple[float, float] | None = None  #: run and speed (counts) of this cycle
+        self._warning: tuple[float, ...] = ()  #: of this cycle, where the PLC has the output
         self._unsaid = ""  #: why there is no command
         self._wrote = False  #: in this cycle, with a life counter
         self._runs = False  #: as it said last
@@ -63,6 +65,8 @@ class Plc:
         low, high = write.speed.range
         if not low <= counts * write.speed.scale <= high:
             raise ValueError(f"speed request {speed_m_per_s} m/s is outside [{low:g}, {high:g}] {write.speed.unit}")
+        if write.warning is not None:
+            self._warning = (float(outputs.warning != write.warning.inverted),)
         self._command = (float(outputs.run != write.run.inverted), to_type(counts, write.speed.type))
         self._unsaid = ""
 
@@ -74,7 +78,8 @@ class Plc:
             return list(zip(self._command_nodes[:2], (float(self._device.write.run.inverted), 0.0), strict=True))
         if command is None or not self._wrote:
             return []
-        return list(zip(self._command_nodes, (*command, self._life.next()), strict=True))
+        nodes = (*self._command_nodes, *self._warning_nodes)
+        return list(zip(nodes, (*command, self._life.next(), *self._warning), strict=True))
 
     def on_written(self, statuses: tuple[int, ...]) -> str:
         """What became of the command; returns what was wrong."""
@@ -118,7 +123,7 @@ class Plc:
         if not self.proof.known:
             self._miss(inputs)
             return list(self.proof.doubts)
-        flags, speed, echo = readings[:_FLAGS], readings[_FLAGS], readings[_FLAGS + 1]
+        flags, (speed, echo) = readings[: len(self._flags)], readings[len(self._flags) :]
         if echo.good and self._life.stands_still(echo.value, moving=self._wrote):
             self._miss(inputs)
             return [f"{self.name}: answers, but its echo of the life counter stands still"]
@@ -127,7 +132,7 @@ class Plc:
         return [*troubles, trouble] if trouble else troubles
 
     def _fill_status(self, inputs: Inputs, time_s: float, flags: tuple[Reading, ...], echo: Reading) -> list[str]:
-        plc, read = inputs.plc, self._device.read
+        plc = inputs.plc
         bad = next((reading for reading in (*flags, echo) if not reading.good), None)
         if bad is not None:
             plc.quality = Quality.BAD
@@ -135,9 +140,10 @@ class Plc:
         # A PLC that can be read but not told to stop is not there for the loop; its v0 is true all the same.
         mute = self.active and (self._unsaid != "" or not self._may_write())
         plc.quality, plc.time_s = Quality.STALE if mute else Quality.GOOD, time_s
-        entries = (read.permissive, read.emergency_stop, read.running, read.watchdog_tripped)
-        said = [entry.is_set(reading.value) for entry, reading in zip(entries, flags, strict=True)]
-        plc.permissive, plc.emergency_stop, plc.running, tripped = said
+        said = [entry.is_set(reading.value) for entry, reading in zip(self._flags, flags, strict=True)]
+        plc.permissive, plc.emergency_stop, plc.running, tripped, *local = said
+        plc.local = any(local)
+        plc.tripped = tripped
         self._runs = plc.running
         troubles = [f"{self.name}: its command watchdog has tripped"] if tripped else []
         if mute:

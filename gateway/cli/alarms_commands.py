@@ -3,7 +3,6 @@
 import asyncio
 import json
 import re
-import time
 from pathlib import Path
 from typing import Annotated, NoReturn
 
@@ -14,6 +13,7 @@ from rich.text import Text
 
 from gateway.cli.operate_commands import REFUSED, UNREACHABLE, Json, RunFolder
 from gateway.cli.status_commands import ask_status, choose_run_folder
+from gateway.cli.status_view import clock_time
 from gateway.core.alarms import LONGEST_SHELVED_S, AcknowledgeAlarm, AlarmSaid, AlarmStatus, ShelveAlarm
 from gateway.core.line_problem import printable
 from gateway.core.messages import Reply
@@ -107,7 +107,7 @@ def _shown(one: AlarmStatus) -> Text:
 
 
 def _clock(wall_s: float | None) -> str:
-    return "-" if wall_s is None else time.strftime("%H:%M:%S", time.localtime(wall_s))
+    return "-" if wall_s is None else clock_time(wall_s)
 
 
 def _seconds(text: str) -> float:

@@ -13,16 +13,18 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
+from gateway.cli.audit_against import why_not_contained, why_not_exported
 from gateway.cli.audit_view import found_in, print_record, print_verification
 from gateway.cli.data_place import data_folder
 from gateway.cli.process_commands import REFUSED, DataFolder, read_line
 from gateway.core.audit_export import RecordLine, blob_line, line_text, wrong_in
+from gateway.core.audit_head import AuditHead, parse_head
 from gateway.core.audit_record import BEFORE_FIRST, NotRecordable, Who
 from gateway.core.line_problem import printable
 from gateway.core.nearest import nearest
 from gateway.supervisor.audit_begin import begin_anew as begin_audit_anew
 from gateway.supervisor.audit_file import FILE_NAME, AuditFile, AuditUnavailable
-from gateway.supervisor.audit_verify import Chained, Verification, chained
+from gateway.supervisor.audit_verify import Chained, chained
 from gateway.supervisor.audit_verify import verify as verify_audit
 
 app = typer.Typer(
@@ -45,8 +47,13 @@ LineOption = Annotated[
 def verify(
     line: LineOption = None,
     data_dir: DataFolder = None,
-    head: Annotated[
-        str | None, typer.Option("--head", help="NUMBER:HEAD of a record, noted elsewhere; it must be there still.")
+    against: Annotated[
+        str | None,
+        typer.Option(
+            "--against",
+            "--head",
+            help="NUMBER:HASH as the log, the page, OPC UA or a report printed it. It must be there still.",
+        ),
     ] = None,
     export_file: Annotated[
         Path | None, typer.Option("--export", help="Verify this export instead; no database is needed.")
@@ -55,24 +62,32 @@ def verify(
 ) -> None:
     """Every record, the chain, what they refer to, and that none is lost at the end.
 
+    Chain and anchor can be made anew together by whoever may write both; a head that lies elsewhere shows it.
+
     Exit code: 0 sound, 1 not sound, 2 refused.
 
     Example: r2rgate audit verify --line line.toml
 
-    Example: r2rgate audit verify --head 301:39103...
+    Example: r2rgate audit verify --against 301:39103...
     """
+    head = _head_of(against)
     if export_file is not None:
-        _verify_export(export_file, as_json)
+        _verify_export(export_file, head, as_json)
         return
     folder = audit_folder(line, data_dir)
     found = verify_audit(folder)
-    if head is not None:
-        _require_head(folder, head, found)
+    missing = "" if head is None else why_not_contained(folder, head)
+    if missing:
+        found.problem(missing)
     if as_json:
         anchor = found.anchor and vars(found.anchor).copy()
-        typer.echo(json.dumps({"folder": str(folder), "sound": found.sound, **vars(found), "anchor": anchor}, indent=2))
+        held = {} if head is None else {"against": str(head), "contained": not missing}
+        document = {"folder": str(folder), "sound": found.sound, **vars(found), "anchor": anchor, **held}
+        typer.echo(json.dumps(document, indent=2))
     else:
         print_verification(found, folder)
+        if head is not None and not missing:
+            typer.echo(f"  it contains {head}")
     raise typer.Exit(0 if found.sound else UNSOUND)
 
 
@@ -204,10 +219,12 @@ def _lines(file: AuditFile, last: int) -> Iterator[str]:
         yield line_text(RecordLine(head=row.head, record=record))
 
 
-def _verify_export(path: Path, as_json: bool) -> None:
+def _verify_export(path: Path, head: AuditHead | None, as_json: bool) -> None:
     try:
         with path.open("rb") as stream:
             wrong = list(wrong_in(stream))
+        if head is not None and (missing := why_not_exported(path, head)):
+            wrong.append(missing)
     except OSError as error:
         refuse(f"{path} cannot be read: {error.strerror}")
     if as_json:
@@ -219,18 +236,11 @@ def _verify_export(path: Path, as_json: bool) -> None:
     raise typer.Exit(UNSOUND if wrong else 0)
 
 
-def _require_head(folder: Path, given: str, found: Verification) -> None:
-    """Adds a problem where a record that somebody has noted elsewhere is not there."""
-    number, _, head = given.partition(":")
-    if not number.isdecimal() or not re.fullmatch(r"[0-9a-f]{64}", head):
-        refuse(f"--head {given}: allowed is NUMBER:HEAD, as verify prints them")
+def _head_of(against: str | None) -> AuditHead | None:
     try:
-        with AuditFile(folder) as file:
-            there = next(file.rows(int(number)), None)
-    except AuditUnavailable:
-        return  # said already
-    if there is None or there.sequence != int(number) or there.head != head:
-        found.problem(f"record {number} is not the one whose head was noted elsewhere, {head}")
+        return None if against is None else parse_head(against)
+    except ValueError as error:
+        refuse(f"--against {against}: {error}")
 
 
 def _require_kind(kind: str, records: list[Chained]) -> None:

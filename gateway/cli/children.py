@@ -36,10 +36,10 @@ class Children:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        with uninterrupted():
-            for name in IN_ORDER:
-                self.end(name)
-        shutil.rmtree(self.run_folder, ignore_errors=True)
+        with uninterrupted(), ExitStack() as ends:  # each, though ending another fails
+            ends.callback(shutil.rmtree, self.run_folder, ignore_errors=True)
+            for name in reversed(IN_ORDER):
+                ends.callback(self.end, name)
 
     def start(self, name: str, *arguments: str | Path) -> None:
         self._running[name] = start([name, *map(str, arguments)], self.log(name))

@@ -26,6 +26,7 @@ from gateway.core.messages import Reply
 from gateway.core.recording import Recording
 from gateway.core.status import GatewayStatus
 from gateway.core.topics import GATEWAY_DECISION, GATEWAY_PROPOSALS, GATEWAY_PROPOSE, GATEWAY_STATUS, Topic
+from gateway.mailbox.inbox import come_again_s
 from gateway.mailbox.port import Mailbox, RemoteError, Unreachable
 from gateway.supervisor import configurations as configurations_store
 from gateway.supervisor import models as models_store
@@ -41,6 +42,7 @@ POLL_S = 0.5
 READY_WITHIN_S = 600.0
 BACK_WITHIN_S = 120.0  #: a gateway that is started anew
 STORED_WITHIN_S = 5.0
+AGAIN_WITHIN_S = 120.0  #: for which a full inbox is waited for
 
 
 class LiveGate:
@@ -141,7 +143,14 @@ class LiveGate:
             await self._pause(POLL_S)
 
     async def propose(self, payload: bytes) -> Reply:
-        return Reply.model_validate_json(await self._ask(GATEWAY_PROPOSE, payload))
+        """Before the gate; where its inbox asks to come again, once it is time to."""
+        began_s = self._clock()
+        while True:
+            reply = Reply.model_validate_json(await self._ask(GATEWAY_PROPOSE, payload))
+            again_s = come_again_s(reply)
+            if again_s is None or self._clock() + again_s - began_s > AGAIN_WITHIN_S:
+                return reply
+            await self._pause(again_s)
 
     async def line_changed(self, because: str) -> None:
         """The line is no longer as it was. Raises CannotGoOn where the gate does not take that."""

@@ -3,11 +3,13 @@
 Everything is what a gateway has, but for the clock, which only this moves, and the judge, which is in this process.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from gateway.cli.commission_changes import LineNow
 from gateway.cli.commission_side import CannotGoOn
@@ -15,16 +17,23 @@ from gateway.cli.stepped import SteppedLoop
 from gateway.core.audit_record import Who
 from gateway.core.controller import canonical as canonical_controller
 from gateway.core.decisions import Archive, Decide, LineChanged, ProposalShown
+from gateway.core.finding import Finding
 from gateway.core.judge_context import JudgeContext
 from gateway.core.line import Line
-from gateway.core.messages import Reply, parse_command
+from gateway.core.messages import Command, Reply
+from gateway.core.proof import Proof
 from gateway.core.recording import Recording, recording_of
 from gateway.core.states import Phase
 from gateway.core.steady_clock import SteadyClock
 from gateway.core.telemetry import Frame, frame_dtype, unpack
-from gateway.core.topics import GATEWAY_DECISION, LOOP_COMMAND
+from gateway.core.topics import GATEWAY_DECISION, LOOP_COMMAND, LOOP_HELLO
 from gateway.core.verdict import Verdict
+from gateway.loop.door import Door
+from gateway.loop.refused import coded, said
 from gateway.mailbox.inprocess import Hub, InProcessMailbox
+from gateway.mailbox.keys import PublicKey
+from gateway.mailbox.seal import LineName, Signer
+from gateway.mailbox.to_loop import ToLoop
 from gateway.supervisor.configurations import Configurations
 from gateway.supervisor.deployer import Deployer
 from gateway.supervisor.experiments import ENDS, MOST_EXPERIMENTS
@@ -98,9 +107,17 @@ class SteppedGate:
         (folder / "controller.json").write_bytes(canonical_controller(loop.config))
         hub = Hub()
         self._mailboxes = InProcessMailbox(hub), InProcessMailbox(hub)
-        self._mailboxes[0].serve(LOOP_COMMAND, self._answer)
+        if before is not None:
+            _go_on(loop, before.loop)
+        key, of = Ed25519PrivateKey.generate(), LineName(self.line.site, self.line.line)
+        self._door = Door(
+            _Behind(loop), of, lambda: PublicKey(key.public_key(), folder), lambda: self.wall_s
+        )  # fmt: skip
+        self._mailboxes[0].serve(LOOP_COMMAND, self._door.command)
+        self._mailboxes[0].serve(LOOP_HELLO, self._door.introduce)
+        to_loop = ToLoop(self._mailboxes[1], Signer(key, of, lambda: self.wall_s))
         self._gate = Gate(
-            self.line, self._mailboxes[1], folder, SteppedJudge(loop, seed), self._around, _unnoted,
+            self.line, self._mailboxes[1], to_loop, folder, SteppedJudge(loop, seed), self._around, _unnoted,
             lambda: self.wall_s, lambda: self.wall_s,  # of one boot, however often the loop is started anew
         )  # fmt: skip
 
@@ -112,6 +129,7 @@ class SteppedGate:
         await self._gate.close()
         for mailbox in self._mailboxes:
             await mailbox.close()
+        self._door.close()
 
     @property
     def gate(self) -> Gate:
@@ -282,8 +300,27 @@ class SteppedGate:
         """All that have been run, the oldest first, each with its end in Unix time."""
         return self._experiments
 
-    async def _answer(self, payload: bytes) -> bytes:
-        return self.loop.command(parse_command(payload)).model_dump_json().encode()
+
+def _go_on(loop: SteppedLoop, before: SteppedLoop) -> None:
+    """As a loop that is started anew goes on with what the one before has kept: its epoch, and as far as it went."""
+    then, now = before.cycle.configurations, loop.cycle.configurations
+    if now.running.hash == then.good.hash:
+        now.running = now.good = replace(now.running, region=then.good.region)
+    now.epoch = then.epoch
+
+
+class _Behind:
+    """A loop in stepped time behind its door. It keeps nothing on a disk, and so no proof."""
+
+    def __init__(self, loop: SteppedLoop) -> None:
+        self._loop = loop
+
+    async def submit(self, command: Command, proof: Proof | None = None) -> Reply:
+        return self._loop.command(command)
+
+    def refused(self, text: str, reasons: Sequence[str | Finding] = ()) -> Reply:
+        state = self._loop.cycle.machine.state.name
+        return Reply(ok=False, state=state, text=text, reasons=said(reasons), findings=coded(reasons))
 
 
 def _unnoted(*_: object, **__: object) -> None:

@@ -11,6 +11,7 @@ from gateway.cli.recordings_table import RecordingRefused
 from gateway.core.controller import Controller, ControllerRefused, parse_controller
 from gateway.core.line import Line
 from gateway.core.line_model import LineModel
+from gateway.files import MOST_BYTES, read_bytes
 from gateway.supervisor.model_store import ModelsError
 from gateway.supervisor.models import FILE_NAME, open_repository
 
@@ -61,7 +62,7 @@ def _of_line(model: LineModel, line: Line, name: str) -> LineModel:
 
 def _controller(path: Path) -> Controller:
     try:
-        return parse_controller(path.read_bytes())
+        return parse_controller(read_bytes(path, MOST_BYTES))
     except OSError as error:
         raise MaterialsRefused(f"{path} cannot be read: {error.strerror}") from error
     except ControllerRefused as error:

@@ -13,7 +13,14 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 
 from gateway.cli.children import ChildFailed, Children
-from gateway.cli.demo_cases import Window, again_after_stops, begin_with_repeats, run_with_repeats, settle_with_repeats
+from gateway.cli.demo_cases import (
+    Window,
+    again_after_stops,
+    begin_with_repeats,
+    prove_with_repeats,
+    run_with_repeats,
+    settle_with_repeats,
+)
 from gateway.cli.demo_failed import DemoFailed, FolderInUse
 from gateway.cli.demo_line import (
     LanguageModelAsked,
@@ -42,10 +49,9 @@ if TYPE_CHECKING:
 
 READY_TIME_S = 20.0
 OPENING = """From a line's file to adapted configurations, each change through the gate, on a simulated line that runs.
-Some five minutes; the first time on a computer some more, to compile. Ctrl-C brings the line to rest and ends all."""
-OPENING_QUICK = (
-    "Both cases on one configuration, without the gate: some 45 s. Ctrl-C brings the line to rest and ends all."
-)
+Some seven minutes; the first time on a computer some more, to compile. Ctrl-C brings the line to rest and ends all."""
+OPENING_QUICK = """Both cases on one configuration, without the gate: some three minutes.
+Ctrl-C brings the line to rest and ends all."""
 NOT_REACHED = "the chain has ended before its aim: {}. The report says which rule refused what, and by how much"
 
 
@@ -176,6 +182,7 @@ async def _story(
             if whole and let_in is not None:
                 await _with_agents(children, setup, operator)
                 operator.panel = await Panel.begin(let_in.script, children.log("client"))
+            await prove_with_repeats(operator)
             await begin_with_repeats(operator)
             if whole:
                 windows, chain = await _whole(operator, setup, stepped)

@@ -152,7 +152,7 @@ def _case(stepped: SteppedAside, trace: CaseTrace, evidence: Evidence) -> CaseRe
         limit_ratio=LIMIT_RATIO,
         tension_min_n=float(tension.min()),
         tension_max_n=float(tension.max()),
-        unsafe_events=sum(begin_s <= event["monotonic_s"] <= end_s for event in recording.of_kind("unsafe")),
+        unsafe_events=int(sum(begin_s <= event["monotonic_s"] <= end_s for event in recording.of_kind("unsafe"))),
         missed_periods=int(missed[-1] - missed[0]),
     )
 

@@ -26,14 +26,23 @@ class Window:
     end_s: float
 
 
+async def prove_with_repeats(operator: Operator) -> None:
+    """That the line is wired as its file says: without it no start."""
+    await _with_repeats(operator, operator.prove, "not proved; once more")
+
+
 async def begin_with_repeats(operator: Operator) -> None:
     """From rest to a line that is being tensioned. Refused, a person reads why and tries again."""
+    await _with_repeats(operator, operator.begin, "not started; once more")
+
+
+async def _with_repeats(operator: Operator, do: Callable[[], Awaitable[None]], story: str) -> None:
     for _ in range(MOST_REPEATS):
         try:
-            return await operator.begin()
+            return await do()
         except DemoFailed as failed:
-            await operator.recover(f"not started; once more ({failed})", str(failed))
-    await operator.begin()
+            await operator.recover(f"{story} ({failed})", str(failed))
+    await do()
 
 
 async def again_after_stops(operator: Operator, do: Callable[[], Awaitable[T]], story: str) -> T:

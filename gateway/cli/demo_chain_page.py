@@ -5,6 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from gateway.cli.audit_against import head_in
 from gateway.cli.demo_adaptations import adaptations_section, selection_section
 from gateway.cli.demo_analysis import CaseTrace, Evidence, trace_of
 from gateway.cli.demo_asked_page import asked_section, in_short
@@ -53,6 +54,7 @@ def page(
             title="r2rgate demonstration",
             origin=f"Line {setup.line.site}/{setup.line.line}, plant {evidence.summary['plant']}",
             when=result.date,
+            audit_head=head_in(setup.data),
             command=result.command,
             versions=result.versions,
             machine=f"{os.cpu_count() or 1} processors. {'. '.join(result.machine)}",

@@ -14,7 +14,8 @@ def demo(
     ),
     seed: Annotated[int, typer.Option(min=0, help="Of the simulated line's noise.")] = 1,
     quick: Annotated[
-        bool, typer.Option("--quick", help="Only both cases on one configuration, without the gate: some 45 s.")
+        bool,
+        typer.Option("--quick", help="Only both cases on one configuration, without the gate: some three minutes."),
     ] = False,
     law: Annotated[
         Literal["lqi", "pid"] | None, typer.Option(help="With --quick: the control law; LQI without it.")
@@ -32,7 +33,7 @@ def demo(
     A simulated six-span line, loop, gateway and agents run in processes of their own, in real time. A first
     configuration, an experiment, a model and a redesign, and once more: agents are asked over their bus which, each is
     judged by the gate and approved by a scripted operator over OPC UA; both cases of the paper run on each
-    configuration. Some five minutes; Ctrl-C brings the line to rest and ends all.
+    configuration. Some seven minutes; Ctrl-C brings the line to rest and ends all.
 
     Exit code: 0 done, 1 failed or not adapted, 130 interrupted before the report.
 
@@ -42,7 +43,7 @@ def demo(
 
     Example, with a language model: r2rgate demo --model qwen3:4b
 
-    Example, a line to play with after a minute: r2rgate demo --quick --stay
+    Example, a line to play with after three minutes: r2rgate demo --quick --stay
     """
     from gateway.cli.demo import run_demo
     from gateway.cli.demo_line import LanguageModelAsked

@@ -16,16 +16,21 @@ from gateway.cli.demo_panel import Panel
 from gateway.cli.demo_people import SCRIPT
 from gateway.cli.demo_progress import Progress
 from gateway.cli.operate_commands import request
+from gateway.cli.prove import prove
 from gateway.cli.status_commands import parse_status
+from gateway.core.finding import Finding
 from gateway.core.messages import Arm, Command, Start, Stop
 from gateway.core.status import GatewayStatus
 from gateway.core.topics import GATEWAY_STATUS
 from gateway.mailbox.paths import GATEWAY_SOCKET
 from gateway.mailbox.port import Unreachable
 from gateway.mailbox.unix import UnixMailbox
+from gateway.wording.catalogue import sentence
 
 LOOK_S = 0.1
-SETTLE_TIME_S = 30.0
+PROOF_REPLY_S = 60.0  #: a drill is answered once it is over
+SETTLE_TIME_S = 60.0  #: a start warns, takes slack up slowly, and tensions the web before it runs
+SLACK_N, SLACK_TIME_S = 2.0, 60.0  #: what a load cell shows of a web that has given way, and how long that may take
 SETTLED_N = 0.6  #: a measured tension this near its set-point has settled (six times the sensors' noise)
 SETTLED_FOR_S = 2.0
 COMMENT = "the demonstration approves what the gate lets through"
@@ -96,6 +101,28 @@ class Operator:
         status = await self.look()
         return status is not None and status.loop.state == "STOP"
 
+    async def prove(self) -> None:
+        """The wiring, with the web at rest. Raises DemoFailed.
+
+        Where no pull can show it, the script answers: the simulated line is wired as its file says, and the proof has
+        by whom that was said.
+        """
+
+        def answered(question: Finding) -> bool:
+            self.progress.step(f"  asked, and answered by {SCRIPT}: {sentence(question)}")
+            return True
+
+        self._stopping = True
+        await self.wait(_slack, SLACK_TIME_S, "the web's giving way")  # of a proof before
+        self.progress.step("proving the wiring: each watchdog, then one drive at a time")
+        proved = await prove(
+            lambda command: request(self.run_folder, command, PROOF_REPLY_S), self.look, answered, SCRIPT,
+            lambda text: self.progress.step(f"  {text}"),
+        )  # fmt: skip
+        if not proved.ok:
+            reply = proved.reply
+            raise DemoFailed(f"{proved.step}: {'; '.join([reply.text, *reply.reasons])}")
+
     async def begin(self) -> None:
         """From rest to a line that is being tensioned."""
         self.progress.step("arming: limits, line PLC, load cells, the drives' watchdogs")
@@ -148,6 +175,10 @@ class Operator:
         if not told.ok:
             raise DemoFailed(f"refused over OPC UA: {told.sentence}")
         return told
+
+
+def _slack(status: GatewayStatus) -> bool:
+    return all(abs(span.tension_n or 0.0) <= SLACK_N for span in status.spans)
 
 
 def _at_rest(status: GatewayStatus) -> bool:

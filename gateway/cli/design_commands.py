@@ -4,6 +4,7 @@ import json
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, nullcontext
+from dataclasses import replace
 from enum import StrEnum
 from os import W_OK, access
 from pathlib import Path
@@ -13,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 import typer
 
 from gateway.cli.operate_commands import RunFolder
-from gateway.cli.process_commands import REFUSED, DataFolder, LineFile, read_line
+from gateway.cli.process_commands import REFUSED, DataFolder, LineFile, default_data_folder, read_line
 from gateway.core.line import Line
 from gateway.core.line_model import LineModel
 
@@ -180,6 +181,7 @@ def _phase(
     as_json: bool,
     asked: "AskedAgents | None",
 ) -> None:
+    from gateway.cli.audit_against import head_in
     from gateway.cli.design_phase import ANSWER_S, RULES_DECIDE, run_design
     from gateway.cli.design_progress import Progress
     from gateway.cli.design_report import page_of
@@ -209,7 +211,8 @@ def _phase(
         _write(out, canonical(found.chosen.config) + b"\n")
     record, report = _beside(out)
     _write(record, (result.model_dump_json(indent=2) + "\n").encode())
-    _write(report, render_page(page_of(result, found)).encode())
+    page = replace(page_of(result, found), audit_head=head_in(default_data_folder(line)))
+    _write(report, render_page(page).encode())
     if as_json:
         typer.echo(result.model_dump_json(indent=2))
     else:

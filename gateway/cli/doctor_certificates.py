@@ -10,6 +10,7 @@ from cryptography import x509
 from gateway.cli.certificates import NoCertificate, Pair, belongs, certificates_of, issued
 from gateway.cli.doctor_check import Check
 from gateway.core.line import Network
+from gateway.files import MOST_BYTES, read_bytes
 from gateway.operator.opcua.trust import CERTIFICATE, PRIVATE_KEY, TRUSTED, NotUsable, certificate_of
 
 GROUP = "certificates"
@@ -55,7 +56,7 @@ def _certificate(
     """The one of a file that ends first."""
     wanted = f"good for {SOON.days} days or longer"
     try:
-        found = read(path.read_bytes())
+        found = read(read_bytes(path, MOST_BYTES))
     except OSError as error:
         return Check(GROUP, name, "", "warning", f"{path} cannot be read: {error.strerror}", wanted, _MEND)
     except NoCertificate as error:
@@ -80,7 +81,7 @@ def _issuer(certificate: Path, authority: Path) -> Iterator[Check]:
     """Nothing where one of them cannot be read: that is told already."""
     wanted = "the authority has signed the certificate"
     try:
-        fits = issued(certificate.read_bytes(), authority.read_bytes())
+        fits = issued(read_bytes(certificate, MOST_BYTES), read_bytes(authority, MOST_BYTES))
     except (OSError, NoCertificate):
         return
     if fits:
@@ -95,7 +96,7 @@ def _private_key(certificate: Path, path: Path) -> Check:
     wanted = "the certificate's, for its owner alone"
     try:
         mode = stat.S_IMODE(path.stat().st_mode)
-        fits = belongs(Pair(certificate.read_bytes(), path.read_bytes()))
+        fits = belongs(Pair(read_bytes(certificate, MOST_BYTES), read_bytes(path, MOST_BYTES)))
     except OSError as error:
         measured = f"{error.filename} cannot be read: {error.strerror}"
         return Check(GROUP, "private key", "", "warning", measured, wanted, _MEND)

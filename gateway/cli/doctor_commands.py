@@ -69,6 +69,7 @@ async def examine(line: Line, run_folder: Path, data_folder: Path, seconds: floa
     """Every check but that of the file."""
     from gateway.cli.doctor_certificates import certificates, opcua_certificates
     from gateway.cli.doctor_clocks import clocks
+    from gateway.cli.doctor_keys import gateway_key
     from gateway.cli.doctor_language_model import language_model
     from gateway.cli.doctor_machine import machine
     from gateway.cli.doctor_permissions import permissions
@@ -76,7 +77,10 @@ async def examine(line: Line, run_folder: Path, data_folder: Path, seconds: floa
     from gateway.operator.opcua.trust import pki_folder
 
     tell("software, permissions, computer, certificates, language model")
-    checks = [*software(), *permissions(line, run_folder, data_folder), *machine(line, data_folder), *clocks()]
+    checks = [
+        *software(), *permissions(line, run_folder, data_folder), gateway_key(line, data_folder),
+        *machine(line, data_folder), *clocks(),
+    ]  # fmt: skip
     now = datetime.now(UTC)
     checks += [*certificates(line.network, now), *opcua_certificates(pki_folder(line, data_folder), now)]
     checks += await language_model(line.agents)
@@ -90,15 +94,21 @@ async def examine(line: Line, run_folder: Path, data_folder: Path, seconds: floa
 
 
 def _file(file: Path) -> list[Check]:
-    """It is valid, or `read_line` had refused it; what is odd about it."""
-    from gateway.cli.line_commands import known_maps
+    """It is valid, or `read_line` had refused it; what is odd about it, and device maps that cannot be used."""
+    from drivers.device_map import load_maps
+    from gateway.cli.line_commands import roles_of
 
-    warnings = check_line(file.read_text(encoding="utf-8"), str(file), known_maps()).warnings
+    maps = load_maps()
+    warnings = check_line(file.read_text(encoding="utf-8"), str(file), roles_of(maps), maps.unusable).warnings
     found = [Check("file", "line", "", "OK", "valid, as `r2rgate check` has it")]
     for warning in warnings:
         found.append(
             Check("file", f"line {warning.line}", "", "warning", f"{warning.key}: {warning.wrong}", warning.allowed)
         )
+    todo = "mend the map, or take the file away: no line can name it; this line does not"
+    for name, (first, *others) in maps.unusable.items():
+        more = f" (and {len(others)} more)" if others else ""
+        found.append(Check("device maps", printable(name), "", "warning", f"{first}{more}", "", todo))
     return found
 
 

@@ -12,10 +12,12 @@ from drivers.inspection import BusFacts, CellFacts, DeviceFacts, DriveFacts, Plc
 from gateway.cli.doctor_check import Check, Verdict
 from gateway.core.can_load import ODD_LOAD, REFUSED_LOAD, bus_load
 from gateway.core.line import Bus, CanopenBus, Drive, Line, LinePlc, LoadCell, ModbusTcpBus
+from gateway.core.line_limits import motor_torque_limit_nm, torque_limit_key
 from gateway.core.line_problem import printable
+from safety.proving import zero_allowed_n
 
 RATED_TOLERANCE = 1e-3  #: of rated and max torque: the drivers refuse to arm beyond it
-NEGATIVE_SHARE = 0.05  #: of a cell's capacity: a tension so far below zero is no web's
+NOISE_DEVIATIONS = 2.0  #: of the readings, that a zero is not sure by
 RESTLESS_SHARE = 0.02  #: of a cell's capacity, standard deviation at rest
 AT_REST_SHARE = 0.01  #: of limits.speed_max_m_per_s
 GROUPS = {Drive: "drives", LoadCell: "load cells", LinePlc: "line PLC"}
@@ -125,7 +127,7 @@ def _watchdog(line: Line, group: str, name: str, watchdog: WatchdogFacts) -> Che
 
 
 def _drive(line: Line, item: Drive, drive: DriveFacts) -> Iterator[Check]:
-    name, limit_nm = item.name, line.limits.torque_nm
+    name, limit_nm, key = item.name, motor_torque_limit_nm(line, item), torque_limit_key(line, item.roller)
     if (rated := drive.rated_torque_nm) is not None:
         wanted = f"{item.rated_torque_nm:g} Nm (rated_torque_nm)"
         wrong = rated.value is None or abs(rated.value - item.rated_torque_nm) > RATED_TOLERANCE * item.rated_torque_nm
@@ -133,12 +135,41 @@ def _drive(line: Line, item: Drive, drive: DriveFacts) -> Iterator[Check]:
         todo = "correct rated_torque_nm: every torque is scaled by it" if wrong else ""
         yield Check("drives", name, "rated torque", "FAIL" if wrong else "OK", measured, wanted, todo)
     if (most := drive.max_torque_nm) is not None:
-        wanted = f"{limit_nm:g} Nm or more (limits.torque_nm)"
+        wanted = f"{limit_nm:g} Nm or more ({key})"
         wrong = most.value is None or most.value < (1.0 - RATED_TOLERANCE) * limit_nm
         measured = f"{most.value:g} Nm" if most.value is not None else f"cannot be read: {most.trouble}"
-        todo = "lower limits.torque_nm, or raise it in the drive" if wrong else ""
+        todo = f"lower {key}, or raise it in the drive" if wrong else ""
         yield Check("drives", name, "max torque", "FAIL" if wrong else "OK", measured, wanted, todo)
     yield _state(name, drive)
+    if not drive.safe_torque_off:  # which takes the supply off, too
+        yield _power(name, drive)
+    if drive.mode_wanted is not None:
+        yield _mode(name, drive, drive.mode_wanted)
+
+
+def _power(name: str, drive: DriveFacts) -> Check:
+    if drive.supplied is None:
+        why = "cannot be seen (no voltage_enabled in its map): without power it is found when it does not enable"
+        return Check("drives", name, "power", "skipped", why)
+    if drive.supplied:
+        return Check("drives", name, "power", "OK", "its power stage is supplied", "supplied")
+    todo = "switch on the supply of its power stage, and check fuses and contactor"
+    return Check("drives", name, "power", "warning", "has no power (voltage enabled, 6041h, = 0)", "supplied", todo)
+
+
+def _mode(name: str, drive: DriveFacts, wanted: int) -> Check:
+    words, mode = f"{wanted} (arming sets it)", drive.mode
+    if mode is None:
+        why = "cannot be seen (no mode_displayed in its map): in another mode it is found by the torque that it gives"
+        return Check("drives", name, "mode", "skipped", why)
+    if mode.value is None:
+        todo = "a drive whose mode cannot be read is not started: correct mode_displayed in its map"
+        return Check("drives", name, "mode", "FAIL", f"cannot be read: {mode.trouble}", words, todo)
+    shown = int(mode.value)
+    if shown in (0, wanted):
+        return Check("drives", name, "mode", "OK", f"{shown}", words)
+    todo = "see who else sets it: another tool, the drive's own program"
+    return Check("drives", name, "mode", "warning", f"{shown}", words, todo)
 
 
 def _state(name: str, drive: DriveFacts) -> Check:
@@ -185,8 +216,12 @@ def _odd_reading(line: Line, item: LoadCell, mean_n: float, spread_n: float, *, 
     if still:
         stop = f"after {line.limits.stuck_s:g} s of one value the moving line is stopped (limits.stuck_s)"
         return "; always the same value", f"press on the roller: does it move? {stop}"
-    if mean_n < -NEGATIVE_SHARE * item.capacity_n:
-        return "; far below zero", "take the web off and zero the cell; is it mounted the right way round?"
+    allowed_n, sure_n = float(zero_allowed_n(line)[item.span - 1]), abs(mean_n) - NOISE_DEVIATIONS * spread_n
+    if sure_n > allowed_n:
+        beyond = f"; a slack web shows at most {allowed_n:.2g} N, either way"
+        if mean_n * (-1.0 if item.sign == "inverted" else 1.0) < 0.0:
+            return beyond, "take the web off and zero the cell; is it mounted the right way round?"
+        return beyond, "if the web is slack, zero the cell; if it is not, slacken it: `r2rgate prove` asks for it"
     if spread_n > RESTLESS_SHARE * item.capacity_n:
         return "; restless at rest", "check shield, ground and filter of the amplifier"
     return "", ""
@@ -208,6 +243,9 @@ def _plc(line: Line, name: str, plc: PlcFacts) -> Iterator[Check]:
     else:
         todo = "the line's own interlocks withhold it: see the PLC"
         yield Check(group, name, "permissive", "warning", "not given", "given", todo)
+    if plc.local:
+        todo = "somebody works at the line: it is not started from here until they have switched it back"
+        yield Check(group, name, "local", "warning", "switched to local", "remote", todo)
     if plc.watchdog_tripped:
         todo = "the next start takes it back; it trips when the gateway was ended while the line ran"
         yield Check(group, name, "command watchdog", "warning", "has tripped", "quiet", todo)

@@ -11,6 +11,7 @@ import typer
 from gateway.cli.operate_commands import REFUSED, UNREACHABLE, Json, RunFolder
 from gateway.cli.process_commands import ControllerFile, DataFolder, LineFile, default_data_folder, read_line
 from gateway.core.line import Line
+from gateway.files import MOST_BYTES, read_bytes
 
 if TYPE_CHECKING:
     from gateway.core.controller import Controller
@@ -152,7 +153,7 @@ def _controller(line: Line, file: Path, given: Path | None, data_dir: Path | Non
 
     path = given or (data_dir or default_data_folder(line)) / "controller.json"
     try:
-        config = parse_controller(path.read_bytes())
+        config = parse_controller(read_bytes(path, MOST_BYTES))
         return config, f"the {config.kind} controller in {path}, {config_hash(config)[:12]}"
     except FileNotFoundError:
         if given is not None:
@@ -181,7 +182,7 @@ def _read(file: Path) -> "Experiment":
     from gateway.core.experiment import ExperimentRefused, parse_experiment
 
     try:
-        return parse_experiment(file.read_bytes())
+        return parse_experiment(read_bytes(file, MOST_BYTES))
     except OSError as error:
         _refuse(f"{file} cannot be read: {error.strerror}; r2rgate experiment design writes an experiment")
     except ExperimentRefused as refused:

@@ -133,6 +133,7 @@ def _identify(
     as_json: bool,
 ) -> None:
     """The work, and what is kept of it; `folder`: the line's, None where nothing is to be stored."""
+    from gateway.cli.audit_against import head_in
     from gateway.cli.identify_align import all_delays, without_offsets
     from gateway.cli.identify_model import model_of_found
     from gateway.cli.identify_outcome import result_of
@@ -173,7 +174,8 @@ def _identify(
         except ModelRefused as refused:
             _end_refused(result_of(data, found.assessments, refused.reasons, None), as_json)
         show("the report")
-        page = render_page(page_of(result, data, found))
+        head = "" if folder is None else head_in(folder)
+        page = render_page(replace(page_of(result, data, found), audit_head=head))
     _write(out, canonical(model) + b"\n")
     _write(report, page.encode())
     kept, problem = _kept(model, found, out, report, folder)

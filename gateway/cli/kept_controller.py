@@ -11,6 +11,7 @@ from typing import Any
 
 from gateway.core.controller import ControllerRefused, canonical, config_hash, parse_controller
 from gateway.core.line import Line
+from gateway.files import MOST_BYTES, read_bytes
 
 CONTROLLER, SOURCE = "controller.json", "controller.source.json"
 
@@ -66,7 +67,7 @@ def kept_controller(line: Line, folder: Path) -> tuple[Path, str]:
 def _hash_of(path: Path) -> str:
     """The hash of the configuration at `path`, as it is written where it cannot be read; "" where there is none."""
     try:
-        payload = path.read_bytes()
+        payload = read_bytes(path, MOST_BYTES)
     except FileNotFoundError:
         return ""
     try:
@@ -77,8 +78,8 @@ def _hash_of(path: Path) -> str:
 
 def _source(path: Path) -> dict[str, Any]:
     try:
-        source = json.loads(path.read_bytes())
-    except (FileNotFoundError, ValueError):
+        source = json.loads(read_bytes(path, MOST_BYTES))
+    except (FileNotFoundError, ValueError, RecursionError):
         return {}
     return source if isinstance(source, dict) else {}
 

@@ -2,8 +2,9 @@
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from enum import StrEnum
+from errno import EFBIG
 from pathlib import Path
 from shlex import quote
 from typing import Annotated, Any, NoReturn
@@ -11,7 +12,9 @@ from typing import Annotated, Any, NoReturn
 import numpy as np
 import typer
 
-from drivers.device_map import MAPS, load_map, map_names
+from drivers.device_map import Maps, load_maps
+from drivers.registry import unnamed_reactions, unseen
+from gateway.cli.plc_signals import missing_plc_signals
 from gateway.core.can_load import REFUSED_LOAD, bus_load
 from gateway.core.line import Bus, CanopenBus, Line, OpcUaBus
 from gateway.core.line_checks import Role
@@ -21,6 +24,7 @@ from gateway.core.line_rules_process import recipe_torque
 from gateway.core.line_rules_wiring import devices
 from gateway.core.line_template import MOST_SPANS, line_template
 from gateway.core.line_template_wiring import Wiring
+from gateway.files import NotText, read_text
 
 REFUSED = 2  #: exit code; 1 is left to crashes
 _LARGEST_FILE_BYTES = 1_000_000
@@ -77,41 +81,58 @@ def check(
     Example: r2rgate check line.toml
     """
     source = printable(str(file))
+    maps = load_maps()
     try:
-        checked = check_line(_read(file, source), source, known_maps())
+        text = read_line_text(file, source)
+        checked = check_line(text, source, roles_of(maps), maps.unusable)
+        checked.warnings.extend(missing_plc_signals(text, source, checked.line))
     except LineRefused as refused:
         _print_refused(source, refused.problems, as_json)
         raise typer.Exit(REFUSED) from None
+    checked = CheckedLine(checked.line, [*checked.warnings, *unusable_map_warnings(maps)])
     if as_json:
         warnings = [asdict(warning) for warning in checked.warnings]
         summary = summary_of(checked.line)
-        _print_json({"file": source, "valid": True, "problems": [], "warnings": warnings, "summary": summary})
+        result = {"file": source, "valid": True, "problems": [], "warnings": warnings, "summary": summary}
+        drilled_only = unnamed_reactions(checked.line)
+        _print_json({**result, "unseen": unseen(checked.line), "reaction_unnamed": drilled_only})
     else:
         typer.echo(_valid_in_words(source, checked))
 
 
 def known_maps() -> Mapping[str, Role]:
-    """Protocol, role and family of every device type that the drivers have a map for."""
-    maps = {name: load_map(MAPS / f"{name}.toml") for name in map_names()}
-    families = {name: getattr(device, "family", None) or "" for name, device in maps.items()}
-    return {name: (device.protocol, device.role, families[name]) for name, device in maps.items()}
+    """Protocol, role and family of every device type that the drivers have a usable map for."""
+    return roles_of(load_maps())
 
 
-def _read(file: Path, source: str) -> str:
-    """The file's text. Raises LineRefused where it is no text file."""
+def roles_of(maps: Maps) -> Mapping[str, Role]:
+    """Protocol, role and family of every usable map."""
+    families = {name: getattr(device, "family", None) or "" for name, device in maps.usable.items()}
+    return {name: (device.protocol, device.role, families[name]) for name, device in maps.usable.items()}
+
+
+def unusable_map_warnings(maps: Maps) -> list[Problem]:
+    """Maps that have mistakes, for whoever looks at a line that names none of them."""
+    found: list[Problem] = []
+    for first, *others in maps.unusable.values():
+        more = f" (and {len(others)} more)" if others else ""
+        wrong = f"this device map is not usable; no device of this line names it: {first.wrong}{more}"
+        found.append(replace(first, wrong=wrong))
+    return found
+
+
+def read_line_text(file: Path, source: str) -> str:
+    """The text of a line's file, called `source` in messages. Raises LineRefused where it is no text file."""
     try:
-        with file.open("rb") as stream:
-            data = stream.read(_LARGEST_FILE_BYTES + 1)
+        return read_text(file, _LARGEST_FILE_BYTES)
     except OSError as error:
+        if error.errno == EFBIG:
+            raise LineRefused([Problem(source, 1, "", "", "is larger than 1 MB: no line description")]) from None
         advice = " (r2rgate init writes one)" if isinstance(error, FileNotFoundError) else ""
         raise LineRefused([Problem(source, 1, "", "", f"cannot be read: {error.strerror}{advice}")]) from None
-    if len(data) > _LARGEST_FILE_BYTES:
-        raise LineRefused([Problem(source, 1, "", "", "is larger than 1 MB: no line description")])
-    try:
-        return data.decode("utf-8")
-    except UnicodeDecodeError as error:
-        line = data.count(b"\n", 0, error.start) + 1
-        raise LineRefused([Problem(source, line, "", "", "is not UTF-8 here: save the file as UTF-8")]) from None
+    except NotText as error:
+        wrong = "is not UTF-8 here: save the file as UTF-8"
+        raise LineRefused([Problem(source, error.line, "", "", wrong)]) from None
 
 
 def _refuse(message: str) -> NoReturn:
@@ -186,6 +207,12 @@ def _valid_in_words(source: str, checked: CheckedLine) -> str:
     spans = f"{summary['spans']} {_count(summary['spans'], 'span')}{draw}"
     timing = f"period {1e3 * summary['period_s']:g} ms, latency {1e3 * summary['latency_s']:g} ms"
     text = [f"warning: {warning}" for warning in checked.warnings]
+    text += [f"note: {note}: say in the map where the drive tells it" for note in unseen(checked.line)]
+    if maps := unnamed_reactions(checked.line):
+        text.append(
+            f"note: no option code says what a watchdog does in device map {', '.join(maps)}: "
+            "only the drill of `r2rgate prove` shows it"
+        )
     text.append(f"{source}: valid. {summary['site']}/{summary['line']}: {spans}; {timing}")
     text += [f"  {row}" for row in _bus_rows(summary["buses"])]
     for recipe in summary["recipes"]:

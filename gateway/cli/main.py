@@ -31,6 +31,7 @@ from gateway.cli import (
     pki_commands,
     process_commands,
     proposal_commands,
+    prove_commands,
     recordings_export,
     refine_commands,
     rehearse_commands,
@@ -78,6 +79,7 @@ app.command(rich_help_panel=PROCESSES)(demo_commands.demo)
 app.add_typer(fault_commands.app, rich_help_panel=PROCESSES)
 app.command(rich_help_panel=LINE)(operate_commands.arm)
 app.command(rich_help_panel=LINE)(operate_commands.start)
+app.command("prove", rich_help_panel=LINE)(prove_commands.prove_wiring)
 app.command(rich_help_panel=LINE)(operate_commands.hold)
 app.command(rich_help_panel=LINE)(operate_commands.stop)
 app.command("set", rich_help_panel=LINE, context_settings=NUMBERS)(operate_commands.set_tension)
@@ -89,6 +91,7 @@ app.command(rich_help_panel=OVERSIGHT)(proposal_commands.proposals)
 app.command(rich_help_panel=OVERSIGHT)(proposal_commands.approve)
 app.command(rich_help_panel=OVERSIGHT)(proposal_commands.reject)
 app.command(rich_help_panel=OVERSIGHT)(proposal_commands.rollback)
+app.command(rich_help_panel=OVERSIGHT)(proposal_commands.confirm)
 app.add_typer(alarms_commands.app, rich_help_panel=OVERSIGHT)
 app.command(rich_help_panel=EVIDENCE)(report_commands.report)
 app.command(rich_help_panel=EVIDENCE)(agents_commands.log)

@@ -3,6 +3,7 @@
 import json
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
@@ -180,6 +181,7 @@ def report(
     Example: r2rgate models report --out models.html
     """
 
+    from gateway.cli.audit_against import head_in
     from gateway.cli.models_report import page_of
     from gateway.cli.origin import command_line, machine, now_iso, versions_of
     from gateway.cli.report.page_render import render_page
@@ -194,6 +196,7 @@ def report(
     except ModelsError as error:
         _refuse(error)
     page = page_of(*lines[0], entries, now_iso(), command_line(), versions_of(LIBRARIES), machine())
+    page = replace(page, audit_head=head_in(place.path.parent))
     _write(out, render_page(page).encode())
     typer.echo(f"report: {out}, {len(entries)} version{'' if len(entries) == 1 else 's'}")
 

@@ -8,10 +8,11 @@ from typing import Annotated, NoReturn
 import typer
 from pydantic import ValidationError
 
+from gateway.cli.stop_line import stop_line
 from gateway.core.messages import Arm, Command, Hold, Reply, SelectRecipe, SetSpeed, SetTension, Start, Stop
-from gateway.core.topics import GATEWAY_COMMAND, LOOP_COMMAND, Topic
+from gateway.core.topics import GATEWAY_COMMAND
 from gateway.mailbox.listener import PathTooLong
-from gateway.mailbox.paths import GATEWAY_SOCKET, LOOP_SOCKET
+from gateway.mailbox.paths import GATEWAY_SOCKET
 from gateway.mailbox.port import Unreachable
 from gateway.mailbox.unix import UnixMailbox
 
@@ -49,6 +50,8 @@ def hold(run_dir: RunFolder = None, as_json: Json = False) -> None:
 
 def stop(run_dir: RunFolder = None, as_json: Json = False) -> None:
     """Controlled stop: ramp to standstill, then torque off. Straight to the loop, also when the gateway is gone.
+
+    It is done once the loop shows it; what only says so is not believed.
 
     It is no emergency stop: that is hard-wired, beside the line.
 
@@ -106,7 +109,9 @@ def recipe(
 
 async def request(run_folder: Path, command: Command, timeout_s: float = REPLY_TIME_S) -> Reply:
     """Send one command and wait for its reply. Raises Unreachable and PathTooLong."""
-    topic, socket = _way(command)
+    if isinstance(command, Stop):
+        return await stop_line(run_folder, timeout_s)
+    topic, socket = GATEWAY_COMMAND, GATEWAY_SOCKET
     mailbox = UnixMailbox()
     mailbox.connect({topic}, run_folder / socket)
     try:
@@ -127,10 +132,6 @@ def _require_number(value: float, unit: str, allowed: str) -> None:
 def _refuse(text: str) -> NoReturn:
     typer.echo(text, err=True)
     raise typer.Exit(REFUSED)
-
-
-def _way(command: Command) -> tuple[Topic, str]:
-    return (LOOP_COMMAND, LOOP_SOCKET) if isinstance(command, Stop) else (GATEWAY_COMMAND, GATEWAY_SOCKET)
 
 
 def send(command: Command, run_dir: Path | None, as_json: bool, timeout_s: float = REPLY_TIME_S) -> None:

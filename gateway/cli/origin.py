@@ -30,4 +30,5 @@ def versions_of(libraries: Sequence[str]) -> dict[str, str]:
 def machine_lines(log: Path) -> list[str]:
     """What this computer is, and what it granted the loop, in the loop's own words."""
     said = log.read_text(errors="replace").splitlines() if log.exists() else []
-    return [machine(), *(text for text in said if "SILENT" not in text)]
+    silent = next((number for number, text in enumerate(said) if "is SILENT" in text), -1)  # before: of line and wiring
+    return [machine(), *said[silent + 1 :]]

@@ -10,6 +10,7 @@ from datetime import datetime
 from pathlib import Path
 
 from gateway.cli.certificates import Authority, NoCertificate, Pair, Purpose
+from gateway.files import MOST_BYTES, read_bytes
 
 AUTHORITY, GATEWAY = "authority", "gateway"  #: names of files
 
@@ -79,7 +80,7 @@ def pair_there(folder: Path, name: str) -> Pair | None:
         return None
     if len(found) == 1:
         raise PkiRefused(f"{found[0]} is there without the other of its pair: bring that back, or move it away")
-    pair = Pair(certificate.read_bytes(), key.read_bytes())
+    pair = Pair(read_bytes(certificate, MOST_BYTES), read_bytes(key, MOST_BYTES))
     try:
         _ = pair.until
     except NoCertificate as error:

@@ -16,6 +16,7 @@ import typer
 from gateway.cli.process_commands import REFUSED, DataFolder, default_data_folder, read_line
 from gateway.core.line_problem import printable
 from gateway.core.line_rules_opcua import is_host
+from gateway.files import MOST_BYTES, read_bytes
 
 if TYPE_CHECKING:
     from gateway.cli.pki_bus import Kept
@@ -118,7 +119,7 @@ def trust(
 
     line = read_line(line_file)
     try:
-        path = trusted(pki_folder(line, data_dir or default_data_folder(line)), file.read_bytes())
+        path = trusted(pki_folder(line, data_dir or default_data_folder(line)), read_bytes(file, MOST_BYTES))
     except NotUsable as error:
         _refuse(f"{file} is not trusted: {error}")
     except OSError as error:

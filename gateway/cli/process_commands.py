@@ -10,10 +10,12 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
-from gateway.cli.line_commands import known_maps
+from drivers.device_map import load_maps
+from gateway.cli.line_commands import read_line_text, roles_of
 from gateway.core.line import Line
 from gateway.core.line_file import load_line
-from gateway.core.line_problem import LineRefused
+from gateway.core.line_problem import LineRefused, printable
+from gateway.files import MOST_BYTES, read_bytes
 from gateway.mailbox.paths import default_run_folder
 
 if TYPE_CHECKING:
@@ -32,14 +34,13 @@ ControllerFile = Annotated[
 
 def read_line(file: Path) -> Line:
     """The line of `file`; every problem goes to standard error and ends the command with code 2."""
+    maps = load_maps()
+    source = printable(str(file))
     try:
-        return load_line(file.read_text(encoding="utf-8"), str(file), known_maps())
+        return load_line(read_line_text(file, source), source, roles_of(maps), maps.unusable)
     except LineRefused as refused:
         for problem in refused.problems:
             typer.echo(str(problem), err=True)
-    except (OSError, UnicodeDecodeError) as error:
-        why = error.strerror if isinstance(error, OSError) else error
-        typer.echo(f"{file} cannot be read: {why}; r2rgate init writes a line.toml", err=True)
     raise typer.Exit(REFUSED)
 
 
@@ -82,7 +83,7 @@ def loop(
     path = controller or (data_dir or default_data_folder(line)) / "controller.json"
     way_out = f"r2rgate design {quote(str(file))} --out {quote(str(path))}"
     try:
-        config = parse_controller(path.read_bytes())
+        config = parse_controller(read_bytes(path, MOST_BYTES))
     except FileNotFoundError:
         _refuse(f"there is no controller configuration at {path}: {way_out} writes one")
     except OSError as error:
@@ -194,6 +195,7 @@ def run(
     _require_alone(run_folder)
     writable_folder(run_folder, "--run-dir", 0o700)
     writable_folder(data, "--data-dir")
+    _require_key(data)
     opening: list[str] = []
     if controller is None:
         try:
@@ -222,6 +224,16 @@ def writable_folder(path: Path, option: str, mode: int = 0o777) -> Path:
     if why:
         _refuse(f"the folder {path} cannot be used: {why}; name one that you may write with {option}")
     return path
+
+
+def _require_key(data: Path) -> None:
+    """The gateway's key, before the loop looks for what it is known by."""
+    from gateway.mailbox.keys import KeyUnusable, private_key
+
+    try:
+        private_key(data)
+    except KeyUnusable as error:
+        _refuse(str(error))
 
 
 def _require_plant(line: Line, file: Path, plant_file: Path) -> None:

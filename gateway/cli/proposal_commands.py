@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import time
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -15,7 +16,15 @@ from gateway.cli.operate_commands import REFUSED, UNREACHABLE, Json, RunFolder
 from gateway.cli.proposal_view import print_list, print_shown
 from gateway.cli.waiting import interruptible, progress
 from gateway.core.controller import ControllerRefused, parse_controller
-from gateway.core.decisions import Decide, ListProposals, ProposalList, ProposalShown, RollBackNow, ShowProposal
+from gateway.core.decisions import (
+    Confirm,
+    Decide,
+    ListProposals,
+    ProposalList,
+    ProposalShown,
+    RollBackNow,
+    ShowProposal,
+)
 from gateway.core.experiment import ExperimentRefused, parse_experiment
 from gateway.core.line_model import ModelRefused, parse_model
 from gateway.core.messages import Reply
@@ -30,6 +39,8 @@ from gateway.core.proposal import (
     proposal_hash,
 )
 from gateway.core.topics import GATEWAY_DECISION, GATEWAY_PROPOSALS, GATEWAY_PROPOSE, Topic
+from gateway.files import MOST_BYTES, read_bytes
+from gateway.mailbox.inbox import come_again_s
 from gateway.mailbox.listener import PathTooLong
 from gateway.mailbox.paths import GATEWAY_SOCKET
 from gateway.mailbox.port import Unreachable
@@ -38,6 +49,7 @@ from gateway.mailbox.unix import UnixMailbox
 REPLY_TIME_S = 20.0  #: a deployment is built and read back before it is answered
 POLL_S = 0.25
 JUDGED_WITHIN_S = 240.0
+AGAIN_WITHIN_S = 30.0  #: for which a full inbox is waited for
 LONG_S = 30.0  #: no verdict takes that long once the judge has begun
 
 Which = Annotated[str, typer.Argument(help="The proposal's hash, or its first letters (at least 6).")]
@@ -78,7 +90,7 @@ def propose(
     content = _read(file) if _names_file(file) else _stored(run_dir, what)
     listed = _listed(run_dir)
     payload = content if _is_proposal(content) else canonical(_made(file, content, reason, author, hours, listed))
-    reply = Reply.model_validate_json(_ask(run_dir, GATEWAY_PROPOSE, payload))
+    reply = _proposed(run_dir, payload)
     if not reply.ok or not wait:
         _end_with(reply, as_json)
         return
@@ -147,6 +159,30 @@ def rollback(comment: Comment = "", run_dir: RunFolder = None, as_json: Json = F
     _end_with(Reply.model_validate_json(_ask(run_dir, GATEWAY_DECISION, command.model_dump_json().encode())), as_json)
 
 
+def confirm(
+    which: Annotated[str, typer.Argument(help="Hash of what is in service, or its beginning.")],
+    because: Annotated[str, typer.Option("--because", help="How it came to be there, for the record.")],
+    run_dir: RunFolder = None,
+    as_json: Json = False,
+) -> None:
+    """Answer for a configuration that nobody has judged: a first one, or one that no record explains.
+
+    A first one is guarded as such no more; one that no record explains may be armed. Either goes no further than a
+    first configuration until another one is approved.
+
+    Example: r2rgate confirm 3f2a91 --because "exchanged by hand after the repair"
+    """
+    found = ProposalList.model_validate_json(
+        _ask(run_dir, GATEWAY_PROPOSALS, ListProposals().model_dump_json().encode())
+    )
+    if found.in_service is None or not found.in_service.startswith(which):
+        _refuse(
+            f"in service is {(found.in_service or 'nothing that is known')[:12]}, not {which}: nothing is confirmed"
+        )
+    command = Confirm(configuration=found.in_service, because=because)
+    _end_with(Reply.model_validate_json(_ask(run_dir, GATEWAY_DECISION, command.model_dump_json().encode())), as_json)
+
+
 def _decide(
     which: str, approve: bool, comment: str, yes: bool, script: str, run_dir: Path | None, as_json: bool
 ) -> None:
@@ -163,7 +199,7 @@ def _decide(
 
 def _read(file: Path) -> bytes:
     try:
-        return file.read_bytes()
+        return read_bytes(file, MOST_BYTES)
     except OSError as error:
         _refuse(f"{file} cannot be read: {error.strerror}")
 
@@ -198,6 +234,17 @@ def _is_proposal(content: bytes) -> bool:
     except (ValueError, RecursionError):
         return False
     return isinstance(document, dict) and "change" in document
+
+
+def _proposed(run_dir: Path | None, payload: bytes) -> Reply:
+    """Where others have filled the inbox, asked again once it is time to; for a while."""
+    began_s = time.monotonic()
+    while True:
+        reply = Reply.model_validate_json(_ask(run_dir, GATEWAY_PROPOSE, payload))
+        again_s = come_again_s(reply)
+        if again_s is None or time.monotonic() + again_s - began_s > AGAIN_WITHIN_S:
+            return reply
+        time.sleep(again_s)
 
 
 def _made(file: Path, content: bytes, reason: str, author: str, hours: float, listed: ProposalList) -> Proposal:

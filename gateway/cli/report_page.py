@@ -88,6 +88,7 @@ def page_of(line: Line, folder: Path, since_s: float, records: LineRecords, tell
         command=command_line(),
         versions=versions_of(LIBRARIES),
         machine=machine(),
+        audit_head=f"{records.found.records}:{records.found.head}" if records.found.records else "",
         answer=tuple(_answer(told, chosen, cases, found)),
         sections=tuple(sections),
         notes=(

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal, NoReturn, TypeVar, get_args
 import typer
 from rich.console import Console, RenderableType
 
-from drivers.device_map import MAPS, load_map, map_names
+from drivers.device_map import Maps, load_maps
 from gateway.cli.scan_view import can_scan, modbus_scan, opcua_scan, register_table
 from gateway.cli.waiting import progress, run_until_done
 from gateway.core.line import CanopenBus
@@ -79,9 +79,10 @@ def canopen(
         }
     )
     where = f"{interface} {channel}" + (f":{port}" if port is not None else "")
+    maps = _load_maps()
     try:
         with progress() as tell:
-            found = run_until_done(scan(config, seconds, _maps_of(CanMap), tell))
+            found = run_until_done(scan(config, seconds, _maps_of(CanMap, maps), tell))
     except OSError as error:
         _nothing(str(error))
     if as_json:
@@ -99,6 +100,7 @@ def canopen(
                 "frames": frames,
                 "not_asked": found.not_asked,
                 "errors": found.errors,
+                "unusable_maps": _unusable(maps),
             }
         )
     else:
@@ -152,10 +154,11 @@ def modbus(
         _refuse(f"{printable(host)}: say the port by itself: {printable(name)} --port {last}")
     _require_no_loop(other_bus)
     if register is None:
+        maps = _load_maps()
         with progress() as tell:
-            found = run_until_done(scan(host, port, numbers, _maps_of(ModbusMap), tell))
+            found = run_until_done(scan(host, port, numbers, _maps_of(ModbusMap, maps), tell))
         if as_json:
-            _print_json(asdict(found))
+            _print_json({**asdict(found), "unusable_maps": _unusable(maps)})
         elif found.units:
             _print(modbus_scan(found))
         if not found.connected:
@@ -212,24 +215,36 @@ def opcua(
 
     if under and not is_node_id(under):
         _refuse(f"--under {printable(under)} is no node; allowed: as ns=2;s=Name or i=85")
+    maps = _load_maps()
     try:
         with progress() as tell:
-            found = run_until_done(scan(endpoint, under, _maps_of(OpcUaMap), tell, most))
+            found = run_until_done(scan(endpoint, under, _maps_of(OpcUaMap, maps), tell, most))
     except ScanFailed as error:
         _nothing(
             f"{endpoint}: {printable(str(error))}: is the server on, is this its address and port, does a firewall "
             "stand between?"
         )
     if as_json:
-        _print_json(asdict(found))
+        _print_json({**asdict(found), "unusable_maps": _unusable(maps)})
     else:
         _print(opcua_scan(found))
 
 
-def _maps_of(kind: type[M]) -> Mapping[str, M]:
-    """The maps of one protocol by name. Raises MapRefused for one that is broken."""
-    maps = {name: load_map(MAPS / f"{name}.toml") for name in map_names()}
-    return {name: device for name, device in maps.items() if isinstance(device, kind)}
+def _maps_of(kind: type[M], maps: Maps) -> Mapping[str, M]:
+    """The usable maps of one protocol by name."""
+    return {name: device for name, device in maps.usable.items() if isinstance(device, kind)}
+
+
+def _load_maps() -> Maps:
+    """All maps; what is wrong with those that cannot be used goes to standard error, and the scan goes on."""
+    maps = load_maps()
+    for reason in _unusable(maps):
+        print(f"this device map is not usable, and not compared: {reason}", file=sys.stderr)
+    return maps
+
+
+def _unusable(maps: Maps) -> list[str]:
+    return [str(problem) for problems in maps.unusable.values() for problem in problems]
 
 
 def _is_multicast(channel: str) -> bool:

@@ -4,6 +4,9 @@ import tomllib
 from pathlib import Path
 
 from gateway.core.scenario import PAPER, Scenario, ScenarioRefused, scenario_of
+from gateway.files import read_text
+
+MOST_BYTES = 1_000_000
 
 
 def load_scenario(given: str) -> Scenario:
@@ -12,12 +15,12 @@ def load_scenario(given: str) -> Scenario:
     if given in known:
         return known[given]
     try:
-        document = tomllib.loads(Path(given).read_text(encoding="utf-8"))
+        document = tomllib.loads(read_text(Path(given), MOST_BYTES))
     except OSError as error:
         raise ScenarioRefused(
             f"{given} cannot be read: {error.strerror}; allowed: {', '.join(known)}, or a TOML file"
         ) from error
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+    except (ValueError, RecursionError) as error:
         raise ScenarioRefused(f"{given} is no TOML: {error}") from error
     try:
         return scenario_of(document)

@@ -2,6 +2,7 @@
 
 import asyncio
 import csv
+import json
 import signal
 import sys
 import time
@@ -19,6 +20,7 @@ from rich.live import Live
 from rich.text import Text
 
 from gateway.cli.status_view import render
+from gateway.core.clean_text import clean_texts
 from gateway.core.status import GatewayStatus
 from gateway.core.topics import GATEWAY_STATUS
 from gateway.mailbox.listener import PathTooLong
@@ -116,7 +118,9 @@ def choose_run_folder(run_dir: Path | None) -> Path:
 def parse_status(text: bytes) -> GatewayStatus:
     """Raises Unreachable for a gateway of another version."""
     try:
-        return GatewayStatus.model_validate_json(text)
+        return GatewayStatus.model_validate_json(json.dumps(clean_texts(json.loads(text))))
+    except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
+        raise Unreachable("what answers for the gateway tells no status") from error
     except ValidationError as error:
         raise Unreachable(
             f"the gateway is of another version than this command: {error.error_count()} fields differ"

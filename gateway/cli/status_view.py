@@ -9,7 +9,8 @@ from rich.text import Text
 
 from gateway.core.line_problem import printable
 from gateway.core.messages import BusReport
-from gateway.core.status import ChangeStatus, GatewayStatus, LimitsStatus, SpanStatus, Spread
+from gateway.core.status import ChangeStatus, GatewayStatus, LimitsStatus, SpanStatus, Spread, band_n
+from gateway.wording.catalogue import sentence
 
 STATE_STYLE = {
     "SILENT": "bold",
@@ -31,7 +32,8 @@ def render(status: GatewayStatus, width: int, height: int | None = None) -> Rend
     """With a `height` (lines), spans that need no attention and old events give way so that it fits."""
     spans, events = status.spans, len(status.events)
     if height is not None:
-        height -= (status.change is not None) + bool(_agents(status)) + bool(status.alarms)
+        height -= (status.change is not None) + bool(_agents(status)) + bool(status.alarms) + bool(status.unconfirmed)
+        height -= bool(_wiring(status))
         room = max(1, height - FIXED_LINES - LEAST_EVENTS)
         if len(spans) > room:
             spans = _urgent(spans, max(1, room - 1), status.limits)
@@ -55,9 +57,13 @@ def _head(status: GatewayStatus) -> RenderableType:
         title.append(f"  signal missing for {loop.held} periods", style="bold yellow")
     if loop.saturated:
         title.append("  torque at its limit", style="bold yellow")
-    head.add_row(title, _clock_time(status.wall_s))
+    head.add_row(title, clock_time(status.wall_s))
     if status.alarms:
         head.add_row(_alarms(status), "")
+    if wiring := _wiring(status):
+        head.add_row(Text(wiring, "yellow", no_wrap=True, overflow="ellipsis"), "")
+    for one in status.unconfirmed:
+        head.add_row(Text(f"Unconfirmed: {sentence(one)}", "yellow", no_wrap=True, overflow="ellipsis"), "")
     for doubt in loop.doubts:
         head.add_row(Text(f"Proposals are blocked: {doubt}", "bold yellow"), "")
     if status.change is not None:
@@ -66,6 +72,16 @@ def _head(status: GatewayStatus) -> RenderableType:
     speed, setpoint = (_number(value, ".4f") for value in (status.unwind_speed_m_per_s, status.speed_setpoint_m_per_s))
     head.add_row(Text(f"Web {speed} m/s, set-point {setpoint} m/s", "" if loop.running else "dim"), "")
     return head
+
+
+def _wiring(status: GatewayStatus) -> str:
+    """Empty where the devices are those that were proved."""
+    if status.wiring is None:
+        return ""
+    if unproved := status.wiring.unproved:
+        more = f" and {len(unproved) - 1} more" if unproved[1:] else ""
+        return f"Not proved{more}: {sentence(unproved[0])}"
+    return "Proved; arming reads whether the devices are still the same" if status.wiring.not_read else ""
 
 
 def _alarms(status: GatewayStatus) -> Text:
@@ -88,7 +104,7 @@ def _change(change: ChangeStatus, now_s: float) -> str:
 
 
 def _spans(spans: list[SpanStatus], limits: LimitsStatus, width: int) -> RenderableType:
-    bar = min(40, max(10, width - 65))
+    bar = min(40, max(10, width - 73))
     band = f"{limits.tension_min_n:g}".ljust(bar - len(f"{limits.tension_max_n:g} N")) + f"{limits.tension_max_n:g} N"
     table = Table(box=None, padding=(0, 1, 0, 0), pad_edge=False, header_style="dim")
     table.add_column("span", no_wrap=True, max_width=16)
@@ -98,6 +114,7 @@ def _spans(spans: list[SpanStatus], limits: LimitsStatus, width: int) -> Rendera
     table.add_column(band, no_wrap=True, width=bar)
     table.add_column("m/s", justify="right", no_wrap=True)
     table.add_column("Nm", justify="right", no_wrap=True)
+    table.add_column("given", justify="right", no_wrap=True)  # as the drive reports it; before it: as asked
     table.add_column("drive", no_wrap=True)
     for span in spans:
         style = _span_style(span, limits)
@@ -110,6 +127,7 @@ def _spans(spans: list[SpanStatus], limits: LimitsStatus, width: int) -> Rendera
             Text(_bar(span, limits, bar), style),
             _number(span.speed_m_per_s, ".4f"),
             _number(span.torque_nm, ".2f"),
+            _number(span.torque_actual_nm, ".2f"),
             Text(span.drive, DRIVE_STYLE.get(span.drive, "red")),
         )
     return table
@@ -121,7 +139,8 @@ def _bar(span: SpanStatus, limits: LimitsStatus, width: int) -> str:
     if span.setpoint_n is not None:
         cells[_cell(span.setpoint_n, limits, width)] = "\u2502"
     if span.tension_n is not None:
-        beyond = "<" if span.tension_n < limits.tension_min_n else ">" if span.tension_n > limits.tension_max_n else ""
+        least, most = band_n(span, limits)
+        beyond = "<" if span.tension_n < least else ">" if span.tension_n > most else ""
         cells[_cell(span.tension_n, limits, width)] = beyond or "\u25cf"
     return "".join(cells)
 
@@ -135,7 +154,8 @@ def _span_style(span: SpanStatus, limits: LimitsStatus) -> str:
     if span.quality != "GOOD" or span.tension_n is None or span.error_n is None or not span.setpoint_n:
         return "dim" if span.quality in ("STALE", "MISSING") else "red"
     error = abs(span.error_n) / span.setpoint_n
-    if not limits.tension_min_n <= span.tension_n <= limits.tension_max_n or error > POOR_ERROR:
+    least, most = band_n(span, limits)
+    if not least <= span.tension_n <= most or error > POOR_ERROR:
         return "red"
     return "green" if error <= GOOD_ERROR else "yellow"
 
@@ -213,8 +233,10 @@ def _events(status: GatewayStatus, room: int, width: int, whole: bool) -> Render
             lines = textwrap.wrap(event.text, max(20, width - _CLOCK_WIDTH - 2)) or lines
             if most is not None and len(lines) > most:
                 lines = [*lines[: most - 1], " ".join(lines[most - 1 :])]
-        grid.add_row(_clock_time(event.wall_s), Text("\n".join(lines)))
+        grid.add_row(clock_time(event.wall_s), Text("\n".join(lines)))
         room -= 1 if whole else len(lines)
+    if status.events_left_out and room > 0:
+        grid.add_row("", Text(f"and {status.events_left_out} older ones: r2rgate export, or the page", "dim"))
     return grid if status.events else Text("no events yet", style="dim")
 
 
@@ -234,5 +256,9 @@ def _duration(time_s: float) -> str:
     return f"{time_s / 60.0:.0f} min" if time_s < 7200.0 else f"{time_s / 3600.0:.0f} h"
 
 
-def _clock_time(wall_s: float) -> str:
-    return time.strftime("%H:%M:%S", time.localtime(wall_s))
+def clock_time(wall_s: float) -> str:
+    """Of Unix time, here."""
+    try:
+        return time.strftime("%H:%M:%S", time.localtime(wall_s))
+    except (OverflowError, ValueError, OSError):  # a time of another age
+        return "--:--:--"

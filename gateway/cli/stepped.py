@@ -13,12 +13,13 @@ from gateway.cli.timed_law import TimedLaw
 from gateway.control.laws import make_law, untimed
 from gateway.core.controller import Controller, ControllerRefused
 from gateway.core.line import Line, Recipe
-from gateway.core.messages import Arm, Command, Deploy, Event, Keep, Reply, WatchGood
+from gateway.core.messages import Arm, Command, Deploy, Drill, Event, Keep, Reply, WatchGood
 from gateway.core.metrics import RunMetrics, run_metrics
 from gateway.core.scenario import Scenario
 from gateway.core.signals import FloatArray
 from gateway.core.states import Phase
 from gateway.core.telemetry import Frame, pack, unpack
+from gateway.core.wiring_proof import CellProved, DriveProved
 from gateway.loop.arming import not_armed, prepare_links, refusal_to_arm
 from gateway.loop.commands import carry_out
 from gateway.loop.cycle import Cycle
@@ -27,11 +28,33 @@ from gateway.loop.machine import Machine
 from gateway.loop.pacer import Tick
 from gateway.loop.refused import Refused
 from gateway.loop.watch import Watch
+from gateway.loop.wiring import Wiring
 from safety.actions import Finding
 from sim_plant.plant import Plant
 from sim_plant.stepped import SteppedLine
 
 T = TypeVar("T")
+
+
+def shown_as_described(line: Line) -> tuple[list[DriveProved], list[CellProved]]:
+    """What drives and load cells of a line that is wired as its file says have shown, at no torque."""
+    drives = [
+        DriveProved(drive=drive.name, roller=drive.roller, torque_nm=0.0, way_m=0.0, answered=[drive.roller])
+        for drive in line.drives
+    ]
+    cells = [
+        CellProved(cell=cell.name, span=cell.span, zero_n=0.0, factor=1.0, answered_to=[cell.span])
+        for cell in line.load_cells
+    ]
+    return drives, cells
+
+
+def wired_as_described(line: Line) -> Wiring:
+    """The wiring of a simulation in memory: its plant is made of numbers, and no cell can be another's."""
+    wiring = Wiring(line, {})
+    wiring.write(wiring.proof_of(*shown_as_described(line), [], []))
+    wiring.take_written()
+    return wiring
 
 
 class CommandRefused(Exception):
@@ -61,7 +84,8 @@ class SteppedLoop:
         watch = Watch(self.line, np.zeros(self.line.n))  # the memory link carries floats
         self.cycle = Cycle(
             self.line, self.config, [link], watch, lambda: self.now_s, self._record, self._announce, self._tell,
-            simulated=True, law_of=lambda config: TimedLaw(make_law(untimed(config))), budget_period_s=inf,
+            simulated=True, wiring=wired_as_described(self.line),
+            law_of=lambda config: TimedLaw(make_law(untimed(config))), budget_period_s=inf,
         )  # fmt: skip
         law = self.cycle.torque_path.law
         assert isinstance(law, TimedLaw)
@@ -81,15 +105,16 @@ class SteppedLoop:
         cycle.setpoints.begin_at_speed(unwind_speed_m_per_s)
         cycle.torque_path.unmeasured_n = tension_n.copy()  # of draw spans: no load cell says it
 
-    def arm(self) -> Reply:
-        """As the operator's `arm`, without waiting for the drives: step on until READY."""
+    def arm(self, command: Arm | Drill | None = None) -> Reply:
+        """As the operator's `arm`, or `drill`, without waiting for the drives: step on until READY, or OFF."""
         if (refusal := refusal_to_arm(self.cycle)) is not None:
             return refusal
         self._release_links()
         if reasons := _finish(prepare_links(self.cycle)):
             self._release_links()
             return not_armed(self.cycle, reasons)
-        return self.command(Arm())
+        self.cycle.wiring.look(self.cycle.links)
+        return self.command(command or Arm())
 
     def command(self, command: Command) -> Reply:
         """Do it between two periods, with what the loop's process would prepare aside."""

@@ -14,6 +14,7 @@ from gateway.control.design.task import linear
 from gateway.control.rollout import Course, Plants, Setup, plants_of
 from gateway.core.line import Line
 from gateway.core.line_model import LineModel, noise_of, theta_of
+from gateway.core.line_scales import runaway_n
 from gateway.core.scenario import Scenario
 from gateway.core.signals import FloatArray
 from gateway.core.web_model import WebModel, equilibrium_torque, reference_speeds
@@ -79,7 +80,7 @@ def ground_of(
         task.period_s, latency_s, substeps, torque_nm=line.limits.torque_nm,
         torque_rate_nm_per_s=line.limits.torque_rate_nm_per_s, tension_noise_n=task.noise.tension_n,
         speed_noise_m_per_s=task.noise.speed_m_per_s, acceleration_m_per_s1_5=task.noise.acceleration_m_per_s1_5,
-        seed=seed,
+        runaway_n=runaway_n(line), seed=seed,
     )  # fmt: skip
     draw = within_tolerances(line) if model is None else within_intervals(line, model)
     models = (task.model, *box_models(line, scenarios, plants, seed, draw))

@@ -21,17 +21,21 @@ from gateway.control.rollout_terms import Course, course_through
 from gateway.control.shaped_run import Way
 from gateway.core.deployment import Region
 from gateway.core.line import Line
+from gateway.core.line_limits import setpoint_bands_n
+from gateway.core.line_scales import line_scales
 from gateway.core.signals import FloatArray
 
-STAND_S = 0.3  #: before the first change
-MOVE_S = 0.5  #: a shaped move, or longer where the line's rate asks for it
+# Times in moments of the line, speeds in small ones (`line_scales`).
+STAND = 15.0  #: before the first change
+MOVE = 25.0  #: a shaped move, or longer where the line's rate asks for it
 MOVED = 0.25  #: of the largest step: more in so short a time is a matter of the torque limit
-LEAST_SPEED_M_PER_S = 0.005  #: the slowest that is looked at, where the line is to run faster
-NEAR_M_PER_S = 1e-3  #: above a speed that was measured: it is not the round number that was asked for
+LEAST_SPEED = 2.5  #: the slowest that is looked at, where the line is to run faster
+NEAR = 0.5  #: above a speed that was measured: it is not the round number that was asked for
 SLOW = 0.1  #: the slow speed, of the fast one
-BETWEEN_S = 2.0  #: that a course stands between its changes, at most
-LONGER_S = 1.0  #: that steps stand before their tail: what still settles there is no oscillation
-TURN_S = 0.25  #: from one step to that of the next span
+BETWEEN = 100.0  #: that a course stands between its changes, at most
+LONGER = 50.0  #: that steps stand before their tail: what still settles there is no oscillation
+LASTING, TAIL, REST = 125.0, 75.0, 50.0  #: a change, the tail behind it, and the rest after a shaped move
+TURN = 12.5  #: from one step to that of the next span
 ROOM = 1.0 / 3.0  #: of a step, to the set-points' limits
 OTHERS_LOW = "some step, the others low"
 MOST_ALONE = 3  #: spans that step alone, at a speed
@@ -51,12 +55,16 @@ class Judged:
     tension_step_n: float
     speed_step_m_per_s: float
 
+    def lasting_s(self, moments: float) -> float:
+        """Seconds that so many moments of the line last."""
+        return moments * line_scales(self.line).moment_s
+
     def within(self, region: Region) -> "Judged":
         """No further than `region`; itself where that is no narrower. Speeds are measured: a millimetre is none."""
         speed = region.speed_max_m_per_s
         mine = Region(
             speed_max_m_per_s=speed
-            if speed is not None and self.speed_max_m_per_s <= speed + NEAR_M_PER_S
+            if speed is not None and self.speed_max_m_per_s <= speed + near_m_per_s(self.line)
             else self.speed_max_m_per_s,
             tension_step_max_n=self.tension_step_n,
             speed_step_max_m_per_s=self.speed_step_m_per_s,
@@ -77,7 +85,10 @@ class Judged:
     @property
     def slow_m_per_s(self) -> float:
         """The lower speed of steps."""
-        return min(max(SLOW * self.speed_max_m_per_s, LEAST_SPEED_M_PER_S), self.speed_max_m_per_s)
+        return min(
+            max(SLOW * self.speed_max_m_per_s, LEAST_SPEED * line_scales(self.line).speed_m_per_s),
+            self.speed_max_m_per_s,
+        )
 
     @property
     def before_m_per_s(self) -> float:
@@ -108,28 +119,35 @@ class Judged:
 
     def levels(self) -> tuple[FloatArray, FloatArray]:
         """The two levels (n,) of set-points. A draw-controlled span keeps its own."""
-        limits = self.line.limits
-        least, most = limits.tension_min_n + limits.tension_margin_n, limits.tension_max_n - limits.tension_margin_n
-        step = min(self.tension_step_n, most - least)
-        room = min(ROOM * step, 0.5 * (most - least - step))
+        least, most = setpoint_bands_n(self.line)
+        step = np.minimum(self.tension_step_n, most - least)
+        room = np.minimum(ROOM * step, 0.5 * (most - least - step))
         center = np.clip(self.tension_n, least + room + 0.5 * step, most - room - 0.5 * step)
-        half = np.array([0.5 * step if span.control == "tension" else 0.0 for span in self.line.spans])
+        controlled = np.array([span.control == "tension" for span in self.line.spans])
+        half = np.where(controlled, 0.5 * step, 0.0)
         own = np.where(half > 0.0, center, self.tension_n)
         return own - half, own + half
 
 
-def improvement_courses(judged: Judged, lasting_s: float = 2.5) -> Courses:
+def near_m_per_s(line: Line) -> float:
+    """By how much a speed that was measured may lie above the one that was asked for."""
+    return NEAR * line_scales(line).speed_m_per_s
+
+
+def improvement_courses(judged: Judged, lasting_s: float | None = None) -> Courses:
     """The named ones but moves, each change standing for `lasting_s`; of steps that the region permits."""
+    stand_s = judged.lasting_s(STAND)
+    lasting_s = judged.lasting_s(LASTING) if lasting_s is None else lasting_s
     low, high = judged.together()
     period_s, fast = judged.line.control.period_s, judged.fast_m_per_s
     found: Courses = {}
     if judged.tension_step_n > 0.0:
-        parts = [(STAND_S, low, fast), (lasting_s, high, fast), (lasting_s, low, fast)]
+        parts = [(stand_s, low, fast), (lasting_s, high, fast), (lasting_s, low, fast)]
         found["tension"] = course_through(period_s, parts)
     if judged.speed_step_m_per_s > 0.0:
         now, before = judged.tension_n, judged.before_m_per_s
         found["velocity"] = course_through(
-            period_s, [(STAND_S, now, fast), (lasting_s, now, before), (lasting_s, now, fast)]
+            period_s, [(stand_s, now, fast), (lasting_s, now, before), (lasting_s, now, fast)]
         )
     return found or {"standing": course_through(period_s, [(lasting_s, judged.tension_n, fast)])}
 
@@ -156,22 +174,27 @@ class CornerCourse:
 CornerCourses = dict[str, CornerCourse]
 
 
-def corner_courses(judged: Judged, lasting_s: float = 2.5, tail_s: float = 1.5) -> CornerCourses:
+def corner_courses(judged: Judged, lasting_s: float | None = None, tail_s: float | None = None) -> CornerCourses:
     """Speed down and up; steps of single spans, slow or fast; one after another; of some at once; each with a tail.
 
     Every other span steps slow, the others fast, and they share the corners among them. Without a tail nothing stands
     longer for it.
     """
+    lasting_s, tail_s = _lasting(judged, lasting_s, tail_s)
     spans = [i for i, span in enumerate(judged.line.spans) if span.control == "tension"]
     some = judged.some(spans)
     period_s, fast, slow = judged.line.control.period_s, judged.fast_m_per_s, judged.slow_m_per_s
     now, before = judged.tension_n, judged.before_m_per_s
 
     def of(first: tuple[FloatArray, float], second: tuple[FloatArray, float], longer_s: float) -> Course:
-        parts = [(STAND_S, *first), (min(lasting_s, BETWEEN_S), *second), (lasting_s + longer_s, *first)]
+        parts = [
+            (judged.lasting_s(STAND), *first),
+            (min(lasting_s, judged.lasting_s(BETWEEN)), *second),
+            (lasting_s + longer_s, *first),
+        ]
         return course_through(period_s, parts, tail_s)
 
-    longer_s = LONGER_S if tail_s > 0.0 else 0.0
+    longer_s = judged.lasting_s(LONGER) if tail_s > 0.0 else 0.0
     found: CornerCourses = {"speed change": CornerCourse(of((now, fast), (now, before), 0.0))}
     if judged.tension_step_n > 0.0:
         every_other = (SLOW_ALONE, slow, spans[::2]), (FAST_ALONE, fast, spans[1::2] or spans)
@@ -190,21 +213,31 @@ def corner_courses(judged: Judged, lasting_s: float = 2.5, tail_s: float = 1.5) 
     return found
 
 
-def programme_courses(judged: Judged, lasting_s: float = 2.5, tail_s: float = 1.5) -> CornerCourses:
+def programme_courses(judged: Judged, lasting_s: float | None = None, tail_s: float | None = None) -> CornerCourses:
     """Those, and one more: spans from the second on step up together while the others stand at their low level.
 
     Those that step draw web out of those that stand before them. Predictive control lets these fall by some newtons
     more than linear laws do, down to the limit that it plans by. Where fewer than two spans step there is none.
     """
+    lasting_s, tail_s = _lasting(judged, lasting_s, tail_s)
     found, (low, high) = corner_courses(judged, lasting_s, tail_s), judged.levels()
     spans = np.flatnonzero(high > low)[1 : 1 + judged.at_once]
     if len(spans) == 0:
         return found
     up, fast = low.copy(), judged.fast_m_per_s
     up[spans] = high[spans]
-    parts = [(STAND_S, low, fast), (min(lasting_s, BETWEEN_S), up, fast), (lasting_s, low, fast)]
+    between_s = min(lasting_s, judged.lasting_s(BETWEEN))
+    parts = [(judged.lasting_s(STAND), low, fast), (between_s, up, fast), (lasting_s, low, fast)]
     course = course_through(judged.line.control.period_s, parts, tail_s)
     return found | {OTHERS_LOW: CornerCourse(course, late=False)}
+
+
+def _lasting(judged: Judged, lasting_s: float | None, tail_s: float | None) -> tuple[float, float]:
+    """How long a change and the tail behind it last where nothing else is asked for (s)."""
+    return (
+        judged.lasting_s(LASTING) if lasting_s is None else lasting_s,
+        judged.lasting_s(TAIL) if tail_s is None else tail_s,
+    )
 
 
 def _least(value: float, most: float | None) -> float:
@@ -220,20 +253,21 @@ def _apart(spans: Sequence[int]) -> list[int]:
 def _in_turn(judged: Judged, lasting_s: float, longer_s: float) -> list[tuple[float, FloatArray, float]]:
     """From high to low, against the web, and back to the middle; each step before the last one is over."""
     low, high = judged.some(range(judged.line.n))
-    parts, now = [(STAND_S, high, judged.fast_m_per_s)], high
+    parts, now = [(judged.lasting_s(STAND), high, judged.fast_m_per_s)], high
     for goal in (low, 0.5 * (low + high)):
         for i in np.flatnonzero(high != low)[::-1].tolist():
             now = np.where(np.arange(len(now)) == i, goal, now)
-            parts.append((TURN_S, now, judged.fast_m_per_s))
-        parts[-1] = (min(lasting_s, BETWEEN_S), now, judged.fast_m_per_s)
+            parts.append((judged.lasting_s(TURN), now, judged.fast_m_per_s))
+        parts[-1] = (min(lasting_s, judged.lasting_s(BETWEEN)), now, judged.fast_m_per_s)
     parts[-1] = (lasting_s + longer_s, now, judged.fast_m_per_s)
     return parts
 
 
-def way_of_moves(judged: Judged, rest_s: float = 1.0) -> Way | None:
+def way_of_moves(judged: Judged, rest_s: float | None = None) -> Way | None:
     """The shaped move; None where no set-point may move at once."""
     low, high = judged.levels()
     middle, half = 0.5 * (low + high), 0.5 * MOVED * (high - low)
-    time_s = max(MOVE_S, MinimumJerk.PEAK * MOVED * judged.tension_step_n / judged.line.moves.tension_rate_n_per_s)
-    way = Way(middle - half, middle + half, judged.fast_m_per_s, STAND_S, time_s, rest_s)
+    needed_s = MinimumJerk.PEAK * MOVED * judged.tension_step_n / judged.line.moves.tension_rate_n_per_s
+    time_s, rest_s = max(judged.lasting_s(MOVE), needed_s), judged.lasting_s(REST) if rest_s is None else rest_s
+    way = Way(middle - half, middle + half, judged.fast_m_per_s, judged.lasting_s(STAND), time_s, rest_s)
     return way if judged.tension_step_n > 0.0 else None

@@ -45,12 +45,15 @@ def run(
         references(config, course), unwinds, samples, moved, setup.late(course.periods, n),
         np.array([setup.tension_step_n] * n + [setup.speed_step_m_per_s] * n),
         BAND * course.settled_at_n, course.direction, course.changes, course.periods - course.tail,
-        setup.substeps, setup.step_s, setup.torque_nm, setup.torque_rate_nm_per_s * setup.period_s,
-        tension_n, torque_nm,
+        setup.substeps, setup.step_s, np.zeros(n) + setup.torque_nm, setup.torque_rate_nm_per_s * setup.period_s,
+        float(setup.runaway_n), tension_n, torque_nm,
     )  # fmt: skip
     rows = sums.transpose(1, 0, 3, 2).reshape(kernel.ROWS, -1, n)[:, :count]
     return told(
-        _figures(rows, course, setup), tension_n[:count] if record else None, torque_nm[:count] if record else None
+        _figures(rows, course, setup),
+        tension_n[:count] if record else None,
+        torque_nm[:count] if record else None,
+        setup.runaway_n,
     )
 
 

@@ -14,8 +14,6 @@ from typing import Any
 import numpy as np
 from numba import njit, prange
 
-from gateway.control.rollout_terms import RUNAWAY_N
-
 LANES = 8
 LOOKED_AT = 8  #: periods, after which blocks that have run away are left
 
@@ -87,7 +85,7 @@ def _limit(asked, before, most_nm, reach_nm, applied, n):
     for i in range(n):
         for w in range(LANES):
             was = before[i, w]
-            held = min(max(asked[i, w], -most_nm), most_nm)
+            held = min(max(asked[i, w], -most_nm[i]), most_nm[i])
             applied[i, w] = min(max(held, was - reach_nm), was + reach_nm)
 
 
@@ -158,12 +156,12 @@ def _account_step(state, sums, in_tail, n):
 
 
 @_part
-def _gone(least, most, n):
+def _gone(least, most, runaway_n, n):
     """Whether all plants of a block have run away."""
     for w in range(LANES):
         held = True
         for i in range(n):
-            held &= least[i, w] >= -RUNAWAY_N and most[i, w] <= RUNAWAY_N  # nan is neither
+            held &= least[i, w] >= -runaway_n and most[i, w] <= runaway_n  # nan is neither
         if held:
             return False
     return True
@@ -378,7 +376,7 @@ def simulate(
     coefficients, boundary, own, eccentric, delays, states, torques, memories,
     torque_begins, torque_columns, torque_values, state_begins, state_columns, state_values, which,
     reference, unwinds, samples, moved, late, steps, bands, directions, changes, tail,
-    substeps, step_s, most_nm, reach_nm, tension_out, torque_out,
+    substeps, step_s, most_nm, reach_nm, runaway_n, tension_out, torque_out,
 ):  # fmt: skip
     """Sums (blocks, ROWS, n, LANES). Without effects `own` is None, and the code for them is left out at compiling."""
     blocks, n, size, periods = states.shape[0], states.shape[1] // 2, memories.shape[1], unwinds.size
@@ -426,6 +424,6 @@ def simulate(
                     coefficients[block], boundary[block], own, block, eccentric, delays[block], sent, now, state,
                     acting, unwinds[k], moved[k * substeps + sub], sub, substeps, step_s, slopes, probe, work, n,
                 )  # fmt: skip
-            if k % LOOKED_AT == LOOKED_AT - 1 and _gone(sums[LEAST], sums[MOST], n):
+            if k % LOOKED_AT == LOOKED_AT - 1 and _gone(sums[LEAST], sums[MOST], runaway_n, n):
                 break
     return found

@@ -11,7 +11,7 @@ from gateway.control.law import Law
 from gateway.control.reference import Steady
 from gateway.control.rollout_line import PlainLine, RealLine, delay_steps
 from gateway.control.rollout_start import start
-from gateway.control.rollout_terms import RUNAWAY_N, Course, Plants, Rollouts, Setup, plants_of
+from gateway.control.rollout_terms import Course, Plants, Rollouts, Setup, plants_of
 from gateway.core.metrics import BAND
 from gateway.core.signals import BoolArray, FloatArray
 from gateway.core.web_model import WebModel
@@ -79,7 +79,7 @@ def run_plant(
         acting.append(np.where(late[k], before, applied))
         for j in range(setup.substeps):
             state = line.state
-            if not (np.abs(state[:n]) <= RUNAWAY_N).all():
+            if not (np.abs(state[:n]) <= setup.runaway_n).all():
                 return stepped, sent
             stepped[k * setup.substeps + j] = state[: 2 * n]
             age = -(-(delay - j) // setup.substeps)  # periods ago that the acting torque was computed
@@ -113,7 +113,7 @@ def rollouts_of(stepped: FloatArray, torques: FloatArray, course: Course, setup:
         figures["tail_swing_n"] = 0.5 * (in_tail.max(axis=1) - in_tail.min(axis=1))
         figures["tail_error_n"] = np.abs(error[:, tail:].mean(axis=1))
         figures["chatter_nm"] = np.sqrt(np.mean(moves**2, axis=1))
-    return told(figures, tensions if record else None, torques if record else None)
+    return told(figures, tensions if record else None, torques if record else None, setup.runaway_n)
 
 
 def _settled_and_beyond(error: FloatArray, course: Course) -> tuple[FloatArray, FloatArray]:
@@ -130,10 +130,12 @@ def _settled_and_beyond(error: FloatArray, course: Course) -> tuple[FloatArray, 
     return settled, beyond
 
 
-def told(figures: dict[str, FloatArray], tension_n: FloatArray | None, torque_nm: FloatArray | None) -> Rollouts:
+def told(
+    figures: dict[str, FloatArray], tension_n: FloatArray | None, torque_nm: FloatArray | None, runaway_n: float
+) -> Rollouts:
     """Rollouts of figures by name, in which those of a plant that has run away are the worst there is."""
     least, most = figures["tension_min_n"], figures["tension_max_n"]
-    diverged = ~((least >= -RUNAWAY_N) & (most <= RUNAWAY_N)).all(axis=1)  # nan is neither
+    diverged = ~((least >= -runaway_n) & (most <= runaway_n)).all(axis=1)  # nan is neither
     for name, values in figures.items():
         values[diverged] = -inf if name == "tension_min_n" else inf
     recorded = {"tension_n": tension_n, "torque_nm": torque_nm}

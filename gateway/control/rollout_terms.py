@@ -11,7 +11,7 @@ from gateway.core.signals import BoolArray, CountArray, FloatArray
 from gateway.core.theta import Theta
 from gateway.core.web_model import WebModel
 
-RUNAWAY_N = 1e3  #: a tension beyond it, either way, or one that is no number: the loop has run away
+RUNAWAY_N = 1e3  #: where a line says nothing of its tensions: beyond it, either way, a loop has run away
 
 
 def _none() -> FloatArray:
@@ -170,7 +170,7 @@ class Setup:
     period_s: float
     latency_s: float
     substeps: int = 1  #: RK4 steps a period; the latency is a whole number of them
-    torque_nm: float = inf
+    torque_nm: float | FloatArray = inf  #: (n,) where drives differ
     torque_rate_nm_per_s: float = inf
     tension_noise_n: float = 0.0
     speed_noise_m_per_s: float = 0.0
@@ -178,6 +178,7 @@ class Setup:
     tension_step_n: float = 0.0  #: of the measurement's quantisation; 0: none
     speed_step_m_per_s: float = 0.0
     seed: int = 0
+    runaway_n: float = RUNAWAY_N  #: a tension beyond it, either way, or one that is no number: the loop has run away
     late_share: float = 0.0  #: of the commands, drive by drive, that arrive a period late; until then the last one acts
 
     @property
@@ -236,5 +237,5 @@ class Rollouts:
 
     @property
     def diverged(self) -> BoolArray:
-        """Whether a plant has run away: a tension beyond RUNAWAY_N, or none that is a number, (b,)."""
+        """Whether a plant has run away: a tension beyond `Setup.runaway_n`, or none that is a number, (b,)."""
         return np.isinf(self.tension_max_n[:, 0])  # or of any other span

@@ -12,7 +12,7 @@ from gateway.core.finding import Finding
 from gateway.core.line import Strict
 
 Priority = Literal["high", "medium", "low"]
-MOST_ALARMS = 12
+MOST_ALARMS = 14
 LONGEST_SHELVED_S = 8.0 * 3600.0  #: a shift
 
 AlarmName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9-]{0,39}$")]
@@ -61,6 +61,14 @@ ALARMS: tuple[Alarm, ...] = (
         consequence="nobody controls: the drives take torque off by their own watchdogs",
         action="see that the line stands; `journalctl` has the reason; start `r2rgate loop`, then arm",
         after_s=0.0, gone_s=1.0,
+    ),
+    Alarm(
+        "false-loop", "high", "something speaks as the control loop and is not",
+        cause="a second loop on this line; a program of the line's user that took its socket; a loop that contradicts"
+        " itself",
+        consequence="what it tells is not taken; but a stop may reach it instead of the loop, and do nothing",
+        action="look at the line itself and stop it there if need be; end the process that is named",
+        after_s=0.0, gone_s=5.0,
     ),
     Alarm(
         "torque-at-limit", "medium", "torques are at their limits",
@@ -116,6 +124,14 @@ ALARMS: tuple[Alarm, ...] = (
         cause="a fault of this program, or of a file that it reads, which its text names",
         consequence="what that task does is not done, or late: a change on probation may fall back, an alarm not come",
         action="read the text; where it lasts, start the gateway anew: the line runs on. Report it with the log",
+        after_s=0.0, gone_s=5.0,
+    ),
+    Alarm(
+        "unexplained-change", "high", "somebody else than the gateway has changed the loop, or has tried to",
+        cause="a program that speaks to the loop past the gateway; a file of the loop that was edited or put back; "
+        "a controller that it was started with and nobody approved",
+        consequence="what was changed goes no further than a first configuration; what was tried was refused",
+        action="find out who: the text names process and user, `r2rgate audit show` the rest. Approve what is to run",
         after_s=0.0, gone_s=5.0,
     ),
 )  # fmt: skip

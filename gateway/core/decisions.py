@@ -56,8 +56,19 @@ class LineChanged(Strict):
     because: Annotated[str, Field(min_length=1, max_length=1000)]
 
 
-Decision = Annotated[Decide | RollBackNow | Archive | LineChanged, Field(discriminator="command")]
-DECISION: TypeAdapter[Decide | RollBackNow | Archive | LineChanged] = TypeAdapter(Decision)
+class Confirm(Strict):
+    """A person knows what controls the line, though no record says how it came to that: it may be armed.
+
+    It goes no further by it than a first configuration: what is to go further is proposed and approved.
+    """
+
+    command: Literal["confirm"] = "confirm"
+    configuration: Digest  #: that the person means
+    because: Annotated[str, Field(min_length=1, max_length=1000)]
+
+
+Decision = Annotated[Decide | RollBackNow | Archive | LineChanged | Confirm, Field(discriminator="command")]
+DECISION: TypeAdapter[Decide | RollBackNow | Archive | LineChanged | Confirm] = TypeAdapter(Decision)
 
 
 MOST_LISTED = 200

@@ -11,6 +11,7 @@ from pydantic import Field, model_validator
 
 from gateway.core.controller import ControllerConfig
 from gateway.core.controller_laws import Feedforward, Matrix
+from gateway.core.finding import Finding
 from gateway.core.line import Line, NonNegative, Positive, Strict
 
 Hash = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]  #: `controller.config_hash`
@@ -118,6 +119,16 @@ class Deployment(Strict):
     watch: RecoveryPrediction | None = None  #: None: no model has been accepted, and nothing is predicted
 
 
+class WiringStatus(Strict):
+    """Whether a line is wired as it was proved to be."""
+
+    unproved: list[Finding] = []  #: why it counts as not proved, and is not started; empty: nothing speaks against it
+    #: Nothing does, but the devices have not been read since the loop began: an arming tells whether it was they.
+    not_read: bool = False
+    proved_wall_s: float | None = None  #: Unix time of the proof that holds
+    proof: Hash | None = None  #: of the proof against which nothing speaks, whole: the audit has one of each
+
+
 class InService(Strict):
     """What controls the line, and how it came to."""
 
@@ -131,3 +142,5 @@ class InService(Strict):
     region: Region
     watched: bool  #: a recovery prediction looks after it
     why: str  #: "start", "deployed", "kept", or "rolled back: .."
+    confirmed: bool = True  #: a verdict has let it through, or a person has confirmed it; else it is guarded as a first
+    wiring: WiringStatus | None = None  #: of the line it controls; None: nobody has looked

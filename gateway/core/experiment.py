@@ -17,6 +17,7 @@ from pydantic import Field, TypeAdapter, ValidationError, model_validator
 
 from gateway.core.canonical import canonical_bytes
 from gateway.core.line import Line, Name, NonNegative, Positive, Strict
+from gateway.core.line_limits import setpoint_bands_n
 from gateway.core.signals import FloatArray
 
 LONGEST_S = 600.0
@@ -174,10 +175,10 @@ def reasons_against(
     if experiment.n != line.n or base_tension_n.shape != (line.n,):
         return [f"the experiment has {experiment.n} amplitudes, the line {line.n} spans"]
     limits, amplitude = line.limits, np.array(experiment.amplitude_n)
-    low, high = limits.tension_min_n + limits.tension_margin_n, limits.tension_max_n - limits.tension_margin_n
+    low, high = setpoint_bands_n(line)
     found = [
         f"span {i + 1} would go from {base_tension_n[i] - amplitude[i]:g} to {base_tension_n[i] + amplitude[i]:g} N; "
-        f"allowed: {low:g} to {high:g} N"
+        f"allowed: {low[i]:g} to {high[i]:g} N"
         for i in np.flatnonzero((base_tension_n - amplitude < low - 1e-9) | (base_tension_n + amplitude > high + 1e-9))
         if amplitude[i] > 0.0
     ]

@@ -17,7 +17,7 @@ def lasting_periods(period_s: float) -> int:
     return max(1, round(LASTING_S / period_s))
 
 
-def at_limit(torque_nm: FloatArray, before_nm: FloatArray, limit_nm: float, reach_nm: float) -> BoolArray:
+def at_limit(torque_nm: FloatArray, before_nm: FloatArray, limit_nm: float | FloatArray, reach_nm: float) -> BoolArray:
     """Which torques are at a limit. `before_nm` are those of `LASTING_S` before, `reach_nm` how far they may have come.
 
     Any shape.

@@ -1,6 +1,7 @@
 """What is wrong with a JSON file of this program: each key, its value, what is allowed, and the nearest valid key."""
 
 import json
+from collections import Counter
 from functools import cache
 from itertools import islice
 from typing import Any, cast
@@ -71,8 +72,7 @@ def _is_too_deep(document: Any) -> bool:
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     found = dict(pairs)
     if len(found) < len(pairs):
-        keys = [key for key, _ in pairs]
-        twice = next(key for key in keys if keys.count(key) > 1)
+        twice = next(key for key, count in Counter(key for key, _ in pairs).items() if count > 1)
         raise ValueError(f'the key "{twice}" stands twice in one object: keep one')
     return found
 
@@ -94,6 +94,8 @@ def _schema_of(root: type[BaseModel]) -> Schema:
 
 def _problem(error: ErrorDetails, root: Schema) -> str:
     path, kind, value = error["loc"], error["type"], error["input"]
+    if kind == "json_invalid":
+        return printable(error["msg"][:1].lower() + error["msg"][1:])
     if kind == "value_error":  # in the words of the format itself
         words = error["msg"].removeprefix("Value error, ")
         return _sentence(path, value if path else None, words) if path else words

@@ -9,10 +9,14 @@ from typing import Annotated, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from gateway.core.line_defaults import derived_defaults
+
 Name = Annotated[str, Field(pattern=r"^[a-z0-9]([a-z0-9-]{0,30}[a-z0-9])?$")]
 Positive = Annotated[float, Field(gt=0.0)]
 NonNegative = Annotated[float, Field(ge=0.0)]
 Fraction = Annotated[float, Field(gt=0.0, lt=1.0)]
+
+BRAKING_MOST_S = 60.0  #: after a web break torque goes off after this time, whatever still turns
 
 
 class Strict(BaseModel):
@@ -65,6 +69,24 @@ class Moves(Strict):
         10.0  #: torque goes off after this time in STOP, whatever the speed
     )
     torque_off_rate_nm_per_s: Positive = 200.0  #: at the end of a stop
+    #: After a web break: from the greatest speed to rest, as far as the drives can brake so fast.
+    brake_time_s: Annotated[float, Field(gt=0.0, le=10.0)] = 7.0
+
+
+class Tensioning(Strict):
+    """Until every span carries tension: small limits of their own, for a web that may not be there."""
+
+    #: Of a roller's surface; without this key a tenth of limits.speed_max_m_per_s, 0.1 m/s, or what a web stands that
+    #: tightens at that speed, whichever is least.
+    roller_speed_max_m_per_s: Positive | None = None
+    torque_share: Annotated[float, Field(gt=0.0, le=2.0)] = 0.5  #: above what the tension that is asked for explains
+
+
+class Stages(Strict):
+    """What a start goes through before the line runs."""
+
+    start_warning_s: Annotated[float, Field(ge=0.0, le=60.0)] = 3.0  #: before anything moves
+    tensioning: Tensioning = Tensioning()
 
 
 class Web(Strict):
@@ -78,12 +100,16 @@ class Roller(Strict):
     radius_m: Parameter
     inertia_kg_m2: Parameter
     friction_nms_per_rad: Parameter
+    torque_nm: Positive | None = None  #: of its drive, either direction; None: limits.torque_nm
 
 
 class Span(Strict):
     name: Name
     length_m: Parameter
     control: Literal["tension", "draw"] = "tension"  #: draw: no load cell, the roller keeps a speed ratio
+    slack_max_m: Annotated[float, Field(ge=0.0, le=10.0)] = 0.2  #: of web that may hang in it at a start
+    tension_min_n: NonNegative | None = None  #: None: as in [limits]; the same of the next
+    tension_max_n: Positive | None = None
 
 
 class CanopenBus(Strict):
@@ -129,12 +155,25 @@ class Drive(Device):
     channel: Channel = 1  #: axis, of a device that moves several
     roller: Annotated[int, Field(ge=1)]
     rated_torque_nm: Positive
+    direction: Literal["forward", "reversed"] = "forward"  #: of transport, for a torque and a speed above 0 of its own
+    gear: Annotated[float, Field(gt=0.0, le=1000.0)] = 1.0  #: turns of the motor for one of the roller
+    #: After a web break it may brake its roller with so much, and feed so much power and energy into its DC link.
+    #: Without torque and power the roller coasts; without an energy its DC link takes any.
+    braking_torque_nm: Positive | None = None
+    braking_power_w: Positive | None = None
+    braking_energy_j: Positive | None = None
+
+    @property
+    def roller_torque_nm(self) -> float:
+        """Its rated torque, as the roller has it."""
+        return self.rated_torque_nm * self.gear
 
 
 class LoadCell(Device):
     channel: Channel = 1  #: of the amplifier
     span: Annotated[int, Field(ge=1)]
     capacity_n: Positive  #: a reading beyond it is not believed
+    sign: Literal["normal", "inverted"] = "normal"  #: of what it shows of a tension
 
 
 class LinePlc(Device):
@@ -271,6 +310,7 @@ class Line(Strict):
     control: Control = Control()
     limits: Limits
     moves: Moves = Moves()
+    stages: Stages = Stages()
     web: Web
     rollers: Annotated[list[Roller], Field(min_length=1, max_length=60)]
     spans: Annotated[list[Span], Field(min_length=1, max_length=60)]
@@ -286,6 +326,15 @@ class Line(Strict):
     operator: Operator = Operator()
     recipes: Annotated[list[Recipe], Field(min_length=1)]  #: the first is the one a line starts with
 
+    @model_validator(mode="after")
+    def _derive(self) -> Self:
+        """What has a dimension and is not given follows from the rest of the file: the numbers above are one line's."""
+        for name, derived in derived_defaults(self).items():
+            table: Strict = getattr(self, name)
+            if missing := {key: value for key, value in derived.items() if key not in table.model_fields_set}:
+                object.__setattr__(self, name, table.model_copy(update=missing))  # frozen for everybody else
+        return self
+
     @property
     def n(self) -> int:
         """Number of spans, and of driven rollers."""
@@ -294,4 +343,6 @@ class Line(Strict):
     @property
     def longest_stop_s(self) -> float:
         """How long the line may take from a stop to torque off."""
-        return self.moves.stop_time_s + self.limits.torque_nm / self.moves.torque_off_rate_nm_per_s + 1.0
+        brakes = any(drive.braking_torque_nm and drive.braking_power_w for drive in self.drives)
+        slowing_s = max(self.moves.stop_time_s, BRAKING_MOST_S if brakes else 0.0)
+        return slowing_s + self.limits.torque_nm / self.moves.torque_off_rate_nm_per_s + 1.0

@@ -1,8 +1,7 @@
 """From the text of `line.toml` to a `Line`, or to every problem at once, each with its line in the file."""
 
-import re
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
 from typing import Any
@@ -12,35 +11,14 @@ from pydantic_core import ErrorDetails
 
 from gateway.core.line import Line
 from gateway.core.line_checks import Role, findings
-from gateway.core.line_problem import Finding, LineRefused, Problem, key_in_words, printable, value_in_words
+from gateway.core.line_problem import Finding, LineRefused, Problem, key_in_words, value_in_words
 from gateway.core.line_words import finding_of, nearest_key, path_of, value_at
 from gateway.core.nearest import is_typo, nearest
 from gateway.core.toml_places import Path, line_of, places
+from gateway.core.toml_syntax import syntax_problem
 
 _FIELDS: dict[str, TypeAdapter[Any]] = {
     name: TypeAdapter(field.rebuild_annotation()) for name, field in Line.model_fields.items()
-}
-_SYNTAX_PLACE = re.compile(r"(.*) \((?:at line (\d+), column (\d+)|at end of document)\)", re.DOTALL)
-
-#: What to do about a syntax error, by what tomllib says.
-_SYNTAX_ADVICE = {
-    "Expected newline or end of document": "one key = value per line, a point in decimal numbers, text in quotes",
-    "Cannot overwrite a value": "this key stands here for the second time: keep one",
-    "Duplicate inline table key": "this key stands here for the second time: keep one",
-    "twice": "this table stands here for the second time: put its keys under the first, "
-    "or write [[...]] where there are several",
-    "Cannot": "this table or key has been given already, in another way: keep one",
-    "Invalid value": "write a number with a decimal point (0.5), text in quotes, true, false, [ ... ] or { ... }",
-    "Unclosed array": "close the list with ] and put commas between its elements",
-    "Unclosed inline table": "close the table with } on the same line and put commas between its keys",
-    "Expected '=' after a key": "write key = value, or [table] for a table; decimal numbers take a point",
-    "at the end of a": "close the brackets of the table's name",
-    "Invalid initial character": "write a key of letters, digits, _ and -; inside { ... } all on one line",
-    "Invalid statement": "write key = value or [table]; begin a comment with #",
-    "Illegal character '\\n'": "close the text with a quote on the same line",
-    "Unterminated string": "close the text with a quote",
-    "Expected \"'": "close the text with a quote",
-    "Unescaped": "write \\\\ for a backslash, or put the text in single quotes",
 }
 
 
@@ -52,26 +30,36 @@ class CheckedLine:
     warnings: list[Problem]
 
 
-def load_line(text: str, source: str, known_maps: Mapping[str, Role] | None = None) -> Line:
+def load_line(
+    text: str,
+    source: str,
+    known_maps: Mapping[str, Role] | None = None,
+    unusable_maps: Mapping[str, Sequence[Problem]] | None = None,
+) -> Line:
     """The line that `text` describes. Raises LineRefused with every problem.
 
     `source` is the file's name in messages. `known_maps` gives protocol and role of each device type; without
-    it map names are not checked.
+    it map names are not checked. `unusable_maps` gives the reasons why a map that is there cannot be used.
     """
-    return check_line(text, source, known_maps).line
+    return check_line(text, source, known_maps, unusable_maps).line
 
 
-def check_line(text: str, source: str, known_maps: Mapping[str, Role] | None = None) -> CheckedLine:
+def check_line(
+    text: str,
+    source: str,
+    known_maps: Mapping[str, Role] | None = None,
+    unusable_maps: Mapping[str, Sequence[Problem]] | None = None,
+) -> CheckedLine:
     """As `load_line`, with the warnings."""
     text = text.removeprefix("\ufeff").replace("\r\n", "\n")
     try:
         document = tomllib.loads(text)
         where = places(text)
     except (ValueError, RecursionError) as error:
-        raise LineRefused([_syntax_problem(error, text, source)]) from None
+        raise LineRefused([syntax_problem(error, text, source)]) from None
     found, valid, names = _validate(document)
     line = Line.model_construct(**valid) if found else Line.model_validate(document)
-    found += findings(line, set(valid), known_maps)
+    found += findings(line, set(valid), known_maps, unusable_maps or {})
     in_file_order = sorted(
         ((finding, _problem(finding, source, document, where, names, line)) for finding in found),
         key=lambda pair: pair[1].line,
@@ -80,21 +68,6 @@ def check_line(text: str, source: str, known_maps: Mapping[str, Role] | None = N
     if errors:
         raise LineRefused(errors)
     return CheckedLine(line, [problem for _, problem in in_file_order])
-
-
-def _syntax_problem(error: Exception, text: str, source: str) -> Problem:
-    if isinstance(error, RecursionError):
-        return Problem(source, 1, "", "", "brackets are nested too deeply to be read")
-    match = _SYNTAX_PLACE.fullmatch(str(error))
-    if match is None:  # a number with thousands of digits: tomllib gives no place
-        digits = re.search(r"\d{1000}", text)
-        line = text.count("\n", 0, digits.start()) + 1 if digits else 1
-        return Problem(source, line, "", "", "this number has too many digits to be read")
-    what, line, column = match.groups()
-    place = f"column {column}" if column else "at the end of the file"
-    advice = next((advice for said, advice in _SYNTAX_ADVICE.items() if said in what), "see https://toml.io")
-    line_number = int(line) if line else max(1, text.rstrip("\n").count("\n") + 1)
-    return Problem(source, line_number, "", "", f"{place}: not TOML ({printable(what)}): {advice}")
 
 
 # A mistyped key would hide what stands under it, and make the key that was meant look missing. So the document is

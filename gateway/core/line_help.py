@@ -23,6 +23,7 @@ HELP: dict[str, dict[str, str]] = {
         "control": "the loop's clock",
         "limits": "what must never be left; changed only here, by an engineer",
         "moves": "how set-points move, and how the line stops",
+        "stages": "what a start goes through before the line runs",
         "web": "the material",
         "rollers": "the driven ones, in the direction of transport; the unwinder (roller 0) is not listed",
         "spans": "free lengths of web, in the direction of transport; span i ends at roller i",
@@ -66,6 +67,16 @@ HELP: dict[str, dict[str, str]] = {
         "stop_rate_m_per_s2": "ramp of a controlled stop",
         "stop_time_s": "torque goes off after this time in a stop, whatever the speed",
         "torque_off_rate_nm_per_s": "ramp of the torque to zero at the end of a stop",
+        "brake_time_s": "after a web break: from the greatest speed to rest, as far as the drives can brake so fast",
+    },
+    "Stages": {
+        "start_warning_s": "after start the line PLC's warning output is on for so long before anything moves",
+        "tensioning": "until every span carries tension: small limits of their own, for a web that may not be there",
+    },
+    "Tensioning": {
+        "roller_speed_max_m_per_s": "of a roller's surface, at most a tenth of limits.speed_max_m_per_s and 0.1 m/s; "
+        "without this key: derived from line and web",
+        "torque_share": "a roller's torque may be so much above what the tension that is asked for explains",
     },
     "Web": {
         "stiffness_n": "E A, modulus times cross-section",
@@ -81,11 +92,15 @@ HELP: dict[str, dict[str, str]] = {
         "radius_m": _PARAMETER,
         "inertia_kg_m2": "roller, gear and motor, seen at the roller",
         "friction_nms_per_rad": "viscous friction",
+        "torque_nm": "of its drive, in either direction; without this key limits.torque_nm, which is the widest",
     },
     "Span": {
         "name": "your name for the span",
         "length_m": "free web between the two rollers",
         "control": '"tension" needs a load cell; "draw" keeps a speed ratio and needs none',
+        "slack_max_m": "web that may hang in it at a start; a span that shows no tension after it stops the line",
+        "tension_min_n": "of this span; without this key limits.tension_min_n, which is the widest",
+        "tension_max_n": "of this span; without this key limits.tension_max_n, which is the widest",
     },
     "CanopenBus": {
         "name": "your name for the bus",
@@ -115,13 +130,19 @@ HELP: dict[str, dict[str, str]] = {
         "address": "CANopen node, 1 to 127",
         "channel": "axis, of a device that moves several rollers",
         "roller": "which roller it drives, counted from 1",
-        "rated_torque_nm": "at the roller, as commissioned in the drive; commands are fractions of it",
+        "direction": "forward, or reversed: a torque and a speed above 0 of its own turn the roller against transport",
+        "gear": "turns of the motor for one of the roller; torques, and speeds in rpm or rad/s, are the motor's",
+        "rated_torque_nm": "of the motor, as commissioned in the drive; commands are fractions of it",
+        "braking_torque_nm": "after a web break the drive may brake with it; without it and a power the roller coasts",
+        "braking_power_w": "that its DC link takes meanwhile: of its brake resistor, or fed back",
+        "braking_energy_j": "that its brake resistor takes in one stop; without this key: any",
     },
     "LoadCell": {
         **_DEVICE,
         "address": "Modbus unit of the amplifier",
         "span": "which span it measures, counted from 1",
         "channel": "channel of the amplifier",
+        "sign": "normal, or inverted: it shows less where the web pulls more",
         "capacity_n": "a reading beyond it is not believed",
     },
     "LinePlc": {

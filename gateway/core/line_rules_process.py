@@ -7,10 +7,13 @@ from itertools import product
 import numpy as np
 
 from gateway.core.line import Line, Recipe
+from gateway.core.line_limits import motor_torque_limit_nm, tension_bands_n, torque_limits_nm
 from gateway.core.line_problem import Finding, odd
 from gateway.core.signals import FloatArray
 from gateway.core.web_model import WebModel, equilibrium_torque, nominal_model, reference_speeds
 
+TENSIONING_SPEED_SHARE = 0.1  #: of the line's greatest speed: a roller's, at most, while tensioning
+TENSIONING_SPEED_MAX_M_PER_S = 0.1  #: and whatever the line's: a person beside a roller can step back from it
 _ROOM = 0.1  #: closer to a limit than this fraction is odd
 _STRAIN = 0.1  #: the web model is linear in the strain
 _COARSE = 20.0  #: rated torque over torque limit; drives take torque in per mille of the rated one
@@ -23,6 +26,33 @@ def tension_limits_ordered(line: Line) -> Iterator[Finding]:
     elif low + line.limits.tension_margin_n >= high - line.limits.tension_margin_n:
         allowed = f"0 or more, and below {0.5 * (high - low):g} N, half of the band of {low:g} to {high:g} N"
         yield Finding(("limits", "tension_margin_n"), "leaves no room for a set-point", allowed)
+
+
+def own_limits_within_common(line: Line) -> Iterator[Finding]:
+    """What one roller or span has of its own is narrower than what all have in common."""
+    limits = line.limits
+    for i, roller in enumerate(line.rollers):
+        if roller.torque_nm is not None and roller.torque_nm > limits.torque_nm:
+            allowed = f"up to limits.torque_nm, {limits.torque_nm:g} Nm, which is the greatest of all drives"
+            yield Finding(("rollers", i, "torque_nm"), "is more than all drives have in common", allowed)
+    for i, span in enumerate(line.spans):
+        low = limits.tension_min_n if span.tension_min_n is None else span.tension_min_n
+        high = limits.tension_max_n if span.tension_max_n is None else span.tension_max_n
+        allowed = f"{limits.tension_min_n:g} to {limits.tension_max_n:g} N, as in [limits]"
+        for key, given in (("tension_min_n", span.tension_min_n), ("tension_max_n", span.tension_max_n)):
+            if given is not None and not limits.tension_min_n <= given <= limits.tension_max_n:
+                yield Finding(("spans", i, key), "is outside of what all spans have in common", allowed)
+        if low + limits.tension_margin_n >= high - limits.tension_margin_n and (low, high) != (
+            limits.tension_min_n,
+            limits.tension_max_n,
+        ):
+            key = "tension_max_n" if span.tension_max_n is not None else "tension_min_n"
+            margin = limits.tension_margin_n
+            yield Finding(
+                ("spans", i, key),
+                f"leaves no room for a set-point between {low:g} and {high:g} N, {margin:g} N from either",
+                allowed,
+            )
 
 
 def web_bears_the_tension(line: Line) -> Iterator[Finding]:
@@ -92,15 +122,22 @@ def stop_is_possible(line: Line) -> Iterator[Finding]:
 
 
 def drives_give_the_torque(line: Line) -> Iterator[Finding]:
-    limit_nm = line.limits.torque_nm
     for i, drive in enumerate(line.drives):
+        limit_nm = motor_torque_limit_nm(line, drive)
         path, rated_nm = ("drives", i, "rated_torque_nm"), drive.rated_torque_nm
         if rated_nm < limit_nm:
             yield Finding(
-                path, "the limit asks for more than the drive gives", f"limits.torque_nm ({limit_nm:g} Nm) or more"
+                path,
+                "the limit asks for more than the drive gives",
+                f"{_name_of_torque(line, drive.roller)} ({limit_nm:g} Nm) or more",
             )
         elif rated_nm > _COARSE * limit_nm:
             yield odd(path, f"commands have steps of {rated_nm / 1000:g} Nm, coarse against a limit of {limit_nm:g} Nm")
+
+
+def _name_of_torque(line: Line, roller: int) -> str:
+    own = 1 <= roller <= len(line.rollers) and line.rollers[roller - 1].torque_nm is not None
+    return f"rollers[{roller}].torque_nm" if own else "limits.torque_nm"
 
 
 def load_cells_see_the_tension(line: Line) -> Iterator[Finding]:
@@ -126,13 +163,13 @@ def recipes_match_spans(line: Line) -> Iterator[Finding]:
 
 
 def recipes_within_tension(line: Line) -> Iterator[Finding]:
-    low, high, margin = line.limits.tension_min_n, line.limits.tension_max_n, line.limits.tension_margin_n
-    lowest, highest = low + margin, high - margin
-    if lowest >= highest:
-        return  # another rule's
-    room_n = _ROOM * (high - low)
+    margin, each = line.limits.tension_margin_n, _bands(line)
     for i, recipe in enumerate(line.recipes):
         for k, tension_n in enumerate(recipe.tension_n):
+            low, high = each[k] if k < len(each) else (line.limits.tension_min_n, line.limits.tension_max_n)
+            lowest, highest, room_n = low + margin, high - margin, _ROOM * (high - low)
+            if lowest >= highest:
+                continue  # another rule's
             path = ("recipes", i, "tension_n", k)
             if not (lowest <= tension_n <= highest and low < tension_n < high):
                 says = "the limits exclude this set-point" if not low < tension_n < high else "is too near to a limit"
@@ -142,6 +179,12 @@ def recipes_within_tension(line: Line) -> Iterator[Finding]:
                 yield Finding(path, says, allowed)
             elif min(tension_n - low, high - tension_n) < room_n:
                 yield odd(path, f"within {room_n:g} N of a limit of {low:g} to {high:g} N: overshoot stops the line")
+
+
+def _bands(line: Line) -> list[tuple[float, float]]:
+    """Least and greatest tension of each span."""
+    low, high = tension_bands_n(line)
+    return list(zip(low.tolist(), high.tolist(), strict=True))
 
 
 def recipes_within_speed(line: Line) -> Iterator[Finding]:
@@ -177,6 +220,18 @@ def tensioning_in_time(line: Line) -> Iterator[Finding]:
                 f"limits.tensioning_time_s is {time_s:g} s",
                 "a faster rate, a longer time or lower tensions",
             )
+
+
+def tensioning_is_slow(line: Line) -> Iterator[Finding]:
+    given, fastest = line.stages.tensioning.roller_speed_max_m_per_s, line.limits.speed_max_m_per_s
+    greatest = min(TENSIONING_SPEED_SHARE * fastest, TENSIONING_SPEED_MAX_M_PER_S)
+    if given is not None and given > greatest:
+        yield Finding(
+            ("stages", "tensioning", "roller_speed_max_m_per_s"),
+            "is too fast for a web that may not be there",
+            f"up to {greatest:g} m/s: a tenth of limits.speed_max_m_per_s ({fastest:g} m/s), and at most "
+            f"{TENSIONING_SPEED_MAX_M_PER_S:g} m/s",
+        )
 
 
 def tensioning_keeps_the_speed(line: Line) -> Iterator[Finding]:
@@ -239,29 +294,31 @@ def _corners(line: Line, model: WebModel) -> Iterator[WebModel]:
 
 def recipes_within_torque(line: Line) -> Iterator[Finding]:
     """Refused where the nominal model needs more than the limit, odd where the tolerances may."""
-    limit_nm = line.limits.torque_nm
+    limit_nm = torque_limits_nm(line)
     for i, recipe in enumerate(line.recipes):
         if not _computable(line, recipe):
             continue
         torque = recipe_torque(line, recipe)
-        path, allowed = ("recipes", i), f"limits.torque_nm, {limit_nm:g} Nm: lower the speed or the tension differences"
+        path = ("recipes", i)
         if not np.all(torque.nominal <= limit_nm):
-            yield Finding(path, _needs(line, recipe, torque.nominal, "nominal model"), allowed)
+            says, of = _needs(line, recipe, torque.nominal, "nominal model")
+            yield Finding(path, says, f"{of}: lower the speed or the tension differences")
         elif np.any(torque.nominal > (1.0 - _ROOM) * limit_nm):
-            yield odd(path, _needs(line, recipe, torque.nominal, "nominal model"), f"{limit_nm:g} Nm; room to control")
+            says, of = _needs(line, recipe, torque.nominal, "nominal model")
+            yield odd(path, says, f"{of.rpartition(', ')[2]}; room to control")
         elif not np.all(torque.worst <= limit_nm):
-            says = _needs(line, recipe, torque.worst, "worst corner of the tolerances")
-            yield odd(path, says, f"{limit_nm:g} Nm; identification will tell")
+            says, of = _needs(line, recipe, torque.worst, "worst corner of the tolerances")
+            yield odd(path, says, f"{of.rpartition(', ')[2]}; identification will tell")
 
 
 def speed_limit_within_torque(line: Line) -> Iterator[Finding]:
     """Odd where not even the first recipe could be run at the highest speed."""
-    fastest, limit_nm, recipe = line.limits.speed_max_m_per_s, line.limits.torque_nm, line.recipes[0]
+    fastest, recipe = line.limits.speed_max_m_per_s, line.recipes[0]
     if _computable(line, recipe):
         torque = recipe_torque(line, recipe, fastest)
-        if not np.all(torque.nominal <= limit_nm):
-            says = _needs(line, recipe, torque.nominal, "nominal model")
-            yield odd(("limits", "speed_max_m_per_s"), f"at this speed {says}", f"{limit_nm:g} Nm")
+        if not np.all(torque.nominal <= torque_limits_nm(line)):
+            says, of = _needs(line, recipe, torque.nominal, "nominal model")
+            yield odd(("limits", "speed_max_m_per_s"), f"at this speed {says}", of.rpartition(", ")[2])
 
 
 def _computable(line: Line, recipe: Recipe) -> bool:
@@ -269,8 +326,12 @@ def _computable(line: Line, recipe: Recipe) -> bool:
     return len(recipe.tension_n) == len(line.spans) == len(line.rollers) and max(recipe.tension_n) < softest_n
 
 
-def _needs(line: Line, recipe: Recipe, torque_nm: FloatArray, model: str) -> str:
-    worst = int(np.argmax(np.nan_to_num(torque_nm, nan=np.inf)))
+def _needs(line: Line, recipe: Recipe, torque_nm: FloatArray, model: str) -> tuple[str, str]:
+    """What the roller needs that is nearest to its limit or furthest beyond it, and that limit with its name."""
+    limit_nm = torque_limits_nm(line)
+    worst = int(np.argmax(np.nan_to_num(torque_nm / limit_nm, nan=np.inf)))
+    needs = f'"{recipe.name}" needs {torque_nm[worst]:.4g} Nm at roller {worst + 1}'
     return (
-        f'"{recipe.name}" needs {torque_nm[worst]:.4g} Nm at roller {worst + 1} ({line.rollers[worst].name}; {model})'
+        f"{needs} ({line.rollers[worst].name}; {model})",
+        f"{_name_of_torque(line, worst + 1)}, {limit_nm[worst]:g} Nm",
     )

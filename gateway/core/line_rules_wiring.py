@@ -1,11 +1,11 @@
 """Rules about what is wired to what: rollers, spans, devices, buses, addresses, device types."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from ipaddress import ip_address
 
 from gateway.core import can_load
 from gateway.core.line import Bus, CanopenBus, Device, Drive, Line, LoadCell, ModbusTcpBus, OpcUaBus
-from gateway.core.line_problem import Finding, key_in_words, odd
+from gateway.core.line_problem import Finding, Problem, key_in_words, odd
 from gateway.core.line_rules_opcua import host_and_port, is_host, opcua_endpoint, opcua_security
 from gateway.core.nearest import nearest
 from gateway.core.toml_places import Path
@@ -183,13 +183,19 @@ def canopen_addresses(line: Line) -> Iterator[Finding]:
             yield Finding((*path, "address"), "is no CANopen node", "a whole number from 1 to 127 on a CANopen bus")
 
 
-def maps_fit(line: Line, known_maps: Mapping[str, Role]) -> Iterator[Finding]:
-    """The map of every device exists, speaks the protocol of its bus, and is for its kind of device."""
+def maps_fit(
+    line: Line, known_maps: Mapping[str, Role], unusable_maps: Mapping[str, Sequence[Problem]] | None = None
+) -> Iterator[Finding]:
+    """The map of every device exists, can be used, speaks the protocol of its bus, and is for its kind of device."""
     protocols = {bus.name: bus.protocol for bus in line.buses}
     for path, device in devices(line):
         role, protocol = _ROLES[str(path[0])], protocols.get(device.bus)
         fitting = [name for name in sorted(known_maps) if _map_fits(known_maps[name], role, protocol)]
         if device.map in fitting:
+            continue
+        if unusable := (unusable_maps or {}).get(device.map):
+            mend = "mend the map, or name another" + (f": {', '.join(fitting)}" if fitting else "")
+            yield Finding((*path, "map"), f"this map has mistakes: {'; '.join(map(str, unusable))}", mend)
             continue
         known = known_maps.get(device.map)
         wrong = "there is no such map" if known is None else f"is a map for a {known[1]} on {known[0]}"

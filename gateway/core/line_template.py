@@ -3,6 +3,7 @@
 import json
 
 from gateway.core.line import Agents, Gate, Operator
+from gateway.core.line_help import HELP
 from gateway.core.line_template_tables import entries, parameter, table, tables
 from gateway.core.line_template_wiring import DEMONSTRATION, Wiring, wired_tables
 
@@ -64,9 +65,17 @@ def _process(spans: int) -> str:
         "stop_rate_m_per_s2": "0.1",
         "stop_time_s": "10.0",
         "torque_off_rate_nm_per_s": "200.0",
+        "brake_time_s": "7.0",
     }
     tables = [table("control", "Control", control), table("limits", "Limits", limits)]
-    return "\n".join([*tables, table("moves", "Moves", moves)])
+    return "\n".join([*tables, table("moves", "Moves", moves), _stages()])
+
+
+def _stages() -> str:
+    stages = entries("Stages", {"start_warning_s": "3.0"})
+    tensioning = entries("Tensioning", {"roller_speed_max_m_per_s": "#0.01", "torque_share": "0.5"})
+    heads = f"[stages]  # {HELP['Line']['stages']}\n", f"[stages.tensioning]  # {HELP['Stages']['tensioning']}\n"
+    return f"{heads[0]}{stages}\n{heads[1]}{tensioning}"
 
 
 def _web() -> str:
@@ -88,6 +97,7 @@ def _rollers(spans: int) -> str:
                 "radius_m": parameter("0.04", "0.2"),
                 "inertia_kg_m2": parameter("0.95", "0.3"),
                 "friction_nms_per_rad": parameter("10.0", "0.75"),
+                **({"torque_nm": "#40.0"} if i == 1 else {}),
             }
             for i in range(1, spans + 1)
         ],
@@ -99,7 +109,13 @@ def _spans(spans: int) -> str:
         "spans",
         "Span",
         [
-            {"name": f'"span-{i}"', "length_m": parameter("1.0", "0.3"), "control": '"tension"'}
+            {
+                "name": f'"span-{i}"',
+                "length_m": parameter("1.0", "0.3"),
+                "control": '"tension"',
+                "slack_max_m": "0.2",
+                **({"tension_min_n": "#5.0", "tension_max_n": "#50.0"} if i == 1 else {}),
+            }
             for i in range(1, spans + 1)
         ],
     )

@@ -113,7 +113,17 @@ def _drives(wiring: Wiring, spans: int, can_buses: int) -> str:
 
     def drive(i: int) -> Values:
         example = {} if i or "channel" in wired(i) else {"channel": "#1"}
-        return {"name": f'"drive-{i + 1}"', **wired(i), **example, "roller": str(i + 1), "rated_torque_nm": "60.0"}
+        # Light rollers with stiff bearings: they stand at once. A reel or a heavy roller wants its brake.
+        brake = {} if i else {"braking_torque_nm": "#60.0", "braking_power_w": "#500.0", "braking_energy_j": "#5000.0"}
+        return {
+            "name": f'"drive-{i + 1}"',
+            **wired(i),
+            **example,
+            "roller": str(i + 1),
+            "rated_torque_nm": "60.0",
+            **({} if i else {"direction": '#"reversed"', "gear": "#1.0"}),
+            **brake,
+        }
 
     return tables("drives", "Drive", [drive(i) for i in range(spans)])
 
@@ -132,7 +142,14 @@ def _load_cells(wiring: Wiring, spans: int, can: str) -> str:
                 return _wired("server", "r2r-opcua-amplifier", 1, i + 1)
 
     cells = [
-        {"name": f'"load-cell-{i + 1}"', **wired(i), "span": str(i + 1), "capacity_n": "100.0"} for i in range(spans)
+        {
+            "name": f'"load-cell-{i + 1}"',
+            **wired(i),
+            "span": str(i + 1),
+            "capacity_n": "100.0",
+            **({} if i else {"sign": '#"inverted"'}),
+        }
+        for i in range(spans)
     ]
     return tables("load_cells", "LoadCell", cells)
 

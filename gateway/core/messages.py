@@ -2,6 +2,8 @@
 
 import json
 import zlib
+from collections import Counter
+from itertools import islice
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, TypeAdapter, ValidationError
@@ -10,6 +12,7 @@ from gateway.core.deployment import Deployment, Epoch, Hash, InService, Recovery
 from gateway.core.experiment import Experiment, experiment_hash
 from gateway.core.finding import Finding
 from gateway.core.line import Strict
+from gateway.core.wiring_proof import Answer as ProofAnswer
 
 
 class Arm(Strict):
@@ -22,6 +25,25 @@ class Start(Strict):
     """READY to RUN: tension the web, then run at the set speed. HOLD to RUN: back to the set speed."""
 
     command: Literal["start"] = "start"
+
+
+class Drill(Strict):
+    """SILENT or STOP, and back to STOP: at rest every watchdog's feed is withheld, and its reaction seen."""
+
+    command: Literal["drill"] = "drill"
+
+
+class Prove(Strict):
+    """READY, and back to STOP: at standstill one drive at a time pulls a little, and what answers proves the wiring."""
+
+    command: Literal["prove"] = "prove"
+
+
+class KeepProof(Strict):
+    """At rest, after a drill and pulls that found nothing: the wiring is proved by them from now on."""
+
+    command: Literal["keep-proof"] = "keep-proof"
+    answers: Annotated[list[ProofAnswer], Field(max_length=200)] = []  #: to what no pull could show
 
 
 class Hold(Strict):
@@ -108,10 +130,24 @@ class WatchGood(Strict):
 class Narrow(Strict):
     """The line is no longer as it was: what runs, and what it would go back to, goes no further than `region` from now
     on, and no prediction watches it. From the gateway only.
+
+    `confine`: nobody knows what runs, so nobody is asked to slow the line down first. It slows down by itself, and an
+    experiment ends. Else a line that shall run faster is left as it is, and a person is told.
     """
 
     command: Literal["narrow"] = "narrow"
     region: Region
+    confine: bool = False
+
+
+class Confirmed(Strict):
+    """A person has confirmed what runs though nobody has judged it: it is guarded as a first one no more. From the
+
+    gateway only, and again after each start of a loop: the audit knows it, not the loop's disk.
+    """
+
+    command: Literal["confirmed"] = "confirmed"
+    configuration: Hash
 
 
 class Rollback(Strict):
@@ -127,16 +163,21 @@ class AskConfiguration(Strict):
     command: Literal["configuration"] = "configuration"
 
 
-Operating = Arm | Start | Hold | Stop | SetTension | SetSpeed | SelectRecipe | RunExperiment | AbortExperiment
-Configuring = Deploy | Renew | Keep | WatchGood | Narrow | Rollback | AskConfiguration
+Operating = (
+    Arm | Drill | Start | Prove | KeepProof | Hold | Stop | SetTension | SetSpeed | SelectRecipe | RunExperiment
+    | AbortExperiment
+)  # fmt: skip
+Configuring = Deploy | Renew | Keep | WatchGood | Narrow | Confirmed | Rollback | AskConfiguration
 Command = Annotated[Operating | Configuring, Field(discriminator="command")]
 _command: TypeAdapter[Command] = TypeAdapter(Command)
 #: What only the gateway's deployer says, never a person directly.
-Deploying = Deploy | Renew | Keep | WatchGood | Narrow
+Deploying = Deploy | Renew | Keep | WatchGood | Narrow | Confirmed
 
 MAX_COMMAND = 4096  #: bytes of a command as JSON
 #: The same for those with matrices, unpacked. What parses it holds the interpreter for about 10 ms a megabyte.
 MAX_DEPLOYMENT = 2 * 1024 * 1024
+MOST_KEYS = 256  #: of one object of a command; none has forty
+MOST_TOLD = 20  #: errors of one command
 
 
 def in_words(command: Command) -> str:
@@ -196,11 +237,14 @@ class MalformedMessage(Exception):
 
 
 def _no_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    keys = [key for key, _ in pairs]
-    twice = {key for key in keys if keys.count(key) > 1}
-    if twice:
-        raise MalformedMessage(f"key given twice: {', '.join(sorted(twice))}")
-    return dict(pairs)
+    """Takes no longer than reading them, whatever is sent: strangers are heard here, within a period of the loop."""
+    if len(pairs) > MOST_KEYS:
+        raise MalformedMessage(f"an object with {len(pairs)} keys; allowed: {MOST_KEYS}")
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        twice = sorted(key for key, count in Counter(key for key, _ in pairs).items() if count > 1)
+        raise MalformedMessage(f"key given twice: {', '.join(twice)}"[:MAX_COMMAND])
+    return found
 
 
 def command_bytes(command: Command) -> bytes:
@@ -225,7 +269,8 @@ def parse_command(payload: bytes) -> Command:
     try:
         command = _command.validate_python(document)
     except ValidationError as error:
-        reasons = "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())
+        told = islice(error.errors(include_url=False), MOST_TOLD)
+        reasons = "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in told)
         raise MalformedMessage(reasons[:MAX_COMMAND]) from error
     if packed and not isinstance(command, Deploy | Keep | WatchGood):
         raise MalformedMessage(

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gateway.core.signals import BoolArray, FloatArray, Quality
-from gateway.core.states import LoopState
+from gateway.core.states import LoopState, Phase
 
 ARRAYS = (
     "time_s", "tension_n", "tension_setpoint_n", "speed_m_per_s", "torque_nm", "torque_actual_nm",
@@ -89,7 +89,10 @@ def recording_of(frames: NDArray[np.void], period_s: float, source: str) -> Reco
         torque_nm=floats("torque_nm"),
         torque_actual_nm=floats("torque_actual_nm"),
         unwind_speed_m_per_s=floats("unwind_speed_m_per_s"),
-        controlled=np.isin(frames["state"], (LoopState.RUN, LoopState.HOLD)) & ~held,
+        # While the wiring is proved the web hangs, and no law holds it.
+        controlled=np.isin(frames["state"], (LoopState.RUN, LoopState.HOLD))
+        & (frames["phase"] != Phase.PROVING)
+        & ~held,
         period_s=period_s,
         source=source,
     )

@@ -5,7 +5,7 @@ by the line PLC). Everything is SI and positive in the direction of transport.
 """
 
 from dataclasses import dataclass, field
-from enum import IntEnum
+from enum import IntEnum, IntFlag
 from math import isfinite, nan
 
 import numpy as np
@@ -36,6 +36,17 @@ class DriveState(IntEnum):
     STOPPING = 4  #: quick stop active
     FAULT = 5  #: fault or fault reaction
     STO = 6  #: safe torque off is active, from the hard-wired circuit
+
+
+class DriveCondition(IntFlag):
+    """What a drive says of itself beside its state, as far as its map knows where it says so."""
+
+    NONE = 0
+    WRONG_MODE = 1  #: its mode of operation is not the one it was told
+    MODE_UNCONFIRMED = 2  #: enabled, and has not said yet in which mode
+    NO_POWER = 4  #: its power stage has no supply
+    LIMITED = 8  #: a limit of its own acts
+    WARNS = 16  #: it warns of something, and goes on
 
 
 class DriveRequest(IntEnum):
@@ -90,12 +101,17 @@ class PlcStatus:
     permissive: bool = False  #: the line may run
     emergency_stop: bool = True  #: the emergency stop circuit is open
     running: bool = False  #: the line's transport is on
+    tripped: bool = False  #: its command watchdog has fired
+    local: bool = False  #: somebody works at the line: it is not started from elsewhere. A PLC without the signal: no
 
 
 class Inputs:
     """Everything that is read in a cycle, for `n` spans."""
 
-    __slots__ = ("drive_state", "n", "plc", "speed", "tension", "torque", "unwind_speed")
+    __slots__ = (
+        "drive_condition", "drive_mode", "drive_state", "drive_warning", "n", "plc", "power_barred", "speed", "tension",
+        "torque", "unwind_speed",
+    )  # fmt: skip
 
     def __init__(self, n: int) -> None:
         self.n = n
@@ -104,13 +120,20 @@ class Inputs:
         self.torque = Channel(n)  #: Nm, as the drive reports it
         self.unwind_speed = Channel(1)  #: m/s, v0
         self.drive_state: IntArray = np.full(n, DriveState.ABSENT, dtype=np.int8)
+        self.drive_condition: IntArray = np.zeros(n, dtype=np.int8)  #: of DriveCondition
+        self.drive_mode: CountArray = np.zeros(n, dtype=np.int64)  #: of operation, where WRONG_MODE is set
+        #: The error code that it warns of, with the error register (CiA 301, 1001h) above 16 bits; 0: none it names
+        self.drive_warning: CountArray = np.zeros(n, dtype=np.int64)
+        #: The statusword of this cycle says fault or switch on disabled; whatever else speaks against a drive is not in
+        #: it, nor a safe torque off. False where no statusword came.
+        self.power_barred: BoolArray = np.zeros(n, dtype=np.bool_)
         self.plc = PlcStatus()
 
 
 class Outputs:
     """Everything that is written in a cycle, for `n` spans. It starts silent: no torque, drives off."""
 
-    __slots__ = ("drive_request", "n", "run", "speed_request_m_per_s", "torque_nm")
+    __slots__ = ("drive_request", "n", "run", "speed_request_m_per_s", "torque_nm", "warning")
 
     def __init__(self, n: int) -> None:
         self.n = n
@@ -118,6 +141,7 @@ class Outputs:
         self.drive_request: IntArray = np.full(n, DriveRequest.OFF, dtype=np.int8)
         self.speed_request_m_per_s = 0.0  #: asked of the line PLC for the unwinder
         self.run = False  #: asks the line PLC for transport
+        self.warning = False  #: asks the line PLC to warn whoever is near: something is about to move
 
 
 @dataclass(slots=True)

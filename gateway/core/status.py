@@ -5,6 +5,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from gateway.core.alarms import AlarmStatus
+from gateway.core.deployment import WiringStatus
 from gateway.core.finding import Finding
 from gateway.core.line import Strict
 from gateway.core.messages import BusReport
@@ -25,6 +26,7 @@ class LoopStatus(Strict):
     saturated: bool  #: a torque or its rate is at its limit
     doubts: list[str]  #: why proposals are blocked, and what to do; empty when they are not
     restarts: int  #: seen by this gateway
+    false_loop: list[Finding] = []  #: what speaks as the loop and is not, or contradicts it, lately
 
 
 class SpanStatus(Strict):
@@ -42,6 +44,9 @@ class SpanStatus(Strict):
     torque_nm: float | None  #: applied
     torque_actual_nm: float | None  #: as the drive reports it
     drive: str  #: a name of DriveState
+    tension_min_n: float | None = None  #: of this span; null: that of `limits`
+    tension_max_n: float | None = None
+    torque_limit_nm: float | None = None  #: of its roller; null: that of `limits`
 
 
 class Spread(Strict):
@@ -65,6 +70,7 @@ class LinkStatus(Strict):
     dropped_frames: int  #: gaps in the sequence: the loop ran, its telemetry was not taken in time
     malformed: int  #: frames and datagrams that were none
     refused: int  #: requests and connections turned away because there were too many
+    untaken: int = 0  #: messages of processes that are not the loop, and frames of the past or the future
 
 
 class HistorianStatus(Strict):
@@ -89,6 +95,17 @@ class LimitsStatus(Strict):
     tension_min_n: float
     tension_max_n: float
     torque_nm: float
+
+
+def band_n(span: SpanStatus, limits: LimitsStatus) -> tuple[float, float]:
+    """The tensions that `span` may have: its own where it has some."""
+    least = limits.tension_min_n if span.tension_min_n is None else span.tension_min_n
+    return least, limits.tension_max_n if span.tension_max_n is None else span.tension_max_n
+
+
+def torque_limit_nm(span: SpanStatus, limits: LimitsStatus) -> float:
+    """The torque that the drive of the span's roller may give, in either direction."""
+    return limits.torque_nm if span.torque_limit_nm is None else span.torque_limit_nm
 
 
 class ChangeStatus(Strict):
@@ -140,5 +157,10 @@ class GatewayStatus(Strict):
     agents_bus: BusStatus
     historian: HistorianStatus
     events: list[EventStatus]  #: the last ones, the newest at the end
+    events_left_out: int = 0  #: older ones, which the message had no room for; the history has them
+    audit_head: str = ""  #: NUMBER:HASH of the audit's last record; empty: none is known
     alarms: list[AlarmStatus] = []  #: what needs a look first stands first
+    unconfirmed: list[Finding] = []  #: what controls the line, where nobody has judged or confirmed it
+    wiring: WiringStatus | None = None  #: whether it is as it was proved to be; None: the loop has not told
+    unexplained: list[Finding] = []  #: changes of the loop, and attempts, that no record explains
     task_faults: list[TaskFaultStatus] = []  #: the oldest first

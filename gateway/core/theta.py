@@ -1,21 +1,37 @@
 """theta: everything that is believed of a line's physics; what the paper leaves out stands beside its two equations."""
 
 from dataclasses import dataclass, field
+from math import sqrt
 
 import numpy as np
 
 from gateway.core.line import Line
+from gateway.core.line_scales import line_scales
 from gateway.core.signals import FloatArray
 from gateway.core.web_model import WebModel, nominal_model
+
+CELL_NOISE = 10.0  #: of load cells (1 sigma): one part in so many of what is a small tension
+ENCODER_NOISE = 12.0, 100.0  #: of encoders (1 sigma): one part in so many, twice, of the greatest speed
+NOISE_SHARE = 0.2  #: of what torque may change by in a period: what encoders' noise may make of it (1 sigma)
+#: What shakes a roller (1 sigma) in the time in which the line answers, in units of an encoder's noise.
+SHAKEN = 16.0 * sqrt(0.6)
 
 
 @dataclass(frozen=True)
 class Noise:
-    """What moves the line and its measurements at random, as far as it is known."""
+    """What moves the line and its measurements at random, as far as it is known. Defaults: a line of 60 N, 0.12 m/s."""
 
     tension_n: float = 0.1  #: standard deviation of a sample
     speed_m_per_s: float = 1e-4
     acceleration_m_per_s1_5: float = 1.6e-3  #: intensity of the white noise on roller accelerations
+
+
+def expected_noise(line: Line) -> Noise:
+    """What is expected of a line of this size before a model says more."""
+    scales, (parts, hundred) = line_scales(line), ENCODER_NOISE
+    speed_m_per_s = line.limits.speed_max_m_per_s / parts / hundred
+    shaken = speed_m_per_s * (SHAKEN / sqrt(scales.response_s))
+    return Noise(scales.tension_n / CELL_NOISE, speed_m_per_s, shaken)
 
 
 @dataclass(frozen=True)

@@ -36,7 +36,9 @@ class AgentTopic:
 LOOP_TELEMETRY = Topic("loop/telemetry", "publish", "once a period", kept=True)
 LOOP_EVENT = Topic("loop/event", "publish", "100/s", kept=True)
 LOOP_BUSES = Topic("loop/buses", "publish", "1/s", kept=False)
+LOOP_SHOWN = Topic("loop/shown", "request", "20/s", kept=False)  #: AskShown -> LoopShown
 LOOP_COMMAND = Topic("loop/command", "request", "100/s", kept=False)
+LOOP_HELLO = Topic("loop/hello", "request", "1/s", kept=False)  #: nothing -> Introduction
 GATEWAY_COMMAND = Topic("gateway/command", "request", "100/s", kept=True)
 GATEWAY_STATUS = Topic("gateway/status", "request", "20/s", kept=False)
 GATEWAY_PROPOSE = Topic("gateway/propose", "request", "1/s", kept=True)
@@ -51,7 +53,8 @@ GATEWAY_COURSES = Topic("gateway/courses", "request", "20/s", kept=False)  #: Sh
 GATEWAY_ASKED = Topic("gateway/asked", "request", "20/s", kept=False)  #: ShowAsked -> AskedTold
 
 TOPICS = (
-    LOOP_TELEMETRY, LOOP_EVENT, LOOP_BUSES, LOOP_COMMAND, GATEWAY_COMMAND, GATEWAY_STATUS, GATEWAY_PROPOSE,
+    LOOP_TELEMETRY, LOOP_EVENT, LOOP_BUSES, LOOP_SHOWN, LOOP_COMMAND, LOOP_HELLO, GATEWAY_COMMAND, GATEWAY_STATUS,
+    GATEWAY_PROPOSE,
     GATEWAY_PROPOSALS, GATEWAY_DECISION, GATEWAY_FOR_PERSON, GATEWAY_ALARM, GATEWAY_ACCESS,
     GATEWAY_PAST, GATEWAY_COURSES, GATEWAY_ASKED,
 )  # fmt: skip

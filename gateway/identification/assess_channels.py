@@ -77,7 +77,7 @@ def speed_units(line: Line, roller: int | None) -> list[Unit]:
 
 
 def torque_units(line: Line, roller: int) -> list[Unit]:
-    rated = [drive.rated_torque_nm for drive in line.drives if drive.roller == roller + 1]
+    rated = [drive.roller_torque_nm for drive in line.drives if drive.roller == roller + 1]
     shares = [
         Unit(f"{name} of the rated torque", k / r)
         for r in rated[:1]

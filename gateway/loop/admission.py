@@ -67,7 +67,9 @@ class Admission:
         if deployment.watch is not None:
             recovery, watch_s = self._recovery(deployment.watch, good.config)
         self._require_time(law_s, watch_s, good.law_s)
-        return Configuration(config, found, law, deployment.region, deployment.watch, recovery, law_s)
+        return Configuration(
+            config, found, law, deployment.region, deployment.watch, recovery, law_s, confirmed=True
+        )  # fmt: skip
 
     def recovery(self, watch: RecoveryPrediction, fallback: Controller, law_s: float) -> Recovery:
         """Whether `fallback` would recover the line, to be asked in each period beside a law that takes `law_s`.
@@ -103,8 +105,10 @@ class Admission:
             except ControllerRefused as refused:
                 say(f"nobody looks whether the line could be recovered: {refused}")
                 watch = None
-        good = Configuration(config, config_hash(config), law, kept.region, watch, recovery, law_s)
-        return (good if top is None else replace(top, watch=watch, recovery=recovery)), good
+        watched = {"watch": watch, "recovery": recovery, "watch_proof": None if watch is None else kept.watch_proof}
+        good = Configuration(config, config_hash(config), law, kept.region, law_s=law_s, proof=kept.proof)
+        good = replace(good, **watched, confirmed=kept.proof is not None)
+        return (good if top is None else replace(top, **watched)), good
 
     def _resumed_top(self, kept: Kept, good_s: float, say: Callable[[str], None]) -> Configuration | None:
         if (top := kept.on_top) is None:
@@ -117,7 +121,10 @@ class Admission:
         except ControllerRefused as refused:
             say(f"{config.kind} controller {config_hash(config)[:12]} is not used, what it stands on is: {refused}")
             return None
-        return Configuration(config, config_hash(config), law, top.region, law_s=law_s)
+        return Configuration(
+            config, config_hash(config), law, top.region, law_s=law_s, proof=top.proof,
+            confirmed=top.proof is not None,
+        )  # fmt: skip
 
     def _law_s(self, law: Law[Any], config: Controller) -> float:
         """What a period of `law` takes, in processor seconds. Raises ControllerRefused where it cannot be run."""

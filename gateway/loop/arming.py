@@ -6,7 +6,6 @@ from gateway.core.messages import Reply
 from gateway.core.signals import Channel, Quality
 from gateway.core.states import LoopState, Phase
 from gateway.loop.cycle import Cycle
-from gateway.loop.machine import STANDSTILL_M_PER_S
 from gateway.loop.refused import Refused, coded, said
 from gateway.tasks.cleanup import finish_all
 
@@ -58,7 +57,11 @@ def not_ready(cycle: Cycle) -> list[str | Finding]:
     """What speaks against arming, as far as the samples tell. One that is late is no reason to send a person away."""
     running = cycle.configurations.running
     unfit: list[str | Finding] = [f"controller {running.hash[:12]}: {running.unfit}"] if running.unfit else []
-    return unfit + forbidden(cycle) + unheard(cycle)
+    return unfit + (forbidden(cycle) or _turning(cycle)) + unheard(cycle)
+
+
+def _turning(cycle: Cycle) -> list[str | Finding]:
+    return list(cycle.standstill.turning(cycle.inputs, cycle.clock()))
 
 
 def forbidden(cycle: Cycle) -> list[str | Finding]:
@@ -70,9 +73,7 @@ def forbidden(cycle: Cycle) -> list[str | Finding]:
         return ["the emergency stop circuit is open: release it"]
     if not inputs.plc.permissive:
         return ["the line PLC gives no permissive"]
-    if not abs(inputs.unwind_speed.value[0]) <= STANDSTILL_M_PER_S:  # NaN does not stand still
-        return [f"the unwinder turns at {inputs.unwind_speed.value[0]:.4f} m/s: wait for standstill"]
-    return []
+    return _turning(cycle)
 
 
 def unheard(cycle: Cycle) -> list[str | Finding]:

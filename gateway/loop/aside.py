@@ -10,8 +10,9 @@ from typing import TypeVar
 
 T = TypeVar("T")
 
-#: How long the thread may hold the interpreter once the loop wants it; Python's own 5 ms are half a period.
-SWITCH_S = 50e-6
+#: How long the thread may hold the interpreter once the loop wants it; Python's own 5 ms are half a period. Whoever
+#: waits for it wakes as often: with one processor, which the thread needs in between, that must leave it time.
+SWITCH_S = 50e-6 if (os.cpu_count() or 1) > 1 else 1e-3
 BEHIND_LOOPS = 1  #: real-time priority: below any loop's, above whatever has none
 
 

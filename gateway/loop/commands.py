@@ -1,16 +1,22 @@
 """What the operator's commands do to a cycle: each is done, or refused with every reason and what is allowed."""
 
+from collections.abc import Callable
+from dataclasses import replace
 from math import isfinite
 
 from gateway.core.doubts import in_words
+from gateway.core.finding import Finding, finding
 from gateway.core.line import Recipe
+from gateway.core.line_limits import setpoint_bands_n
 from gateway.core.messages import (
-    AbortExperiment,
     Arm,
     Command,
     Configuring,
+    Drill,
     Hold,
+    KeepProof,
     Operating,
+    Prove,
     Reply,
     RunExperiment,
     SelectRecipe,
@@ -20,17 +26,20 @@ from gateway.core.messages import (
     Stop,
 )
 from gateway.core.nearest import nearest
+from gateway.core.proof import Proof
 from gateway.core.states import OPERATORS_STOP, LoopState, Phase
+from gateway.core.wiring_proof import WiringProof, asked_of, not_shown
 from gateway.loop import machine as machines
 from gateway.loop.arming import heard, not_ready, require_rest
 from gateway.loop.cycle import Cycle
 from gateway.loop.deploy import Prepared, configure
 from gateway.loop.judged import least, on_probation, require_judged, unjudged
-from gateway.loop.refused import Refused
-from gateway.loop.setpoints import STEP_PAUSE_S
+from gateway.loop.refused import Refused, said
 
 
-def carry_out(cycle: Cycle, command: Command, now_s: float, prepared: Prepared = None) -> Reply:
+def carry_out(
+    cycle: Cycle, command: Command, now_s: float, prepared: Prepared = None, proof: Proof | None = None
+) -> Reply:
     """Do `command` between two periods.
 
     What takes longer goes before it, aside: `arming.prepare_links` for an arming, `deploy.prepare` for what changes
@@ -38,7 +47,7 @@ def carry_out(cycle: Cycle, command: Command, now_s: float, prepared: Prepared =
     """
     configuring = isinstance(command, Configuring)
     try:
-        text = configure(cycle, command, prepared, now_s) if configuring else _do(cycle, command, now_s)
+        text = configure(cycle, command, prepared, now_s, proof) if configuring else _do(cycle, command, now_s)
     except Refused as refusal:
         reply = Reply(
             ok=False, state=cycle.machine.state.name, text=str(refusal), reasons=refusal.reasons,
@@ -47,7 +56,7 @@ def carry_out(cycle: Cycle, command: Command, now_s: float, prepared: Prepared =
     else:
         reply = Reply(ok=True, state=cycle.machine.state.name, text=text)
     if configuring:
-        return reply.model_copy(update={"in_service": cycle.configurations.in_service(now_s)})
+        return reply.model_copy(update={"in_service": cycle.in_service()})
     if not reply.ok:
         return reply
     if isinstance(command, SetTension | SetSpeed | SelectRecipe):  # the operator's word goes before an experiment's
@@ -56,31 +65,36 @@ def carry_out(cycle: Cycle, command: Command, now_s: float, prepared: Prepared =
 
 
 def _do(cycle: Cycle, command: Operating, now_s: float) -> str:
+    if plain := PLAIN.get(type(command)):
+        return plain(cycle, now_s)
     match command:
-        case Arm():
-            return _arm(cycle, now_s)
-        case Start():
-            return _start(cycle, now_s)
-        case Hold():
-            return _hold(cycle, now_s)
-        case Stop():
-            return _stop(cycle, now_s)
+        case KeepProof():
+            return cycle.wiring.take_written()
         case SetTension():
             return _set_tension(cycle, command, now_s)
         case SetSpeed():
             return _set_speed(cycle, command, now_s)
         case SelectRecipe():
-            return _select_recipe(cycle, command)
+            return _select_recipe(cycle, command, now_s)
         case RunExperiment():
             return _run_experiment(cycle, command)
-        case AbortExperiment():
+        case _:
             return _abort_experiment(cycle)
 
 
 def _arm(cycle: Cycle, now_s: float) -> str:
     require_rest(cycle)
     cycle.change(machines.to_phase(cycle.machine, Phase.ARMING, now_s, ""))
-    return "watchdogs confirmed; the drives become ready"
+    unproved = f"; start will be refused: {said(cycle.wiring.against)[0]}" if cycle.wiring.against else ""
+    return f"watchdogs confirmed; the drives become ready{unproved}"
+
+
+def _drill(cycle: Cycle, now_s: float) -> str:
+    require_rest(cycle)
+    if cycle.inputs.plc.local:
+        raise Refused("not drilled; mend what is named and try again", [finding("line-local")])
+    cycle.change(machines.to_phase(cycle.machine, Phase.DRILLING, now_s, ""))
+    return "the feed of every watchdog is withheld at rest, and its reaction seen"
 
 
 def _start(cycle: Cycle, now_s: float) -> str:
@@ -88,34 +102,99 @@ def _start(cycle: Cycle, now_s: float) -> str:
     match machine.phase:
         case Phase.READY:
             require_judged(cycle, cycle.setpoints.speed_target_m_per_s)
-            reasons = not_ready(cycle) + _moving_rollers(cycle)
-            if reasons:
+            if reasons := [*cycle.wiring.against, *_against_torque(cycle)]:
                 raise Refused("not started; mend what is named and start again", reasons)
-            cycle.change(machines.to_phase(machine, Phase.ENABLING, now_s, ""))
-            return f"tensioning the web, then {cycle.setpoints.speed_target_m_per_s:g} m/s"
+            warned = _warn(cycle, now_s, proves=False)
+            return f"{warned}tensioning the web, then {cycle.setpoints.speed_target_m_per_s:g} m/s"
         case Phase.HOLDING:
-            cycle.change(machines.to_phase(machine, Phase.RUNNING, now_s, ""))
-            return f"back to {cycle.setpoints.speed_target_m_per_s:g} m/s"
-        case Phase.ENABLING | Phase.TENSIONING | Phase.RUNNING:
-            return "running already"
+            if machine.resumes:
+                return "started already: the warning lasts"
+            _require_remote(cycle)
+            warned = _resume(cycle, now_s, stands=cycle.setpoints.speed_m_per_s == 0.0)
+            return f"{warned}back to {cycle.setpoints.speed_target_m_per_s:g} m/s"
+        case Phase.PROVING:
+            raise Refused("the wiring is being proved; wait for its end, or stop it")
+        case Phase.WARNING | Phase.ENABLING | Phase.TENSIONING | Phase.RUNNING:
+            return "running already" if machine.phase is not Phase.WARNING else "started already: the warning lasts"
         case _:
             raise Refused(f"the line is {machine.state.name}: arm it first")
 
 
-def _moving_rollers(cycle: Cycle) -> list[str]:
+def _resume(cycle: Cycle, now_s: float, *, stands: bool) -> str:
+    """Go on running; a web that `stands` moves after the warning. Returns what is done first, in words."""
+    warning_s = cycle.line.stages.start_warning_s
+    if stands and warning_s and cycle.setpoints.speed_target_m_per_s > 0.0:
+        cycle.change(machines.resume(cycle.machine, now_s))
+        return f"warning for {warning_s:g} s, then "
+    if cycle.machine.phase is not Phase.RUNNING:
+        cycle.change(machines.to_phase(cycle.machine, Phase.RUNNING, now_s, ""))
+    return ""
+
+
+def _require_remote(cycle: Cycle) -> None:
+    """Nobody who does not see the line sets it in motion from standstill while the line PLC says "local"."""
+    if cycle.inputs.plc.local:
+        raise Refused("not started; mend what is named and start again", [finding("line-local")])
+
+
+def _prove(cycle: Cycle, now_s: float) -> str:
+    machine = cycle.machine
+    if machine.phase is not Phase.READY:
+        raise Refused(f"the line is {machine.state.name}: arm it first; the wiring is proved from READY")
+    # A drive that nothing is known of is given torque only once its watchdog has been seen to take it off.
+    undrilled: list[str | Finding] = [] if cycle.drill.watchdogs else [finding("not-drilled")]
+    if reasons := undrilled + _against_torque(cycle):
+        raise Refused("not proved; mend what is named and prove again", reasons)
+    return f"{_warn(cycle, now_s, proves=True)}one drive after the other pulls a little; the line stands meanwhile"
+
+
+def proof_to_keep(cycle: Cycle, command: KeepProof) -> WiringProof:
+    """The proof that the last drill and the last pulls make, with a person's answers. Raises Refused."""
+    require_rest(cycle)
+    judged, watchdogs = cycle.proving.judged, cycle.drill.watchdogs
+    if not watchdogs:
+        raise Refused("nothing is kept", [finding("not-drilled")])
+    if judged is None:
+        raise Refused("nothing is kept", [finding("not-pulled")])
+    if judged.findings:
+        coded = [data for each in judged.findings if (data := each.as_data()) is not None]
+        raise Refused("the wiring is not as the line's file says; mend what is named and prove again", coded)
+    answered = {(answer.question, answer.device) for answer in command.answers}
+    if open_ := [each for each in judged.questions if (each.code, asked_of(each)) not in answered]:
+        raise Refused("nothing is kept before a person has answered", [finding("person-asked"), *open_])
+    # An answer to what nobody has asked stands for nothing.
+    asked = {(each.code, asked_of(each)) for each in judged.questions}
+    answers = [each for each in command.answers if (each.question, each.device) in asked]
+    if unshown := not_shown(cycle.line, judged.drives, judged.cells, answers):
+        raise Refused("nothing is kept of a proof that leaves something out", unshown)
+    return cycle.wiring.proof_of(judged.drives, judged.cells, watchdogs, answers)
+
+
+def _against_torque(cycle: Cycle) -> list[str | Finding]:
+    """What speaks against a first torque now."""
+    reasons = not_ready(cycle) + _unknown_rollers(cycle)
+    return [*reasons, finding("line-local")] if cycle.inputs.plc.local else reasons
+
+
+def _warn(cycle: Cycle, now_s: float, *, proves: bool) -> str:
+    """Begin with the warning, where there is one. Returns what is done first, in words."""
+    warning_s = cycle.line.stages.start_warning_s
+    started = replace(cycle.machine, proves=proves)
+    cycle.change(machines.to_phase(started, Phase.WARNING if warning_s else Phase.ENABLING, now_s, ""))
+    return f"warning for {warning_s:g} s, then " if warning_s else ""
+
+
+def _unknown_rollers(cycle: Cycle) -> list[str | Finding]:
     speed = cycle.inputs.speed
-    # A web that gives way after a stop lets its rollers creep; a tenth of the line's speed is no creeping.
-    creeping = 0.1 * cycle.line.limits.speed_max_m_per_s
-    return [
-        f"roller {i + 1} does not stand still, or its speed is not known"
-        for i in range(cycle.line.n)
-        if not heard(cycle, speed, i) or not abs(speed.value[i]) <= creeping
-    ]
+    return [finding("roller-speed-unknown", roller=i + 1) for i in range(cycle.line.n) if not heard(cycle, speed, i)]
 
 
 def _hold(cycle: Cycle, now_s: float) -> str:
     machine = cycle.machine
     if machine.phase is Phase.HOLDING:
+        if machine.resumes:
+            cycle.change(machines.to_phase(machine, Phase.HOLDING, now_s, ""))
+            return "the warning ends, and the line stays held"
         return "held already"
     if machine.phase is not Phase.RUNNING:
         raise Refused(f"only a running line can be held; this one is {machine.phase.name.lower()}")
@@ -133,13 +212,18 @@ def _stop(cycle: Cycle, now_s: float) -> str:
     return "the line ramps to standstill, then torque goes off; arm leads out of it"
 
 
+#: Commands that say nothing but what they are.
+PLAIN: dict[type[Operating], Callable[[Cycle, float], str]] = {
+    Arm: _arm, Drill: _drill, Start: _start, Prove: _prove, Hold: _hold, Stop: _stop,
+}  # fmt: skip
+
+
 def _set_tension(cycle: Cycle, command: SetTension, now_s: float) -> str:
     line, setpoints = cycle.line, cycle.setpoints
     if command.span > line.n:
         raise Refused(f"there is no span {command.span}; allowed: 1 to {line.n}")
     # Noise and overshoot need room: a set-point at the limit would trip the line.
-    low = line.limits.tension_min_n + line.limits.tension_margin_n
-    high = line.limits.tension_max_n - line.limits.tension_margin_n
+    low, high = (float(bound[command.span - 1]) for bound in setpoint_bands_n(line))
     if not (isfinite(command.tension_n) and low <= command.tension_n <= high):
         raise Refused(f"{command.tension_n:g} N is too near a limit or beyond it; allowed: {low:g} to {high:g} N")
     i = command.span - 1
@@ -148,7 +232,9 @@ def _set_tension(cycle: Cycle, command: SetTension, now_s: float) -> str:
         judged = cycle.configurations.running.region.tension_step_max_n
         largest = least(line.limits.tension_step_max_n, judged)
         _require_step(cycle, size, largest, "N", setpoints.tension_step_pause_s(i, now_s))
-        _require_few(size, line.limits.steps_together * largest, setpoints.stepped_lately_n(now_s))
+        _require_few(
+            size, line.limits.steps_together * largest, setpoints.stepped_lately_n(now_s), setpoints.step_pause_s
+        )
         stepped_n = setpoints.tension_n.copy()
         stepped_n[i] = command.tension_n
         _require_safe(cycle.foreseen(stepped_n))
@@ -164,7 +250,12 @@ def _set_speed(cycle: Cycle, command: SetSpeed, now_s: float) -> str:
     if not (isfinite(command.speed_m_per_s) and 0.0 <= command.speed_m_per_s <= high):
         raise Refused(f"{command.speed_m_per_s:g} m/s is outside the limits; allowed: 0 to {high:g} m/s")
     require_judged(cycle, command.speed_m_per_s)
+    departs = _departs(cycle, command.speed_m_per_s)
+    if departs:
+        _require_remote(cycle)
     if command.step:
+        if departs and line.stages.start_warning_s:
+            raise Refused("a web that stands moves after a warning, and then on a ramp; leave out the step")
         size = abs(command.speed_m_per_s - setpoints.speed_m_per_s)
         judged = cycle.configurations.running.region.speed_step_max_m_per_s
         largest = least(line.limits.speed_step_max_m_per_s, judged)
@@ -172,8 +263,15 @@ def _set_speed(cycle: Cycle, command: SetSpeed, now_s: float) -> str:
         _require_safe(cycle.foreseen(setpoints.tension_n, command.speed_m_per_s))
         setpoints.step_speed(command.speed_m_per_s, now_s)
     setpoints.speed_target_m_per_s = command.speed_m_per_s
+    warned = _resume(cycle, now_s, stands=True) if departs else ""
     how = "at once" if command.step else _pace(cycle, f"at {line.moves.speed_rate_m_per_s2:g} m/s2")
-    return f"line speed to {command.speed_m_per_s:g} m/s {how}"
+    return f"{warned}line speed to {command.speed_m_per_s:g} m/s {how}"
+
+
+def _departs(cycle: Cycle, speed_m_per_s: float) -> bool:
+    """Whether a line that runs at standstill is set in motion by this speed."""
+    stands = cycle.machine.phase is Phase.RUNNING and cycle.setpoints.speed_m_per_s == 0.0
+    return stands and speed_m_per_s > 0.0
 
 
 def _pace(cycle: Cycle, rate: str) -> str:
@@ -195,11 +293,11 @@ def _require_step(cycle: Cycle, size: float, largest: float, unit: str, pause_s:
         raise Refused(f"the last step was just now; the next one may come in {pause_s:.1f} s, a ramp at any time")
 
 
-def _require_few(size_n: float, largest_n: float, lately_n: float) -> None:
+def _require_few(size_n: float, largest_n: float, lately_n: float, pause_s: float) -> None:
     """Steps of several spans add up in the speed of the rollers behind them."""
     if lately_n + size_n > largest_n * (1.0 + 1e-9):
         raise Refused(
-            f"with this step of {size_n:g} N those of the last {STEP_PAUSE_S:g} s come to {lately_n + size_n:g} N; "
+            f"with this step of {size_n:g} N those of the last {pause_s:g} s come to {lately_n + size_n:g} N; "
             f"allowed: {largest_n:g} N together (limits.steps_together), or a ramp at any time"
         )
 
@@ -210,7 +308,7 @@ def _require_safe(foreseen: str) -> None:
         raise Refused(f"this step is too large at this speed: {foreseen}; a smaller step, or a ramp at any time")
 
 
-def _select_recipe(cycle: Cycle, command: SelectRecipe) -> str:
+def _select_recipe(cycle: Cycle, command: SelectRecipe, now_s: float) -> str:
     recipes: dict[str, Recipe] = {recipe.name: recipe for recipe in cycle.line.recipes}
     recipe = recipes.get(command.name)
     if recipe is None:
@@ -218,8 +316,12 @@ def _select_recipe(cycle: Cycle, command: SelectRecipe) -> str:
         hint = f"; did you mean {close}?" if close else ""
         raise Refused(f"there is no recipe {command.name!r}{hint} Known: {', '.join(recipes)}")
     require_judged(cycle, recipe.speed_m_per_s)
+    departs = _departs(cycle, recipe.speed_m_per_s)
+    if departs:
+        _require_remote(cycle)
     cycle.setpoints.aim_at(recipe)
-    return f"recipe {recipe.name}: tensions and speed move to it"
+    warned = _resume(cycle, now_s, stands=True) if departs else ""
+    return f"{warned}recipe {recipe.name}: tensions and speed move to it"
 
 
 def _run_experiment(cycle: Cycle, command: RunExperiment) -> str:
@@ -230,6 +332,9 @@ def _run_experiment(cycle: Cycle, command: RunExperiment) -> str:
         raise Refused(f"an experiment needs a running line, this one is {cycle.machine.phase.name.lower()}")
     reasons = cycle.experiments.why_not(experiment, cycle.line, judged=command.proposal is not None)
     reasons += on_probation(cycle)
+    warns = cycle.line.stages.start_warning_s > 0.0
+    if warns and any(_departs(cycle, leg.speed_m_per_s or 0.0) for leg in experiment.legs):
+        reasons.append("it would set a web in motion that stands: set a speed first, of which the line PLC warns")
     if command.proposal is None:
         reasons += unjudged(cycle, experiment)
     if doubts := in_words(int(cycle.watch.doubts)):

@@ -16,6 +16,7 @@ from gateway.core.controller import Controller
 from gateway.core.controller_laws import MpcConfig
 from gateway.core.deployment import Deployment, InService, RecoveryPrediction, Region
 from gateway.core.line import Line
+from gateway.core.proof import Proof
 from gateway.loop.experiment import Tell
 from gateway.loop.kept import Durable, OnTop
 from gateway.loop.setpoints import Setpoints
@@ -37,6 +38,11 @@ class Configuration:
     recovery: Recovery | None = None  #: what `watch` has been made into
     law_s: float = 0.0  #: that a period of the law takes, in processor seconds, as it was measured
     unfit: str = ""  #: why it must not control the line; empty: it may
+    proof: Proof | None = None  #: of the deployment that has brought it; None: the loop was given it
+    watch_proof: Proof | None = None  #: of what has brought `watch`
+    confirmed: bool = (
+        False  #: a verdict has let it through, or a person has confirmed it; else it is guarded as a first
+    )
 
 
 @dataclass(slots=True)
@@ -103,45 +109,59 @@ class Configurations:
     def durable(self) -> Durable:
         """What a loop that starts anew is to run."""
         running, good = self.running, self.good
-        on_top = OnTop(controller=running.config, region=running.region) if self.is_on_top else None
-        return Durable(self.epoch, good.config, good.region, good.watch, on_top)
+        on_top = _on_top(running) if self.is_on_top else None
+        return Durable(self.epoch, good.config, good.region, good.watch, on_top, good.proof, good.watch_proof)
 
-    def durable_if_kept(self, watch: RecoveryPrediction | None) -> Durable:
-        """As `durable`, were `keep` done with this watch."""
+    def durable_if_kept(self, watch: RecoveryPrediction | None, proof: Proof | None) -> Durable:
+        """As `durable`, were `keep` done with this watch and this proof."""
         then, running = self.good_if_kept, self.running
-        on_top = None if then is running else OnTop(controller=running.config, region=running.region)
-        return Durable(self.epoch, then.config, then.region, watch, on_top)
+        on_top = None if then is running else _on_top(running)
+        watch_proof = None if watch is None else proof
+        return Durable(self.epoch, then.config, then.region, watch, on_top, then.proof, watch_proof)
 
-    def keep(self, watch: RecoveryPrediction | None, recovery: Recovery | None) -> None:
+    def keep(self, watch: RecoveryPrediction | None, recovery: Recovery | None, proof: Proof | None) -> None:
         """What is on probation is kept; `watch` is for what the line goes back to from now on."""
         self.good = self.good_if_kept
-        self._watch(watch, recovery)
+        self._watch(watch, recovery, proof)
         self.probation = None
         self.changes += 1
         self.why = "kept"
         good = "is the last known good from now on"
         self._say("kept", good if self.running is self.good else f"is kept, with {self.good.hash[:12]} to go back to")
 
-    def watch_good(self, watch: RecoveryPrediction, recovery: Recovery) -> None:
+    def watch_good(self, watch: RecoveryPrediction, recovery: Recovery, proof: Proof | None) -> None:
         """The line is watched by another model. Only where nothing is on probation."""
-        self._watch(watch, recovery)
+        self._watch(watch, recovery, proof)
         self.changes += 1
         self._say("watched", "is watched by the model that was accepted last")
+
+    def confirm(self, hash_: str) -> bool:
+        """A person knows it: what runs, or is gone back to. False where that is not it."""
+        known = [one for one in (self.running, self.good) if one.hash == hash_]
+        if not known:
+            return False
+        if all(one.confirmed for one in known):
+            return True
+        alone = self.running is self.good
+        self.good = replace(self.good, confirmed=self.good.confirmed or self.good.hash == hash_)
+        running = replace(self.running, confirmed=self.running.confirmed or self.running.hash == hash_)
+        self.running = self.good if alone else running
+        self._say("confirmed", "is confirmed by a person: it is guarded as a first one no more")
+        return True
 
     def narrow(self, region: Region) -> None:
         """The line is another one. Only where nothing is on probation."""
         alone = self.running is self.good
-        self.good = replace(self.good, region=self.good.region.no_further(region), watch=None, recovery=None)
-        self.running = self.good if alone else replace(
-            self.running, region=self.running.region.no_further(region), watch=None, recovery=None
-        )  # fmt: skip
+        self.good = _unwatched(self.good, region)
+        self.running = self.good if alone else _unwatched(self.running, region)
         self.changes += 1
         self._no_faster(self.running.region)
         self._say("narrowed", "is no longer known to hold: it goes no further than a first configuration")
 
-    def _watch(self, watch: RecoveryPrediction | None, recovery: Recovery | None) -> None:
-        good = replace(self.good, watch=watch, recovery=recovery)
-        self.running = good if self.running is self.good else replace(self.running, watch=watch, recovery=recovery)
+    def _watch(self, watch: RecoveryPrediction | None, recovery: Recovery | None, proof: Proof | None) -> None:
+        watched = {"watch": watch, "recovery": recovery, "watch_proof": None if watch is None else proof}
+        good = replace(self.good, **watched)
+        self.running = good if self.running is self.good else replace(self.running, **watched)
         self.good = good
 
     def roll_back(self, reason: str) -> bool:
@@ -194,6 +214,7 @@ class Configurations:
             region=running.region,
             watched=running.recovery is not None,
             why=self.why,
+            confirmed=running.confirmed,
         )
 
     def _say(self, kind: str, text: str, **data: object) -> None:
@@ -201,3 +222,12 @@ class Configurations:
             running = self.running
             said = f"{running.config.kind} controller {running.hash[:12]} {text}"
             self._tell(kind, said, hash=running.hash, epoch=self.epoch, last_known_good=self.good.hash, **data)
+
+
+def _on_top(running: Configuration) -> OnTop:
+    return OnTop(controller=running.config, region=running.region, proof=running.proof)
+
+
+def _unwatched(one: Configuration, region: Region) -> Configuration:
+    """`one`, no further than `region`."""
+    return replace(one, region=one.region.no_further(region), watch=None, recovery=None, watch_proof=None)

@@ -11,10 +11,13 @@ from typing import Annotated
 from pydantic import Field, ValidationError
 
 from gateway.core.deployment import Hash
+from gateway.core.json_problems import problems
 from gateway.core.line import Strict
+from gateway.files import read_bytes
 
 DEATHS = "deaths.json"
 MOST_DEATHS = 2  #: in a row, until a configuration is set aside
+MOST_BYTES = 1_000_000  #: of the file
 LONGEST_REASON = 500  #: characters
 
 
@@ -30,12 +33,24 @@ class Deaths:
     most = MOST_DEATHS
 
     def __init__(self, path: Path) -> None:
-        self._path = path
+        self.path = path
 
     @property
     def last_reason(self) -> str:
         """What the last one died of."""
         return self._read().last_reason
+
+    def why_unreadable(self) -> str:
+        """Why nothing is counted of what the file says; "": it is read, or not there."""
+        try:
+            _Counted.model_validate_json(read_bytes(self.path, MOST_BYTES))
+        except FileNotFoundError:
+            return ""
+        except OSError as error:
+            return f"cannot be read: {error.strerror}"
+        except ValidationError as error:
+            return f"is not used: {problems(error, _Counted)[0]}"
+        return ""
 
     def too_often(self, fingerprint: str) -> bool:
         """Whether what has this fingerprint has ended the loop `MOST_DEATHS` times without one good end in between."""
@@ -56,15 +71,15 @@ class Deaths:
 
     def _read(self) -> _Counted:
         try:
-            return _Counted.model_validate_json(self._path.read_bytes())
+            return _Counted.model_validate_json(read_bytes(self.path, MOST_BYTES))
         except (OSError, ValidationError):
             return _Counted(counts={})
 
     def _write(self, counted: _Counted) -> None:
-        self._path.parent.mkdir(parents=True, exist_ok=True)
-        beside = self._path.with_name(self._path.name + ".part")
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        beside = self.path.with_name(self.path.name + ".part")
         with beside.open("wb") as file:
             file.write(counted.model_dump_json().encode())
             file.flush()
             os.fsync(file.fileno())
-        beside.replace(self._path)
+        beside.replace(self.path)

@@ -4,7 +4,18 @@ from dataclasses import replace
 
 from gateway.core.deployment import Deployment, RecoveryPrediction
 from gateway.core.doubts import in_words
-from gateway.core.messages import AskConfiguration, Configuring, Deploy, Keep, Narrow, Renew, Rollback, WatchGood
+from gateway.core.messages import (
+    AskConfiguration,
+    Configuring,
+    Confirmed,
+    Deploy,
+    Keep,
+    Narrow,
+    Renew,
+    Rollback,
+    WatchGood,
+)
+from gateway.core.proof import Proof
 from gateway.core.states import Phase
 from gateway.loop.configurations import Configuration, Configurations
 from gateway.loop.cycle import Cycle
@@ -32,15 +43,17 @@ def require(cycle: Cycle, command: Deploy | Keep | WatchGood) -> None:
             _require_nothing_on_probation(cycle.configurations)
 
 
-def durable_after(configurations: Configurations, command: Deploy | Keep | WatchGood) -> Durable:
+def durable_after(
+    configurations: Configurations, command: Deploy | Keep | WatchGood, proof: Proof | None = None
+) -> Durable:
     """What a loop that starts anew is to run once `command` is done. One on probation leaves only its epoch."""
     match command:
         case Deploy():
             return replace(configurations.durable, epoch=command.deployment.epoch)
         case Keep():
-            return configurations.durable_if_kept(command.watch)
+            return configurations.durable_if_kept(command.watch, proof)
         case WatchGood():
-            return replace(configurations.durable, watch=command.watch)
+            return replace(configurations.durable, watch=command.watch, watch_proof=proof)
 
 
 def prepare(cycle: Cycle, command: Configuring) -> Prepared:
@@ -57,19 +70,26 @@ def prepare(cycle: Cycle, command: Configuring) -> Prepared:
             return None
 
 
-def configure(cycle: Cycle, command: Configuring, prepared: Prepared, now_s: float) -> str:
-    """Do `command` between two periods, with what `prepare` has made of it. Raises Refused."""
+def configure(cycle: Cycle, command: Configuring, prepared: Prepared, now_s: float, proof: Proof | None = None) -> str:
+    """Do `command` between two periods, with what `prepare` has made of it. Raises Refused.
+
+    `proof`: that the gateway has asked for it; it is kept with the configuration.
+    """
     configurations = cycle.configurations
     match command:
         case Deploy() | Keep() | WatchGood():
             require(cycle, command)
-            return _change(cycle, command, prepared, now_s)
+            return _change(cycle, command, prepared, now_s, proof)
         case Renew():
             _require_probation(cycle, command.epoch)
             configurations.renew(now_s)
             return f"the lease of epoch {command.epoch} begins anew"
         case Narrow():
             return _narrow(cycle, command)
+        case Confirmed():
+            if not configurations.confirm(command.configuration):
+                raise Refused(f"{command.configuration[:12]} does not control the line: nothing is confirmed")
+            return f"{command.configuration[:12]} is guarded as a first configuration no more"
         case Rollback():
             done = cycle.roll_back(command.reason)
             runs = f"{configurations.good.hash[:12]}, the last known good, runs"
@@ -78,15 +98,19 @@ def configure(cycle: Cycle, command: Configuring, prepared: Prepared, now_s: flo
             return "what controls the line"
 
 
-def _change(cycle: Cycle, command: Deploy | Keep | WatchGood, prepared: Prepared, now_s: float) -> str:
+def _change(
+    cycle: Cycle, command: Deploy | Keep | WatchGood, prepared: Prepared, now_s: float, proof: Proof | None
+) -> str:
     match command:
         case Deploy():
             assert isinstance(prepared, Configuration)
-            return _deploy(cycle, command.deployment, prepared, now_s)
+            watch_proof = None if prepared.watch is None else proof
+            proven = replace(prepared, proof=proof, watch_proof=watch_proof)
+            return _deploy(cycle, command.deployment, proven, now_s)
         case Keep():
-            return _keep(cycle.configurations, command, _recovery(prepared))
+            return _keep(cycle.configurations, command, _recovery(prepared), proof)
         case WatchGood():
-            return _watch_good(cycle.configurations, command.watch, _recovery(prepared))
+            return _watch_good(cycle.configurations, command.watch, _recovery(prepared), proof)
 
 
 def against(cycle: Cycle, deployment: Deployment) -> list[str]:
@@ -121,35 +145,46 @@ def _deploy(cycle: Cycle, deployment: Deployment, candidate: Configuration, now_
     return f"{candidate.config.kind} controller {candidate.hash[:12]} controls the line, on probation"
 
 
-def _keep(configurations: Configurations, command: Keep, recovery: Recovery | None) -> str:
+def _keep(configurations: Configurations, command: Keep, recovery: Recovery | None, proof: Proof | None) -> str:
     _require_still(recovery, configurations.good_if_kept, NOT_DONE[Keep])
-    configurations.keep(command.watch, recovery)
+    configurations.keep(command.watch, recovery, proof)
     good = configurations.good
     under = "" if configurations.running is good else f", with {good.hash[:12]} to go back to"
     return f"epoch {command.epoch} is kept{under}"
 
 
-def _watch_good(configurations: Configurations, watch: RecoveryPrediction, recovery: Recovery | None) -> str:
+def _watch_good(
+    configurations: Configurations, watch: RecoveryPrediction, recovery: Recovery | None, proof: Proof | None
+) -> str:
     assert recovery is not None
     _require_still(recovery, configurations.good, NOT_DONE[WatchGood])
-    configurations.watch_good(watch, recovery)
+    configurations.watch_good(watch, recovery, proof)
     return f"{configurations.running.hash[:12]} is watched by the model that was accepted last"
 
 
 def _narrow(cycle: Cycle, command: Narrow) -> str:
+    configurations = cycle.configurations
+    if reasons := _against_narrowing(cycle, command):
+        raise Refused("not narrowed", reasons)
+    if command.confine:
+        cycle.experiments.end("no record explains what controls the line")
+    configurations.narrow(command.region)  # the set-point of the speed goes down with it
+    return f"{configurations.running.hash[:12]} goes no further than a first configuration"
+
+
+def _against_narrowing(cycle: Cycle, command: Narrow) -> list[str]:
     configurations, speed = cycle.configurations, cycle.setpoints.speed_target_m_per_s
     reasons: list[str] = []
     if configurations.probation is not None:
         reasons.append(f"epoch {configurations.epoch} is on probation: keep it or roll it back first")
+    if command.confine:
+        return reasons
     if cycle.experiments.run is not None:
         reasons.append("an experiment is under way: wait for its end, or abort it")
     most = command.region.speed_max_m_per_s
     if most is not None and speed > most and cycle.machine.phase is not Phase.SILENT:
         reasons.append(f"the line shall run at {speed:g} m/s; allowed: up to {most:g} m/s, `r2rgate speed {most:g}`")
-    if reasons:
-        raise Refused("not narrowed", reasons)
-    configurations.narrow(command.region)
-    return f"{configurations.running.hash[:12]} goes no further than a first configuration"
+    return reasons
 
 
 def _recovery(prepared: Prepared) -> Recovery | None:

@@ -12,6 +12,7 @@ from gateway.core.signals import FloatArray
 from gateway.loop.configurations import Configuration, Configurations
 from gateway.loop.torque import TorquePath
 from safety.actions import Finding
+from safety.first_configuration import FirstState, first_limits, look_at_first
 from safety.monitor import MonitorState, look, monitor_limits, recoverable
 
 LAG_S = 0.05  #: of the drives, for which there is room from the beginning: as much as the gate lets a model have
@@ -22,6 +23,9 @@ class Guard:
         self._limits = monitor_limits(line)
         self._state = MonitorState()
         self._watched: Configuration | None = None  #: that `_state` belongs to
+        self._first_limits = first_limits(line)
+        self._first_state = FirstState()
+        self._first: Configuration | None = None  #: that `_first_state` belongs to
         # In flight: through the latency, the lag, and the period in which a torque is computed.
         periods = 2 + ceil((line.control.latency_s + LAG_S) / line.control.period_s)
         self._sent_nm: FloatArray = np.zeros((periods, line.n))  #: newest first
@@ -32,7 +36,7 @@ class Guard:
 
     def off(self) -> None:
         """Control is off: what was seen does not count any more."""
-        self._watched = None
+        self._watched = self._first = None
 
     def sent(self, torque_nm: FloatArray) -> None:
         """Every period: what was sent (n,)."""
@@ -64,6 +68,16 @@ class Guard:
             remembered = memory(path.state) if recovery.fallback == running.hash else None
             findings += recoverable(recovery, measured, setpoint_n, self._sent_nm, torque_nm, remembered)
         return findings
+
+    def against_first(
+        self, running: Configuration, path: TorquePath, measured: Measured, setpoint_n: FloatArray
+    ) -> list[Finding]:
+        """What speaks against a law that nobody has judged or confirmed yet, from its first period on."""
+        if running is not self._first:
+            self._first, self._first_state = running, FirstState()
+        return look_at_first(
+            self._first_limits, self._first_state, measured.tension_n, setpoint_n, path.asked_nm, self._sent_nm[0]
+        )
 
     def foresees(
         self, configurations: Configurations, path: TorquePath, measured: Measured, setpoint_n: FloatArray

@@ -6,15 +6,18 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
+from drivers.device_map import load_maps
 from drivers.port import Link
-from drivers.registry import build_links, speed_steps_m_per_s
+from drivers.registry import build_links, drive_tells, map_files, speed_steps_m_per_s
 from gateway.core.controller import Controller, ControllerRefused
 from gateway.core.line import Line
 from gateway.core.signals import Outputs
 from gateway.core.states import Phase
-from gateway.core.topics import LOOP_BUSES, LOOP_COMMAND, LOOP_EVENT, LOOP_TELEMETRY
+from gateway.core.topics import LOOP_BUSES, LOOP_COMMAND, LOOP_EVENT, LOOP_HELLO, LOOP_SHOWN, LOOP_TELEMETRY
 from gateway.loop.arming import release_links
 from gateway.loop.cycle import Cycle
+from gateway.loop.door import Door
+from gateway.loop.identity import Identity
 from gateway.loop.kept import Kept, Store, fingerprint
 from gateway.loop.memory import RestCollector
 from gateway.loop.pacer import TimerPacer, monotonic
@@ -22,12 +25,23 @@ from gateway.loop.realtime import become_punctual, freeze_collector, stay_awake
 from gateway.loop.runner import Runner
 from gateway.loop.voice import Voice
 from gateway.loop.watch import Watch
+from gateway.loop.wiring import Wiring
+from gateway.mailbox.keys import KeyUnusable, PublicKey, public_key
+from gateway.mailbox.listener import AlreadyRunning
+from gateway.mailbox.loop_proof import NoKey, keep_key, new_key, read_key
+from gateway.mailbox.one_process import hold_alone
 from gateway.mailbox.paths import GATEWAY_SOCKET, LOOP_SOCKET
+from gateway.mailbox.seal import LineName
 from gateway.mailbox.unix import UnixMailbox
 from gateway.tasks.cleanup import finish, finish_all
+from gateway.wording.catalogue import sentences
+from safety.actions import Action, Finding, found
 
 RESTING_PERIODS = 5
 PERSISTED_S = 2.0  #: that a loop which ends waits for its disk
+SET_ASIDE = "configuration-set-aside"  #: kind of event
+#: Messages that are taken within 25 ms of all who write to it: whoever floods it takes little of a period.
+MOST_PER_WINDOW = 20
 
 
 def run_loop(
@@ -47,36 +61,85 @@ def run_loop(
     Raises AlreadyRunning before anything is sent, CannotListen, PathTooLong, and LinksRefused
     when the drivers cannot carry the line.
     """
-    asyncio.run(_main(line, config, run_folder, say, Store(data_folder, config), simulated))
+
+    def gateways_key() -> PublicKey | None:
+        try:
+            return public_key(line.site, line.line, data_folder)
+        except KeyUnusable as error:
+            say(f"no command of the gateway can be taken: {error}")
+            return None
+
+    asyncio.run(_main(line, config, run_folder, data_folder, say, gateways_key, simulated))
 
 
 async def _main(
-    line: Line, config: Controller, run_folder: Path, say: Callable[[str], None], store: Store, simulated: bool
+    line: Line,
+    config: Controller,
+    run_folder: Path,
+    data_folder: Path,
+    say: Callable[[str], None],
+    gateways_key: Callable[[], PublicKey | None],
+    simulated: bool,
 ) -> None:
-    mailbox = UnixMailbox()
-    # First the socket, whose lock makes this the only loop of the line; only then are the buses touched.
+    key = gateways_key()
+    store = Store(data_folder, config, key)
+    mailbox = UnixMailbox(most_per_window=MOST_PER_WINDOW)
+    # First the socket, whose lock makes this the only loop of the line; only then are the buses touched. Whoever asks
+    # waits in the kernel until there are answers: up to `_open` nothing gives the event loop a turn.
     await mailbox.listen(run_folder / LOOP_SOCKET)
+    try:
+        alone = hold_alone(data_folder, "loop", say)
+    except AlreadyRunning:
+        await mailbox.close()
+        raise
     mailbox.connect({LOOP_TELEMETRY, LOOP_EVENT, LOOP_BUSES}, run_folder / GATEWAY_SOCKET)
     links = build_links(line)
     voice = Voice(mailbox, links, line.control.period_s)
-    watch = Watch(line, speed_steps_m_per_s(line))
-    cycle = Cycle(line, config, links, watch, monotonic, voice.record, voice.announce, voice.tell, simulated=simulated)
+    watch = Watch(line, speed_steps_m_per_s(line), drive_tells(line))
+    wiring = Wiring(line, map_files(line), data_folder)
+    wiring.read(say)
+    cycle = Cycle(
+        line, config, links, watch, monotonic, voice.record, voice.announce, voice.tell, simulated=simulated,
+        wiring=wiring,
+    )  # fmt: skip
     try:
         store.write_given(config)
     except OSError as error:
         say(f"the gateway cannot know what this loop was given: {store.path.parent}: {error.strerror}")
     begin(cycle, store.read(line, say), say)
     runner = Runner(cycle, store)
+    # A gateway that is started for the first time makes its key later than this loop has looked for it.
+    door = Door(
+        runner, LineName(line.site, line.line), lambda: key or gateways_key(), monotonic, voice.tell, is_open=False
+    )
+    identity = _identity(run_folder, cycle, say)
     ending = asyncio.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         asyncio.get_running_loop().add_signal_handler(number, ending.set)
     try:
+        mailbox.serve(LOOP_SHOWN, identity.answer)
+        mailbox.serve(LOOP_COMMAND, door.command)
+        mailbox.serve(LOOP_HELLO, door.introduce)
         for trouble in await _open(links):
             say(trouble)
-            voice.tell("bus", trouble)
-        mailbox.serve(LOOP_COMMAND, runner.command)
+            voice.tell_start("bus", trouble)
+        for unusable in [*store.unusable, *wiring.unusable, *_unusable_maps()]:
+            voice.tell_start("file", unusable.text, findings=[unusable])
+        door.open()
         running = cycle.configurations.running
-        voice.tell("start", f"loop of {line.site}/{line.line}, {running.config.kind} controller {running.hash[:12]}")
+        if store.unexplained:
+            told = [found(one.code, Action.NONE, **one.parameters) for one in store.unexplained]
+            voice.tell_start(SET_ASIDE, sentences(store.unexplained), findings=told)
+        if store.unverified:
+            told = [found(one.code, Action.NONE, **one.parameters) for one in store.unverified]
+            voice.tell_start("configuration-not-used", sentences(store.unverified), findings=told)
+        if against := cycle.wiring.against:  # so that nobody learns of it from a start that is refused
+            told = [found(one.code, Action.NONE, **one.parameters) for one in against]
+            voice.tell_start("wiring", sentences(against), findings=told)
+            say(sentences(against))
+        voice.tell_start(
+            "start", f"loop of {line.site}/{line.line}, {running.config.kind} controller {running.hash[:12]}"
+        )
         say(f"loop of {line.site}/{line.line} is SILENT, commands on {run_folder / LOOP_SOCKET}")
         freeze_collector()
         # Last: what starts up must not take a processor from another line's loop.
@@ -89,14 +152,23 @@ async def _main(
     finally:
         await finish_all(link.close() for link in links)
         runner.close()
+        door.close()
+        identity.close()
         await mailbox.close()
+        alone.close()
 
 
 def begin(cycle: Cycle, kept: Kept | None, say: Callable[[str], None]) -> None:
     """Before the first period: what runs is what the loop before has kept, or what this one is given; measured.
 
-    What cannot be used is told. A controller that takes longer than a period has for it is not armed.
+    What cannot be used is told. A controller that takes longer than a period has for it is not armed. What no verdict
+    has let through goes no further than a first configuration.
     """
+    _begin(cycle, kept, say)
+    cycle.confine_unconfirmed()
+
+
+def _begin(cycle: Cycle, kept: Kept | None, say: Callable[[str], None]) -> None:
     if kept is not None:
         try:
             cycle.resume(kept, say)
@@ -106,6 +178,27 @@ def begin(cycle: Cycle, kept: Kept | None, say: Callable[[str], None]) -> None:
             cycle.go_no_further(kept)
     if unfit := cycle.measure_given():
         say(f"the line cannot be armed with the controller given: {unfit}")
+
+
+def _unusable_maps() -> list[Finding]:
+    """Device maps with mistakes. None of this line's: with such a one it would have been refused."""
+    return [
+        found("file-unusable", Action.NONE, file=problems[0].file, reason=str(problems[0]))
+        for problems in load_maps().unusable.values()
+    ]
+
+
+def _identity(run_folder: Path, cycle: Cycle, say: Callable[[str], None]) -> Identity:
+    """With the key that lies in the run folder, or a new one; where it cannot lie there, that is tried again."""
+    try:
+        key = read_key(run_folder)
+    except NoKey:
+        key = new_key()
+    try:
+        keep_key(run_folder, key)
+    except NoKey as error:
+        say(f"this loop cannot show who it is yet, and the gateway takes nothing of it until it can: {error}")
+    return Identity(key, cycle, lambda: keep_key(run_folder, key))
 
 
 async def _open(links: list[Link]) -> list[str]:

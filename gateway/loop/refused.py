@@ -11,7 +11,7 @@ class Refused(Exception):
 
     def __init__(self, text: str, reasons: Iterable[str | Finding] = ()) -> None:
         super().__init__(text)
-        told = list(reasons)
+        self.told = told = list(reasons)
         self.reasons = said(told)
         self.findings = coded(told)
 

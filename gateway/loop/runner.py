@@ -8,23 +8,27 @@ from dataclasses import dataclass
 from gateway.core.controller import ControllerRefused
 from gateway.core.finding import Finding
 from gateway.core.messages import (
-    MAX_COMMAND,
     Arm,
+    AskConfiguration,
     Command,
     Deploy,
+    Drill,
+    Hold,
     Keep,
-    MalformedMessage,
+    KeepProof,
     Narrow,
+    Prove,
     Reply,
     Rollback,
+    Start,
     Stop,
     WatchGood,
-    parse_command,
 )
+from gateway.core.proof import Proof
 from gateway.core.states import LoopState, Phase
 from gateway.loop.arming import forbidden, not_armed, prepare_links, refusal_to_arm, release_links, unheard
 from gateway.loop.aside import Aside
-from gateway.loop.commands import carry_out
+from gateway.loop.commands import carry_out, proof_to_keep
 from gateway.loop.containment import Part
 from gateway.loop.cycle import SUPERVISED, Cycle
 from gateway.loop.deploy import NOT_DONE, Prepared, durable_after, prepare, require
@@ -33,10 +37,14 @@ from gateway.loop.pacer import Tick
 from gateway.loop.persistence import NotPersisted, Persistence
 from gateway.loop.refused import Refused, coded, said
 from gateway.tasks.cleanup import end
+from gateway.wording.catalogue import sentences
+from safety.actions import Action, found
 
 HEARD_AGAIN_S = 1.0  #: for devices that were lost to tell what speaks against arming, or that nothing does
 PERSISTED_S = 1.0  #: for the disk to have what was taken back, until the answer says that it has not
-MAX_WAITING = 32  #: commands between two periods; more are refused, but for a stop
+MAX_WAITING = 32  #: commands between two periods; more are refused, but for what is SAFE
+#: Before everything else and in this order; each has one place of its own, however many ask for it.
+SAFE: tuple[type[Command], ...] = (Stop, Hold)
 BOUNDARY_SHARE = 0.1  #: of a period, for the commands of one boundary; what is left over waits for the next
 
 Answer = asyncio.Future[Reply]
@@ -48,6 +56,7 @@ class Waiting:
 
     command: Command
     prepared: Prepared
+    proof: Proof | None
     answer: Answer
 
 
@@ -62,6 +71,7 @@ class Runner:
         self._configuring = asyncio.Lock()
         self._configurings: set[asyncio.Task[Reply]] = set()  #: asyncio itself keeps tasks only weakly
         self._waiting: deque[Waiting] = deque()
+        self._safe: dict[type[Command], Waiting] = {}  #: what is SAFE and waits
         self._passed = asyncio.Event()
         self._arming: asyncio.Task[Reply | None] | None = None  #: its proofs
         self._armed: asyncio.Task[Reply] | None = None  #: the arming that was asked for last
@@ -72,7 +82,7 @@ class Runner:
     async def period(self, tick: Tick) -> None:
         """Carry out what waits, then one control period."""
         if self._ending:
-            self._carry_out(Stop(), None, tick.now_s)
+            self._carry_out(Stop(), None, None, tick.now_s)
         self._carry_out_waiting(tick.now_s)
         await self.cycle.period(tick)
         self._persistence.look()
@@ -80,40 +90,45 @@ class Runner:
         self._passed.clear()  # whoever waited goes on all the same
 
     def _carry_out_waiting(self, now_s: float) -> None:
-        """In their order, as many as there is time for; at least one, and a stop goes first (`submit`)."""
+        """In their order, as many as there is time for; at least one, and what is SAFE goes first."""
         cycle = self.cycle
         until_s = cycle.clock() + BOUNDARY_SHARE * cycle.limits.period_s
-        while self._waiting:
-            waiting = self._waiting.popleft()
-            reply = self._carry_out(waiting.command, waiting.prepared, now_s)
+        while (waiting := self._next()) is not None:
+            reply = self._carry_out(waiting.command, waiting.prepared, waiting.proof, now_s)
             if not waiting.answer.done():
                 waiting.answer.set_result(reply)
             if cycle.clock() >= until_s:
                 return
 
-    def _carry_out(self, command: Command, prepared: Prepared, now_s: float) -> Reply:
+    def _next(self) -> Waiting | None:
+        for kind in SAFE:
+            if kind in self._safe:
+                return self._safe.pop(kind)
+        return self._waiting.popleft() if self._waiting else None
+
+    def _carry_out(self, command: Command, prepared: Prepared, proof: Proof | None, now_s: float) -> Reply:
         """A command that fails stops the line in order, as any part of a period does."""
         name = command.command
         run = self.cycle.containment.run
         reply = run(
-            Part(f"the command {name}", of_configuration=False), None, carry_out, self.cycle, command, now_s, prepared
-        )
-        return reply or self._refused(f"{name} failed within the loop, which stops the line for it")
+            Part(f"the command {name}", of_configuration=False), None,
+            carry_out, self.cycle, command, now_s, prepared, proof,
+        )  # fmt: skip
+        return reply or self.refused(f"{name} failed within the loop, which stops the line for it")
 
     async def end(self) -> None:
         """From now on the line is being stopped, and no other command is taken. Periods must go on until it rests."""
         self._ending = True
         self._stops += 1
-        self._refuse_waiting_arms()
+        self._refuse_waiting((Arm, Drill), "not armed: it was stopped")
         await self._cancel_arming()
 
     async def over(self, within_s: float) -> None:
         """The last period is over: nothing is decided any more, and the disk has what was, if it takes it in time."""
         self._over = True
-        while self._waiting:
-            answer = self._waiting.popleft().answer
-            if not answer.done():
-                answer.set_result(self._refused("the loop is ending"))
+        while (waiting := self._next()) is not None:
+            if not (answer := waiting.answer).done():
+                answer.set_result(self.refused("the loop is ending"))
         await self.persisted(within_s)
 
     async def persisted(self, within_s: float) -> str:
@@ -124,37 +139,40 @@ class Runner:
     def at_rest(self) -> bool:
         return self.cycle.machine.phase in (Phase.SILENT, Phase.OFF)
 
-    async def command(self, payload: bytes) -> bytes:
-        """Answer a command from outside. Never raises for what is in `payload`."""
-        try:
-            large = len(payload) > MAX_COMMAND
-            command = await self._aside.do(lambda: parse_command(payload)) if large else parse_command(payload)
-            reply = await self.submit(command)
-        except MalformedMessage as error:
-            reply = self._refused(f"not a command: {error}")
-        return reply.model_dump_json().encode()
+    async def submit(self, command: Command, proof: Proof | None = None) -> Reply:
+        """Do `command` at the next boundary between periods; the reply says what was done, or why not.
 
-    async def submit(self, command: Command) -> Reply:
-        """Do `command` at the next boundary between periods; the reply says what was done, or why not."""
+        Who may say it is not asked here (`door`). `proof` is kept with a configuration that is kept.
+        """
         if isinstance(command, Stop):
             return await self._stop(command)
         if self._ending:
-            return self._refused("the loop is ending")
+            return self.refused("the loop is ending")
+        if isinstance(command, Hold):
+            self._refuse_waiting((Start, Prove), "not started: it was held")
+            return await self._at_boundary(command)
+        if isinstance(command, AskConfiguration):  # whoever only asks takes nobody's place
+            return self._carry_out(command, None, None, self.cycle.clock())
         if len(self._waiting) >= MAX_WAITING:
-            return self._refused("too many commands at once: try again")
+            return self.refused("too many commands at once: try again")
+        return await self._in_turn(command, proof)
+
+    async def _in_turn(self, command: Command, proof: Proof | None) -> Reply:
         match command:
-            case Arm():  # it comes to its end, and is undone, even where nobody waits for it any more
+            case Arm() | Drill():  # it comes to its end, and is undone, even where nobody waits for it any more
                 if self._armed is not None and not self._armed.done():
-                    return self._refused("arming is under way")
+                    return self.refused("arming is under way")
                 self._armed = asyncio.create_task(self._arm(command))
                 return await asyncio.shield(self._armed)
             case Deploy() | Keep() | WatchGood():  # what is written ahead is decided, whoever waits for it
-                configuring = asyncio.create_task(self._configure_next(command))
+                configuring = asyncio.create_task(self._configure_next(command, proof))
                 self._configurings.add(configuring)
                 configuring.add_done_callback(self._configurings.discard)
                 return await asyncio.shield(configuring)
             case Rollback() | Narrow():
                 return await self._take_back(command)
+            case KeepProof():
+                return await self._keep_proof(command)
             case _:
                 return await self._at_boundary(command)
 
@@ -166,48 +184,85 @@ class Runner:
     async def _stop(self, command: Stop) -> Reply:
         """Whatever else waits, and also into an arming, whose undoing it does not wait for."""
         self._stops += 1
-        self._refuse_waiting_arms()
+        self._refuse_waiting((Arm, Drill), "not armed: it was stopped")
         undone = asyncio.create_task(self._cancel_arming())
         reply = await self._at_boundary(command)
         await undone
         return reply
 
-    async def _at_boundary(self, command: Command, prepared: Prepared = None) -> Reply:
+    async def _at_boundary(self, command: Command, prepared: Prepared = None, proof: Proof | None = None) -> Reply:
         if self._over:
-            return self._refused("the loop is ending")
-        waiting = Waiting(command, prepared, asyncio.get_running_loop().create_future())
-        (self._waiting.appendleft if isinstance(command, Stop) else self._waiting.append)(waiting)
-        return await waiting.answer
+            return self.refused("the loop is ending")
+        kind = type(command)
+        if kind in self._safe:
+            return await asyncio.shield(self._safe[kind].answer)
+        waiting = Waiting(command, prepared, proof, asyncio.get_running_loop().create_future())
+        if kind in SAFE:
+            self._safe[kind] = waiting
+        else:
+            self._waiting.append(waiting)
+        return await asyncio.shield(waiting.answer)  # others may wait for the same
 
-    async def _arm(self, command: Arm) -> Reply:
+    async def _keep_proof(self, command: KeepProof) -> Reply:
+        """On the disk, and then the line is proved by it."""
+        cycle = self.cycle
+        try:
+            proof = proof_to_keep(cycle, command)
+            await self._disk.do(lambda: cycle.wiring.write(proof))
+        except Refused as refused:
+            return self.refused(str(refused), refused.told)
+        except OSError as error:
+            return self.refused(f"nothing could be kept at {cycle.wiring.path}: {error.strerror or error}")
+        reply = await self._at_boundary(command)
+        if reply.ok:
+            cycle.tell("wiring-proved", reply.text, proof=proof.model_dump(mode="json"))
+        return reply
+
+    async def _arm(self, command: Arm | Drill) -> Reply:
         self._arming = asyncio.create_task(self._prove())
         stops = self._stops
         try:
             await asyncio.wait([self._arming])
             if self._arming.cancelled():
-                return self._refused("not armed: it was stopped")
+                return self.refused("not armed: it was stopped")
             if self._stops != stops and self._arming.result() is None:  # it came when everything was proven already
                 await release_links(self.cycle)
-                return self._refused("not armed: it was stopped")
+                return self.refused("not armed: it was stopped")
             refusal = self._arming.result()
             reply = refusal or await self._at_boundary(command)
             if refusal is None and not reply.ok:  # proven, and then stopped or refused: nothing stays active
                 await release_links(self.cycle)
         finally:  # only now: a second arming would prove, and then release, what this one has armed
             self._arming = None
-        while reply.ok and self.cycle.machine.phase is Phase.ARMING:
+        while reply.ok and self.cycle.machine.phase in (Phase.ARMING, Phase.DRILLING):
             await self._passed.wait()
         if not reply.ok:
             return reply
+        if isinstance(command, Drill):
+            return await self._drilled(reply)
         if self.cycle.machine.state is not LoopState.READY:
-            return self._refused(f"not armed: {self.cycle.machine.reason}")
+            refusal = self.refused(f"not armed: {self.cycle.machine.reason}")
+            return refusal.model_copy(update={"findings": self.cycle.watch.drives.standing_as_data()})
         return reply.model_copy(update={"state": self.cycle.machine.state.name})
 
-    async def _configure_next(self, command: Deploy | Keep | WatchGood) -> Reply:
-        async with self._configuring:
-            return await self._configure(command)
+    async def _drilled(self, reply: Reply) -> Reply:
+        """The drill is over: the devices are left, and what was seen of them is told."""
+        cycle = self.cycle
+        if self.at_rest:
+            await release_links(cycle)
+        data = [data for each in cycle.drill.findings if (data := each.as_data()) is not None]
+        if data or not cycle.drill.watchdogs:
+            text = "not drilled; mend what is named and try again" if data else f"not drilled: {cycle.machine.reason}"
+            return self.refused(text, data)
+        shown = [watchdog.model_dump(mode="json") for watchdog in cycle.drill.watchdogs]
+        cycle.tell("drilled", cycle.machine.reason, watchdogs=shown)
+        return reply.model_copy(update={"state": cycle.machine.state.name, "text": cycle.machine.reason})
 
-    async def _configure(self, command: Deploy | Keep | WatchGood) -> Reply:
+    async def _configure_next(self, command: Deploy | Keep | WatchGood, proof: Proof | None) -> Reply:
+        async with self._configuring:
+            return await self._configure(command, proof)
+
+    async def _configure(self, command: Deploy | Keep | WatchGood, proof: Proof | None) -> Reply:
         """Build, warm and measure what the command brings, and have it on the disk, while periods go on; then do it.
 
         The disk first: after a restart the line runs what somebody was told is kept, and no epoch is used twice.
@@ -216,14 +271,14 @@ class Runner:
 
         def ahead() -> Durable:
             require(cycle, command)  # what it was prepared for may have been taken back since
-            return durable_after(cycle.configurations, command)
+            return durable_after(cycle.configurations, command, proof)
 
         try:
             await self._signals_are_there(command)
             require(cycle, command)
             prepared = await self._aside.do(lambda: prepare(cycle, command))
             await self._signals_are_there(command)
-            return await self._persistence.write_ahead(ahead, lambda: self._at_boundary(command, prepared))
+            return await self._persistence.write_ahead(ahead, lambda: self._at_boundary(command, prepared, proof))
         except ControllerRefused as refused:
             return self._not_done(NOT_DONE[type(command)], [str(refused)])
         except NotPersisted as failed:
@@ -233,8 +288,7 @@ class Runner:
 
     def _not_done(self, text: str, reasons: list[str]) -> Reply:
         """A refusal says what is in service, as every answer to such a command does."""
-        in_service = self.cycle.configurations.in_service(self.cycle.clock())
-        return self._refused(text, reasons).model_copy(update={"in_service": in_service})
+        return self.refused(text, reasons).model_copy(update={"in_service": self.cycle.in_service()})
 
     async def _take_back(self, command: Rollback | Narrow) -> Reply:
         """At once; the answer waits, a while, until a loop that starts anew would know it, too."""
@@ -274,6 +328,7 @@ class Runner:
             if cycle.machine.phase is Phase.OFF:
                 await release_links(cycle)
             reasons = await prepare_links(cycle)
+            self._look_at_wiring()
         except BaseException:  # cancelled by a stop, or a link that failed: nothing stays half-way
             if self.at_rest:
                 await release_links(cycle)
@@ -283,18 +338,30 @@ class Runner:
         await release_links(cycle)
         return not_armed(cycle, reasons)
 
+    def _look_at_wiring(self) -> None:
+        """The devices have been prepared. Whoever looks on need not wait until they ask whether it is proved still."""
+        cycle, before = self.cycle, self.cycle.wiring.status()
+        if cycle.wiring.look(cycle.links):
+            cycle.drill.forget()
+        if cycle.wiring.status() == before:
+            return
+        against = cycle.wiring.against
+        told = [found(one.code, Action.NONE, **one.parameters) for one in against]
+        cycle.tell("wiring", sentences(against) or "the devices are those that were proved", findings=told)
+
     async def _cancel_arming(self) -> None:
         """Once: what the first stop has begun to undo is not cut by the second."""
         if self._arming is not None:
             await end(self._arming)
 
-    def _refuse_waiting_arms(self) -> None:
-        """An arming that has proven everything and waits for its period is stopped like one that is under way."""
-        for waiting in [waiting for waiting in self._waiting if isinstance(waiting.command, Arm)]:
+    def _refuse_waiting(self, kinds: tuple[type[Command], ...], text: str) -> None:
+        """What waits for its period and is overtaken by what is SAFE; also an arming that has proven everything."""
+        for waiting in [waiting for waiting in self._waiting if isinstance(waiting.command, kinds)]:
             self._waiting.remove(waiting)
             if not waiting.answer.done():
-                waiting.answer.set_result(self._refused("not armed: it was stopped"))
+                waiting.answer.set_result(self.refused(text))
 
-    def _refused(self, text: str, reasons: Sequence[str | Finding] = ()) -> Reply:
+    def refused(self, text: str, reasons: Sequence[str | Finding] = ()) -> Reply:
+        """Not done, and why."""
         state = self.cycle.machine.state.name
         return Reply(ok=False, state=state, text=text, reasons=said(reasons), findings=coded(reasons))

@@ -11,8 +11,8 @@ from gateway.control.takeover import NEAR_SETPOINT
 from gateway.core.line import Moves, Recipe
 from gateway.core.signals import BoolArray, FloatArray
 
-STEP_PAUSE_S = 2.0  #: between two steps of one quantity, so that they do not add up to one that is larger than allowed
-LEAST_MOVE_S = 0.2  #: that a minimum-jerk move takes, however small
+STEP_PAUSE = 100.0  #: moments between two steps of one quantity: they must not add up to one that is too large
+LEAST_MOVE = 10.0  #: moments that a minimum-jerk move takes, however small
 NEAR = 0.2  #: a tension this near its set-point, as a fraction, has followed it
 
 
@@ -35,7 +35,10 @@ class OnTheWay:
 class Setpoints:
     """Tensions (n,) in N and the line's speed in m/s: now, and where they move to."""
 
-    def __init__(self, recipe: Recipe) -> None:
+    def __init__(self, recipe: Recipe, moment_s: float) -> None:
+        """`moment_s` is that of the line (`line_scales`)."""
+        self.step_pause_s = STEP_PAUSE * moment_s  #: between two steps of one quantity
+        self._least_move_s = LEAST_MOVE * moment_s
         n = len(recipe.tension_n)
         self.recipe = recipe
         self.tension_n: FloatArray = np.zeros(n)  #: what control follows now
@@ -116,15 +119,15 @@ class Setpoints:
 
     def tension_step_pause_s(self, span: int, now_s: float) -> float:
         """Seconds until another step of this tension may be made; not positive when it may be made now."""
-        return float(self._tension_stepped_s[span]) + STEP_PAUSE_S - now_s
+        return float(self._tension_stepped_s[span]) + self.step_pause_s - now_s
 
     def stepped_lately_n(self, now_s: float) -> float:
         """What the steps of all tensions come to together that are so young that another one would add to them."""
-        lately = self._tension_stepped_s > now_s - STEP_PAUSE_S
+        lately = self._tension_stepped_s > now_s - self.step_pause_s
         return float(self._tension_stepped_n[lately].sum())
 
     def speed_step_pause_s(self, now_s: float) -> float:
-        return self._speed_stepped_s + STEP_PAUSE_S - now_s
+        return self._speed_stepped_s + self.step_pause_s - now_s
 
     def advance(
         self,
@@ -155,7 +158,7 @@ class Setpoints:
             target_n = float(self.tension_target_n[i])
             if not self._ramped[i] and not self._curve.is_moving(i, before_s):
                 # It begins where it is now, and has moved in a period from now.
-                self._curve.move(i, target_n, moves.tension_rate_n_per_s, self._time_s, LEAST_MOVE_S)
+                self._curve.move(i, target_n, moves.tension_rate_n_per_s, self._time_s, self._least_move_s)
                 continue
             reach, value = moves.tension_rate_n_per_s * period_s, float(self.tension_n[i])
             self._curve.put(i, value + max(-reach, min(reach, target_n - value)))
@@ -169,7 +172,7 @@ class Setpoints:
             if self._ramped[i] or self._curve.is_moving(i, before_s):
                 self._ramp_speed(period_s, goal_m_per_s, rate_m_per_s2)
                 return
-            self._curve.move(i, goal_m_per_s, rate_m_per_s2, self._time_s, LEAST_MOVE_S)
+            self._curve.move(i, goal_m_per_s, rate_m_per_s2, self._time_s, self._least_move_s)
         self.speed_m_per_s = float(self._curve.at(self._time_s)[0, i])
 
     def _ramp_speed(self, period_s: float, goal_m_per_s: float, rate_m_per_s2: float) -> None:

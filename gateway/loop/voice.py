@@ -1,5 +1,6 @@
 """What the loop says to the gateway: a frame a period, events, and how its buses fare. Never blocks, never waits."""
 
+from collections import deque
 from collections.abc import Sequence
 
 from drivers.port import Link
@@ -12,6 +13,7 @@ from gateway.mailbox.port import Mailbox
 from safety.actions import Finding
 
 REPORT_EVERY_S = 1.0
+MOST_UNHEARD = 64  #: events of a start: some of each bus, file and finding
 
 
 class Voice:
@@ -20,18 +22,29 @@ class Voice:
         self._links = links
         self._report_every = max(1, round(REPORT_EVERY_S / period_s))  # periods
         self._led_here: Sequence[Finding] = ()  #: what led to the state that the loop is in
+        self._unheard: deque[bytes] = deque(maxlen=MOST_UNHEARD)  #: events of the start, until there is a gateway
 
     def record(self, frame: Frame) -> None:
         """A period's telemetry, and now and then the buses."""
         self._mailbox.publish(LOOP_TELEMETRY, pack(frame))
+        if self._unheard and frame.sequence % self._report_every == 0:
+            self._tell_unheard()
         if frame.sequence % self._report_every == 0:
             self._mailbox.publish(LOOP_BUSES, BUS_REPORTS.dump_json([_report(link) for link in self._links]))
 
     def tell(self, kind: str, text: str, *, findings: Sequence[Finding] = (), **data: object) -> None:
         """An event."""
-        coded = [found for finding in findings if (found := finding.as_data()) is not None]
-        event = Event(time_s=monotonic(), kind=kind, text=text, findings=coded, data=data)
-        self._mailbox.publish(LOOP_EVENT, event.model_dump_json().encode())
+        self._mailbox.publish(LOOP_EVENT, _event(kind, text, findings, data))
+
+    def tell_start(self, kind: str, text: str, *, findings: Sequence[Finding] = (), **data: object) -> None:
+        """An event of the start: told again once a second until there is a gateway that takes it."""
+        self._unheard.append(_event(kind, text, findings, data))
+        self._tell_unheard()
+
+    def _tell_unheard(self) -> None:
+        """In their order."""
+        while self._unheard and self._mailbox.publish(LOOP_EVENT, self._unheard[0]):
+            self._unheard.popleft()
 
     def announce(self, before: Machine, after: Machine, findings: list[Finding]) -> None:
         """A change of phase with what led to it and what the buses say; or an alarm within a phase.
@@ -49,6 +62,11 @@ class Voice:
         if after.state is not before.state:
             self._led_here = findings
         self.tell("state", text, findings=findings or self._led_here, state=after.state.name, rules=rules)
+
+
+def _event(kind: str, text: str, findings: Sequence[Finding], data: dict[str, object]) -> bytes:
+    coded = [found for finding in findings if (found := finding.as_data()) is not None]
+    return Event(time_s=monotonic(), kind=kind, text=text, findings=coded, data=data).model_dump_json().encode()
 
 
 def _report(link: Link) -> BusReport:

@@ -3,37 +3,54 @@
 import numpy as np
 
 from gateway.core.doubts import Doubt
+from gateway.core.drive_tells import DriveTells
 from gateway.core.line import Line
+from gateway.core.line_scales import line_scales
 from gateway.core.signals import BoolArray, FloatArray, Inputs
+from gateway.core.tension_estimate import MEAN_PERIODS
+from gateway.loop.drive_watch import DriveWatch
 from gateway.loop.setpoints import Setpoints
 from safety import frozen
 from safety.actions import Action, Finding
 from safety.drift import DriftState, drift_limits, restart, watch_balance
-from safety.jumps import JumpState, jump_limits, reject_jumps, reject_unwinder
+from safety.estimated_tension import EstimateState, estimate_limits, find_estimated, steady_n
+from safety.impossible import ValueState, reject_impossible, value_limits
+from safety.jumps import UNWINDER_SPEED, JumpState, jump_limits, reject_jumps, reject_unwinder
+from safety.limits import envelope_limits
+from safety.rejections import rejections, take_in
 from safety.stuck import StuckState, find_stuck, stuck_limits
 
 CREEPING = 0.02  #: of the greatest speed; below it torques say nothing about load cells
-SATURATED_S = 2.0  #: at a limit, net of the time away from it, until proposals are blocked
+_AVERAGED_PERIODS = 6 * MEAN_PERIODS  #: after which averages of averages hold 2 % of what was before
+SATURATED = 100.0  #: moments at a limit, net of the time away from it, until proposals are blocked
 
 
 class Watch:
     """`doubts` is what blocks proposals now; `stuck` (n,) are the spans whose load cell stands still.
 
-    `speed_steps_m_per_s` (n,) is what a count of each drive's speed is worth.
+    `speed_steps_m_per_s` (n,) is what a count of each drive's speed is worth; `tells` what else the drives' maps know,
+    None for drives that keep to the profile and report torques without steps.
     """
 
-    def __init__(self, line: Line, speed_steps_m_per_s: FloatArray) -> None:
+    def __init__(self, line: Line, speed_steps_m_per_s: FloatArray, tells: DriveTells | None = None) -> None:
         self.doubts = Doubt.NONE
+        self.speed_steps_m_per_s = speed_steps_m_per_s
+        self.drives = DriveWatch(line, tells)
         self.stuck: BoolArray = np.zeros(line.n, np.bool_)
         self._cells = {cell.span: cell.name for cell in line.load_cells}
         self._jump_limits, self._jumps = jump_limits(line, speed_steps_m_per_s), JumpState()
+        self._value_limits, self._values = value_limits(line, speed_steps_m_per_s), ValueState()
+        self._rejections = rejections(line)
         self._applied_nm: FloatArray = np.zeros(line.n)
         self._stuck_limits, self._stuck = stuck_limits(line), StuckState()
         self._turning_m_per_s, self._frozen = frozen.turning_m_per_s(line), frozen.FrozenState()
+        self._estimate_limits, self._estimate = estimate_limits(line, envelope_limits(line)), EstimateState()
+        self._unreliable = MEAN_PERIODS  #: periods until the estimate is of drives and cells that were reliable alone
         self._drift_limits, self._drift = drift_limits(line), DriftState()
         self._creeping_m_per_s = CREEPING * line.limits.speed_max_m_per_s
         self._saturated = 0  # periods, up and down
-        self._saturated_periods = max(1, round(SATURATED_S / line.control.period_s))
+        self._saturated_periods = line_scales(line).periods(SATURATED)
+        self._saturated_s = SATURATED * line_scales(line).moment_s
         self._setpoints: tuple[bytes, float] | None = None  #: of the period before; None while control is off
         self._drifts = False  #: a cell has been told to drift
         restart(self._drift_limits, self._drift)
@@ -44,15 +61,64 @@ class Watch:
         self._applied_nm = applied_nm
         return reject_jumps(self._jump_limits, self._jumps, inputs, acted_nm)
 
-    def reject_unwinder(self, inputs: Inputs, request_m_per_s: float) -> None:
-        """Discard a v0 that cannot be true. `request_m_per_s` is what the PLC was asked for last."""
+    def forget_speeds(self) -> None:
+        """What comes next is believed, as the first sample of all is."""
+        self._jumps = JumpState()
+
+    def reject_impossible(self, inputs: Inputs, request_m_per_s: float, asked_nm: FloatArray) -> list[Finding]:
+        """Discard what tension, torque and v0 cannot be, while the line is controlled. What is told, or stops the line.
+
+        `request_m_per_s` is what the PLC was asked for last, `asked_nm` (n,) what the drives were.
+        """
         reject_unwinder(self._jump_limits, self._jumps, inputs, request_m_per_s)
+        found = reject_impossible(self._value_limits, self._values, inputs, request_m_per_s, asked_nm)
+        if self._jumps.rejected:
+            found += self._jumps.rejected
+            self._jumps.rejected.clear()
+        confirmed = self._values.confirmed
+        if self._jumps.unwind_confirmed:
+            confirmed = [*confirmed, UNWINDER_SPEED]
+        return take_in(self._rejections, found, confirmed)
+
+    def believe_again(self) -> None:
+        """The line is not controlled: whoever threads it moves what he likes, and what comes next is believed."""
+        self._jumps.rejected.clear()
+        self._rejections.waiting.clear()
+        if len(self._values.tension_n):
+            self._values = ValueState()
 
     def find_stuck(self, inputs: Inputs) -> list[Finding]:
         """Load cells and drives whose samples stand still while the line is controlled: what stops the line."""
         findings = find_stuck(self._stuck_limits, self._stuck, inputs)
         self.stuck = self._stuck.stuck
         return findings + frozen.find_frozen(self._turning_m_per_s, self._frozen, inputs)
+
+    def find_estimated(
+        self, inputs: Inputs, applied_nm: FloatArray, set_n: FloatArray, *, floor: bool
+    ) -> list[Finding]:
+        """Spans without a load cell whose tension cannot be within its band, or has fallen: what stops the line.
+
+        `applied_nm` (n,) acted while the samples were taken, `set_n` (n,) are the set-points; `floor`: the web has been
+        tensioned.
+        """
+        if self._estimate_limits is None:
+            return []
+        return find_estimated(self._estimate_limits, self._estimate, inputs, applied_nm, set_n, floor=floor)
+
+    def estimated_n(self, *, doubted: bool) -> FloatArray | None:
+        """Once a period: the least and the most (2, n) that tensions may be, by torques and speeds where no cell is.
+
+        None where every span has a load cell, and until drives and cells have been reliable for as long as it averages.
+        `doubted`: a drive is lost, or nobody knows.
+        """
+        if self._estimate_limits is None:
+            return None
+        drives = self.drives
+        if doubted or any(drives.suspected.tobytes()) or self.silent or drives.any_uncompared():
+            self._unreliable = _AVERAGED_PERIODS
+        elif self._unreliable:
+            self._unreliable -= 1
+        return None if self._unreliable else steady_n(self._estimate_limits, self._estimate)
 
     def controlled(
         self, inputs: Inputs, setpoints: Setpoints, applied_nm: FloatArray, saturated: bool
@@ -70,6 +136,9 @@ class Watch:
 
     def off(self) -> None:
         """Control is off. What was doubted stays so, until somebody has looked and arms."""
+        if self._estimate.means is not None:
+            self._estimate = EstimateState()
+        self._unreliable = MEAN_PERIODS  # averages begin with what is there
         if self._setpoints is None:
             return
         self._setpoints = None
@@ -82,8 +151,14 @@ class Watch:
     def armed(self) -> list[Finding]:
         """A person arms: everything begins anew. Returns what is to be told."""
         self.stuck = np.zeros_like(self.stuck)
+        self.drives.armed()
         self._drifts = False
         return self._tell(Doubt.NONE)
+
+    @property
+    def silent(self) -> list[int]:
+        """Spans, from 0, whose load cell has shown one value for longer than its noise allows."""
+        return self._stuck.silent
 
     def any_stuck(self) -> bool:
         """Whether a load cell stands still."""
@@ -100,6 +175,8 @@ class Watch:
         self._drifts = self._drifts or bool(np.count_nonzero(self._drift.drift_n))
         if self._drifts:
             doubts |= Doubt.CELL_DRIFTS
+        if self.drives.any_uncompared():
+            doubts |= Doubt.TORQUE_UNCOMPARED
         return doubts
 
     def _tell(self, doubts: Doubt) -> list[Finding]:
@@ -113,10 +190,13 @@ class Watch:
 
     def _text(self, doubt: Doubt) -> str:
         if doubt == Doubt.SATURATED:
-            return f"torques have been at their limits for {SATURATED_S:g} s: proposals are blocked"
+            return f"torques have been at their limits for {self._saturated_s:g} s: proposals are blocked"
         if doubt == Doubt.CELL_STUCK:
             cells = ", ".join(self._cell(int(i)) for i in np.flatnonzero(self.stuck))
             return f"stuck: {cells}; proposals are blocked: check cell, amplifier and cable"
+        if doubt == Doubt.TORQUE_UNCOMPARED:
+            names = ", ".join(self.drives.names_of(self.drives.uncompared))
+            return f"torque asked and torque given are not compared any more: {names}; proposals are blocked"
         drift_n = self._drift.drift_n
         cells = ", ".join(f"{self._cell(int(i))} by about {drift_n[i]:+.1f} N" for i in np.flatnonzero(drift_n))
         first = " (or the friction of roller 1 has changed)" if drift_n[0] else ""

@@ -11,14 +11,13 @@ from pathlib import Path
 from gateway.mailbox.codec import MAX_DATAGRAM, Envelope, MalformedEnvelope, decode
 from gateway.mailbox.listener import new_socket
 from gateway.mailbox.port import Counters, Peer, Unreachable
+from gateway.mailbox.turns import Turns
 
 #: What may lie unread in the kernel for one peer. About 250 telemetry frames of six spans, and one longest message.
 SEND_BUFFER = 262_144
 #: Datagrams taken from one peer before everybody else in the event loop has a turn.
 READ_BUDGET = 8
-#: A peer that sends more than this in a window is not read until the window ends; its own sends fail meanwhile.
-WINDOW_S = 0.1
-MAX_PER_WINDOW = 400
+_TIMEVAL = struct.Struct("ll")  # seconds, microseconds: socket(7), SO_SNDTIMEO
 _UCRED = struct.Struct("3i")  # pid, uid, gid: unix(7), SO_PEERCRED
 #: The datagram is lost, the connection is not.
 _DROPPED = frozenset((errno.EAGAIN, errno.ENOBUFS, errno.EMSGSIZE, errno.ENOMEM))
@@ -33,6 +32,21 @@ def dial(path: Path) -> socket.socket:
         connecting.close()
         raise
     return connecting
+
+
+def dial_patiently(path: Path, within_s: float) -> socket.socket:
+    """As `dial`, but waits for a place in the backlog, in the order in which others do. Blocks for so long at most."""
+    waiting = new_socket()
+    try:
+        seconds, fraction_s = divmod(within_s, 1.0)
+        waiting.setblocking(True)
+        waiting.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, _TIMEVAL.pack(int(seconds), int(fraction_s * 1e6)))
+        waiting.connect(os.fspath(path))
+        waiting.setblocking(False)
+    except OSError:
+        waiting.close()
+        raise
+    return waiting
 
 
 def receive_buffer() -> memoryview:
@@ -50,12 +64,11 @@ class Connection:
         "_buffer",
         "_closed",
         "_counters",
-        "_in_window",
         "_loop",
         "_receive",
-        "_resume",
         "_socket",
-        "_window_end_s",
+        "_turns",
+        "heard_s",
         "in_flight",
         "open",
         "peer",
@@ -69,6 +82,7 @@ class Connection:
         receive: Callable[["Connection", Envelope], None],
         closed: Callable[["Connection"], None],
         buffer: memoryview,
+        turns: Turns,
     ) -> None:
         connected.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
         pid, uid, _ = _UCRED.unpack(connected.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _UCRED.size))
@@ -81,11 +95,16 @@ class Connection:
         self._receive = receive
         self._closed = closed
         self._buffer = buffer
-        self._in_window = 0
-        self._window_end_s = 0.0
-        self._resume: asyncio.TimerHandle | None = None
+        self._turns = turns
+        turns.come(pid)
         self._loop = asyncio.get_running_loop()
+        self.heard_s = self._loop.time()
         self._loop.add_reader(connected, self._readable)
+
+    @property
+    def pid(self) -> int:
+        """Of the process at the other end."""
+        return self.peer.pid
 
     def send(self, datagram: bytes) -> bool:
         """Hand `datagram` to the kernel. False, and counted, when there is no room or nobody there."""
@@ -104,8 +123,7 @@ class Connection:
         if not self.open:
             return
         self.open = False
-        if self._resume is not None:
-            self._resume.cancel()
+        self._turns.go(self.pid)
         self._loop.remove_reader(self._socket)
         self._socket.close()
         for future in self.pending.values():
@@ -115,6 +133,10 @@ class Connection:
 
     def _readable(self) -> None:
         for _ in range(READ_BUDGET):
+            if not self._turns.is_on(self.pid):
+                self._loop.remove_reader(self._socket)
+                self._turns.wait(self.pid, self._go_on)
+                return
             try:
                 length = self._socket.recv_into(self._buffer)
             except BlockingIOError:
@@ -124,9 +146,16 @@ class Connection:
             if length == 0:
                 self.close()
                 return
+            self._turns.took(self.pid)
+            self.heard_s = self._loop.time()
             self._take(bytes(self._buffer[:length]))
-            if not self.open or self._too_many():
+            if not self.open:
                 return
+
+    def _go_on(self) -> None:
+        if self.open:
+            self._loop.add_reader(self._socket, self._readable)
+            self._readable()
 
     def _take(self, datagram: bytes) -> None:
         try:
@@ -136,15 +165,3 @@ class Connection:
             self._counters.last_error = f"malformed datagram from process {self.peer.pid}: {error}"
             return
         self._receive(self, envelope)
-
-    def _too_many(self) -> bool:
-        now_s = self._loop.time()
-        if now_s >= self._window_end_s:
-            self._window_end_s = now_s + WINDOW_S
-            self._in_window = 0
-        self._in_window += 1
-        if self._in_window < MAX_PER_WINDOW:
-            return False
-        self._loop.remove_reader(self._socket)
-        self._resume = self._loop.call_at(self._window_end_s, self._loop.add_reader, self._socket, self._readable)
-        return True

@@ -8,11 +8,13 @@ import fcntl
 import os
 import socket
 import stat
-from collections.abc import Callable
+from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 MAX_PATH = 107  #: bytes of `sun_path` before its closing zero, unix(7)
-BACKLOG = 16
+BACKLOG = 128  #: that may wait to be taken
+AT_ONCE = 4  #: that are taken before everybody else in the event loop has a turn
 
 
 class CannotListen(Exception):
@@ -62,6 +64,7 @@ class Listener:
     def __init__(self, path: Path) -> None:
         check_path(path)
         self.path = path
+        self.closed = False
         _private_folder(path.parent)
         self._lock = _lock(path)
         try:
@@ -72,6 +75,7 @@ class Listener:
             raise
 
     def close(self) -> None:
+        self.closed = True
         self.socket.close()
         try:
             self.path.unlink(missing_ok=True)
@@ -104,9 +108,15 @@ def _lock(path: Path) -> int:
         holder = os.pread(descriptor, 20, 0).decode("ascii", "replace").strip() or "unknown"
         os.close(descriptor)
         raise AlreadyRunning(f"{path} is served already, by process {holder}") from None
-    os.ftruncate(descriptor, 0)
-    os.pwrite(descriptor, f"{os.getpid()}\n".encode(), 0)
+    note_holder(descriptor)
     return descriptor
+
+
+def note_holder(descriptor: int) -> None:
+    """This process's number into the lock that it holds, for whoever is refused. On a full disk the lock holds too."""
+    with suppress(OSError):
+        os.ftruncate(descriptor, 0)
+        os.pwrite(descriptor, f"{os.getpid()}\n".encode(), 0)
 
 
 def _remove_stale(path: Path) -> None:
@@ -134,12 +144,12 @@ def _bound(path: Path) -> socket.socket:
     return listening
 
 
-def accept_all(listening: socket.socket, take: Callable[[socket.socket], None]) -> None:
-    """Take every connection that waits, without blocking."""
-    for _ in range(BACKLOG):
+def accepted_at_once(listening: socket.socket) -> Iterator[socket.socket]:
+    """Some of the connections that wait, without blocking; the others with the next wake-up."""
+    for _ in range(AT_ONCE):
         try:
             accepted, _ = listening.accept()
         except OSError:  # none left, or the peer has gone, or no descriptor is free: the next wake-up tries again
             return
         accepted.setblocking(False)
-        take(accepted)
+        yield accepted

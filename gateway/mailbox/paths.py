@@ -35,7 +35,15 @@ def run_base() -> Path:
     return next((base for base in preferred if _usable(base)), last)
 
 
+def _folders_in(base: Path) -> list[Path]:
+    """None where the base is not there, is no folder or may not be read."""
+    try:
+        return list(base.iterdir())
+    except OSError:
+        return []
+
+
 def running_lines() -> list[Path]:
     """Run folders in which a gateway or a loop answers now, by name."""
-    folders = {folder for base in _bases() if os.access(base, os.R_OK | os.X_OK) for folder in base.iterdir()}
+    folders = {folder for base in _bases() for folder in _folders_in(base)}
     return sorted(folder for folder in folders if living(folder / GATEWAY_SOCKET) or living(folder / LOOP_SOCKET))

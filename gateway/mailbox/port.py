@@ -35,8 +35,12 @@ class Peer:
     pid: int
 
 
-#: The asking peer, readable inside a request handler; None where the transport cannot tell (in-process).
+#: The peer that asks or publishes, readable inside a handler; None where the transport cannot tell (in-process).
 PEER: ContextVar[Peer | None] = ContextVar("peer", default=None)
+
+
+#: Who has answered the last request of this task; None where the transport cannot tell (in-process, Zenoh).
+ANSWERED: ContextVar[Peer | None] = ContextVar("answered", default=None)
 
 
 @dataclass(slots=True)

@@ -10,15 +10,18 @@ import socket
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from functools import partial
 from itertools import count
 from pathlib import Path
 
 from gateway.core.topics import Topic
 from gateway.mailbox.codec import Envelope, Kind, MalformedEnvelope, encode
-from gateway.mailbox.connection import Connection, dial, receive_buffer
-from gateway.mailbox.listener import Listener, accept_all, check_path
+from gateway.mailbox.connection import Connection, dial, dial_patiently, receive_buffer
+from gateway.mailbox.crowd import who_makes_room
+from gateway.mailbox.listener import Listener, accepted_at_once, check_path
 from gateway.mailbox.port import (
+    ANSWERED,
     MAX_PAYLOAD,
     PEER,
     Counters,
@@ -30,16 +33,26 @@ from gateway.mailbox.port import (
     no_answer,
     what_to_start,
 )
+from gateway.mailbox.turns import MAX_PER_WINDOW, Turns
 
 RECONNECT_S = 1.0  #: a publisher looks for a lost listener at most this often
 MAX_CONNECTIONS = 32
 MAX_IN_FLIGHT = 32  #: requests of one peer that are answered at the same time
 
 
+PATIENCE_S = 1.0  #: of a request, for a place among those who wait to be taken
+
+
+class Crowded(NotSent):
+    """So many wait to be taken that there is no place to wait."""
+
+
 class UnixMailbox:
-    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, clock: Callable[[], float] = time.monotonic, most_per_window: int = MAX_PER_WINDOW) -> None:
+        """`most_per_window`: see `Turns`."""
         self.counters = Counters()
         self._clock = clock
+        self._most_per_window = most_per_window
         self._listeners: list[Listener] = []
         self._accepted: set[Connection] = set()
         self._routes: dict[str, Path] = {}
@@ -50,13 +63,13 @@ class UnixMailbox:
         self._answering: set[asyncio.Task[None]] = set()
         self._ids = count(1)
         self._buffer = receive_buffer()
+        self._turns: Turns | None = None  #: from the first connection on
 
     async def listen(self, path: Path) -> None:
         """Take connections on `path`. Raises PathTooLong, AlreadyRunning, CannotListen (see `listener`)."""
         listener = Listener(path)
         self._listeners.append(listener)
-        take = partial(accept_all, listener.socket, self._accept)
-        asyncio.get_running_loop().add_reader(listener.socket, take)
+        self._heed(listener)
 
     def connect(self, topics: Iterable[Topic], path: Path) -> None:
         """Send `topics` to whoever listens on `path`; dialled when needed. Raises PathTooLong."""
@@ -94,11 +107,17 @@ class UnixMailbox:
             datagram = encode(Envelope(Kind.REQUEST, topic.name, number, payload))
         except MalformedEnvelope as error:
             raise RemoteError(str(error)) from error
-        connection = self._send_request(topic, datagram)
+        try:
+            connection = self._send_request(topic, datagram)
+        except Crowded:
+            await self._dial_patiently(topic, min(timeout_s, PATIENCE_S))
+            connection = self._send_request(topic, datagram)
         future = connection.pending[number] = asyncio.get_running_loop().create_future()
         try:
             async with asyncio.timeout(timeout_s):
-                return await future
+                answer = await future
+            ANSWERED.set(connection.peer)
+            return answer
         except TimeoutError:
             raise Unreachable(no_answer(topic, timeout_s)) from None
         finally:
@@ -111,6 +130,8 @@ class UnixMailbox:
             loop.remove_reader(listener.socket)
             listener.close()
         self._listeners.clear()
+        if self._turns is not None:
+            self._turns.close()
         for task in self._answering:
             task.cancel()
         # Before anything is waited for, which may be cancelled.
@@ -118,18 +139,45 @@ class UnixMailbox:
             connection.close()
         await asyncio.gather(*self._answering, return_exceptions=True)
 
+    def _heed(self, listener: Listener) -> None:
+        if not listener.closed:
+            asyncio.get_running_loop().add_reader(listener.socket, self._accept_some, listener)
+
+    def _accept_some(self, listener: Listener) -> None:
+        for accepted in accepted_at_once(listener.socket):
+            self._accept(accepted)
+            again_s = self._all_turns().accept()
+            if again_s is not None:
+                loop = asyncio.get_running_loop()
+                loop.remove_reader(listener.socket)
+                loop.call_at(again_s, self._heed, listener)
+                return
+
     def _accept(self, accepted: socket.socket) -> None:
         if len(self._accepted) >= MAX_CONNECTIONS:
             self.counters.refused += 1
-            accepted.close()
-            return
+            who_makes_room(self._accepted).close()
         self._accepted.add(self._connection(accepted, self._accepted.discard))
 
     def _connection(self, connected: socket.socket, closed: Callable[[Connection], None]) -> Connection:
-        return Connection(connected, self.counters, self._receive, closed, self._buffer)
+        return Connection(connected, self.counters, self._receive, closed, self._buffer, self._all_turns())
+
+    def _all_turns(self) -> Turns:
+        if self._turns is None:
+            self._turns = Turns(self._most_per_window)
+        return self._turns
+
+    async def _dial_patiently(self, topic: Topic, within_s: float) -> None:
+        """Until there is a place in the backlog, in a thread; where there is none in time, nothing is dialled."""
+        path = self._routes[topic.name]
+        with suppress(OSError):
+            self._took(path, await asyncio.to_thread(dial_patiently, path, within_s))
 
     def _dial(self, path: Path) -> Connection:
-        connection = self._connection(dial(path), partial(self._lost, path))
+        return self._took(path, dial(path))
+
+    def _took(self, path: Path, dialled: socket.socket) -> Connection:
+        connection = self._connection(dialled, partial(self._lost, path))
         self._dialled[path] = connection
         self.counters.connects += 1
         return connection
@@ -163,7 +211,7 @@ class UnixMailbox:
         try:
             connection = self._dial(path)
         except BlockingIOError:
-            raise NotSent(f"{topic.name}: nobody takes connections on {path}, its process is stuck") from None
+            raise Crowded(f"{topic.name}: nobody takes connections on {path}, its process is stuck") from None
         except PermissionError:
             raise NotSent(f"{path} belongs to another user: run this as the one who started it") from None
         except OSError as error:
@@ -174,6 +222,7 @@ class UnixMailbox:
 
     def _receive(self, connection: Connection, envelope: Envelope) -> None:
         if envelope.kind is Kind.PUBLISH:
+            PEER.set(connection.peer)
             for handler in self._subscribers.get(envelope.topic, ()):
                 try:
                     handler(envelope.payload)

@@ -18,10 +18,17 @@ from pathlib import Path
 from typing import Annotated, NamedTuple
 
 from pydantic import Field, ValidationError
+from pydantic_core import ErrorDetails
 
 from gateway.core.line import Strict
+from gateway.core.line_problem import key_in_words
+from gateway.core.nearest import nearest
 from gateway.core.people import Role, UserName
+from gateway.core.toml_places import Path as Place
+from gateway.core.toml_places import line_of, places
+from gateway.core.toml_syntax import syntax_problem
 from gateway.core.topics import AGENT_NAMES
+from gateway.files import read_bytes
 
 FILE_NAME, LOCK = "users.toml", "users.lock"
 #: Names by which the audit calls what is no person.
@@ -78,22 +85,13 @@ class Users:
     def read(cls, path: Path) -> "Users":
         """Raises UsersRefused, also where others than its owner may read or write it."""
         try:
-            with path.open("rb") as stream:
-                others = stat.S_IMODE(os.fstat(stream.fileno()).st_mode) & 0o077
-                content = stream.read(MOST_BYTES + 1)
+            content = read_bytes(path, MOST_BYTES)
+            others = stat.S_IMODE(path.stat().st_mode) & 0o077
         except OSError as error:
             raise UsersRefused(f"{path} cannot be read: {error.strerror}") from error
         if others:
             raise UsersRefused(f"{path} is open to others than its owner: `chmod 600 {path}` mends it")
-        if len(content) > MOST_BYTES:
-            raise UsersRefused(f"{path} has more than {MOST_BYTES} bytes")
-        try:
-            found = _File.model_validate(tomllib.loads(content.decode()))
-        except ValidationError as error:
-            reasons = "; ".join(f"{'.'.join(map(str, one['loc']))}: {one['msg']}" for one in error.errors()[:5])
-            raise UsersRefused(f"{path}: {reasons}") from None  # the cause has what was entered
-        except ValueError as error:
-            raise UsersRefused(f"{path} is no TOML: {error}") from error
+        found = _parsed(content, path)
         by_name = {one.name: one for one in found.users}
         if len(by_name) < len(found.users):
             raise UsersRefused(f"{path} has a name twice; allowed: each once")
@@ -172,6 +170,36 @@ def change(path: Path, how: Callable[[Users], Users]) -> None:
         how(UsersFile(path).current()).write(path)  # of the last user who is removed an empty file stays
     finally:
         os.close(lock)
+
+
+def _parsed(content: bytes, path: Path) -> _File:
+    """Raises UsersRefused with the line of what is wrong, and never with what was entered there."""
+    try:
+        text = content.decode().replace("\r\n", "\n")
+    except UnicodeDecodeError as error:
+        line = content.count(b"\n", 0, error.start) + 1
+        raise UsersRefused(f"{path}:{line}: is not UTF-8 here: save the file as UTF-8") from None
+    try:
+        document = tomllib.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise UsersRefused(str(syntax_problem(error, text, str(path)))) from None
+    try:
+        return _File.model_validate(document)
+    except ValidationError as error:
+        where = places(text)
+        raise UsersRefused("; ".join(_mistake(one, where, path) for one in error.errors()[:5])) from None
+
+
+def _mistake(error: ErrorDetails, where: dict[Place, int], path: Path) -> str:
+    """Where, what, and the nearest key; without the value."""
+    place: Place = error["loc"]
+    said = f"{path}:{line_of(where, place)}: {key_in_words(place)}: {error['msg']}"
+    key = next(reversed(place), None)
+    if error["type"] != "extra_forbidden" or key is None:
+        return said
+    known = list((_Entry if len(place) > 1 else _File).model_fields)
+    near = nearest(str(key), known)
+    return f"{said}; allowed: {', '.join(known)}" + (f"; did you mean {near!r}?" if near else "")
 
 
 class UsersFile:

@@ -30,7 +30,6 @@ from gateway.core.topics import (
     ASK_UNANSWERED,
     AgentName,
 )
-from gateway.mailbox.allowance import Allowance
 from gateway.mailbox.port import MAX_PAYLOAD, Mailbox
 from gateway.supervisor.agents_cases import AgentsCases
 from gateway.supervisor.deployer_sides import NotKnown
@@ -42,8 +41,6 @@ from gateway.supervisor.proposal_records import iso, refused
 RULES = "rules"
 AUTHOR = "agents"  #: of all their proposals
 MOST_TEXT = 400  #: letters of an event
-#: Of all agents, beyond the first few. The list of proposals is a person's, and what the phases know of their past.
-PROPOSALS_PER_S = 30.0 / 3600.0
 STEP_OF_CHAIN = "commissioning:"  #: by which the chain knows its own proposals (gateway/commissioning/past.py)
 NAMES_AGENT = "agent "  #: an evidence that begins so names who proposes
 
@@ -51,7 +48,7 @@ NAMES_AGENT = "agent "  #: an evidence that begins so names who proposes
 class AgentsDesk:
     def __init__(
         self, status: Callable[[], GatewayStatus], gate: Gate, dry_runs: DryRuns, log: Interactions,
-        note: Callable[..., None], cases: AgentsCases, clock: Callable[[], float] = time.monotonic,
+        note: Callable[..., None], cases: AgentsCases,
     ) -> None:  # fmt: skip
         self._status = status
         self._gate = gate
@@ -60,8 +57,6 @@ class AgentsDesk:
         self._writing = asyncio.Lock()  #: one thread for the log, however many agents talk
         self._note = note
         self._cases = cases
-        self._clock = clock
-        self._proposals = Allowance(PROPOSALS_PER_S)
 
     def serve_on(self, bus: Mailbox) -> None:
         for agent in AGENT_NAMES:
@@ -74,13 +69,11 @@ class AgentsDesk:
 
     async def _propose(self, agent: AgentName, payload: bytes) -> bytes:
         reasons = _not_theirs(agent, payload)
-        if not reasons and not self._proposals.take(self._clock()):
-            reasons = [f"agents propose too often; allowed: {3600.0 * PROPOSALS_PER_S:g} an hour, of all together"]
         if reasons:
             reply = self._refused(agent, "it is not judged", reasons)
             self._note("proposal", f"agent {agent}: {reply.text}", ok=False, reasons=reasons)
         else:
-            reply = await self._gate.propose(payload, Who(name=f"agent {agent}"))
+            reply = await self._gate.propose(payload, Who(name=f"{NAMES_AGENT}{agent}"))
         return _bytes(reply)
 
     async def _tell_status(self, _: bytes) -> bytes:
@@ -99,7 +92,7 @@ class AgentsDesk:
             return _bytes(self._gate.shut_reply())
         try:
             parse_proposal(payload, MAX_PAYLOAD)
-            found = await self._dry_runs.run(payload, self._gate.deployer)
+            found = await self._dry_runs.run(payload, self._gate.deployer, agent)
         except ProposalRefused as malformed:
             return _bytes(self._refused(agent, "it is no proposal", malformed.reasons))
         except (TooMany, NotKnown) as error:

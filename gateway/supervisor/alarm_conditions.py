@@ -8,8 +8,9 @@ from collections.abc import Callable
 from gateway.core.doubts import WORDS, Doubt
 from gateway.core.finding import Finding
 from gateway.core.states import OPERATORS_STOP
-from gateway.core.status import GatewayStatus, SpanStatus
+from gateway.core.status import GatewayStatus, SpanStatus, band_n, torque_limit_nm
 from gateway.supervisor.audit import AuditState
+from gateway.wording.catalogue import sentences
 
 OFF_SHARE = 0.2  #: of the set-point
 MISSED_SHARE = 0.01  #: of the periods of ten seconds
@@ -24,17 +25,25 @@ class Conditions:
     def __init__(self) -> None:
         self._told = ""  #: with the last change of state
         self.stopped_by: list[Finding] = []  #: what led to the last change of state, as far as it is data
+        self.false_loop: list[Finding] = []  #: what was found last of one that is none
 
     def look(self, status: GatewayStatus, audit: AuditState) -> dict[str, str]:
         """By alarm what is so now, in words."""
         self._hear(status)
         found = {"audit-unavailable": "" if audit.available else audit.text, "loop-lost": _loop_lost(status)}
+        self.false_loop = status.loop.false_loop or self.false_loop
+        found["false-loop"] = sentences(status.loop.false_loop)
         found["gateway-task"] = _gateway_task(status)
+        found["unexplained-change"] = sentences(status.unexplained)
         found["history-not-stored"] = "" if status.historian.storing else status.historian.text
         if status.loop.running:
             found |= {name: condition(status) for name, condition in OF_THE_LINE.items()}
             found["line-stopped"] = self._line_stopped(status)
         return {name: text[:LONGEST_TEXT] for name, text in found.items() if text}
+
+    def findings_of(self, alarm: str) -> list[Finding]:
+        """What led to an alarm, as far as it is data."""
+        return {"line-stopped": self.stopped_by, "false-loop": self.false_loop}.get(alarm, [])
 
     def _hear(self, status: GatewayStatus) -> None:
         newest = next((event for event in reversed(status.events) if event.kind == "state"), None)
@@ -77,16 +86,17 @@ def _torque_at_limit(status: GatewayStatus) -> str:
     doubted = WORDS[Doubt.SATURATED] in status.loop.doubts
     if status.loop.state not in MOVING or not (status.loop.saturated or doubted):
         return ""
-    most = max(status.spans, key=lambda span: abs(span.torque_nm or 0.0))
-    return f"{most.roller} at {most.torque_nm or 0.0:.1f} Nm; allowed: {status.limits.torque_nm:g} Nm"
+    limits = status.limits
+    most = max(status.spans, key=lambda span: abs(span.torque_nm or 0.0) / torque_limit_nm(span, limits))
+    return f"{most.roller} at {most.torque_nm or 0.0:.1f} Nm; allowed: {torque_limit_nm(most, limits):g} Nm"
 
 
 def _out_of_band(status: GatewayStatus) -> str:
     """Once the set-point is in the band: on the way there from a slack web it is not."""
-    least, most = status.limits.tension_min_n, status.limits.tension_max_n
     return "; ".join(
         f"{_measured(span)}; allowed: {least:g} to {most:g} N"
         for span, tension_n, setpoint_n in _controlled(status)
+        for least, most in (band_n(span, status.limits),)
         if least <= setpoint_n <= most and not least <= tension_n <= most
     )
 

@@ -61,6 +61,11 @@ class AlarmStates:
         self._restored = dict(kept.acknowledged)
         self._restored_until_s = now_s + RESTORED_S
 
+    def restore_shelved(self, name: str, left_s: float, now_s: float) -> None:
+        """As it was before a restart, unless somebody has said otherwise since."""
+        if name in BY_NAME and left_s > 0.0 and name not in self.shelved:
+            self.shelve(name, left_s, now_s)
+
     def look(self, conditions: Mapping[str, str], now_s: float) -> list[tuple[str, str]]:
         """`conditions` that hold now, by alarm in words. Returns what has come or gone, with its text, for a record."""
         told = list[tuple[str, str]]()

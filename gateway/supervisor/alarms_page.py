@@ -23,7 +23,8 @@ does so in the loop, before an alarm is told.
   it back at once. Without an audit nothing is shelved.
 - **First of several**: of alarms that began within {TOGETHER_S:g} s the one that began first. Look there first.
 - Both are on record with who and why (`r2rgate audit show --kind acknowledged`, `--kind shelved`). They outlive a
-  restart of the gateway: what comes again within {RESTORED_S:g} s of it is the same alarm.
+  restart of the gateway: what comes again within {RESTORED_S:g} s of it is the same alarm. What the file
+  `alarms.json` has on the shelf and no record explains shows again, as the event `alarm-not-shelved` tells.
 - Through OPC UA and the page it takes an operator.
 - An alarm comes when its condition has held for the time under "after", and ends when it has not for that under
   "gone", so that nothing flickers.

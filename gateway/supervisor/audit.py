@@ -21,6 +21,20 @@ from gateway.supervisor.audit_file import AuditUnavailable
 from gateway.supervisor.audit_verify import MOST_AT_ONCE
 from gateway.supervisor.audit_writer import NOT_DONE, NOT_TOLD, AuditWriter, Draft, this_process
 
+#: Kinds of record that come as often as people, agents and strangers like. All others are decisions, or their ends.
+OFTEN = frozenset(
+    (
+        "agents",
+        "logged-in",
+        "operated",
+        "refused-person",
+        "refused-decision",
+        "wrong-logins",
+        "received",
+        "refused",
+        "judged",
+    )
+)  # fmt: skip
 MOST_WAITING = 1000
 MOST_BLOB_BYTES = 16 * 2**20
 WITHIN_S = 10.0  #: longer than SQLite waits for a reader
@@ -31,6 +45,7 @@ class AuditState:
     available: bool
     text: str  #: one sentence for a person
     last: Anchor  #: number and head of the last record
+    decided: int = 0  #: number of the last record of a decision, or of what came of one
 
 
 @dataclass(frozen=True)
@@ -57,6 +72,7 @@ class Audit:
         self._given_up: list[int] = []  #: stored, nobody was told, and not noted yet
         self._changed = threading.Condition()
         self._closing = False
+        self._decided = 0
         self._state = AuditState(False, "starting", NOTHING_YET)
         self._thread = threading.Thread(target=self._live, name="audit", daemon=True)
 
@@ -148,13 +164,15 @@ class Audit:
         except Exception as error:
             self._refuse(batch, error)
             return
-        self._state = AuditState(True, "recording", self._writer.last)
+        decided = [at.sequence for one, at in zip(batch, stored, strict=True) if one.draft.kind not in OFTEN]
+        self._decided = max([self._decided, *decided])
+        self._state = self._recording()
         self._given_up += [at.sequence for one, at in zip(batch, stored, strict=True) if not _tell(one.stored, at)]
         self._note_given_up()
 
     def _refuse(self, batch: list[_Waiting], error: Exception) -> None:
         unavailable = error if isinstance(error, AuditUnavailable) else AuditUnavailable(f"the audit failed: {error!r}")
-        self._state = AuditState(False, str(unavailable), self._writer.last)
+        self._state = AuditState(False, str(unavailable), self._writer.last, self._decided)
         for one in batch:
             if not one.stored.cancelled():
                 try:
@@ -172,7 +190,10 @@ class Audit:
             self._refuse([], error)  # it is noted with the next one
             return
         self._given_up.clear()
-        self._state = AuditState(True, "recording", self._writer.last)
+        self._state = self._recording()
+
+    def _recording(self) -> AuditState:
+        return AuditState(True, "recording", self._writer.last, self._decided)
 
 
 def _tell(stored: "Future[Anchor]", at: Anchor) -> bool:

@@ -12,8 +12,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gateway.core.audit_record import BEFORE_FIRST, canonical_json, head_of
+from gateway.files import NO_FILE, read_bytes
 
 FILE_NAME = "audit.anchor"
+MOST_BYTES = 4096
 
 
 class AnchorDamaged(Exception):
@@ -37,9 +39,15 @@ def encode(anchor: Anchor) -> bytes:
 def read_anchor(folder: Path) -> Anchor | None:
     """None: there is none. Raises AnchorDamaged and OSError."""
     try:
-        content = (folder / FILE_NAME).read_bytes()
+        content = read_bytes(folder / FILE_NAME, MOST_BYTES)
     except FileNotFoundError:
         return None
+    except OSError as error:
+        if error.errno in NO_FILE:
+            raise AnchorDamaged(
+                f"{folder / FILE_NAME} is damaged: {error.strerror}, which was never written"
+            ) from error
+        raise
     try:
         fields = json.loads(content)
         anchor = Anchor(fields["sequence"], fields["head"])

@@ -57,6 +57,7 @@ class AuditWriter:
         self._file: AuditFile | None = None
         self._inode: int | None = None
         self._last = NOTHING_YET  #: of the open file, committed and anchored
+        self._known = NOTHING_YET  #: the last that this process has stored itself: it is in the file for ever
 
     @property
     def last(self) -> Anchor:
@@ -125,6 +126,8 @@ class AuditWriter:
             anchor = read_anchor(self.folder)
         except AnchorDamaged as error:
             raise AuditUnavailable(f"{error}. {WHAT_TO_DO}") from error
+        if self._known.sequence and anchor in (None, NOTHING_YET):
+            raise AuditUnavailable(f"the audit in {self.folder} is gone: {_made_anew(self._known)}")
         if anchor is None:
             if traces := _traces(self.folder):
                 raise AuditUnavailable(
@@ -153,6 +156,8 @@ class AuditWriter:
         self._use(AuditFile(self.folder, open_there(self.path, KIND)), anchor)
         assert self._file is not None
         last, not_told = _verify_tail(self._file, anchor)
+        if self._known.sequence and not _holds(self._file, self._known):
+            raise AuditUnavailable(f"the audit in {self.folder} is another one: {_made_anew(self._known)}")
         if last != anchor:
             self._anchor(anchor)  # where none can be written now, no note is added at each attempt
             # Noted first, anchored with the note: interrupted in between, it is noted again.
@@ -185,6 +190,7 @@ class AuditWriter:
                 )
                 stored.append(last)
         self._anchor(last)
+        self._known = last
         return stored
 
     def _anchor(self, last: Anchor) -> None:
@@ -222,6 +228,19 @@ def _store_blob(file: AuditFile, payload: bytes) -> None:
     file.connection.execute("INSERT INTO blob (id, content) VALUES (?, ?) ON CONFLICT DO NOTHING", (id_, payload))
     if not file.connection.changes() and file.blob(id_) is None:
         raise AuditUnavailable(f"{file.path} is damaged: blob {id_} is not what was stored. {WHAT_TO_DO}")
+
+
+def _holds(file: AuditFile, known: Anchor) -> bool:
+    row = next(file.rows(known.sequence), None)
+    return row is not None and Anchor(row.sequence, row.head) == known
+
+
+def _made_anew(known: Anchor) -> str:
+    """Database and anchor may agree: whoever writes both can make them so."""
+    return (
+        f"this gateway has stored record {known.sequence}, {known.head}, and it is not there. Somebody has exchanged "
+        f"database and anchor together. {WHAT_TO_DO}"
+    )
 
 
 def _traces(folder: Path) -> list[str]:

@@ -20,17 +20,22 @@ class CannotBegin(Exception):
 def book_in(folder: Path) -> Book:
     """What the audit of a folder says; what a record calls not done was not. Raises CannotBegin."""
     try:
-        with AuditFile(folder) as file:
-            records = [row.record() for row in file.rows()]
-        not_done: set[int] = set()
-        for record in records:
-            if record.kind == NOT_DONE:
-                not_done |= _SEQUENCES.validate_python(record.what["sequences"])
-        return book_of((record.kind, _what(record)) for record in records if record.sequence not in not_done)
+        return book_of((record.kind, _what(record)) for record in done_in(folder))
     except AuditUnavailable as error:
         raise CannotBegin(str(error)) from error
     except (Impossible, ValueError, KeyError) as error:
         raise CannotBegin(f"the records of the audit do not fit together: {error}; `r2rgate audit verify`") from error
+
+
+def done_in(folder: Path) -> list[AuditRecord]:
+    """A folder's records but those that were not done. Raises AuditUnavailable, ValueError and KeyError."""
+    with AuditFile(folder) as file:
+        records = [row.record() for row in file.rows()]
+    not_done: set[int] = set()
+    for record in records:
+        if record.kind == NOT_DONE:
+            not_done |= _SEQUENCES.validate_python(record.what["sequences"])
+    return [record for record in records if record.sequence not in not_done]
 
 
 def _what(record: AuditRecord) -> dict[str, Any]:

@@ -5,6 +5,7 @@ the loop runs on. Here is what people and programs ask for, and what passes with
 proposals judged, `on_the_line` carries out what is approved.
 """
 
+import asyncio
 import os
 from collections.abc import Awaitable, Callable, Mapping
 from itertools import islice
@@ -12,8 +13,9 @@ from math import inf
 from typing import Any
 
 from gateway.core.audit_record import Who
-from gateway.core.decisions import MOST_LISTED, Decide, ProposalLine, ProposalList, ProposalShown, shown_hash
-from gateway.core.deployment import InService, Region
+from gateway.core.decisions import MOST_LISTED, Confirm, Decide, ProposalLine, ProposalList, ProposalShown, shown_hash
+from gateway.core.deployment import InService, Region, WiringStatus
+from gateway.core.finding import Finding, finding
 from gateway.core.judge_context import JudgeContext
 from gateway.core.line import Line
 from gateway.core.messages import Reply
@@ -36,6 +38,7 @@ from gateway.supervisor.four_eyes import (
     why_not_second,
 )
 from gateway.supervisor.lifecycle import (
+    CONFIRMED,
     LINE_CHANGED,
     ON_THE_LINE,
     PERSON,
@@ -91,7 +94,7 @@ class Deployer:
         self._surroundings = surroundings
         clocks = SteadyClock(clock, wall_clock, boot_id())
         self._records = ProposalRecords(book, audit, clocks)
-        self._inbox = Inbox(line, self._records, judge, surroundings)
+        self._inbox = Inbox(line, self._records, judge, surroundings, lambda: roles() or ())
         self._on_the_line = OnTheLine(line, self._records, loop, surroundings, take_up, clock, note)
         self._small = SmallChanges(line, self._records)
         self._clock = clock
@@ -103,6 +106,27 @@ class Deployer:
     def trouble(self) -> str:
         """Why the last look came to nothing; empty: it did not."""
         return self._records.trouble
+
+    @property
+    def unexplained(self) -> list[Finding]:
+        """What is in service, where no record says how it came to be."""
+        hash_ = self.book.unexplained
+        if hash_ is None or hash_ != self.book.in_service:
+            return []
+        return [finding("configuration-unexplained", configuration=hash_[:12], epoch=self.book.epoch)]
+
+    @property
+    def unconfirmed(self) -> list[Finding]:
+        """What is in service, where nobody has judged or confirmed it, though the records say how it came to be."""
+        hash_ = self.book.in_service
+        if hash_ is None or self.unexplained or not self.book.is_unconfirmed:
+            return []
+        return [finding("configuration-unconfirmed", configuration=hash_[:12])]
+
+    @property
+    def wiring(self) -> WiringStatus | None:
+        """Of the line, as the loop told it last; None: it has not told yet."""
+        return self._on_the_line.wiring
 
     async def propose(self, payload: bytes, who: Who) -> Reply:
         """Take a proposal in, and judge it in the background."""
@@ -202,6 +226,43 @@ class Deployer:
             "stays, for low speed and small steps, until something else is approved"
         )
 
+    async def confirm(self, said: Confirm, who: Who) -> Reply:
+        """What is in service may be armed, though no record says how it came to be: a person knows it."""
+        if self._line.gate.approvals > 1 and (reason := why_no_person(who, self._own_uid)):
+            return refused("nothing is confirmed", [reason])
+        async with self._records.one_step:
+            try:
+                await self._on_the_line.look_after()
+                what = {"configuration": said.configuration, "because": said.because}
+                await self._records.step(CONFIRMED, what, who)
+                self._on_the_line.settled = False  # the loop is told with the next look
+            except (AuditUnavailable, Unreachable, Impossible) as error:
+                return refused("nothing is confirmed", [str(error)])
+        return done(
+            f"{said.configuration[:12]} may be armed; it goes no further than a first configuration until one is "
+            "proposed for more, and approved"
+        )
+
+    async def hold_against_records(self, within_s: float) -> str:
+        """Why what the loop runs is not held against the records yet; empty: it is. Raises Unreachable.
+
+        `within_s`: for another step to end first; the loop's answer has its own time.
+        """
+        if self._on_the_line.settled:
+            return ""
+        try:
+            async with asyncio.timeout(within_s):
+                await self._records.one_step.acquire()
+        except TimeoutError:
+            return "another change is under way"
+        try:
+            await self._on_the_line.look_after()
+        except (AuditUnavailable, Impossible) as error:
+            return str(error)
+        finally:
+            self._records.one_step.release()
+        return "" if self._on_the_line.settled else "what becomes of a change is not known yet"
+
     def look_again(self) -> None:
         """The loop has told of a change that this process did not order, or of its start."""
         self._on_the_line.settled = False
@@ -233,7 +294,7 @@ class Deployer:
                 # What nobody holds the loop takes back by itself; the next look settles it.
                 self._records.trouble = str(error)
             else:
-                self._records.trouble = self._on_the_line.unwatched
+                self._records.trouble = self._on_the_line.unconfined or self._on_the_line.unwatched
 
     async def judged(self) -> None:
         """Until nothing is being judged any more."""

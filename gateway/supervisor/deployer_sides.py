@@ -7,6 +7,7 @@ from gateway.core.audit_record import Who
 from gateway.core.deployment import RecoveryPrediction, Region
 from gateway.core.judge_context import JudgeContext
 from gateway.core.messages import Command, Reply
+from gateway.core.proof import Grounds
 from gateway.core.proposal import Proposal
 from gateway.core.recording import Recording
 from gateway.core.verdict import Verdict
@@ -46,8 +47,8 @@ class AuditSide(Protocol):
 
 
 class LoopSide(Protocol):
-    async def tell(self, command: Command) -> Reply:
-        """Raises Unreachable."""
+    async def tell(self, command: Command, grounds: Grounds | None = None) -> Reply:
+        """`grounds`: by what it is allowed, where a proposal is. Raises Unreachable."""
         ...
 
 

@@ -6,6 +6,7 @@ judge alone.
 """
 
 import asyncio
+from collections import Counter
 from collections.abc import Sequence
 from typing import Protocol
 
@@ -17,11 +18,11 @@ from gateway.core.verdict import Verdict
 from gateway.supervisor.deployer import Deployer
 from gateway.supervisor.judging import LONGER
 
-MOST = 4  #: under way and waiting
+MOST_EACH = 2  #: of one who asks, under way and waiting: an agent that asks without end keeps no other from asking
 
 
 class TooMany(Exception):
-    """The text says how many wait."""
+    """The text says how many wait (inbox-full)."""
 
 
 class PatientJudge(Protocol):
@@ -43,13 +44,13 @@ class DryRuns:
         self._limit_s = LONGER * line.gate.verdict_max_s
         self._judge = judge
         self._turn = asyncio.Lock()
-        self._count = 0
+        self._asked: Counter[str] = Counter()  #: by who asks
 
-    async def run(self, payload: bytes, deployer: Deployer) -> DryRun:
+    async def run(self, payload: bytes, deployer: Deployer, who: str) -> DryRun:
         """Of the line as it is then. Raises TooMany, and NotKnown where there is nothing to judge against."""
-        if self._count >= MOST:
-            raise TooMany(f"{MOST} dry runs wait already; ask again when one is done")
-        self._count += 1
+        if self._asked[who] >= MOST_EACH:
+            raise TooMany(f"{MOST_EACH} dry runs of agent {who} wait already; ask again when one is done (inbox-full)")
+        self._asked[who] += 1
         try:
             async with self._turn:
                 # Shielded: whoever gives up waiting here would take the proposals that are being judged along.
@@ -57,7 +58,7 @@ class DryRuns:
                 context, recordings = await deployer.context()
                 return dry_run_of(await self._judge.judge(payload, context, recordings, limit_s=self._limit_s))
         finally:
-            self._count -= 1
+            self._asked[who] -= 1
 
     async def close(self) -> None:
         await self._judge.close()

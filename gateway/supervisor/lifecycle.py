@@ -10,6 +10,7 @@ from enum import StrEnum
 from itertools import islice
 from typing import Any
 
+from gateway.core.canonical import hash_of
 from gateway.core.deployment import InService, Region
 from gateway.core.proposal import Kind
 from gateway.core.steady_clock import Moment
@@ -59,8 +60,9 @@ STEPS: dict[str, tuple[tuple[Stage, ...], Stage]] = {
 }
 WELL = ("kept", "model-in-service", "experiment-ends")  #: the ends of changes that went well
 PERSON, SCRIPT, VERDICT = "person", "script", "verdict"  #: who approved
-PROPOSED, FOUND, LINE_CHANGED = "proposed", "found-in-service", "line-changed"
-OF_NO_PROPOSAL = (FOUND, LINE_CHANGED)
+PROPOSED, FOUND, LINE_CHANGED, CONFIRMED = "proposed", "found-in-service", "line-changed", "confirmed"
+WIRING_PROVED = "wiring-proved"  #: the kind of a record that is no step: the loop has kept a proof
+OF_NO_PROPOSAL = (FOUND, LINE_CHANGED, CONFIRMED)
 OWN_KIND: dict[str, Kind] = {"deploying": "gains", "experiment-begins": "experiment", "model-in-service": "model"}
 
 
@@ -87,10 +89,12 @@ class Entry:
     line: str | None = None  #: hash of the line's file by which it was judged; None: not on record
     epoch: int | None = None
     by_person: bool = False  #: approved by one, not by its verdict alone
+    approval: str | None = None  #: hash of what the record of its approval says
     first: FirstApproval | None = None  #: while it waits for a second one
     since_s: float | None = None  #: Unix time at which it came to its stage
     received: Moment | None = None  #: None: its record does not say
     region: Region | None = None  #: of a configuration that has been deployed: for what it was judged
+    good: str | None = None  #: of one that was kept: what was gone back to from then on
 
 
 @dataclass
@@ -102,6 +106,12 @@ class Book:
     last_known_good: str | None = None
     epoch: int = 0  #: of the last deployment that the loop has taken, or is being told of
     region: Region = Region()  #: in which the loop lets it run
+    #: By configuration that was in service: as far as it went then.
+    regions: dict[str, Region] = field(default_factory=dict[str, Region])
+    unexplained: str | None = None  #: a configuration that was found in service, until another one is approved and kept
+    #: Hashes of the proofs of the wiring that were kept, as far as records before this process tell.
+    wiring_proofs: set[str] = field(default_factory=set[str], compare=False)
+    confirmed: set[str] = field(default_factory=set[str])  #: configurations that a person has confirmed, unjudged
     model: str | None = None
     #: Hash of the line's file as this process has read it, which no record tells; None: nobody asks.
     line: str | None = field(default=None, compare=False)
@@ -125,6 +135,15 @@ class Book:
     @property
     def undecided(self) -> list[Entry]:
         return [entry for entry in self.entries.values() if entry.stage in UNDECIDED]
+
+    @property
+    def is_unconfirmed(self) -> bool:
+        """Whether what is in service has neither been deployed by a proposal nor been confirmed by a person."""
+        here = self.in_service
+        if here is None or here == self.unexplained:
+            return here is not None
+        judged = any(entry.changes == here and entry.region is not None for entry in self.entries.values())
+        return not judged and here not in self.confirmed
 
     @property
     def since_change(self) -> list[Entry]:
@@ -171,6 +190,8 @@ class Book:
         entry = self.entries.get(proposal)
         if kind == PROPOSED and entry is not None:
             return f"proposal {proposal[:12]} was made before: {entry.stage}"
+        if kind == CONFIRMED and not (self.is_unconfirmed and what.get("configuration") == self.in_service):
+            return "that is not what is in service, or it was judged or confirmed before: there is nothing to confirm"
         if kind == LINE_CHANGED and (other := self.on_the_line) is not None:
             return f"proposal {other.proposal[:12]} is {other.stage}: wait for its end, or roll it back"
         if kind == PROPOSED or kind in OF_NO_PROPOSAL:
@@ -197,6 +218,7 @@ class Book:
     def apply(self, kind: str, what: Mapping[str, Any]) -> None:
         """Take in a record that has been stored. Raises Impossible; other kinds of the audit are passed over."""
         if kind not in STEPS and kind != PROPOSED and kind not in OF_NO_PROPOSAL:
+            self._note_wiring(kind, what)
             return
         if reason := self.why_not(kind, what):
             raise Impossible(reason)
@@ -205,6 +227,10 @@ class Book:
             return
         if kind == LINE_CHANGED:
             self._line_changed(what)
+            return
+        if kind == CONFIRMED:
+            self.unexplained, self.regions[str(what["configuration"])] = None, self.region
+            self.confirmed.add(str(what["configuration"]))
             return
         proposal = str(what["proposal"])
         if kind == PROPOSED:
@@ -223,13 +249,17 @@ class Book:
         if kind == "deploying":
             more["region"] = _region(what)
         if kind == "approved":
-            more["by_person"] = what.get("by", PERSON) == PERSON
+            more["by_person"], more["approval"] = what.get("by", PERSON) == PERSON, hash_of(dict(what))
         self.entries[proposal] = entry = replace(
             entry, stage=STEPS[kind][1], why=str(what.get("because", entry.why)), since_s=_at(what),
             first=first_of(what) if kind == APPROVED_ONCE else None, **more,
         )  # fmt: skip
         self._in_service(kind, entry, what)
         self._trust(kind, entry)
+
+    def _note_wiring(self, kind: str, what: Mapping[str, Any]) -> None:
+        if kind == WIRING_PROVED and "proof" in what:  # records of an earlier version do not say which
+            self.wiring_proofs.add(str(what["proof"]))
 
     def _trust(self, kind: str, entry: Entry) -> None:
         if kind == "rolled-back":
@@ -246,10 +276,16 @@ class Book:
             self.epoch = int(what["epoch"]) - 1
         elif kind == "deployed":
             self.in_service, self.region = entry.changes, entry.region or Region()
+            self.regions[entry.changes] = self.region
         elif kind == "kept":
             self.last_known_good = str(what.get("last_known_good", entry.changes))
+            self.entries[entry.proposal] = replace(entry, good=self.last_known_good)
+            if self.last_known_good != self.unexplained:  # what is kept on top of it does not explain it
+                self.unexplained = None
         elif kind == "rolled-back":
             self.in_service, self.region = str(what["to"]), _region(what)
+            if not what.get("explained", True) or (self.in_service not in self.regions and self.regions):
+                self.unexplained = self.in_service
         elif kind == "model-in-service":
             self.model = entry.changes
 
@@ -257,6 +293,10 @@ class Book:
         """The loop's own word on what controls the line."""
         if self.in_service not in (None, what["configuration"]):  # what was kept has been taken back
             self.trusted.clear()
+        if not what.get("explained", True) and what.get("confined"):  # records of an earlier version confine nothing
+            self.unexplained = str(what["configuration"])
+        else:
+            self.regions[str(what["configuration"])] = _region(what)
         self.in_service = str(what["configuration"])
         self.last_known_good = str(what["last_known_good"])
         self.epoch = int(what["epoch"])
@@ -272,10 +312,35 @@ class Book:
             )
         self.line_changed_s, self.line_changed, self.before_change = _at(what), moment_of(what), len(self.entries)
 
-    def explains(self, configuration: str, epoch: int) -> bool:
-        """Whether the records say how the line may have come to this configuration, at this epoch of the loop."""
-        deployed = {entry.changes for entry in self.entries.values() if entry.epoch == epoch}
-        return configuration in {self.in_service, self.last_known_good, *deployed}
+    def explains(self, found: InService) -> bool:
+        """Whether the records say how the loop may have come to what it says of itself, in all that its proof says.
+
+        Which configuration at which epoch, for what it was judged, and what is gone back to. What was deployed before
+        the last deployment is not in service again by itself: a file of the loop that was put back would be explained
+        by it.
+        """
+        if self.in_service is None:
+            # Nothing is on record. Nor was there anything to record, where the loop has never taken a deployment.
+            return found.epoch == 0 and found.hash == found.last_known_good
+        # The loop has been told of these, or is about to be; whether it took them is not always on record yet.
+        every = [(one, one.epoch) for one in self.entries.values() if one.epoch is not None]
+        # What has lowered the epoch was unexplained itself, and makes nothing older right.
+        taken = max((epoch for one, epoch in every if one.stage is not Stage.NOT_DEPLOYED), default=0)
+        told = [(one, epoch) for one, epoch in every if epoch >= max(self.epoch, taken)]
+        brought = [one for one, epoch in told if (one.changes, epoch) == (found.hash, found.epoch)]
+        epochs = {self.epoch, *(epoch for _, epoch in told)}
+        epochs |= {epoch - 1 for one, epoch in told if one.stage is Stage.DEPLOYING}
+        # The one that was kept last is back where the files of the loop are put back as they were.
+        good = {
+            self.last_known_good,
+            *(one.good for one in brought),
+            *(one.changes for one, _ in told if one.stage is Stage.KEEPING),
+        }
+        known = bool(brought) or found.hash in {self.in_service, self.last_known_good}
+        if not (known and found.epoch in epochs and found.last_known_good in good):
+            return False
+        judged = [self.regions.get(found.hash), *(one.region for one in brought)]
+        return any(one is not None and found.region.within(one) for one in judged)
 
 
 def _at(what: Mapping[str, Any]) -> float | None:
@@ -310,7 +375,7 @@ def reconciled(book: Book, found: InService) -> tuple[str, dict[str, Any]] | Non
     """
     change = book.on_the_line
     if change is not None and change.stage is not Stage.RUNNING:
-        return _settled(change, found)
+        return _settled(book, change, found)
     said = (found.hash, found.last_known_good, found.epoch, found.region)
     if said != (book.in_service, book.last_known_good, book.epoch, book.region):
         return FOUND, {
@@ -319,7 +384,8 @@ def reconciled(book: Book, found: InService) -> tuple[str, dict[str, Any]] | Non
             "epoch": found.epoch,
             "region": found.region.model_dump(),
             "because": found.why,
-            "explained": book.explains(found.hash, found.epoch),
+            "explained": (explained := book.explains(found)),
+            **({} if explained else {"confined": True}),
         }
     stale = next((entry for entry in book.undecided if entry.base != book.in_service), None)
     if stale is not None:
@@ -328,10 +394,12 @@ def reconciled(book: Book, found: InService) -> tuple[str, dict[str, Any]] | Non
     return None
 
 
-def _settled(change: Entry, found: InService) -> tuple[str, dict[str, Any]] | None:
+def _settled(book: Book, change: Entry, found: InService) -> tuple[str, dict[str, Any]] | None:
     """What has become of a change that was on its way to the line."""
     # The same configuration may be deployed again for another region: what was before it is back, then.
     runs = (found.hash, found.epoch) == (change.changes, change.epoch) and change.region in (None, found.region)
+    goods = {book.last_known_good} if found.on_probation else {book.last_known_good, change.changes}
+    runs = runs and found.last_known_good in goods
     named: dict[str, Any] = {"proposal": change.proposal, "epoch": change.epoch}
     if runs and found.on_probation:
         return ("deployed", named) if change.stage is Stage.DEPLOYING else None
@@ -342,7 +410,8 @@ def _settled(change: Entry, found: InService) -> tuple[str, dict[str, Any]] | No
     if change.stage is Stage.DEPLOYING and found.epoch != change.epoch:
         return "not-deployed", {**named, "because": f"the loop is at epoch {found.epoch}: {found.why}"}
     because = found.why.removeprefix("rolled back: ")
-    return "rolled-back", {**named, "to": found.hash, "region": found.region.model_dump(), "because": because}
+    what = {**named, "to": found.hash, "region": found.region.model_dump(), "because": because}
+    return "rolled-back", what if book.explains(found) else {**what, "explained": False}
 
 
 def book_of(records: Iterable[tuple[str, Mapping[str, Any]]]) -> Book:

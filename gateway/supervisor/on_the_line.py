@@ -7,11 +7,12 @@ from collections.abc import Awaitable, Callable
 from typing import Any
 
 from gateway.core.audit_record import Who
-from gateway.core.deployment import Deployment, InService, first_region
+from gateway.core.deployment import Deployment, InService, WiringStatus, first_region
 from gateway.core.line import Line
 from gateway.core.messages import (
     AskConfiguration,
     Command,
+    Confirmed,
     Deploy,
     Keep,
     Narrow,
@@ -20,6 +21,7 @@ from gateway.core.messages import (
     Rollback,
     RunExperiment,
 )
+from gateway.core.proof import Grounds
 from gateway.core.proposal import ExperimentChange, GainsChange, Proposal
 from gateway.mailbox.port import NotSent, RemoteError, Unreachable
 from gateway.supervisor.audit_file import AuditUnavailable
@@ -54,6 +56,8 @@ class OnTheLine:
         clock: Callable[[], float],
         note: Callable[..., None],
     ) -> None:
+        self.unconfined = ""  #: why what no record explains goes further than a first configuration; empty: it does not
+        self.wiring: WiringStatus | None = None  #: as the loop told it last
         self.settled = False  #: the loop has been asked since this process began, or since it told of a change
         self._line = line
         self._records = records
@@ -86,6 +90,7 @@ class OnTheLine:
         if reply.in_service is None:
             raise RemoteError("the loop does not say what controls the line")
         found = reply.in_service
+        self.wiring = found.wiring
         for _ in range(MOST_SETTLING):
             if (step := reconciled(self._records.book, found)) is None:
                 self.settled = True
@@ -113,10 +118,11 @@ class OnTheLine:
             told = f"proposal {proposal[:12]} is {kind}{epoch}, though the loop's answer did not come{because}"
             self._note("outcome", told, proposal=proposal, outcome=kind, epoch=what.get("epoch"))
 
-    async def _tell(self, command: Command) -> Reply:
-        """Raises Unreachable; then the loop is asked again what it runs."""
+    async def _tell(self, command: Command, entry: Entry | None = None) -> Reply:
+        """By the proposal of `entry`. Raises Unreachable; then the loop is asked again what it runs."""
+        grounds = None if entry is None else _grounds(entry)
         try:
-            return await self._loop.tell(command)
+            return await self._loop.tell(command, grounds)
         except Unreachable:
             self.settled = False
             raise
@@ -142,7 +148,7 @@ class OnTheLine:
             and now_s - self._followed_s < UNRECORDED_S
             and entry.epoch is not None
         ):
-            reply = await self._tell(Renew(epoch=entry.epoch))
+            reply = await self._tell(Renew(epoch=entry.epoch), entry)
             self._renewed_s = now_s
             self.settled = self.settled and reply.ok  # one that is refused is kept by now, or has gone back
 
@@ -170,7 +176,7 @@ class OnTheLine:
         named = {"proposal": entry.proposal}
         await self._records.step("experiment-begins", named, who)
         try:
-            reply = await self._tell(RunExperiment(experiment=change.experiment, proposal=entry.proposal))
+            reply = await self._tell(RunExperiment(experiment=change.experiment, proposal=entry.proposal), entry)
         except NotSent as error:
             await self._records.step("experiment-ends", {**named, "because": str(error)}, GATEWAY)
             return refused("it is not run", [str(error)])
@@ -193,9 +199,9 @@ class OnTheLine:
         await self.settle()
         return reply
 
-    async def narrow(self) -> Reply:
-        """To what a first configuration is judged for. Raises as `settle`."""
-        reply = await self._tell(Narrow(region=first_region(self._line)))
+    async def narrow(self, *, confine: bool = False) -> Reply:
+        """To what a first configuration is judged for; `confine`: also a line that runs faster. Raises as `settle`."""
+        reply = await self._tell(Narrow(region=first_region(self._line), confine=confine))
         await self.settle()
         return reply
 
@@ -228,7 +234,7 @@ class OnTheLine:
         await self._records.step("deploying", {**named, **what, "watched": watch is not None}, who)
         self._surroundings.begin_probation()
         try:
-            reply = await self._tell(Deploy(deployment=deployment))
+            reply = await self._tell(Deploy(deployment=deployment), entry)
         except NotSent as error:
             await self._records.step("not-deployed", {**named, "because": str(error)}, GATEWAY)
             return refused("it is not deployed", [str(error)])
@@ -258,9 +264,14 @@ class OnTheLine:
 
     async def _look_after(self, found: InService) -> None:
         entry, now_s = self._records.book.on_the_line, self._clock()
+        if found.hash == self._records.book.unexplained and (entry is None or entry.stage is Stage.RUNNING):
+            await self._confine(found)
+            entry = self._records.book.on_the_line
         if entry is None:
             if self._goes_too_far(found):  # a loop that was started anew before its disk knew
                 await self.narrow()
+            if not found.confirmed and found.hash in self._records.book.confirmed:
+                await self._tell(Confirmed(configuration=found.hash))
             await self._good_watch.look(found)
             return
         if entry.stage is Stage.RUNNING:
@@ -272,6 +283,14 @@ class OnTheLine:
             await self.roll_back(against)
         elif entry.stage is Stage.KEEPING or not self._unseen(now_s):
             await self._keep(entry, found)
+
+    async def _confine(self, found: InService) -> None:
+        """What no record explains: back, where there is something to go back to, else no further than a first one."""
+        if found.on_probation:
+            await self.roll_back("no record says how it came to the line")
+        elif not found.region.within(first_region(self._line)):
+            reply = await self.narrow(confine=True)
+            self.unconfined = "" if reply.ok else "; ".join([reply.text, *reply.reasons])
 
     def _goes_too_far(self, found: InService) -> bool:
         """For a line that has changed, and of which nothing has been learned since."""
@@ -291,7 +310,7 @@ class OnTheLine:
         watch = None
         try:
             watch = await self._surroundings.recovery(found.good_if_kept, found.region, self._records.book)
-            reply = await self._tell(Keep(epoch=entry.epoch or found.epoch, watch=watch))
+            reply = await self._tell(Keep(epoch=entry.epoch or found.epoch, watch=watch), entry)
             because = "" if reply.ok else "; ".join([reply.text, *reply.reasons])
         except NotKnown as error:
             because = str(error)
@@ -319,3 +338,7 @@ class OnTheLine:
             if entry.proposal in self._unanswered:
                 because = "whether it ran is not known: the loop has neither answered nor told its end"
             await self._record_outcome("experiment-ends", {"proposal": entry.proposal, "because": because})
+
+
+def _grounds(entry: Entry) -> Grounds:
+    return Grounds(proposal=entry.proposal, verdict=entry.verdict, approval=entry.approval)

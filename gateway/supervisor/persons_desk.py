@@ -12,9 +12,11 @@ from gateway.core.messages import Command, Reply, command_bytes, in_words
 from gateway.core.people import FOR_PERSON, why_may_not
 from gateway.core.topics import GATEWAY_FOR_PERSON
 from gateway.mailbox.port import PEER, Mailbox
+from gateway.mailbox.rights import OVERTAKES
 from gateway.supervisor.audit_file import AuditUnavailable
 from gateway.supervisor.bounded import Bounded, with_left_out
 from gateway.supervisor.peers import who_is
+from gateway.supervisor.said_inbox import COMMAND_EVENT, OF_PEOPLE, SaidInbox
 
 #: What one person can have recorded: more than any hand does, and little enough for a disk.
 MOST_SAID, SAID_EVERY_S = 600, 1.0
@@ -34,14 +36,19 @@ class PersonsDesk:
         alarm: Callable[[AlarmSaid, Who], Awaitable[Reply]],
         note: Callable[[str, Who, Mapping[str, Any]], Awaitable[object]],
         clock: Callable[[], float],
+        event: Callable[..., None] = lambda *_, **__: None,
     ) -> None:
-        """`note` appends a record to the audit; raises AuditUnavailable. `decide` is told what was left out, too."""
+        """`note` appends a record to the audit; raises AuditUnavailable. `decide` is told what was left out, too.
+
+        `event`: of the gateway: kind, text and data.
+        """
         self._command = command
         self._decide = decide
         self._alarm = alarm
         self._note = note
         self._refusals = Bounded(clock)
         self._said = Bounded(clock, MOST_SAID, SAID_EVERY_S)
+        self._inbox = SaidInbox(COMMAND_EVENT, OF_PEOPLE, clock, event)
         mailbox.serve(GATEWAY_FOR_PERSON, self._answer)
 
     async def _answer(self, payload: bytes) -> bytes:
@@ -52,6 +59,9 @@ class PersonsDesk:
             return _reply(Reply(ok=False, state="", text="not understood", reasons=reasons[:20]))
         person, said = asked.person, asked.said
         who = who_is(person, PEER.get())
+        safe = said.command in OVERTAKES or isinstance(said, RollBackNow)
+        if not safe and (refusal := self._inbox.refuse(who, len(payload))) is not None:
+            return _reply(refusal)
         if reason := why_may_not(person, said.command):
             if (left_out := self._refusals.left_out(who.name)) is not None:
                 what = with_left_out({"command": said.command, "because": reason}, left_out)

@@ -1,7 +1,11 @@
-"""Proposals come in, and are judged in the background. The verdict is that of the judge of this process alone."""
+"""Proposals come in, and are judged in the background. The verdict is that of the judge of this process alone.
+
+They are judged in turns (`mailbox.inbox`): whoever proposes much waits behind himself, and nobody behind him.
+"""
 
 import asyncio
 import hashlib
+from collections.abc import Callable, Collection
 from datetime import datetime
 from typing import Any
 
@@ -26,20 +30,32 @@ from gateway.core.proposal import (
 )
 from gateway.core.verdict import Verdict, canonical_line, verdict_hash
 from gateway.core.verdict import canonical as canonical_verdict
+from gateway.mailbox.inbox import FairQueue
+from gateway.supervisor.admission import bounds_of, caller_of, turned_away, why_not_author
 from gateway.supervisor.audit_file import AuditUnavailable
 from gateway.supervisor.deployer_sides import JudgeSide, Surroundings
 from gateway.supervisor.lifecycle import PROPOSED, Impossible, Stage
 from gateway.supervisor.peers import GATEWAY
 from gateway.supervisor.proposal_records import ProposalRecords, done, refused
 
+AT_ONCE = 2  #: that are being judged: one has its context made up while the judge is at the other
+
 
 class Inbox:
-    def __init__(self, line: Line, records: ProposalRecords, judge: JudgeSide, surroundings: Surroundings) -> None:
+    def __init__(
+        self, line: Line, records: ProposalRecords, judge: JudgeSide, surroundings: Surroundings,
+        people: Callable[[], Collection[str]] = tuple,
+    ) -> None:  # fmt: skip
+        """`people`: who may come in through the page or OPC UA, by name."""
         self._line = line
         self._records = records
         self._judge = judge
         self._surroundings = surroundings
+        self._people = people
         self._judging: dict[str, asyncio.Task[None]] = {}
+        self._waiting: FairQueue[str] = FairQueue()
+        self._closed = False
+        self._known: set[str] = set()  #: that wait or are being judged
 
     async def propose(self, payload: bytes, who: Who) -> Reply:
         """Take a proposal in, and judge it in the background."""
@@ -53,8 +69,14 @@ class Inbox:
         ]
         if self._line.gate.autonomy == "closed":
             wrong.append('the line takes no changes: gate.autonomy is "closed" in its file')
+        if (differs := why_not_author(proposal.author, who, self._people())) is not None:
+            return turned_away(differs)
         if wrong:
             return refused("it is not judged", wrong)
+        caller = caller_of(who)
+        full = self._waiting.refuse(caller, bounds_of(who, self._line), self._line.gate.verdict_max_s)
+        if full is not None:
+            return turned_away(full)
         hash_ = proposal_hash(proposal)
         what = {
             "proposal": hash_,
@@ -71,31 +93,45 @@ class Inbox:
                 await self._records.step(PROPOSED, what, who, {"proposal": canonical(proposal)})
         except (Impossible, AuditUnavailable) as error:
             return refused("it is not judged", [str(error)])
-        self._begin(hash_)
+        self._begin(hash_, who)
         text = f"proposal {hash_[:12]} ({proposal.kind}) is being judged: `r2rgate proposals {hash_[:12]}` shows how"
         return done(text)
 
     def judge_again(self) -> None:
         """What was being judged when the process before this one ended, or could not be recorded."""
         for entry in self._records.book.undecided:
-            if entry.stage is Stage.RECEIVED and entry.proposal not in self._judging:
-                self._begin(entry.proposal)
+            if entry.stage is Stage.RECEIVED and entry.proposal not in self._known:
+                self._begin(entry.proposal, GATEWAY)
 
     async def judged(self) -> None:
         """Until nothing is being judged any more."""
         while self._judging:
             await asyncio.gather(*self._judging.values())
+            await asyncio.sleep(0)  # what ends begins the next one
 
     async def close(self) -> None:
+        self._closed = True
         judging = list(self._judging.values())
         for task in judging:
             task.cancel()
         await asyncio.gather(*judging, return_exceptions=True)
 
-    def _begin(self, proposal: str) -> None:
-        task = asyncio.get_running_loop().create_task(self._judged(proposal))
-        self._judging[proposal] = task
-        task.add_done_callback(lambda _: self._judging.pop(proposal, None))
+    def _begin(self, proposal: str, who: Who) -> None:
+        self._known.add(proposal)
+        self._waiting.put(caller_of(who), proposal)
+        self._begin_next()
+
+    def _begin_next(self) -> None:
+        while len(self._judging) < AT_ONCE and len(self._waiting) and not self._closed:
+            proposal = self._waiting.take()
+            task = asyncio.get_running_loop().create_task(self._judged(proposal))
+            self._judging[proposal] = task
+            task.add_done_callback(lambda _, proposal=proposal: self._end(proposal))
+
+    def _end(self, proposal: str) -> None:
+        self._judging.pop(proposal, None)
+        self._known.discard(proposal)
+        self._begin_next()
 
     async def _judged(self, hash_: str) -> None:
         try:

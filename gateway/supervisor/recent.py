@@ -16,6 +16,7 @@ from safety.probation import LEAST_TENSION, Standing, standing
 
 SETTLE_S = 3.0  #: after the last move of a set-point
 WINDOW_S = 2.0
+_FAR = 1e9  #: periods: outside of every window
 STANDING_S = SETTLE_S + WINDOW_S
 
 
@@ -84,19 +85,23 @@ class Recent:
         if not self._frames or self._first_s is None:
             return None
         frames = np.frombuffer(b"".join(self._frames), self._dtype)
-        passed = (frames["time_s"][-1] - self._first_s) / self._period_s + 1.0  # periods
-        if not round(passed) >= self._periods:
+        with np.errstate(over="ignore", invalid="ignore"):  # a frame may tell any time that is a number
+            passed = (frames["time_s"][-1] - self._first_s) / self._period_s + 1.0  # periods
+        if not passed >= self._periods - 0.5:
             return None
         before = self._periods_before_newest(frames)
         frames = frames[(before >= 0) & (before < self._periods)]
         # What is no number is not 0: it moves.
-        moved = np.ptp(frames["tension_setpoint_n"], axis=0).any() or np.ptp(frames["speed_setpoint_m_per_s"])
+        with np.errstate(over="ignore", invalid="ignore"):
+            moved = np.ptp(frames["tension_setpoint_n"], axis=0).any() or np.ptp(frames["speed_setpoint_m_per_s"])
         ran = (frames["state"] == LoopState.RUN).all()
         return frames if ran and not moved else None
 
     def _periods_before_newest(self, frames: NDArray[np.void]) -> NDArray[np.int64]:
         """Of each frame (k,). Frames may be lost, and a loop may skip periods."""
-        return np.rint((frames["time_s"][-1] - frames["time_s"]) / self._period_s).astype(np.int64)
+        with np.errstate(over="ignore", invalid="ignore"):
+            before = np.rint((frames["time_s"][-1] - frames["time_s"]) / self._period_s)
+        return np.nan_to_num(np.clip(before, -_FAR, _FAR), nan=_FAR).astype(np.int64)
 
     def _in_rows(self, row: NDArray[np.int64], values: FloatArray) -> FloatArray:
         """One row for each period of the window: NaN where no frame came."""
@@ -106,4 +111,5 @@ class Recent:
 
 
 def _floats(frames: NDArray[np.void], name: str) -> FloatArray:
-    return frames[name].astype(np.float64)
+    with np.errstate(invalid="ignore"):  # a signalling NaN becomes a quiet one
+        return frames[name].astype(np.float64)

@@ -84,6 +84,14 @@ def _found(_: str, what: What) -> str:
     return f"the loop says that it runs {_hash(what, 'configuration')}, epoch {epoch}{_because(what)}{odd}"
 
 
+def _wiring_proved(_: str, what: What) -> str:
+    answers = what.get("answers")
+    asked = [one for one in answers if isinstance(one, Mapping)] if isinstance(answers, list) else []
+    by = sorted({_clean(str(one.get("by", "-")), LONGEST_TOLD) for one in asked})
+    told = f"; {len(asked)} questions answered by {', '.join(by)}" if asked else ""
+    return f"the wiring is proved: {_hash(what, 'wiring')}{told}"
+
+
 def _operated(who: str, what: What) -> str:
     done = "done" if what.get("done") else "refused"
     return (
@@ -120,6 +128,10 @@ def _refused_person(who: str, what: What) -> str:
 def _refused_decision(who: str, what: What) -> str:
     word = "approval" if what.get("approve") else "rejection"
     return f"{who}: {word} of proposal {_hash(what)} was refused{_because(what)}{_left_out(what)}"
+
+
+def _refused_proposal(who: str, what: What) -> str:
+    return f"a proposal of {who} was not taken{_because(what)}{_left_out(what)}"
 
 
 def _logged_in(who: str, what: What) -> str:
@@ -173,13 +185,19 @@ SENTENCES: dict[str, Callable[[str, What], str]] = {
     "experiment-ends": _experiment_ends,
     "model-in-service": lambda who, what: f"proposals are judged by model {_hash(what, 'model')} from now on",
     "found-in-service": _found,
+    "confirmed": lambda who, what: f"{who} confirms {_hash(what, 'configuration')}{quoted(what.get('because'))}",
+    "refused-at-loop": lambda _, what: f"at the loop was refused{_because(what)}{_left_out(what)}",
+    "set-aside": lambda _, what: f"the loop has set aside what lay in its folder{_because(what)}",
     "rollback-asked": lambda who, what: f"{who} asks for what was before{quoted(what.get('comment'))}{_left_out(what)}",
+    "wiring-proved": _wiring_proved,
     "line-changed": lambda who, what: f"{who} says that the line has changed{quoted(what.get('because'))}",
     "archived": _archived,
     "not-archived": _not_archived,
     "operated": _operated,
     "refused-person": _refused_person,
     "refused-decision": _refused_decision,
+    "refused-proposal": _refused_proposal,
+    "false-loop": lambda who, what: f"a false loop{_because(what)}{_left_out(what)}",
     "logged-in": _logged_in,
     "wrong-logins": _wrong_logins,
     "users": _users,

@@ -6,7 +6,8 @@ from math import isfinite
 
 import numpy as np
 
-from gateway.core.doubts import in_words
+from gateway.core.doubts import WORDS as DOUBTS
+from gateway.core.doubts import Doubt, in_words
 from gateway.core.line import Line
 from gateway.core.signals import DriveState, Quality
 from gateway.core.states import LoopState, Phase
@@ -16,6 +17,8 @@ from gateway.supervisor.telemetry_sink import Cycle, TelemetrySink
 
 LOST_S = 1.0  #: a loop whose newest frame is older than this is taken to be gone
 START_LOOP = "start it with `r2rgate loop LINE.toml`"
+
+_UNCOMPARED = DOUBTS[Doubt.TORQUE_UNCOMPARED]
 
 #: What a state means, and what to do next.
 WORDS: dict[str, tuple[str, str]] = {
@@ -49,9 +52,20 @@ def loop_status(line: Line, sink: TelemetrySink, now_s: float) -> LoopStatus:
         period_s=line.control.period_s,
         held=frame.held if frame is not None and running else 0,
         saturated=frame.saturated if frame is not None and running else False,
-        doubts=in_words(frame.doubts) if frame is not None and running else [],
+        doubts=_doubts(line, frame) if frame is not None and running else [],
         restarts=sink.restarts,
     )
+
+
+def _doubts(line: Line, frame: Frame) -> list[str]:
+    """In words; with the names of the drives whose torque is not compared any more."""
+    said = in_words(frame.doubts)
+    if frame.doubts & Doubt.TORQUE_UNCOMPARED:
+        unknown = np.isnan(frame.torque_actual_nm)
+        names = ", ".join(drive.name for drive in line.drives if unknown[drive.roller - 1])
+        named = f"{names}: torque asked and given are not compared any more: check the drive's torque reading"
+        said = [named if text == _UNCOMPARED else text for text in said]
+    return said
 
 
 def span_statuses(line: Line, frame: Frame | None, running: bool) -> list[SpanStatus]:
@@ -86,6 +100,9 @@ def _span_status(line: Line, k: int, frame: Frame | None, running: bool) -> Span
         torque_nm=torque,
         torque_actual_nm=actual,
         drive=drive,
+        tension_min_n=span.tension_min_n,
+        tension_max_n=span.tension_max_n,
+        torque_limit_nm=line.rollers[k].torque_nm,
     )
 
 

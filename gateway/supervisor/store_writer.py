@@ -12,6 +12,7 @@ from pathlib import Path
 from gateway.core.controller import Controller, ControllerRefused, config_hash, parse_controller
 from gateway.core.line import Line
 from gateway.core.proposal import GainsChange, ModelChange, Proposal
+from gateway.files import MOST_BYTES, read_bytes
 from gateway.supervisor import configurations as configurations_store
 from gateway.supervisor import models as models_store
 from gateway.supervisor.configurations import Configurations, ConfigurationsError, Origin, open_configurations
@@ -69,8 +70,8 @@ class StoreWriter:
         found: list[tuple[str, Controller]] = []
         for name, read in STARTED_WITH.items():
             try:
-                found.append((name, read((self._folder / name).read_bytes())))
-            except (OSError, ValueError, KeyError, ControllerRefused):
+                found.append((name, read(read_bytes(self._folder / name, MOST_BYTES))))
+            except (OSError, ValueError, KeyError, TypeError, RecursionError, ControllerRefused):
                 continue  # the loop says what it runs; a proposal finds that it is not known here
         site, line = self._line.site, self._line.line
         with open_configurations(self._configurations) as configurations:

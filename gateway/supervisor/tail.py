@@ -23,9 +23,11 @@ from numpy.typing import NDArray
 
 from gateway.core.messages import Event
 from gateway.core.telemetry import frame_dtype
+from gateway.files import NO_FILE, read_bytes
 from gateway.supervisor.store import Run
 
 _MOST_HEAD = 1000  #: bytes
+MOST_BYTES = 256 * 2**20  #: of a tail; it is packed long before
 ENDING = "-tail"  #: of its name, after that of the history
 _MAGIC = b"R2RTAIL1"
 _FRAME = struct.Struct("<II")  # length and CRC-32 of what follows
@@ -102,9 +104,13 @@ class Tail:
 def read_tail(path: Path) -> TailRead | None:
     """What lies in the tail; None: nothing, as where it is about to be begun. Raises DamagedTail and OSError."""
     try:
-        content = path.read_bytes()
+        content = read_bytes(path, MOST_BYTES)
     except FileNotFoundError:
         return None
+    except OSError as error:
+        if error.errno in NO_FILE:
+            raise DamagedTail(f"{path} is no tail of a history: {error.strerror}") from error
+        raise
     if not content.startswith(_MAGIC[: len(content)]):
         raise DamagedTail(f"{path} is no tail of a history")
     payloads = _payloads(content[len(_MAGIC) :])

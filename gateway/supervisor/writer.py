@@ -188,7 +188,7 @@ class Writer:
 
 def _pack_left(connection: apsw.Connection, path: Path) -> None:
     """What a process that was killed has left; a tail that cannot be read is kept aside."""
-    if not path.exists():
+    if not os.path.lexists(path):
         return
     try:
         found = read_tail(path)

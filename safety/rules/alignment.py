@@ -21,9 +21,9 @@ from safety.findings import at_most, told
 from safety.predicting import Foretold, foretold_of, with_swings
 
 RULE = "alignment"
-MOST_S = 20.0  #: of data are looked at
+MOST = 1000.0  #: moments of data that are looked at
 SURE = 1.96  #: standard deviations
-PROBE_S = 1e-3
+PROBE = 0.1  #: of a period
 
 
 def check(case: Case) -> list[RuleFinding]:
@@ -38,7 +38,7 @@ def of_model(case: Case, model: LineModel, name: str = RULE) -> list[RuleFinding
     noise, most_s = noise_of(model), case.line.gate.alignment_max_s
     if noise is None or not case.excited:
         return [told(name, False, "there are no data by which channels could be compared: see model validity")]
-    found = foretold_of(case, model, noise, MOST_S)
+    found = foretold_of(case, model, noise, MOST)
     names = channels(found[0].predicted.stretch)
     late_s, spread_s = lateness(theta_of(model), found)
     if np.isnan([late_s, spread_s]).any():  # a channel that tells nothing is endless, not this
@@ -86,21 +86,22 @@ def sensitivities(theta: Theta, predicted: Predicted) -> tuple[FloatArray, Float
     before = np.zeros_like(stretch.measured)
     states = predicted.state[:, stretch.outputs]
     before[stretch.first + 2 :] = np.diff(states, axis=0) / period_s
-    rows = [_whitened(theta, predicted, replace(stretch, measured=_moved(stretch.measured, before, j)))
+    change = PROBE * period_s * before
+    rows = [_whitened(theta, predicted, replace(stretch, measured=_moved(stretch.measured, change, j)))
             for j in range(before.shape[1])]  # fmt: skip
     jumps = np.diff(stretch.torque_nm, axis=0, prepend=stretch.torque_nm[:1], append=stretch.torque_nm[-1:]) / period_s
     turned = [
-        [_whitened(theta, predicted, replace(stretch, torque_nm=_moved(stretch.torque_nm, slope, j)))
+        [_whitened(theta, predicted, replace(stretch, torque_nm=_moved(stretch.torque_nm, PROBE * period_s * slope, j)))
          for j in range(stretch.n)]
         for slope in (jumps[:-1], jumps[1:] if theta.latency_s >= period_s - 1e-9 else jumps[:-1])
     ]  # fmt: skip
     white = _whitened(theta, predicted, stretch)
-    return (np.array([[*rows, *either] for either in turned]) - white) / PROBE_S, white
+    return (np.array([[*rows, *either] for either in turned]) - white) / (PROBE * period_s), white
 
 
-def _moved(values: FloatArray, rate: FloatArray, column: int) -> FloatArray:
+def _moved(values: FloatArray, change: FloatArray, column: int) -> FloatArray:
     moved = values.copy()
-    moved[:, column] -= PROBE_S * rate[:, column]
+    moved[:, column] -= change[:, column]
     return moved
 
 

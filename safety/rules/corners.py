@@ -14,6 +14,8 @@ from gateway.control.mpc_linear import unconstrained
 from gateway.control.rollout import Rollouts, simulate
 from gateway.core.controller import Controller
 from gateway.core.controller_laws import MpcConfig
+from gateway.core.line_limits import tension_bands_n, torque_limits_nm
+from gateway.core.signals import FloatArray
 from gateway.core.verdict import RuleFinding
 from safety import programme
 from safety.case import Case
@@ -22,23 +24,25 @@ from safety.findings import at_least, at_most, told
 from safety.simulated import holdable, plants_out_of_round, setup_of, stressed
 
 RULE = "corners"
-LATE, FINE_STEP_S = 2, 0.001  #: plants that are later than the line is, and the steps in which they are so
+LATE, FINE = 2, 0.1  #: plants that are later than the line is, and the part of a period in steps of which they are so
 
 
 @dataclass
 class Worst:
     """Over corners and courses, with the name of the course."""
 
-    lowest_n: tuple[float, str] = (inf, "")
-    highest_n: tuple[float, str] = (-inf, "")
+    low_n: FloatArray  #: (n,), what tensions may fall to, and rise to
+    high_n: FloatArray
+    lowest_n: tuple[float, str, int] = (inf, "", 0)  #: above its limit, and of which span (from 0)
+    highest_n: tuple[float, str, int] = (inf, "", 0)  #: below its limit
     swing_n: tuple[float, str] = (-inf, "")
     error_n: tuple[float, str] = (-inf, "")
     chatter_nm: tuple[float, str] = (-inf, "")
 
     def take(self, found: Rollouts, name: str, spans: list[int]) -> None:
         """A course's rollouts; the tensions of `spans` should stand. What is no number is the worst there is."""
-        self.lowest_n = min(self.lowest_n, (-_greatest(-found.tension_min_n), name))
-        self.highest_n = max(self.highest_n, (_greatest(found.tension_max_n), name))
+        self.lowest_n = min(self.lowest_n, _least_room(found.tension_min_n - self.low_n, name))
+        self.highest_n = min(self.highest_n, _least_room(self.high_n - found.tension_max_n, name))
         self.swing_n = max(self.swing_n, (_greatest(found.tail_swing_n[:, spans]), name))
         self.error_n = max(self.error_n, (_greatest(found.tail_error_n[:, spans]), name))
         self.chatter_nm = max(self.chatter_nm, (_greatest(found.chatter_nm), name))
@@ -54,7 +58,7 @@ def check(case: Case) -> list[RuleFinding]:
 
 
 def _of_law(case: Case, config: Controller) -> Worst:
-    worst, courses = Worst(), courses_of(case)
+    worst, courses = Worst(*tension_bands_n(case.line)), courses_of(case)
     for name, found in in_largest_steps(case).items():
         worst.take(found, name, case.tension_spans)
         for late in _late(case, config, courses[name]):
@@ -75,15 +79,15 @@ def _late(case: Case, config: Controller, one: CornerCourse) -> list[Rollouts]:
         latency_s=case.latency_s + gate.delay_margin_min_s,
         torque_lag_s=believed.torque_lag_s,
     )
-    if not one.late or not holdable([late], one.course, case.line.limits.torque_nm):
+    if not one.late or not holdable([late], one.course, torque_limits_nm(case.line)):
         return []
-    setup = setup_of(case.line, case.stress_noise, case.seed, gate.stress_late_share, FINE_STEP_S)
+    setup = setup_of(case.line, case.stress_noise, case.seed, gate.stress_late_share, FINE * case.line.control.period_s)
     return [simulate(config, plants_out_of_round([late] * LATE, gate, case.seed), one.course, setup)]
 
 
 def _of_mpc(case: Case, config: MpcConfig) -> Worst:
     """Small moves on all corners by the law that it is where no limit is reached; large ones by itself, on some."""
-    worst, courses = Worst(), programme.small_courses(case)
+    worst, courses = Worst(*tension_bands_n(case.line)), programme.small_courses(case)
     for name, found in programme.in_small(case).items():
         worst.take(found, f"{name}, small", case.tension_spans)
         for late in _late(case, unconstrained(config), courses[name]):
@@ -95,17 +99,19 @@ def _of_mpc(case: Case, config: MpcConfig) -> Worst:
 
 
 def _limits(case: Case, worst: Worst) -> list[RuleFinding]:
-    limits, gate = case.line.limits, case.line.gate
-    (low, low_at), (high, high_at) = worst.lowest_n, worst.highest_n
+    gate = case.line.gate
+    (low_room, low_at, low_span), (high_room, high_at, high_span) = worst.lowest_n, worst.highest_n
+    least, most = float(worst.low_n[low_span]), float(worst.high_n[high_span])
+    low, high = least + low_room, most - high_room
     (swing, swing_at), (error, error_at), (chatter, chatter_at) = worst.swing_n, worst.error_n, worst.chatter_nm
     return [
         at_least(
-            "corners: lowest tension", low, limits.tension_min_n, "N",
-            f"tension falls to {_n(low)} ({low_at}); allowed: down to {limits.tension_min_n:g} N",
+            "corners: lowest tension", low, least, "N",
+            f"tension falls to {_n(low)} ({low_at}); allowed: down to {least:g} N",
         ),
         at_most(
-            "corners: highest tension", high, limits.tension_max_n, "N",
-            f"tension rises to {_n(high)} ({high_at}); allowed: up to {limits.tension_max_n:g} N",
+            "corners: highest tension", high, most, "N",
+            f"tension rises to {_n(high)} ({high_at}); allowed: up to {most:g} N",
         ),
         at_most(
             "corners: oscillation", swing, gate.tail_oscillation_max_n, "N",
@@ -156,6 +162,13 @@ def _nobody_holds(case: Case, name: str) -> RuleFinding:
         f"none of {len(case.corners)} plants that the line may be is held with {case.line.limits.torque_nm:g} Nm "
         f"({name}, up to {case.speed_max_m_per_s:g} m/s): a lower speed, or larger drives",
     )  # fmt: skip
+
+
+def _least_room(room_n: FloatArray, name: str) -> tuple[float, str, int]:
+    """Of (b, n): how far a tension keeps from its limit, where, and of which span. What is no number is the least."""
+    found = np.where(np.isnan(room_n), -inf, room_n).min(axis=0)
+    span = int(found.argmin())
+    return float(found[span]), name, span
 
 
 def _greatest(values: object) -> float:

@@ -11,6 +11,8 @@ from gateway.control.prediction import Unpredictable
 from gateway.control.rollout import Course
 from gateway.core.controller_laws import MpcConfig
 from gateway.core.experiment import Experiment, course, reasons_against
+from gateway.core.line_limits import tension_bands_n, torque_limits_nm
+from gateway.core.line_scales import line_scales
 from gateway.core.theta import Theta
 from gateway.core.verdict import RuleFinding
 from safety.believed import prior_corners
@@ -22,8 +24,8 @@ from safety.rules.validity import check as check_validity
 from safety.simulated import holdable, stressed
 
 RULE, LIMITS_RULE, ABORT_RULE = "experiment", "experiment: limits", "experiment: abort"
-LEG_S = 8.0  #: of a leg are simulated; what comes after is more of the same
-CORNERS_MPC, LEG_MPC_S = 4, 2.5  #: with a predictive controller, which takes a millisecond a period
+LEG = 400.0  #: moments of a leg are simulated; what comes after is more of the same
+CORNERS_MPC, LEG_MPC = 4, 125.0  #: with a predictive controller, which takes a millisecond a period
 
 
 def check_limits(case: Case) -> list[RuleFinding]:
@@ -38,8 +40,8 @@ def check_limits(case: Case) -> list[RuleFinding]:
 def check_abort(case: Case) -> list[RuleFinding]:
     """It ends before a tension leaves its band, wherever the set-points stand."""
     limits, allowed_n = case.line.limits, case.experiment.abort.deviation_n
-    low, high = float(case.tension_n.min()), float(case.tension_n.max())
-    most = min(low - limits.tension_min_n, limits.tension_max_n - high)
+    low_n, high_n = tension_bands_n(case.line)
+    most = float(np.minimum(case.tension_n - low_n, high_n - case.tension_n).min())
     text = (
         f"it is aborted when a tension is {allowed_n:g} N from where it stood; allowed: up to {most:g} N, which is the "
         f"nearest limit of {limits.tension_min_n:g} to {limits.tension_max_n:g} N"
@@ -51,17 +53,21 @@ def check_corners(case: Case) -> list[RuleFinding]:
     """Peak deviation on the worst corner, against the abort condition; tension against its band."""
     plants, where = _plants(case)
     asked = _course(case, case.experiment)
-    kept = holdable([stressed(theta, case.line.gate) for theta in plants], asked, case.line.limits.torque_nm)
+    kept = holdable([stressed(theta, case.line.gate) for theta in plants], asked, torque_limits_nm(case.line))
     if not kept:
         return [told(RULE, False, f"none of {len(plants)} {where} is held by the torque at these speeds: go slower")]
     if isinstance(case.context.in_service, MpcConfig):
         kept = kept[:CORNERS_MPC]
     found = rollouts(case.line, case.context.in_service, kept, asked, case.stress_noise, case.seed)
-    lowest, highest = float(found.tension_min_n.min()), float(found.tension_max_n.max())
+    low_n, high_n = tension_bands_n(case.line)
+    below, above = (found.tension_min_n - low_n).min(axis=0), (high_n - found.tension_max_n).min(axis=0)
+    span, other = int(below.argmin()), int(above.argmin())  # what is no number is the least of all
+    least, most = float(low_n[span]), float(high_n[other])
+    lowest, highest = float(found.tension_min_n[:, span].min()), float(found.tension_max_n[:, other].max())
     # Of numpy: Python's own maximum passes over what is no number, where it does not come first.
     away_n = np.maximum(case.tension_n - found.tension_min_n, found.tension_max_n - case.tension_n)
     deviation = float(away_n.max())
-    limits, abort_n = case.line.limits, case.experiment.abort.deviation_n
+    abort_n = case.experiment.abort.deviation_n
     fastest, envelope = float(found.roller_speed_max_m_per_s.max()), envelope_limits(case.line)
     # The monitor watches it, too, with what noise adds.
     allowed = envelope.roller_speed_in_step_m_per_s(float(asked.unwind_speed_m_per_s.max()))
@@ -72,12 +78,12 @@ def check_corners(case: Case) -> list[RuleFinding]:
             f"tension goes up to {deviation:.1f} N from where it stood ({on}); allowed: {abort_n:g} N, where it aborts",
         ),
         at_least(
-            f"{RULE}: lowest tension", lowest, limits.tension_min_n, "N",
-            f"tension falls to {lowest:.1f} N ({on}); allowed: down to {limits.tension_min_n:g} N",
+            f"{RULE}: lowest tension", lowest, least, "N",
+            f"tension falls to {lowest:.1f} N ({on}); allowed: down to {least:g} N",
         ),
         at_most(
-            f"{RULE}: highest tension", highest, limits.tension_max_n, "N",
-            f"tension rises to {highest:.1f} N ({on}); allowed: up to {limits.tension_max_n:g} N",
+            f"{RULE}: highest tension", highest, most, "N",
+            f"tension rises to {highest:.1f} N ({on}); allowed: up to {most:g} N",
         ),
         at_most(
             f"{RULE}: roller speed", fastest, allowed, "m/s",
@@ -103,7 +109,8 @@ def _borne_out(case: Case) -> bool:
 
 def _course(case: Case, experiment: Experiment) -> Course:
     """Its begin of each leg, with the way from speed to speed at the line's rate."""
-    most_s = LEG_MPC_S if isinstance(case.context.in_service, MpcConfig) else LEG_S
+    most = LEG_MPC if isinstance(case.context.in_service, MpcConfig) else LEG
+    most_s = most * line_scales(case.line).moment_s
     legs = [leg.model_copy(update={"duration_s": min(leg.duration_s, most_s)}) for leg in experiment.legs]
     shorter = experiment.model_copy(update={"legs": legs})
     state, period_s = case.context.state, case.line.control.period_s

@@ -5,7 +5,7 @@ from datetime import datetime
 from gateway.core.recording import joined
 from gateway.core.verdict import RuleFinding
 from safety.case import Case
-from safety.excitation import LEAST_S, MOVING, SAME_M_PER_S, SAME_SPEED
+from safety.excitation import MOVING, least_seconds, near_m_per_s
 from safety.findings import told
 
 RULE = "model: data"
@@ -16,11 +16,11 @@ def check(case: Case) -> list[RuleFinding]:
     found = [told(RULE, *_origin(case))]
     if not case.excited:
         return [*found, told(RULE, False, (
-            f"none of {len(case.data)} recent recordings has {LEAST_S:g} s at one speed in which every tension moves "
-            f"by {MOVING:g} times its noise: run an experiment, and identify on its data"
+            f"none of {len(case.data)} recent recordings has {least_seconds(case.line):g} s at one speed in which "
+            f"every tension moves by {MOVING:g} times its noise: run an experiment, and identify on its data"
         ))]  # fmt: skip
     region, fastest = case.model.region, max(part.speed_m_per_s for part in case.excited)
-    near = fastest + max(SAME_SPEED * fastest, SAME_M_PER_S)
+    near = fastest + near_m_per_s(fastest, case.line)
     if not region.speed_to_m_per_s <= near:
         text = f"the model says that it was made up to {region.speed_to_m_per_s:.3g} m/s; the data go to {fastest:.3g}"
         return [*found, told(RULE, False, f"{text} m/s")]

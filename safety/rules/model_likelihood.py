@@ -31,7 +31,7 @@ from safety.findings import at_least, at_most, told
 from safety.predicting import Foretold, foretold, foretold_of, normalised, with_swings
 
 SHIFT, SURENESS, NOISE, OTHERS = "model: shift", "model: sureness", "model: noise", "model: held-out prediction"
-MOST_S = 20.0  #: of data are looked at
+MOST = 1000.0  #: moments of data that are looked at
 SHIFT_MOST = 4.0  #: times the number of parameters
 SURENESS_LEAST = 0.25  #: of the covariance that data and tolerances support: half the standard deviation
 NOISE_FACTOR = 1.5
@@ -55,7 +55,7 @@ def look_at(case: Case) -> Look:
     if noise is None or not case.excited:
         raise Unbelievable("without the noise in the model, and data in which tensions move, nothing can be said")
     theta = theta_of(case.model)
-    return Look(theta, noise, foretold_of(case, case.model, noise, MOST_S))
+    return Look(theta, noise, foretold_of(case, case.model, noise, MOST))
 
 
 def check_sureness(case: Case) -> list[RuleFinding]:

@@ -16,6 +16,7 @@ import numpy as np
 from gateway.control.judged_courses import corner_courses, improvement_courses
 from gateway.control.rollout import Course, plants_of_thetas, simulate
 from gateway.core.controller_laws import MpcConfig
+from gateway.core.line_limits import torque_limits_nm
 from gateway.core.verdict import RuleFinding
 from safety import programme
 from safety.case import Case
@@ -76,7 +77,7 @@ def _robust(case: Case) -> RuleFinding:
     name, one = next(reversed(corner_courses(judged_of(case)).items()))
     course = one.course
     most = CORNERS_MPC if isinstance(case.controller, MpcConfig) else CORNERS
-    thetas = holdable(case.corners[:most], course, case.line.limits.torque_nm)
+    thetas = holdable(case.corners[:most], course, torque_limits_nm(case.line))
     if not thetas:
         return told("paper: S_robust", False, "S_robust: no corner is held by the torque")
     setup = setup_of(case.line, case.noise, case.seed, 0.0)

@@ -16,6 +16,8 @@ from gateway.control.judged_courses import SLOW_ALONE, CornerCourse, CornerCours
 from gateway.control.mpc_linear import unconstrained
 from gateway.control.rollout import Rollouts, plants_of_thetas, simulate
 from gateway.core.controller_laws import MpcConfig
+from gateway.core.line_limits import torque_limits_nm
+from gateway.core.line_scales import line_scales
 from gateway.core.theta import Noise
 from gateway.core.verdict import RuleFinding
 from safety import programme
@@ -27,12 +29,11 @@ from safety.simulated import held, judged_of, setup_of, stressed
 
 RULE = "roller speed"
 SPEED_CHANGE = "speed change"  #: the course whose steps are of the speed; those of the others are of tensions
-LEAST_STEP_N = 1.0  #: of one span on a slow line: a law that does not let even that is too quick for the line
 SMALL = 1.0 / 16.0  #: of the largest step: at first nothing is cut
 TRIES = 3
 BELOW = 0.97  #: of the step that the one before lets expect
 JUDGED = 0.95  #: of the speed at which torque goes off: corners are not all that the line may be
-LASTING_S = 0.6  #: of a change: by then rollers run as fast as the web again, or never
+LASTING = 30.0  #: moments of a change: by then rollers run as fast as the web again, or never
 QUIET = Noise(0.0, 0.0, 0.0)
 
 Fastest = Callable[[str, CornerCourse], float]  #: the greatest speed of any roller in a course of this name, either way
@@ -61,7 +62,8 @@ def check(case: Case) -> list[RuleFinding]:
         return [told(RULE, False, _too_quick(case, "no step at all"))]
     alone = [share for name, share in found.share.items() if SLOW_ALONE in name]
     single = case.tension_step_n * min(alone, default=1.0)
-    if single < min(LEAST_STEP_N, case.tension_step_n):
+    # A law that does not let even a small step of one span on a slow line is too quick for the line.
+    if single < min(line_scales(case.line).tension_n, case.tension_step_n):
         return [told(RULE, False, _too_quick(case, f"a step of {single:.2g} N of one span"))]
     name, value = max(found.fastest_m_per_s.items(), key=lambda pair: pair[1])
     if value == np.inf:
@@ -134,7 +136,7 @@ def _courses(case: Case, share: float) -> CornerCourses:
         tension_step_n=share * judged.tension_step_n,
         speed_step_m_per_s=share * judged.speed_step_m_per_s,
     )
-    return courses_through(case, smaller, LASTING_S, 0.0)
+    return courses_through(case, smaller, LASTING * line_scales(case.line).moment_s, 0.0)
 
 
 def _looks(case: Case) -> tuple[Fastest, Fastest]:
@@ -144,7 +146,7 @@ def _looks(case: Case) -> tuple[Fastest, Fastest]:
     mean, setup = plants_of_thetas([case.believed]), setup_of(case.line, QUIET, case.seed, 0.0)
 
     def on_corners(name: str, one: CornerCourse) -> float:
-        kept = held(corners, one, case.line.limits.torque_nm)
+        kept = held(corners, one, torque_limits_nm(case.line))
         return _greatest(rollouts(case.line, law, kept, one.course, case.stress_noise, case.seed)) if kept else np.inf
 
     if isinstance(config, MpcConfig) and not case.first:  # under its limits it goes otherwise than without them

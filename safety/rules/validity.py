@@ -6,7 +6,7 @@ The predictor has no disturbance states: with them quiet data pass everything.
 from gateway.core.line_model import LineModel, noise_of
 from gateway.core.verdict import RuleFinding
 from safety.case import Case
-from safety.excitation import LEAST_S, MOVING, SAME_M_PER_S, SAME_SPEED
+from safety.excitation import MOVING, least_seconds, near_m_per_s
 from safety.findings import at_least, at_most, told
 from safety.predicting import Foretold, by_speed, foretold_of, normalised, normalised_by_output, seconds
 
@@ -30,7 +30,7 @@ def of_model(case: Case, model: LineModel, name: str = RULE) -> list[RuleFinding
     if not case.excited:
         return [told(name, False, _asks_for_data(case))]
     found = foretold_of(case, model, noise)
-    return [_at_speed(case, speed, of, name) for speed, of in by_speed(found)] or [
+    return [_at_speed(case, speed, of, name) for speed, of in by_speed(found, case.line)] or [
         told(name, False, "no data were seen")
     ]
 
@@ -58,7 +58,7 @@ def _at_speed(case: Case, speed: float, found: list[Foretold], name: str) -> Rul
 def _fast_enough(case: Case) -> RuleFinding:
     """The line does not run faster than where the model has been seen to hold."""
     speed, fastest = case.context.state.speed_m_per_s, case.validated_m_per_s
-    near = max((1.0 + SAME_SPEED) * fastest, fastest + SAME_M_PER_S)
+    near = fastest + near_m_per_s(fastest, case.line)
     text = f"data have shown the model up to {fastest:.3g} m/s; the line runs at {speed:g} m/s"
     if speed > near:
         text += f": {_experiment(speed)}"
@@ -72,8 +72,8 @@ def _asks_for_data(case: Case) -> str:
         f"{len(case.recordings)} recordings"
     )  # fmt: skip
     return (
-        f"no recent data show the model: of {had}, none has {LEAST_S:g} s at one speed in which every tension moves by "
-        f"{MOVING:g} times its noise; {_experiment(state.speed_m_per_s)}"
+        f"no recent data show the model: of {had}, none has {least_seconds(case.line):g} s at one speed in which every "
+        f"tension moves by {MOVING:g} times its noise; {_experiment(state.speed_m_per_s)}"
     )
 
 

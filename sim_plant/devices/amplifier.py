@@ -25,17 +25,19 @@ class Amplifier:
         self._world = world
         self._status = [ChannelStatus.OK] * world.n
         self._cells = [Misreading() for _ in range(world.n)]
+        self._plugged = list(range(world.n))  #: which load cell is plugged into each channel, from 0
 
     def tension_n(self, channel: int, now_s: float) -> float:
         """The measurement of this millisecond in N. Raises IndexError for a channel that does not exist."""
         self._check(channel)
         self._world.advance(now_s)
-        return self._cells[channel - 1].shown(self._world.measure_tension_n(channel - 1), self._world.steps)
+        cell = self._plugged[channel - 1]
+        return self._cells[channel - 1].shown(self._world.measure_tension_n(cell), self._world.steps)
 
     def tensions_n(self, now_s: float) -> FloatArray:
         """All channels at once, shape (n,)."""
         self._world.advance(now_s)
-        shown = self._world.measure_tensions_n()
+        shown = self._world.measure_tensions_n()[self._plugged]
         if all(cell.healthy for cell in self._cells):
             return shown
         return np.array([cell.shown(float(v), self._world.steps) for cell, v in zip(self._cells, shown, strict=True)])
@@ -50,6 +52,17 @@ class Amplifier:
         self._status[channel - 1] = status
 
     # What can go wrong with a load cell, from now on until `heal`. The channel's status stays as it is.
+
+    def swap(self, channel: int, other: int) -> None:
+        """The plugs of two channels are exchanged; once more, and they are as before."""
+        self._check(channel)
+        self._check(other)
+        plugged = self._plugged
+        plugged[channel - 1], plugged[other - 1] = plugged[other - 1], plugged[channel - 1]
+
+    def scale(self, channel: int, factor: float) -> None:
+        """The channel shows so many times what it should; -1 is the wrong way round, 0 nothing."""
+        self._cell(channel).scale(factor)
 
     def stick(self, channel: int) -> None:
         """The channel stays at what it shows next."""

@@ -10,6 +10,7 @@ CYCLIC_SYNCHRONOUS_TORQUE = 10  #: modes of operation 6060h
 
 # Bits of the statusword that are no part of the state's code.
 VOLTAGE_ENABLED = 1 << 4
+WARNING = 1 << 7
 REMOTE = 1 << 9
 INTERNAL_LIMIT = 1 << 11
 FOLLOWS_COMMAND = 1 << 12  #: in a cyclic synchronous mode: the target value is followed, not ignored

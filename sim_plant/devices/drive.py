@@ -10,10 +10,12 @@ from typing import NamedTuple
 from sim_plant.devices import cia402
 from sim_plant.devices.cia402 import Machine, State
 from sim_plant.devices.misreading import Misreading
+from sim_plant.devices.shortcomings import Shortcomings
 from sim_plant.recorder import Recorder
 from sim_plant.world import World
 
 WATCHDOG_ERROR = 0x8250  #: RPDO deadline missed
+WATCHDOG_REGISTER = 0x11  #: 1001h with it: generic error, communication error
 QUICK_STOP_TIME_S = 0.1  #: the quick stop ramp takes this long from rated torque to zero
 
 
@@ -50,6 +52,8 @@ class Drive:
         self.watchdog_s = 0.0  #: torque goes off this long after the last command; 0 is off. Acts from the next command
         self.watchdog_is_dead = False  #: a drive that takes the setting, and never acts on it
         self.encoder = Misreading()
+        #: Told error code and error register of each warning, and 0, 0 when it is over.
+        self.on_warning: Callable[[int, int], None] | None = None
         self.on_emergency: Callable[[int], None] | None = None  #: told the code of each fault, and 0 when it is cleared
         self._world = world
         self._recorder = recorder
@@ -57,6 +61,8 @@ class Drive:
         self._machine = Machine()
         self._mode = 0
         self._limited = False
+        self._short = Shortcomings()
+        self._watchdog_only_warns = False
         self._sto: set[str] = set()  #: who demands that the torque is safely off
         self._operational = False
         self._staged: _Command | None = None
@@ -70,7 +76,12 @@ class Drive:
     @property
     def mode(self) -> int:
         """Mode in effect (6061h)."""
-        return self._mode
+        return self._mode if self._short.lost_to_mode is None else self._short.lost_to_mode
+
+    @property
+    def shown_code(self) -> int:
+        """The error code of its fault, or of what it warns of; 0 without."""
+        return self.error_code or (self._short.warning[0] if self._short.warning else 0)
 
     @property
     def sto(self) -> bool:
@@ -133,18 +144,21 @@ class Drive:
         self._world.advance(now_s)
         return DriveSample(
             self.statusword,
-            self.encoder.shown(self._world.measure_speed_m_per_s(self.index), self._world.steps),
-            float(self._world.torque_nm[self.index]),
+            self._short.direction
+            * self.encoder.shown(self._world.measure_speed_m_per_s(self.index), self._world.steps),
+            self._short.direction * float(self._world.torque_nm[self.index]),
         )
 
     @property
     def statusword(self) -> int:
         enabled = self.state is State.OPERATION_ENABLED
         word = int(self.state) | cia402.MAKERS_OWN
-        word |= 0 if self._sto else cia402.VOLTAGE_ENABLED
+        word |= 0 if self._sto or self._short.unpowered else cia402.VOLTAGE_ENABLED
+        word |= cia402.WARNING if self._short.warning else 0
         word |= cia402.REMOTE if self._operational else 0
         word |= cia402.INTERNAL_LIMIT if enabled and self._limited else 0
-        word |= cia402.FOLLOWS_COMMAND if enabled and self._mode == cia402.CYCLIC_SYNCHRONOUS_TORQUE else 0
+        follows = self.mode == cia402.CYCLIC_SYNCHRONOUS_TORQUE or self._short.says_follows
+        word |= cia402.FOLLOWS_COMMAND if enabled and follows else 0
         return word
 
     def poll(self, now_s: float) -> None:
@@ -164,9 +178,53 @@ class Drive:
         """The encoder is off by this from now on, until `heal_speed`."""
         self.encoder.offset(delta_m_per_s, 0.0, self._world.steps)
 
+    def turn_encoder(self) -> None:
+        """The encoder shows the speed with the wrong sign, until `heal_speed`."""
+        self.encoder.scale(-1.0)
+
+    def reverse(self, reverse: bool) -> None:
+        """The motor turns the roller backwards, or forwards again, from the next command on."""
+        self._short.direction = -1.0 if reverse else 1.0
+
     def heal_speed(self) -> None:
         """The encoder shows the speed again."""
         self.encoder.heal()
+
+    def give_share(self, share: float) -> None:
+        """From the next command on it gives so much of the torque that it is asked for, within its greatest torque."""
+        self._short.torque_share = share
+
+    def lose_mode(self, mode: int, now_s: float, *, says_follows: bool) -> None:
+        """It leaves the mode that it was told for `mode`, and gives no torque.
+
+        `says_follows`: its statusword (bit 12) says all the same that it follows its target torque.
+        """
+        self._world.advance(now_s)
+        self._short.lost_to_mode, self._short.says_follows = mode, says_follows
+        self._world.set_torque_nm(self.index, 0.0)
+
+    def regain_mode(self) -> None:
+        """It is in the mode again that it was told, and follows the next command."""
+        self._short.lost_to_mode, self._short.says_follows = None, False
+
+    def set_powered(self, powered: bool, now_s: float) -> None:
+        """The supply of the power stage: without it nothing leaves READY TO SWITCH ON, and torque is off."""
+        self._world.advance(now_s)
+        self._short.unpowered = not powered
+        if not powered and self.state in (State.SWITCHED_ON, State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE):
+            self._enter(cia402.without_power(self._machine), "power", now_s)
+
+    def warn(self, code: int, register: int) -> None:
+        """It warns of something and goes on; code 0 takes that back."""
+        self._short.warning = (code, register) if code else None
+        if self.on_warning is not None:
+            self.on_warning(code, register)
+
+    def only_warn(self, only: bool) -> None:
+        """When its watchdog fires it warns, and its state stays as it is; or it goes to fault again."""
+        self._watchdog_only_warns = only
+        if not only:
+            self.warn(0, 0)
 
     def set_sto(self, active: bool, now_s: float, source: str = "drive") -> None:
         """The safe torque off input. It is active as long as one `source` (contact of its circuit) demands it.
@@ -191,12 +249,16 @@ class Drive:
     def _latch(self, command: _Command, now_s: float) -> None:
         step = cia402.step_without_power if self._sto else cia402.step
         self._mode = command.mode
-        self._enter(step(self._machine, command.controlword), "command", now_s)
+        after = step(self._machine, command.controlword)
+        if self._short.unpowered and after.state in (State.SWITCHED_ON, State.OPERATION_ENABLED):
+            after = Machine(self.state, command.controlword)  # it takes power to go there
+        self._enter(after, "command", now_s)
         if self.state is not State.OPERATION_ENABLED:
             return
-        wanted = command.target_torque_nm if command.mode == cia402.CYCLIC_SYNCHRONOUS_TORQUE else 0.0
+        wanted = command.target_torque_nm if self.mode == cia402.CYCLIC_SYNCHRONOUS_TORQUE else 0.0
+        self._limited = abs(wanted) > self.max_torque_nm
+        wanted *= self._short.torque_share * self._short.direction
         possible = max(-self.max_torque_nm, min(self.max_torque_nm, wanted))
-        self._limited = possible != wanted
         self._world.ramp_torque_nm(self.index, possible, self._torque_rate_nm_per_s)
 
     def _enter(self, machine: Machine, cause: str, now_s: float) -> None:
@@ -225,6 +287,9 @@ class Drive:
     def _watchdog_expired(self, now_s: float) -> None:
         # In FAULT there is no torque to take off, and the code of the first fault says what went wrong.
         if self.watchdog_is_dead or self.state is State.FAULT:
+            return
+        if self._watchdog_only_warns:
+            self.warn(WATCHDOG_ERROR, WATCHDOG_REGISTER)
             return
         self._recorder.note("watchdog", now_s, roller=self.index + 1, watchdog_s=self.watchdog_s)
         self._fail(WATCHDOG_ERROR, "watchdog", now_s)

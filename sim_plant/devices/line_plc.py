@@ -22,6 +22,7 @@ class LinePlcStatus:
     watchdog_tripped: bool
     unwind_speed_m_per_s: float  #: v0 as measured
     life_echo: int
+    local: bool = False  #: somebody has switched the line to local operation
 
 
 class LinePlc:
@@ -51,7 +52,10 @@ class LinePlc:
         self._sto_delay_s = sto_delay_s
         self._permissive = True
         self._emergency_stop = False
+        self._local = False
+        self._warning = False
         self._watchdog_tripped = False
+        self._watchdog_only_warns = False
         self._run = False
         self._running = False
         self._request_m_per_s = 0.0
@@ -68,6 +72,27 @@ class LinePlc:
         self._permissive = value
         self._recorder.note("permissive", self._world.now_s, active=value)
         self._stop_unless_allowed()
+
+    @property
+    def local(self) -> bool:
+        """Whether somebody has switched the line to local operation: who works at it starts it there."""
+        return self._local
+
+    @local.setter
+    def local(self, value: bool) -> None:
+        self._local = value
+        self._recorder.note("local", self._world.now_s, active=value)
+
+    @property
+    def warning(self) -> bool:
+        """Whether lamp and horn are on."""
+        return self._warning
+
+    def warn(self, on: bool, now_s: float) -> None:
+        """Lamp and horn, as the gateway asks for them. A program that stands still does nothing of it."""
+        if self._frozen is None and on != self._warning:
+            self._warning = on
+            self._recorder.note("warning", now_s, active=on)
 
     @property
     def emergency_stop(self) -> bool:
@@ -94,6 +119,10 @@ class LinePlc:
         """Its program goes on; its watchdog counts from the next change of the life counter."""
         self._world.advance(now_s)
         self._frozen = None
+
+    def only_warn(self, only: bool) -> None:
+        """When its watchdog fires it says so, and transport goes on; or transport ends again."""
+        self._watchdog_only_warns = only
 
     def command(self, run: bool, speed_request_m_per_s: float, life: int, now_s: float) -> None:
         """What the gateway asks for. Raises ValueError when the speed is not finite."""
@@ -129,6 +158,7 @@ class LinePlc:
             self._watchdog_tripped,
             self._world.measure_unwind_speed_m_per_s(),
             self._life,
+            self._local,
         )
 
     def poll(self, now_s: float) -> None:
@@ -154,6 +184,8 @@ class LinePlc:
         if self.watchdog_is_dead:
             return
         self._watchdog_tripped = True
+        if self._watchdog_only_warns:
+            return
         self._recorder.note("plc_watchdog", now_s, watchdog_s=self.watchdog_s)
         self._stop_unless_allowed()
 

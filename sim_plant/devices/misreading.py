@@ -25,6 +25,7 @@ class Misreading:
         self.healthy = True
         self._sticks = False
         self._held: float | None = None
+        self._factor = 1.0
         self._offset = 0.0
         self._rate_per_s = 0.0
         self._since_step = 0
@@ -43,6 +44,10 @@ class Misreading:
         """It shows no number from now on."""
         self.show(nan)
 
+    def scale(self, factor: float) -> None:
+        """It shows so many times what it should; -1 is the wrong way round, 0 nothing."""
+        self.healthy, self._factor = False, factor
+
     def offset(self, offset: float, rate_per_s: float, step: int) -> None:
         """It is off by `offset`, and by `rate_per_s` more for every second from `step` on."""
         self.healthy = False
@@ -58,7 +63,12 @@ class Misreading:
             return value
         if self._held is not None:
             return self._held
-        shown = value + self._offset + self._rate_per_s * (step - self._since_step) * STEP_S + self._spiked(step)
+        shown = (
+            self._factor * value
+            + self._offset
+            + self._rate_per_s * (step - self._since_step) * STEP_S
+            + self._spiked(step)
+        )
         if self._sticks:
             self._held = shown
         return shown

@@ -1,11 +1,12 @@
 """A drive as a CANopen node: the objects of docs/devices/r2r-drive.md beside network management."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
 from canopen.objectdictionary import ObjectDictionary
 from canopen.sdo.exceptions import SdoAbortedError
 
 from sim_plant.devices.drive import Drive, DriveSample
+from sim_plant.faces.canopen_node import TellError
 from sim_plant.faces.canopen_pdo import OUT_OF_RANGE, Key
 from sim_plant.faces.canopen_sdo import Reader, Writer, drive_dictionary
 from sim_plant.faces.words import speed_word, torque_word, watchdog_allowed
@@ -59,8 +60,9 @@ class DriveDevice:
     def error_code(self) -> int:
         return self._drive.error_code
 
-    def tell_errors(self, to: Callable[[int], None]) -> None:
+    def tell_errors(self, to: TellError) -> None:
         self._drive.on_emergency = to
+        self._drive.on_warning = to
 
     def reset(self) -> None:
         self._drive.watchdog_s = 0.0

@@ -5,7 +5,7 @@ it answers through `network.send_message`. Time is an argument.
 """
 
 import struct
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import partial
 from math import inf
 from typing import Protocol
@@ -36,6 +36,12 @@ _ERROR_HISTORY = 4
 _RPDO = 0x1400
 _TPDOS = range(0x1800, 0x1804)
 _MAPPING = 0x200  #: a PDO's mapping parameters stand this far behind its communication parameters
+
+
+class TellError(Protocol):
+    """Told the code of each error, and 0 when it is gone; the error register where it is not that of the code."""
+
+    def __call__(self, code: int, register: int | None = None) -> None: ...
 
 
 class Device(Protocol):
@@ -71,8 +77,8 @@ class Device(Protocol):
         """The code of the error that there is, 0 without."""
         ...
 
-    def tell_errors(self, to: Callable[[int], None]) -> None:
-        """`to` wants to be told the code of each error, and 0 when it is gone."""
+    def tell_errors(self, to: TellError) -> None:
+        """`to` wants to be told of each error."""
         ...
 
     def reset(self) -> None:
@@ -215,11 +221,12 @@ class Node:
         self.state = state
         self.device.set_operational(state == OPERATIONAL, self._now_s)
 
-    def _send_emergency(self, code: int) -> None:
+    def _send_emergency(self, code: int, register: int | None = None) -> None:
         if code:
             self._errors = [code, *self._errors][:_ERROR_HISTORY]
         if self.state != STOPPED:
-            self.network.send_message(0x80 + self.node_id, _EMERGENCY.pack(code, _error_register(code)))
+            told = _error_register(code) if register is None else register
+            self.network.send_message(0x80 + self.node_id, _EMERGENCY.pack(code, told))
 
     def _pdo(self, communication: int, mappable: Mapping[Key, str]) -> Pdo:
         objects, mapping = self.objects, communication + _MAPPING

@@ -16,7 +16,16 @@ from sim_plant.faces.canopen_objects import (
 )
 from sim_plant.faces.canopen_pdo import OUT_OF_RANGE, Key
 from sim_plant.faces.canopen_sdo import Reader, Writer
-from sim_plant.faces.words import PLC_WATCHDOG_MS, RUN_BIT, UM_PER_M, speed_word, status_word, watchdog_allowed
+from sim_plant.faces.words import (
+    COMMAND_BITS,
+    PLC_WATCHDOG_MS,
+    RUN_BIT,
+    UM_PER_M,
+    WARNING_BIT,
+    speed_word,
+    status_word,
+    watchdog_allowed,
+)
 
 _STATUS, _SPEED, _ECHO = ((0x2000, k) for k in (1, 2, 3))
 _COMMAND, _REQUEST, _LIFE = ((0x2001, k) for k in (1, 2, 3))
@@ -65,13 +74,14 @@ class PlcDevice:
     def set_operational(self, operational: bool, now_s: float) -> None:
         self._held = None
         if not operational:
+            self._plc.warn(False, now_s)
             self._plc.command(False, self._request_m_per_s, self._status.life_echo, now_s)
 
     def lose_power(self, now_s: float) -> None:
         self.set_operational(False, now_s)
 
     def command(self, values: Mapping[Key, int], now_s: float) -> bool:
-        if values[_COMMAND] & ~RUN_BIT:
+        if values[_COMMAND] & ~COMMAND_BITS:
             return False
         self._held = values[_COMMAND], values[_REQUEST] / UM_PER_M, values[_LIFE]
         return True
@@ -80,7 +90,8 @@ class PlcDevice:
         if self._held is not None:
             command, self._request_m_per_s, life = self._held
             self._held = None
-            self._plc.command(command == RUN_BIT, self._request_m_per_s, life, now_s)
+            self._plc.warn(bool(command & WARNING_BIT), now_s)
+            self._plc.command(bool(command & RUN_BIT), self._request_m_per_s, life, now_s)
         self._status = self._plc.status(now_s)
 
     def poll(self, now_s: float) -> None:

@@ -105,7 +105,7 @@ class DriveRegisters:
             shown.speed_um_per_s,
             shown.torque_per_mille,
             shown.flags,
-            axis.drive.error_code,
+            axis.drive.shown_code,
         )
         settings = _SETTINGS.pack(*self._command, axis.rated_torque_word, axis.max_torque_word, self._watchdog_ms)
         return (told + settings)[2 * address : 2 * (address + count)]

@@ -16,7 +16,16 @@ from sim_plant.faces.modbus_codec import (
 )
 from sim_plant.faces.modbus_drive import WATCHDOG_MS, AxisReading, ModbusAxis
 from sim_plant.faces.modbus_units import channel_words
-from sim_plant.faces.words import PLC_WATCHDOG_MS, RUN_BIT, UM_PER_M, speed_word, status_word, watchdog_allowed
+from sim_plant.faces.words import (
+    COMMAND_BITS,
+    PLC_WATCHDOG_MS,
+    RUN_BIT,
+    UM_PER_M,
+    WARNING_BIT,
+    speed_word,
+    status_word,
+    watchdog_allowed,
+)
 
 RACK_ID = 0x5204
 
@@ -91,7 +100,7 @@ class RackRegisters:
         self._act(written, now_s)
 
     def _check(self, words: Mapping[int, int]) -> None:
-        if words[_LINE.start] & ~RUN_BIT:
+        if words[_LINE.start] & ~COMMAND_BITS:
             raise Refused(ILLEGAL_VALUE)
         for register, allowed in ((_LINE_WATCHDOG, PLC_WATCHDOG_MS), (_AXES_WATCHDOG, WATCHDOG_MS)):
             if not watchdog_allowed(words[register], allowed):
@@ -110,8 +119,9 @@ class RackRegisters:
                 axis.command(words[first], words[first + 1], now_s)
         if self._plc is not None and written[0] in _LINE:
             packed = _LINE_WORDS.pack(*(words[k] for k in _LINE))
-            run, request_um_per_s, life = _LINE_COMMAND.unpack(packed)
-            self._plc.command(run == RUN_BIT, request_um_per_s / UM_PER_M, life, now_s)
+            command, request_um_per_s, life = _LINE_COMMAND.unpack(packed)
+            self._plc.warn(bool(command & WARNING_BIT), now_s)
+            self._plc.command(bool(command & RUN_BIT), request_um_per_s / UM_PER_M, life, now_s)
 
     def _inputs(self, now_s: float) -> bytes:
         amplifier = self._amplifier

@@ -16,7 +16,16 @@ from sim_plant.faces.modbus_codec import (
     WRITE_ONE,
     Refused,
 )
-from sim_plant.faces.words import PLC_WATCHDOG_MS, RUN_BIT, UM_PER_M, speed_word, status_word, watchdog_allowed
+from sim_plant.faces.words import (
+    COMMAND_BITS,
+    PLC_WATCHDOG_MS,
+    RUN_BIT,
+    UM_PER_M,
+    WARNING_BIT,
+    speed_word,
+    status_word,
+    watchdog_allowed,
+)
 
 AMPLIFIER_ID = 0x5201
 PLC_ID = 0x5202
@@ -99,13 +108,14 @@ class PlcRegisters:
         after = self._command.copy()
         for register, value in zip(written, values, strict=True):
             after[register - _COMMAND.start] = value
-        run, request_um_per_s, life, watchdog_ms = _PLC_COMMAND.unpack(_FIVE_WORDS.pack(*after))
-        if run & ~RUN_BIT or not watchdog_allowed(watchdog_ms, PLC_WATCHDOG_MS):
+        command, request_um_per_s, life, watchdog_ms = _PLC_COMMAND.unpack(_FIVE_WORDS.pack(*after))
+        if command & ~COMMAND_BITS or not watchdog_allowed(watchdog_ms, PLC_WATCHDOG_MS):
             raise Refused(ILLEGAL_VALUE)
         self._command = after
         self._plc.watchdog_s = watchdog_ms * 1e-3
         if address < _WATCHDOG:
-            self._plc.command(run == RUN_BIT, request_um_per_s / UM_PER_M, life, now_s)
+            self._plc.warn(bool(command & WARNING_BIT), now_s)
+            self._plc.command(bool(command & RUN_BIT), request_um_per_s / UM_PER_M, life, now_s)
 
     def _status(self, now_s: float) -> bytes:
         status = self._plc.status(now_s)

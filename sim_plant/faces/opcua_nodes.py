@@ -154,7 +154,7 @@ class _Axis:
             Variable(self, "Speed", Kind.DOUBLE, lambda: self._sample.speed_m_per_s, "m/s"),
             Variable(self, "Torque", Kind.DOUBLE, lambda: self._sample.torque_nm, "Nm"),
             Variable(self, "SafeTorqueOff", Kind.BOOLEAN, lambda: drive.sto),
-            Variable(self, "ErrorCode", Kind.UINT16, lambda: drive.error_code),
+            Variable(self, "ErrorCode", Kind.UINT16, lambda: drive.shown_code),
             Variable(self, "Controlword", Kind.UINT16, lambda: written["Controlword"], accepts=_any),
             Variable(self, "TargetTorque", Kind.DOUBLE, lambda: written["TargetTorque"], "Nm", accepts=isfinite),
             Variable(self, "Life", Kind.UINT16, lambda: written["Life"], accepts=_any),
@@ -228,7 +228,9 @@ class _Line:
 
     def __init__(self, plc: LinePlc) -> None:
         self._plc = plc
-        self._written: dict[str, Scalar] = {"Run": False, "SpeedRequest": 0.0, "Life": 0, "Watchdog": 0}
+        self._written: dict[str, Scalar] = {
+            "Run": False, "Warning": False, "SpeedRequest": 0.0, "Life": 0, "Watchdog": 0,
+        }  # fmt: skip
         self.sample(0.0)
 
     def variables(self) -> Sequence[Variable]:
@@ -239,9 +241,11 @@ class _Line:
             Variable(self, "EmergencyStopHealthy", Kind.BOOLEAN, lambda: not self._status.emergency_stop),
             Variable(self, "Running", Kind.BOOLEAN, lambda: self._status.running),
             Variable(self, "WatchdogTripped", Kind.BOOLEAN, lambda: self._status.watchdog_tripped),
+            Variable(self, "Local", Kind.BOOLEAN, lambda: self._status.local),
             Variable(self, "UnwindSpeed", Kind.DOUBLE, lambda: self._status.unwind_speed_m_per_s, "m/s"),
             Variable(self, "LifeEcho", Kind.UINT16, lambda: self._status.life_echo),
             Variable(self, "Run", Kind.BOOLEAN, lambda: written["Run"], accepts=_any),
+            Variable(self, "Warning", Kind.BOOLEAN, lambda: written["Warning"], accepts=_any),
             Variable(self, "SpeedRequest", Kind.DOUBLE, lambda: written["SpeedRequest"], "m/s", accepts=isfinite),
             Variable(self, "Life", Kind.UINT16, lambda: written["Life"], accepts=_any),
             Variable(self, "Watchdog", Kind.UINT16, lambda: written["Watchdog"], "ms", accepts=_is_watchdog),
@@ -255,5 +259,6 @@ class _Line:
         self._plc.poll(now_s)
         self._plc.watchdog_s = self._written["Watchdog"] * 1e-3
         if written.keys() != {"Watchdog"}:
+            self._plc.warn(bool(self._written["Warning"]), now_s)
             run, request_m_per_s, life = (self._written[name] for name in ("Run", "SpeedRequest", "Life"))
             self._plc.command(bool(run), float(request_m_per_s), int(life), now_s)

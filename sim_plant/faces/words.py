@@ -5,7 +5,9 @@ from math import isfinite
 from sim_plant.devices.line_plc import LinePlcStatus
 
 UM_PER_M = 1e6
-RUN_BIT = 1  #: the only bit of a line command
+RUN_BIT = 1  #: of a line command
+WARNING_BIT = 2
+COMMAND_BITS = RUN_BIT | WARNING_BIT
 PLC_WATCHDOG_MS = range(10, 1001)  #: of the line's command watchdog, beside 0 for off
 INT16, INT32 = 0x7FFF, 0x7FFFFFFF
 
@@ -32,6 +34,7 @@ def status_word(status: LinePlcStatus) -> int:
         | (not status.emergency_stop) << 1
         | status.running << 2
         | status.watchdog_tripped << 3
+        | status.local << 4
     )  # fmt: skip
 
 

@@ -5,6 +5,7 @@ from typing import Any
 
 from sim_plant.faults.frame_effects import FRAME_FAULTS
 from sim_plant.faults.parse import FaultRefused, Injection
+from sim_plant.faults.table import FOLLOWS
 from sim_plant.faults.targets import (
     FaultyAmplifier,
     FaultyDrive,
@@ -13,6 +14,7 @@ from sim_plant.faults.targets import (
     FaultyWeb,
     Freezable,
     HasWatchdog,
+    Warns,
     key_of,
 )
 
@@ -76,16 +78,49 @@ def _sto(line: FaultyLine, injection: Injection) -> Begin:
     return _lasting(lambda now_s: drive.set_sto(True, now_s), lambda now_s: drive.set_sto(False, now_s))
 
 
-def _watchdog_dead(line: FaultyLine, injection: Injection) -> Begin:
+def _torque_share(line: FaultyLine, injection: Injection) -> Begin:
+    drive, share = _drive(line, injection), injection.number("share")
+    return _lasting(lambda now_s: drive.give_share(share), lambda now_s: drive.give_share(1.0))
+
+
+def _mode_lost(line: FaultyLine, injection: Injection) -> Begin:
+    drive, mode = _drive(line, injection), int(injection.number("mode"))
+    says = injection.word("says") == FOLLOWS
+    return _lasting(lambda now_s: drive.lose_mode(mode, now_s, says_follows=says), lambda now_s: drive.regain_mode())
+
+
+def _no_power(line: FaultyLine, injection: Injection) -> Begin:
+    drive = _drive(line, injection)
+    return _lasting(lambda now_s: drive.set_powered(False, now_s), lambda now_s: drive.set_powered(True, now_s))
+
+
+def _drive_warning(line: FaultyLine, injection: Injection) -> Begin:
+    drive = _drive(line, injection)
+    if not isinstance(drive, Warns):
+        raise FaultRefused(f"{injection}: the drives of this line have no words to warn with")
+    warning, code, register = drive, int(injection.number("code")), int(injection.number("register"))
+    return _lasting(lambda now_s: warning.warn(code, register), lambda now_s: warning.warn(0, 0))
+
+
+def _with_watchdog(line: FaultyLine, injection: Injection) -> HasWatchdog:
     device = _plc(line, injection) if injection.target.number is None else _drive(line, injection)
     if not isinstance(device, HasWatchdog):
         raise FaultRefused(f"{injection}: {injection.target} has no communication watchdog here")
-    watchdog = device
+    return device
+
+
+def _watchdog_dead(line: FaultyLine, injection: Injection) -> Begin:
+    watchdog = _with_watchdog(line, injection)
 
     def set_dead(dead: bool) -> None:
         watchdog.watchdog_is_dead = dead
 
     return _lasting(lambda now_s: set_dead(True), lambda now_s: set_dead(False))
+
+
+def _watchdog_warns(line: FaultyLine, injection: Injection) -> Begin:
+    watchdog = _with_watchdog(line, injection)
+    return _lasting(lambda now_s: watchdog.only_warn(True), lambda now_s: watchdog.only_warn(False))
 
 
 def _restart(line: FaultyLine, injection: Injection) -> Begin:
@@ -104,6 +139,23 @@ def _encoder_jump(line: FaultyLine, injection: Injection) -> Begin:
 def _encoder_frozen(line: FaultyLine, injection: Injection) -> Begin:
     drive = _drive(line, injection)
     return _lasting(lambda now_s: drive.freeze_speed(), lambda now_s: drive.heal_speed())
+
+
+def _encoder_reversed(line: FaultyLine, injection: Injection) -> Begin:
+    drive = _drive(line, injection)
+    return _lasting(lambda now_s: drive.turn_encoder(), lambda now_s: drive.heal_speed())
+
+
+def _reversed(line: FaultyLine, injection: Injection) -> Begin:
+    drive = _drive(line, injection)
+    return _lasting(lambda now_s: drive.reverse(True), lambda now_s: drive.reverse(False))
+
+
+def _cells_swapped(line: FaultyLine, injection: Injection) -> Begin:
+    (amplifier, channel), other = _cell(line, injection), int(injection.number("other"))
+    if other > line.spans or other == channel:
+        raise FaultRefused(f"{injection}: other is {other}; allowed: another span, 1 to {line.spans}")
+    return _lasting(lambda now_s: amplifier.swap(channel, other), lambda now_s: amplifier.swap(channel, other))
 
 
 def _reading(mistake: Callable[[FaultyAmplifier, int, Injection], object]) -> _Prepare:
@@ -137,6 +189,15 @@ def _permissive_lost(line: FaultyLine, injection: Injection) -> Begin:
         plc.permissive = given
 
     return _lasting(lambda now_s: give(False), lambda now_s: give(True))
+
+
+def _local(line: FaultyLine, injection: Injection) -> Begin:
+    plc = _plc(line, injection)
+
+    def switch(local: bool) -> None:
+        plc.local = local
+
+    return _lasting(lambda now_s: switch(True), lambda now_s: switch(False))
 
 
 def _plc_freeze(line: FaultyLine, injection: Injection) -> Begin:
@@ -176,9 +237,18 @@ EFFECTS: dict[str, _Prepare] = {
     "restart": _restart,
     "drive-fault": _fault_of_drive,
     "sto": _sto,
+    "torque-share": _torque_share,
+    "mode-lost": _mode_lost,
+    "no-power": _no_power,
+    "drive-warning": _drive_warning,
     "watchdog-dead": _watchdog_dead,
+    "watchdog-warns": _watchdog_warns,
     "encoder-jump": _encoder_jump,
     "encoder-frozen": _encoder_frozen,
+    "encoder-reversed": _encoder_reversed,
+    "reversed": _reversed,
+    "cells-swapped": _cells_swapped,
+    "cell-factor": _reading(lambda amplifier, channel, asked: amplifier.scale(channel, asked.number("factor"))),
     "nan": _reading(lambda amplifier, channel, _: amplifier.nan(channel)),
     "stuck": _reading(lambda amplifier, channel, _: amplifier.stick(channel)),
     "offset": _reading(lambda amplifier, channel, asked: amplifier.offset_n(channel, 0.0, asked.number("by_n"))),
@@ -187,6 +257,7 @@ EFFECTS: dict[str, _Prepare] = {
     "spike": _spike,
     "emergency-stop": _emergency_stop,
     "permissive-lost": _permissive_lost,
+    "local": _local,
     "plc-freeze": _plc_freeze,
     "web-break": _web_break,
     "slip": _slip,

@@ -33,6 +33,8 @@ A fault is asked for in these words:
   and restart of a drive are one there: torque goes off, until the drive has been told off and is enabled anew.
 - The first line on a machine to which faults can come compiles the full model of the physics, for some seconds, before
   its time begins.
+- A web that is missing at a start is `web 3 web-break` before it, one that hangs `web 3 slack length_m=0.2`; what the
+  gateway does about them stands in [starting.md](starting.md).
 - What a fault does is judged as all else: a `web-break` by itself is a tension out of its band and counts as
   `tension-band`, whatever the gateway does. A restart, a fault or STO of a drive leads to `tension-after-trip`.
 

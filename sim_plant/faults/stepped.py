@@ -51,3 +51,23 @@ class _SteppedDrive:
 
     def heal_speed(self) -> None:
         self._line.encoders[self._index].heal()
+
+    def turn_encoder(self) -> None:
+        self._line.encoders[self._index].scale(-1.0)
+
+    def reverse(self, reverse: bool) -> None:
+        self._line.direction[self._index] = -1.0 if reverse else 1.0
+
+    def give_share(self, share: float) -> None:
+        self._line.torque_share[self._index] = share
+
+    def lose_mode(self, mode: int, now_s: float, *, says_follows: bool) -> None:
+        self._line.torque_share[self._index] = 0.0
+
+    def regain_mode(self) -> None:
+        self._line.torque_share[self._index] = 1.0
+
+    def set_powered(self, powered: bool, now_s: float) -> None:
+        self._line.powered[self._index] = powered
+        if not powered:
+            self._line.take_off(self._index, now_s)

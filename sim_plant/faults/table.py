@@ -89,7 +89,8 @@ _DICE = (_PROBABILITY, _COUNT)
 _FRAMES = (Kind.WIRE, Kind.DRIVE, Kind.LOAD_CELL, Kind.PLC)  #: a device stands for its own address on its own wire
 _CELL, _DRIVE, _PLC, _WEB = (Kind.LOAD_CELL,), (Kind.DRIVE,), (Kind.PLC,), (Kind.WEB,)
 _NODES = (Kind.DRIVE, Kind.LOAD_CELL, Kind.PLC)
-_READING = "reading"
+_READING, _TORQUE, _WATCHDOG = "reading", "torque", "watchdog"
+IGNORES, FOLLOWS = "ignores", "follows"  #: its target torque, as the statusword says
 
 FAULTS = (
     # Frames. All of them may be asked of a whole wire, of one address on it, or of a device by its own name.
@@ -195,12 +196,55 @@ FAULTS = (
         Lasting.ONCE,
         (Number("code", "as in 603Fh", 1, 0xFFFF, 0x2310, whole=True),),
     ),
+    Fault(
+        "torque-share",
+        _DRIVE,
+        "The drive gives so many times the torque that it is asked for, and reports what it gives.",
+        "drive 2 torque-share share=0.1 at 5",
+        parameters=(Number("share", "", -10.0, 10.0),),
+        group=_TORQUE,
+    ),
+    Fault(
+        "mode-lost",
+        _DRIVE,
+        "The drive is in another mode of operation and gives no torque; its state stays. Its statusword (bit 12) says "
+        "that it ignores its target torque, or that it follows it.",
+        "drive 2 mode-lost says=follows at 5 for 0.6",
+        parameters=(Number("mode", "as in 6061h", -128, 127, 0, whole=True), Choice("says", (IGNORES, FOLLOWS))),
+        group=_TORQUE,
+    ),
+    Fault(
+        "no-power",
+        _DRIVE,
+        "The power stage has no supply: torque is off, and the drive cannot be enabled.",
+        "drive 2 no-power at 5",
+    ),
+    Fault(
+        "drive-warning",
+        _DRIVE,
+        "The drive warns of something and goes on: emergency message, bit 7 of its statusword, its error code. On "
+        "wires only.",
+        "drive 2 drive-warning code=0x4210 register=0x08 at 5",
+        parameters=(
+            Number("code", "as in 603Fh", 0x100, 0xFFFF, 0x4210, whole=True),
+            Number("register", "as in 1001h", 0, 0xFF, 0x08, whole=True),
+        ),
+    ),
     Fault("sto", _DRIVE, "Safe torque off is active.", "drive 1 sto at 5 for 0.1"),
     Fault(
         "watchdog-dead",
         (Kind.DRIVE, Kind.PLC),
         "The communication watchdog takes its setting and shows it, and never fires.",
         "drive 3 watchdog-dead",
+        group=_WATCHDOG,
+    ),
+    Fault(
+        "watchdog-warns",
+        (Kind.DRIVE, Kind.PLC),
+        "The communication watchdog fires and takes nothing away: a drive warns (emergency message 8250h, bit 7 of its "
+        "statusword) and keeps its state, the line PLC says that it has tripped and keeps transport on.",
+        "drive 3 watchdog-warns",
+        group=_WATCHDOG,
     ),
     Fault(
         "encoder-jump",
@@ -217,6 +261,19 @@ FAULTS = (
         "drive 4 encoder-frozen at 5 for 1",
         group=_READING,
     ),
+    Fault(
+        "encoder-reversed",
+        _DRIVE,
+        "The measured speed has the wrong sign; the torque is right.",
+        "drive 4 encoder-reversed at 0",
+        group=_READING,
+    ),
+    Fault(
+        "reversed",
+        _DRIVE,
+        "The motor turns its roller backwards; torque and speed have their signs as the drive sees them.",
+        "drive 2 reversed at 0",
+    ),
     # Load cells. The channel's status stays ok.
     Fault("nan", _CELL, "The measured tension is not a number.", "load-cell 3 nan at 12.5 for 0.2", group=_READING),
     Fault("stuck", _CELL, "The measured tension stands still.", "load-cell 3 stuck at 5", group=_READING),
@@ -227,6 +284,21 @@ FAULTS = (
         "load-cell 2 offset by_n=3 at 5 for 10",
         parameters=(Number("by_n", "N", -1e5, 1e5),),
         group=_READING,
+    ),
+    Fault(
+        "cell-factor",
+        _CELL,
+        "The measured tension is so many times the true one; -1 is the wrong way round, 0 nothing.",
+        "load-cell 2 cell-factor factor=0.5 at 0",
+        parameters=(Number("factor", "", -100.0, 100.0),),
+        group=_READING,
+    ),
+    Fault(
+        "cells-swapped",
+        _CELL,
+        "The plugs of two load cells are exchanged.",
+        "load-cell 2 cells-swapped other=3 at 0",
+        parameters=(Number("other", "span", 1, 60, whole=True),),
     ),
     Fault(
         "drift",
@@ -255,6 +327,7 @@ FAULTS = (
     # Line PLC.
     Fault("emergency-stop", _PLC, "The emergency stop is pressed; cleared, it is released.", "plc emergency-stop at 5"),
     Fault("permissive-lost", _PLC, "The PLC takes its permissive away.", "plc permissive-lost at 5 for 0.5"),
+    Fault("local", _PLC, "The line is switched to local operation: nobody starts it from afar.", "plc local at 0"),
     Fault(
         "plc-freeze",
         _PLC,

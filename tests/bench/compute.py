@@ -71,6 +71,9 @@ class Between:
     ) -> None:
         self._command = torque_nm, enable, speed_request_m_per_s, run
 
+    def warn(self, on: bool, now_s: float) -> None:
+        """Nobody is near."""
+
 
 class Subject:
     """A loop in the middle of production, of which every section is timed."""

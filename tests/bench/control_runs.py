@@ -4,7 +4,6 @@ Every run goes through the whole cycle in stepped time (loop, envelope, in-memor
 the recorder there. A design knows the model that it was made on and nothing else.
 """
 
-import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
@@ -180,8 +179,6 @@ class Runs(Workers):
     """Runs in other processes. What was run before is not run again. Use as a context."""
 
     def __init__(self, workers: int | None = None) -> None:
-        # What they compute is small: threads of linear algebra would only stand in each other's way.
-        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
         super().__init__(workers)
         self._outcomes: dict[Job, Outcome] = {}
         self._bests: dict[Bound, Best] = {}

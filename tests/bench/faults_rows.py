@@ -182,6 +182,26 @@ ROWS = (
         ),
     ),
     Row(
+        "torque-unlike", "a drive gives a share of its torque, or loses its mode: timed to the stop",
+        Wanted.STOP, "1 s", 1.0,
+        (
+            *(
+                Variant(f"share {share}", (f"drive {{roller}} torque-share share={share}",))
+                for share in ("0", "0.1", "0.5")
+            ),
+            Variant("mode lost, told", ("drive {roller} mode-lost",)),
+            Variant("mode lost, not told", ("drive {roller} mode-lost says=follows for 0.6",)),
+            Variant("power lost", ("drive {roller} no-power",)),
+        ),
+    ),
+    Row(
+        "drive-warning", "a drive warns and goes on", Wanted.RUN_ON, "-", 0.0,
+        (
+            Variant("emergency message", ("drive {roller} drive-warning code=0x4210 register=0x08 for 0.2",)),
+            Variant("with the generic bit", ("drive {roller} drive-warning code=0x3110 register=0x05 for 0.2",)),
+        ),
+    ),
+    Row(
         "web-break", "the web tears", Wanted.STOP, "5 T", 5 * T,
         (Variant("web-break", ("web {span} web-break",)),), harms_web=True,
     ),

@@ -3,20 +3,30 @@
 A line is drawn by what has no dimension, then given its size: strain at the working tension, how fast a span swings on
 its rollers, how much of the torque friction takes at full speed. What the gateway's file says of it is off by up to
 half of the tolerances that the file names. A function of its seed alone.
+
+Seeds from `DRAW_SPANS` on are lines with draw-controlled spans that no load cell measures, whose rollers are known as
+well as `check` asks for.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
 
 from gateway.core.line import Line
+from gateway.core.line_checks import RULES
+from gateway.core.line_defaults import derived_defaults
 from gateway.core.line_file import load_line
 from gateway.core.line_template import line_template
 from sim_plant.plant import Plant, load_plant
 
 PLANT = "sim_plant/plants/s_real.toml"
 NOISE = 0.003  #: of a load cell, as a share of the working tension; S_real has 0.1 of 28 N
+DRAW_SPANS = 1_000_000  #: the first seed of such lines
+DRAW_SHARE = 0.3  #: of the spans of such a line, and one at least
+#: Shares of the tolerances: the first that `check` takes counts.
+KNOWN = (1.0, 0.5, 0.2, 0.1, 0.05, 0.02, 0.01)
+SPREAD = 0.05  #: by which rollers and spans of one line differ, where tolerances are the template's
 OFF = 0.5  #: of a tolerance, by which what the file says may be off
 
 
@@ -32,6 +42,8 @@ class Size:
     strain: float  #: at the working tension
     swing_rad_per_s: float  #: sqrt(EA / (L M)), M the roller's inertia at its surface
     friction: float  #: force at full speed over the working tension
+    draw_spans: tuple[int, ...] = ()  #: from 1: draw-controlled, without a load cell
+    known: float = 1.0  #: tolerances, and what rollers and spans differ by, as a share of the usual ones
 
     @property
     def mass_kg(self) -> float:
@@ -66,7 +78,26 @@ def draw_size(seed: int) -> Size:
 @lru_cache(maxsize=8)
 def drawn(seed: int) -> Drawn:
     """A line of a size of its own, threaded and slack at the start. Its file may be one that `check` refuses."""
-    size, dice = draw_size(seed), np.random.default_rng([seed, 32])
+    size = draw_size(seed)
+    if seed < DRAW_SPANS:
+        return _of_size(size, seed)
+    dice = np.random.default_rng([seed, 36])
+    chosen = np.flatnonzero(dice.uniform(size=size.spans) < DRAW_SHARE) + 1
+    spans = tuple(chosen.tolist()) or (int(dice.integers(1, size.spans + 1)),)
+    for known in KNOWN:
+        found = _of_size(replace(size, draw_spans=spans, known=known), seed)
+        if not is_refused(found.line):
+            break
+    return found
+
+
+def is_refused(line: Line) -> bool:
+    """Whether `check` does not take it, whatever else it advises."""
+    return any(found.severity == "error" for rule in RULES for found in rule.check(line))
+
+
+def _of_size(size: Size, seed: int) -> Drawn:
+    dice = np.random.default_rng([seed, 32])
     return Drawn(size, _line(size, dice), _plant(size, dice), seed)
 
 
@@ -81,21 +112,29 @@ def _line(size: Size, dice: np.random.Generator) -> Line:
     }  # fmt: skip
 
     def parameter(of: object, name: str) -> dict[str, object]:
-        tolerance = getattr(of, name).tolerance
+        tolerance = size.known * getattr(of, name).tolerance
         value = believed[name] * (1.0 + OFF * tolerance * float(dice.uniform(-1.0, 1.0)))
-        return {name: getattr(of, name).model_copy(update={"value": value})}
+        return {name: getattr(of, name).model_copy(update={"value": value, "tolerance": tolerance})}
 
     stiffness, radius = parameter(base.web, "stiffness_n"), parameter(base.rollers[0], "radius_m")
     inertia, friction = (parameter(base.rollers[0], name) for name in ("inertia_kg_m2", "friction_nms_per_rad"))
     length = parameter(base.spans[0], "length_m")
     torque_nm, accelerates_s = _torque_nm(size), _accelerates_s(size)
-    return base.model_copy(
+    brake = {"braking_torque_nm": torque_nm, "braking_power_w": torque_nm * top / size.radius_m}
+    line = base.model_copy(
         update={
             "web": base.web.model_copy(update=stiffness),
             "rollers": [roller.model_copy(update=radius | inertia | friction) for roller in base.rollers],
-            "spans": [span.model_copy(update=length) for span in base.spans],
-            "drives": [drive.model_copy(update={"rated_torque_nm": torque_nm}) for drive in base.drives],
-            "load_cells": [cell.model_copy(update={"capacity_n": 4.0 * tension_n}) for cell in base.load_cells],
+            "spans": [
+                span.model_copy(update=length | ({"control": "draw"} if i in size.draw_spans else {}))
+                for i, span in enumerate(base.spans, start=1)
+            ],
+            "drives": [drive.model_copy(update={"rated_torque_nm": torque_nm, **brake}) for drive in base.drives],
+            "load_cells": [
+                cell.model_copy(update={"capacity_n": 4.0 * tension_n})
+                for cell in base.load_cells
+                if cell.span not in size.draw_spans
+            ],
             "limits": base.limits.model_copy(
                 update={
                     "torque_nm": torque_nm, "torque_rate_nm_per_s": 16.0 * torque_nm,
@@ -120,6 +159,8 @@ def _line(size: Size, dice: np.random.Generator) -> Line:
             ],
         }
     )  # fmt: skip
+    # What the file does not give follows from its limits, not from those of the line that it was written from.
+    return line.model_copy(update={"gate": line.gate.model_copy(update=derived_defaults(line)["gate"])})
 
 
 def _torque_nm(size: Size) -> float:
@@ -137,7 +178,7 @@ def _plant(size: Size, dice: np.random.Generator) -> Plant:
     base = load_plant(PLANT)
 
     def each(value: float) -> list[float]:
-        return (value * (1.0 + 0.05 * dice.uniform(-1.0, 1.0, n))).tolist()
+        return (value * (1.0 + SPREAD * size.known * dice.uniform(-1.0, 1.0, n))).tolist()
 
     web = base.web.model_copy(update={"stiffness_n": each(tension_n / size.strain), "length_m": each(size.length_m)})
     rollers = base.rollers.model_copy(

@@ -12,13 +12,15 @@ import numpy as np
 
 from gateway.cli.stepped import SteppedLoop
 from gateway.control.design import DesignRefused, design_lqi, task_of
+from gateway.core.braking import brakes_of, braking_s
 from gateway.core.controller import Controller
-from gateway.core.line_checks import RULES
+from gateway.core.line_rules_braking import AT_REST_S
 from gateway.core.messages import Command, Hold, SetSpeed, SetTension, Start, Stop
 from gateway.core.states import LoopState, Phase
+from safety.tensioning import TensioningState, longest_tensioning_s, surely_stretched_m, tensioning_limits
 from sim_plant.faults.parse import parse_fault
 from sim_plant.faults.stepped import injector_of
-from tests.bench.harm_lines import Drawn, drawn
+from tests.bench.harm_lines import Drawn, drawn, is_refused
 
 STANDS = 0.01  #: of the top speed: what is slower stands
 AT_MOST_S = 40.0  #: that is waited for a line to come to rest
@@ -50,15 +52,20 @@ def configuration(seed: int) -> Controller:
 
 
 def drawable(seed: int) -> bool:
-    """Whether `check` takes the file of this seed's line, and there is a controller for it."""
-    line = drawn(seed).line
-    if any(list(rule.check(line)) for rule in RULES):
+    """Whether `check` takes the file of this seed's line, whatever it advises, and there is a controller for it."""
+    if is_refused(drawn(seed).line):
         return False
     try:
         configuration(seed)
     except DesignRefused:
         return False
     return True
+
+
+def rest_bound_s(seed: int) -> float:
+    """When everything must be at rest after a web break: in 10 s, or when `check` says where it takes longer."""
+    brakes = brakes_of(drawn(seed).line)
+    return max(AT_REST_S, float(braking_s(brakes).max()))
 
 
 def begun(seed: int, speed_share: float) -> SteppedLoop:
@@ -148,17 +155,43 @@ class Watched:
 
 
 def at_start(row: str, seed: int, broken: list[int]) -> Outcome:
-    """Armed and started with the web missing in these spans, from 1."""
+    """Armed and started with the web missing in these spans, from 1.
+
+    Times are from when the slack that may be there, and what radii leave open, had been used up in one of them.
+    """
     loop = threaded(seed)
     watched = Watched(row, seed, loop, [f"web {span} web-break" for span in broken])
     loop.step(3)
     if refused := armed(loop) or started(loop):
         return watched.outcome(0.0, ("tension-band",), refused)
-    rest_s = watched.step_until(
-        lambda: loop.cycle.machine.state is LoopState.STOP and watched.rests(),
-        2.0 * loop.line.longest_stop_s + AT_MOST_S,
-    )
-    return watched.outcome(rest_s, ("tension-band",))
+    taken_up = TakenUp(loop, broken)
+
+    def rests() -> bool:
+        taken_up.look()
+        return loop.cycle.machine.state is LoopState.STOP and watched.rests()
+
+    rest_s = watched.step_until(rests, 2.0 * loop.line.longest_stop_s + longest_tensioning_s(loop.line) + AT_MOST_S)
+    found, used_up_s = watched.outcome(rest_s, ("tension-band",)), taken_up.used_up_s - watched.begin_s
+    return replace(found, found_s=max(0.0, found.found_s - used_up_s), rest_s=max(0.0, found.rest_s - used_up_s))
+
+
+class TakenUp:
+    """When the slack that may be there had been taken up in one of some spans: `used_up_s`; until then now."""
+
+    def __init__(self, loop: SteppedLoop, spans: list[int]) -> None:
+        self._loop, self._spans = loop, np.array(spans) - 1
+        self._state, self._limits = TensioningState(way_m=np.zeros(loop.line.n + 1)), tensioning_limits(loop.line)
+        self._is_used_up = False
+        self.used_up_s = loop.now_s
+
+    def look(self) -> None:
+        """Once a period."""
+        world = self._loop.truth.world
+        speeds = np.concatenate(((world.unwind_speed_m_per_s,), world.surface_speed_m_per_s))
+        self._state.way_m += self._loop.line.control.period_s * speeds
+        self._is_used_up |= bool((surely_stretched_m(self._limits, self._state)[self._spans] >= 0.0).any())
+        if not self._is_used_up:
+            self.used_up_s = self._loop.now_s
 
 
 def started(loop: SteppedLoop) -> str:
@@ -167,12 +200,17 @@ def started(loop: SteppedLoop) -> str:
 
 
 def in_production(row: str, seed: int, fault: Callable[[Drawn, np.random.Generator], str], within_s: float,
-                  spared: tuple[str, ...] = ()) -> Outcome:  # fmt: skip
-    """A fault at a random speed and phase; watched until the line rests, or for `within_s`."""
+                  spared: tuple[str, ...] = (), stopped_at_once: bool = False) -> Outcome:  # fmt: skip
+    """A fault at a random speed and phase; watched until the line rests, or for `within_s`.
+
+    `stopped_at_once`: by a person who knows of it in the very period; what no rule can be quicker than.
+    """
     dice = np.random.default_rng([seed, 33])
     loop = begun(seed, float(dice.uniform(0.1, 0.9)))
     loop.step(int(dice.integers(1, 100)))
     watched = Watched(row, seed, loop, [fault(drawn(seed), dice)])
+    if stopped_at_once:
+        loop.command(Stop())
     rest_s = watched.step_until(lambda: loop.cycle.machine.state is LoopState.STOP and watched.rests(), within_s)
     return watched.outcome(rest_s, spared)
 
@@ -184,7 +222,7 @@ def healthy(row: str, seed: int) -> Outcome:
     watched = Watched(row, seed, loop, [])
     way_s = line.limits.speed_max_m_per_s / line.moves.speed_rate_m_per_s2
     refused = armed(loop)
-    refused = refused or ordered(loop, Start(), Phase.RUNNING, line.limits.tensioning_time_s + 10.0)
+    refused = refused or ordered(loop, Start(), Phase.RUNNING, longest_tensioning_s(line) + 10.0)
     if not refused:
         loop.step(round(way_s / line.control.period_s))
         for span, value in enumerate(line.recipes[0].tension_n, start=1):

@@ -27,6 +27,7 @@ from gateway.identification.prior import prior_of
 from tests.bench.identify_runs import FAST_M_PER_S, SPEED_M_PER_S, Found, against_truth
 from tests.closed_loop.recorded import real_plant
 from tests.closed_loop.wire import WireLine
+from tests.support.proved import store_proof
 
 LEG_S = 5.0
 SETTLE_S = 1.0  #: in stepped time, before the experiment
@@ -37,6 +38,7 @@ class SimulatedLine(WireLine):
     """Its loop knows that nobody can be hurt, and takes experiments."""
 
     def start_loop(self) -> None:
+        store_proof(self.line, self.folder / "data")
         controller = self.folder / "controller.json"
         self.children.start("loop", self.folder / "line.toml", "--controller", controller, "--simulated", *self.folders)
 

@@ -66,11 +66,11 @@ def plant_text(wiring: Wiring, can: CanWire = UDP_MULTICAST, spans: int = 6) -> 
 
 
 def line_text(wiring: Wiring, period_s: float, ports: Ports, can: CanWire = UDP_MULTICAST, spans: int = 6) -> str:
-    """LINE.toml, for a period and a latency of one period."""
+    """LINE.toml, for a period and a latency of one period; a start waits for no warning: nobody is near."""
     text = line_template(spans)
-    for key in ("period_s", "latency_s"):
+    for key, value in (("period_s", period_s), ("latency_s", period_s), ("start_warning_s", 0.0)):
         before, _, after = _parted(text, f"\n{key} = ")
-        text = f"{before}\n{key} = {period_s}\n{after.partition(chr(10))[2]}"
+        text = f"{before}\n{key} = {value}\n{after.partition(chr(10))[2]}"
     process, _, rest = _parted(text, "\n# Buses:")
     _, history, rest = _parted(rest, "\n[history]")
     devices = [*_buses(wiring, ports, can), *_drives(wiring, spans), *_load_cells(wiring, spans), _plc(wiring)]

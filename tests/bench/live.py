@@ -29,6 +29,7 @@ from gateway.supervisor.history import History
 from sim_plant.recorder import read_recording
 from sim_plant.recording import Recording
 from tests.bench.lines import UDP_MULTICAST, CanWire, Ports, Wiring, line_text, plant_text
+from tests.support.proved import record_proof, store_proof
 
 SIM_PRIORITY = 40  #: below the loop's
 SETTLED_N = 1.0  #: a measured tension this near its set-point has settled (ten times the sensors' noise)
@@ -84,12 +85,14 @@ class LiveLine:
         (self.folder / "controller.json").write_bytes(canonical(design_lqi(task_of(self.line))))
 
     def start_gateway(self) -> None:
-        """And wait until it answers."""
+        """And wait until it answers. Its audit knows the proof of the wiring."""
+        record_proof(self.line, self.folder / "data")
         self.children.start("gateway", self.folder / "line.toml", *self._folders)
         self.wait(lambda status: True)
 
     def start_loop(self) -> None:
-        """And wait until it has heard of every device."""
+        """And wait until it has heard of every device. Its wiring counts as proved."""
+        store_proof(self.line, self.folder / "data")
         self.loop_started_s = time.monotonic()
         controller = self.folder / "controller.json"
         self.children.start("loop", self.folder / "line.toml", "--controller", controller, *self._folders)

@@ -6,13 +6,13 @@ written at once to `out/bench/loop-states.jsonl`: `--go-on` runs only what is no
 """
 
 import argparse
-import json
 import os
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 
 from tests.bench.figures import Bench
+from tests.bench.kept_rows import KeptRows
 from tests.bench.workers import Workers
 from tests.closed_loop.loop_mutations import FAULTS, FOUND_WITHIN
 from tests.closed_loop.loop_sequences import STEPS, Ran, run_sequences
@@ -20,6 +20,7 @@ from tests.closed_loop.loop_sequences import STEPS, Ran, run_sequences
 SEQUENCES = 20_000
 TASK = 250  #: sequences of one seed
 FOUND = Path("out/bench/loop-states.jsonl")
+_SIZE = {"task": TASK, "steps": STEPS}
 #: One of them is put back in two ways: its two halves break two invariants.
 OLD_FAULTS = 6
 
@@ -34,17 +35,17 @@ def main() -> None:
     parser.add_argument("--go-on", action="store_true", help="with what an earlier run has left")
     given = parser.parse_args()
     seeds = [given.seed + k for k in range(-(-given.sequences // TASK))]
-    before = _found_before() if given.go_on else {}
+    kept = KeptRows(FOUND, given.go_on)
+    before = _by_seed(kept)
     with Workers(given.workers) as workers:
-        runs = [before[seed] for seed in seeds if seed in before]
-        for ran in workers.each(_run, [seed for seed in seeds if seed not in before], "tasks"):
-            runs.append(ran)
-            _note([*runs])
+        for ran in workers.as_done(_run, [seed for seed in seeds if seed not in before], "tasks"):
+            kept.add(asdict(ran) | _SIZE)
         faults = list(workers.each(partial(_find, given.seed), list(FAULTS), "faults put back"))
-    _report(given.seed, runs, faults)
+    found = _by_seed(kept)
+    _report(given.seed, [found[seed] for seed in seeds], faults, kept.made_by())
 
 
-def _report(seed: int, runs: list[Ran], faults: list[tuple[str, Ran]]) -> None:
+def _report(seed: int, runs: list[Ran], faults: list[tuple[str, Ran]], made_by: dict[str, int]) -> None:
     bench = Bench("loop-states", [seed], libraries=("hypothesis", "numpy"))
     sequences = sum(ran.sequences for ran in runs)
     broken = [ran for ran in runs if ran.broken]
@@ -59,6 +60,7 @@ def _report(seed: int, runs: list[Ran], faults: list[tuple[str, Ran]]) -> None:
         for fault, ran in faults
     ]
     bench.tables["broken"] = [asdict(ran) for ran in broken]
+    bench.tables["tasks by program"] = made_by
     for row in bench.tables["faults put back"]:
         print(f"{row['sequences']:>6}  {row['fault']}: {row['broken'] or 'NOT FOUND'}")
     for ran in broken:
@@ -75,18 +77,10 @@ def _find(seed: int, fault: str) -> tuple[str, Ran]:
     return fault, replace(ran, broken=ran.broken.partition("\n")[0])
 
 
-def _note(runs: list[Ran]) -> None:
-    FOUND.parent.mkdir(parents=True, exist_ok=True)
-    FOUND.write_text("".join(json.dumps(asdict(ran) | {"task": TASK, "steps": STEPS}) + "\n" for ran in runs))
-
-
-def _found_before() -> dict[int, Ran]:
-    """By seed. Tasks of another size are run anew."""
-    if not FOUND.exists():
-        return {}
-    rows = [json.loads(line) for line in FOUND.read_text().splitlines()]
-    fitting = [row for row in rows if (row.pop("task"), row.pop("steps")) == (TASK, STEPS)]
-    return {row["seed"]: Ran(**row) for row in fitting}
+def _by_seed(kept: KeptRows) -> dict[int, Ran]:
+    """Tasks of another size are run anew."""
+    fitting = [row for row in kept if row.items() >= _SIZE.items()]
+    return {row["seed"]: Ran(**{key: value for key, value in row.items() if key not in _SIZE}) for row in fitting}
 
 
 if __name__ == "__main__":

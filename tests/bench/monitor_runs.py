@@ -58,6 +58,9 @@ class LateCommands:
         self._before_nm = torque_nm.copy()
         self._line.apply(acting, enable, speed_request_m_per_s, run, now_s)
 
+    def warn(self, on: bool, now_s: float) -> None:
+        """Nobody is near."""
+
 
 @dataclass(frozen=True)
 class Case:
@@ -262,8 +265,8 @@ class Forecast:
 
     def look(self) -> None:
         cycle, inputs = self._loop.cycle, self._loop.cycle.inputs
-        if self._said is not None or not cycle.configurations.why.startswith("rolled"):
-            return
+        if self._said is not None or self._loop.transitions or not cycle.configurations.why.startswith("rolled"):
+            return  # where the line is stopped in the same period, no fallback takes over
         case = self._case
         watch = recovery_prediction(case.theta, case.good, case.line, SPEEDS_M_PER_S)
         recovery = Recovery(watch, case.good, case.line)

@@ -60,4 +60,4 @@ def test_a_design_on_the_truth_is_worth_itself_and_no_more_than_the_oracle():
     on_truth = design_lqi(task_on(line, truth_of(plant, line)))
     found = worth(line, plant, on_truth, Law("lqi"), 1, plain=True)
     assert found.b_to_truth == {"tension": 1.0, "velocity": 1.0} and not found.stopped and not found.unsafe_events
-    assert all(1.0 < ratio < 1.2 for ratio in found.a_to_oracle.values())
+    assert all(1.0 < ratio < 1.25 for ratio in found.a_to_oracle.values())

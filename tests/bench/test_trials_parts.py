@@ -26,7 +26,7 @@ class Told:
         each = np.full(LINE.n, self.count)
         return SimpleNamespace(
             tension_n=each, speed_m_per_s=each, torque_nm=each, unwind_speed_m_per_s=self.count, permissive=True,
-            emergency_stop=False, running=True, enabled=np.ones(LINE.n, dtype=np.bool_),
+            emergency_stop=False, running=True, local=False, enabled=np.ones(LINE.n, dtype=np.bool_),
         )  # fmt: skip
 
 

@@ -21,6 +21,7 @@ from gateway.core.deployment import RecoveryPrediction, Region
 from gateway.core.judge_context import JudgeContext, LineState
 from gateway.core.line import Line
 from gateway.core.messages import Command, Reply
+from gateway.core.proof import Grounds
 from gateway.core.proposal import GainsChange, Proposal, canonical, proposal_hash
 from gateway.core.recording import Recording
 from gateway.core.signals import Inputs, Quality
@@ -99,7 +100,7 @@ async def _take_up_nothing(*_: object) -> None:
 class LoopSide:
     loop: SteppedLoop
 
-    async def tell(self, command: Command) -> Reply:
+    async def tell(self, command: Command, grounds: Grounds | None = None) -> Reply:
         return self.loop.command(command)
 
 

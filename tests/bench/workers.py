@@ -1,7 +1,7 @@
 """Processes that a benchmark runs one thing after another in."""
 
 from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from multiprocessing import get_context
 from typing import Any, Self
 
@@ -22,6 +22,14 @@ class Workers:
 
     def __exit__(self, *_: object) -> None:
         self._pool.shutdown(cancel_futures=True)
+
+    def as_done(self, function: Callable[[Any], Any], given: Sequence[Any], title: str) -> Iterable[Any]:
+        """`function` of each, as they come."""
+        with Progress() as progress:
+            bar = progress.add_task(title, total=len(given))
+            for found in as_completed([self._pool.submit(function, one) for one in given]):
+                progress.advance(bar)
+                yield found.result()
 
     def each(self, function: Callable[[Any], Any], given: Sequence[Any], title: str) -> Iterable[Any]:
         """`function` of each, in its order."""

@@ -8,13 +8,16 @@ from gateway.core.line import Line
 from gateway.core.line_file import load_line
 from gateway.core.line_template import line_template
 from gateway.core.states import Phase
+from safety.tensioning import longest_tensioning_s
 from sim_plant.plant import Plant, load_plant
 
 S_REAL = "sim_plant/plants/s_real.toml"
 
 
 def demo_line(spans: int = 6) -> Line:
-    return load_line(line_template(spans, "line.toml"), "line.toml")
+    """The line of `init`, that starts without a warning: nobody is near."""
+    line = load_line(line_template(spans, "line.toml"), "line.toml")
+    return line.model_copy(update={"stages": line.stages.model_copy(update={"start_warning_s": 0.0})})
 
 
 def real_plant(spans: int = 6) -> Plant:
@@ -46,6 +49,6 @@ def start(loop: SteppedLoop) -> SteppedLoop:
     assert loop.arm().ok
     assert loop.step_until(Phase.READY, 1.0)
     assert loop.command(Start()).ok
-    assert loop.step_until(Phase.RUNNING, loop.line.limits.tensioning_time_s), loop.cycle.machine.reason
+    assert loop.step_until(Phase.RUNNING, longest_tensioning_s(loop.line)), loop.cycle.machine.reason
     loop.step(round(3.0 / loop.line.control.period_s))
     return loop

@@ -41,14 +41,21 @@ from gateway.core.topics import (
     GATEWAY_PROPOSE,
     LOOP_COMMAND,
     LOOP_EVENT,
+    LOOP_HELLO,
+    LOOP_SHOWN,
     LOOP_TELEMETRY,
 )
+from gateway.loop.door import Door
+from gateway.loop.identity import Identity
 from gateway.loop.kept import Kept, Store
 from gateway.loop.pacer import Tick
 from gateway.loop.runner import Runner
 from gateway.loop.voice import Voice
+from gateway.mailbox.keys import public_key
+from gateway.mailbox.loop_proof import make_key
 from gateway.mailbox.paths import GATEWAY_SOCKET, LOOP_SOCKET
 from gateway.mailbox.port import Unreachable
+from gateway.mailbox.seal import LineName
 from gateway.mailbox.unix import UnixMailbox
 from gateway.supervisor.audit_file import AuditFile
 from gateway.supervisor.audit_verify import verify
@@ -89,11 +96,15 @@ class FastLoop(SteppedLoop):
     def talk(self, mailbox: UnixMailbox, fast: FastTime, folder: Path) -> None:
         self._mailbox = mailbox
         self.runner = Runner(self.cycle, Store(folder, self.config))
+        site, line = self.line.site, self.line.line
+        self.door = Door(self.runner, LineName(site, line), lambda: public_key(site, line, folder), fast.clock)
         tension_n = np.array(self.line.recipes[0].tension_n)
         self.begin_in_production(tension_n, self.line.recipes[0].speed_m_per_s)
         self._fast = fast
         self._voice = Voice(mailbox, self.cycle.links, self.line.control.period_s)
-        mailbox.serve(LOOP_COMMAND, self.runner.command)
+        mailbox.serve(LOOP_COMMAND, self.door.command)
+        mailbox.serve(LOOP_HELLO, self.door.introduce)
+        mailbox.serve(LOOP_SHOWN, Identity(make_key(folder.parent / "run"), self.cycle).answer)
 
     async def live(self) -> None:
         """Periods as they come due; a machine that is too slow makes the line's time slower, not its periods."""
@@ -344,6 +355,7 @@ async def site(tally: Tally, rng: random.Random) -> AsyncIterator[Site]:
                 tally.problem(f"{type(ended).__name__}: {ended}")
                 tally.shut += 1
         loop.runner.close()
+        loop.door.close()
         await mailbox.close()
         await wire.close()
         assert forks.stdin is not None and forks.stdout is not None

@@ -17,11 +17,13 @@ from gateway.core.deployment import Deployment, InService
 from gateway.core.messages import AskConfiguration, Deploy, Reply, command_bytes
 from gateway.core.proposal import GainsChange, Proposal, canonical, proposal_hash
 from gateway.core.topics import GATEWAY_DECISION, GATEWAY_PROPOSALS, GATEWAY_PROPOSE, LOOP_COMMAND, Topic
+from gateway.mailbox.inbox import come_again_s
 from gateway.mailbox.paths import GATEWAY_SOCKET, LOOP_SOCKET
 from gateway.mailbox.port import Unreachable
 from gateway.mailbox.unix import UnixMailbox
 from sim_plant.recording import Recording
 from tests.closed_loop.wire import WireLine
+from tests.support.gateway_key import as_gateway
 
 LOOK_S = 0.05
 T = TypeVar("T")
@@ -52,6 +54,9 @@ class GateLine(WireLine):
             created=now.isoformat(), expires=(now + timedelta(seconds=for_s)).isoformat(),
         )  # fmt: skip
         reply = Reply.model_validate_json(self._ask(GATEWAY_PROPOSE, canonical(proposal)))
+        while (again_s := come_again_s(reply)) is not None:
+            time.sleep(again_s)
+            reply = Reply.model_validate_json(self._ask(GATEWAY_PROPOSE, canonical(proposal)))
         assert reply.ok, reply
         return proposal_hash(proposal)
 
@@ -100,13 +105,14 @@ class GateLine(WireLine):
         return reply.in_service
 
     def deploy(self, deployment: Deployment) -> Reply:
-        """Past the gate, straight into the loop."""
-        return Reply.model_validate_json(self._ask(LOOP_COMMAND, command_bytes(Deploy(deployment=deployment))))
+        """Past the gate, straight into the loop: with the gateway's key, as only its own user has it."""
+        socket = self.children.run_folder / LOOP_SOCKET
+        return asyncio.run(as_gateway(socket, self.line, self.data, Deploy(deployment=deployment)))
 
-    def approved(self, controller: Controller) -> str:
+    def approved(self, controller: Controller, within_s: float = 60.0) -> str:
         """Proposed, accepted, approved: it runs, on probation."""
         proposal = self.propose(controller)
-        self.until(proposal, "waiting")
+        self.until(proposal, "waiting", within_s)
         reply = self.decide(proposal)
         assert reply.ok, reply
         assert self.in_service() == config_hash(controller)
@@ -123,7 +129,7 @@ class GateLine(WireLine):
     def _command(self, *words: str | Path) -> str:
         arguments = [sys.executable, "-m", "gateway.cli", *words]
         done = subprocess.run(arguments, capture_output=True, text=True, timeout=60, check=False)
-        assert done.returncode == 0, (done.stdout[-3000:], done.stderr)
+        assert done.returncode == 0, (done.stdout[-3000:], done.stderr, self.status())
         return done.stdout
 
     def _ask(self, topic: Topic, payload: bytes) -> bytes:

@@ -19,11 +19,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from gateway.core.controller import config_hash
 from gateway.core.messages import Reply
-from tests.closed_loop.loop_model import RUNS, Law, Model, Runs
+from tests.closed_loop.loop_model import RUNS, Model, Runs, first_law
 from tests.closed_loop.loop_victim import NOTES, PLACES, Order
-from tests.closed_loop.loop_world import GIVEN
+from tests.closed_loop.loop_world import GIVEN, LINE
 
 SAME_FOLDER = 20  #: kills until everything is begun anew
 MOST_TIMES = 9  #: that a place is come to before the kill
@@ -52,7 +51,7 @@ def _site(folder: Path, kills: int, rng: random.Random, tally: Tally, advance: C
     arguments = [sys.executable, "-m", "tests.closed_loop.loop_victim", str(folder)]
     forks = subprocess.Popen(arguments, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     assert forks.stdin is not None and forks.stdout is not None
-    given, notes = Law(config_hash(GIVEN)), folder / NOTES
+    given, notes = first_law(GIVEN, LINE), folder / NOTES
     model = Model(given, given)
     try:
         for number in range(kills + 1):

@@ -12,6 +12,7 @@ from pydantic import TypeAdapter
 from gateway.core.controller import config_hash
 from gateway.core.controller_laws import MpcConfig
 from gateway.core.deployment import RecoveryPrediction, Region
+from gateway.core.line import Line
 from gateway.core.messages import (
     AbortExperiment,
     Command,
@@ -80,6 +81,20 @@ def runs_of(durable: Durable) -> Runs:
     )
 
 
+def first_law(config: object, line: Line) -> Law:
+    """Given, and judged by nobody."""
+    limits, gate = line.limits, line.gate
+    speed_m_per_s = min(gate.first_speed_max_m_per_s, limits.speed_max_m_per_s)
+    return _law(
+        config,
+        Region(
+            speed_max_m_per_s=speed_m_per_s,
+            tension_step_max_n=min(gate.first_step_max_n, limits.tension_step_max_n),
+            speed_step_max_m_per_s=min(speed_m_per_s, limits.speed_step_max_m_per_s),
+        ),
+    )
+
+
 def _law(config: object, region: Region) -> Law:
     return Law(config_hash(config), region, isinstance(config, MpcConfig))
 
@@ -103,6 +118,7 @@ class Model:
     until_s: float | None = None  #: the lease's end; None: nothing is on probation
     experiment: Begun | None = None
     may: list[Runs] = field(default_factory=list[Runs])
+    ahead_of: list[tuple[Command, Runs]] = field(default_factory=list[tuple[Command, Runs]])  #: of those under way
     goods: set[tuple[str, Watch]] = field(default_factory=set[tuple[str, Watch]])  #: that were ever decided
     ends: Counter[object] = field(default_factory=Counter[object])  #: by an exception, in a row
     epochs: dict[int, str] = field(default_factory=dict[int, str])  #: what each has been used for
@@ -160,7 +176,9 @@ class Model:
                 assert self.until_s is None, "watched anew on probation"
                 self.watch = watch_key(command.watch)
                 self.goods.add((self.good.hash, self.watch))
-                self.may = [self.durable]
+                # A narrow that was done while this was being written is not on the disk with it: the disk follows.
+                written = [ahead for of, ahead in self.ahead_of if of is command and ahead.watch == self.watch]
+                self.may = [*written, self.durable]
             case Narrow():
                 self._narrow(command.region)
             case Rollback():
@@ -210,14 +228,17 @@ class Model:
 
     def under_way(self, commands: list[Command]) -> None:
         """These are not answered yet: what they write ahead may be found."""
+        self.ahead_of = [one for one in self.ahead_of if any(one[0] is command for command in commands)]
         for command in commands:
-            ahead = self.ahead(command)
-            if ahead is not None and ahead not in self.may:
+            if (ahead := self.ahead(command)) is None:
+                continue
+            self.ahead_of.append((command, ahead))
+            if ahead not in self.may:
                 self.may.append(ahead)
 
     def settled(self) -> None:
         """The disk has had the time to follow, or somebody was told that it has."""
-        self.may = [self.durable]
+        self.may, self.ahead_of = [self.durable], []
 
     def begin_anew(self, found: Runs) -> None:
         """The next process runs `found`. Raises AssertionError where it must not."""

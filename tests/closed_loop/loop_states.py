@@ -55,7 +55,7 @@ from gateway.core.theta import nominal_theta
 from gateway.loop.kept import FILE, Kept
 from safety.recovery_prediction import recovery_prediction
 from tests.closed_loop.loop_invariants import FOLLOWS_AGAIN_PERIODS, Invariants
-from tests.closed_loop.loop_model import Law, Model, runs_of
+from tests.closed_loop.loop_model import Model, first_law, runs_of
 from tests.closed_loop.loop_world import BREAKABLE, GIVEN, LINE, PARTS, PERIOD_S, Ask, Broken, Life
 
 TASK = task_of(LINE)
@@ -124,7 +124,7 @@ class LoopStates(RuleBasedStateMachine):
 
     @initialize(production=st.sampled_from([True, True, True, False]))
     def begin(self, production):
-        given = Law(config_hash(GIVEN))
+        given = first_law(GIVEN, LINE)
         self.model = Model(given, given)
         self._begin_life(production)
 
@@ -369,7 +369,7 @@ class LoopStates(RuleBasedStateMachine):
     # lives
 
     def _on_disk(self):
-        path, given = self.folder / FILE, Law(config_hash(GIVEN))
+        path, given = self.folder / FILE, first_law(GIVEN, LINE)
         if not path.exists():
             return Model(given, given).durable
         return runs_of(Kept.model_validate_json(path.read_bytes()).durable)

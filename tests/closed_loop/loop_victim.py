@@ -31,6 +31,7 @@ from gateway.loop.runner import Runner
 from tests.closed_loop.loop_model import RUNS, runs_of
 from tests.closed_loop.loop_states import LAWS, REGIONS, watch_for
 from tests.closed_loop.loop_world import GIVEN, LINE, PERIOD_S, PLANT
+from tests.support.gateway_key import proof_of, store_of
 
 NOTES = "notes.jsonl"
 DECISIONS = 12  #: of a life, at most
@@ -79,7 +80,7 @@ class Victim:
         self._place, self._count = place, count
         self._orders: dict[int, Order] = {}
         self._loop = SteppedLoop(LINE, GIVEN, PLANT, 1)
-        store = Store(folder, GIVEN)
+        store = store_of(folder, GIVEN)
         begin(self._loop.cycle, store.read(LINE, lambda _: None), lambda _: None)
         self._configurations = self._loop.cycle.configurations
         self.note("begins", runs=RUNS.dump_python(runs_of(self._configurations.durable), mode="json"))
@@ -126,7 +127,7 @@ class Victim:
         self._orders[id(command)] = order
         self.note("asked", order=asdict(order))
         self.come_to("asked")
-        reply = await self._runner.submit(command)
+        reply = await self._runner.submit(command, proof_of(command, LINE))
         late = "does not know it yet" in reply.text
         self.note("answered", order=asdict(order), ok=reply.ok, late=late, text=reply.text)
         self.come_to("answered")

@@ -20,14 +20,16 @@ from gateway.control.design import design_lqi, task_of
 from gateway.core.line import Line
 from gateway.core.messages import Arm, Command, Reply
 from gateway.loop import deaths, kept, process, runner
-from gateway.loop.kept import Store
 from gateway.loop.pacer import Tick
 from gateway.loop.process import begin, run_until
 from gateway.loop.runner import Runner
 from sim_plant.plant import Plant
 from tests.closed_loop.conftest import demo_line, real_plant
+from tests.support.gateway_key import proof_of, store_of
 
+FIRST_M_PER_S = 0.04  #: of a configuration that nobody has judged; between the speeds that a sequence asks for
 LINE: Line = demo_line(2)
+LINE = LINE.model_copy(update={"gate": LINE.gate.model_copy(update={"first_speed_max_m_per_s": FIRST_M_PER_S})})
 PLANT: Plant = real_plant(2)
 PERIOD_S = LINE.control.period_s
 GIVEN = design_lqi(task_of(LINE))
@@ -138,12 +140,15 @@ class SlowLink:
         self.name, self._inner, self._life = name, inner, life
         self.health = inner.health
         self.active = False
+        self.serials, self.watched = {}, frozenset()
 
     async def prepare(self) -> None:
         self._life.armed_since_prepared = False
         await self._wait(self._life.prepare_periods)
         await self._inner.prepare()
         self.active = True
+
+    def withhold(self, devices: object) -> None: ...
 
     def silence(self) -> None:
         self._inner.silence()
@@ -269,7 +274,7 @@ class Life:
         self.time = SteppedTime()
         self.pacer = Pacer(PERIOD_S)
         self.said: list[str] = []
-        self.store = Store(self.folder, GIVEN)
+        self.store = store_of(self.folder, GIVEN)
         self.loop = WatchedLoop(LINE, GIVEN, PLANT, 1)
         self.loop.life = self
         self.cycle = cycle = self.loop.cycle
@@ -301,7 +306,7 @@ class Life:
 
     def order(self, command: Command) -> Ask:
         async def asked() -> Ask:
-            return Ask(command, asyncio.create_task(self.runner.submit(command)))
+            return Ask(command, asyncio.create_task(self.runner.submit(command, proof_of(command, LINE))))
 
         ask = self.time.run_until_complete(asked())
         self.asks.append(ask)
@@ -373,9 +378,9 @@ class Life:
 
         self.runner.period = watched
 
-    def _carry_out(self, cycle: object, command: Command, now_s: float, prepared: object = None) -> Reply:
+    def _carry_out(self, cycle: object, command: Command, now_s: float, *given: object) -> Reply:
         self.raise_if_broken("command")
-        reply = _carry_out(cycle, command, now_s, prepared)
+        reply = _carry_out(cycle, command, now_s, *given)
         if isinstance(command, Arm) and reply.ok:
             self.armed_since_prepared = True
         self.carried_out(command, reply, now_s)

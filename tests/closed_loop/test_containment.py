@@ -15,11 +15,12 @@ from gateway.core.states import LoopState, Phase
 from gateway.core.theta import nominal_theta
 from gateway.loop import process
 from gateway.loop.containment import PART_FAILED
-from gateway.loop.kept import SET_ASIDE, Durable, OnTop, Store, fingerprint
+from gateway.loop.kept import SET_ASIDE, Durable, OnTop, fingerprint
 from gateway.loop.pacer import Tick
 from gateway.loop.runner import Runner
 from safety.recovery_prediction import recovery_prediction
 from tests.closed_loop.conftest import demo_line, real_plant
+from tests.support.gateway_key import proven, store_of
 
 TENSION_N = np.array([28.0, 36.0, 20.0, 40.0, 24.0, 32.0])
 
@@ -48,6 +49,8 @@ def at_line(loop, name):
         "monitor": (loop.cycle.guard, "against"),
         "stuck": (loop.cycle.watch, "find_stuck"),
         "jumps": (loop.cycle.watch, "reject_jumps"),
+        "drives": (loop.cycle.watch.drives, "compare"),
+        "warnings": (loop.cycle.watch.drives, "find_told"),
         "doubts": (loop.cycle.watch, "controlled"),
         "lease": (loop.cycle.configurations, "lapsed"),
         "experiment": (loop.cycle.experiments, "look"),
@@ -58,7 +61,19 @@ def at_line(loop, name):
     }[name]
 
 
-PARTS = ["monitor", "stuck", "jumps", "doubts", "lease", "experiment", "telemetry", "rest", "link"]
+PARTS = [
+    "monitor",
+    "stuck",
+    "jumps",
+    "drives",
+    "warnings",
+    "doubts",
+    "lease",
+    "experiment",
+    "telemetry",
+    "rest",
+    "link",
+]
 
 
 @pytest.mark.parametrize("name", PARTS)
@@ -174,18 +189,18 @@ def test_what_has_ended_the_loop_twice_is_set_aside_for_what_ran_before(tmp_path
     line = demo_line()
     given = design_lqi(task_of(line))
     watch = recovery_prediction(nominal_theta(line), given, line, [0.05])
-    store = Store(tmp_path, given)
+    store = store_of(tmp_path, given)
     judged = Region(speed_max_m_per_s=0.08)
     store.write(Durable(3, given, judged))
-    store.write(Durable(4, given, judged, watch))
+    store.write(proven(Durable(4, given, judged, watch), line))
     for _ in range(2):
-        running, said = one_life(Store(tmp_path, given), line, monkeypatch, breaks=["doubts", "telemetry"])
+        running, said = one_life(store_of(tmp_path, given), line, monkeypatch, breaks=["doubts", "telemetry"])
         assert running.watch == watch and not said
-    running, said = one_life(Store(tmp_path, given), line, monkeypatch, breaks=[])
+    running, said = one_life(store_of(tmp_path, given), line, monkeypatch, breaks=[])
     assert running.watch is None and running.region == judged
     assert (tmp_path / SET_ASIDE).exists()
     assert "2 times in a row" in said[0] and "a defect" in said[0]
-    kept = Store(tmp_path, given).read(line, said.append)
+    kept = store_of(tmp_path, given).read(line, said.append)
     assert (kept.epoch, kept.watch) == (4, None)
 
 
@@ -194,20 +209,22 @@ def test_what_was_taken_back_in_the_period_that_ends_the_loop_does_not_come_back
     line = demo_line()
     given, top = design_lqi(task_of(line)), design_mpc(task_of(line))
     on_top = OnTop(controller=top, region=Region())
-    Store(tmp_path, given).write(Durable(3, given, Region(), None, on_top))
-    running, _ = one_life(Store(tmp_path, given), line, monkeypatch, breaks=["law", "monitor", "doubts", "telemetry"])
+    store_of(tmp_path, given).write(proven(Durable(3, given, Region(), None, on_top), line))
+    running, _ = one_life(
+        store_of(tmp_path, given), line, monkeypatch, breaks=["law", "monitor", "doubts", "telemetry"]
+    )
     assert running.config == given
-    running, _ = one_life(Store(tmp_path, given), line, monkeypatch, breaks=[])
+    running, _ = one_life(store_of(tmp_path, given), line, monkeypatch, breaks=[])
     assert running.config == given
 
 
 def test_failing_links_and_commands_say_nothing_of_a_configuration(tmp_path, monkeypatch):
     line = demo_line()
     given = design_lqi(task_of(line))
-    Store(tmp_path, given).write(Durable(3, given, Region()))
+    store_of(tmp_path, given).write(Durable(3, given, Region()))
     for _ in range(3):
-        one_life(Store(tmp_path, given), line, monkeypatch, breaks=["link", "telemetry"])
-    assert not Store(tmp_path, given).deaths.too_often(fingerprint(Durable(3, given, Region())))
+        one_life(store_of(tmp_path, given), line, monkeypatch, breaks=["link", "telemetry"])
+    assert not store_of(tmp_path, given).deaths.too_often(fingerprint(Durable(3, given, Region())))
 
 
 def test_a_loop_that_is_told_to_end_arms_nothing_that_was_proven():
@@ -258,9 +275,9 @@ def test_the_last_act_reaches_every_link_at_once(monkeypatch):
 def test_an_orderly_end_after_a_run_forgives(tmp_path, monkeypatch):
     line = demo_line()
     given = design_lqi(task_of(line))
-    Store(tmp_path, given).write(Durable(3, given, Region()))
+    store_of(tmp_path, given).write(Durable(3, given, Region()))
     for breaks in (["doubts", "telemetry"], [], ["doubts", "telemetry"], []):
-        running, said = one_life(Store(tmp_path, given), line, monkeypatch, breaks=breaks)
+        running, said = one_life(store_of(tmp_path, given), line, monkeypatch, breaks=breaks)
         assert not said
     assert not (tmp_path / SET_ASIDE).exists()
 

@@ -14,7 +14,7 @@ from gateway.core.controller import config_hash
 from gateway.core.line_file import load_line
 from tests.operator.real_line import OperatorLine
 
-pytestmark = [pytest.mark.long, pytest.mark.realtime, pytest.mark.timeout(240)]
+pytestmark = [pytest.mark.long, pytest.mark.realtime, pytest.mark.timeout(600)]
 
 
 async def decide(access, user, password, proposal, shown, revision):

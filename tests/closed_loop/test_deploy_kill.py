@@ -13,56 +13,64 @@ import pytest
 from gateway.control.design import design_lqg, task_of
 from gateway.core.controller import config_hash
 from gateway.core.deployment import Deployment
-from gateway.core.messages import AskConfiguration, Deploy, Keep, Reply, Stop, command_bytes
-from gateway.core.topics import LOOP_COMMAND
+from gateway.core.messages import AskConfiguration, Deploy, Keep, Stop
 from gateway.mailbox.paths import LOOP_SOCKET
-from gateway.mailbox.unix import UnixMailbox
+from gateway.mailbox.port import Unreachable
 from tests.closed_loop.wire import WireLine
+from tests.support.gateway_key import as_gateway
 
 pytestmark = pytest.mark.realtime
 
+NAMES = ("line.toml", "data")
 LEASE_S = 1.0  # longer than a busy test machine stalls
 RENEWER = """
 import asyncio, sys
 from pathlib import Path
-from gateway.core.messages import Renew, command_bytes
-from gateway.core.topics import LOOP_COMMAND
-from gateway.mailbox.unix import UnixMailbox
+from gateway.core.line_file import load_line
+from gateway.core.messages import Renew
+from tests.support.gateway_key import as_gateway
 
-async def renew():
-    mailbox = UnixMailbox()
-    mailbox.connect({LOOP_COMMAND}, Path(sys.argv[1]))
+async def renew(socket, line, data):
     while True:
-        answer = await mailbox.request(LOOP_COMMAND, command_bytes(Renew(epoch=1)), 1.0)
-        print(answer.decode(), flush=True)
+        answer = await as_gateway(socket, line, data, Renew(epoch=1), 1.0)
+        print(answer.model_dump_json(), flush=True)
         await asyncio.sleep(0.05)
 
-asyncio.run(renew())
+socket, line, data = map(Path, sys.argv[1:])
+asyncio.run(renew(socket, load_line(line.read_text(), "line.toml"), data))
 """
 
 
 def ask(wire, command):
-    """Straight to the loop, as the gateway's deployer does."""
+    """Straight to the loop, as the gateway's deployer does, with its key."""
+    socket = wire.children.run_folder / LOOP_SOCKET
+    return asyncio.run(as_gateway(socket, wire.line, wire.folder / "data", command, 5.0))
 
-    async def requested():
-        mailbox = UnixMailbox()
-        mailbox.connect({LOOP_COMMAND}, wire.children.run_folder / LOOP_SOCKET)
-        try:
-            return Reply.model_validate_json(await mailbox.request(LOOP_COMMAND, command_bytes(command), 5.0))
-        finally:
-            await mailbox.close()
 
-    return asyncio.run(requested())
+def until(holds):
+    deadline_s = time.monotonic() + 30.0
+    while not holds():
+        assert time.monotonic() < deadline_s
+        time.sleep(0.05)  # between two looks
+
+
+def is_up(wire):
+    try:
+        return ask(wire, AskConfiguration()).state == "SILENT"
+    except Unreachable:
+        return False
 
 
 def test_the_renewer_is_killed_and_the_loop_goes_back_by_itself_and_what_is_kept_outlives_the_loop(tmp_path):
     with WireLine(tmp_path) as wire:
         wire.run()
+        wire.children.end("gateway")  # it would take back what no record of it explains
         good = ask(wire, AskConfiguration()).in_service
         config = design_lqg(task_of(wire.line))
         given = {"controller": config, "hash": config_hash(config), "lease_s": LEASE_S}
         renewer = subprocess.Popen(
-            [sys.executable, "-c", RENEWER, str(wire.children.run_folder / LOOP_SOCKET)], stdout=subprocess.PIPE
+            [sys.executable, "-c", RENEWER, wire.children.run_folder / LOOP_SOCKET, *map(tmp_path.joinpath, NAMES)],
+            stdout=subprocess.PIPE,
         )
         try:
             assert not json.loads(renewer.stdout.readline())["ok"]  # it is there, and nothing is on probation
@@ -77,7 +85,7 @@ def test_the_renewer_is_killed_and_the_loop_goes_back_by_itself_and_what_is_kept
             killed_s = time.monotonic()
             renewer.wait(10.0)
             renewer.stdout.close()
-        wire.wait(lambda status: any(event.kind == "rolled-back" for event in status.events), 5.0)
+        until(lambda: not ask(wire, AskConfiguration()).in_service.on_probation)
         assert time.monotonic() - killed_s < LEASE_S + 3.0
         found = ask(wire, AskConfiguration()).in_service
         assert found.hash == good.hash and "lease" in found.why and found.epoch == 1
@@ -91,7 +99,7 @@ def test_the_renewer_is_killed_and_the_loop_goes_back_by_itself_and_what_is_kept
         wire.kill("loop")
         wire.children.end("loop")
         wire.start_loop()
-        wire.wait(lambda status: status.loop.running and status.loop.state == "SILENT")
+        until(lambda: is_up(wire))
         found = ask(wire, AskConfiguration()).in_service
         assert (found.hash, found.epoch, found.on_probation) == (config_hash(config), 3, False)
         wire.recording()

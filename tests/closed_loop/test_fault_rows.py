@@ -13,6 +13,7 @@ BY_ID = {row.id: row for row in ROWS}
 #: Injections of each row: its variants come in turn.
 NUMBERS = {
     "frame-once": [0, 6, 12, 18], "frame-thrice": [1, 8, 19], "nmt": [0, 3], "stale-pdo": [0, 1],
+    "torque-unlike": [0, 1, 2, 3, 4, 5], "drive-warning": [0, 1],
     "overrun-many": [2, 4], "overrun-few": [0, 4], "frame-twice": [0, 1, 2], "frame-corrupt": [0, 1, 2],
 }  # fmt: skip
 SLACK_PERIODS = 2  #: beyond a row's bound: the bench, which has no such slack, tells of each

@@ -10,6 +10,7 @@ from gateway.cli.stepped import SteppedLoop
 from gateway.core.messages import Hold, SetSpeed, SetTension, Start, Stop
 from gateway.core.signals import DriveRequest
 from gateway.core.states import LoopState, Phase
+from safety.tensioning import longest_tensioning_s, tensioning_speed_m_per_s
 from tests.closed_loop.conftest import real_plant, stepped
 
 TORQUE_KINDS = ("torque-limit", "torque-rate", "torque-not-enabled")
@@ -71,11 +72,11 @@ def test_a_line_without_a_web_does_not_run_away(reading_n, monkeypatch):
     loop.step(3)
     assert loop.arm().ok and loop.step_until(Phase.READY, 1.0)
     assert loop.command(Start()).ok
-    assert loop.step_until(Phase.OFF, loop.line.limits.tensioning_time_s + loop.line.longest_stop_s)
-    assert "threaded" in loop.cycle.machine.reason
+    assert loop.step_until(Phase.OFF, longest_tensioning_s(loop.line))
+    assert "span 1: " in loop.cycle.machine.reason and "no web" in loop.cycle.machine.reason
     assert all(phase is not Phase.RUNNING for _, phase, _ in loop.transitions)
     fastest = np.abs(loop.truth.recorder.recording().speed_m_per_s).max()
-    assert fastest < 1.3 * loop.line.limits.speed_max_m_per_s
+    assert fastest <= tensioning_speed_m_per_s(loop.line)
 
 
 def test_steps_do_not_add_up_to_a_larger_one(running):

@@ -20,7 +20,7 @@ WATCHDOG_S, PERIOD_S = 0.1, 0.01
 
 @pytest.fixture
 def wire(tmp_path):
-    with WireLine(tmp_path) as line:
+    with WireLine(tmp_path, gate="first_speed_max_m_per_s = 0.12") as line:  # faster than what nobody has judged may
         yield line
 
 

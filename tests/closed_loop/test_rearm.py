@@ -6,6 +6,7 @@ import can
 import pytest
 
 from gateway.core.states import LoopState, Phase
+from safety.tensioning import longest_tensioning_s
 from tests.bench.faults_lines import virtual_line
 from tests.bench.lines import AMPLIFIER_NODE, PLC_NODE
 from tests.closed_loop.virtual_line import VirtualLine
@@ -41,7 +42,7 @@ def test_what_was_lost_on_canopen_and_came_back_is_armed_and_started_again(nodes
         armed = line.arm()
         assert armed.ok, armed
         assert line.start().ok
-        assert line.step_until(Phase.RUNNING, line.line.limits.tensioning_time_s), line.cycle.machine.reason
+        assert line.step_until(Phase.RUNNING, longest_tensioning_s(line.line)), line.cycle.machine.reason
 
 
 def test_what_the_line_plc_says_refuses_at_once_and_touches_no_link() -> None:

@@ -10,13 +10,14 @@ from drivers.memory import MemoryLink
 from gateway.control.design import design_lqg, task_of
 from gateway.core.controller import config_hash
 from gateway.core.deployment import Deployment
-from gateway.core.messages import Arm, Deploy, SetSpeed, SetTension, Start, Stop
+from gateway.core.messages import Arm, AskConfiguration, Deploy, Hold, Rollback, SetSpeed, SetTension, Start, Stop
 from gateway.core.states import LoopState, Phase
 from gateway.loop.machine import Machine
 from gateway.loop.pacer import Tick
 from gateway.loop.process import run_until
 from gateway.loop.runner import MAX_WAITING, Runner
 from tests.closed_loop.conftest import start, stepped
+from tests.support.gateway_key import door_of
 
 
 class Story:
@@ -54,6 +55,43 @@ def test_a_stop_is_taken_however_many_commands_wait():
         assert (await stop).ok and told.loop.cycle.machine.phase is Phase.SLOWING
         replies = [await answer for answer in waiting]
         assert sum("too many" in reply.text for reply in replies) == 3
+
+    asyncio.run(story())
+
+
+def test_a_hold_and_what_the_gateway_orders_are_taken_however_many_ask_and_however_often():
+    async def story():
+        told = Story(start(stepped()))
+        asked = [told.order(AskConfiguration()) for _ in range(2 * MAX_WAITING)]
+        held = [told.order(Hold()) for _ in range(2 * MAX_WAITING)]
+        rollback = told.order(Rollback(reason="a test's"))
+        stop = told.order(Stop())
+        for _ in range(5):
+            await asyncio.sleep(0)
+        assert all(answer.done() and answer.result().ok for answer in asked)  # before any period
+        assert (await told.until(stop)).ok and told.loop.cycle.machine.phase is Phase.SLOWING
+        assert len({(await told.until(answer)).text for answer in held}) == 1
+        assert "too many" not in (await told.until(rollback)).text
+
+    asyncio.run(story())
+
+
+def test_a_hold_goes_before_what_waits_and_a_start_that_waits_does_not_undo_it():
+    async def story():
+        told = Story(start(stepped()))
+        waiting = [told.order(SetTension(span=1, tension_n=30.0)) for _ in range(MAX_WAITING)]
+        hold = told.order(Hold())
+        await asyncio.sleep(0)
+        await told.periods(1)
+        assert (await hold).ok and told.loop.cycle.machine.phase is Phase.HOLDING
+        for answer in waiting:
+            await told.until(answer)
+        started, held = told.order(Start()), told.order(Hold())
+        assert (await told.until(held)).ok and not (await told.until(started)).ok
+        assert told.loop.cycle.machine.phase is Phase.HOLDING
+        held, started = told.order(Hold()), told.order(Start())
+        assert (await told.until(held)).ok and (await told.until(started)).ok
+        assert told.loop.cycle.machine.phase is Phase.RUNNING
 
     asyncio.run(story())
 
@@ -214,7 +252,9 @@ def test_what_is_no_command_is_answered_and_does_nothing(payload):
     async def story():
         told = Story(stepped())
         before = told.loop.cycle.machine
-        assert b'"ok":false' in await told.runner.command(payload)
+        door = door_of(told.runner, told.loop.line, told.loop.cycle.clock)
+        assert b'"ok":false' in await door.command(payload)
+        door.close()
         await told.periods(2)
         assert told.loop.cycle.machine == before
 

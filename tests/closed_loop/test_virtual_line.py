@@ -15,7 +15,8 @@ from gateway.core.scenario import TENSION
 from gateway.core.signals import Quality
 from gateway.core.states import Phase
 from gateway.core.telemetry import Frame
-from gateway.loop.standstill import MOVES_M_PER_S
+from gateway.loop.standstill import MOVES
+from safety.tensioning import longest_tensioning_s
 from sim_plant.recording import EVENTS_FILE, TRACE_FILE
 from tests.closed_loop.conftest import demo_line, real_plant
 from tests.closed_loop.virtual_line import VirtualLine
@@ -116,7 +117,7 @@ def test_a_line_is_brought_up_and_down_by_the_operator_alone():
         assert not line.recording().of_kind("command") and line.cycle.machine.phase is Phase.SILENT
         assert line.arm().state == "READY"
         assert line.start().ok
-        assert line.step_until(Phase.RUNNING, line.line.limits.tensioning_time_s), line.cycle.machine.reason
+        assert line.step_until(Phase.RUNNING, longest_tensioning_s(line.line)), line.cycle.machine.reason
         line.step(200)
         tension_n, recipe = line.truth.world.tension_n, line.line.recipes[0]
         assert np.abs(tension_n - recipe.tension_n).max() < 1.5
@@ -128,10 +129,10 @@ def test_a_line_is_brought_up_and_down_by_the_operator_alone():
         assert line.truth.recorder.unsafe_total == 0, line.truth.recorder.unsafe_events
         phases = [transition.phase for transition in line.transitions]
         line.step(1000)  # without torque the web draws on the rollers for some seconds
-        told = line.recorded()
+        told, moves_m_per_s = line.recorded(), MOVES * line.cycle.limits.standstill_m_per_s
         assert told[-1].by_person and told[-1].standstill and told[-1].phase == Phase.OFF
         assert {frame.by_person for frame in told if frame.phase < Phase.SLOWING} == {False}
-        assert not [frame for frame in told if frame.standstill and np.abs(frame.speed_m_per_s).max() > MOVES_M_PER_S]
+        assert not [frame for frame in told if frame.standstill and np.abs(frame.speed_m_per_s).max() > moves_m_per_s]
         assert not [frame for frame in told if frame.standstill and frame.phase == Phase.RUNNING]
     assert phases == [
         Phase.ARMING, Phase.READY, Phase.ENABLING, Phase.TENSIONING, Phase.RUNNING,

@@ -43,6 +43,25 @@ def with_speed(roller, value):
     return change
 
 
+@pytest.mark.parametrize("beside_n", [-0.5, 0.3, 0.5])
+@pytest.mark.parametrize("span", [0, 2, 5])
+def test_what_a_stuck_cell_shows_beside_its_setpoint_is_not_controlled_away(running, monkeypatch, span, beside_n):
+    """For as long as it takes to be sure that it is stuck: an integral action on it empties the span before."""
+    assert running.command(SetSpeed(speed_m_per_s=0.1)).ok
+    running.step(500)
+    target_n = float(running.cycle.setpoints.tension_n[span])
+    lying(running, monkeypatch, with_tension(span, lambda tension_n, passed_s: target_n + beside_n))
+    furthest_n = 0.0
+    for _ in range(round(1.0 / running.line.control.period_s)):  # so soon it is stopped
+        running.step()
+        if running.cycle.machine.state is not LoopState.RUN:
+            break
+        furthest_n = max(furthest_n, abs(float(running.truth.world.tension_n[span]) - target_n))
+    assert [finding.rule for _, finding in running.stopped_by] == ["load cell stuck"]
+    assert furthest_n < 0.3 * target_n
+    assert running.step_until(Phase.OFF, 5.0) and not any(running.truth.recorder.unsafe_events.values())
+
+
 @pytest.mark.parametrize("speed_m_per_s", [0.01, 0.1])
 @pytest.mark.parametrize("span", [0, 2, 5])
 def test_a_stuck_cell_is_told_and_stops_the_line_within_a_second(running, monkeypatch, span, speed_m_per_s):
@@ -150,3 +169,36 @@ def test_two_signals_that_agree_are_a_broken_web(running, monkeypatch):
     running.step(3)
     (_, phase, reason) = running.transitions[-1]
     assert phase is Phase.UNLOADING and "the web has broken" in reason
+
+
+def with_unwinder(value):
+    def change(sample, passed_s):
+        shown = value(sample.unwind_speed_m_per_s, round(passed_s / 0.01))
+        object.__setattr__(sample, "unwind_speed_m_per_s", shown)
+
+    return change
+
+
+def at_0_1_m_per_s(running):
+    assert running.command(SetSpeed(speed_m_per_s=0.1)).ok
+    running.step(500)
+    assert running.cycle.inputs.unwind_speed.value[0] > 0.09
+    return running
+
+
+def test_a_torn_unwinder_speed_is_not_used_and_stops_the_line_when_it_comes_again(running, monkeypatch):
+    lying(at_0_1_m_per_s(running), monkeypatch, with_unwinder(lambda v, k: 0.001 if k in (10, 200, 202, 204) else v))
+    for _ in range(100):
+        running.step()
+        assert running.cycle.inputs.unwind_speed.value[0] > 0.09
+    assert [finding.rule for _, finding in running.alarms] == ["value-impossible"]
+    assert running.cycle.machine.phase is Phase.RUNNING
+    running.step(110)
+    assert running.cycle.machine.state is LoopState.STOP and running.stopped_by[-1][1].rule == "value-impossible"
+
+
+def test_a_transport_that_stops_at_once_is_no_wrong_value(running, monkeypatch):
+    lying(at_0_1_m_per_s(running), monkeypatch, with_unwinder(lambda v, k: 0.0 if k >= 5 else v))
+    running.step(8)
+    assert running.cycle.inputs.unwind_speed.value[0] == 0.0
+    assert "value-impossible" not in [finding.rule for _, finding in running.alarms]

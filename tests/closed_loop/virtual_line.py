@@ -17,7 +17,7 @@ from typing import Any, Self, TypeVar
 import numpy as np
 
 from drivers.port import Link
-from drivers.registry import build_links, speed_steps_m_per_s
+from drivers.registry import build_links, drive_tells, speed_steps_m_per_s
 from gateway.cli.children import free_udp_port
 from gateway.control.design import design_lqi, task_of
 from gateway.core.controller import Controller
@@ -39,6 +39,7 @@ from sim_plant.recording import Recording
 from sim_plant.wired import Settings, WiredLine, WorldClock
 from tests.closed_loop.conftest import demo_line, real_plant
 from tests.closed_loop.virtual_time import VirtualTimeLoop
+from tests.support.proved import proved_wiring
 
 T = TypeVar("T")
 
@@ -116,7 +117,11 @@ class VirtualLine:
         seed: int = 1,
         folder: Path | None = None,
         build: Callable[[Line], list[Link]] = build_links,
+        *,
+        proved: bool = True,
     ) -> None:
+        """`proved`: its wiring has been, before."""
+        self._proved = proved
         self.frames: list[bytes] = []
         self.transitions: list[Transition] = []
         self.findings: list[Finding] = []  #: that came with a transition or an alarm
@@ -259,8 +264,11 @@ class VirtualLine:
 
     def _new_cycle(self) -> None:
         clock = asyncio.get_running_loop().time
-        watch = Watch(self.line, speed_steps_m_per_s(self.line))
-        self.cycle = Cycle(self.line, self._config, self.links, watch, clock, self._record, self._announce)
+        watch = Watch(self.line, speed_steps_m_per_s(self.line), drive_tells(self.line))
+        self.cycle = Cycle(
+            self.line, self._config, self.links, watch, clock, self._record, self._announce,
+            wiring=proved_wiring(self.line) if self._proved else None,
+        )  # fmt: skip
         self.runner = Runner(self.cycle)
 
     async def _periods(self, count: int) -> None:

@@ -4,8 +4,11 @@ import asyncio
 import json
 import os
 import signal
+import subprocess
+import sys
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Self
 
@@ -25,6 +28,7 @@ from gateway.mailbox.port import Unreachable
 from gateway.mailbox.unix import UnixMailbox
 from sim_plant.recorder import read_recording
 from sim_plant.recording import Recording
+from tests.support.proved import record_proof, store_proof
 
 CHANNEL = "239.74.163.2"
 
@@ -37,6 +41,15 @@ class WireLine:
         (folder / "logs").mkdir()
         self.folder = folder
         self.children = Children(folder / "logs")
+        self.folders = ("--run-dir", self.children.run_folder, "--data-dir", folder / "data")
+        with ExitStack() as undo:
+            undo.push(self.children)
+            self._describe(seed, spans, gate)
+            undo.pop_all()
+
+    def _describe(self, seed: int, spans: int, gate: str) -> None:
+        """The simulated line runs from here on; the line's file and a first controller are those of its ports."""
+        folder = self.folder
         self.can_port = free_udp_port()
         plant = Path("sim_plant/plants/s_real.toml").read_text().replace("spans = 6", f"spans = {spans}")
         (folder / "plant.toml").write_text(plant)
@@ -46,12 +59,12 @@ class WireLine:
         )  # fmt: skip
         self.world_start_s: float = ready["monotonic_start_s"]
         text = line_template(spans, "line.toml").replace("port = 43113", f"port = {self.can_port}")
+        text = text.replace("start_warning_s = 3.0", "start_warning_s = 0.0")  # nobody is near
         text = text.replace("port = 5020", f"port = {ready['modbus_port']}")
         text = text.replace('autonomy = "approve-all" ', f'{gate}\nautonomy = "approve-all" ')
         (folder / "line.toml").write_text(text)
         self.line = load_line(text, "line.toml")
         (folder / "controller.json").write_bytes(canonical(design_lqi(task_of(self.line))))
-        self.folders = ("--run-dir", self.children.run_folder, "--data-dir", folder / "data")
 
     def __enter__(self) -> Self:
         return self
@@ -59,10 +72,16 @@ class WireLine:
     def __exit__(self, *error: object) -> None:
         self.children.__exit__(None, None, None)
 
-    def start_gateway(self) -> None:
+    def start_gateway(self, *, proved: bool = True) -> None:
+        """`proved`: its audit knows the proof that `start_loop` stores."""
+        if proved:
+            record_proof(self.line, self.folder / "data")
         self.children.start("gateway", self.folder / "line.toml", *self.folders)
 
-    def start_loop(self) -> None:
+    def start_loop(self, *, proved: bool = True) -> None:
+        """`proved`: its wiring, as `r2rgate prove` would have."""
+        if proved:
+            store_proof(self.line, self.folder / "data")
         self.children.start(
             "loop", self.folder / "line.toml", "--controller", self.folder / "controller.json", *self.folders
         )
@@ -77,13 +96,28 @@ class WireLine:
     def arm_and_start(self) -> None:
         """From rest to RUN, settled."""
         for _ in range(3):
-            assert self.order(Arm()).ok
-            assert self.order(Start()).ok
+            for command in (Arm(), Start()):
+                reply = self.order(command)
+                assert reply.ok, reply
             status = self.wait(lambda status: settled(status) or at_rest(status))
             if settled(status):
                 return
             # A test machine that stalls for longer than loop or devices may miss stops the line, as it must.
         raise AssertionError("this machine stalls too often for a line in real time")
+
+    def inject(self, fault: str) -> None:
+        """Into the simulated line, as `r2rgate fault inject` does."""
+        command = [
+            sys.executable,
+            "-m",
+            "gateway.cli",
+            "fault",
+            "inject",
+            "--control",
+            self.folder / "recording",
+            fault,
+        ]
+        subprocess.run(command, check=True, capture_output=True)
 
     def order(self, command: Command) -> Reply:
         return asyncio.run(request(self.children.run_folder, command, 15.0))
@@ -102,7 +136,7 @@ class WireLine:
         except Unreachable:
             return None
 
-    def wait(self, enough: Callable[[GatewayStatus], bool], within_s: float = 30.0) -> GatewayStatus:
+    def wait(self, enough: Callable[[GatewayStatus], bool], within_s: float = 60.0) -> GatewayStatus:
         status = None
         deadline_s = time.monotonic() + within_s
         while time.monotonic() < deadline_s:
@@ -115,7 +149,7 @@ class WireLine:
     def wait_at_rest(self, within_s: float = 15.0) -> None:
         """Until the recorder has seen no torque for 0.1 s; for when there is no gateway to ask."""
         deadline_s = time.monotonic() + within_s
-        while read_recording(self.folder / "recording").torque_nm[-100:].any():
+        while read_recording(self.folder / "recording", events=False).torque_nm[-100:].any():
             assert time.monotonic() < deadline_s, "there is torque still"
             time.sleep(0.05)  # between two looks
 

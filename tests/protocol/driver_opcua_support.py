@@ -19,6 +19,7 @@ from drivers.device_map import MAPS, load_map
 from drivers.opcua.build import build_on
 from drivers.opcua.inprocess import EngineChannel
 from drivers.opcua.link import OpcUaLink
+from drivers.port import PrepareRefused
 from drivers.registry import build_links
 from drivers.wiring import Wired
 from gateway.core.line import Line
@@ -49,9 +50,11 @@ class Devices:
             "Line.EmergencyStopHealthy": (BOOL, True),
             "Line.Running": (BOOL, False),
             "Line.WatchdogTripped": (BOOL, False),
+            "Line.Local": (BOOL, False),
             "Line.UnwindSpeed": (F64, 0.1),
             "Line.LifeEcho": (U16, 0),
             "Line.Run": (BOOL, False),
+            "Line.Warning": (BOOL, False),
             "Line.SpeedRequest": (F64, 0.0),
             "Line.Life": (U16, 0),
             "Line.Watchdog": (U16, 0),
@@ -305,9 +308,19 @@ class Rig:
                 await self.cycle()
                 await asyncio.sleep(0.005)  # a period, however short
 
+    async def prepare(self) -> None:
+        """Asked again where a stall of the machine has used up a question's time. Raises PrepareRefused."""
+        async with asyncio.timeout(20.0):
+            while True:
+                try:
+                    return await self.link.prepare()
+                except PrepareRefused as refused:
+                    if not any(str(reason).endswith(": no answer in time") for reason in refused.reasons):
+                        raise
+
     async def enable(self, torque_nm: float = 5.0) -> None:
         """Prepared, every drive enabled, transport on."""
-        await self.link.prepare()
+        await self.prepare()
         self.outputs.drive_request[:] = DriveRequest.ENABLE
         self.outputs.torque_nm[:] = torque_nm
         self.outputs.run, self.outputs.speed_request_m_per_s = True, 0.2

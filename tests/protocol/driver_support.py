@@ -5,7 +5,7 @@ import socket
 import struct
 import threading
 from collections.abc import Awaitable, Callable
-from typing import Any
+from typing import Any, Self
 
 import can
 
@@ -129,6 +129,7 @@ class Drive:
             (0x1018, 2): struct.pack("<I", 0x402),
             (0x1017, 0): struct.pack("<H", 100),
             (0x6060, 0): b"\0",
+            (0x6061, 0): b"\x0a",
             (0x6072, 0): struct.pack("<H", 1000),
             (0x6076, 0): struct.pack("<I", 80_000),
             (0x60FD, 0): struct.pack("<I", 0),
@@ -180,7 +181,7 @@ class Drives:
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
 
-    async def __aenter__(self) -> "Drives":
+    async def __aenter__(self) -> Self:
         try:
             asyncio.get_running_loop().add_reader(self._bus.fileno(), self._read)
         except NotImplementedError:

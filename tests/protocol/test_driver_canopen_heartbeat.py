@@ -19,7 +19,9 @@ from gateway.core.line import Line
 from gateway.core.signals import DriveRequest, DriveState, Inputs, Outputs
 from tests.protocol.driver_support import (
     ENABLED,
+    FAULT,
     GROUP,
+    READY,
     SWITCH_ON_DISABLED,
     Drive,
     Drives,
@@ -413,3 +415,43 @@ def test_what_is_wrong_in_such_a_map_is_named(tmp_path: Path, old: str, new: str
     with pytest.raises(MapRefused) as refused:
         load_map(tmp_path / "drive.toml")
     assert all(word in " / ".join(refused.value.reasons) for word in words), refused.value.reasons
+
+
+# the drill of the watchdogs
+
+
+@pytest.mark.parametrize(("statusword", "barred"), [(FAULT, True), (SWITCH_ON_DISABLED, True), (READY, False)])
+def test_of_a_drive_that_leaves_operational_for_its_watchdog_the_statusword_is_asked_by_sdo(
+    statusword: int, barred: bool
+) -> None:
+    async def body(link: CanopenLink, bus: Bus, first: Epos, second: Epos) -> None:
+        inputs = Inputs(2)
+        await link.prepare()
+        first.statusword = second.statusword = READY
+        await cycle(link, inputs)
+        assert not inputs.power_barred.any()
+        link.withhold(link.watched)
+        begun = len(bus.frames)
+        first.on_sync = lambda drive: []
+        first.statusword = statusword
+        second.statusword = FAULT
+        bus.heartbeat(1, 0x7F)
+        while statusword_questions(bus, begun) < 2 or not inputs.power_barred[1]:  # so the first one is answered
+            await cycle(link, inputs, 0.01)
+            write(link, 0.0)
+        await cycle(link, inputs, 0.01)
+        assert inputs.power_barred.tolist() == [barred, True]
+        assert inputs.drive_state[0] != DriveState.READY, "it left operational, whatever its power stage is"
+        sent = bus.frames[begun:]
+        told = [data for cob_id, data in sent if cob_id == 0x000]
+        orders = [data for cob_id, data in sent if cob_id == 0x601 and data[:3] == b"\x2b\x40\x60"]
+        assert not told and not orders, "who takes torque off because it is told has shown nothing of its watchdog"
+        link.withhold(frozenset())
+        await cycle(link, inputs)
+        assert not inputs.power_barred[0]
+
+    bench(body)
+
+
+def statusword_questions(bus: Bus, begun: int) -> int:
+    return sum(cob_id == 0x601 and data[:3] == b"\x40\x41\x60" for cob_id, data in bus.frames[begun:])

@@ -202,6 +202,7 @@ def test_periods_go_on_while_the_line_is_armed() -> None:
             while not arming.done():
                 link.write(torques(TO_READY, 0.0, 0.0))
                 await cycle(link, inputs, 0.02)
+                await asyncio.sleep(0)  # between periods others come to their turn, also where nothing was waited for
             await arming
             for _ in range(3):
                 link.write(torques(TO_READY, 0.0, 0.0))

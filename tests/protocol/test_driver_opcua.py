@@ -67,7 +67,7 @@ def test_a_round_trip_of_all_roles(server: DeviceServer) -> None:
         await rig.until(lambda: devices.value("Axis2.TargetTorque") == 5.0)
         assert devices.value("Line.SpeedRequest") == 0.2
         both = {f"Axis{k}.{name}" for k in (1, 2) for name in ("Controlword", "TargetTorque", "Life")}
-        assert set(devices.writes[-1]) == both | {"Line.Run", "Line.SpeedRequest", "Line.Life"}
+        assert set(devices.writes[-1]) == both | {"Line.Run", "Line.SpeedRequest", "Line.Life", "Line.Warning"}
         for life in (devices.written(f"{name}.Life") for name in ("Axis1", "Axis2", "Line")):
             assert len(set(life)) == len(life)
         rig.link.silence()
@@ -214,7 +214,7 @@ def test_a_drive_without_statusword_is_lost_and_not_written_to(server: DeviceSer
         rig.outputs.drive_request[:] = DriveRequest.OFF
         await rig.until(lambda: devices.value("Axis2.Statusword") == 0x0250)
         devices.set("Axis1.Statusword", 0x0250)  # its watchdog's doing
-        await rig.link.prepare()
+        await rig.prepare()
         await rig.until(lambda: devices.written("Axis1.Life") != [])
 
     run(server, scene)
@@ -343,7 +343,7 @@ def test_prepare_refuses_by_name_and_leaves_no_watchdog_set(
 
     async def scene(rig: Rig) -> None:
         with pytest.raises(PrepareRefused) as refused:
-            await rig.link.prepare()
+            await rig.prepare()
         assert any(given.startswith(reason) for given in refused.value.reasons), refused.value.reasons
         assert [devices.value(f"{name}.Watchdog") for name in ("Axis1", "Axis2", "Line")] == [0] * 3
         devices.writes.clear()
@@ -361,7 +361,7 @@ def test_every_reason_is_named(server: DeviceServer) -> None:
 
     async def scene(rig: Rig) -> None:
         with pytest.raises(PrepareRefused) as refused:
-            await rig.link.prepare()
+            await rig.prepare()
         assert [reason.split(":")[0] for reason in refused.value.reasons] == ["drive-1", "drive-2", "plc"]
 
     run(server, scene)

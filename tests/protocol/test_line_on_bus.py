@@ -18,6 +18,7 @@ from gateway.supervisor.gate import Gate
 from gateway.supervisor.line_desk import LineDesk
 from tests.protocol.bus_support import client, raw_answers, router, run
 from tests.protocol.test_agents import answered, process, serve_log
+from tests.support.gateway_key import to_loop_over
 from tests.unit.deployer_support import LINE, Death, FakeJudge, FakeLoop, FakeSurroundings, controller
 from tests.unit.knowledge_support import Records
 from tests.unit.language_model_support import QUESTION
@@ -29,7 +30,7 @@ from tests.unit.test_line_desk import recording
 async def served(bus: ZenohMailbox, data: Path):
     """A desk with a real gate over records; it is the loop's word that is missing, and what the gate goes by."""
     gate = Gate(
-        LINE, InProcessMailbox(Hub()), data, FakeJudge(),
+        LINE, InProcessMailbox(Hub()), to_loop_over(InProcessMailbox(Hub()), LINE), data, FakeJudge(),
         lambda configurations, models: FakeSurroundings(FakeLoop(Death())), lambda *_, **__: None, lambda: 1.0,
         lambda: 1_800_000_000.0,
     )  # fmt: skip

@@ -306,7 +306,7 @@ def test_the_command_watchdog_of_the_line(bench: Bench) -> None:
 
 def test_a_command_that_means_nothing_is_not_taken(bench: Bench) -> None:
     bench.start()
-    order(bench, 3, 100_000, 5)
+    order(bench, 4 | 1, 100_000, 5)
     assert bench.face.malformed == 1
     assert answer(bench) == (0b0011, pytest.approx(0, abs=600), 0)
     bench.take()

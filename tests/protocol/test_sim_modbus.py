@@ -119,7 +119,7 @@ def test_exceptions_as_pymodbus_sees_them() -> None:
                 (client.write_register(4, 1, device_id=PLC), 2),
                 (client.write_registers(9, [0, 0], device_id=PLC), 2),
                 (client.write_register(11, 1, device_id=PLC), 3),  # half a speed
-                (client.write_register(10, 2, device_id=PLC), 3),  # a bit that has no meaning
+                (client.write_register(10, 4, device_id=PLC), 3),  # a bit that has no meaning
                 (client.write_register(14, 9, device_id=PLC), 3),
                 (client.write_register(14, 1001, device_id=PLC), 3),
                 (client.read_holding_registers(0, count=1, device_id=77), 11),

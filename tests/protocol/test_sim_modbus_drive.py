@@ -431,7 +431,7 @@ def test_what_a_rack_refuses_changes_nothing() -> None:
         refusals: list[tuple[Coroutine[Any, Any, int], int]] = [
             (bench.write(200, *half, unit=RACK), 3),
             (bench.write(202, 0, 0, unit=RACK), 3),
-            (bench.write_one(200, 2, RACK), 3),
+            (bench.write_one(200, 4, RACK), 3),
             (bench.write_one(RACK_AXIS_3, ENABLE, RACK), 3),
             (bench.write(RACK_AXIS_3, SHUTDOWN, 0, SHUTDOWN, unit=RACK), 3),
             (bench.write(RACK_AXIS_3 + 1, 0, SHUTDOWN, 0, unit=RACK), 3),

@@ -5,11 +5,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from gateway.core.line_scales import line_scales
 from gateway.core.web_model import equilibrium_torque, reference_speeds
-from safety.drift import DRIFT_ALONE_N, DRIFT_N, DriftState, drift_limits, drift_of, restart, watch_balance
+from safety.drift import DRIFT, DRIFT_ALONE, DriftState, drift_limits, drift_of, restart, watch_balance
 from tests.closed_loop.conftest import demo_line
 
 LINE = demo_line()
+SMALL_N = line_scales(LINE).tension_n
+DRIFT_N, DRIFT_ALONE_N = DRIFT * SMALL_N, DRIFT_ALONE * SMALL_N
 
 
 @given(
@@ -21,7 +24,7 @@ def test_the_drift_of_one_cell_is_told_with_its_size(cell: int, drift_n: float) 
     change_n[cell] -= drift_n
     if cell:
         change_n[cell - 1] += drift_n
-    told = drift_of(change_n)
+    told = drift_of(change_n, SMALL_N)
     assert told[cell] == pytest.approx(drift_n) and np.count_nonzero(told) == 1
 
 
@@ -29,7 +32,7 @@ def test_the_drift_of_one_cell_is_told_with_its_size(cell: int, drift_n: float) 
 def test_the_friction_of_one_roller_is_no_drift(roller: int, change_n: float) -> None:
     changes_n = np.zeros(6)
     changes_n[roller] = change_n
-    assert not drift_of(changes_n).any()
+    assert not drift_of(changes_n, SMALL_N).any()
 
 
 def test_the_balance_of_the_model_itself_tells_no_drift_and_a_cell_that_lies_is_found() -> None:
@@ -100,4 +103,4 @@ def test_a_span_without_a_cell_has_no_drift() -> None:
     ],
 )
 def test_which_cell_drifts_and_by_how_much(change_n: list[float], drift_n: list[float]) -> None:
-    assert drift_of(np.array(change_n)) == pytest.approx(drift_n)
+    assert drift_of(np.array(change_n), SMALL_N) == pytest.approx(drift_n)

@@ -78,8 +78,8 @@ def test_a_draw_span_has_no_load_cell_and_none_is_missed():
         (60.0, Action.NONE),
         (60.01, Action.STOP),
         (2.0, Action.NONE),
-        (1.99, Action.TORQUE_OFF),
-        (-5.0, Action.TORQUE_OFF),
+        (1.99, Action.BRAKE),
+        (-5.0, Action.BRAKE),
     ],
 )
 def test_the_tension_band_trips_on_the_second_sample_outside(tension, action):
@@ -166,10 +166,10 @@ def test_a_web_that_breaks_is_told_from_slack():
     broken = healthy()
     broken.tension.put(1, 0.0, 1.0)
     (finding,) = findings_after(2, broken)
-    assert finding.rule == "slack" and finding.action is Action.TORQUE_OFF
+    assert finding.rule == "slack" and finding.action is Action.BRAKE
     broken.speed.put(1, 0.08, 1.0)
     found = [finding for finding in findings_after(2, broken) if finding.rule == "web break"]
-    assert len(found) == 1 and found[0].action is Action.TORQUE_OFF and "roller 2 runs away" in found[0].text
+    assert len(found) == 1 and found[0].action is Action.BRAKE and "roller 2 runs away" in found[0].text
 
 
 def test_missing_signals_without_a_gap_are_told_as_a_range():

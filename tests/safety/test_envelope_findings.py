@@ -8,7 +8,7 @@ from safety.actions import Action, Finding
 from safety.envelope import EnvelopeState, check_inputs, check_timing, check_torque
 from tests.safety.envelope_support import EVERYTHING, LIMITS, TORQUE_FREE, findings_after, healthy, story
 
-HOLD, STOP, OFF = Action.HOLD_OUTPUTS, Action.STOP, Action.TORQUE_OFF
+HOLD, STOP, BRAKE, OFF = Action.HOLD_OUTPUTS, Action.STOP, Action.BRAKE, Action.TORQUE_OFF
 
 
 def line(**what):
@@ -55,9 +55,9 @@ SAID = [
     (1, line(drives={0: DriveState.FAULT, 2: DriveState.STO}),
      ("drives", STOP, "drives that are not ENABLED: 1 FAULT, 3 STO: read their fault")),
     (2, line(tension={0: 60.004}), ("tension band", STOP, "tension 1 is 60.00 N, allowed is 2 to 60 N")),
-    (2, line(tension={1: 1.994}), ("slack", OFF, "tension 2 is 1.99 N, allowed is 2 to 60 N")),
+    (2, line(tension={1: 1.994}), ("slack", BRAKE, "tension 2 is 1.99 N, allowed is 2 to 60 N")),
     (2, line(tension={1: 0.5}, speed={1: 0.06}),
-     ("web break", OFF, "tension 2 is 0.50 N, allowed is 2 to 60 N, and roller 2 runs away from the one before: the "
+     ("web break", BRAKE, "tension 2 is 0.50 N, allowed is 2 to 60 N, and roller 2 runs away from the one before: the "
                         "web has broken")),
     (2, line(speed={1: -0.19}),
      ("roller speed", OFF, "roller 2 runs at -0.190 m/s, the line's greatest speed is 0.12 m/s: is the web threaded "

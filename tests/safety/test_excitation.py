@@ -6,9 +6,14 @@ from math import nan
 import numpy as np
 import pytest
 
+from gateway.core.line_scales import line_scales
 from gateway.core.recording import Recording
 from gateway.core.theta import Noise
-from safety.excitation import MOVING, SAME_M_PER_S, excited_parts, recent
+from safety.excitation import MOVING, excited_parts, recent
+from tests.closed_loop.conftest import demo_line
+
+LINE = demo_line()
+SAME_M_PER_S = line_scales(LINE).speed_m_per_s
 
 MOVED_N = 0.25  #: of the hand-made tensions; a power of two, so that their standard deviation is this very number
 
@@ -24,7 +29,7 @@ def recorded(speed_m_per_s, period_s=0.01):
 
 
 def lengths_of(recording):
-    return [part.recording.samples for part in excited_parts(recording)]
+    return [part.recording.samples for part in excited_parts(recording, LINE)]
 
 
 @pytest.mark.parametrize(("now", "count"), [("14:00:00", 1), ("14:00:00.500000", 1), ("13:59:59.999999", 0)])
@@ -41,15 +46,15 @@ def test_recordings_that_are_not_those_of_the_context_are_an_error(of, context):
 
 def test_a_tension_that_moves_by_just_as_much_as_is_asked_tells():
     recording = recorded(np.full(400, 0.05))
-    (part,) = excited_parts(recording, Noise(tension_n=MOVED_N / MOVING))
+    (part,) = excited_parts(recording, LINE, Noise(tension_n=MOVED_N / MOVING))
     assert part.movement_n == MOVED_N and part.recording.samples == 400
-    assert excited_parts(recording, Noise(tension_n=np.nextafter(MOVED_N / MOVING, 1.0))) == []
+    assert excited_parts(recording, LINE, Noise(tension_n=np.nextafter(MOVED_N / MOVING, 1.0))) == []
 
 
 def test_a_span_without_a_load_cell_leaves_it_to_the_others_to_move():
     recording = recorded(np.full(400, 0.05))
     recording = replace(recording, tension_n=np.where(np.arange(2) == 1, nan, recording.tension_n))
-    (part,) = excited_parts(recording)
+    (part,) = excited_parts(recording, LINE)
     assert part.movement_n == MOVED_N
 
 

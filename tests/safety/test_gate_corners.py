@@ -9,7 +9,8 @@ import pytest
 from gateway.control.design import MpcWeights, design_lqi, design_mpc
 from gateway.control.judged_courses import corner_courses, improvement_courses, programme_courses
 from gateway.control.rollout import Rollouts
-from gateway.loop.setpoints import STEP_PAUSE_S
+from gateway.core.line_scales import line_scales
+from gateway.loop.setpoints import STEP_PAUSE
 from safety import corner_runs, programme
 from safety.findings import at_least, at_most, told
 from safety.rules import corners, paper, roller_speed
@@ -64,7 +65,7 @@ def test_corners_that_nobody_could_hold_are_left_out_and_told(of, context, redes
 def test_no_course_asks_for_more_than_the_loop_permits(case, together):
     limits = case.line.limits.model_copy(update={"steps_together": together})
     judged = replace(judged_of(case), line=case.line.model_copy(update={"limits": limits}))
-    pause, most_n = round(STEP_PAUSE_S / case.line.control.period_s), limits.tension_step_max_n
+    pause, most_n = line_scales(case.line).periods(STEP_PAUSE), limits.tension_step_max_n
     for course in [*(one.course for one in programme_courses(judged).values()), *improvement_courses(judged).values()]:
         steps = np.abs(np.diff(course.tension_n, axis=0))
         lately = np.lib.stride_tricks.sliding_window_view(steps, min(pause, len(steps)), axis=0)
@@ -134,12 +135,16 @@ def test_a_predictive_controller_runs_whole_on_some_corners_and_says_what_is_los
 
 
 def test_the_worst_over_corners_knows_where_it_was():
-    worst = Worst()
+    worst = Worst(np.full(2, 1.0), np.full(2, 10.0))
     one = np.ones((1, 2))
     for name, swing in (("first", 0.5), ("second", 0.7)):
         worst.take(Rollouts(one, 3 * one, 9 * one, one, one, one, one, one, one, tail_swing_n=swing * one,
                             tail_error_n=one, chatter_nm=one), name, [0, 1])  # fmt: skip
-    assert worst.swing_n == (0.7, "second") and worst.lowest_n[0] == 3.0
+    assert (
+        worst.swing_n == (0.7, "second")
+        and worst.lowest_n == (2.0, "first", 0)
+        and worst.highest_n == (1.0, "first", 0)
+    )
 
 
 def test_corners_that_torque_does_not_hold_leave_the_papers_criterion_open(of, context, case):

@@ -61,7 +61,7 @@ def test_validity_tells_first_of_what_is_loud_then_of_what_is_quiet_then_of_all(
 ):
     names = ["tension 1", "tension 2", "speed 2"]
     monkeypatch.setattr(validity, "foretold_of", lambda *_: [])
-    monkeypatch.setattr(validity, "by_speed", lambda _: [(0.0512, [])])
+    monkeypatch.setattr(validity, "by_speed", lambda _, _line: [(0.0512, [])])
     monkeypatch.setattr(validity, "seconds", lambda _: 12.34)
     monkeypatch.setattr(validity, "normalised", lambda _: value)
     monkeypatch.setattr(validity, "normalised_by_output", lambda _: (names, np.array(each)))
@@ -121,7 +121,7 @@ def test_the_line_runs_no_faster_than_data_have_shown_but_for_a_twentieth_or_two
         context = with_state(at.context(), speed_m_per_s=speed_m_per_s)
         return validity.check(case_of(gains(redesigned, context), context, at))[-1]
 
-    (part,) = excited_parts(at.recording)
+    (part,) = excited_parts(at.recording, at.line)
     shown = part.speed_m_per_s
     most = (1.0 + share) * shown + more
     faster = most + 1e-9
@@ -140,7 +140,7 @@ def test_parts_at_one_speed_are_judged_together(of, context, redesigned):
 
 @pytest.mark.parametrize(("shaken_m_per_s", "way"), [(1e-3, "held"), (5e-3, "linear")])
 def test_between_samples_the_unwinder_goes_the_way_that_explains_more(of, case, shaken_m_per_s, way):
-    (part,) = excited_parts(of.recording)
+    (part,) = excited_parts(of.recording, of.line)
     recording = part.recording
     shaken = np.random.default_rng(1).standard_normal(recording.samples) * shaken_m_per_s
     recording = replace(recording, unwind_speed_m_per_s=recording.unwind_speed_m_per_s + shaken)
@@ -210,7 +210,7 @@ def test_alignment_looks_at_the_newest_data_only(of, case, monkeypatch):
 
     monkeypatch.setattr(alignment, "foretold_of", foretold_of)
     alignment.of_model(case, of.model)
-    assert asked == [alignment.MOST_S]
+    assert asked == [alignment.MOST]
 
 
 def test_what_is_kept_of_a_prediction_is_of_the_noise_that_is_asked_for(of, case):
@@ -224,7 +224,7 @@ def test_what_is_kept_of_a_prediction_is_of_the_noise_that_is_asked_for(of, case
 @pytest.mark.parametrize(("latency_s", "same"), [(0.004, True), (0.01, False), (0.02, False)])
 def test_a_torque_that_acts_within_a_period_is_held_against_the_slope_before_it_alone(of, case, latency_s, same):
     theta = replace(theta_of(of.model), latency_s=latency_s)
-    (predicted, *_) = (one.predicted for one in alignment.foretold_of(case, of.model, Noise(), alignment.MOST_S))
+    (predicted, *_) = (one.predicted for one in alignment.foretold_of(case, of.model, Noise(), alignment.MOST))
     (before, after), _ = alignment.sensitivities(theta, predicted)
     torques = slice(-predicted.stretch.n, None)
     assert np.array_equal(before[: torques.start], after[: torques.start])
@@ -293,15 +293,15 @@ def test_a_measured_latency_is_what_is_judged_by(of, context, redesigned):
 
 def test_excited_parts_are_at_one_speed_and_move(of):
     recording = of.recording
-    (part,) = excited_parts(recording)
+    (part,) = excited_parts(recording, of.line)
     assert part.speed_m_per_s == pytest.approx(0.05, abs=1e-4) and part.movement_n > 1.0
     standing = replace(recording, tension_n=np.where(np.arange(6) == 3, 30.0, recording.tension_n))
-    assert excited_parts(standing) == []
+    assert excited_parts(standing, of.line) == []
     half = recording.samples // 2
     speed = np.where(np.arange(recording.samples) < half, 0.05, 0.1)
-    assert excited_parts(replace(recording, unwind_speed_m_per_s=speed)) == []
+    assert excited_parts(replace(recording, unwind_speed_m_per_s=speed), of.line) == []
     draws = replace(recording, tension_n=np.full_like(recording.tension_n, nan))
-    assert excited_parts(draws)[0].movement_n == inf
+    assert excited_parts(draws, of.line)[0].movement_n == inf
 
 
 def test_old_and_future_data_do_not_count(of, context):
@@ -314,10 +314,15 @@ def test_old_and_future_data_do_not_count(of, context):
 
 
 def test_of_much_data_the_newest_are_looked_at_and_every_speed(of):
-    (part,) = excited_parts(of.recording)
+    (part,) = excited_parts(of.recording, of.line)
     slow = replace(part, speed_m_per_s=0.01)
-    assert newest([part] * 5 + [slow] * 5, 5.0) == [part, part, slow]
+    assert newest([part] * 5 + [slow] * 5, of.line, 250.0) == [part, part, slow]
     part_s = part.recording.samples * part.recording.period_s
-    assert newest([part] * 3, part_s) == [part] and newest([part] * 3, part_s + 0.5) == [part] * 2
-    assert same_speed(0.004, 0.002) and same_speed(0.002, 0.004), "as far apart as one speed may be"
-    assert same_speed(0.05, 0.0524) and same_speed(0.002, 0.0039) and not same_speed(0.1, 0.106)
+    assert (
+        newest([part] * 3, of.line, part_s / 0.02) == [part]
+        and newest([part] * 3, of.line, (part_s + 0.5) / 0.02) == [part] * 2
+    )
+    assert same_speed(0.004, 0.002, of.line) and same_speed(0.002, 0.004, of.line), "as far apart as one speed may be"
+    assert (
+        same_speed(0.05, 0.0524, of.line) and same_speed(0.002, 0.0039, of.line) and not same_speed(0.1, 0.106, of.line)
+    )

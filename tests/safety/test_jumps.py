@@ -5,12 +5,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from gateway.core.line_scales import line_scales
 from gateway.core.signals import FloatArray, Inputs, Quality
 from safety.actions import Action
-from safety.jumps import NOISE_M_PER_S, UNWINDER_MARGIN, JumpState, jump_limits, reject_jumps, reject_unwinder
+from safety.jumps import UNWINDER_MARGIN, JumpState, jump_limits, reject_jumps, reject_unwinder
 from tests.closed_loop.conftest import demo_line
 
 LINE = demo_line()
+NOISE_M_PER_S = line_scales(LINE).speed_m_per_s
 
 
 def speeds(inputs: Inputs, values: list[float]) -> Inputs:
@@ -151,7 +153,9 @@ def test_after_missed_samples_a_roller_may_have_come_further() -> None:
         (0.01, 0.10, 0.10, True),  # a PLC that steps
         (0.01, 0.10, 0.117, True),  # and overshoots
         (0.01, 0.10, 0.119, False),
-        (0.10, 0.10, 0.0, True),  # a PLC that stops the transport at once
+        (0.10, 0.10, 0.0, False),  # a PLC that stops the transport at once: the next sample says so, too
+        (0.10, 0.0, 0.0, True),  # and one that is asked to
+        (0.10, 0.10, 0.083, True),
         (0.10, 0.10, -0.019, False),
         (0.05, 0.05, 0.069, False),
         (0.05, 0.05, 0.067, True),
@@ -160,12 +164,12 @@ def test_after_missed_samples_a_roller_may_have_come_further() -> None:
         (-0.05, 0.0, -0.067, True),  # backwards, likewise
         (-0.05, 0.0, -0.069, False),
         (0.0, -0.05, -0.067, True),
-        (-0.05, -0.05, 0.0, True),
+        (-0.05, -0.05, 0.0, False),
         (0.0, 0.0, UNWINDER_MARGIN * LINE.limits.speed_max_m_per_s, True),  # at the boundary
         (0.0, 0.0, -UNWINDER_MARGIN * LINE.limits.speed_max_m_per_s, True),
     ],
 )
-def test_v0_lies_between_standstill_its_last_value_and_its_request(
+def test_v0_lies_between_its_last_value_and_its_request(
     last: float, asked: float, value: float, believed: bool
 ) -> None:
     limits, state, inputs = jump_limits(LINE, np.zeros(6)), JumpState(), Inputs(6)
@@ -175,6 +179,37 @@ def test_v0_lies_between_standstill_its_last_value_and_its_request(
     reject_unwinder(limits, state, inputs, asked)
     assert (inputs.unwind_speed.quality[0] == Quality.GOOD) == believed
     assert inputs.unwind_speed.value[0] == (value if believed else last)
+
+
+def unwinder(shown: list[float], asked: float = 0.1) -> tuple[list[bool], JumpState]:
+    """Which of an unwinder's samples are used, and the state after them."""
+    limits, state, inputs, used = jump_limits(LINE, np.zeros(6)), JumpState(), Inputs(6), []
+    for k, value in enumerate(shown):
+        inputs.unwind_speed.put(0, value, 0.01 * k)
+        reject_unwinder(limits, state, inputs, asked)
+        used.append(bool(inputs.unwind_speed.quality[0] == Quality.GOOD))
+    return used, state
+
+
+def test_a_v0_that_falls_away_from_its_request_is_believed_when_the_next_sample_says_so() -> None:
+    used, state = unwinder([0.1, 0.0, 0.0, 0.0])
+    assert used == [True, False, True, True] and state.unwind_speed_m_per_s == 0.0
+    assert len(state.rejected) == 1 and state.rejected[0].confirmable
+    used, state = unwinder([0.1, 0.06, 0.02, 0.0])  # one that brakes hard
+    assert used == [True, False, True, True]
+
+
+def test_a_torn_v0_is_never_used() -> None:
+    """Its high word is that of another time: the request has not moved, and the next sample is as before."""
+    used, state = unwinder([0.1, *[0.001, 0.1] * 5])
+    assert used == [True, *[False, True] * 5] and state.unwind_speed_m_per_s == 0.1
+    assert [(one.name, one.value) for one in state.rejected] == [(("unwinder speed", 0), 0.001)] * 5
+    assert all(one.low > 0.001 for one in state.rejected)
+
+
+def test_what_no_sample_confirms_is_beyond_standstill_and_request() -> None:
+    used, state = unwinder([0.1, -0.05, -0.05, 0.3, 0.3])
+    assert used == [True, False, False, False, False] and not state.rejected[0].confirmable
 
 
 def test_a_v0_that_did_not_come_says_nothing() -> None:
@@ -248,3 +283,18 @@ def test_a_second_jump_says_from_where_to_where() -> None:
     assert [finding.text for finding in findings] == [
         "the speed of roller 6 jumped twice, to 0.6000 from 0.0500 m/s: check its encoder and the encoder's cable"
     ]
+
+
+@pytest.mark.parametrize("speed_max_m_per_s", [0.12, 8.0])
+def test_noise_is_small_against_the_lines_greatest_speed(speed_max_m_per_s: float) -> None:
+    """Of 8 m/s an encoder shows some 10 mm/s more or less; 2 mm/s, which is much at 0.12 m/s, stopped such a line."""
+    limits = LINE.limits.model_copy(update={"speed_max_m_per_s": speed_max_m_per_s})
+    line = LINE.model_copy(update={"limits": limits})
+    for share, good in ((0.9, True), (1.1, False)):
+        state, inputs, still_nm = JumpState(), Inputs(6), np.zeros(6)
+        for i in range(6):
+            inputs.tension.put(i, 0.0, 0.0)
+        reject_jumps(jump_limits(line, np.zeros(6)), state, speeds(inputs, [0.0] * 6), [still_nm])
+        shown = [share * speed_max_m_per_s / 60.0] * 6
+        reject_jumps(jump_limits(line, np.zeros(6)), state, speeds(inputs, shown), [still_nm])
+        assert inputs.speed.good() == good

@@ -166,9 +166,9 @@ def test_a_plant_whose_torque_is_no_number_is_not_left_out(case, monkeypatch) ->
 
 def test_a_recording_whose_speed_is_no_number_excites_nothing() -> None:
     recording = published().recording
-    assert excited_parts(recording)
+    assert excited_parts(recording, published().line)
     lost = np.full_like(recording.unwind_speed_m_per_s, nan)
-    assert not excited_parts(replace(recording, unwind_speed_m_per_s=lost))
+    assert not excited_parts(replace(recording, unwind_speed_m_per_s=lost), published().line)
 
 
 @given(st.sampled_from([EVERYTHING, AT_STANDSTILL]), st.sampled_from(["tension", "speed"]), st.integers(0, 2))

@@ -32,7 +32,7 @@ def test_a_plan_that_rides_the_limits_lets_spans_fall_that_stand_low_while_other
     def lowest_n(config):
         case = case_of(gains(config, context), context, of)
         judged = judged_of(case)
-        course = programme_courses(judged, programme.LASTING_S, programme.TAIL_S)[OTHERS_LOW]
+        course = programme_courses(judged, 0.02 * programme.LASTING, 0.02 * programme.TAIL)[OTHERS_LOW]
         assert OTHERS_LOW not in corner_courses(judged)
         return programme.in_courses(case, {OTHERS_LOW: course})[OTHERS_LOW].tension_min_n.min()
 

@@ -5,7 +5,7 @@ import pytest
 
 from gateway.core.signals import Inputs
 from safety.actions import Action
-from safety.stuck import LEARNT_REVERSALS, Cell, StuckLimits, StuckState, find_stuck, stuck_limits
+from safety.stuck import LEARNT_REVERSALS, SILENT_PERIODS, Cell, StuckLimits, StuckState, find_stuck, stuck_limits
 from tests.closed_loop.conftest import demo_line
 
 LINE = demo_line()
@@ -50,6 +50,21 @@ def test_a_cell_that_stands_still_while_rollers_move_is_stuck_after_its_time() -
         "the load cell of span 2 has shown 31.00 N 5 times in a row while rollers move: check it, its amplifier and "
         "its cable"
     ]
+
+
+def test_a_fine_cell_that_shows_one_value_is_silent_until_it_shows_another() -> None:
+    still = [(40.0 + 0.1 * k, 31.0, 31.0) for k in range(SILENT_PERIODS + 1)]
+    assert stuck_after(noisy(300) + still[:-1])[0].silent == []
+    assert stuck_after(noisy(300) + still)[0].silent == [1]
+    assert stuck_after([*noisy(300), *still, (40.0, 31.1, 31.0)])[0].silent == []
+
+
+@pytest.mark.parametrize("repeats", [2, 5, 9, 20])
+def test_an_amplifier_slower_than_the_loop_is_never_silent(repeats: int) -> None:
+    assert not any(
+        stuck_after([sample for sample in noisy(100) for _ in range(repeats)][:count])[0].silent
+        for count in range(60 * repeats, 100 * repeats)
+    )
 
 
 def test_a_cell_is_judged_only_after_it_has_been_learnt() -> None:

@@ -9,7 +9,19 @@ from gateway.core.controller import config_hash
 from gateway.core.deployment import Deployment, InService, RecoveryNode, RecoveryPrediction, Region
 from gateway.core.judge_context import JudgeContext, LineState, context_hash
 from gateway.core.line_model import LineModel
-from gateway.core.messages import Command, Deploy, Keep, Narrow, Renew, Reply, Rollback, RunExperiment, WatchGood
+from gateway.core.messages import (
+    Command,
+    Confirmed,
+    Deploy,
+    Keep,
+    Narrow,
+    Renew,
+    Reply,
+    Rollback,
+    RunExperiment,
+    WatchGood,
+)
+from gateway.core.proof import Grounds
 from gateway.core.proposal import GainsChange, ModelChange, Proposal, proposal_hash
 from gateway.core.verdict import RuleFinding, Verdict
 from gateway.mailbox.port import NotSent, Unreachable
@@ -112,11 +124,13 @@ class FakeLoop:
         self.spoiled: set[str] | None = None  #: the commands that `answers`, `loses` and `late_s` are for; None: all
         self.takes = True
         self.fast = False
+        self.narrows = True
         self.watches: list[tuple[str, RecoveryPrediction | None]] = []  #: by command
         self.watched = self.good_watched = False
+        self.confirmed: set[str] | None = None  #: hashes, of a loop that guards what nobody has confirmed
         self.watch_refusal = ""  #: why it does not take a watch of what is good
 
-    async def tell(self, command: Command) -> Reply:
+    async def tell(self, command: Command, grounds: Grounds | None = None) -> Reply:
         due = self.death.due()
         if due and not self.death.after:
             raise Killed
@@ -155,16 +169,26 @@ class FakeLoop:
             lease_left_s=self.lease_end_s - self.now_s if probation else None, last_known_good=self.good,
             good_if_kept=self.good if self.runs in self.predictive else self.runs,
             region=self.region, watched=self.watched, why=self.why,
+            confirmed=self.confirmed is None or self.runs in self.confirmed,
         )  # fmt: skip
 
     def go_back(self, why: str) -> None:
         self.runs, self.region, self.lease_end_s, self.why = self.good, self.good_region, None, why
         self.watched = self.good_watched
 
-    def _narrowed(self, region: Region) -> tuple[bool, str]:
-        if self.lease_end_s is not None or self.fast:
+    def _told_of(self, command: Narrow | Confirmed) -> tuple[bool, str]:
+        if isinstance(command, Narrow):
+            return self._narrowed(command)
+        assert self.confirmed is not None
+        self.confirmed.add(command.configuration)
+        return True, "confirmed"
+
+    def _narrowed(self, command: Narrow) -> tuple[bool, str]:
+        if self.lease_end_s is not None or (self.fast and not command.confine):
             return False, "the line shall run at 1 m/s"
-        self.region, self.good_region = (one.no_further(region) for one in (self.region, self.good_region))
+        if not self.narrows:
+            return False, "the loop is ending"
+        self.region, self.good_region = (one.no_further(command.region) for one in (self.region, self.good_region))
         self.watched = self.good_watched = False
         return True, "narrowed"
 
@@ -180,8 +204,8 @@ class FakeLoop:
 
     def _done(self, command: Command) -> Reply:
         ok, text = True, "done"
-        if isinstance(command, Narrow):
-            ok, text = self._narrowed(command.region)
+        if isinstance(command, Narrow | Confirmed):
+            ok, text = self._told_of(command)
         if isinstance(command, WatchGood | Keep):
             self.watches.append((command.command, command.watch))
         if isinstance(command, Deploy):

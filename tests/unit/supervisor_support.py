@@ -1,10 +1,13 @@
 """A line, its telemetry and a short folder for sockets, for the tests of the gateway process."""
 
 import asyncio
+import os
+import secrets
 import shutil
 import subprocess
 import sys
 import tempfile
+import time
 import tomllib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -16,8 +19,9 @@ import numpy as np
 from gateway.core.line import Line
 from gateway.core.line_template import line_template
 from gateway.core.signals import DriveState, Quality
-from gateway.core.states import LoopState, Phase
+from gateway.core.states import STATE_OF, LoopState, Phase
 from gateway.core.telemetry import Frame, pack
+from gateway.mailbox.loop_proof import AskShown, make_key, shown
 
 
 def line_of(spans: int = 6, name: str | None = None) -> Line:
@@ -54,6 +58,24 @@ async def until(condition: Callable[[], bool]) -> None:
     """Lets the event loop turn until `condition`; what it waits for may happen in another process."""
     while not condition():  # noqa: ASYNC110
         await asyncio.sleep(0.001)
+
+
+class ShowsWho:
+    """A loop's answer to who it is, as of one start: for a mailbox that serves LOOP_SHOWN on the loop's socket."""
+
+    def __init__(self, folder: Path, phase: Phase = Phase.RUNNING) -> None:
+        self.phase = phase
+        self.asked = 0
+        self._key = make_key(folder)
+        self._start = secrets.token_hex(32)
+
+    async def answer(self, payload: bytes) -> bytes:
+        self.asked += 1
+        challenge = AskShown.model_validate_json(payload).challenge
+        state = STATE_OF[self.phase].name
+        return shown(
+            self._key, challenge, self._start, os.getpid(), self.asked, time.monotonic(), state, self.phase.name
+        )
 
 
 def frame_of(sequence: int, time_s: float, spans: int = 6, **changes: Any) -> bytes:

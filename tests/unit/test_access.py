@@ -1,7 +1,6 @@
 """Who came in, who did not, who may: told by the operator's process, on record at the gateway, and no disk filled."""
 
 import asyncio
-import os
 import threading
 from pathlib import Path
 
@@ -12,6 +11,7 @@ from gateway.core.access import MOST_PLACES
 from gateway.core.messages import Reply
 from gateway.core.people import Person
 from gateway.core.topics import GATEWAY_ACCESS
+from gateway.files import read_bytes
 from gateway.mailbox.inprocess import Hub, InProcessMailbox
 from gateway.operator import access
 from gateway.operator.access import MOST_WAITING, REPORT_S, Access
@@ -232,15 +232,18 @@ def test_the_newest_users_are_known_whether_on_record_or_not(both, users):
 
 
 def test_a_disk_that_does_not_answer_holds_up_neither_the_event_loop_nor_who_is_at_work(both, users, monkeypatch):
-    """A named pipe that nobody writes to: whoever opens it waits, as with a disk that hangs."""
     users.write(both.path)
+    answers = threading.Event()
+
+    def reads(path, most_bytes):
+        answers.wait()
+        return read_bytes(path, most_bytes)
 
     async def story():
         await both.access.look()
         assert both.users.role_of("otto") == "operator"
         monkeypatch.setattr(access, "READ_S", 0.01)
-        both.path.unlink()
-        os.mkfifo(both.path, 0o600)
+        monkeypatch.setattr("gateway.operator.users.read_bytes", reads)
         threads, before = [], len(both.records)
         try:
             for _ in range(3):
@@ -248,8 +251,8 @@ def test_a_disk_that_does_not_answer_holds_up_neither_the_event_loop_nor_who_is_
                 await both.access.look()
                 threads.append(threading.active_count())
         finally:
-            os.close(os.open(both.path, os.O_RDWR))  # and now it answers
             users.without("otto").write(both.path)
+            answers.set()
         assert len(set(threads)) == 1  # no further one waits
         assert len(both.records) == before + 3
         assert both.users.role_of("otto") == "operator"

@@ -39,12 +39,13 @@ from gateway.supervisor.agents_cases import RECORD_EVERY_S, AgentsCases
 from gateway.supervisor.agents_desk import AgentsDesk
 from gateway.supervisor.audit_file import AuditFile, AuditUnavailable
 from gateway.supervisor.deployer_sides import NotKnown
-from gateway.supervisor.dry_runs import MOST, DryRuns
+from gateway.supervisor.dry_runs import MOST_EACH, DryRuns
 from gateway.supervisor.gate import Gate
 from gateway.supervisor.interactions import Interactions
 from gateway.supervisor.judging import LONGER
 from gateway.supervisor.lifecycle import Stage
 from gateway.supervisor.line_desk import LineDesk
+from tests.support.gateway_key import to_loop_over
 from tests.unit.deployer_support import FIRST, LINE, Death, FakeJudge, FakeLoop, FakeSurroundings, proposal
 from tests.unit.language_model_support import QUESTION
 from tests.unit.supervisor_support import until
@@ -87,16 +88,17 @@ class Desk:
         self.events: list[tuple[str, str]] = []
         self.judge, self.dry = SlowJudge("real", self.asked), SlowJudge("dry", self.asked)
         self.surroundings = FakeSurroundings(FakeLoop(Death()))
+        self.now_s = 0.0
         self.gate = Gate(
-            LINE, InProcessMailbox(self.hub), folder, self.judge, lambda configurations, models: self.surroundings,
-            self.note, lambda: 1.0, lambda: NOW_S,
+            LINE, InProcessMailbox(self.hub), to_loop_over(InProcessMailbox(self.hub), LINE), folder, self.judge,
+            lambda configurations, models: self.surroundings,
+            self.note, lambda: 1.0 + self.now_s, lambda: NOW_S,
         )  # fmt: skip
         self.dry_runs = DryRuns(LINE, self.dry)
         self.log = Interactions(folder)
-        self.now_s = 0.0
         self.cases = AgentsCases(self.gate.audit.append, lambda: self.now_s)
         desk = AgentsDesk(
-            lambda: STATUS, self.gate, self.dry_runs, self.log, self.note, self.cases, lambda: self.now_s
+            lambda: STATUS, self.gate, self.dry_runs, self.log, self.note, self.cases
         )  # fmt: skip
         desk.serve_on(InProcessMailbox(self.hub))
         LineDesk(LINE, self.gate, folder, lambda most_s: [], self.cases).serve_on(InProcessMailbox(self.hub))
@@ -159,17 +161,27 @@ def test_a_proposal_is_taken_in_as_the_agents_on_whose_key_it_came(tmp_path):
     at_desk(story, tmp_path)
 
 
-def test_all_agents_together_fill_no_list_of_proposals(tmp_path):
+def test_an_agent_proposes_once_in_ten_seconds_thirty_times_an_hour_and_takes_nothing_of_anothers_share(tmp_path):
     async def story(desk: Desk) -> None:
         await desk.opened()
+        assert (await desk.propose(of_agents(nonce=1000))).ok
+        for k in range(50):  # at once: what it was refused is not put off, either
+            reply = await desk.propose(of_agents(nonce=1001 + k))
+            assert [one.code for one in reply.findings] == ["inbox-rate"]
+            assert reply.findings[0].parameters["every_s"] == reply.findings[0].parameters["again_s"] == 10.0
+        assert (await desk.propose(of_agents(nonce=1100), "adaptation")).ok
         took = []
-        for k in range(200):  # for an hour
-            desk.now_s = 18.0 * k
-            reply = await desk.propose(of_agents(nonce=k), ("sysid", "adaptation")[k % 2])
+        for k in range(1, 361):  # for an hour
+            desk.now_s = 10.0 * k
+            reply = await desk.propose(of_agents(nonce=k))
             took.append(reply.ok)
-        assert 30 <= sum(took) <= 36 and took[:5] == [True] * 5
-        assert "agents propose too often; allowed: 30 an hour, of all together" in reply.reasons[0]
-        assert desk.gate.deployer is not None and len(desk.gate.deployer.book.entries) == sum(took)
+            assert reply.ok or reply.findings[0].parameters["every_s"] == 120.0
+        assert 30 <= sum(took) <= 36 and took[:3] == [True] * 3
+        assert (await desk.propose(of_agents(nonce=2000), "adaptation")).ok
+        assert desk.gate.deployer is not None and len(desk.gate.deployer.book.entries) == sum(took) + 3
+        told = [text for kind, text in desk.events if kind == "proposal" and "too often" in text]
+        refused = [kind for kind, _ in desk.records() if kind == "refused-proposal"]
+        assert len(told) <= 80 and 0 < len(refused) <= 80  # of 380
         await desk.gate.deployer.judged()
 
     at_desk(story, tmp_path)
@@ -292,7 +304,7 @@ def test_verdicts_go_first_and_dry_runs_one_after_the_other(tmp_path):
         desk.judge.let.set()
         await until(lambda: len(desk.asked) == 2)
         assert desk.asked[1:] == ["dry trial 2"]
-        assert (await desk.propose(of_agents(3, nonce=4))).ok  # one that comes meanwhile does not wait
+        assert (await desk.propose(of_agents(3, nonce=4), "code")).ok  # one that comes meanwhile does not wait
         await until(lambda: len(desk.asked) == 3)
         assert desk.asked[2:] == ["real trial 4"]
         assert desk.gate.deployer is not None
@@ -311,7 +323,7 @@ def test_who_gives_up_a_dry_run_takes_no_verdict_along(tmp_path):
         one = of_agents(1)
         await desk.propose(one)
         assert desk.gate.deployer is not None
-        waiting = asyncio.create_task(desk.dry_runs.run(canonical(of_agents(2)), desk.gate.deployer))
+        waiting = asyncio.create_task(desk.dry_runs.run(canonical(of_agents(2)), desk.gate.deployer, "sysid"))
         for _ in range(10):
             await asyncio.sleep(0)
         waiting.cancel()
@@ -324,17 +336,22 @@ def test_who_gives_up_a_dry_run_takes_no_verdict_along(tmp_path):
     at_desk(story, tmp_path)
 
 
-def test_more_dry_runs_than_may_wait_are_refused(tmp_path):
+def test_dry_runs_of_one_agent_keep_no_other_from_asking(tmp_path):
     async def story(desk: Desk) -> None:
         await desk.opened()
         desk.dry.let.clear()
-        agents = [AGENT_NAMES[k % len(AGENT_NAMES)] for k in range(MOST)]
-        waiting = [asyncio.create_task(desk.ask(ASK_JUDGE, canonical(of_agents()), agent)) for agent in agents]
+
+        def ask(agent: AgentName) -> asyncio.Task[bytes]:
+            return asyncio.create_task(desk.ask(ASK_JUDGE, canonical(of_agents()), agent))
+
+        waiting = [ask("sysid") for _ in range(MOST_EACH)]
         await until(lambda: len(desk.asked) == 1)
         reply = Reply.model_validate_json(await desk.ask(ASK_JUDGE, canonical(of_agents())))
-        assert not reply.ok and f"{MOST} dry runs wait already" in reply.reasons[0]
+        assert not reply.ok and f"{MOST_EACH} dry runs of agent sysid wait already" in reply.reasons[0]
+        waiting += [ask(agent) for agent in AGENT_NAMES if agent != "sysid"]
         desk.dry.let.set()
-        assert len(await asyncio.gather(*waiting)) == MOST
+        answers = await asyncio.gather(*waiting)
+        assert all(DryRun.model_validate_json(one).would_pass for one in answers)
         assert DryRun.model_validate_json(await desk.ask(ASK_JUDGE, canonical(of_agents()))).would_pass
 
     at_desk(story, tmp_path)

@@ -21,8 +21,9 @@ from gateway.core.alarms import (
     AlarmStatus,
     ShelveAlarm,
 )
-from gateway.core.audit_record import Who
+from gateway.core.audit_record import BEFORE_FIRST, AuditRecord, Who
 from gateway.core.doubts import WORDS, Doubt
+from gateway.core.finding import finding
 from gateway.core.messages import Reply
 from gateway.core.people import LEAST, ForPerson, Person
 from gateway.core.states import OPERATORS_STOP
@@ -36,6 +37,8 @@ from gateway.supervisor.audit import AuditState
 from gateway.supervisor.audit_anchor import NOTHING_YET
 from gateway.supervisor.audit_file import AuditUnavailable
 from gateway.supervisor.persons_desk import PersonsDesk
+from gateway.supervisor.said_inbox import OF_DECISIONS
+from gateway.supervisor.store import boot_id
 from tests.unit.alarm_support import RECORDING, bus, span, state_event, status
 from tests.unit.supervisor_support import short_folder
 
@@ -49,6 +52,9 @@ CASES: dict[str, tuple[GatewayStatus, str]] = {
     "drive-fault": (status(spans=[span(1), span(2, drive="STO")]), "drive of roller-2: STO"),
     "load-cell": (status(spans=[span(1, quality="STALE")]), "span 1 zone-1: STALE"),
     "loop-lost": (status(LOST), "no telemetry for 1.5 s"),
+    "false-loop": (
+        status({"false_loop": [finding("false-loop-answered", command="stop")]}), "what answered is not the line's loop"
+    ),
     "torque-at-limit": (status({"saturated": True}), "roller-1 at 5.0 Nm; allowed: 20 Nm"),
     "tension-out-of-band": (
         status(spans=[span(1), span(2, tension_n=61.0, setpoint_n=55.0)]),
@@ -70,6 +76,10 @@ CASES: dict[str, tuple[GatewayStatus, str]] = {
             task="gate", error="KeyError", text="'x'", since_wall_s=1.0, times=3, in_a_row=3,
         )]),
         "gate: KeyError: 'x'",
+    ),
+    "unexplained-change": (
+        status(unexplained=[finding("configuration-unexplained", configuration="c0ffee", epoch=7)]),
+        "the loop runs configuration c0ffee, epoch 7",
     ),
 }  # fmt: skip
 
@@ -307,16 +317,20 @@ class Desk:
         self.now_s, self.wall_ahead_s = 1000.0, 1_700_000_000.0
         self.records = list[tuple[str, str, Mapping[str, Any]]]()
         self.notes = list[tuple[str, str]]()
+        self.shelved = list[AuditRecord]()
         self.audit_open = True
         self.begin()
 
     def begin(self) -> None:
         self.mailbox = UnixMailbox()
         self.alarms = Alarms(
-            self.mailbox, self.folder, self.append, lambda kind, text: self.notes.append((kind, text)),
-            lambda: self.now_s, lambda: self.now_s + self.wall_ahead_s,
+            self.mailbox, self.folder, self.append, self.note,
+            lambda: self.now_s, lambda: self.now_s + self.wall_ahead_s, self.shelvings,
         )  # fmt: skip
         PersonsDesk(self.mailbox, self._none, self._none, self.alarms.say, self.append, lambda: 0.0)
+
+    def note(self, kind: str, text: str, **_: object) -> None:
+        self.notes.append((kind, text))
 
     async def _none(self, *_: object) -> Reply:
         raise AssertionError
@@ -325,6 +339,17 @@ class Desk:
         if not self.audit_open:
             raise AuditUnavailable("the disk is full")
         self.records.append((kind, who.name, what))
+        record = AuditRecord(
+            sequence=len(self.records), wall_s=self.now_s + self.wall_ahead_s, monotonic_s=self.now_s, boot=boot_id(),
+            kind=kind, who=who, what=dict(what), previous=BEFORE_FIRST,
+        )  # fmt: skip
+        self.shelved += [record] if kind == "shelved" else []
+
+    async def shelvings(self) -> list[AuditRecord] | None:
+        return self.shelved if self.audit_open else None
+
+    def keep(self) -> None:
+        asyncio.run(self.alarms.keep())
 
     def look(self, found: GatewayStatus, seconds: float = 0.25) -> None:
         for _ in range(round(4 * seconds)):
@@ -467,11 +492,54 @@ def test_a_gateway_that_begins_anew_knows_what_was_seen_and_shelved(desk: Desk) 
     desk.ask(AcknowledgeAlarm(alarm="device-absent"))
     desk.ask(ShelveAlarm(alarm="load-cell", for_s=600.0, because="being mended"))
     desk.begin()
+    desk.keep()
     desk.now_s += 10.0
     desk.look(status(buses=[bus(["a"])], spans=[span(1, quality="BAD")]))
     told = {one.name: one for one in desk.listed()}
     assert told["device-absent"].acknowledged and not told["load-cell"].acknowledged
     assert abs((told["load-cell"].shelved_until_wall_s or 0.0) - 1_700_001_600.0) < 1.0
+
+
+def written(desk: Desk, **shelved_until_s: float) -> None:
+    """As whoever may write the folder can write it."""
+    names = {name.replace("_", "-"): at_s for name, at_s in shelved_until_s.items()}
+    said = {"format": 1, "acknowledged": {}, "boot": boot_id(), "shelved_until_s": names}
+    wall = {name: at_s + desk.wall_ahead_s for name, at_s in names.items()}
+    (desk.folder / FILE_NAME).write_text(json.dumps({**said, "shelved_until_wall_s": wall}))
+
+
+def silent(desk: Desk) -> dict[str, float]:
+    """Alarms on the shelf, and until when."""
+    return {one.name: one.shelved_until_wall_s - desk.wall_ahead_s for one in desk.listed() if one.shelved_until_wall_s}
+
+
+def test_what_no_record_has_put_on_the_shelf_is_not_silent_after_a_restart_and_told(desk: Desk) -> None:
+    desk.ask(ShelveAlarm(alarm="load-cell", for_s=600.0, because="being mended"))
+    desk.ask(ShelveAlarm(alarm="drive-fault", for_s=600.0, because="being mended"))
+    desk.ask(ShelveAlarm(alarm="drive-fault", for_s=0.0, because="done"))
+    written(desk, load_cell=desk.now_s + 28_000.0, device_absent=desk.now_s + 600.0, drive_fault=desk.now_s + 600.0)
+    desk.begin()
+    desk.keep()
+    assert silent(desk) == pytest.approx({"load-cell": 1600.0})  # for as long as it is on record
+    told = [text for kind, text in desk.notes if kind == "alarm-not-shelved"]
+    assert len(told) == 3 and all(name in " ".join(told) for name in ("load-cell", "device-absent", "drive-fault"))
+    desk.begin()
+    desk.keep()  # told once: the file says now what is on record
+    assert len([kind for kind, _ in desk.notes if kind == "alarm-not-shelved"]) == 3
+    assert silent(desk) == pytest.approx({"load-cell": 1600.0}, abs=1.0)
+
+
+def test_until_the_records_can_be_read_nothing_is_silent_and_nothing_is_forgotten(desk: Desk) -> None:
+    desk.ask(ShelveAlarm(alarm="load-cell", for_s=600.0, because="being mended"))
+    desk.audit_open = False
+    for _ in range(2):  # and again, before the audit is there
+        desk.begin()
+        desk.keep()
+        desk.now_s += 10.0
+        assert not silent(desk)
+    desk.audit_open = True
+    desk.keep()
+    assert silent(desk) == pytest.approx({"load-cell": 1600.0}, abs=1.0) and not desk.notes
 
 
 @pytest.mark.parametrize("jump_s", [1e9, -1e9, 3600.0, -3600.0])
@@ -481,6 +549,7 @@ def test_a_clock_that_is_set_while_the_gateway_is_down_keeps_what_is_shelved_as_
     desk.ask(ShelveAlarm(alarm="load-cell", for_s=600.0, because="being mended"))
     desk.wall_ahead_s += jump_s
     desk.begin()
+    desk.keep()
     for passed_s, shelved in ((590.0, True), (20.0, False)):
         desk.now_s += passed_s
         desk.look(status(spans=[span(1, quality="BAD")]))
@@ -496,11 +565,34 @@ def test_a_file_that_is_none_lets_alarms_come_again_and_none_be_silent_for_long(
     with short_folder() as folder:
         (folder / FILE_NAME).write_bytes(content)
         desk = Desk(folder)
+        desk.keep()
         desk.look(ABSENT)
         told = {one.name: one for one in desk.listed()}
         assert not told.pop("device-absent").acknowledged
         for one in told.values():
             assert (one.shelved_until_wall_s or 0.0) <= 1_700_000_000.0 + 1000.0 + LONGEST_SHELVED_S
+
+
+def test_whoever_says_without_end_what_is_of_alarms_fills_no_audit(desk: Desk) -> None:
+    said = ALARM_SAID.dump_json(ShelveAlarm(alarm="load-cell", for_s=60.0, because="x"))
+
+    async def flood() -> list[Reply]:
+        asking = UnixMailbox()
+        try:
+            await desk.mailbox.listen(desk.folder / "g.sock")
+            asking.connect((GATEWAY_ALARM,), desk.folder / "g.sock")
+            return [
+                Reply.model_validate_json(await asking.request(GATEWAY_ALARM, said, 5.0))
+                for _ in range(3 * round(OF_DECISIONS.at_once))
+            ]
+        finally:
+            await asking.close()
+            await desk.mailbox.close()
+
+    replies = asyncio.run(flood())
+    assert sum(reply.ok for reply in replies) == len(desk.records) == OF_DECISIONS.at_once
+    assert {one.code for reply in replies for one in reply.findings} == {"inbox-rate"}
+    assert 0 < len([kind for kind, _ in desk.notes if kind == "said-of-alarms"]) <= 10
 
 
 def test_where_the_file_cannot_be_written_it_is_told(desk: Desk) -> None:

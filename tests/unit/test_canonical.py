@@ -14,9 +14,10 @@ from gateway.core.controller import canonical, config_hash, parse_controller
 from gateway.core.deployment import Region
 from gateway.core.line_model import canonical as canonical_model
 from gateway.core.line_model import model_hash, parse_model
-from gateway.loop.kept import FILE, Durable, Store
+from gateway.loop.kept import FILE, Durable
 from gateway.supervisor.configurations import Origin, begin_configurations
 from gateway.supervisor.store_writer import StoreWriter
+from tests.support.gateway_key import store_of
 from tests.unit.deployer_support import FIRST, LINE
 from tests.unit.model_support import model as fitted
 
@@ -85,7 +86,7 @@ def test_a_model_with_a_negative_zero_has_the_hash_of_the_one_with_zero() -> Non
 
 def test_what_was_kept_by_an_earlier_version_is_still_what_the_loop_starts_with(tmp_path) -> None:
     one, formerly = negative_zero()
-    store = Store(tmp_path, one)
+    store = store_of(tmp_path, one)
     store.write(Durable(3, one, Region()))
     content = json.loads((tmp_path / FILE).read_text())
     (tmp_path / FILE).write_text(json.dumps({**content, "started_with": formerly}))

@@ -34,6 +34,7 @@ from gateway.supervisor.configurations import FILE_NAME, Origin, begin_configura
 from gateway.supervisor.historian import Historian
 from gateway.supervisor.recent import SETTLE_S, WINDOW_S
 from gateway.supervisor.service import Gateway
+from tests.support.gateway_key import to_loop_over
 from tests.unit.supervisor_support import frame_of, line_of, until
 
 LINE = line_of(2)
@@ -73,7 +74,8 @@ class OneProcess:
         self.mailbox, self.loop = InProcessMailbox(hub), InProcessMailbox(hub)
         clock, wall_clock = lambda: self.now_s, lambda: 1.8e9 + self.now_s
         kept = historian(folder, line.site, line.line, line.n, clock=clock, wall_clock=wall_clock)
-        Gateway(line, InProcessMailbox(hub), kept, Counters(), clock=clock, wall_clock=wall_clock)
+        to_loop = to_loop_over(InProcessMailbox(hub), line, clock)
+        Gateway(line, InProcessMailbox(hub), to_loop, kept, Counters(), clock=clock, wall_clock=wall_clock)
         self.loop.serve(GATEWAY_PROPOSE, self._propose)
         self.loop.serve(GATEWAY_PROPOSALS, self._proposals)
         with begin_configurations(folder / FILE_NAME) as store:

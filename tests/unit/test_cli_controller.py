@@ -74,8 +74,8 @@ def test_names_and_wires_are_no_reason_for_another_controller(tmp_path: Path) ->
 def test_what_does_not_change_the_design_is_no_news(tmp_path: Path) -> None:
     path, _ = kept_controller(line(), tmp_path)
     before = path.read_bytes()
-    wider = line(("tension_max_n = 60.0", "tension_max_n = 61.0"))
-    assert kept_controller(wider, tmp_path) == (path, "")
+    later = line(("stop_time_s = 10.0", "stop_time_s = 11.0"))
+    assert kept_controller(later, tmp_path) == (path, "")
     assert path.read_bytes() == before
     assert sorted(file.name for file in tmp_path.iterdir()) == [CONTROLLER, SOURCE]
 

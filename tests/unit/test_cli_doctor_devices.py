@@ -24,8 +24,10 @@ from tests.protocol.driver_support import line
 LINE = line(2)  # rated 80 Nm, limits.torque_nm 60, watchdog_s 0.1, cells of 100 N
 FITS = Identity("vendor 1", "vendor 1", fits=True)
 WATCHDOG = WatchdogFacts(Number(0.0), 0.01, 0.2)
-DRIVE = DriveFacts(Number(0x250), PowerState.SWITCH_ON_DISABLED, False, "", Number(80.0), Number(80.0))
-CELL = CellFacts((20.0, 20.1, 19.9), "", True)
+DRIVE = DriveFacts(
+    Number(0x250), PowerState.SWITCH_ON_DISABLED, False, "", Number(80.0), Number(80.0), True, Number(0.0), 10
+)
+CELL = CellFacts((0.1, 0.2, 0.0), "", True)
 PLC = PlcFacts("", permissive=True, speed_m_per_s=Number(0.0))
 
 
@@ -48,7 +50,9 @@ def plc_checks(plc: PlcFacts) -> dict[str, Verdict]:
 
 def test_a_drive_at_rest_is_fine() -> None:
     assert {check.verdict for check in drive_checks().values()} == {"OK"}
-    assert set(drive_checks()) == {"identity", "watchdog", "rated torque", "max torque", "state"}
+    assert set(drive_checks()) == {"identity", "watchdog", "rated torque", "max torque", "state", "power", "mode"}
+    assert "power" not in drive_checks(DRIVE._replace(supplied=False, safe_torque_off=True)), "STO takes it off, too"
+    assert "mode" not in drive_checks(DRIVE._replace(mode_wanted=None)), "it has but one"
 
 
 @pytest.mark.parametrize(
@@ -65,12 +69,28 @@ def test_a_drive_at_rest_is_fine() -> None:
         (DRIVE._replace(rated_torque_nm=Number(None, "aborted")), "rated torque", "FAIL", "aborted"),
         (DRIVE._replace(max_torque_nm=Number(60.0)), "max torque", "OK", "60 Nm"),
         (DRIVE._replace(max_torque_nm=Number(59.0)), "max torque", "FAIL", "59 Nm"),
+        (DRIVE._replace(supplied=False), "power", "warning", "has no power"),
+        (DRIVE._replace(mode=Number(10.0)), "mode", "OK", "10"),
+        (DRIVE._replace(mode=Number(8.0)), "mode", "warning", "8"),
+        (DRIVE._replace(mode=Number(None, "aborted")), "mode", "FAIL", "aborted"),
     ],
 )
 def test_a_drive(drive: DriveFacts, name: str, verdict: Verdict, says: str) -> None:
     check = drive_checks(drive)[name]
     assert check.verdict == verdict and says in check.measured
     assert bool(check.todo) == (verdict != "OK")
+
+
+@pytest.mark.parametrize(
+    ("drive", "name", "key"),
+    [
+        (DRIVE._replace(supplied=None), "power", "voltage_enabled"),
+        (DRIVE._replace(mode=None), "mode", "mode_displayed"),
+    ],
+)
+def test_what_a_map_does_not_say_is_told_as_not_seen(drive: DriveFacts, name: str, key: str) -> None:
+    check = drive_checks(drive)[name]
+    assert check.verdict == "skipped" and "cannot be seen" in check.measured and key in check.measured
 
 
 @pytest.mark.parametrize(
@@ -91,16 +111,18 @@ def test_a_watchdog(watchdog: WatchdogFacts, verdict: Verdict, says: str) -> Non
 @pytest.mark.parametrize(
     ("cell", "verdict", "says"),
     [
-        (CELL, "OK", "20.00 N, spread 0.082 N over 3 readings"),
-        (CELL._replace(counter_moves=None), "OK", "20.00 N"),
+        (CELL, "OK", "0.10 N, spread 0.082 N over 3 readings"),
+        (CELL._replace(counter_moves=None), "OK", "0.10 N"),
         (CELL._replace(counter_moves=False), "FAIL", "stands still"),
         (CELL._replace(samples_n=(20.0, 20.0, 20.0)), "warning", "always the same"),
-        (CELL._replace(samples_n=(100.0, 99.9)), "OK", "99.95 N"),
+        (CELL._replace(samples_n=(100.0, 99.9)), "warning", "99.95 N"),
         (CELL._replace(samples_n=(100.1, 99.9)), "FAIL", "100.00 N"),
         (CELL._replace(samples_n=(-100.1, -99.9)), "FAIL", "-100.00 N"),
-        (CELL._replace(samples_n=(-5.1, -5.2)), "warning", "below zero"),
-        (CELL._replace(samples_n=(-4.9, -4.8)), "OK", "-4.85 N"),
-        (CELL._replace(samples_n=(10.0, 15.0)), "warning", "restless"),
+        (CELL._replace(samples_n=(-3.1, -3.2)), "warning", "a slack web shows at most 2.9 N"),
+        (CELL._replace(samples_n=(3.1, 3.2)), "warning", "a slack web shows at most 2.9 N"),
+        (CELL._replace(samples_n=(-2.8, -2.7)), "OK", "-2.75 N"),
+        (CELL._replace(samples_n=(3.4, 2.8)), "OK", "3.10 N"),  # its noise leaves it open
+        (CELL._replace(samples_n=(0.0, 5.0)), "warning", "restless"),
         (CELL._replace(trouble="overload"), "FAIL", "at times: overload"),
         (CellFacts((), "wire break", True), "FAIL", "wire break"),
         (None, "FAIL", "not read"),
@@ -174,3 +196,14 @@ def test_the_load_is_what_check_computes_and_what_others_send(foreign: float, ve
     assert bus_load(LINE, BUS) < 0.02
     (load,) = (check for check in bus_checks(replace(HEARD, foreign_load=foreign)) if check.name == "load")
     assert load.verdict == verdict
+
+
+def test_a_drive_is_held_against_the_torque_limit_of_its_own_roller() -> None:
+    item = LINE.drives[0]
+    rollers = [roller.model_copy(update={"torque_nm": 20.0}) if i == item.roller else roller
+               for i, roller in enumerate(LINE.rollers, 1)]  # fmt: skip
+    own = LINE.model_copy(update={"rollers": rollers})
+    for most_nm, verdict in ((20.0, "OK"), (19.0, "FAIL")):
+        facts = DeviceFacts(item.name, "node 1", drive=DRIVE._replace(max_torque_nm=Number(most_nm)))
+        (check,) = (check for check in of_device(own, item, facts) if check.name == "max torque")
+        assert check.verdict == verdict and f"rollers[{item.roller}].torque_nm" in check.wanted

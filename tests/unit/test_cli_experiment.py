@@ -12,13 +12,14 @@ from gateway.cli.experiment_run import follow_on
 from gateway.cli.main import app
 from gateway.core.experiment import Abort, Experiment, Leg, parse_experiment
 from gateway.core.line_template import line_template
-from gateway.core.messages import AbortExperiment
+from gateway.core.messages import AbortExperiment, parse_command
 from gateway.core.status import EventStatus, GatewayStatus
 from gateway.loop.pacer import Tick
 from gateway.loop.runner import Runner
 from gateway.mailbox.port import Unreachable
 from tests.closed_loop.conftest import stepped
 from tests.closed_loop.test_experiment import producing
+from tests.support.gateway_key import door_of, signer_of
 
 EXAMPLE = Path("docs/examples/experiment.json")
 SHORT = Experiment(
@@ -92,14 +93,19 @@ def test_a_loop_that_is_gone_and_an_end_that_is_never_told_are_said():
 
 def test_the_loops_socket_takes_an_experiment_as_json():
     loop = producing()
-    payload = json.dumps({"command": "experiment", "experiment": json.loads(EXAMPLE.read_text())}).encode()
+    given = json.dumps({"command": "experiment", "experiment": json.loads(EXAMPLE.read_text())}).encode()
+    command = parse_command(given)
 
     async def story():
         runner = Runner(loop.cycle)
-        answer = asyncio.ensure_future(runner.command(payload))
-        await asyncio.sleep(0)
-        await runner.period(Tick(loop.now_s + 0.01, loop.now_s + 0.01, 0))
-        return json.loads(await answer)
+        door = door_of(runner, loop.line, loop.cycle.clock)
+        payload = signer_of(loop.line, loop.cycle.clock).sealed(command, door.nonce)
+        answer = asyncio.ensure_future(door.command(payload))
+        while not answer.done():
+            await runner.period(Tick(loop.now_s + 0.01, loop.now_s + 0.01, 0))
+            await asyncio.sleep(0.001)
+        door.close()
+        return json.loads(answer.result())
 
     reply = asyncio.run(story())
     assert reply["ok"], reply

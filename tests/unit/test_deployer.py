@@ -103,7 +103,7 @@ async def test_an_answer_that_does_not_come_is_asked_for_later():
     await gateway.propose(one)
     loop, tell = gateway.loop, gateway.loop.tell
 
-    async def silent(command):
+    async def silent(command, grounds=None):
         loop.answers = command.command != "deploy"
         return await tell(command)
 

@@ -92,7 +92,7 @@ async def test_a_loop_that_could_not_be_told_has_not_taken_it():
     await gateway.propose(one)
     tell = gateway.loop.tell
 
-    async def gone(command):
+    async def gone(command, grounds=None):
         gateway.loop.reachable = command.command != "deploy"
         return await tell(command)
 
@@ -148,7 +148,7 @@ async def test_a_second_keep_that_is_refused_because_the_first_was_done_late_tak
     gateway.loop.predictive.add(gateway.loop.runs)
     runs, tell, told = gateway.loop.runs, gateway.loop.tell, []
 
-    async def late(command):
+    async def late(command, grounds=None):
         if command.command != "keep":
             return await tell(command)
         told.append(command)
@@ -208,7 +208,7 @@ async def test_what_is_on_the_line_and_could_not_be_recorded_is_not_called_not_c
     await gateway.propose(one)
     tell = gateway.loop.tell
 
-    async def disk_full_after(command):
+    async def disk_full_after(command, grounds=None):
         reply = await tell(command)
         if command.command == "deploy":
             gateway.audit.available = False

@@ -60,7 +60,7 @@ async def test_who_asks_for_what_was_before_without_end_is_heard_and_fills_no_di
     gateway.loop.restart()
     told, tell = [], gateway.loop.tell
 
-    async def counted(command):
+    async def counted(command, grounds=None):
         told.append(command.command)
         assert not gateway.deployer._records.one_step.locked()  # noqa: SLF001 (the gateway goes on looking)
         return await tell(command)

@@ -18,6 +18,7 @@ from gateway.core.line_template import line_template
 from gateway.core.messages import (
     MAX_COMMAND,
     MAX_DEPLOYMENT,
+    MOST_KEYS,
     AskConfiguration,
     Deploy,
     Keep,
@@ -81,6 +82,14 @@ def test_what_is_too_long_packed_or_not_is_refused_before_it_is_read():
         parse_command(zlib.compress(b" " * (MAX_DEPLOYMENT + 1)))
     with pytest.raises(MalformedMessage, match="cut off"):
         parse_command(command_bytes(Deploy(deployment=deployment(20)))[:-20])
+
+
+def test_an_object_with_more_keys_than_any_command_has_is_refused_before_it_is_looked_at():
+    pairs = ",".join(f'"k{number}":0' for number in range(100_000))
+    with pytest.raises(MalformedMessage, match=f"100001 keys; allowed: {MOST_KEYS}"):
+        parse_command(zlib.compress(f'{{"command":"stop",{pairs}}}'.encode()))
+    with pytest.raises(MalformedMessage, match=r"^key given twice: a, b$"):
+        parse_command(b'{"command":"stop","b":0,"a":0,"b":1,"a":2,"c":3}')
 
 
 def test_only_deployments_may_be_packed():

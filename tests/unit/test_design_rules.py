@@ -1,6 +1,9 @@
-"""Weights by rule: today's at 10 ms, margins and stability from 1 to 20 ms on random plants, monotone in between."""
+"""Weights by rule: today's at 10 ms, margins and stability from 1 to 20 ms on random plants, monotone in between.
 
-from dataclasses import astuple
+And of lines of every size: the same law in other units, and no more torque from encoders' noise than its share.
+"""
+
+from dataclasses import astuple, replace
 from itertools import pairwise
 
 import numpy as np
@@ -24,13 +27,17 @@ from gateway.control.design import (
     margins,
     mpc_weights,
     require_margin,
+    task_of,
     without_disturbances,
 )
 from gateway.control.design.margins import LEAST_DELAY_MARGIN_S
 from gateway.control.design.mpc import HORIZON_S, default_blocks
-from gateway.control.design.weights import LET_GO_S, STOOD_BEYOND_S, stood_s
+from gateway.control.design.weights import LET_GO_S, STOOD_BEYOND_S, encoder_bandwidth, stood_s
 from gateway.control.mpc_problem import MpcProblem
 from gateway.control.rollout import Course, Setup, plants_of, simulate, simulate_slowly
+from gateway.core.line_file import load_line
+from gateway.core.line_template import line_template
+from gateway.core.theta import NOISE_SHARE
 from gateway.core.web_model import WebModel
 from tests.unit.control_support import model
 
@@ -148,3 +155,74 @@ def test_cheap_common_torque_nearly_halves_the_offset_of_friction_that_is_wrong_
     setup = Setup(0.01, 0.01, 10, 60.0, 1000.0)
     cheap, plain = (simulate(design_lqr(asked, w), plants, course, setup) for w in (None, LqrWeights()))
     assert cheap.rmse_n[0] < 0.6 * plain.rmse_n[0]
+
+
+def scaled(theta, length=1.0, tension=1.0, inertia=1.0):
+    """The same line with lengths, tensions and inertias so many times as large: J as m R^2, friction as T R t."""
+    return WebModel(
+        tension * theta.stiffness_n, length * theta.length_m, length * theta.radius_m,
+        inertia * length**2 * theta.inertia_kg_m2, inertia * length**2 * theta.friction_nms_per_rad,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("draw_spans", [(), (2,)])
+@pytest.mark.parametrize("design", [design_pid, design_lqr, design_lqi])
+@pytest.mark.parametrize(("length", "tension"), [(0.25, 2.0**-9), (4.0, 2.0**-3), (1.0, 2.0**8), (2.0, 2.0**8)])
+def test_a_line_in_other_units_gets_the_same_law(design, length, tension, draw_spans):
+    """Times are the same, so masses are as tension over length; torques are as tension times length."""
+    inertia, torque = tension / length, tension * length
+    noise_m_per_s = 5e-3  # counts: the second weight of three is not the only one tried
+    small = replace(task(), encoder_noise_m_per_s=noise_m_per_s, draw_spans=draw_spans)
+    large = DesignTask(
+        scaled(small.model, length, tension, inertia), small.period_s, small.latency_s, tension * small.tension_n,
+        length * small.unwind_speed_m_per_s, draw_spans,
+        limits=DesignLimits(60.0 * torque, 1000.0 * torque, 2.0 * tension, 60.0 * tension),
+        encoder_noise_m_per_s=length * noise_m_per_s,
+    )  # fmt: skip
+    per_tension, per_speed = torque / tension, torque / length
+    units = np.concatenate((np.full(6, per_tension), np.full(6, per_speed)))
+    of_small, of_large = design(small), design(large)
+    if design is design_pid:
+        expected, found = of_small.gain_proportional, of_large.gain_proportional
+    else:
+        expected, found = of_small.gain_state, of_large.gain_state
+    _same(found, np.array(expected) * units)
+    if design is design_lqi:
+        of_span = np.where(np.isin(np.arange(6), draw_spans), per_speed, per_tension)
+        _same(of_large.gain_integral, np.array(of_small.gain_integral) * of_span)
+
+
+def _same(found, expected):
+    """But for the rounding of the largest gains of each unit."""
+    for columns in (slice(0, 6), slice(6, 12)):
+        of_unit = expected[:, columns]
+        if of_unit.size:
+            close = 1e-8 * np.abs(of_unit).max()
+            assert np.array(found)[:, columns] == pytest.approx(of_unit, rel=1e-6, abs=close)
+
+
+@pytest.mark.parametrize("times", [10.0, 30.0, 100.0, 300.0])
+@pytest.mark.parametrize("design", [design_pid, design_lqr, design_lqi])
+def test_noise_of_encoders_makes_no_more_of_the_torque_than_its_share(design, times):
+    """Independently of the rule: from the gain itself, every roller's noise added up."""
+    for theta in (model(), model(length=0.3), *random_plants(2, 13)):
+        noise_m_per_s = times * 1e-4
+        asked = replace(task(theta), encoder_noise_m_per_s=noise_m_per_s)
+        found = design(asked)
+        gain = np.array(found.gain_proportional if design is design_pid else found.gain_state)[:, 6:]
+        torque_nm = noise_m_per_s * np.linalg.norm(gain, axis=1).max()
+        free = design(replace(asked, encoder_noise_m_per_s=0.0))
+        free_gain = np.array(free.gain_proportional if design is design_pid else free.gain_state)[:, 6:]
+        share = torque_nm / (1000.0 * asked.period_s)
+        assert share < 1.05 * NOISE_SHARE
+        if times == 30.0 and noise_m_per_s * np.linalg.norm(free_gain, axis=1).max() > NOISE_SHARE * 10.0:
+            assert share > 0.5 * NOISE_SHARE  # nor much less; beyond it friction damps the line more than the law does
+        require_margin(margins(found, asked))
+
+
+def test_what_is_expected_of_encoders_comes_from_the_line_and_bounds_no_design_of_the_demonstration():
+    line = load_line(line_template(6), "line.toml")
+    asked = task_of(line)
+    assert asked.encoder_noise_m_per_s == pytest.approx(1e-4)
+    assert encoder_bandwidth(asked) > 100.0
+    assert design_lqi(asked) == design_lqi(replace(asked, encoder_noise_m_per_s=0.0))

@@ -28,13 +28,18 @@ class FakePlant:
     emergency_stop: bool = False
     running: bool = True
     enabled: BoolArray = field(default_factory=lambda: np.ones(N, dtype=np.bool_))
+    local: bool = False
     applied: list[tuple[FloatArray, BoolArray, float, bool, float]] = field(default_factory=list)
+    warned: list[tuple[bool, float]] = field(default_factory=list)
 
     def sample(self, now_s: float) -> "FakePlant":
         return self
 
     def apply(self, torque_nm: FloatArray, enable: BoolArray, speed: float, run: bool, now_s: float) -> None:
         self.applied.append((torque_nm.copy(), enable, speed, run, now_s))
+
+    def warn(self, on: bool, now_s: float) -> None:
+        self.warned.append((on, now_s))
 
 
 def finish(coroutine: Coroutine[Any, Any, None]) -> None:

@@ -7,13 +7,14 @@ import pytest
 
 from gateway.mailbox.bus import BusUnavailable
 from gateway.mailbox.inprocess import Hub, InProcessMailbox
-from gateway.mailbox.port import Counters
+from gateway.mailbox.port import Counters, Unreachable
 from gateway.supervisor.agents_bus import AgentsBus
 from gateway.supervisor.agents_cases import AgentsCases
 from gateway.supervisor.configurations import ConfigurationsError
 from gateway.supervisor.gate import Gate
 from gateway.supervisor.patience import FIRST_WAIT_S, LONGEST_WAIT_S, Patience
 from gateway.supervisor.store_writer import StoreWriter
+from tests.support.gateway_key import to_loop_over
 from tests.unit.deployer_support import LINE, Death, FakeJudge, FakeLoop, FakeSurroundings
 
 LOOK_S, NOW_S = 0.25, 1_795_000_000.0
@@ -64,7 +65,7 @@ def test_a_store_that_could_not_be_reached_is_told_later_what_the_loop_was_start
     async def story() -> None:
         nonlocal locked
         gate = Gate(
-            LINE, InProcessMailbox(Hub()), tmp_path, FakeJudge(),
+            LINE, InProcessMailbox(Hub()), to_loop_over(InProcessMailbox(Hub()), LINE), tmp_path, FakeJudge(),
             lambda configurations, models: FakeSurroundings(FakeLoop(Death())), bench.note, bench.clock, lambda: NOW_S,
         )  # fmt: skip
         try:
@@ -86,6 +87,27 @@ def test_a_store_that_could_not_be_reached_is_told_later_what_the_loop_was_start
             locked = False
             assert await pass_time(LONGEST_WAIT_S) == 1
             assert bench.codes[-1] == "given-stored"
+        finally:
+            await gate.close()
+
+    asyncio.run(story())
+
+
+def test_nothing_is_armed_while_the_gate_is_shut_and_an_arming_waits_for_it_to_open(tmp_path: Path) -> None:
+    bench = Bench()
+
+    async def story() -> None:
+        gate = Gate(
+            LINE, InProcessMailbox(Hub()), to_loop_over(InProcessMailbox(Hub()), LINE), tmp_path, FakeJudge(),
+            lambda configurations, models: FakeSurroundings(FakeLoop(Death())), bench.note, bench.clock, lambda: NOW_S,
+        )  # fmt: skip
+        try:
+            assert [one.code for one in await gate.hold_against_records()] == ["configuration-not-looked-at"]
+            waits = asyncio.create_task(gate.hold_against_records())
+            while gate.deployer is None:
+                await gate.look()
+            with pytest.raises(Unreachable):  # it has asked the loop, and there is none
+                await waits
         finally:
             await gate.close()
 

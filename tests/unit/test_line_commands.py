@@ -135,3 +135,14 @@ def test_every_shipped_map_has_a_role_that_the_line_knows() -> None:
     assert set(known_maps()) >= {"cia402-torque", "loadcell-amp", "line-plc"}
     protocols, roles = ("canopen", "modbus-tcp", "opcua"), ("drive", "load-cell", "line-plc")
     assert {(protocol, role) for protocol, role, _ in known_maps().values()} <= set(product(protocols, roles))
+
+
+def test_check_tells_which_device_maps_name_no_option_code(tmp_path: Path) -> None:
+    path = tmp_path / "line.toml"
+    path.write_text(line_template(), encoding="utf-8")
+    said = run("check", path).output
+    assert "note: no option code says what a watchdog does in device map line-plc (" in said
+    assert "cia402-torque" not in said
+    document = json.loads(run("check", path, "--json").output)
+    (plc,) = document["reaction_unnamed"]
+    assert plc.startswith("line-plc (")

@@ -32,6 +32,7 @@ from gateway.supervisor.configurations import Origin, begin_configurations
 from gateway.supervisor.gate import Gate
 from gateway.supervisor.line_desk import LineDesk
 from gateway.supervisor.models import begin_repository
+from tests.support.gateway_key import to_loop_over
 from tests.unit.deployer_support import FIRST, LINE, Death, FakeJudge, FakeLoop, FakeSurroundings, controller
 
 NOW_S = 1_700_000_000.0
@@ -60,7 +61,7 @@ class Desk:
         self.read = 0
         self.folder = folder
         self.gate = Gate(
-            LINE, InProcessMailbox(self.hub), folder, FakeJudge(),
+            LINE, InProcessMailbox(self.hub), to_loop_over(InProcessMailbox(self.hub), LINE), folder, FakeJudge(),
             lambda configurations, models: FakeSurroundings(FakeLoop(Death())), lambda *_, **__: None, lambda: 1.0,
             lambda: NOW_S,
         )  # fmt: skip

@@ -28,6 +28,21 @@ REFUSED: list[Refused] = [
         "leaves no band; allowed: below limits.tension_max_n, 60 N",
     ),
     (
+        "own_limits_within_common",
+        [("# torque_nm = 40.0 ", "torque_nm = 61.0 ")],
+        "rollers[1].torque_nm",
+        "torque_nm = 61.0",
+        "= 61.0: is more than all drives have in common; allowed: up to limits.torque_nm, 60 Nm, which is the greatest "
+        "of all drives",
+    ),
+    (
+        "own_limits_within_common",
+        [("# tension_max_n = 50.0 ", "tension_max_n = 61.0 ")],
+        "spans[1].tension_max_n",
+        "tension_max_n = 61.0",
+        "= 61.0: is outside of what all spans have in common; allowed: 2 to 60 N, as in [limits]",
+    ),
+    (
         "web_bears_the_tension",
         [("value = 2400.0", "value = 80.0")],
         "web.stiffness_n",
@@ -158,6 +173,14 @@ REFUSED: list[Refused] = [
         "tension_n",
         "at moves.tension_rate_n_per_s (20 N/s) the ramp takes 2 s, limits.tensioning_time_s is 2 "
         "s; allowed: a faster rate, a longer time or lower tensions",
+    ),
+    (
+        "tensioning_is_slow",
+        [("# roller_speed_max_m_per_s = 0.01", "roller_speed_max_m_per_s = 0.02")],
+        "stages.tensioning.roller_speed_max_m_per_s",
+        "roller_speed_max_m_per_s = 0.02",
+        "= 0.02: is too fast for a web that may not be there; allowed: up to 0.012 m/s: a tenth of "
+        "limits.speed_max_m_per_s (0.12 m/s), and at most 0.1 m/s",
     ),
     (
         "tensioning_keeps_the_speed",

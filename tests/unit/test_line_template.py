@@ -61,7 +61,8 @@ def test_every_key_of_the_format_is_in_it_with_its_help() -> None:
         if model in ("Line", "Parameter"):
             continue
         for key, said in keys.items():
-            assert re.search(rf"^(?:# )?{key} = .*# {re.escape(said)}$", text, re.MULTILINE), f"{model}.{key}"
+            entry = rf"^(?:(?:# )?{key} = .*|\[{model.lower()}\.{key}\]  )# {re.escape(said)}$"
+            assert re.search(entry, text, re.MULTILINE), f"{model}.{key}"
 
 
 def test_every_key_of_the_format_has_its_help() -> None:

@@ -2,9 +2,12 @@
 
 from gateway.core.messages import Event
 from gateway.core.states import Phase
+from gateway.core.telemetry import Frame, unpack
+from gateway.core.topics import LOOP_EVENT
 from gateway.loop.machine import Machine
 from gateway.loop.voice import Voice
 from safety.actions import Action, Finding, found
+from tests.unit.supervisor_support import frame_of
 
 WHY = found("part-failed", Action.STOP, part="the lease", error="ValueError: 1.5")
 IN_WORDS = Finding("slack", Action.TORQUE_OFF, "tension 1 is 0.5 N")
@@ -40,3 +43,43 @@ def test_what_led_to_a_stop_is_told_until_the_line_is_armed_again():
 def test_what_a_person_wanted_and_what_is_in_words_only_has_no_code():
     assert told((Phase.SLOWING, []), (Phase.OFF, [])) == [[], []]
     assert told((Phase.SLOWING, [IN_WORDS, WHY])) == [["part-failed"]]
+
+
+class Deaf(Heard):
+    """Where no gateway is, until there is one."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.is_there = False
+
+    def publish(self, topic: object, payload: bytes) -> bool:
+        if self.is_there and topic is LOOP_EVENT:
+            super().publish(topic, payload)
+        return self.is_there
+
+
+def test_what_was_found_at_the_start_is_told_once_there_is_a_gateway_and_then_no_more():
+    mailbox = Deaf()
+    voice = Voice(mailbox, [], 0.1)
+    voice.tell_start("configuration-set-aside", "not signed", findings=[WHY])
+    voice.tell_start("start", "loop of demo/line")
+    frames = [frame(k) for k in range(40)]
+    for one in frames[:20]:
+        voice.record(one)
+    assert not mailbox.events
+    mailbox.is_there = True
+    for one in frames[20:]:
+        voice.record(one)
+    assert [event.kind for event in mailbox.events] == ["configuration-set-aside", "start"]
+    assert [one.code for one in mailbox.events[0].findings] == ["part-failed"]
+
+
+def test_where_a_gateway_is_there_it_is_told_at_once():
+    mailbox = Deaf()
+    mailbox.is_there = True
+    Voice(mailbox, [], 0.1).tell_start("start", "loop of demo/line")
+    assert [event.kind for event in mailbox.events] == ["start"]
+
+
+def frame(sequence: int) -> Frame:
+    return unpack(frame_of(sequence, 1.0 + sequence, spans=2))

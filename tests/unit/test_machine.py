@@ -52,6 +52,25 @@ def test_from_arming_to_running():
     assert advance(TIMES, machine, FINE, 4.0).phase is Phase.RUNNING
 
 
+def test_a_warning_comes_before_the_drives_take_over():
+    times = replace(TIMES, warning_s=3.0)
+    warning = Machine(Phase.WARNING, 1.0)
+    assert warning.state is LoopState.READY
+    assert advance(times, warning, FINE, 3.9).phase is Phase.WARNING
+    assert advance(times, warning, FINE, 4.0).phase is Phase.ENABLING
+    against = advance(times, warning, replace(FINE, not_startable="roller 2 turns"), 4.0)
+    assert against.phase is Phase.READY and "roller 2 turns" in against.reason
+    assert stop(warning, 2.0, "operator's stop").phase is Phase.OFF
+
+
+def test_web_that_is_taken_up_has_its_own_time():
+    slack = replace(FINE, tensioned=False, taking_up_s=30.0)
+    tensioning = Machine(Phase.TENSIONING)
+    assert advance(TIMES, tensioning, slack, 49.9).phase is Phase.TENSIONING
+    over = advance(TIMES, tensioning, slack, 50.1)
+    assert over.phase is Phase.SLOWING and "within 50 s" in over.reason
+
+
 def test_a_drive_that_does_not_become_ready_refuses_the_arming():
     unready = replace(FINE, not_ready="drive-3 STO")
     assert after(Phase.ARMING, unready, ARMING_TIME_S).phase is Phase.ARMING
@@ -69,7 +88,19 @@ def test_nothing_but_a_finding_leads_out_of_a_lasting_phase(phase, seen):
 
 @pytest.mark.parametrize("phase", [phase for phase in Phase if phase not in LASTING])
 def test_every_other_phase_ends_by_itself(phase):
-    assert after(phase, replace(FINE, torque_zero=True), 1e6) != Machine(phase)
+    assert after(phase, replace(FINE, torque_zero=True, drilled="every watchdog reacts"), 1e6) != Machine(phase)
+
+
+def test_a_proof_of_the_wiring_ends_with_torque_off_and_no_production() -> None:
+    begun = Machine(Phase.ENABLING, proves=True)
+    proving = advance(TIMES, begun, FINE, 0.0)
+    assert (proving.phase, proving.state) == (Phase.PROVING, LoopState.RUN)
+    over = advance(TIMES, proving, replace(FINE, proved="a load cell is inverted"), 0.0)
+    assert (over.phase, over.reason, over.proves) == (Phase.UNLOADING, "a load cell is inverted", False)
+    for way in (stop, torque_off):
+        assert way(proving, 1.0, "why").phase is Phase.UNLOADING
+    late = advance(replace(TIMES, proving_s=5.0), proving, FINE, 5.1)
+    assert late.phase is Phase.UNLOADING and "could not be proved within 5 s" in late.reason
 
 
 def test_a_web_that_cannot_be_tensioned_stops_the_line():
@@ -104,6 +135,48 @@ def test_what_makes_tension_control_pointless_ends_the_slowing(seen):
 def test_slowing_ends_when_its_time_is_up():
     assert after(Phase.SLOWING, FINE, 10.0).phase is Phase.SLOWING
     assert after(Phase.SLOWING, FINE, 10.01).phase is Phase.UNLOADING
+
+
+BRAKES = replace(TIMES, braking_s=12.0)
+
+
+@pytest.mark.parametrize("phase", [Phase.RUNNING, Phase.HOLDING, Phase.SLOWING])
+def test_a_web_break_is_braked_and_then_torque_goes_off(phase):
+    torn = replace(FINE, action=Action.BRAKE, reason="torn", braked=False)
+    machine = advance(BRAKES, Machine(phase), torn, 1.0)
+    assert (machine.phase, machine.reason, machine.state) == (Phase.BRAKING, "torn", LoopState.STOP)
+    # What was found goes on, and less is found beside it: neither begins anything anew.
+    assert advance(BRAKES, machine, torn, 2.0) == machine
+    assert advance(BRAKES, machine, replace(torn, action=Action.STOP, plc_answers=False), 2.0) == machine
+    assert advance(BRAKES, machine, replace(torn, braked=True), 3.0).phase is Phase.UNLOADING
+    assert advance(BRAKES, machine, replace(torn, action=Action.NONE), 13.1).phase is Phase.UNLOADING
+
+
+@pytest.mark.parametrize(
+    ("seen", "at_s"),
+    [(replace(FINE, feedback=False), 0.1), (replace(FINE, plc_answers=False), 0.1), (FINE, 10.01)],
+)
+def test_what_is_fast_when_tension_control_cannot_go_on_is_braked(seen, at_s):
+    def slowing(times, seen):
+        return advance(times, Machine(Phase.SLOWING, reason="why"), seen, at_s)
+
+    machine = slowing(BRAKES, replace(seen, fast=True))
+    assert (machine.phase, machine.reason) == (Phase.BRAKING, "why")
+    # Where it creeps or stands, and where no drive may brake, torque goes off as before.
+    assert slowing(BRAKES, seen).phase is Phase.UNLOADING
+    assert slowing(BRAKES, replace(seen, fast=True, standstill=True)).phase is Phase.UNLOADING
+    assert slowing(TIMES, replace(seen, fast=True)).phase is Phase.UNLOADING
+
+
+def test_what_takes_torque_off_ends_the_braking():
+    off = replace(FINE, action=Action.TORQUE_OFF, reason="emergency stop", braked=False)
+    assert advance(BRAKES, Machine(Phase.BRAKING), off, 1.0).phase is Phase.UNLOADING
+
+
+@pytest.mark.parametrize(("times", "phase"), [(TIMES, Phase.RUNNING), (BRAKES, Phase.TENSIONING)])
+def test_without_brakes_or_speed_a_web_break_takes_torque_off_at_once(times, phase):
+    torn = replace(FINE, action=Action.BRAKE, reason="torn", braked=False)
+    assert advance(times, Machine(phase), torn, 1.0).phase is Phase.UNLOADING
 
 
 @given(st.sampled_from(list(Phase)), st.sampled_from([Action.STOP, Action.TORQUE_OFF]), st.floats(0, 1e4))

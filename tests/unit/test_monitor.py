@@ -70,7 +70,7 @@ def test_a_torque_that_is_cut_in_half_of_the_window():
 def test_limits_follow_the_lines_period_and_rate():
     assert monitor_limits(LINE) == MonitorLimits(n=6, reversal_nm=5.0, window=50, reversals=15, cuts=25)
     slow = LINE.model_copy(update={"control": LINE.control.model_copy(update={"period_s": 0.1})})
-    assert monitor_limits(slow) == MonitorLimits(n=6, reversal_nm=50.0, window=10, reversals=3, cuts=5)
+    assert monitor_limits(slow) == MonitorLimits(n=6, reversal_nm=50.0, window=28, reversals=9, cuts=14)
 
 
 def test_what_is_said_names_roller_count_and_limit_and_stops_nothing_by_itself():

@@ -22,7 +22,7 @@ from gateway.identification.structure_choice import _known  # pyright: ignore[re
 from gateway.identification.whiteness import strongest_line
 from gateway.loop.experiment import ExperimentRun
 from gateway.loop.setpoints import Setpoints
-from gateway.loop.standstill import STILL_S, Standstill
+from gateway.loop.standstill import Standstill
 from safety.limits import envelope_limits
 from tests.closed_loop.recorded import demonstration_line
 from tests.unit.deployer_gateway import run, started
@@ -110,7 +110,7 @@ def test_a_line_in_innovations_that_are_no_numbers_is_none() -> None:
 
 
 def experiment_run() -> tuple[ExperimentRun, Inputs]:
-    setpoints, inputs = Setpoints(LINE.recipes[0]), Inputs(LINE.n)
+    setpoints, inputs = Setpoints(LINE.recipes[0], 0.02), Inputs(LINE.n)
     setpoints.begin_at(np.array(LINE.recipes[0].tension_n))
     asked = Experiment(
         format=1, amplitude_n=[1.0] * LINE.n, dwell_s=0.1, legs=[Leg(duration_s=1.0)], abort=Abort(deviation_n=8.0)
@@ -137,11 +137,11 @@ def test_an_experiment_ends_where_a_tension_is_no_number(span: int) -> None:
 
 @given(st.integers(0, LINE.n))
 def test_what_moves_at_no_known_speed_does_not_stand_still(which: int) -> None:
-    inputs, still = Inputs(LINE.n), Standstill(0.01)
+    inputs, still = Inputs(LINE.n), Standstill(LINE, 0.002, 30)
     inputs.unwind_speed.put(0, 0.0, 0.0)
     for i in range(LINE.n):
         inputs.speed.put(i, 0.0, 0.0)
-    periods = round(STILL_S / 0.01) + 1
+    periods = 31
     assert [still.look(inputs, asked=False) for _ in range(periods)][-1]
     (inputs.speed.value if which < LINE.n else inputs.unwind_speed.value)[which % LINE.n] = nan
     assert inputs.speed.quality[0] == Quality.GOOD and not still.look(inputs, asked=False)

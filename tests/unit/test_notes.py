@@ -50,7 +50,7 @@ def test_each_note_says_which_questions_it_answers(notes: list[Note]) -> None:
         ("# A title\n" + HEAD + "+++\ntext", "head between two lines"),
         (HEAD + "text", "head between two lines"),
         (HEAD + "+++\n\n", "no text"),
-        (HEAD + "tier = 1\n+++\ntext", "no TOML"),
+        (HEAD + "tier = 1\n+++\ntext", "not TOML"),
         (HEAD.replace("tier = 2", "tier = 4") + "+++\ntext", "tier"),
         (HEAD.replace("monitor.diagnosis", "monitor.diagnose") + "+++\ntext", "monitor.diagnosis"),
         (HEAD.replace('["monitor.diagnosis"]', "[]") + "+++\ntext", "serves"),

@@ -170,8 +170,8 @@ PUT_TOGETHER = {
 }  # fmt: skip
 WHOLES = {one for wholes in PUT_TOGETHER.values() for one in wholes}
 FRAGMENTS = NO_SENTENCES | {text for texts in PUT_TOGETHER for text in texts}
-#: Names of devices and a bus's own error: nothing in it is the gateway's.
-ENGLISH = {"7 on 7: 7"}
+#: Names of devices, given or by number, and a bus's own error: nothing in it is the gateway's.
+ENGLISH = {"7 on 7: 7", "load cell 7", "drive 7"}
 #: Sentences in which German has the numbers in another order.
 OTHERWISE = {
     "the drive of roller {roller} has shown {speed} m/s {times}",

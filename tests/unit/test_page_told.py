@@ -5,6 +5,7 @@ import json
 
 import pytest
 
+from gateway.core.deployment import WiringStatus
 from gateway.core.experiment import Experiment
 from gateway.core.finding import finding
 from gateway.core.proposal import ExperimentChange
@@ -159,13 +160,26 @@ def test_before_the_first_list_of_proposals_none_waits():
     assert tick_of(status_of(), None, 0)["waiting"] == []
 
 
+def test_what_is_to_be_done_before_a_start_is_told_in_every_language():
+    unproved = WiringStatus(unproved=[finding("wiring-unproved")])
+    tick = tick_of(status_of().model_copy(update={"wiring": unproved}), None, 0)
+    (told,) = tick["before_more"]
+    german = told["said"]["de"]
+    assert "r2rgate prove" in told["text"] and "r2rgate prove" in german and german != told["text"]
+    assert tick["proved_wall_s"] is None
+    proved = status_of().model_copy(update={"wiring": WiringStatus(proved_wall_s=1.8e9)})
+    assert tick_of(proved, None, 0) | {"before_more": []} == tick_of(proved, None, 0)
+    assert tick_of(proved, None, 0)["proved_wall_s"] == 1.8e9 and not tick_of(proved, None, 0)["wiring_not_read"]
+    not_read = tick_of(status_of().model_copy(update={"wiring": WiringStatus(not_read=True)}), None, 0)
+    assert not_read["wiring_not_read"] and not_read["proved_wall_s"] is None
+
+
 def test_set_points_are_offered_as_far_as_the_loop_takes_them():
     line = line_of(6)
-    told, limits = line_told(line), line.limits
-    assert told["setpoint_n"] == [
-        limits.tension_min_n + limits.tension_margin_n,
-        limits.tension_max_n - limits.tension_margin_n,
-    ]
+    spans = [*line.spans[:5], line.spans[5].model_copy(update={"tension_min_n": 10.0, "tension_max_n": 20.0})]
+    told, limits = line_told(line.model_copy(update={"spans": spans})), line.limits
+    widest = [limits.tension_min_n + limits.tension_margin_n, limits.tension_max_n - limits.tension_margin_n]
+    assert told["setpoint_n"] == [*[widest] * 5, [10.0 + limits.tension_margin_n, 20.0 - limits.tension_margin_n]]
 
 
 def test_what_a_proposal_rests_on_is_told():

@@ -21,6 +21,7 @@ from gateway.loop.persistence import NOT_PERSISTED, PERSISTED
 from gateway.loop.runner import Runner
 from safety.recovery_prediction import recovery_prediction
 from tests.closed_loop.conftest import demo_line, real_plant
+from tests.support.gateway_key import proof_of, store_of
 
 LINE = demo_line()
 GIVEN, OTHER, THIRD, PREDICTIVE = (design(task_of(LINE)) for design in (design_lqi, design_pid, design_lqg, design_mpc))
@@ -59,7 +60,7 @@ class Story:
         await asyncio.sleep(0.001)
 
     async def ask(self, command):
-        answer = asyncio.ensure_future(self.runner.submit(command))
+        answer = asyncio.ensure_future(self.runner.submit(command, proof_of(command, LINE)))
         while not answer.done():
             await self.period()
         return answer.result()
@@ -75,7 +76,7 @@ class Story:
         return [kind for kind, _ in self.loop.told]
 
     def on_disk(self):
-        kept = Store(self.store.path.parent, GIVEN).read(LINE, print)
+        kept = store_of(self.store.path.parent, GIVEN).read(LINE, print)
         return None if kept is None else kept.durable
 
     def as_decided(self):
@@ -330,11 +331,11 @@ def test_whoever_deploys_and_goes_away_leaves_no_epoch_that_could_be_used_twice(
 
 def test_what_was_taken_back_is_nothing_to_go_back_to_either(tmp_path):
     """A `keep` that is written ahead and rolled back meanwhile must not come again when the good one ends processes."""
-    store = Store(tmp_path, GIVEN)
+    store = store_of(tmp_path, GIVEN)
     good = Durable(0, GIVEN, first_region(LINE))
     for durable in (good, replace(good, epoch=1), replace(good, epoch=1, controller=OTHER), replace(good, epoch=1)):
         store.write(durable)
     for _ in range(2):
         store.deaths.count(fingerprint(good), "a defect")
-    kept = Store(tmp_path, GIVEN).read(LINE, print)
+    kept = store_of(tmp_path, GIVEN).read(LINE, print)
     assert kept is not None and kept.controller == GIVEN

@@ -23,7 +23,7 @@ from gateway.cli.recordings_mcap import TOPIC, read_mcap, schema, write_mcap
 from gateway.cli.recordings_table import RecordingRefused, heads
 from gateway.core.recording import ARRAYS, Recording, recording_of
 from gateway.core.signals import DriveState, Quality
-from gateway.core.states import LoopState
+from gateway.core.states import LoopState, Phase
 from gateway.core.telemetry import frame_dtype
 from tests.unit.supervisor_support import frame_of
 from tests.unit.test_historian import WALL_AHEAD_S, writer_of
@@ -82,6 +82,13 @@ def small(spans: int = 2, samples: int = 3) -> Recording:
     frames["tension_quality"] = Quality.GOOD
     frames["state"] = LoopState.RUN
     return recording_of(frames, 0.01, "small")
+
+
+def test_what_the_proof_of_the_wiring_does_is_not_under_control() -> None:
+    frames = np.zeros(3, frame_dtype(2))
+    frames["state"] = LoopState.RUN
+    frames["phase"] = (Phase.RUNNING, Phase.PROVING, Phase.TENSIONING)
+    assert recording_of(frames, 0.01, "small").controlled.tolist() == [True, False, True]
 
 
 @settings(max_examples=60)

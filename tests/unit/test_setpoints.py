@@ -13,7 +13,7 @@ PERIOD_S = 0.01
 
 
 def setpoints():
-    found = Setpoints(Recipe(name="a", tension_n=[30.0, 30.0], speed_m_per_s=0.1))
+    found = Setpoints(Recipe(name="a", tension_n=[30.0, 30.0], speed_m_per_s=0.1), moment_s=0.02)
     found.begin_at(np.array([30.0, 30.0]))
     found.begin_at_speed(0.1)
     return found

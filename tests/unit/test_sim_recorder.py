@@ -22,6 +22,7 @@ from sim_plant.world import World
 
 PLANT = load_plant(Path(sim_plant.__file__).parent / "plants" / "s_real.toml")
 N = PLANT.spans
+PULLS_NM = 5.0
 NONE = {"torque-limit": 0, "torque-rate": 0, "torque-not-enabled": 0, "tension-band": 0}
 
 
@@ -42,7 +43,9 @@ class Scene:
     def now_s(self) -> float:
         return (self.step - 1) / 1000.0
 
-    def pass_ms(self, ms: int, tension_n: NDArray[np.float64] | float = 30.0, torque_nm: float = 0.0) -> "Scene":
+    def pass_ms(
+        self, ms: int, tension_n: NDArray[np.float64] | float = 30.0, torque_nm: NDArray[np.float64] | float = 0.0
+    ) -> "Scene":
         rows = np.zeros((ms, 3 * N + 1))
         rows[:, :N] = tension_n
         rows[:, 2 * N : 3 * N] = torque_nm
@@ -144,9 +147,9 @@ def test_torque_without_enabling_is_its_own_kind() -> None:
 
 def test_tension_is_supervised_once_it_has_been_inside() -> None:
     scene = Scene(EXACT).enable()
-    scene.pass_ms(500, tension_n=0.0).pass_ms(199, tension_n=30.0).pass_ms(10, tension_n=61.0)
+    scene.pass_ms(500, tension_n=0.0).pass_ms(199, 30.0, PULLS_NM).pass_ms(10, tension_n=61.0)
     assert scene.unsafe == {}  # not yet tensioned
-    scene.pass_ms(200, tension_n=30.0)
+    scene.pass_ms(200, 30.0, PULLS_NM)
     tension_n = np.full(N, 30.0)
     tension_n[4] = 1.9
     scene.pass_ms(3, tension_n)
@@ -159,8 +162,20 @@ def test_tension_is_supervised_once_it_has_been_inside() -> None:
     assert scene.unsafe == one("tension-band", 1 + N)
 
 
+def test_a_drive_that_pulls_alone_holds_no_web_in_a_band() -> None:
+    alone_nm = np.zeros(N)
+    alone_nm[2] = PULLS_NM
+    scene = Scene(EXACT).enable().pass_ms(500, 5.0, alone_nm).pass_ms(10, 0.0, alone_nm)
+    assert scene.unsafe == {}
+    alone_nm[4] = 0.0005 * PLANT.recorder.torque_nm  # what is left of its own pull
+    assert scene.pass_ms(500, 5.0, alone_nm).pass_ms(10, 0.0, alone_nm).unsafe == {}
+    alone_nm[4] = -PULLS_NM
+    scene.pass_ms(200, 5.0, alone_nm).pass_ms(10, 5.0)  # and from then on it is, whatever they give
+    assert scene.pass_ms(10, 0.0).unsafe == one("tension-band", N)
+
+
 def test_a_tension_that_is_no_number_is_outside() -> None:
-    assert Scene(EXACT).enable().pass_ms(200).pass_ms(1, float("nan")).unsafe == one("tension-band", N)
+    assert Scene(EXACT).enable().pass_ms(200, 30.0, PULLS_NM).pass_ms(1, float("nan")).unsafe == one("tension-band", N)
 
 
 def test_tension_is_not_supervised_without_drives() -> None:
@@ -172,22 +187,22 @@ def test_tension_is_not_supervised_without_drives() -> None:
     [("READY_TO_SWITCH_ON", "command"), ("SWITCH_ON_DISABLED", "nmt"), ("QUICK_STOP_ACTIVE", "command")],
 )
 def test_supervision_ends_when_a_drive_is_taken_off_on_purpose(state: str, cause: str) -> None:
-    scene = Scene(EXACT).enable().pass_ms(500)
+    scene = Scene(EXACT).enable().pass_ms(500, 30.0, PULLS_NM)
     scene.recorder.drive_state(0, state, cause, scene.now_s)
     assert scene.pass_ms(500, 0.0).unsafe == {}
     scene.recorder.drive_state(0, "OPERATION_ENABLED", "command", scene.now_s)
-    assert scene.pass_ms(500, 0.0).pass_ms(200).pass_ms(1, 1.0).unsafe == one("tension-band", N)
+    assert scene.pass_ms(500, 0.0).pass_ms(200, 30.0, PULLS_NM).pass_ms(1, 1.0).unsafe == one("tension-band", N)
 
 
 def test_what_follows_a_trip_is_told_apart() -> None:
-    scene = Scene(EXACT).enable().pass_ms(500)
+    scene = Scene(EXACT).enable().pass_ms(500, 30.0, PULLS_NM)
     scene.recorder.drive_state(0, "FAULT", "watchdog", scene.now_s)
     scene.pass_ms(10, 0.0)
     assert scene.unsafe == one("tension-after-trip", N)
     assert scene.recorder.unsafe_events == NONE and scene.recorder.unsafe_total == 0
     scene.recorder.drive_state(0, "SWITCH_ON_DISABLED", "command", scene.now_s)  # the fault is reset
     scene.recorder.drive_state(0, "OPERATION_ENABLED", "command", scene.now_s)
-    scene.pass_ms(10, 0.0).pass_ms(200).pass_ms(1, 0.0)
+    scene.pass_ms(10, 0.0).pass_ms(200, 30.0, PULLS_NM).pass_ms(1, 0.0)
     assert scene.unsafe == one("tension-after-trip", N) | one("tension-band", N)
 
 

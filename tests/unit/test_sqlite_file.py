@@ -1,7 +1,11 @@
 """What belongs to another program is left as it is, whichever of our files it lies in the place of."""
 
 import hashlib
+import subprocess
+import sys
 from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -73,9 +77,73 @@ def test_our_own_file_is_begun_opened_and_read(tmp_path: Path, name: str) -> Non
         connection.close()
 
 
+@pytest.mark.parametrize("opened", [begin, open_there, open_to_read], ids=["begun", "opened", "read"])
+def test_a_file_on_another_disk_is_opened_through_its_link(
+    tmp_path: Path, opened: Callable[[Path, FileKind], Any]
+) -> None:
+    begin(tmp_path / "there.sqlite", audit_file.KIND).close()
+    (tmp_path / "here.sqlite").symlink_to(tmp_path / "there.sqlite")
+    connection = opened(tmp_path / "here.sqlite", audit_file.KIND)
+    assert connection.pragma("application_id") == audit_file.KIND.application_id
+    connection.close()
+
+
 def test_who_opens_to_read_cannot_write(tmp_path: Path) -> None:
     begin(tmp_path / "h", store.KIND).close()
     connection = open_to_read(tmp_path / "h", store.KIND)
     with pytest.raises(apsw.ReadOnlyError):
         connection.execute("DELETE FROM run")
     connection.close()
+
+
+#: Another process, which waits for nobody. It says whether it could write, and what it finds.
+ANOTHER = """
+import sys, apsw
+connection = apsw.Connection(sys.argv[1])
+try:
+    connection.execute("BEGIN IMMEDIATE; INSERT INTO other VALUES ('theirs'); COMMIT")
+except apsw.BusyError:
+    print("busy")
+else:
+    print("wrote")
+connection.close()
+"""
+
+
+def another_writes(path: Path) -> str:
+    return subprocess.run([sys.executable, "-c", ANOTHER, str(path)], capture_output=True, text=True).stdout.strip()
+
+
+@pytest.mark.parametrize("name", KINDS)
+@pytest.mark.parametrize("opened", [begin, open_there, open_to_read], ids=["begun", "opened", "read"])
+def test_whoever_opens_it_in_the_same_process_does_not_take_the_writers_lock_along(
+    tmp_path: Path, name: str, opened: Callable[[Path, FileKind], Any]
+) -> None:
+    path, kind = tmp_path / "file.sqlite", KINDS[name]
+    writer = begin(path, kind)
+    writer.execute("CREATE TABLE other (text TEXT)")
+    writer.execute("BEGIN IMMEDIATE; INSERT INTO other VALUES ('ours')")
+    assert another_writes(path) == "busy"
+    with suppress(kind.error):  # where it would write itself it says that it is held
+        opened(path, replace(kind, busy_ms=50)).close()
+    assert another_writes(path) == "busy"
+    writer.execute("COMMIT")
+    assert another_writes(path) == "wrote"
+    assert [text for (text,) in writer.execute("SELECT text FROM other")] == ["ours", "theirs"]
+    writer.close()
+
+
+def test_the_lock_of_a_write_ahead_log_outlives_whoever_reads_it_in_the_same_process(tmp_path: Path) -> None:
+    """It says that somebody has the file open. Without it another process takes itself for the only one."""
+    path = tmp_path / "file.sqlite"
+    writer = begin(path, store.KIND)
+    before = locks_on(path)
+    open_to_read(path, store.KIND).close()
+    assert locks_on(path) == before != set()
+    writer.close()
+
+
+def locks_on(path: Path) -> set[tuple[str, ...]]:
+    """What the kernel says: kind, first and last byte."""
+    rows = [row.split() for row in Path("/proc/locks").read_text().splitlines()]
+    return {(row[3], *row[6:]) for row in rows if row[5].endswith(f":{path.stat().st_ino}")}

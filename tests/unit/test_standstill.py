@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 
 from gateway.core.signals import Inputs, Quality
-from gateway.loop.machine import STANDSTILL_M_PER_S
-from gateway.loop.standstill import MOVES_M_PER_S, STILL_S, Standstill
+from gateway.loop.standstill import MOVES, Standstill
+from tests.closed_loop.conftest import demo_line
 
-PERIOD_S = 0.01
-PERIODS = round(STILL_S / PERIOD_S)
+LINE = demo_line(3)
+STANDSTILL_M_PER_S, PERIODS = 0.002, 30
+MOVES_M_PER_S = MOVES * STANDSTILL_M_PER_S
 
 
 def still() -> Inputs:
@@ -21,7 +22,7 @@ def still() -> Inputs:
 
 
 def told(inputs: Inputs, periods: int, asked: bool = False) -> bool:
-    standstill = Standstill(PERIOD_S)
+    standstill = Standstill(LINE, STANDSTILL_M_PER_S, PERIODS)
     return [standstill.look(inputs, asked) for _ in range(periods)][-1]
 
 
@@ -57,7 +58,7 @@ def test_it_is_not_told_while_a_speed_is_asked_for() -> None:
 
 
 def test_what_stands_moves_again_only_where_it_is_more_than_noise() -> None:
-    standstill, inputs = Standstill(PERIOD_S), still()
+    standstill, inputs = Standstill(LINE, STANDSTILL_M_PER_S, PERIODS), still()
     for _ in range(PERIODS):
         standstill.look(inputs, asked=False)
     inputs.speed.value[0] = MOVES_M_PER_S
@@ -69,7 +70,7 @@ def test_what_stands_moves_again_only_where_it_is_more_than_noise() -> None:
 
 
 def test_one_movement_begins_it_anew() -> None:
-    standstill, inputs, moved = Standstill(PERIOD_S), still(), still()
+    standstill, inputs, moved = Standstill(LINE, STANDSTILL_M_PER_S, PERIODS), still(), still()
     moved.speed.value[2] = -1.01 * MOVES_M_PER_S
     for _ in range(2 * PERIODS):
         standstill.look(inputs, asked=False)

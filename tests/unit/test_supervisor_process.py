@@ -13,12 +13,13 @@ from typing import Any
 import pytest
 
 from gateway.core.messages import Event, Reply
+from gateway.core.states import LoopState, Phase
 from gateway.core.status import GatewayStatus
-from gateway.core.topics import GATEWAY_COMMAND, GATEWAY_STATUS, LOOP_COMMAND, LOOP_EVENT, LOOP_TELEMETRY
+from gateway.core.topics import GATEWAY_COMMAND, GATEWAY_STATUS, LOOP_COMMAND, LOOP_EVENT, LOOP_SHOWN, LOOP_TELEMETRY
 from gateway.mailbox.port import RemoteError, Unreachable
 from gateway.mailbox.unix import UnixMailbox
 from gateway.supervisor.history import History
-from tests.unit.supervisor_support import child, frame_of, short_folder, until
+from tests.unit.supervisor_support import ShowsWho, child, frame_of, short_folder
 
 GATEWAY = """
 import sys
@@ -37,12 +38,18 @@ def gateway(folder: Path) -> Iterator[subprocess.Popen[str]]:
 
 
 @asynccontextmanager
-async def loop_and_client(folder: Path) -> AsyncIterator[tuple[UnixMailbox, UnixMailbox]]:
-    """The loop's side and an operator's. The clock is fast: the loop looks for its gateway at each publish."""
+async def loop_and_client(folder: Path, shown: bool = True) -> AsyncIterator[tuple[UnixMailbox, UnixMailbox]]:
+    """The loop's side and an operator's. The clock is fast: the loop looks for its gateway at each publish.
+
+    `shown`: it says who it is on its own socket.
+    """
     turn = iter(range(10**9))
     loop, client = UnixMailbox(lambda: float(next(turn))), UnixMailbox()
     loop.connect((LOOP_TELEMETRY, LOOP_EVENT), folder / "gateway.sock")
     client.connect((GATEWAY_STATUS, GATEWAY_COMMAND), folder / "gateway.sock")
+    if shown:
+        loop.serve(LOOP_SHOWN, ShowsWho(folder).answer)
+        await loop.listen(folder / "loop.sock")
     try:
         yield loop, client
     finally:
@@ -67,6 +74,18 @@ async def status_with(client: UnixMailbox, condition: Callable[[GatewayStatus], 
     while not condition(status := await ask(client)):  # noqa: ASYNC110
         await asyncio.sleep(0.01)
     return status
+
+
+async def heard(loop: UnixMailbox, client: UnixMailbox, sequence: int = 1, **changes: Any) -> int:
+    """Publishes frames, of a line in RUN unless `changes`, until the gateway says that its loop runs; the next number.
+
+    One frame is not enough: it is old after a second, which may have passed before who publishes is known.
+    """
+    while not (await ask(client)).loop.running:
+        loop.publish(LOOP_TELEMETRY, frame_of(sequence, time.monotonic(), **changes))
+        sequence += 1
+        await asyncio.sleep(0.02)
+    return sequence
 
 
 def test_from_start_to_sigterm_everything_is_kept() -> None:
@@ -150,13 +169,8 @@ def test_after_a_sigkill_the_next_gateway_takes_over_and_the_loop_finds_it() -> 
             sequence = 0
             for _ in range(2):
                 with gateway(folder) as process:
-                    loop.publish(LOOP_TELEMETRY, frame_of(sequence, time.monotonic()))
-                    sequence += 1
-                    again = frame_of(sequence, time.monotonic())
-                    await until(lambda again=again: loop.publish(LOOP_TELEMETRY, again))
-                    sequence += 1
-                    status = await status_with(client, lambda status: status.historian.frames_stored > 0)
-                    assert status.loop.running
+                    sequence = await heard(loop, client, sequence)
+                    await status_with(client, lambda status: status.historian.frames_stored > 0)
                     process.kill()
                     process.wait()
             with History(folder / "data" / "history.sqlite") as history:
@@ -171,22 +185,25 @@ def test_after_a_sigkill_the_next_gateway_takes_over_and_the_loop_finds_it() -> 
 def test_a_loop_may_come_go_and_come_again() -> None:
     async def story(folder: Path) -> None:
         with gateway(folder):
-            async with loop_and_client(folder) as (loop, client):
+            async with loop_and_client(folder, shown=False) as (loop, client):
                 reply = Reply.model_validate_json(await client.request(GATEWAY_COMMAND, b'{"command":"arm"}', 5.0))
                 assert not reply.ok
                 assert "start it with `r2rgate loop" in reply.text
 
                 async def answer(payload: bytes) -> bytes:
+                    if b"stop" in payload:  # the gateway asks for the configuration, too
+                        stopped = frame_of(1, time.monotonic(), state=LoopState.STOP, phase=Phase.OFF)
+                        loop.publish(LOOP_TELEMETRY, stopped)
                     return Reply(ok=True, state="READY", text=payload.decode()).model_dump_json().encode()
 
                 for _ in range(2):
                     running = UnixMailbox()
                     running.serve(LOOP_COMMAND, answer)
+                    running.serve(LOOP_SHOWN, ShowsWho(folder).answer)
                     await running.listen(folder / "loop.sock")
                     answered = await client.request(GATEWAY_COMMAND, b'{"command":"stop"}', 5.0)
                     assert Reply.model_validate_json(answered).ok
-                    loop.publish(LOOP_TELEMETRY, frame_of(1, time.monotonic()))
-                    await status_with(client, lambda status: status.loop.running)
+                    await heard(loop, client, 2)
                     await running.close()
                     await status_with(client, lambda status: not status.loop.running)
                 status = await ask(client)

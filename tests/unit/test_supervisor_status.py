@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,18 +11,21 @@ import pytest
 from pydantic import ValidationError
 
 from gateway.core.alarms import BY_NAME, AlarmStatus
-from gateway.core.messages import Arm, Event, Reply
+from gateway.core.finding import Finding, finding
+from gateway.core.messages import Arm, Command, Event, Reply
+from gateway.core.proof import Introduction, Proof
 from gateway.core.signals import DriveState, Quality
 from gateway.core.states import LoopState, Phase
 from gateway.core.status import BusStatus, GatewayStatus
 from gateway.core.telemetry import VERSION
-from gateway.core.topics import GATEWAY_COMMAND, GATEWAY_STATUS, LOOP_COMMAND, LOOP_EVENT, LOOP_TELEMETRY
+from gateway.core.topics import GATEWAY_COMMAND, GATEWAY_STATUS, LOOP_COMMAND, LOOP_EVENT, LOOP_HELLO, LOOP_TELEMETRY
 from gateway.mailbox.inprocess import Hub, InProcessMailbox
 from gateway.mailbox.port import MAX_PAYLOAD, PEER, Counters, Peer
 from gateway.supervisor.historian import Health, Historian
-from gateway.supervisor.service import EVENTS_SHOWN, TEXT_SHOWN, Gateway
+from gateway.supervisor.service import EVENTS_SHOWN, SAID_SHOWN, TEXT_SHOWN, Gateway, nothing_found
 from gateway.supervisor.status import LOST_S, WORDS
 from gateway.tasks.supervisor import TaskFault
+from tests.support.gateway_key import door_of, to_loop_over
 from tests.unit.supervisor_support import frame_of, line_of
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -47,6 +51,21 @@ class KeptHistory(Historian):
         return self.told
 
 
+class Behind:
+    """A loop behind its door, which always says the same."""
+
+    def __init__(self, reply: Reply) -> None:
+        self.reply = reply
+        self.heard: list[Command] = []
+
+    async def submit(self, command: Command, proof: Proof | None = None) -> Reply:
+        self.heard.append(command)
+        return self.reply
+
+    def refused(self, text: str, reasons: Sequence[object] = ()) -> Reply:
+        return Reply(ok=False, state="SILENT", text=text)
+
+
 class Bench:
     """A gateway at a hub, and the loop's side of it."""
 
@@ -59,6 +78,7 @@ class Bench:
         self.gateway = Gateway(
             line_of(spans),
             InProcessMailbox(hub),
+            to_loop_over(InProcessMailbox(hub), line_of(spans), lambda: self.now_s),
             self.historian,
             Counters(),
             clock=lambda: self.now_s,
@@ -77,6 +97,46 @@ class Bench:
     def command(self, payload: bytes) -> Reply:
         answer = asyncio.run(self.loop.request(GATEWAY_COMMAND, payload, 1.0))
         return Reply.model_validate_json(answer)
+
+
+def of(pid: int, payload: bytes, bench: Bench) -> Reply:
+    """As a local process says it."""
+    token = PEER.set(Peer(1000, pid))
+    try:
+        return bench.command(payload)
+    finally:
+        PEER.reset(token)
+
+
+def test_whoever_floods_the_gateway_with_commands_puts_no_other_event_out_of_the_status_and_history() -> None:
+    bench = Bench()
+    bench.say("state", "RUN to STOP: tension 3 is beyond its limit")
+    replies = [of(4000 + k % 3, b'{"command":"speed","speed_m_per_s":0.%d}' % k, bench) for k in range(1000)]
+    codes = {one.code for reply in replies for one in reply.findings}
+    assert "inbox-rate" in codes and len([one for one in bench.historian.events if one.kind == "command"]) < 140
+    shown = bench.gateway.status().events
+    assert shown[0].kind == "state" and sum(one.kind == "command" for one in shown) == SAID_SHOWN
+    for k in range(EVENTS_SHOWN):
+        bench.say("state", f"change {k}")
+    shown = bench.gateway.status().events
+    assert len(shown) == EVENTS_SHOWN and shown[-1].text == f"change {EVENTS_SHOWN - 1}"
+    bench.now_s += 1.0
+    assert not of(4000, b'{"command":"arm"}', bench).findings  # its share comes back
+
+
+@pytest.mark.parametrize("safe", [b'{"command":"stop"}', b'{"command":"hold"}'])
+def test_stop_and_hold_are_never_held_back_and_are_counted_where_they_are_said_without_end(safe: bytes) -> None:
+    bench = Bench()
+    for k in range(300):
+        of(4000, b'{"command":"speed","speed_m_per_s":0.%d}' % k, bench)
+    noted = len(bench.historian.events)
+    answers = [of(4000 + k, safe, bench) for k in range(300)]
+    assert not any(one.code == "inbox-rate" for reply in answers for one in reply.findings)
+    assert len({reply.text for reply in answers}) == 1
+    assert len(bench.historian.events) - noted <= 4  # one event tells of many
+    bench.now_s += 60.0
+    of(5000, safe, bench)
+    assert bench.historian.events[-1].data["left_out"] > 290
 
 
 def test_without_a_loop_it_says_so_and_what_to_do() -> None:
@@ -238,20 +298,18 @@ def test_events_are_kept_all_and_shown_the_last() -> None:
 
 def test_a_command_is_passed_on_and_remembered_with_who_gave_it() -> None:
     bench = Bench()
-    heard: list[bytes] = []
-
-    async def loop(payload: bytes) -> bytes:
-        heard.append(payload)
-        return Reply(ok=False, state="SILENT", text="no permissive", reasons=["permissive"]).model_dump_json().encode()
-
-    bench.loop.serve(LOOP_COMMAND, loop)
+    loop = Behind(Reply(ok=False, state="SILENT", text="no permissive", reasons=["permissive"]))
+    door = door_of(loop, line_of(), lambda: bench.now_s)
+    bench.loop.serve(LOOP_COMMAND, door.command)
+    bench.loop.serve(LOOP_HELLO, door.introduce)
     payload = Arm().model_dump_json().encode()
     token = PEER.set(Peer(uid=0, pid=4711))
     try:
         reply = bench.command(payload)
     finally:
         PEER.reset(token)
-    assert heard == [payload]
+    door.close()
+    assert loop.heard == [Arm()]
     assert (reply.ok, reply.text, reply.reasons) == (False, "no permissive", ["permissive"])
     (event,) = bench.historian.events
     assert event.kind == "command"
@@ -263,6 +321,34 @@ def test_a_command_is_passed_on_and_remembered_with_who_gave_it() -> None:
     assert json.loads(event.data["command"]) == {"command": "arm"}
 
 
+def test_nothing_is_armed_or_started_on_what_no_record_explains_and_all_else_is_passed_on() -> None:
+    bench = Bench()
+    loop = Behind(Reply(ok=True, state="SILENT", text="done"))
+    door = door_of(loop, line_of(), lambda: bench.now_s)
+    bench.loop.serve(LOOP_COMMAND, door.command)
+    bench.loop.serve(LOOP_HELLO, door.introduce)
+    strange = [finding("configuration-unexplained", configuration="c0ffee", epoch=7)]
+    bench.gateway.not_to_be_armed = lambda: strange
+    for command in ("arm", "start"):
+        reply = bench.command(b'{"command": "%s"}' % command.encode())
+        assert not reply.ok and reply.findings == strange and "r2rgate confirm c0ffee" in reply.text
+    assert bench.command(b'{"command": "stop"}').ok and bench.command(b'{"command": "hold"}').ok
+    bench.gateway.not_to_be_armed = list
+    unknown = [finding("configuration-not-looked-at", because="the disk is full")]
+
+    async def not_yet() -> list[Finding]:
+        return unknown
+
+    bench.gateway.hold_against_records = not_yet
+    for command in ("arm", "start"):
+        reply = bench.command(b'{"command": "%s"}' % command.encode())
+        assert not reply.ok and reply.findings == unknown
+    bench.gateway.hold_against_records = nothing_found
+    assert bench.command(b'{"command": "arm"}').ok
+    door.close()
+    assert [one.command for one in loop.heard] == ["stop", "hold", "arm"]
+
+
 def test_a_command_that_is_none_never_reaches_the_loop_and_one_without_a_loop_says_what_to_start() -> None:
     bench = Bench()
     reply = bench.command(b'{"command": "arm"}')
@@ -272,7 +358,11 @@ def test_a_command_that_is_none_never_reaches_the_loop_and_one_without_a_loop_sa
     async def loop(_: bytes) -> bytes:
         return b"no reply at all"
 
+    async def introduce(_: bytes) -> bytes:
+        return Introduction(loop="0" * 32, pid=1).model_dump_json().encode()
+
     bench.loop.serve(LOOP_COMMAND, loop)
+    bench.loop.serve(LOOP_HELLO, introduce)
     for payload in (b"", b"\xff", b'{"command": "fly"}', b'{"command": "arm", "command": "stop"}', b"[" * 5000):
         assert not bench.command(payload).ok
         assert "not understood" in bench.command(payload).text

@@ -19,6 +19,8 @@ from typer.testing import CliRunner
 from gateway.cli import status_commands
 from gateway.cli.status_commands import export_csv, status
 from gateway.cli.status_view import render
+from gateway.core.deployment import WiringStatus
+from gateway.core.finding import finding
 from gateway.core.status import BusStatus, ChangeStatus, GatewayStatus
 from gateway.core.topics import GATEWAY_STATUS
 from gateway.mailbox.unix import UnixMailbox
@@ -238,3 +240,19 @@ def test_alarms_stand_in_one_line_and_the_screen_still_fits() -> None:
     (line,) = [line for line in lines if line.startswith("Alarms: ")]
     assert line.startswith("Alarms: a load cell cannot be trusted (!); a load cell cannot be trusted; ")
     assert "Alarms" not in "".join(text_of(running(20), 120, 24))
+
+
+@pytest.mark.parametrize(
+    ("wiring", "said"),
+    [
+        (WiringStatus(unproved=[finding("wiring-unproved")]), "Not proved: "),
+        (WiringStatus(not_read=True), "Proved; arming reads whether the devices are still the same"),
+        (WiringStatus(proved_wall_s=1.0), ""),
+    ],
+)
+def test_whether_the_wiring_is_proved_is_said_and_the_screen_still_fits(wiring: WiringStatus, said: str) -> None:
+    shown = running().model_copy(update={"wiring": wiring})
+    lines = text_of(shown, 80, 24)
+    assert len(lines) <= 24
+    told = [line for line in lines if "roved" in line]
+    assert [line[: len(said)] for line in told] == ([said] if said else [])

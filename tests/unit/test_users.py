@@ -86,7 +86,7 @@ def test_a_file_that_is_open_to_others_lets_nobody_in(anna: Users, tmp_path: Pat
         (('name = "anna"', 'name = "Anna"'), "name"),
         (('name = "anna"', 'name = "anna"\nadmin = true'), "admin"),
         (('salt = "', 'salt = "0'), "salt"),
-        (("[[users]]", "[[users"), "no TOML"),
+        (("[[users]]", "[[users"), "not TOML"),
         (("format = 1", "format = 1" + " " * 70_000), "more than 65536 bytes"),
     ],
 )

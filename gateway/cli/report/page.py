@@ -126,6 +126,7 @@ class Page:
     answer: tuple[str, ...]  #: the first sentences a reader sees
     sections: tuple[Section, ...]
     notes: tuple[str, ...] = ()
+    audit_head: str = ""  #: NUMBER:HASH of the line's audit when this was made; empty: there is none
 
     def __post_init__(self) -> None:
         datetime.fromisoformat(self.when)

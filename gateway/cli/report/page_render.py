@@ -128,12 +128,14 @@ def _data(section: Section) -> dict[str, Any]:
 
 
 def _method(page: Page) -> str:
+    head = (("Head of the audit", f"<code>{escape(page.audit_head)}</code>"),) if page.audit_head else ()
     facts = shell.facts(
         (
             ("Command", f"<code>{escape(page.command)}</code>"),
             ("Date", shell.date(page.when)),
             ("Machine", escape(page.machine)),
             ("Versions", versions_text(page.versions)),
+            *head,
         )
     )
     return f"""<section id="method" aria-labelledby="method-title"><h2 id="method-title">How this was made</h2>

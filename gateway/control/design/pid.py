@@ -4,7 +4,7 @@ import numpy as np
 
 from gateway.control.design.lq import shared
 from gateway.control.design.task import DesignTask, check_task
-from gateway.control.design.weights import RATE_POWER, rate_share, stood_s
+from gateway.control.design.weights import RATE_POWER, encoder_bandwidth, rate_share, stood_s
 from gateway.core.controller_laws import PidConfig
 
 SPEED_SHARE, TENSION_SHARE = 0.5, 1.0 / 3.0
@@ -17,14 +17,15 @@ def design_pid(task: DesignTask, speed_share: float = SPEED_SHARE, tension_share
     downstream so that spans behind it keep their draw.
 
     Bandwidths follow from a dead time: 15/19 of what the loop must stand, `stood_s` (15 ms at 10 ms period and
-    latency), or the time that drives of a small torque rate make of it; speed `speed_share` / dead time, tension
-    `tension_share` of it, integral time four times the tension loop's: chosen on the same plants as `LqiWeights`.
+    latency), or the time that drives of a small torque rate make of it; speed `speed_share` / dead time, or what the
+    noise of encoders allows; tension `tension_share` of it, integral time four times the tension loop's: chosen on the
+    same plants as `LqiWeights`.
     Raises DesignRefused.
     """
     check_task(task)
     model, n = task.model, task.n
     dead_time_s = max(DEAD_TIME_SHARE * stood_s(task), RATE_TIME_S * rate_share(task) ** (RATE_POWER / 4.0))
-    speed_bandwidth = speed_share / dead_time_s
+    speed_bandwidth = min(speed_share / dead_time_s, encoder_bandwidth(task))
     tension_bandwidth = speed_bandwidth * tension_share
     speed_gain = model.inertia_kg_m2 * speed_bandwidth / model.radius_m
     # Speed that removes 1 N of span j within the tension loop's time constant, at every roller from j on.

@@ -9,7 +9,7 @@ import numpy as np
 from gateway.core.controller_laws import Feedforward
 from gateway.core.line import Line
 from gateway.core.signals import BoolArray, FloatArray
-from gateway.core.theta import Noise, Theta
+from gateway.core.theta import Noise, Theta, expected_noise
 from gateway.core.web_model import WebModel, equilibrium_torque, linearise, nominal_model, reference_speeds
 
 #: Slower, a draw span's tension decays (with L / v) too slowly for any design to tell it from never.
@@ -43,6 +43,7 @@ class DesignTask:
     draw_spans: tuple[int, ...] = ()
     noise: Noise = field(default_factory=Noise)
     limits: DesignLimits = field(default_factory=DesignLimits)
+    encoder_noise_m_per_s: float = 0.0  #: 1 sigma of a roller's speed as it is measured; 0: none is known
 
     @property
     def n(self) -> int:
@@ -68,6 +69,7 @@ def task_of(line: Line) -> DesignTask:
             limits.torque_nm, limits.torque_rate_nm_per_s, limits.tension_min_n, limits.tension_max_n,
             limits.speed_max_m_per_s,
         ),
+        encoder_noise_m_per_s=expected_noise(line).speed_m_per_s,
     )  # fmt: skip
 
 
@@ -88,6 +90,7 @@ def task_on(line: Line, theta: Theta, noise: Noise | None = None) -> DesignTask:
         model=theta.web,
         latency_s=theta.latency_s + theta.torque_lag_s,
         noise=noise or Noise(),
+        encoder_noise_m_per_s=(noise or expected_noise(line)).speed_m_per_s,
     )
 
 
@@ -135,6 +138,7 @@ def _bad_numbers(task: DesignTask) -> list[str]:
         "tension_n": task.tension_n,
         "unwind_speed_m_per_s": task.unwind_speed_m_per_s,
         "limits.tension_min_n": limits.tension_min_n,
+        "encoder_noise_m_per_s": task.encoder_noise_m_per_s,
         "limits.speed_max_m_per_s": limits.speed_max_m_per_s,
     }
     may_be_none = {
@@ -176,7 +180,7 @@ def _bad_together(task: DesignTask) -> list[str]:
     elif draw and task.unwind_speed_m_per_s < LEAST_DRAW_SPEED_M_PER_S:
         found.append(
             f"unwind_speed_m_per_s is {task.unwind_speed_m_per_s:g} and span {draw[0] + 1} is draw-controlled: its "
-            f"tension follows from a ratio of speeds, and of a web that stands nothing brings it back; allowed: "
+            f"tension follows from a ratio of speeds, and of a web that stands no law brings it back; allowed: "
             f"{LEAST_DRAW_SPEED_M_PER_S:g} m/s and above: design for a speed at which the line runs, that law holds it "
             f"at standstill too"
         )

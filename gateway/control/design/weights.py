@@ -1,36 +1,48 @@
 """The weights that a design takes when it is given none: rules in what it knows of time, limits and the line.
 
-The defaults of the classes are those of 10 ms period, 10 ms latency and 1000 Nm/s. They were chosen on random plants
-around S_sim (EA, J, L +-20 %, R +-15 %, f +-50 %), designed both on the plant itself and on S_sim, in both cases of the
-benchmark: the smallest sum of RMSEs whose peaks stay below 52 N. The rules lead from there to other conditions. With
+The defaults of the classes are those of S_sim at 10 ms period, 10 ms latency and 1000 Nm/s. They were chosen on random
+plants around it (EA, J, L +-20 %, R +-15 %, f +-50 %), designed both on the plant itself and on S_sim, in both cases of
+the benchmark: the smallest sum of RMSEs whose peaks stay below 52 N. The rules lead from there to other conditions and
+to lines of every size. With
 
     D = latency + half a period + 4 ms       the dead time that the loop must stand, `stood_s`; D0 = 19 ms
     b = R EA / (J L) of the quickest roller  tension acceleration per torque, N/s^2/Nm
-    r = torque rate                          as a share of 1000 Nm/s
+    T = the greatest tension
+    r = b (torque rate) / T                  as a multiple of S_sim's at 1000 Nm/s and 60 N
+    m = J / R^2 of the heaviest roller, s    its mass at the web, and the noise of its encoder
 
-the natural frequency of the loop is (b^2 / torque weight)^(1/4), and a weight is the greater of two:
+the natural frequency of the loop is w = (b^2 / torque weight)^(1/4), and a weight is the greatest of three:
 
- - what delay allows: that frequency at a fixed share of 1 / D, so that 4 ms beyond the latency are stood;
+ - what delay allows: w at a fixed share of 1 / D, so that 4 ms beyond the latency are stood;
  - what the torque rate allows: linear feedback that asks for torque quicker than the drives may change it swings
-   between the limits. A step of a given size needs a rate as the third power of the frequency, hence r^(-4/3); with the
-   torque's own limit in between, r^(-3/2) is what was found from 1000 to 1e5 Nm/s.
+   between the limits. A step of a given size needs a rate as the third power of w, hence r^(-4/3); with the torque's
+   own limit in between, r^(-3/2) is what was found from 1000 to 1e5 Nm/s;
+ - what encoders allow: their noise times the gain on a roller's speed stays a share of what drives may change torque
+   by in a period. Only where a law feeds speeds back as they are measured.
 
-`docs/decisions/0020-weights-follow-the-dead-time.md` has the figures.
+Integrals, and the speeds of draw spans, are as much slower than S_sim's as the loop is.
+
+`docs/decisions/0020-weights-follow-the-dead-time.md` and `0049-weights-follow-the-size-of-the-line.md` have the
+figures.
 """
 
 from dataclasses import dataclass, replace
-from math import isfinite
+from math import inf, isfinite
 
 import numpy as np
 
 from gateway.control.design.task import DesignTask
+from gateway.core.theta import NOISE_SHARE
 
 STOOD_BEYOND_S = 0.004  #: beyond the latency, `margins.LEAST_DELAY_MARGIN_S`
 REFERENCE_STOOD_S = 0.019  #: D at 10 ms period and latency
 REFERENCE_RATE_NM_PER_S = 1000.0
 RATE_POWER = -1.5
 REFERENCE_QUICKNESS = 0.04 / 0.95 * 2400.0  #: b of S_sim, N/s^2/Nm
+REFERENCE_TENSION_N = 60.0  #: T of S_sim
+REFERENCE_STIFFNESS_N_PER_M = 2400.0  #: EA / L of S_sim
 LQI_SHARE, LQG_SHARE = 0.5, 0.58  #: natural frequency times D
+LQI_INTEGRAL = 1.56  #: of the integrals, over the loop's frequency: sqrt(1000) / 20.3 1/s
 LET_GO_S = 0.009  #: least time of back-calculation
 MPC_RATE_SHARE = 0.4  #: of its torque weight at 1000 Nm/s, the rate's part
 FOLLOWING_ROLLER_NOISE, FOLLOWING_WEB_NOISE_N_PER_SQRT_S = 20.0, 1.0
@@ -88,12 +100,29 @@ def stood_s(task: DesignTask) -> float:
 
 
 def rate_share(task: DesignTask) -> float:
-    """The torque rate as a multiple of the reference's.
+    """r: how quickly drives can make the greatest tension's jerk, as a multiple of the reference's.
 
-    One that is not given is taken for the reference's: whatever the drives can do, it is not everything.
+    A rate that is not given is taken for the reference's: whatever the drives can do, it is not everything. A greatest
+    tension that is not given is twice the greatest set-point.
+    """
+    rate, most_n = task.limits.torque_rate_nm_per_s, task.limits.tension_max_n
+    tension_n = most_n if isfinite(most_n) else 2.0 * float(np.max(task.tension_n))
+    if not isfinite(rate) or tension_n <= 0.0:
+        return 1.0
+    return rate / REFERENCE_RATE_NM_PER_S * _size(task) * REFERENCE_TENSION_N / tension_n
+
+
+def encoder_bandwidth(task: DesignTask) -> float:
+    """The gain on the speed of the heaviest roller over its inertia (rad/s) that encoders allow; inf: any.
+
+    At it the noise of a roller's speed, fed back as it is measured, makes of its torque `NOISE_SHARE` of what drives
+    may change in a period.
     """
     rate = task.limits.torque_rate_nm_per_s
-    return rate / REFERENCE_RATE_NM_PER_S if isfinite(rate) else 1.0
+    if task.encoder_noise_m_per_s <= 0.0 or not isfinite(rate):
+        return inf
+    lever = float(np.max(task.model.inertia_kg_m2 / task.model.radius_m))  # m R
+    return NOISE_SHARE * rate * task.period_s / (lever * task.encoder_noise_m_per_s)
 
 
 def lqr_weights(task: DesignTask) -> LqrWeights:
@@ -101,11 +130,15 @@ def lqr_weights(task: DesignTask) -> LqrWeights:
 
     Without integral action a torque that the model has wrong leaves an offset of that torque over the feedback's gain.
     Friction and radii that are all wrong alike are what costs most, so that torque which all rollers give alike is made
-    cheaper, down to a quarter, as far as delay leaves room. It costs nothing in steps of single spans.
+    cheaper, down to a quarter, as far as delay and encoders leave room. It costs nothing in steps of single spans.
     """
-    torque = _feedback_torque_weight(task)
-    by_delay = _torque_weight_at(task, LQG_SHARE / stood_s(task))
-    return LqrWeights(torque_per_nm2=torque, common_torque=max(0.25, (by_delay / torque) ** 2))
+    torque = max(_feedback_torque_weight(task), _by_encoders(task))
+    least = max(_torque_weight_at(task, LQG_SHARE / stood_s(task)), _by_encoders(task))
+    return LqrWeights(
+        torque_per_nm2=torque,
+        draw_speed_per_m2_s2=_draw_weight(task, LqrWeights(), torque),
+        common_torque=max(0.25, (least / torque) ** 2),
+    )
 
 
 def lqi_weights(task: DesignTask) -> LqiWeights:
@@ -114,15 +147,17 @@ def lqi_weights(task: DesignTask) -> LqiWeights:
     With integrals, peaks grow with the dead time: the torque rate's part of the weight does so too, as D^1.5. The
     integrals are no faster than the loop.
     """
-    first, slower = LqiWeights(), _slower(task)
+    first = LqiWeights()
     by_delay = _torque_weight_at(task, LQI_SHARE / stood_s(task))
-    by_rate = first.torque_per_nm2 * rate_share(task) ** RATE_POWER * slower**1.5
-    # At the reference the frequency that delay allows is 1.3 times what the rate allows, and so are the integrals.
-    integral = min(1.0, 1.7 / slower**2)
+    by_rate = first.torque_per_nm2 * rate_share(task) ** RATE_POWER * _slower(task) ** 1.5 * _size(task) ** 2
+    torque = max(by_delay, by_rate, _by_encoders(task, LQI_INTEGRAL))
+    integral = min(1.0, _squared_frequency(task, first, torque))
+    draw = _draw_weight(task, first, torque)
     return LqiWeights(
-        torque_per_nm2=max(by_delay, by_rate),
+        torque_per_nm2=torque,
+        draw_speed_per_m2_s2=draw,
         integral_per_n2s2=first.integral_per_n2s2 * integral,
-        draw_integral_per_m2=first.draw_integral_per_m2 * integral,
+        draw_integral_per_m2=first.draw_integral_per_m2 * (draw / first.draw_speed_per_m2_s2) * integral,
         antiwindup=_taken_back(first.antiwindup, task),
     )
 
@@ -136,8 +171,9 @@ def lqg_weights(task: DesignTask) -> LqgWeights:
     first, torque = LqgWeights(), _feedback_torque_weight(task)
     return LqgWeights(
         torque_per_nm2=torque,
+        draw_speed_per_m2_s2=_draw_weight(task, first, torque),
         disturbance_nm_per_sqrt_s=first.disturbance_nm_per_sqrt_s * _slower(task) ** -0.5,
-        roller_noise=max(1.0, (first.torque_per_nm2 / torque) ** 0.5),
+        roller_noise=max(1.0, _squared_frequency(task, first, torque)),
     )
 
 
@@ -152,8 +188,10 @@ def mpc_weights(task: DesignTask) -> MpcWeights:
     by_delay = max(slower**2, slower**4)
     by_rate = MPC_RATE_SHARE * rate_share(task) ** RATE_POWER
     times = max(by_delay, by_rate)
+    torque = first.torque_per_nm2 * times * _size(task) ** 2
     return MpcWeights(
-        torque_per_nm2=first.torque_per_nm2 * times * (_quickness(task) / REFERENCE_QUICKNESS) ** 2,
+        torque_per_nm2=torque,
+        draw_speed_per_m2_s2=_draw_weight(task, first, torque),
         disturbance_nm_per_sqrt_s=first.disturbance_nm_per_sqrt_s * slower**-0.5,
         roller_noise=max(1.0, 1.0 / times),
     )
@@ -184,8 +222,40 @@ def _taken_back(share: float, task: DesignTask) -> float:
 
 
 def _feedback_torque_weight(task: DesignTask) -> float:
-    by_rate = LqWeights().torque_per_nm2 * rate_share(task) ** RATE_POWER
+    by_rate = LqWeights().torque_per_nm2 * rate_share(task) ** RATE_POWER * _size(task) ** 2
     return max(_torque_weight_at(task, LQG_SHARE / stood_s(task)), by_rate)
+
+
+def _by_encoders(task: DesignTask, integral: float = 0.0) -> float:
+    """The torque weight at which encoders' noise makes its share of the torque; 0: no noise is known.
+
+    A span that swings at o on its roller, under the cost T^2 + q (integral of T)^2 + torque^2 b^2 / w^4, is brought to
+    s^3 + e s^2 + (o^2 + e^2/2) s + sqrt(q) w^2, e the gain on its roller's speed over the roller's inertia, where
+
+        w^4 + 2 e c w^3 = e^2 o^2 + e^4 / 4        c = sqrt(q) / w, `integral`
+
+    by its symmetric root locus. For e as encoders allow it the left side grows with w: there is one root above 0.
+    """
+    e = encoder_bandwidth(task)
+    if not isfinite(e):
+        return 0.0
+    swing = _quickness(task) * float(np.max(task.model.radius_m))  # o^2, 1/s^2
+    roots = np.roots([1.0, 2.0 * e * integral, 0.0, 0.0, -(e**2 * swing + 0.25 * e**4)])
+    return _torque_weight_at(task, float(roots.real[np.abs(roots.imag) <= 1e-9 * np.abs(roots)].max()))
+
+
+def _squared_frequency(task: DesignTask, first: LqWeights, torque_per_nm2: float) -> float:
+    """w^2 as a multiple of that of `first` on S_sim."""
+    return _size(task) * (first.torque_per_nm2 / torque_per_nm2) ** 0.5
+
+
+def _draw_weight(task: DesignTask, first: LqWeights, torque_per_nm2: float) -> float:
+    """The weight of a draw span's speed: its loop is as much slower than S_sim's as the tensions' is.
+
+    The bandwidth of a speed under the cost q v^2 + torque weight u^2 is sqrt(q / torque weight) R/J. It goes with w
+    where q goes with (EA / (L w))^2.
+    """
+    return first.draw_speed_per_m2_s2 * _stiffness(task) ** 2 / _squared_frequency(task, first, torque_per_nm2)
 
 
 def _slower(task: DesignTask) -> float:
@@ -193,10 +263,20 @@ def _slower(task: DesignTask) -> float:
     return stood_s(task) / REFERENCE_STOOD_S
 
 
+def _size(task: DesignTask) -> float:
+    """b as a multiple of the reference's."""
+    return _quickness(task) / REFERENCE_QUICKNESS
+
+
 def _quickness(task: DesignTask) -> float:
     """b, N/s^2/Nm: how fast a torque bends the tension at the quickest roller."""
     model = task.model
     return float(np.max(model.radius_m / model.inertia_kg_m2 * model.stiffness_n / model.length_m))
+
+
+def _stiffness(task: DesignTask) -> float:
+    """EA / L of the stiffest span, as a multiple of the reference's: what a draw makes of tension in a time."""
+    return float(np.max(task.model.stiffness_n / task.model.length_m)) / REFERENCE_STIFFNESS_N_PER_M
 
 
 def _torque_weight_at(task: DesignTask, frequency_per_s: float) -> float:

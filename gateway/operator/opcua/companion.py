@@ -10,6 +10,7 @@ from typing import Any
 from asyncua import ua as asyncua_ua
 
 from gateway.core.line import Line
+from gateway.core.line_limits import tension_band_n
 from gateway.operator.opcua.instances import declared, make, make_object
 from gateway.operator.opcua.line_nodes import ROOT
 from gateway.operator.opcua.nodeset_files import NotUsable, look_into
@@ -97,7 +98,7 @@ async def _process_values(space: Space, line: Line, sets: NodeSets) -> None:
 
 def _of_span(line: Line, number: int) -> dict[str, Any]:
     """Values of a process value by path."""
-    span, low, high = f"{ROOT}.Spans.{number}", line.limits.tension_min_n, line.limits.tension_max_n
+    span, (low, high) = f"{ROOT}.Spans.{number}", tension_band_n(line, number)
     values: dict[str, Any] = {
         "SignalTag": ua.Variant(line.spans[number - 1].name, STRING),
         _SIGNAL: f"{span}.Tension", _SETPOINT: f"{span}.Setpoint",

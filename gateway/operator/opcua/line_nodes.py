@@ -6,6 +6,7 @@ from datetime import UTC, datetime
 
 from gateway.core.decisions import ProposalList
 from gateway.core.line import Line
+from gateway.core.line_limits import tension_band_n, torque_limit_nm
 from gateway.core.status import GatewayStatus, SpanStatus
 from gateway.operator.opcua.space import (
     BOOLEAN,
@@ -42,12 +43,17 @@ async def make_line(space: Space, line: Line) -> None:
     limits = line.limits
     speed, torque = (0.0, limits.speed_max_m_per_s), (-limits.torque_nm, limits.torque_nm)
     await _objects(space, line, speed)
-    span = await space.type("SpanType", "The web between two rollers", _span_rows(line))
+    widest = (limits.tension_min_n, limits.tension_max_n)
+    span = await space.type("SpanType", "The web between two rollers", _span_rows(*widest))
     await space.object(f"{ROOT}.Spans", ROOT, "By number; span 1 begins at the unwinder")
     roller = await space.type("RollerType", "A driven roller", _roller_rows(speed, torque))
     await space.object(f"{ROOT}.Rollers", ROOT, "By number; roller 1 ends span 1")
     for number in range(1, line.n + 1):
-        for group, rows, kind in (("Spans", _span_rows(line), span), ("Rollers", _roller_rows(speed, torque), roller)):
+        most_nm = torque_limit_nm(line, number)
+        for group, rows, kind in (
+            ("Spans", _span_rows(*tension_band_n(line, number)), span),
+            ("Rollers", _roller_rows(speed, (-most_nm, most_nm)), roller),
+        ):
             path = f"{ROOT}.{group}.{number}"
             await space.object(path, f"{ROOT}.{group}", "", kind)
             await space.variables(path, rows)
@@ -86,7 +92,7 @@ def of_status(status: GatewayStatus) -> Iterator[Told]:
         "Mode": mode(status), "Stage": "" if change is None else change.stage,
         "StageText": "" if change is None else change.text,
         "Changing": "" if change is None else change.proposal, "Health": health(status),
-        "Doubts": status.loop.doubts, "Missed": timing.missed,
+        "Doubts": status.loop.doubts, "Missed": timing.missed, "AuditHead": status.audit_head,
     }.items():  # fmt: skip
         yield Told(f"{ROOT}.Controller.{name}", value)
     for name, spread in (("CycleP99", timing.cycle), ("LatenessP99", timing.lateness)):
@@ -200,8 +206,7 @@ def _fixed(line: Line) -> Iterator[Told]:
         yield Told(f"{ROOT}.Rollers.{number}.Radius", roller.radius_m.value)
 
 
-def _span_rows(line: Line) -> list[Row]:
-    low, high = line.limits.tension_min_n, line.limits.tension_max_n
+def _span_rows(low: float, high: float) -> list[Row]:
     return [
         Row("Name", STRING, "As the line's file has it"),
         Row("Control", STRING, "tension, or draw: no load cell, the roller keeps a speed ratio"),
@@ -269,6 +274,7 @@ _CONTROLLER = (
     Row("CycleP99", DOUBLE, "Of the loop's cycles in the last ten seconds", SECOND, (0.0, 0.1)),
     Row("LatenessP99", DOUBLE, "Of the loop in the last ten seconds", SECOND, (0.0, 0.1)),
     Row("Missed", UINT32, "Periods skipped in the last ten seconds"),
+    Row("AuditHead", STRING, "NUMBER:HASH of the audit's last record: for `r2rgate audit verify --against`"),
 )
 _PERFORMANCE = (
     Row("Value", DOUBLE, "RMSE of the tensions, over all spans", NEWTON, (0.0, 1e3)),

@@ -8,6 +8,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from xml.parsers import expat
 
+from gateway.files import read_beginning
+
 MOST_FILES = 200  #: of a folder; others are not looked at
 MOST_BYTES = 4 * 2**20  #: of a file
 _HEAD_BYTES = 65_536  #: by then a file has said what it is
@@ -50,10 +52,12 @@ class Folder:
 def look_into(folder: Path) -> Folder:
     found = Folder()
     try:
-        paths = sorted(path for path in folder.iterdir() if path.suffix.lower() == ".xml" and path.is_file())
+        paths = sorted(path for path in folder.iterdir() if path.suffix.lower() == ".xml")
     except OSError as error:
         found.problems.append(f"{folder} cannot be read: {error.strerror}")
         return found
+    if len(paths) > MOST_FILES:
+        found.problems.append(f"{folder} holds {len(paths)} files: only the first {MOST_FILES} are looked at")
     for path in paths[:MOST_FILES]:
         try:
             one = _node_set(path)
@@ -108,8 +112,7 @@ def _model(attributes: dict[str, str]) -> Model:
 
 def _read(path: Path, most: int) -> bytes:
     try:
-        with path.open("rb") as file:
-            return file.read(most)
+        return read_beginning(path, most)
     except OSError as error:
         raise NotUsable(f"{path} cannot be read: {error.strerror}") from error
 

@@ -42,8 +42,10 @@ class States(NamedTuple):
 
 
 _RUNNING = {
-    Phase.ARMING: "Resetting", Phase.READY: "Idle", Phase.ENABLING: "Starting", Phase.TENSIONING: "Starting",
-    Phase.RUNNING: "Execute",
+    Phase.ARMING: "Resetting", Phase.READY: "Idle", Phase.WARNING: "Starting",
+    Phase.ENABLING: "Starting", Phase.TENSIONING: "Starting", Phase.RUNNING: "Execute",
+    Phase.PROVING: "Starting",
+    Phase.DRILLING: "Resetting",
 }  # fmt: skip
 
 
@@ -61,7 +63,7 @@ def states_of(status: GatewayStatus) -> States | None:
             return None
         case Phase.HOLDING:
             return States("Cleared", "Running", "Held" if status.loop.standstill else "Holding")
-        case Phase.SLOWING | Phase.UNLOADING | Phase.OFF:
+        case Phase.SLOWING | Phase.BRAKING | Phase.UNLOADING | Phase.OFF:
             stands = phase is Phase.OFF and status.loop.standstill
             if status.loop.by_person:
                 return States("Cleared", "Stopped" if stands else "Stopping")

@@ -19,6 +19,7 @@ from asyncua.server.server import Server
 from cryptography import x509
 from cryptography.hazmat.primitives.serialization import load_pem_private_key
 
+from gateway.files import MOST_BYTES, read_bytes
 from gateway.operator.opcua import limits
 from gateway.operator.opcua.decoder import bound_decoder
 from gateway.operator.opcua.login import Logins
@@ -157,8 +158,8 @@ def _load(stack: InternalServer, pki: Path) -> str:
     """The server's own certificate and key. Returns its ApplicationUri; raises CannotServe."""
     way_out = "`r2rgate pki init --line LINE.toml` makes what is missing"
     try:
-        stack.certificate = x509.load_pem_x509_certificate((pki / CERTIFICATE).read_bytes())
-        stack.private_key = load_pem_private_key((pki / PRIVATE_KEY).read_bytes(), password=None)
+        stack.certificate = x509.load_pem_x509_certificate(read_bytes(pki / CERTIFICATE, MOST_BYTES))
+        stack.private_key = load_pem_private_key(read_bytes(pki / PRIVATE_KEY, MOST_BYTES), password=None)
         if stack.private_key.public_key() != stack.certificate.public_key():
             raise CannotServe(f"{pki / PRIVATE_KEY} is not the key of {pki / CERTIFICATE}: move both away; {way_out}")
         return application_uri(stack.certificate)

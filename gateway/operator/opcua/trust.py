@@ -17,6 +17,7 @@ from cryptography.hazmat.primitives.asymmetric.rsa import RSAPublicKey
 from cryptography.hazmat.primitives.serialization import Encoding
 
 from gateway.core.line import Line
+from gateway.files import read_bytes
 
 CERTIFICATE, PRIVATE_KEY = "opcua-server.pem", "opcua-server.key.pem"  #: files
 TRUSTED, REJECTED = "trusted", "rejected"  #: folders
@@ -183,14 +184,24 @@ class TrustList:
             if before.stamp == stamp:
                 return before
             usable = S_ISREG(found.st_mode) and found.st_size <= MOST_BYTES
-            return _File(stamp, path.read_bytes() if usable else b"")
-        except FileNotFoundError:
-            return _NOTHING
+            der = read_bytes(path, MOST_BYTES) if usable else b""
+            self._say_whether_good(path, der)
+            return _File(stamp, der)
         except OSError as error:
+            if isinstance(error, FileNotFoundError) and not path.is_symlink():
+                return _NOTHING
             if not before.unreadable:
                 holds = "what it held last holds" if before.der else "it lets nobody in"
                 self._tell(f"{path} cannot be read, and {holds}: {error.strerror}")
             return _File((0, 0, 0), before.der, unreadable=True)
+
+    def _say_whether_good(self, path: Path, der: bytes) -> None:
+        """Once, when it is new: a file that is no certificate lets nobody in, and keeps nobody else out."""
+        try:
+            certificate_of(der)
+        except NotUsable as error:
+            why = str(error) if der else f"it is no file of 1 to {MOST_BYTES} bytes"
+            self._tell(f"{path} lets nobody in: {why}")
 
     def _keep(self, der: bytes) -> None:
         """Beside the newest others; told once as long as it lies there."""

@@ -9,13 +9,13 @@ from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
 from starlette.middleware import Middleware
 from starlette.requests import Request
-from starlette.responses import JSONResponse
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
 from gateway.core.line import Line
 from gateway.operator.access import Access
 from gateway.operator.line_side import LineSide
+from gateway.operator.page.answer import JSONResponse
 from gateway.operator.page.asks import Asks
 from gateway.operator.page.events import Ticks, stream
 from gateway.operator.page.guard import Guarded, names_of

@@ -7,7 +7,6 @@ from typing import Annotated, Any
 from pydantic import Field, TypeAdapter, ValidationError
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
-from starlette.responses import JSONResponse
 from starlette.routing import Route
 
 from gateway.core.line import Line, Strict
@@ -15,6 +14,7 @@ from gateway.core.line_past import TensionsBetween
 from gateway.core.messages import Reply
 from gateway.core.people import LEAST, Said, may, why_may_not
 from gateway.operator.line_side import Declined, LineSide, NotTold
+from gateway.operator.page.answer import JSONResponse
 from gateway.operator.page.guard import body_of
 from gateway.operator.page.login import Door
 from gateway.operator.page.tick import line_told

@@ -14,6 +14,7 @@ from starlette.requests import Request
 from starlette.responses import StreamingResponse
 from starlette.types import Receive, Scope, Send
 
+from gateway.core.clean_text import clean_texts
 from gateway.core.decisions import ProposalList
 from gateway.core.people import Role
 from gateway.core.status import GatewayStatus
@@ -110,4 +111,4 @@ def stream(
 
 
 def _event(kind: str, data: dict[str, Any]) -> str:
-    return f"event: {kind}\ndata: {json.dumps(data, separators=(',', ':'), allow_nan=False)}\n\n"
+    return f"event: {kind}\ndata: {json.dumps(clean_texts(data), separators=(',', ':'), allow_nan=False)}\n\n"

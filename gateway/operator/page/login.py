@@ -9,12 +9,12 @@ from typing import Annotated
 from pydantic import Field, ValidationError
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
-from starlette.responses import JSONResponse
 from starlette.routing import Route
 
 from gateway.core.line import Strict
 from gateway.core.people import Person, Role
 from gateway.operator.access import Access
+from gateway.operator.page.answer import JSONResponse
 from gateway.operator.page.guard import body_of
 from gateway.operator.page.sessions import LONGEST_S, Session, Sessions, Tries
 from gateway.operator.users import RoleOf

@@ -7,9 +7,11 @@ from typing import Any
 
 from gateway.core.alarms import AlarmStatus
 from gateway.core.decisions import ProposalList
+from gateway.core.finding import Finding
 from gateway.core.line import Line
-from gateway.core.status import EventStatus, GatewayStatus, LimitsStatus, SpanStatus
-from gateway.wording.catalogue import languages, sentences
+from gateway.core.line_limits import setpoint_bands_n
+from gateway.core.status import EventStatus, GatewayStatus, LimitsStatus, SpanStatus, band_n
+from gateway.wording.catalogue import languages, sentence, sentences
 
 DRIVES_THAT_FAIL = frozenset({"ABSENT", "STOPPING", "FAULT", "STO"})
 IN_MOTION = frozenset({"RUN", "HOLD"})  #: states in which tensions are controlled
@@ -18,6 +20,7 @@ OFF_SHARE = 0.2  #: of the set-point: a tension farther off is told. As the alar
 
 def line_told(line: Line) -> dict[str, Any]:
     """What never changes while the process runs."""
+    low, high = setpoint_bands_n(line)
     return {
         "site": line.site,
         "line": line.line,
@@ -25,10 +28,7 @@ def line_told(line: Line) -> dict[str, Any]:
         "n": line.n,
         "period_s": line.control.period_s,
         "tension_n": [line.limits.tension_min_n, line.limits.tension_max_n],
-        "setpoint_n": [
-            line.limits.tension_min_n + line.limits.tension_margin_n,
-            line.limits.tension_max_n - line.limits.tension_margin_n,
-        ],
+        "setpoint_n": [list(band) for band in zip(low.tolist(), high.tolist(), strict=True)],
         "torque_nm": line.limits.torque_nm,
         "speed_max_m_per_s": line.limits.speed_max_m_per_s,
         "spans": [{"name": span.name, "control": span.control} for span in line.spans],
@@ -46,6 +46,9 @@ def tick_of(status: GatewayStatus, proposals: ProposalList | None, revision: int
         "speed": _short(status.unwind_speed_m_per_s),
         "speed_setpoint": _short(status.speed_setpoint_m_per_s),
         "stands": status.stands,
+        "before_more": [_in_words(one) for one in _before_more(status)],
+        "wiring_not_read": status.wiring is not None and status.wiring.not_read,
+        "proved_wall_s": None if status.wiring is None else status.wiring.proved_wall_s,
         "change": None if status.change is None else status.change.model_dump(),
         "spans": [
             [
@@ -64,9 +67,19 @@ def tick_of(status: GatewayStatus, proposals: ProposalList | None, revision: int
         "historian": status.historian.model_dump(include={"storing", "text", "frames_lost", "events_lost"}),
         "events": [_told(event) for event in status.events[-20:]],
         "alarms": [_told(alarm) for alarm in status.alarms],
+        "audit_head": status.audit_head,
         "revision": revision,
         "waiting": [one.proposal for one in proposals.proposals if one.stage == "waiting"] if proposals else [],
     }
+
+
+def _before_more(status: GatewayStatus) -> list[Finding]:
+    """What a person has to do before the line starts, or goes faster."""
+    return [*([] if status.wiring is None else status.wiring.unproved), *status.unconfirmed]
+
+
+def _in_words(one: Finding) -> dict[str, Any]:
+    return {"text": sentence(one), "said": {language: sentence(one, language) for language in languages()[1:]}}
 
 
 def _told(one: EventStatus | AlarmStatus) -> dict[str, Any]:
@@ -91,9 +104,9 @@ def abnormal(span: SpanStatus, limits: LimitsStatus, moving: bool) -> tuple[str,
         return _how_bad(span, moving), f"quality.{'MISSING' if span.tension_n is None else span.quality}"
     if span.control != "tension" or not moving:
         return "", ""
-    return (
-        ("", "") if span.tension_n is None or span.setpoint_n is None else _off(span.tension_n, span.setpoint_n, limits)
-    )
+    if span.tension_n is None or span.setpoint_n is None:
+        return "", ""
+    return _off(span.tension_n, span.setpoint_n, band_n(span, limits))
 
 
 def _how_bad(span: SpanStatus, moving: bool) -> str:
@@ -103,8 +116,8 @@ def _how_bad(span: SpanStatus, moving: bool) -> str:
     return "" if span.tension_n is None else "attention"
 
 
-def _off(tension_n: float, setpoint_n: float, limits: LimitsStatus) -> tuple[str, str]:
-    least, most = limits.tension_min_n, limits.tension_max_n
+def _off(tension_n: float, setpoint_n: float, band: tuple[float, float]) -> tuple[str, str]:
+    least, most = band
     if least <= setpoint_n <= most and not least <= tension_n <= most:
         return "alarm", "span.outside"
     if abs(tension_n - setpoint_n) > OFF_SHARE * setpoint_n > 0.0:

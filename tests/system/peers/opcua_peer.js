@@ -86,8 +86,10 @@ function axisNodes (axis) {
 }
 
 function lineNodes () {
+  let warning = false
   const act = (values) => {
     if ('watchdog' in values) plc.watchdog.set(values.watchdog)
+    if ('warning' in values) warning = values.warning
     plc.command(values.run ?? plc.commanded, values.speed ?? plc.request, values.life ?? plc.life)
   }
   return {
@@ -96,9 +98,11 @@ function lineNodes () {
     EmergencyStopHealthy: read(BOOLEAN, () => plc.emergencyStopHealthy),
     Running: read(BOOLEAN, () => plc.running),
     WatchdogTripped: read(BOOLEAN, () => plc.tripped),
+    Local: read(BOOLEAN, () => false),
     UnwindSpeed: read(DOUBLE, () => plc.speed),
     LifeEcho: read(UINT16, () => plc.life),
     Run: written(BOOLEAN, plc, 'run', act, () => plc.commanded),
+    Warning: written(BOOLEAN, plc, 'warning', act, () => warning),
     SpeedRequest: written(DOUBLE, plc, 'speed', act, () => plc.request, Number.isFinite),
     Life: written(UINT16, plc, 'life', act, () => plc.life),
     Watchdog: written(UINT16, plc, 'watchdog', act, () => plc.watchdog.ms, Watchdog.allows)

@@ -9,13 +9,17 @@ export function paintHealth(tick, line) {
   const now_ms = performance.now(); // the line's clock may be set back
   if (now_ms - painted_ms < 900 && $("view-health").dataset.key) return;
   painted_ms = now_ms;
-  const key = JSON.stringify([tick.timing, tick.loop.doubts, tick.buses, tick.agents, tick.historian, tick.link, tick.events, document.documentElement.lang]);
+  const key = JSON.stringify([tick.timing, tick.loop.doubts, tick.before_more, tick.wiring_not_read, tick.proved_wall_s, tick.buses, tick.agents, tick.historian, tick.link, tick.events, document.documentElement.lang]);
   replaced($("view-health"), key, () => [h("div", { class: "stack" }, diagnoses(tick), parts(tick)), h("div", { class: "stack" }, timing(tick, line), events(tick))]);
 }
 
-function diagnoses({ loop, change }) {
+function diagnoses({ loop, change, before_more, wiring_not_read, proved_wall_s }) {
+  const told = (one) => h("li", { class: "attention-text" }, coded("span", one.said[document.documentElement.lang] ?? one.text));
   return h("section", { class: "panel" }, h("h2", {}, word("health.diagnoses")),
     loop.doubts.length ? h("ul", {}, loop.doubts.map((doubt) => translated("li", doubt, { class: "attention-text" }))) : h("p", {}, word("health.no-diagnoses")),
+    before_more.length ? [h("h3", {}, word("health.before-more")), h("ul", {}, before_more.map(told))] : [],
+    wiring_not_read && h("p", {}, word("health.wiring-not-read")),
+    proved_wall_s !== null && h("p", {}, word("health.proved", { since: time(proved_wall_s, true) })),
     change && [h("h3", {}, word("health.change")), h("p", {}, word(`kind.${change.kind}`), ". ", word(`stage.${change.stage}`), change.text && [": ", translated("span", change.text)])]);
 }
 

@@ -116,6 +116,7 @@ function paint() {
     parts.operate.paint(tick);
   }
   if (open() === "health") paintHealth(tick, parts.line);
+  setText($("audit-head"), tick.audit_head || "–");
   const { waiting } = tick;
   show($("waiting"), waiting.length > 0);
   setText($("waiting"), String(waiting.length));

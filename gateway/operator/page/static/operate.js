@@ -80,8 +80,15 @@ export class Operate {
 
   tension() {
     const span = h("select", {}, this.line.spans.map((one, i) => h("option", { value: i + 1 }, `${i + 1} ${one.name}`)));
-    const [min, max] = this.line.setpoint_n;
-    const value = this.field(min, max, () => this.last.spans[span.value - 1][1]);
+    const band = () => this.line.setpoint_n[span.value - 1], [min, max] = band();
+    const value = this.field(min, max, () => this.last.spans[span.value - 1][1]), allowed = h("span");
+    const bound = () => {
+      const [least, most] = band();
+      Object.assign(value.input, { min: least, max: most });
+      setText(allowed, `N, ${number(least, 0)} ${word("operate.to")} ${number(most, 0)}`);
+    };
+    bound();
+    span.addEventListener("change", bound);
     span.addEventListener("change", value.anew);
     const submit = async () => {
       const answered = value.sending();
@@ -90,7 +97,7 @@ export class Operate {
     };
     return this.form("tension", submit,
       h("label", {}, h("span", {}, word("operate.tension")), span),
-      h("label", {}, h("span", {}, `N, ${number(min, 0)} ${word("operate.to")} ${number(max, 0)}`), value.input));
+      h("label", {}, allowed, value.input));
   }
 
   speed() {

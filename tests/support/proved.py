@@ -1,0 +1,53 @@
+"""Lines whose wiring has been proved, for tests of what comes after: the stored proof that `start` asks for."""
+
+from pathlib import Path
+
+from drivers.registry import map_files
+from gateway.cli.stepped import shown_as_described
+from gateway.core.line import CanopenBus, Line
+from gateway.core.wiring_proof import WiringProof, device_identities, devices_of, proof_hash, wiring_hash
+from gateway.loop.wiring import FILE, Wiring
+from gateway.supervisor.audit import Audit
+from gateway.supervisor.audit_file import FILE_NAME
+from gateway.supervisor.lifecycle import WIRING_PROVED
+from gateway.supervisor.peers import GATEWAY
+
+SERIAL_OF_NODE_0 = 0x52520000  #: of a simulated CANopen node; its number is added
+
+
+def proof_of_wiring(line: Line, *, serials: bool = True) -> WiringProof:
+    """Of `line` on simulated devices. Without `serials`: in memory, where nothing has a number."""
+    buses = {bus.name for bus in line.buses if isinstance(bus, CanopenBus)} if serials else set[str]()
+    numbers = {each.name: f"{SERIAL_OF_NODE_0 + each.address:#x}" for each in devices_of(line) if each.bus in buses}
+    maps = map_files(line)
+    drives, cells = shown_as_described(line)
+    return WiringProof(
+        wiring=wiring_hash(line, maps, numbers), wall_s=0.0, devices=device_identities(line, maps, numbers),
+        drives=drives, cells=cells, watchdogs=[],
+    )  # fmt: skip
+
+
+def store_proof(line: Line, folder: Path) -> None:
+    """Into the data folder of a loop that is not started yet."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / FILE).write_text(proof_of_wiring(line).model_dump_json())
+
+
+def proved_wiring(line: Line, *, serials: bool = True) -> Wiring:
+    """For a loop without a folder."""
+    wiring = Wiring(line, map_files(line))
+    wiring.write(proof_of_wiring(line, serials=serials))
+    wiring.take_written()
+    return wiring
+
+
+def record_proof(line: Line, folder: Path) -> None:
+    """Into the audit of a gateway that is not started there yet: it explains the proof that `store_proof` stores."""
+    if (folder / FILE_NAME).exists():
+        return
+    folder.mkdir(parents=True, exist_ok=True)
+    proof, audit = proof_of_wiring(line), Audit(folder)
+    audit.start()
+    what = {"wiring": proof.wiring, "wall_s": proof.wall_s, "answers": [], "proof": proof_hash(proof)}
+    audit.append_and_wait(WIRING_PROVED, GATEWAY, what)
+    audit.close()
