@@ -7,7 +7,7 @@ PARALLEL := --numprocesses auto --maxprocesses 4 --dist loadfile
 export PYTHONDONTWRITEBYTECODE :=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup run test test-long test-long-realtime test-long-rest coverage test-realtime test-rest system-test check types lint format bench bench-stepped bench-wire bench-processes bench-cycle bench-engage bench-history bench-trials bench-mpc bench-loop-states bench-loop-kill bench-monitor bench-control bench-identify bench-faults bench-fuzz bench-soak bench-gate bench-lifecycle bench-audit bench-kill bench-gate-live bench-agents-live bench-operator bench-harm bench-intrusions bench-knowledge bench-agents minilm mutate lock clean
+.PHONY: help setup run test test-long test-long-realtime test-long-rest coverage test-realtime test-rest system-test landing search test-fast ready check types lint format bench bench-stepped bench-wire bench-processes bench-cycle bench-engage bench-history bench-trials bench-mpc bench-loop-states bench-loop-kill bench-monitor bench-control bench-identify bench-faults bench-fuzz bench-soak bench-gate bench-lifecycle bench-audit bench-kill bench-gate-live bench-agents-live bench-operator bench-harm bench-intrusions bench-knowledge bench-agents minilm mutate lock clean
 
 help: ## this list
 	@echo "r2rgate: make TARGET"
@@ -47,6 +47,12 @@ system-test: $(VENV)/.compiled ## a real CAN kernel and foreign protocol stacks;
 	@$(PY) -m tests.system.needs
 	@$(PY) -m pytest tests/system $(ARGS)
 
+landing: $(VENV)/.compiled ## what a change must pass: all tests in stages, what failed tried again alone (about 25 min; as root; ARGS="--stage wires")
+	@$(PY) -m tests.landing $(ARGS)
+
+search: $(VENV)/.compiled ## new draws and another order of the tests that draw: faults that no fixed draw shows (ARGS=tests/safety)
+	@$(PY) -m pytest -m "not realtime and not long" $(PARALLEL) --hypothesis-profile "any machine" $(ARGS)
+
 coverage: setup ## every line and branch of safety/, run by its own tests (about 3 min)
 	@$(PY) -m coverage run -m pytest tests/safety tests/unit/test_monitor.py tests/unit/test_recoverability.py
 	@$(PY) -m coverage report
@@ -65,6 +71,7 @@ lint: setup
 	@$(PY) -m ruff format --check .
 	@mkdir -p out
 	@$(VENV)/bin/lint-imports --no-cache > out/lint-imports.txt 2>&1 || { cat out/lint-imports.txt; exit 1; }
+	@$(PY) -m tests.landing mended
 
 format: setup ## format the code
 	@$(PY) -m ruff format .

@@ -6,5 +6,8 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the commands: on small 
 
 from hypothesis import HealthCheck, settings
 
-settings.register_profile("any machine", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.register_profile(
+    "any machine", deadline=None, derandomize=False, max_examples=100, suppress_health_check=[HealthCheck.too_slow]
+)
+settings.register_profile("landing", settings.get_profile("any machine"), derandomize=True, database=None)
 settings.load_profile("any machine")

@@ -55,11 +55,15 @@ class FileKind:
     journal: Journal = Journal.ROLLBACK
     additions: str = ""  #: IF NOT EXISTS: tables that older programs of the same schema need not know
     gives_back: bool = False  #: free pages can be given back to the disk; of a file that is begun
-    busy_ms: int = BUSY_MS
+    busy_ms: int | None = None  #: how long a lock of somebody else is waited for; None: `BUSY_MS`
 
     @property
     def schema(self) -> int:
         return len(self.migrations)
+
+    @property
+    def waits_ms(self) -> int:
+        return BUSY_MS if self.busy_ms is None else self.busy_ms
 
 
 def open_there(path: Path, kind: FileKind) -> apsw.Connection:
@@ -89,7 +93,7 @@ def open_to_read(path: Path, kind: FileKind, busy_ms: int | None = None) -> apsw
         _require_not_anothers(path, kind)
         connection = apsw.Connection(os.fspath(path), flags=apsw.SQLITE_OPEN_READWRITE)
         try:
-            connection.set_busy_timeout(kind.busy_ms if busy_ms is None else busy_ms)
+            connection.set_busy_timeout(kind.waits_ms if busy_ms is None else busy_ms)
             connection.execute("PRAGMA query_only = ON")
             _require_ours(connection, path, kind)
         except BaseException:
@@ -106,7 +110,7 @@ def connect(
     _require_not_anothers(path, kind)
     connection = apsw.Connection(os.fspath(path), flags=flags)
     try:
-        connection.set_busy_timeout(kind.busy_ms)
+        connection.set_busy_timeout(kind.waits_ms)
         _require_ours(connection, path, kind)
         check_whole(connection, path)
         if kind.gives_back:
@@ -262,7 +266,12 @@ def told(path: Path, kind: FileKind) -> Iterator[None]:
         kinds = (words for type_, words in _WORDS.items() if isinstance(error, type_))
         words = next(kinds, _WORDS[apsw.CorruptError])
         text = words.format(
-            path=path, error=error, name=kind.name, damaged=kind.damaged, undone=kind.undone, busy_s=BUSY_MS // 1000
+            path=path,
+            error=error,
+            name=kind.name,
+            damaged=kind.damaged,
+            undone=kind.undone,
+            busy_s=f"{kind.waits_ms / 1000:g}",
         )
         raise kind.error(text) from error
     except OSError as error:

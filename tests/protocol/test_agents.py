@@ -6,6 +6,8 @@ import sys
 from contextlib import asynccontextmanager
 from pathlib import Path
 
+import pytest
+
 from agents.code.materials import Given
 from agents.process import begin
 from agents.rag.stages import Asked, Retrieval
@@ -19,6 +21,8 @@ from gateway.core.topics import AGENT_DECIDE, AGENT_NAMES, ASK_LOG
 from gateway.mailbox.zenoh_mailbox import ZenohMailbox
 from tests.protocol.bus_support import LINE, answer_of, client, is_here, never, router, run
 from tests.unit.language_model_support import QUESTION
+
+pytestmark = pytest.mark.wires
 
 #: As `r2rgate agents` has it.
 PROCESS = """

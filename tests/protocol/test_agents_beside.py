@@ -14,6 +14,8 @@ from gateway.core.topics import AGENT_DECIDE
 from tests.protocol.bus_support import LINE, client, never, router, run
 from tests.unit.language_model_support import QUESTION
 
+pytestmark = pytest.mark.wires
+
 
 def test_a_command_asks_them_and_goes_on_by_the_rules_once_they_are_gone() -> None:
     chosen = Answer(choice=Choice(option="mpc", reason="the least error"), by="adaptation")

@@ -30,6 +30,8 @@ from tests.protocol.bus_support import (
 )
 from tests.unit.supervisor_support import child, line_of, until
 
+pytestmark = pytest.mark.wires
+
 
 def test_agents_ask_the_gateway_and_the_phases_ask_agents() -> None:
     async def story(folder: Path) -> None:

@@ -6,6 +6,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from gateway.cli.asked_agents import AskedAgents
 from gateway.control.design import design_lqi, task_of
 from gateway.core.audit_record import Who
@@ -23,6 +25,8 @@ from gateway.supervisor.proposal_records import iso
 from tests.protocol.bus_support import AGENT, LINE, LONG_S, client, is_here, run
 from tests.unit.language_model_support import QUESTION
 from tests.unit.supervisor_support import child, until
+
+pytestmark = pytest.mark.wires
 
 GATEWAY = """
 import sys

@@ -27,6 +27,8 @@ from tests.protocol.bus_support import (
 )
 from tests.unit.supervisor_support import short_folder, until
 
+pytestmark = pytest.mark.wires
+
 
 def test_a_flood_of_messages_and_of_requests_is_turned_away_and_the_gateway_answers_others() -> None:
     async def story(folder: Path) -> None:

@@ -38,6 +38,8 @@ from tests.protocol.bus_support import (
 )
 from tests.unit.supervisor_support import until
 
+pytestmark = pytest.mark.wires
+
 
 async def forged(_: bytes) -> bytes:
     return b"forged"

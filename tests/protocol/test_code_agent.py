@@ -20,6 +20,8 @@ from tests.stand_in.personas import PERSONAS
 from tests.stand_in.server import StandIn
 from tests.unit.language_model_support import QUESTION
 
+pytestmark = pytest.mark.wires
+
 LONG_S = 300.0  #: a fresh checkout compiles first
 CONFIG = design_lqi(task_of(LINE))
 

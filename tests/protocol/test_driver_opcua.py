@@ -14,6 +14,8 @@ from drivers.port import PrepareRefused
 from gateway.core.signals import DriveRequest, DriveState, Quality
 from tests.protocol.driver_opcua_support import U32, DeviceServer, Rig, device_server, line, link_in_process
 
+pytestmark = pytest.mark.wires
+
 CODES = ua.StatusCodes
 
 

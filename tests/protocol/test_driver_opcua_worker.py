@@ -26,6 +26,8 @@ from gateway.core.signals import DriveState, Quality
 from tests.protocol.driver_opcua_support import DeviceServer, Rig, device_server, line, link_with_worker
 from tests.protocol.driver_support import until
 
+pytestmark = pytest.mark.wires
+
 NULL_BOMB = bytes.fromhex("80 ffffff7f")  #: a Variant: an array of 2^31 - 1 Nulls, in five bytes
 
 

@@ -25,6 +25,8 @@ from tests.unit.language_model_support import QUESTION
 from tests.unit.supervisor_support import until
 from tests.unit.test_line_desk import recording
 
+pytestmark = pytest.mark.wires
+
 
 @asynccontextmanager
 async def served(bus: ZenohMailbox, data: Path):

@@ -24,6 +24,8 @@ from tests.stand_in.personas import PERSONAS
 from tests.stand_in.server import StandIn
 from tests.unit.language_model_support import PROMPT, QUESTION, says
 
+pytestmark = pytest.mark.wires
+
 SKY = [Said("user", "Why is the sky blue?")]
 
 

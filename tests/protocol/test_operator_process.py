@@ -30,6 +30,8 @@ from tests.protocol.bus_support import free_port
 from tests.protocol.operator_support import NUMBER, FakeGateway, der, pair
 from tests.unit.supervisor_support import short_folder
 
+pytestmark = pytest.mark.wires
+
 
 def set_up(folder: Path, *words: str) -> Path:
     """A line's file, and certificates of server and client."""

@@ -29,6 +29,8 @@ from gateway.core.topics import ASK_STATUS
 from gateway.mailbox.bus import BusUnavailable, TlsEndpoint, connect
 from tests.protocol.bus_support import LONG_S, client, echo, free_port, router, run
 
+pytestmark = pytest.mark.wires
+
 NOW = datetime.now(UTC)
 STATUS = ASK_STATUS.of("sysid")
 

@@ -26,6 +26,8 @@ from sim_plant.recorder import read_recording
 from sim_plant.wired import Settings, WiredLine
 from tests.protocol.driver_support import GROUP, Registers, free_port
 
+pytestmark = pytest.mark.wires
+
 PLANT = Path("sim_plant/plants/s_real.toml")
 
 

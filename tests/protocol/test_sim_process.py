@@ -32,6 +32,8 @@ from sim_plant.process import main, run_plant
 from sim_plant.recorder import read_recording
 from sim_plant.wired import WiredLine, WorldClock
 
+pytestmark = pytest.mark.wires
+
 ROOT = Path(__file__).parents[2]
 PLANT = ROOT / "sim_plant/plants/s_real.toml"
 GROUP = "239.74.163.2"

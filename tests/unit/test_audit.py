@@ -30,6 +30,8 @@ from tests.unit import audit_damage
 from tests.unit.supervisor_support import child, until
 from tests.unit.test_models import HOLD_LOCK
 
+pytestmark = pytest.mark.wires
+
 ROOT = Path(__file__).parents[2]
 ANN = Who(name="ann", uid=1000, pid=7)
 

@@ -21,6 +21,8 @@ from gateway.supervisor.alarms import Alarms
 from tests.unit.alarm_support import RECORDING, bus, span, status
 from tests.unit.supervisor_support import short_folder
 
+pytestmark = pytest.mark.wires
+
 WALL_S = 1_700_000_000.0
 BROKEN = status(buses=[bus(["drive-3"], "no \x1b[31mheartbeat")], spans=[span(1, quality="BAD")])
 

@@ -18,6 +18,8 @@ from gateway.core.recording import Recording
 from tests.unit import code_support as works
 from tests.unit.code_support import LINE, in_service, job, nothing
 
+pytestmark = pytest.mark.wires
+
 LONG_S = 120.0  #: nobody waits for it in a test that goes well
 
 

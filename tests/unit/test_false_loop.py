@@ -34,6 +34,8 @@ from gateway.supervisor.audit_file import AuditFile
 from tests.unit.supervisor_support import ShowsWho, child, frame_of, short_folder
 from tests.unit.test_supervisor_process import GATEWAY, ask, gateway, heard, loop_and_client, run, status_with
 
+pytestmark = pytest.mark.wires
+
 #: Serves the loop's socket where told to, and says what a loop in RUN says; how it shows who it is: not, or by relay.
 FALSE_LOOP = """
 import asyncio, json, sys, time

@@ -20,6 +20,8 @@ from tests.unit import historian_victim
 from tests.unit.supervisor_support import child, frame_of
 from tests.unit.test_historian import eventually, running, writer_of
 
+pytestmark = pytest.mark.wires
+
 ROOT = Path(__file__).parents[2]
 
 

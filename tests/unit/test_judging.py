@@ -18,6 +18,8 @@ from safety.courses import courses_of
 from safety.judge import judge
 from tests.safety.case_support import EXAMPLES, gains, published
 
+pytestmark = pytest.mark.wires
+
 
 @pytest.fixture(scope="module")
 def of():

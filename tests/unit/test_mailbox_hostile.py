@@ -20,6 +20,8 @@ from gateway.mailbox.unix import MAX_IN_FLIGHT, UnixMailbox
 from tests.unit.supervisor_support import child, frame_of, until
 from tests.unit.test_mailbox_unix import LISTEN, echo, mailboxes, run
 
+pytestmark = pytest.mark.wires
+
 LONGEST_CALL_S = 1.0  # a blocked call would take for ever; a busy test machine may take its time
 
 

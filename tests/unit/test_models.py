@@ -23,6 +23,8 @@ from tests.unit import models_victim
 from tests.unit.model_support import model
 from tests.unit.supervisor_support import child, short_folder
 
+pytestmark = pytest.mark.wires
+
 ROOT = Path(__file__).parents[2]
 OLDER = ROOT / "tests" / "unit" / "data" / "models-schema-1.sqlite"
 OLDER_IDS = [

@@ -138,6 +138,7 @@ def test_where_the_disk_refuses_nothing_is_granted_and_it_is_not_behind(tmp_path
     async def story(it):
         if isinstance(command, Keep):
             assert (await it.ask(deploy())).ok
+            assert not await it.runner.persisted(10.0)  # the deployment's own write takes no refusal meant for this
         before = it.loop.cycle.configurations.durable
         it.store.refused = {it.store.asked + 1}
         reply = await it.ask(command)

@@ -20,6 +20,8 @@ from agents.rag.minilm import PACKAGE, MiniLm
 from agents.rag.ollama_embedder import OllamaEmbedder
 from agents.rag.wordpiece import WordPieces
 
+pytestmark = pytest.mark.wires
+
 WIDTH, HEADS, LAYERS, INNER = 8, 2, 2, 12
 VOCABULARY = "[PAD] [UNK] [CLS] [SEP] tension load ##ing ##s cell - 2 . a ##m 中 µm".split()
 

@@ -21,6 +21,8 @@ from gateway.mailbox.unix import UnixMailbox
 from gateway.supervisor.history import History
 from tests.unit.supervisor_support import ShowsWho, child, frame_of, short_folder
 
+pytestmark = pytest.mark.wires
+
 GATEWAY = """
 import sys
 from pathlib import Path

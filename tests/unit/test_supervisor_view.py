@@ -28,6 +28,8 @@ from tests.unit.supervisor_support import frame_of, short_folder
 from tests.unit.test_historian import writer_of
 from tests.unit.test_supervisor_status import Bench, example
 
+pytestmark = pytest.mark.wires
+
 app = typer.Typer()
 app.command("status")(status)
 app.command("export-csv")(export_csv)
