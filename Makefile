@@ -47,6 +47,12 @@ system-test: $(VENV)/.compiled ## a real CAN kernel and foreign protocol stacks;
 	@$(PY) -m tests.system.needs
 	@$(PY) -m pytest tests/system $(ARGS)
 
+test-fast: $(VENV)/.compiled ## unit and safety, what takes no second each: at each save (a minute)
+	@$(PY) -m pytest tests/unit tests/safety -m "not slow and not wires and not realtime and not long" $(PARALLEL) --hypothesis-profile fast $(ARGS)
+
+ready: check test-fast ## whether a change will land, in ten minutes: then what is new in the tests ten times on a busy machine (ARGS="--since COMMIT")
+	@$(PY) -m tests.landing ready $(ARGS)
+
 landing: $(VENV)/.compiled ## what a change must pass: all tests in stages, what failed tried again alone (about 25 min; as root; ARGS="--stage wires")
 	@$(PY) -m tests.landing $(ARGS)
 

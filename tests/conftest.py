@@ -1,6 +1,11 @@
 """For all tests: what is about the wall clock says so by its mark, and no property fails because it took long."""
 
+import gc
 import os
+import sys
+from collections.abc import Iterator
+
+import pytest
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the commands: on small matrices threads wait on each other
 
@@ -10,4 +15,14 @@ settings.register_profile(
     "any machine", deadline=None, derandomize=False, max_examples=100, suppress_health_check=[HealthCheck.too_slow]
 )
 settings.register_profile("landing", settings.get_profile("any machine"), derandomize=True, database=None)
+settings.register_profile("fast", settings.get_profile("landing"), max_examples=25)
 settings.load_profile("any machine")
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _leaves_nothing_behind() -> Iterator[None]:
+    """What a module leaks is told in it, not in whichever comes next; nor does its thread switching stay."""
+    before_s = sys.getswitchinterval()
+    yield
+    sys.setswitchinterval(before_s)
+    gc.collect()

@@ -20,7 +20,6 @@ from gateway.mailbox.keys import private_key
 from gateway.mailbox.paths import LOOP_SOCKET
 from gateway.mailbox.unix import UnixMailbox
 from tests.closed_loop.gate_line import GateLine
-from tests.closed_loop.wire import at_rest
 from tests.support.gateway_key import as_gateway
 
 pytestmark = [pytest.mark.realtime, pytest.mark.timeout(180)]
@@ -84,7 +83,6 @@ while os.getppid() == (began_by if os.getpid() == mine else mine):  # it outlive
 """
 TAKEN_WITHIN_S = 1.0
 FLOODED_S = 3.0  #: of a flood, before anything is ordered
-TRIES = 3
 
 
 @pytest.fixture
@@ -136,36 +134,32 @@ def flooded(line: GateLine, crowd: list[str]) -> Iterator[None]:
 @pytest.mark.parametrize(
     "crowd", [["1", "1000"], ["32", "1"]], ids=["one process with all it can open", "32 processes"]
 )
-def test_a_line_runs_on_through_a_flood_and_hold_and_stop_are_taken_within_a_second_of_it(line, crowd):
+def test_no_flood_keeps_hold_or_stop_waiting_for_a_second_and_nothing_unsafe_comes_of_it(line, crowd):
+    """How much of each period a flood takes at most is counted in test_mailbox_turns; here it takes the machine, too.
+
+    One that has no processor left for the line stops it: then it is not held any more, and stop is taken all the same.
+    """
     line.run()
-    for _ in range(TRIES):  # a machine that stalls stops the line, too, but not each time
-        with flooded(line, crowd):
-            time.sleep(FLOODED_S)
-            status = line.wait(lambda _: True)
-            print(f"{status.loop.state} under a flood: {status.timing}")
-            if status.loop.state == "RUN" and take(line):
-                break
-        line.wait(at_rest)
-        line.arm_and_start()
-    else:
-        raise AssertionError(f"a flood of {FLOODED_S} s stopped the line {TRIES} times")
+    with flooded(line, crowd):
+        time.sleep(FLOODED_S)
+        status = line.wait(lambda _: True)
+        print(f"{status.loop.state} under a flood: {status.timing}")
+        take(line)
     line.recording()
     assert not any(line.unsafe().values()), line.unsafe()
 
 
-def take(line: GateLine) -> bool:
-    """Hold and stop, each twice, past the gateway. Whether they were done: a line that has just stopped is not held."""
+def take(line: GateLine) -> None:
+    """Hold and stop, each twice, past the gateway, answered in time."""
     took_s: dict[str, list[float]] = {}
-    done = True
     for command in (Hold(), Hold(), Stop(), Stop()):
         began_s = time.monotonic()
         reply = straight(line.children.run_folder / LOOP_SOCKET, command)
         took_s.setdefault(command.command, []).append(time.monotonic() - began_s)
-        done = done and reply.ok
+        assert reply.ok or command.command == "hold", reply
     line.wait_at_rest()
     print("under a flood they took", took_s)
     assert max(max(took_s["hold"]), max(took_s["stop"])) < TAKEN_WITHIN_S, took_s
-    return done
 
 
 def straight(socket, command) -> Reply:

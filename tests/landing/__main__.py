@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from tests.landing import known
+from tests.landing.ready import ready
 from tests.landing.record import Recorded
 from tests.landing.second_try import Crashes, tried_again
 from tests.landing.stages import SAME_DRAWS, STAGES, WHOLE_LIMIT_S, Stage
@@ -145,11 +146,15 @@ def main() -> int:
     keep.add_argument("log", type=Path, help="what the run printed")
     keep.add_argument("--run", required=True, help="its commit")
     commands.add_parser("mended", help="fail while a test is intermittent again and again")
+    repeat = commands.add_parser("ready", help="changed tests ten times, on a busy machine")
+    repeat.add_argument("--since", default="HEAD", help="what they differ from; default: the last commit")
     parser.add_argument("--stage", action="append", choices=[stage.name for stage in STAGES], help="only this one")
     options = parser.parse_args()
     if options.command == "keep":
         print(f"{known.keep(options.log.read_text(errors='replace'), options.run)} kept in {known.FILE.name}")
         return 0
+    if options.command == "ready":
+        return 0 if ready(options.since) else 1
     if options.command == "mended":
         tests = known.to_be_mended()
         for test in tests:

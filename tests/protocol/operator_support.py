@@ -1,6 +1,7 @@
 """A fake gateway on a real mailbox, the OPC UA server in front of it, and clients of every kind."""
 
 import asyncio
+import gc
 import json
 import logging
 import time
@@ -326,9 +327,11 @@ async def bench(
             if begin:
                 await found.opcua.start()
                 tasks.append(asyncio.create_task(found.opcua.run()))
+            gc.freeze()  # half a million nodes and references that stay, as the operator process does
             yield found
             assert not any(task.done() for task in tasks), [task.exception() for task in tasks if task.done()]
         finally:
+            gc.unfreeze()
             for task in tasks:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
