@@ -7,6 +7,8 @@ from collections.abc import Iterator
 
 import pytest
 
+from tests.support.alone import MARKS, alone
+
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the commands: on small matrices threads wait on each other
 
 from hypothesis import HealthCheck, settings
@@ -14,7 +16,9 @@ from hypothesis import HealthCheck, settings
 settings.register_profile(
     "any machine", deadline=None, derandomize=False, max_examples=100, suppress_health_check=[HealthCheck.too_slow]
 )
-settings.register_profile("landing", settings.get_profile("any machine"), derandomize=True, database=None)
+settings.register_profile(
+    "landing", settings.get_profile("any machine"), derandomize=True, database=None, max_examples=40
+)
 settings.register_profile("fast", settings.get_profile("landing"), max_examples=25)
 settings.load_profile("any machine")
 
@@ -26,3 +30,12 @@ def _leaves_nothing_behind() -> Iterator[None]:
     yield
     sys.setswitchinterval(before_s)
     gc.collect()
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
+    """Fixtures of a module are of the clock of the test that asks for them first: a mark is of a whole file."""
+    if any(item.get_closest_marker(mark) for mark in MARKS) or "system" in item.path.parts:
+        return (yield)
+    with alone():
+        return (yield)

@@ -49,10 +49,10 @@ from gateway.core.line_queries import Generated
 from gateway.core.questions import usual_choice
 from tests.bench.figures import Bench
 from tests.bench.workers import Workers
-from tests.closed_loop.virtual_time import VirtualTimeLoop
 from tests.stand_in.engine import Engine
 from tests.stand_in.in_process import InProcess
 from tests.stand_in.personas import PERSONAS
+from tests.support.virtual_time import VirtualTimeLoop
 
 SEED = 7300
 TASKS, SPANS = 20, 2

@@ -37,7 +37,7 @@ from gateway.supervisor.history import History
 from tests.bench.agents_live_records import missing, records_in, settled_s
 from tests.bench.figures import Bench
 from tests.closed_loop.gate_line import GateLine
-from tests.protocol.bus_support import free_port
+from tests.support.ports import free_port
 from tests.unit.language_model_support import QUESTION
 
 AGENT = QUESTION.agent

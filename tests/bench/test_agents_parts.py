@@ -24,7 +24,7 @@ from tests.bench.agents import (
     written,
 )  # fmt: skip
 from tests.bench.figures import GOALS, Bench
-from tests.closed_loop.virtual_time import VirtualTimeLoop
+from tests.support.virtual_time import VirtualTimeLoop
 from tests.unit.language_model_support import QUESTION
 
 

@@ -261,6 +261,7 @@ def test_what_is_no_command_is_answered_and_does_nothing(payload):
     asyncio.run(story())
 
 
+@pytest.mark.wires
 def test_a_cycle_that_breaks_twice_ends_and_tells_every_drive_to_take_torque_off(monkeypatch):
     """In real time: the last resort of the process waits for one more period."""
 

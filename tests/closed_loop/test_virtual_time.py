@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.closed_loop import virtual_time
-from tests.closed_loop.virtual_time import START_S, TimeStuck, VirtualTimeLoop
+from tests.support import virtual_time
+from tests.support.virtual_time import START_S, TimeStuck, VirtualTimeLoop
 
 
 def run(story):

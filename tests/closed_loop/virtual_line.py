@@ -18,7 +18,6 @@ import numpy as np
 
 from drivers.port import Link
 from drivers.registry import build_links, drive_tells, speed_steps_m_per_s
-from gateway.cli.children import free_udp_port
 from gateway.control.design import design_lqi, task_of
 from gateway.core.controller import Controller
 from gateway.core.line import Bus, Line, OpcUaBus, Recipe
@@ -38,8 +37,9 @@ from sim_plant.recorder import read_recording
 from sim_plant.recording import Recording
 from sim_plant.wired import Settings, WiredLine, WorldClock
 from tests.closed_loop.conftest import demo_line, real_plant
-from tests.closed_loop.virtual_time import VirtualTimeLoop
+from tests.support.ports import free_port
 from tests.support.proved import proved_wiring
+from tests.support.virtual_time import VirtualTimeLoop
 
 T = TypeVar("T")
 
@@ -252,7 +252,7 @@ class VirtualLine:
         clock = VirtualClock(asyncio.get_running_loop())
         attempts = 0
         while True:
-            settings = Settings(self._folder, self._seed, can_port=free_udp_port(), modbus_port=0, opcua_port=0)
+            settings = Settings(self._folder, self._seed, can_port=free_port(), modbus_port=0, opcua_port=0)
             truth = WiredLine(self._plant, settings, clock)
             try:
                 await truth.open()

@@ -14,7 +14,7 @@ from typing import Self
 
 import can
 
-from gateway.cli.children import Children, free_udp_port
+from gateway.cli.children import Children
 from gateway.cli.operate_commands import request
 from gateway.control.design import design_lqi, task_of
 from gateway.core.controller import canonical
@@ -28,6 +28,7 @@ from gateway.mailbox.port import Unreachable
 from gateway.mailbox.unix import UnixMailbox
 from sim_plant.recorder import read_recording
 from sim_plant.recording import Recording
+from tests.support.ports import free_port
 from tests.support.proved import record_proof, store_proof
 
 CHANNEL = "239.74.163.2"
@@ -50,7 +51,7 @@ class WireLine:
     def _describe(self, seed: int, spans: int, gate: str) -> None:
         """The simulated line runs from here on; the line's file and a first controller are those of its ports."""
         folder = self.folder
-        self.can_port = free_udp_port()
+        self.can_port = free_port()
         plant = Path("sim_plant/plants/s_real.toml").read_text().replace("spans = 6", f"spans = {spans}")
         (folder / "plant.toml").write_text(plant)
         ready = self.children.start_sim(

@@ -23,32 +23,38 @@ OUT = Path("out/landing")
 SLOWEST = 20
 NEEDS_TRIES = 3
 CALM_S, CALM_PATIENCE_S = 5.0, 60.0
+TRY_LIMIT_S = 900.0
 END_S = 30.0  #: for pytest to say what it has, once it is asked to end
 ALL_PASSED, TESTS_FAILED, NONE_ASKED_FOR = 0, 1, 5  # pytest's exit codes
 
 
 @dataclass
 class Landing:
-    """One run of the stages."""
+    """One run of the stages. `only`: paths; empty for all tests of a stage."""
 
     seed: int
+    only: tuple[str, ...] = ()
     began_s: float = field(default_factory=time.monotonic)
     passed: int = 0
     skipped: int = 0
     failed: Crashes = field(default_factory=dict)
+    broken: Crashes = field(default_factory=dict)  #: by stage, where it is no test that failed
     took_s: dict[str, float] = field(default_factory=dict)  #: by test
     minutes: dict[str, float] = field(default_factory=dict)  #: by stage
 
     def run(self, stage: Stage) -> None:
         began_s = time.monotonic()
+        paths = tuple(path for path in self.only if path.startswith(stage.paths)) if self.only else stage.paths
+        if not paths:
+            return
         print(f"\n== {stage.name} ==", flush=True)
         if stage.needs and not _installed(stage.needs):
-            self.failed[f"stage {stage.name}"] = f"{stage.needs} could not be installed"
+            self.broken[f"stage {stage.name}"] = f"{stage.needs} could not be installed"
             return
         limit_s = min(stage.limit_s, self.began_s + WHOLE_LIMIT_S - began_s)
         path = OUT / f"{stage.name.replace(' ', '-')}.jsonl"
         path.unlink(missing_ok=True)
-        code = _pytest([*stage_arguments(stage, self.seed), "--record", str(path)], limit_s)
+        code = _pytest([*paths, *stage_arguments(stage, self.seed), "--record", str(path)], limit_s)
         self._take(stage, Recorded.read(path), code)
         self.minutes[stage.name] = (time.monotonic() - began_s) / 60.0
 
@@ -59,16 +65,17 @@ class Landing:
         self.failed |= recorded.failed
         if code is None:
             running = ", ".join(sorted(recorded.running)) or "none"
-            self.failed[f"stage {stage.name}"] = f"took longer than it may; what was running: {running}"
+            self.broken[f"stage {stage.name}"] = f"took longer than it may; what was running: {running}"
         elif code not in (ALL_PASSED, NONE_ASKED_FOR) and not (code == TESTS_FAILED and recorded.failed):
-            self.failed[f"stage {stage.name}"] = f"pytest ended with {code}"
+            self.broken[f"stage {stage.name}"] = f"pytest ended with {code}"
 
     def verdict(self, witness: Witness) -> bool:
         """Whether the change passes, after what failed was tried again and all was told."""
         began_s = time.monotonic()
         if self.failed:
             print("\n== second tries ==", flush=True)
-        intermittent, failed = tried_again(self.failed, lambda tests, number: _passes(tests, number, witness))
+        intermittent, failed = tried_again(self.failed, lambda tests, number: self._passes(tests, number, witness))
+        failed |= self.broken
         self.minutes["second tries"] = (time.monotonic() - began_s) / 60.0
         slowest = sorted(self.took_s.items(), key=lambda row: -row[1])[:SLOWEST]
         print("\nslowest:", *(f"  {took_s:6.1f} s {test}" for test, took_s in slowest), sep="\n")
@@ -79,7 +86,7 @@ class Landing:
         for test, crash in failed.items():
             print(f"FAILED {test} ({crash})")
             if test.startswith("tests/"):
-                print(f"  again: {sys.executable} -m pytest {' '.join(_alone())} '{test}'")
+                print(f"  again: {sys.executable} -m pytest {' '.join(self._alone())} '{test}'")
         counted = f"{len(failed)} failed, " if failed else ""
         took_s = time.monotonic() - self.began_s
         print(
@@ -87,27 +94,25 @@ class Landing:
         )
         return not failed
 
+    def _passes(self, tests: list[str], number: int, witness: Witness) -> bool:
+        """Each of them: what is skipped has not passed."""
+        witness.calm_for(CALM_S, CALM_PATIENCE_S)
+        print(f"try {number} of {' '.join(tests)}", flush=True)
+        path = OUT / "again.jsonl"
+        path.unlink(missing_ok=True)
+        code = _pytest([*self._alone(), "--record", str(path), *tests], TRY_LIMIT_S)
+        passed = Recorded.read(path).passed
+        return code == ALL_PASSED and all(test in passed or "::" not in test for test in tests)
+
+    def _alone(self) -> list[str]:
+        return ["-p", "no:xdist", *SAME_DRAWS, "--randomly-seed", str(self.seed), "--randomly-dont-reorganize"]
+
 
 def stage_arguments(stage: Stage, seed: int) -> list[str]:
-    """Of pytest, for a whole stage."""
+    """Of pytest, for a stage, but for its paths."""
     workers = ["--numprocesses", str(stage.workers), "--dist", "worksteal"] if stage.workers else ["-p", "no:xdist"]
     marks = ["-m", stage.marks] if stage.marks else []
-    return [*stage.paths, *marks, *workers, *SAME_DRAWS, "--randomly-seed", str(seed)]
-
-
-def _alone() -> list[str]:
-    return ["-p", "no:xdist", "-p", "no:randomly", *SAME_DRAWS]
-
-
-def _passes(tests: list[str], number: int, witness: Witness) -> bool:
-    """Each of them: what is skipped has not passed."""
-    witness.calm_for(CALM_S, CALM_PATIENCE_S)
-    print(f"try {number} of {' '.join(tests)}", flush=True)
-    path = OUT / "again.jsonl"
-    path.unlink(missing_ok=True)
-    code = _pytest([*_alone(), "--record", str(path), *tests], 900.0)
-    passed = Recorded.read(path).passed
-    return code == ALL_PASSED and all(test in passed or "::" not in test for test in tests)
+    return [*marks, *workers, *SAME_DRAWS, "--randomly-seed", str(seed)]
 
 
 def _pytest(arguments: list[str], limit_s: float) -> int | None:
@@ -149,6 +154,7 @@ def main() -> int:
     repeat = commands.add_parser("ready", help="changed tests ten times, on a busy machine")
     repeat.add_argument("--since", default="HEAD", help="what they differ from; default: the last commit")
     parser.add_argument("--stage", action="append", choices=[stage.name for stage in STAGES], help="only this one")
+    parser.add_argument("--only", action="append", default=[], metavar="PATH", help="only tests in this file or folder")
     options = parser.parse_args()
     if options.command == "keep":
         print(f"{known.keep(options.log.read_text(errors='replace'), options.run)} kept in {known.FILE.name}")
@@ -161,7 +167,9 @@ def main() -> int:
             print(f"intermittent in more than {known.MOST} of the last {known.RUNS} runs, to be mended first: {test}")
         return int(bool(tests))
     OUT.mkdir(parents=True, exist_ok=True)
-    landing = Landing(_seed())
+    # Where this was begun in the background it is ignored, and would be in all that is begun from here.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    landing = Landing(_seed(), tuple(options.only))
     with Witness() as witness:
         for stage in STAGES:
             if not options.stage or stage.name in options.stage:

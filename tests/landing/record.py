@@ -34,7 +34,7 @@ class _Recorder:
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
         self._write(
-            test=report.nodeid, when=report.when or "dead", outcome=report.outcome, took_s=report.duration,
+            test=report.nodeid, when=report.when, outcome=report.outcome, took_s=report.duration,
             crash=_crash(report),
         )  # fmt: skip
 
@@ -95,7 +95,7 @@ class Recorded:
             self.skipped.add(test)
         elif when == "call":
             self.passed.add(test)
-        if when in ("teardown", "dead"):
+        if when not in ("setup", "call"):  # xdist says "???" of a test at which a worker died
             self.running.discard(test)
 
 

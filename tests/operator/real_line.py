@@ -19,7 +19,7 @@ from gateway.supervisor.peers import GATEWAY
 from tests.closed_loop.gate_line import GateLine
 from tests.closed_loop.wire import at_rest, settled
 from tests.operator.names import PANEL, PASSWORD, STRANGER, USERS
-from tests.protocol.bus_support import free_port
+from tests.support.ports import free_port
 
 LOOK_S = 0.05
 DOOR = ("logged-in", "wrong-logins", "users")  #: records of who comes in

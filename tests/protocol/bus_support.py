@@ -1,7 +1,6 @@
 """The agents' bus for tests: a router in this process, agents in this and others, and certificates of their own."""
 
 import asyncio
-import socket
 import time
 from collections.abc import AsyncIterator, Callable, Coroutine
 from contextlib import asynccontextmanager
@@ -18,6 +17,7 @@ from gateway.mailbox.bus import TlsEndpoint, connect, open_router, open_session,
 from gateway.mailbox.paths import BUS_SOCKET
 from gateway.mailbox.port import Unreachable
 from gateway.mailbox.zenoh_mailbox import ZenohMailbox
+from tests.support.ports import free_port
 from tests.unit.supervisor_support import line_of, short_folder, until
 
 LINE = line_of(1)
@@ -124,12 +124,6 @@ async def is_here(mailbox: ZenohMailbox, topic: Topic) -> None:
     here: list[bool] = []
     mailbox.watch(topic, here.append)
     await until(lambda: here[-1:] == [True])
-
-
-def free_port() -> int:
-    with socket.socket() as probing:
-        probing.bind(("127.0.0.1", 0))
-        return probing.getsockname()[1]
 
 
 class Authority:

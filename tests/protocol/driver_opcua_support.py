@@ -25,6 +25,7 @@ from drivers.wiring import Wired
 from gateway.core.line import Line
 from gateway.core.signals import DriveRequest, Inputs, Outputs
 from tests.protocol import driver_support
+from tests.support.ports import free_port
 
 NAMESPACE = "urn:r2rgate:devices"
 EPOCH = datetime(1601, 1, 1, tzinfo=UTC)
@@ -196,7 +197,7 @@ class DeviceServer:
         self._going.set()
         server = self._server = Server()
         await server.init()
-        self.port = driver_support.free_port(driver_support.socket.SOCK_STREAM)
+        self.port = free_port()
         server.set_endpoint(self.endpoint)
         policies = [ua.SecurityPolicyType.NoSecurity]
         if self._certificates is not None:

@@ -1,7 +1,6 @@
 """Scripted peers for the drivers: raw CAN frames and raw Modbus TCP bytes, written apart from the code under test."""
 
 import asyncio
-import socket
 import struct
 import threading
 from collections.abc import Awaitable, Callable
@@ -83,12 +82,6 @@ def line(
             "recipes": [{"name": "a", "tension_n": [20.0] * n, "speed_m_per_s": 0.1}],
         }
     )
-
-
-def free_port(kind: socket.SocketKind) -> int:
-    with socket.socket(socket.AF_INET, kind) as probe:
-        probe.bind(("", 0))
-        return probe.getsockname()[1]
 
 
 async def cycle(link: Any, inputs: Inputs, wait_s: float = 0.5) -> None:

@@ -20,8 +20,6 @@ from tests.stand_in.personas import PERSONAS
 from tests.stand_in.server import StandIn
 from tests.unit.language_model_support import QUESTION
 
-pytestmark = pytest.mark.wires
-
 LONG_S = 300.0  #: a fresh checkout compiles first
 CONFIG = design_lqi(task_of(LINE))
 
@@ -30,6 +28,7 @@ async def nothing(_: Asked) -> Retrieval:
     raise OSError("nothing here")
 
 
+@pytest.mark.wires
 def test_a_phase_has_something_computed_over_the_bus_and_it_is_logged_as_the_code_agents() -> None:
     async def story(folder: Path) -> None:
         async with router(folder) as gateway, client(folder) as agents, client(folder) as phases:
@@ -52,6 +51,7 @@ def test_a_phase_has_something_computed_over_the_bus_and_it_is_logged_as_the_cod
     run(story)
 
 
+@pytest.mark.wires
 @pytest.mark.parametrize("persona", ["perfect", "adversarial"])
 def test_a_model_over_http_has_something_computed_before_it_answers(persona: str) -> None:
     async def story(folder: Path) -> None:
@@ -73,6 +73,7 @@ def test_a_model_over_http_has_something_computed_before_it_answers(persona: str
     run(story)
 
 
+@pytest.mark.wires
 def test_the_code_agent_decides_nothing() -> None:
     async def story(folder: Path) -> None:
         async with router(folder), client(folder) as agents, client(folder) as phases:

@@ -110,6 +110,7 @@ def server(shared_server: DeviceServer) -> DeviceServer:
 WATCHDOGS = ("Axis1.Watchdog", "Axis2.Watchdog", "Line.Watchdog")
 
 
+@pytest.mark.wires
 @CANCELLATIONS
 def test_wherever_an_arming_on_opcua_is_cut_its_watchdogs_are_left_as_it_found_them(
     server: DeviceServer, cancellations: int
@@ -140,6 +141,7 @@ def test_wherever_an_arming_on_opcua_is_cut_its_watchdogs_are_left_as_it_found_t
     asyncio.run(story())
 
 
+@pytest.mark.wires
 @pytest.mark.parametrize("turns", range(0, 60, 3))
 def test_a_release_on_opcua_that_is_cut_takes_torque_off_and_ends_supervision(server: DeviceServer, turns: int) -> None:
     devices = server.devices
@@ -160,6 +162,7 @@ def test_a_release_on_opcua_that_is_cut_takes_torque_off_and_ends_supervision(se
     asyncio.run(story())
 
 
+@pytest.mark.wires
 def test_drives_on_opcua_are_left_in_order_though_the_link_was_silent_first(server: DeviceServer) -> None:
     devices = server.devices
 

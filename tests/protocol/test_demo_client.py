@@ -29,6 +29,7 @@ def approve(one):
     return Approve(proposal=one.proposal_hash, comment="a test")
 
 
+@pytest.mark.wires
 def test_it_arms_and_approves_exactly_what_it_has_read_from_a_process_of_its_own():
     async def story():
         async with bench(spans=1) as b:

@@ -26,10 +26,10 @@ from tests.protocol.driver_support import (
     Drive,
     Drives,
     cycle,
-    free_port,
     line,
     until,
 )
+from tests.support.ports import free_port
 
 Body = Callable[[CanopenLink, Drives, Drive, Drive], Awaitable[None]]
 
@@ -37,7 +37,7 @@ Body = Callable[[CanopenLink, Drives, Drive, Drive], Awaitable[None]]
 def bench(body: Body, **bus: Any) -> None:
     """Two drives on a fresh bus, the link open."""
     if not bus:
-        bus = {"interface": "udp_multicast", "channel": GROUP, "port": free_port(socket.SOCK_DGRAM)}
+        bus = {"interface": "udp_multicast", "channel": GROUP, "port": free_port()}
     peer_bus = {**bus, "hop_limit": 0, "fd": False} if bus["interface"] == "udp_multicast" else bus
 
     async def run() -> None:
@@ -117,7 +117,7 @@ def test_silent_link_sends_nothing() -> None:
     bench(body)
 
 
-@pytest.mark.parametrize("interface", ["udp_multicast", "virtual"])
+@pytest.mark.parametrize("interface", ["udp_multicast", pytest.param("virtual", marks=pytest.mark.wires)])
 def test_a_cycle_reads_si_and_commands_one_transition_at_a_time(interface: str) -> None:
     async def body(link: CanopenLink, drives: Drives, first: Drive, second: Drive) -> None:
         inputs = Inputs(2)
@@ -606,7 +606,7 @@ def test_a_bus_that_was_not_there_is_opened_by_prepare(monkeypatch: pytest.Monke
         return real(**options)
 
     async def run() -> None:
-        bus = {"interface": "udp_multicast", "channel": GROUP, "port": free_port(socket.SOCK_DGRAM)}
+        bus = {"interface": "udp_multicast", "channel": GROUP, "port": free_port()}
         link = build_links(line(can_bus=bus))[0]
         async with Drives([Drive(1), Drive(2)], **bus, hop_limit=0, fd=False):
             monkeypatch.setattr(can, "Bus", comes_up)
@@ -672,7 +672,7 @@ def test_surplus_bytes_that_are_not_zero_are_refused() -> None:
 
 
 def test_garbage_on_the_bus_is_counted_and_harmless() -> None:
-    port = free_port(socket.SOCK_DGRAM)
+    port = free_port()
 
     async def body(link: CanopenLink, drives: Drives, first: Drive, second: Drive) -> None:
         inputs = Inputs(2)

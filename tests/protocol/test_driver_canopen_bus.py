@@ -15,7 +15,8 @@ from drivers.canopen.link import CanopenLink
 from drivers.registry import build_links
 from gateway.core.line import CanopenBus
 from gateway.core.signals import DriveRequest, DriveState, Inputs, Outputs, Quality
-from tests.protocol.driver_support import ENABLED, GROUP, Drive, Drives, cycle, free_port, line, until
+from tests.protocol.driver_support import ENABLED, GROUP, Drive, Drives, cycle, line, until
+from tests.support.ports import free_port
 
 Body = Callable[[CanopenLink, Drives, Drive, Drive], Awaitable[None]]
 
@@ -23,7 +24,7 @@ Body = Callable[[CanopenLink, Drives, Drive, Drive], Awaitable[None]]
 def bench(body: Body, **bus: Any) -> None:
     """Two drives on a fresh bus, the link prepared."""
     if not bus:
-        bus = {"interface": "udp_multicast", "channel": GROUP, "port": free_port(socket.SOCK_DGRAM)}
+        bus = {"interface": "udp_multicast", "channel": GROUP, "port": free_port()}
     peer_bus = {**bus, "hop_limit": 0, "fd": False} if bus["interface"] == "udp_multicast" else bus
 
     async def run() -> None:
@@ -71,7 +72,7 @@ NAMELESS = can.CanOperationError("the adapter does not say why")
 
 
 @pytest.mark.parametrize("error", [DOWN, OSError(errno.ENODEV, "No such device"), NAMELESS])
-@pytest.mark.parametrize("kind", ["udp_multicast", "virtual"])
+@pytest.mark.parametrize("kind", ["udp_multicast", pytest.param("virtual", marks=pytest.mark.wires)])
 def test_a_dead_receiver_is_missed_in_the_same_cycle_and_opened_again(kind: str, error: Exception) -> None:
     async def body(link: CanopenLink, drives: Drives, first: Drive, second: Drive) -> None:
         inputs = Inputs(2)
@@ -218,7 +219,7 @@ def test_a_sender_that_is_full_for_long_is_opened_again() -> None:
 
 
 def test_frames_that_are_none_do_not_close_the_bus() -> None:
-    port = free_port(socket.SOCK_DGRAM)
+    port = free_port()
 
     async def body(link: CanopenLink, drives: Drives, first: Drive, second: Drive) -> None:
         inputs = Inputs(2)

@@ -1,7 +1,6 @@
 """What a CANopen drive says beside its state: mode, power, warnings; and one that has just been switched on."""
 
 import asyncio
-import socket
 import struct
 from collections.abc import Awaitable, Callable
 from pathlib import Path
@@ -16,7 +15,8 @@ from drivers.port import PrepareRefused
 from drivers.registry import build_links
 from gateway.core.finding import Finding
 from gateway.core.signals import DriveCondition, DriveRequest, DriveState, Inputs, Outputs
-from tests.protocol.driver_support import ENABLED, FAULT, GROUP, READY, Drive, Drives, cycle, free_port, line, until
+from tests.protocol.driver_support import ENABLED, FAULT, GROUP, READY, Drive, Drives, cycle, line, until
+from tests.support.ports import free_port
 
 Body = Callable[[CanopenLink, Drives, Drive], Awaitable[None]]
 PERIOD_S = 0.02  # of the tests: how often a drive is asked
@@ -24,7 +24,7 @@ PERIOD_S = 0.02  # of the tests: how often a drive is asked
 
 def bench(body: Body, maps: Path = MAPS, **objects: bytes | None) -> None:
     """One drive on a fresh bus, the link open."""
-    port = free_port(socket.SOCK_DGRAM)
+    port = free_port()
     bus: dict[str, Any] = {"interface": "udp_multicast", "channel": GROUP, "port": port}
 
     async def run() -> None:

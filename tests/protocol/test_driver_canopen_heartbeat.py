@@ -1,7 +1,6 @@
 """Drives whose watchdog listens to the gateway's heartbeat, as the shipped EPOS4 map has it, against scripted ones."""
 
 import asyncio
-import socket
 import struct
 from collections.abc import Awaitable, Callable
 from math import nan
@@ -26,10 +25,10 @@ from tests.protocol.driver_support import (
     Drive,
     Drives,
     cycle,
-    free_port,
     line,
     until,
 )
+from tests.support.ports import free_port
 
 MAP = "maxon-epos4-50-15-can"
 OURS = (0x77F, b"\x05")
@@ -84,7 +83,7 @@ Body = Callable[[CanopenLink, Bus, Epos, Epos], Awaitable[None]]
 
 def bench(body: Body) -> None:
     async def run() -> None:
-        port = free_port(socket.SOCK_DGRAM)
+        port = free_port()
         first, second = Epos(1), Epos(2)
         link = build_links(epos_line(port))[0]
         assert isinstance(link, CanopenLink)

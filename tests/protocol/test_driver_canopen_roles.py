@@ -1,7 +1,6 @@
 """Drives, a load-cell amplifier and the line PLC on one bus: the link against scripted nodes, bytes by hand."""
 
 import asyncio
-import socket
 import struct
 from collections.abc import Awaitable, Callable
 from math import inf, nan
@@ -14,7 +13,8 @@ from drivers.port import PrepareRefused
 from drivers.registry import LinksRefused, build_links
 from gateway.core.line import Line
 from gateway.core.signals import DriveRequest, DriveState, Inputs, Outputs, Quality
-from tests.protocol.driver_support import ENABLED, GROUP, READY, Drive, Drives, cycle, free_port, line, until
+from tests.protocol.driver_support import ENABLED, GROUP, READY, Drive, Drives, cycle, line, until
+from tests.support.ports import free_port
 
 AMPLIFIER, PLC = 20, 30
 SPANS = 3
@@ -155,7 +155,7 @@ Body = Callable[[CanopenLink, Bus], Awaitable[None]]
 
 def bench(body: Body) -> None:
     async def run() -> None:
-        port = free_port(socket.SOCK_DGRAM)
+        port = free_port()
         (link,) = build_links(mixed(port))
         assert isinstance(link, CanopenLink)
         async with Bus(port) as bus:

@@ -17,7 +17,8 @@ from hypothesis import strategies as st
 from drivers.canopen.bus import CanBus
 from drivers.canopen.wire import SocketcanWire, packed, unpacked
 from gateway.core.line import CanopenBus
-from tests.protocol.driver_support import GROUP, free_port
+from tests.protocol.driver_support import GROUP
+from tests.support.ports import free_port
 
 cob_ids, payloads = st.integers(0, 0x7FF), st.binary(max_size=8)
 
@@ -102,7 +103,7 @@ def test_a_datagram_that_is_no_frame_is_not_quoted() -> None:
 
 
 def test_what_is_sent_and_received_meets_python_can() -> None:
-    port = free_port(socket.SOCK_DGRAM)
+    port = free_port()
     came: list[tuple[int, bytes]] = []
 
     async def run() -> None:

@@ -124,6 +124,7 @@ async def _read(connection: ModbusConnection, ended: list[bytes | ModbusFailed])
     await until(lambda: len(ended) == many)
 
 
+@pytest.mark.wires
 def test_an_opcua_cycle_asks_for_little_room() -> None:
     """On the loop's side: the worker, which has nobody to connect to, says so each time."""
 

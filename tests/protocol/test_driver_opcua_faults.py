@@ -13,6 +13,8 @@ from gateway.core.signals import DriveState, Quality
 from tests.protocol.driver_opcua_support import NAMESPACE, DeviceServer, Rig, device_server, line, link_in_process
 from tests.protocol.driver_support import until
 
+pytestmark = pytest.mark.wires
+
 LIFE = Node(NAMESPACE, "Axis1.Life", "u16")
 
 

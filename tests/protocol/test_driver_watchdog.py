@@ -1,7 +1,6 @@
 """A simulated drive that no longer hears the SYNC: driver and device meet on the wire, torque has to go off."""
 
 import asyncio
-import socket
 from collections.abc import Callable
 from pathlib import Path
 
@@ -16,7 +15,8 @@ from sim_plant.faces.canopen_bus import open_bus
 from sim_plant.plant import load_plant
 from sim_plant.recorder import Recorder
 from sim_plant.world import World
-from tests.protocol.driver_support import GROUP, free_port, line
+from tests.protocol.driver_support import GROUP, line
+from tests.support.ports import free_port
 
 PLANT = load_plant(Path(__file__).parents[2] / "sim_plant/plants/s_real.toml")
 
@@ -31,7 +31,7 @@ def test_a_drive_that_is_deaf_to_sync_loses_its_torque(hears_nmt: bool) -> None:
         world = World(PLANT, 1)
         recorder = Recorder(world)
         drives = [Drive(k, world, recorder, 80.0, 80.0) for k in range(2)]
-        bus = {"interface": "udp_multicast", "channel": GROUP, "port": free_port(socket.SOCK_DGRAM)}
+        bus = {"interface": "udp_multicast", "channel": GROUP, "port": free_port()}
         wire = open_bus(**bus)
         face = CanopenFace(wire.bus, drives, 1, lambda: loop.time() - begin_s)
         face.boot()

@@ -1,7 +1,6 @@
 """What doctor and scan ask of CANopen nodes, against scripted drives; and that they only ask."""
 
 import asyncio
-import socket
 import struct
 from collections.abc import Awaitable, Callable
 from typing import Any
@@ -16,7 +15,8 @@ from drivers.device_map import MAPS, load_map
 from drivers.inspection import BusFacts
 from drivers.wiring import Wired
 from gateway.core.line import CanopenBus
-from tests.protocol.driver_support import FAULT, GROUP, Drive, Drives, free_port, line
+from tests.protocol.driver_support import FAULT, GROUP, Drive, Drives, line
+from tests.support.ports import free_port
 
 LISTEN_S = 0.1
 READS = {0x40, 0x60, 0x70, 0x80}  #: first bytes of SDO uploads and their abort (CiA 301, 7.2.4.3)
@@ -34,7 +34,7 @@ async def inspected(bus: CanopenBus, drives: int = 2, listen_s: float = LISTEN_S
 
 def bench(body: Callable[[CanopenBus, Drives], Awaitable[None]], *peers: Drive) -> None:
     """`body` with a bus and drives on it; afterwards everything that was sent to them must have been a reading."""
-    wire: dict[str, Any] = {"interface": "udp_multicast", "channel": GROUP, "port": free_port(socket.SOCK_DGRAM)}
+    wire: dict[str, Any] = {"interface": "udp_multicast", "channel": GROUP, "port": free_port()}
 
     async def run() -> None:
         bus = CanopenBus(name="drives", protocol="canopen", **wire)

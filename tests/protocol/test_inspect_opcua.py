@@ -1,7 +1,6 @@
 """What doctor and scan ask of OPC UA servers, against a real one; and that they only ask."""
 
 import asyncio
-import socket
 from collections.abc import Iterator
 
 import pytest
@@ -15,7 +14,9 @@ from drivers.opcua.scan import MapFit, OpcUaScan, ScanFailed, is_node_id, scan
 from drivers.wiring import Wired
 from gateway.core.line import OpcUaBus
 from tests.protocol.driver_opcua_support import DeviceServer, device_server, line
-from tests.protocol.driver_support import free_port
+from tests.support.ports import free_port
+
+pytestmark = pytest.mark.wires
 
 
 @pytest.fixture(scope="module")
@@ -78,7 +79,7 @@ def test_what_is_wrong_is_said(server: DeviceServer) -> None:
 
 
 def test_nobody_there() -> None:
-    facts = inspected(f"opc.tcp://127.0.0.1:{free_port(socket.SOCK_STREAM)}")
+    facts = inspected(f"opc.tcp://127.0.0.1:{free_port()}")
     assert facts.trouble and not facts.devices
 
 

@@ -24,8 +24,6 @@ from tests.stand_in.personas import PERSONAS
 from tests.stand_in.server import StandIn
 from tests.unit.language_model_support import PROMPT, QUESTION, says
 
-pytestmark = pytest.mark.wires
-
 SKY = [Said("user", "Why is the sky blue?")]
 
 
@@ -269,6 +267,7 @@ def test_the_stand_in_speaks_as_the_official_client_expects() -> None:
     asyncio.run(story())
 
 
+@pytest.mark.wires
 def test_the_stand_in_as_a_process() -> None:
     command = [sys.executable, "-m", "tests.stand_in", "--persona", "perfect", "--pace", "0"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import pytest
 from asyncua import ua
 
 from gateway.core.decisions import Decide
@@ -163,6 +164,7 @@ def test_who_comes_later_asks_for_all_that_waits_and_for_nobody_else(monkeypatch
     run(story)
 
 
+@pytest.mark.wires
 def test_nobody_is_told_that_something_waits_which_nobody_knows():
     async def story():
         async with bench(spans=1) as b, b.connected("vera") as client:

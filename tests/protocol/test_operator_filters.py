@@ -149,6 +149,7 @@ def test_a_condition_that_is_changed_counts_from_then_on():
     run(story)
 
 
+@pytest.mark.wires
 def test_values_that_are_watched_take_their_own_kind_of_filter_and_lose_nothing_where_there_is_no_number():
     async def story():
         async with bench(spans=1) as b, b.connected("vera") as client:

@@ -26,8 +26,8 @@ from gateway.mailbox.unix import UnixMailbox
 from gateway.operator.opcua.trust import MOST_BYTES, TRUSTED, fingerprint
 from gateway.operator.users import FILE_NAME, Users
 from tests.operator.names import PASSWORD
-from tests.protocol.bus_support import free_port
 from tests.protocol.operator_support import NUMBER, FakeGateway, der, pair
+from tests.support.ports import free_port
 from tests.unit.supervisor_support import short_folder
 
 pytestmark = pytest.mark.wires

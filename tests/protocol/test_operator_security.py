@@ -198,6 +198,7 @@ def test_a_file_among_the_trusted_that_cannot_be_read_keeps_nobody_else_out(monk
     run(story)
 
 
+@pytest.mark.wires
 def test_a_disk_that_hangs_keeps_out_nobody_who_was_trusted_before(monkeypatch):
     hanging, over = threading.Event(), threading.Event()
 

@@ -27,9 +27,8 @@ from gateway.core.line_file import load_line
 from gateway.core.line_template import line_template
 from gateway.core.topics import ASK_STATUS
 from gateway.mailbox.bus import BusUnavailable, TlsEndpoint, connect
-from tests.protocol.bus_support import LONG_S, client, echo, free_port, router, run
-
-pytestmark = pytest.mark.wires
+from tests.protocol.bus_support import LONG_S, client, echo, router, run
+from tests.support.ports import free_port
 
 NOW = datetime.now(UTC)
 STATUS = ASK_STATUS.of("sysid")
@@ -73,6 +72,7 @@ def as_agent(pki: Path, name: str, address: str) -> TlsEndpoint:
     return TlsEndpoint(address, pki / f"{name}.pem", pki / f"{name}.key.pem", pki / "authority.pem")
 
 
+@pytest.mark.wires
 def test_what_it_makes_opens_a_session_and_lets_no_stranger_in() -> None:
     async def story(folder: Path) -> None:
         stranger = folder / "stranger"
@@ -96,6 +96,7 @@ def test_what_it_makes_opens_a_session_and_lets_no_stranger_in() -> None:
     run(story)
 
 
+@pytest.mark.wires
 def test_the_agents_process_meets_a_gateway_elsewhere_by_its_certificate() -> None:
     async def story(folder: Path) -> None:
         address = f"127.0.0.1:{free_port()}"
@@ -255,6 +256,7 @@ def test_doctor_tells_a_certificate_that_another_authority_has_signed(tmp_path: 
     assert issued((tmp_path / "own" / "gateway.pem").read_bytes(), both), "one of several is enough"
 
 
+@pytest.mark.wires
 def test_doctor_tells_what_cannot_be_read_and_what_does_not_fit(tmp_path: Path) -> None:
     lost = looked_at(tmp_path / "a", 0, certificate="lost.pem")
     assert lost["certificate"][0] == lost["private key"][0] == "warning" and "cannot be read" in lost["certificate"][1]

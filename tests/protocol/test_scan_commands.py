@@ -2,7 +2,6 @@
 
 import asyncio
 import json
-import socket
 import threading
 import tomllib
 from collections.abc import Callable, Iterator
@@ -24,7 +23,8 @@ from gateway.mailbox.paths import LOOP_SOCKET
 from sim_plant.plant import plant_of
 from sim_plant.recorder import read_recording
 from sim_plant.wired import Settings, WiredLine
-from tests.protocol.driver_support import GROUP, Registers, free_port
+from tests.protocol.driver_support import GROUP, Registers
+from tests.support.ports import free_port
 
 pytestmark = pytest.mark.wires
 
@@ -47,9 +47,7 @@ def run(*arguments: object) -> Result:
 def simulated(folder: Path, wire: str) -> WiredLine:
     document = tomllib.loads(PLANT.read_text())
     document["wires"] |= {"drives": wire, "load_cells": wire, "plc": wire}
-    return WiredLine(
-        plant_of(document), Settings(folder / "record", can_port=free_port(socket.SOCK_DGRAM), modbus_port=0)
-    )
+    return WiredLine(plant_of(document), Settings(folder / "record", can_port=free_port(), modbus_port=0))
 
 
 def template(sim: WiredLine, wire: str) -> Line:

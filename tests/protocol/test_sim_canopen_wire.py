@@ -23,7 +23,8 @@ from sim_plant.faces.canopen_drive import DriveDevice
 from sim_plant.plant import load_plant
 from sim_plant.recorder import Recorder
 from sim_plant.world import World
-from tests.protocol.test_sim_process import GROUP, free_port
+from tests.protocol.test_sim_process import GROUP
+from tests.support.ports import free_port
 
 PLANT = load_plant(Path(__file__).parents[2] / "sim_plant/plants/s_real.toml")
 BITRATE = 1_000_000

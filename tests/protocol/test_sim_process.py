@@ -31,18 +31,13 @@ from sim_plant.plant import PlantRefused, load_plant, plant_of
 from sim_plant.process import main, run_plant
 from sim_plant.recorder import read_recording
 from sim_plant.wired import WiredLine, WorldClock
+from tests.support.ports import free_port
 
 pytestmark = pytest.mark.wires
 
 ROOT = Path(__file__).parents[2]
 PLANT = ROOT / "sim_plant/plants/s_real.toml"
 GROUP = "239.74.163.2"
-
-
-def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
 
 
 class Line:

@@ -9,11 +9,11 @@ import pytest
 from pymodbus.client import AsyncModbusTcpClient
 from pymodbus.exceptions import ModbusIOException
 
-from gateway.cli.children import free_udp_port
 from sim_plant.faults.control import SOCKET_FILE, ask
 from sim_plant.faults.parse import parse_fault
 from sim_plant.plant import load_plant
 from sim_plant.wired import Settings, WiredLine
+from tests.support.ports import free_port
 
 CHANNEL = "239.74.163.2"
 PLANT = load_plant("sim_plant/plants/s_real.toml")
@@ -22,7 +22,7 @@ SYNC = can.Message(arbitration_id=0x80, is_extended_id=False)
 
 class Rig:
     def __init__(self, folder: Path) -> None:
-        self.port = free_udp_port()
+        self.port = free_port()
         control = folder / SOCKET_FILE
         self.line = WiredLine(PLANT, Settings(folder / "record", can_port=self.port, modbus_port=0, control=control))
         self.control = control
@@ -94,6 +94,7 @@ def test_a_drive_is_mute_for_its_node_alone(run):
     run(test)
 
 
+@pytest.mark.wires
 def test_a_heartbeat_is_lost_and_a_restart_boots(run):
     async def test(rig: Rig) -> None:
         await rig.inject("drive 2 heartbeat-lost")
@@ -172,12 +173,13 @@ def test_a_disconnected_wire_comes_back(run):
     run(test)
 
 
+@pytest.mark.wires
 def test_faults_from_the_start_come_at_their_time_and_are_recorded(tmp_path):
     from sim_plant.recorder import read_recording
 
     async def whole() -> None:
         faults = (parse_fault("load-cell 3 nan at 0.02 for 0.05"),)
-        line = WiredLine(PLANT, Settings(tmp_path / "r", can_port=free_udp_port(), modbus_port=0, faults=faults))
+        line = WiredLine(PLANT, Settings(tmp_path / "r", can_port=free_port(), modbus_port=0, faults=faults))
         await line.open()
         stop = asyncio.Event()
         asyncio.get_running_loop().call_later(0.2, stop.set)

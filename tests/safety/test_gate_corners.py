@@ -93,6 +93,7 @@ def test_a_loop_is_simulated_as_late_as_its_delay_margin_says(case, monkeypatch)
     )
 
 
+@pytest.mark.slow
 def test_a_late_loop_is_not_looked_at_where_no_torque_holds_it(case, monkeypatch):
     steps_s: list[float] = []
 

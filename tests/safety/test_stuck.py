@@ -59,6 +59,7 @@ def test_a_fine_cell_that_shows_one_value_is_silent_until_it_shows_another() -> 
     assert stuck_after([*noisy(300), *still, (40.0, 31.1, 31.0)])[0].silent == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("repeats", [2, 5, 9, 20])
 def test_an_amplifier_slower_than_the_loop_is_never_silent(repeats: int) -> None:
     assert not any(

@@ -11,7 +11,7 @@ from gateway.operator.line_side import TOPICS, LineSide
 from gateway.operator.page.app import page_app
 from gateway.operator.page.serve import serve_page
 from tests.operator.fake_line import FakeGateway, check, role_of
-from tests.protocol.bus_support import free_port
+from tests.support.ports import free_port
 from tests.unit.supervisor_support import line_of, short_folder
 
 BEGINS_S = 30.0

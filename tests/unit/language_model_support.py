@@ -9,11 +9,11 @@ from agents.language_model.client import LanguageModel
 from agents.language_model.deciding import Answered, Unanswered, decide
 from gateway.core.line import Agents
 from gateway.core.questions import Figure, Knob, Option, Question
-from tests.closed_loop.virtual_time import VirtualTimeLoop
 from tests.stand_in.engine import Engine
 from tests.stand_in.in_process import InProcess
 from tests.stand_in.personas import PERSONAS
 from tests.stand_in.spoken import Persona, Spoken
+from tests.support.virtual_time import VirtualTimeLoop
 
 T = TypeVar("T")
 PROMPT = "You choose among designs for a line that moves a web."

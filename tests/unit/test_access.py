@@ -231,6 +231,7 @@ def test_the_newest_users_are_known_whether_on_record_or_not(both, users):
     assert both.desk.roles() == {"otto": "operator", "vera": "viewer"}
 
 
+@pytest.mark.wires
 def test_a_disk_that_does_not_answer_holds_up_neither_the_event_loop_nor_who_is_at_work(both, users, monkeypatch):
     users.write(both.path)
     answers = threading.Event()
@@ -292,6 +293,7 @@ def test_a_users_file_that_is_gone_puts_nobody_out_and_is_told(both, users):
     assert both.users.role_of("otto") == "operator" and "nobody can log in" in both.told[0]
 
 
+@pytest.mark.slow
 def test_who_was_added_a_moment_ago_is_let_in_once_they_are_known(both, users):
     async def story():
         users.write(both.path)

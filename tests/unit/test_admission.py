@@ -53,6 +53,7 @@ def deployment(config=OTHER, **changes):
     return Deployment(**(given | changes))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", ["engage", "ask", "commit"])
 def test_a_law_that_takes_longer_than_its_share_is_refused_with_the_figure(what):
     period_s = 0.05
@@ -75,6 +76,7 @@ def test_a_prediction_that_takes_longer_than_its_share_is_refused_along_its_long
         Admission(LINE, make_law, 0.05).recovery(WATCH, GIVEN, 0.0)
 
 
+@pytest.mark.slow
 def test_law_prediction_and_what_would_take_over_count_together():
     admission = Admission(LINE, lambda config: Slow(config, "ask", 0.015), 0.05)
     back = Configuration(GIVEN, config_hash(GIVEN), make_law(GIVEN), Region(), law_s=0.03)
@@ -84,6 +86,7 @@ def test_law_prediction_and_what_would_take_over_count_together():
         Admission(LINE, make_law, 0.05).recovery(WATCH, GIVEN, 0.023)
 
 
+@pytest.mark.slow
 def test_one_that_takes_too_long_is_unfit_and_the_line_is_not_armed_with_it():
     unfit = Admission(LINE, lambda config: Slow(config, "ask", 0.03), 0.05)
     given = Configuration(GIVEN, config_hash(GIVEN), Slow(GIVEN, "ask", 0.03), Region())
@@ -134,6 +137,7 @@ def test_a_prediction_for_another_fallback_or_of_no_use_is_refused(monkeypatch):
         admission.recovery(WATCH, GIVEN, 0.0)
 
 
+@pytest.mark.slow
 def test_what_was_kept_on_top_and_takes_too_long_by_now_is_left_out():
     top = OnTop(controller=OTHER, region=Region())
     kept = Kept(started_with=config_hash(GIVEN), epoch=3, controller=GIVEN, region=Region(), watch=None, on_top=top)

@@ -161,6 +161,7 @@ def test_a_proposal_is_taken_in_as_the_agents_on_whose_key_it_came(tmp_path):
     at_desk(story, tmp_path)
 
 
+@pytest.mark.slow
 def test_an_agent_proposes_once_in_ten_seconds_thirty_times_an_hour_and_takes_nothing_of_anothers_share(tmp_path):
     async def story(desk: Desk) -> None:
         await desk.opened()

@@ -39,18 +39,21 @@ def hopeless(ground):
     return attempted(LQR, ground, Suggestion(values={"torque_per_nm2": 1e-4}, reason="haste"), ())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["pid", "lqr", "lqi", "lqg"])
 def test_asked_the_rules_give_what_the_search_gives(ground, name):
     found = tune(ARCHITECTURES[name], ground, asking(Rules()), 5)
     assert found == tune(ARCHITECTURES[name], ground, PatternSearch(), 5)
 
 
+@pytest.mark.slow
 def test_and_so_they_do_from_a_hopeless_start_and_to_the_end(ground, hopeless):
     assert hopeless.refused
     found = tune(LQR, ground, asking(Rules()), 25, [hopeless])
     assert found == tune(LQR, ground, PatternSearch(), 25, [hopeless]) and found.converged
 
 
+@pytest.mark.slow
 @settings(max_examples=7, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(seed=st.integers(0, 10**6), name=st.sampled_from(["lqr", "lqr", "lqi", "pid"]))
 def test_whatever_somebody_chooses_only_what_holds_is_accepted(ground, seed, name):
@@ -100,6 +103,7 @@ def test_factors_lead_no_further_than_a_knob_goes(ground):
     assert found.history[1].values == {"torque_per_nm2": LQR.knobs[0].least} and found.history[1].by == AGENT
 
 
+@pytest.mark.slow
 def test_as_long_as_nothing_holds_the_search_goes_its_own_way(ground, hopeless):
     """Not from where somebody has led it."""
     astray = Says(lambda question: ("last", {"torque_per_nm2": 0.5}))
@@ -143,6 +147,7 @@ def test_a_turn_that_is_named_is_the_one_that_was_shown(ground):
     assert found.history[1].usual.values != found.history[1].values
 
 
+@pytest.mark.slow
 def test_a_perfect_model_tunes_as_well_as_the_search():
     """On the example line, with the real agent and client."""
     with open("docs/examples/line.toml", encoding="utf-8") as file:

@@ -30,8 +30,6 @@ from tests.unit import audit_damage
 from tests.unit.supervisor_support import child, until
 from tests.unit.test_models import HOLD_LOCK
 
-pytestmark = pytest.mark.wires
-
 ROOT = Path(__file__).parents[2]
 ANN = Who(name="ann", uid=1000, pid=7)
 
@@ -98,6 +96,7 @@ def test_many_at_once_each_wait_for_their_own_and_share_commits(tmp_path: Path) 
     ]
 
 
+@pytest.mark.wires
 def test_an_event_loop_turns_while_the_disk_does_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     async def turns(audit: Audit) -> None:
         with blocked(monkeypatch, 2) as asked:
@@ -185,6 +184,7 @@ def blocked(monkeypatch: pytest.MonkeyPatch, sequence: int) -> Iterator[threadin
         answers.set()
 
 
+@pytest.mark.wires
 def test_a_disk_that_does_not_answer_is_told_in_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     async def append(audit: Audit) -> None:
         await audit.append("proposed", ANN, {"k": 1})
@@ -198,6 +198,7 @@ def test_a_disk_that_does_not_answer_is_told_in_time(tmp_path: Path, monkeypatch
     assert kinds(tmp_path) in (["begun"], ["begun", "proposed", NOT_DONE])
 
 
+@pytest.mark.wires
 def test_a_record_that_nobody_waits_for_any_more_is_called_not_done(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -472,7 +473,7 @@ def test_where_there_was_an_audit_none_is_begun_silently(tmp_path: Path) -> None
 
 
 def test_no_kill_loses_what_was_said_to_be_stored_or_breaks_the_chain(tmp_path: Path) -> None:
-    seed = int(np.random.default_rng().integers(1 << 30))
+    seed = int(np.random.randint(1 << 30))
     print(f"seed {seed}")
     command = [sys.executable, "-m", "tests.unit.audit_victim", str(tmp_path / "audit"), "50", str(seed)]
     run = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=100, check=True)
@@ -482,7 +483,7 @@ def test_no_kill_loses_what_was_said_to_be_stored_or_breaks_the_chain(tmp_path: 
 
 
 def test_every_damage_is_told_or_harmless(tmp_path: Path) -> None:
-    seed = int(np.random.default_rng().integers(1 << 30))
+    seed = int(np.random.randint(1 << 30))
     print(f"seed {seed}")
     damages = audit_damage.campaign(tmp_path, 200, seed)
     assert damages.tried == 200 and damages.undetected == 0, damages.examples

@@ -46,6 +46,7 @@ def fields(**changes: object) -> dict[str, object]:
     } | changes  # fmt: skip
 
 
+@pytest.mark.slow
 @given(RECORDS)
 def test_a_record_is_read_back_as_what_it_was(record: AuditRecord) -> None:
     content = canonical(record)

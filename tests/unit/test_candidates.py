@@ -41,6 +41,7 @@ def test_the_line_goes_as_fast_as_its_drives_hold():
     assert roller.friction_nms_per_rad.value * omega_per_s < 0.9 * 20.0
 
 
+@pytest.mark.slow
 def test_a_first_experiment_keeps_to_the_steps_of_a_first_configuration_and_is_refused_where_it_cannot():
     config = configuration(LINE, None, 0.02, FIRST_LAWS[0])
     given = (LINE, None, config, LINE.recipes[0].tension_n, 0.01)
@@ -51,6 +52,7 @@ def test_a_first_experiment_keeps_to_the_steps_of_a_first_configuration_and_is_r
         experiment(*given, [0.01, 2.0 * LINE.limits.speed_max_m_per_s])
 
 
+@pytest.mark.slow
 def test_on_a_slow_line_set_points_of_an_experiment_move_on_ramps():
     """The rollers of a line for 0.03 m/s may run ahead of the web by no more than 0.018 m/s at 0.02 m/s."""
     slow = LINE.model_copy(update={"limits": LINE.limits.model_copy(update={"speed_max_m_per_s": 0.03})})

@@ -96,6 +96,7 @@ def test_nothing_found_is_told() -> None:
     assert code == 1 and "Nothing was found" in said
 
 
+@pytest.mark.slow
 def test_what_the_lines_own_records_tell_is_known_without_a_gateway(tmp_path: Path) -> None:
     line, data = tmp_path / "line.toml", tmp_path / "data"
     line.write_text(line_template(2))

@@ -6,6 +6,7 @@ from datetime import UTC, datetime
 
 import pytest
 
+from gateway.cli import commission_changes
 from gateway.cli.commission import commission
 from gateway.cli.commission_changes import Changes, LineNow, Made, Offer
 from gateway.cli.commission_history import approvals, history
@@ -35,10 +36,18 @@ from gateway.supervisor.historian import Historian
 from gateway.supervisor.recent import SETTLE_S, WINDOW_S
 from gateway.supervisor.service import Gateway
 from tests.support.gateway_key import to_loop_over
+from tests.support.once import once
 from tests.unit.supervisor_support import frame_of, line_of, until
 
 LINE = line_of(2)
 CONFIG = design_lqi(task_of(LINE))
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _experiments_are_designed_once():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(commission_changes, "experiment", once(commission_changes.experiment))
+        yield
 
 
 class QuietHistorian(Historian):
@@ -126,6 +135,7 @@ class OneProcess:
         ).model_dump_json().encode()  # fmt: skip
 
 
+@pytest.mark.slow
 def test_each_candidate_is_proposed_once_and_the_end_says_why(tmp_path):
     gateway = OneProcess(tmp_path)
     found = asyncio.run(commission(LINE, gateway.side, gateway.told.append))
@@ -157,6 +167,7 @@ class Dying:
         return answer
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("which", [1, 2, LADDERS[Step.FIRST]])
 def test_a_gateway_that_dies_is_waited_for_and_the_chain_goes_on_from_its_list(tmp_path, which):
     whole = asyncio.run(commission(LINE, OneProcess(tmp_path).side))
@@ -167,6 +178,7 @@ def test_a_gateway_that_dies_is_waited_for_and_the_chain_goes_on_from_its_list(t
     assert "the gateway answers again" in gateway.told
 
 
+@pytest.mark.slow
 def test_a_gateway_that_is_gone_for_good_or_was_not_there_at_all_ends_it_with_the_reason(tmp_path):
     gateway = OneProcess(tmp_path)
     side = LiveGate(LINE, Dying(gateway, 1e9), gateway.told.append, gateway.pause, lambda: gateway.now_s)
@@ -204,6 +216,7 @@ class Picky:
         return Decided(choice, "initial-control", interaction=f"{len(self.asked):016x}")
 
 
+@pytest.mark.slow
 def test_what_an_agent_chooses_is_proposed_in_its_name_and_what_was_refused_is_told_the_next_time(tmp_path):
     gateway, picky = OneProcess(tmp_path), Picky()
     found = asyncio.run(commission(LINE, gateway.side, gateway.told.append, decider=picky))
@@ -236,6 +249,7 @@ def test_no_words_of_an_agent_end_the_phase_however_long_they_are_once_printed(t
     assert all(len(one.proposal.reason) <= 4000 for one in gateway.shown.values())
 
 
+@pytest.mark.slow
 def test_an_agent_that_asks_for_more_data_has_them_before_any_model_is_proposed_and_is_asked_once(
     tmp_path, monkeypatch
 ):

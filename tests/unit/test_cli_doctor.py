@@ -27,6 +27,8 @@ from gateway.mailbox.listener import Listener
 from gateway.mailbox.paths import LOOP_SOCKET
 from tests.protocol.driver_support import line
 
+pytestmark = pytest.mark.wires
+
 
 def only(checks: list[Check], subject: str) -> Check:
     (check,) = (check for check in checks if check.subject == subject)

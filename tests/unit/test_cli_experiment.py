@@ -112,6 +112,7 @@ def test_the_loops_socket_takes_an_experiment_as_json():
     assert loop.cycle.experiments.run is not None
 
 
+@pytest.mark.slow
 def test_the_example_is_what_design_writes_today(tmp_path):
     line = tmp_path / "line.toml"
     line.write_text(line_template(6, "line.toml"))
@@ -129,6 +130,7 @@ def test_the_example_is_what_design_writes_today(tmp_path):
     assert json.loads(result.output)["expected_half_widths"]["stiffness_per_length"] < 0.005
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [

@@ -67,6 +67,7 @@ def tension() -> list[ConfigurationResult]:
     return rehearse(cases_of(line(), plant(), [TENSION], A), seed=1, workers=1)[0]
 
 
+@pytest.mark.slow
 def test_every_design_runs_and_is_held_against_the_best_on_the_truth(tension: list[ConfigurationResult]) -> None:
     assert [(one.name, one.model) for one in tension] == [
         ("lqr", "nominal"),

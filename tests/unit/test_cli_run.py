@@ -25,8 +25,6 @@ from gateway.mailbox.listener import Listener
 from gateway.mailbox.paths import LOOP_SOCKET
 from sim_plant.plant import load_plant
 
-pytestmark = pytest.mark.wires
-
 ROOT = Path(__file__).parents[2]
 PLANT = ROOT / "sim_plant" / "plants" / "s_real.toml"
 TEXT = line_template(6)

@@ -15,8 +15,6 @@ import pytest
 from gateway.cli.background import in_background
 from gateway.core.line_template import line_template
 
-pytestmark = pytest.mark.wires
-
 PATIENCE_S = 30.0  #: for what takes a tenth of a second; what it ends would take minutes
 STORY = """
 import os, sys, time

@@ -108,6 +108,7 @@ def test_controllers_are_compared_in_the_same_noise() -> None:
             assert figure.value == next(one.value for one in found.figures if one.name == f"{name}: {figure.name}")
 
 
+@pytest.mark.slow
 def test_predictive_control_is_simulated_too() -> None:
     found = carry_out(job({"call": "simulate", "scenario": "speed-step"}, design_mpc(task_of(LINE))))
     assert 0.0 < value(found, "tracking error, speed-step") < 10.0
@@ -146,6 +147,7 @@ def recording() -> Recording:
     return shaken(LINE, true_model(3), duration_s=8.0, noise=Noise(), amplitude_nm=8.0)
 
 
+@pytest.mark.slow
 def test_physics_are_found_with_intervals(recording: Recording) -> None:
     found = carry_out(job({"call": "identify"}, recordings=(recording,)))
     for name, truth in (("stiffness_per_length", 2200.0 / 1.2), ("radius_per_inertia", 0.035)):

@@ -224,6 +224,7 @@ def test_nothing_to_offer_is_said_with_the_reasons(ground):
         tuned.config(LQR, ground)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["pid", "lqr", "lqi", "lqg"])
 def test_the_search_betters_the_first_guess_and_goes_on_from_any_history(ground, name):
     architecture = ARCHITECTURES[name]
@@ -234,6 +235,7 @@ def test_the_search_betters_the_first_guess_and_goes_on_from_any_history(ground,
     assert cut.history == whole.history, "interrupted, it goes on as if it had not been"
 
 
+@pytest.mark.slow
 def test_the_search_finds_its_way_back_from_a_hopeless_start(ground):
     hopeless = attempted(LQR, ground, Suggestion(values={"torque_per_nm2": 1e-5}, reason="haste"), ())
     assert hopeless.refused
@@ -247,6 +249,7 @@ def test_the_search_takes_over_from_whoever_named_knobs_that_there_are_not(groun
     assert tuned.best is not None
 
 
+@pytest.mark.slow
 def test_the_search_ends_at_a_minimum(ground):
     tuned = tune(LQR, ground, PatternSearch(), 50)
     assert tuned.converged

@@ -266,6 +266,7 @@ def test_what_is_ended_in_order_is_not_interrupted():
         signal.signal(signal.SIGINT, before)
 
 
+@pytest.mark.slow
 def test_who_is_let_in_has_a_certificate_that_is_trusted_and_a_password_that_is_a_good_one(tmp_path):
     alone, people = (let_in(LINE, tmp_path / name, people=name == "b") for name in ("a", "b"))
     users = [UsersFile(tmp_path / name / FILE_NAME).current() for name in ("a", "b")]

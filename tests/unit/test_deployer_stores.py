@@ -119,6 +119,7 @@ async def test_another_approval_while_a_change_is_on_probation_keeps_no_lease_wa
     assert taken_up == [] and gateway.stage(two) is Stage.WAITING
 
 
+@pytest.mark.wires
 def test_a_store_that_a_backup_holds_for_five_seconds_ends_nothing_and_holds_up_nobody(tmp_path: Path) -> None:
     begin_configurations(tmp_path / "configurations.sqlite").close()
     begin_repository(tmp_path / "models.sqlite").close()

@@ -51,6 +51,7 @@ def prediction(n=2, **changes):
     return RecoveryPrediction(**(given | {"model": model, "coulomb_nm": [0.0] * n} | changes))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("spans", "design"), [(1, design_lqi), (6, design_lqi), (6, design_lqg), (20, design_lqg), (60, design_lqi)]
 )

@@ -198,6 +198,7 @@ def test_a_candidate_that_is_not_offered_cannot_be_chosen() -> None:
     assert any("pid is not offered: it is unstable" in fact for fact in question.facts)
 
 
+@pytest.mark.wires
 def test_the_command_says_once_that_nobody_can_be_asked(tmp_path: Path) -> None:
     from typer.testing import CliRunner
 

@@ -110,6 +110,7 @@ def test_at_standstill_no_more_web_is_taken_than_stretches_all_of_it_twice():
     assert stepped(trim, found_n, 10, stands=True)[1] > 0.0, "a line that ran begins anew"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("begun_n", [-21.0, 25.0])
 def test_a_span_whose_tension_never_comes_takes_nothing_from_another_that_has_its_own(begun_n):
     """Span 2 is broken for good; span 4 was brought to its set-point before it, and stays there."""

@@ -295,6 +295,7 @@ def test_layouts_round_trip(kinds: list[str], data: st.DataObject) -> None:
         layout.encode([KINDS[kinds[0]][1] + 1, *numbers[1:]])
 
 
+@pytest.mark.wires
 def test_whatever_an_interface_raises_its_thread_goes_on_and_it_is_told_as_a_failure_of_the_bus() -> None:
     class Interface:
         def __init__(self) -> None:

@@ -3,7 +3,6 @@
 import asyncio
 import re
 import shutil
-import socket
 import struct
 from collections.abc import Callable
 from itertools import product
@@ -23,7 +22,8 @@ from drivers.registry import LinksRefused, build_links
 from gateway.core.line import Line
 from gateway.core.signals import DriveRequest, DriveState, Inputs, Outputs
 from gateway.core.units import SI_PER_UNIT
-from tests.protocol.driver_support import ENABLED, GROUP, Drive, Drives, cycle, free_port, line, until
+from tests.protocol.driver_support import ENABLED, GROUP, Drive, Drives, cycle, line, until
+from tests.support.ports import free_port
 
 
 def test_the_shipped_maps_load_and_each_is_for_a_role_on_its_wire() -> None:
@@ -268,7 +268,7 @@ async def drive_the_pd2s(drives: list[Pd2], port: int) -> None:
 
 def test_a_nanotec_drive_is_configured_and_driven() -> None:
     drives = [Pd2(1), Pd2(2)]
-    asyncio.run(drive_the_pd2s(drives, free_port(socket.SOCK_DGRAM)))
+    asyncio.run(drive_the_pd2s(drives, free_port()))
     for drive, per_mille in zip(drives, (500, -200), strict=True):
         assert drive.rpdos == [struct.pack("<Hhb", 0x0F, per_mille, 10)]
         assert drive.objects[0x1016, 1] == bytes.fromhex("6400 7F00")
@@ -287,5 +287,5 @@ def test_a_nanotec_drive_that_is_otherwise_is_refused(place: tuple[int, int], va
     drives = [Pd2(1), Pd2(2)]
     drives[1].objects[place] = struct.pack("<I", value)
     with pytest.raises(PrepareRefused, match=words):
-        asyncio.run(drive_the_pd2s(drives, free_port(socket.SOCK_DGRAM)))
+        asyncio.run(drive_the_pd2s(drives, free_port()))
     assert drives[0].writes == drives[1].writes == []

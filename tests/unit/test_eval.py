@@ -37,10 +37,10 @@ from gateway.core.questions import Knob, Option, Question, usual_choice, wrong_w
 from sim_plant.drawn import random_plant, unruly_plant
 from sim_plant.plant import plant_of
 from tests.bench.agents import Nobody
-from tests.closed_loop.virtual_time import VirtualTimeLoop
 from tests.stand_in.engine import Engine
 from tests.stand_in.in_process import InProcess
 from tests.stand_in.personas import PERSONAS
+from tests.support.virtual_time import VirtualTimeLoop
 from tests.unit.language_model_support import QUESTION
 
 SETTINGS = Agents(llm="ollama", url="http://stand-in", answer_max_s=60.0)
@@ -84,6 +84,7 @@ def test_a_drawn_plant_is_a_plant_that_a_file_may_hold(drawn: Any) -> None:
     assert plant_of(plant.model_dump()) == plant and drawn(5, 3) == plant
 
 
+@pytest.mark.slow
 def test_what_is_designed_on_the_truth_knows_the_truth_and_does_better_than_the_file() -> None:
     task = task_of(1, 4, 1)
     theta = theta_of(true_model(task.plant, task.line))

@@ -15,8 +15,6 @@ from gateway.cli.eval_work import BASELINES, Job, _result_of, carried_out, carry
 from gateway.commissioning.decisions import Decided
 from gateway.core.questions import Question
 
-pytestmark = pytest.mark.wires
-
 EXAMPLE = Path("docs/examples/eval.json")
 
 

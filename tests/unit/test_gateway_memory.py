@@ -10,8 +10,6 @@ import pytest
 
 from gateway.supervisor.memory import EVERY_S, UP_S, GivenBack
 
-pytestmark = pytest.mark.wires
-
 
 class Cycle:
     def __init__(self) -> None:

@@ -20,8 +20,6 @@ from tests.unit import historian_victim
 from tests.unit.supervisor_support import child, frame_of
 from tests.unit.test_historian import eventually, running, writer_of
 
-pytestmark = pytest.mark.wires
-
 ROOT = Path(__file__).parents[2]
 
 
@@ -31,7 +29,7 @@ def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_no_kill_loses_what_was_said_to_be_stored_or_harms_the_file(tmp_path: Path) -> None:
-    seed = int(np.random.default_rng().integers(1 << 30))
+    seed = int(np.random.randint(1 << 30))
     print(f"seed {seed}")
     command = [sys.executable, "-m", "tests.unit.historian_victim", str(tmp_path), str(seed)]
     victims = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=True)

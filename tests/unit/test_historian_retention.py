@@ -59,6 +59,7 @@ def test_telemetry_goes_after_its_days_and_events_after_theirs(tmp_path: Path) -
     assert (frames, events) == (4 * 20, [f"event {k}" for k in range(3, 10)])
 
 
+@pytest.mark.slow
 def test_a_history_that_is_too_large_loses_its_oldest_and_gives_space_back(tmp_path: Path) -> None:
     path = tmp_path / "history.sqlite"
     written(path, 200, 10.0, frames=100)

@@ -185,6 +185,7 @@ def test_a_reader_that_waits_in_the_middle_keeps_no_log_from_beginning_anew(tmp_
     writer.close()
 
 
+@pytest.mark.slow
 def test_the_log_shrinks_again_after_another_program_held_a_read_open(tmp_path: Path) -> None:
     path = tmp_path / "h"
     writer = writer_of(path, spans=60)
@@ -215,6 +216,7 @@ def test_events_of_a_kind_are_found_in_the_database_and_in_the_tail(tmp_path: Pa
     writer.close()
 
 
+@pytest.mark.slow
 def test_while_another_program_holds_the_database_the_tail_takes_so_much_and_no_more(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

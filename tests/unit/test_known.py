@@ -183,6 +183,7 @@ def test_while_the_next_index_is_made_questions_are_answered_from_the_one_before
     run(story)
 
 
+@pytest.mark.slow
 def test_an_index_of_another_embedder_is_made_anew_and_never_mixed(tmp_path):
     async def story() -> None:
         first, second = WordCounter("one"), WordCounter("another")

@@ -127,6 +127,7 @@ def by_rules(in_service, proposed=()):
     return offer
 
 
+@pytest.mark.slow
 def test_it_is_a_tenth_better_in_a_course_and_says_what_it_promises_in_each():
     offer = by_rules(CALM)
     shares = offer.redesign.shares
@@ -145,12 +146,14 @@ def test_what_has_been_proposed_on_the_model_is_not_proposed_again():
     assert len(proposed) > 1
 
 
+@pytest.mark.slow
 def test_where_what_is_in_service_is_the_rules_own_there_is_none():
     best = by_rules(CALM).redesign.controller
     with pytest.raises(Exhausted):
         by_rules(best)
 
 
+@pytest.mark.slow
 def test_without_a_model_it_is_what_the_rules_would_have_begun_with_unless_that_had_its_answer():
     step, line = Next(Step.FIRST, BY_RULES + 1), now(CALM, None)
     (offer,) = CHANGES.offers(step, line, [], None)
@@ -167,6 +170,7 @@ def test_the_last_word_may_use_all_that_the_gate_tolerates():
     assert no_worse(LINE, one, before, of_tolerance=1.0) and not no_worse(LINE, one, before)
 
 
+@pytest.mark.slow
 def test_the_last_word_has_calmer_predictive_control_too_which_overshoots_less():
     offers = redesigns(LINE, MODEL, CALM, TENSION_N, Region(), last=True)
     overshoot_pct = {one.law: one.figures["tension"].overshoot_pct for one in offers}

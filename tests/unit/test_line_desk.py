@@ -230,6 +230,7 @@ ASKS = st.one_of(
 )  # fmt: skip
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(payload=ASKS)
 def test_whatever_is_asked_nothing_fails_and_nothing_is_written(tmp_path, payload):

@@ -318,6 +318,7 @@ def known_key_lines() -> list[tuple[int, str]]:
     return found
 
 
+@pytest.mark.slow
 @settings(max_examples=150)
 @given(st.data())
 def test_any_typo_in_a_key_is_reported_with_line_and_nearest_key(data: st.DataObject) -> None:
@@ -381,6 +382,7 @@ def replaced(path: tuple[Any, ...], junk: Any) -> dict[str, Any]:
     return document
 
 
+@pytest.mark.slow
 def test_every_error_that_pydantic_can_give_is_translated() -> None:
     kinds: set[str] = set()
     for path in paths(tomllib.loads(line_template(2)))[1:]:
@@ -407,6 +409,7 @@ def written(value: Any) -> str:
 ALL_PATHS = paths(tomllib.loads(line_template(2)))[1:]
 
 
+@pytest.mark.slow
 @settings(max_examples=200)
 @given(st.lists(st.tuples(st.sampled_from(ALL_PATHS), st.sampled_from(JUNK)), min_size=1, max_size=3))
 def test_junk_anywhere_is_refused_or_read_but_never_crashes(edits: list[tuple[tuple[Any, ...], Any]]) -> None:

@@ -20,6 +20,8 @@ from gateway.supervisor.bounded import AT_ONCE
 from tests.unit.supervisor_support import frame_of, until
 from tests.unit.test_supervisor_process import gateway, loop_and_client, run
 
+pytestmark = pytest.mark.wires
+
 ANNA = Person(name="anna", role="operator", through="opc-ua", certificate="c" * 64)
 
 

@@ -115,6 +115,7 @@ def test_the_example_has_the_structure_of_the_schema() -> None:
     fits(tomllib.loads((DOCS / "examples/line.toml").read_text(encoding="utf-8")), published)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("spans", [1, 8, 9, 14, 60])
 def test_every_mix_of_wires_is_valid_and_every_device_is_on_the_wire_asked_for(spans: int) -> None:
     wires: tuple[Wire, ...] = ("canopen", "modbus-tcp", "opcua", "rack")

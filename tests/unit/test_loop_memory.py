@@ -46,6 +46,7 @@ def test_it_never_collects_otherwise(phase: Phase) -> None:
     assert not collected
 
 
+@pytest.mark.slow
 def test_it_finds_a_cycle_that_a_run_has_left() -> None:
     collector = RestCollector()
     gc.collect()

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from gateway.cli.children import free_udp_port
 from gateway.control.design import design_lqi, task_of
 from gateway.core.controller import canonical
 from gateway.core.line_file import load_line
@@ -21,7 +20,10 @@ from gateway.mailbox.paths import LOOP_SOCKET
 from gateway.mailbox.port import ANSWERED
 from gateway.mailbox.unix import UnixMailbox
 from tests.support.gateway_key import as_gateway
+from tests.support.ports import free_port
 from tests.unit.supervisor_support import child, short_folder
+
+pytestmark = pytest.mark.wires
 
 #: A loop whose buses open once there is the file "open".
 LOOP = """
@@ -62,7 +64,7 @@ def starting(key: bytes | None = None) -> Iterator[Path]:
         if key is not None:
             (folder / KEY_FILE).touch(0o600)
             (folder / KEY_FILE).write_bytes(key)
-        text = line_template(2, "line.toml").replace("port = 43113", f"port = {free_udp_port()}")
+        text = line_template(2, "line.toml").replace("port = 43113", f"port = {free_port()}")
         (folder / "line.toml").write_text(text)
         controller = design_lqi(task_of(load_line(text, "line.toml")))
         (folder / "controller.json").write_bytes(canonical(controller))

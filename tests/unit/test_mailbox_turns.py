@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gateway.mailbox.turns import MAX_ACCEPTED, WINDOW_S, Turns
-from tests.closed_loop.virtual_time import START_S, VirtualTimeLoop
+from tests.support.virtual_time import START_S, VirtualTimeLoop
 
 
 class Greedy:

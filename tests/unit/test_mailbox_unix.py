@@ -410,6 +410,7 @@ asyncio.run(main())
 """
 
 
+@pytest.mark.wires
 def test_a_living_listener_is_refused_and_a_killed_one_replaced() -> None:
     async def story(folder: Path) -> None:
         path = folder / "g"

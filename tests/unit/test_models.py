@@ -23,8 +23,6 @@ from tests.unit import models_victim
 from tests.unit.model_support import model
 from tests.unit.supervisor_support import child, short_folder
 
-pytestmark = pytest.mark.wires
-
 ROOT = Path(__file__).parents[2]
 OLDER = ROOT / "tests" / "unit" / "data" / "models-schema-1.sqlite"
 OLDER_IDS = [
@@ -257,7 +255,7 @@ def test_a_damaged_model_is_named_and_hides_no_other(tmp_path: Path) -> None:
 
 
 def test_no_kill_loses_what_was_said_to_be_stored_or_harms_the_file(tmp_path: Path) -> None:
-    seed = int(np.random.default_rng().integers(1 << 30))
+    seed = int(np.random.randint(1 << 30))
     print(f"seed {seed}")
     command = [sys.executable, "-m", "tests.unit.models_victim", str(tmp_path), str(OLDER), str(seed)]
     victims = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=90, check=True)

@@ -58,6 +58,7 @@ def random_line(generator, n=6):
 CLOSE = {"daqp": (1e-4, 1e-6, 1e-3, 0.01), "osqp": (0.1, 2e-3, 0.02, 1.0)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", CLOSE)
 @pytest.mark.parametrize("seed", range(2))
 def test_solutions_are_those_of_a_second_solver(solver, seed):

@@ -142,6 +142,7 @@ def test_only_a_line_that_names_the_map_is_refused(maps: Path, tmp_path: Path) -
         assert "draft.toml:" in bad.output and "address_base" in bad.output and "Traceback" not in bad.output
 
 
+@pytest.mark.wires
 def test_scan_and_doctor_list_what_is_not_usable(maps: Path, tmp_path: Path) -> None:
     put(maps / "draft.toml", "half written")
     scanned = CliRunner().invoke(app, ["scan", "modbus", "127.0.0.1", "--port", "1", "--units", "1"])

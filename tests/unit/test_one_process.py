@@ -8,6 +8,8 @@ from gateway.mailbox.listener import AlreadyRunning, Listener
 from gateway.mailbox.one_process import hold_alone
 from tests.unit.supervisor_support import child, short_folder
 
+pytestmark = pytest.mark.wires
+
 #: Holds both locks where not one byte can be written, as on a full disk.
 ON_A_FULL_DISK = """
 import resource, sys, time

@@ -11,6 +11,7 @@ TIER_A = Terms(0.010, 0.010, 60.0, 1000.0)
 STUDY_N = {"tension": 1.8348, "velocity": 1.0867}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", PAPER, ids=lambda case: case.name)
 def test_it_is_that_of_an_independent_study(case):
     found = oracle(case, load_plant("sim_plant/plants/s_real.toml").parameters(), TIER_A, by_piqp)
@@ -19,6 +20,7 @@ def test_it_is_that_of_an_independent_study(case):
     assert np.abs(np.diff(found.torque_nm, axis=0)).max() <= 10.0 + 1e-6
 
 
+@pytest.mark.slow
 def test_a_second_solver_finds_the_same():
     truth = load_plant("sim_plant/plants/s_sim.toml").parameters()
     found = [oracle(PAPER[1], truth, TIER_A, solve).rmse_n for solve in (by_piqp, by_clarabel)]

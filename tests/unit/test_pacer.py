@@ -7,6 +7,8 @@ import pytest
 
 from gateway.loop.pacer import TimerPacer
 
+pytestmark = pytest.mark.wires
+
 PERIOD_S = 0.01
 
 

@@ -153,6 +153,7 @@ def test_all_who_look_get_the_same_and_it_goes_on():
     asyncio.run(story())
 
 
+@pytest.mark.slow
 def test_who_does_not_read_gets_the_newest_later_and_nothing_queues_up():
     ticks = 4000
 

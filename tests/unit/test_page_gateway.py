@@ -6,6 +6,7 @@ import time
 from pathlib import Path
 
 import httpx
+import pytest
 
 from gateway.mailbox.unix import UnixMailbox
 from gateway.operator.line_side import TOPICS, LineSide
@@ -19,6 +20,7 @@ from tests.unit.test_line_side import told
 from tests.unit.test_supervisor_process import gateway, run
 
 
+@pytest.mark.wires
 def test_what_is_said_through_the_page_is_recorded_and_told_there_again() -> None:
     async def story(folder: Path) -> None:
         with gateway(folder):

@@ -65,6 +65,7 @@ def test_the_cookie_alone_says_nothing(token: str):
     asyncio.run(story())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("host", ["elsewhere.example", "127.0.0.1.elsewhere.example:8480", "", "[", "169.254.1.1"])
 def test_a_name_that_somebody_else_points_here_gets_no_answer(host: str):
     async def story() -> None:
@@ -92,6 +93,7 @@ def test_what_is_reached_from_other_machines_has_any_name():
     assert why_not_this_host("", names_of("192.168.7.5")) == "the request names no host"
 
 
+@pytest.mark.slow
 def test_what_is_too_long_is_not_read_to_its_end():
     async def story() -> None:
         async with page() as there:

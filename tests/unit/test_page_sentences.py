@@ -208,6 +208,7 @@ def test_a_sentence_has_the_same_places_to_fill_in_and_something_between_them(en
     assert "}{" not in english
 
 
+@pytest.mark.slow
 def test_no_sentence_is_there_that_nobody_says():
     """Each is a text of the code, or what is put together of several."""
     spoken = {sample for _, sample in composed(everywhere=True)} | WHOLES

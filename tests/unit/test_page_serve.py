@@ -37,6 +37,7 @@ def certificate_in(folder: Path) -> tuple[Path, Path]:
     return at, key_at
 
 
+@pytest.mark.wires
 def test_beyond_loopback_the_page_speaks_tls(tmp_path: Path):
     certificate, key = certificate_in(tmp_path)
 

@@ -319,6 +319,7 @@ def test_what_cannot_be_told_is_refused_with_what_can(folder: Path, from_s: floa
     assert said in refusal(asked(folder, query)[0])
 
 
+@pytest.mark.slow
 def test_most_points_of_many_spans_fit_a_message(folder: Path) -> None:
     time_s = np.arange(0.0, 100.0, 0.01)
     writer = writer_of(folder / HISTORY, spans=60)

@@ -201,6 +201,7 @@ def test_a_deployment_that_is_not_made_leaves_what_was_kept_on_top(tmp_path):
     told(Disk(tmp_path), story)
 
 
+@pytest.mark.wires
 def test_a_keep_that_is_written_ahead_while_the_loop_ends_is_not_what_the_next_one_runs(tmp_path):
     async def story(it):
         assert (await it.ask(deploy())).ok
@@ -260,6 +261,7 @@ def test_a_model_that_is_refused_at_the_boundary_is_not_on_the_disk(tmp_path):
     told(Disk(tmp_path), story)
 
 
+@pytest.mark.wires
 def test_a_keep_that_was_rolled_back_while_it_was_prepared_writes_nothing(tmp_path, monkeypatch):
     """It would write its own watch beside a configuration that this is not for."""
     begun, go_on = threading.Event(), threading.Event()
@@ -292,6 +294,7 @@ def test_a_keep_that_was_rolled_back_while_it_was_prepared_writes_nothing(tmp_pa
     asyncio.run(story())
 
 
+@pytest.mark.wires
 def test_whoever_deploys_and_goes_away_leaves_no_epoch_that_could_be_used_twice(tmp_path, monkeypatch):
     """What was written ahead stays on the disk until it is decided, whoever waits for it."""
     begun, go_on = threading.Event(), threading.Event()

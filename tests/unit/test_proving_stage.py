@@ -1,6 +1,7 @@
 """The stage of a proof by itself, on rollers that no web holds: each turns under its own torque and friction."""
 
 import numpy as np
+import pytest
 
 from gateway.core.line import Line
 from gateway.core.line_file import load_line
@@ -50,6 +51,7 @@ def test_a_roller_that_no_web_holds_is_found_and_the_others_are_not_tried() -> N
     assert found(without_web(line_of(set()))) == ([("no-answer", 3)], [3])
 
 
+@pytest.mark.slow
 def test_one_whose_span_no_load_cell_sees_is_asked_about_and_leaves_the_others_their_turn() -> None:
     stage = without_web(line_of({3}))
     assert found(stage) == ([("no-answer", 2)], [2, 3])
@@ -57,6 +59,7 @@ def test_one_whose_span_no_load_cell_sees_is_asked_about_and_leaves_the_others_t
     assert ("drive-direction-unseen", 3) in [(one.code, one.parameters.get("roller")) for one in stage.judged.questions]
 
 
+@pytest.mark.slow
 def test_where_no_load_cell_is_every_drive_is_asked_about() -> None:
     stage = without_web(line_of({1, 2, 3}))
     assert found(stage) == ([], [1, 2, 3])

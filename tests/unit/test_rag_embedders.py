@@ -20,8 +20,6 @@ from agents.rag.minilm import PACKAGE, MiniLm
 from agents.rag.ollama_embedder import OllamaEmbedder
 from agents.rag.wordpiece import WordPieces
 
-pytestmark = pytest.mark.wires
-
 WIDTH, HEADS, LAYERS, INNER = 8, 2, 2, 12
 VOCABULARY = "[PAD] [UNK] [CLS] [SEP] tension load ##ing ##s cell - 2 . a ##m 中 µm".split()
 
@@ -202,6 +200,7 @@ async def embedded(url: str, texts: list[str], model: str = "words") -> tuple[ob
         return embedder.identity, await embedder.embed(texts)
 
 
+@pytest.mark.wires
 def test_ollama_gives_vectors_and_the_digest_of_its_weights() -> None:
     with ollama(vectors_for) as url:
         identity, vectors = asyncio.run(embedded(url, ["a", "abc"]))
@@ -237,6 +236,7 @@ def test_an_answer_that_is_no_vectors_is_a_failure_that_is_told(then: object) ->
         asyncio.run(embedded(url, ["a", "b"]))
 
 
+@pytest.mark.wires
 def test_a_server_that_is_away_or_lacks_the_model_says_what_to_do() -> None:
     with ollama(vectors_for) as url, pytest.raises(EmbedderFailed, match="ollama pull other fetches it; it has words"):
         asyncio.run(embedded(url, ["a"], "other"))

@@ -18,8 +18,6 @@ from agents.rag.library import INDEX, Opened, add_files, open_library, program_n
 from agents.rag.stages import Asked
 from tests.unit.rag_support import WordCounter, document, index_of
 
-pytestmark = pytest.mark.wires
-
 DOCUMENTS = [
     document("belt-slip", "The belt slips under load.", keywords=["belt"], tier=2),
     document("oven", "The web softens in the oven.\n\n# Draw\n\nTension by draw disappears there.", tier=1),

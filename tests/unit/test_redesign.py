@@ -34,6 +34,7 @@ def offered():
     return redesigns(LINE, MODEL, CALM, TENSION_N, Region())
 
 
+@pytest.mark.slow
 def test_where_data_reach_the_highest_speed_predictive_control_comes_before_the_others(offered):
     laws = [one.law for one in offered]
     assert len(laws) <= RUNGS and laws[0] in PREDICTIVE

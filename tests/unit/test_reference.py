@@ -72,6 +72,7 @@ class Curve:
         return Motion(then[0, :6], then[1, :6], then[2, :6], float(then[1, 6]), float(then[0, 6] - now))
 
 
+@pytest.mark.slow
 def test_flat_torques_drive_the_nonlinear_line_along_the_curve():
     theta, step_s = model(), 2e-4
     deviation = Deviation(feedforward_of(theta), [], step_s, 0.0)  # the torque for the middle of each step

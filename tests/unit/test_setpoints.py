@@ -22,6 +22,7 @@ def setpoints():
 changes = st.lists(st.tuples(st.integers(1, 120), st.floats(2.0, 58.0), st.floats(0.0, 0.1)), min_size=1, max_size=6)
 
 
+@pytest.mark.slow
 @settings(max_examples=60)
 @given(changes)
 def test_no_change_on_the_way_takes_them_past_old_and_new_targets(story):

@@ -14,6 +14,8 @@ from gateway.mailbox.unix import UnixMailbox
 from gateway.supervisor.true_loop import is_shown
 from tests.unit.supervisor_support import ShowsWho, short_folder
 
+pytestmark = pytest.mark.wires
+
 STOPPED = Reply(ok=True, state="STOP", text="the line stops")
 
 

@@ -16,8 +16,6 @@ from agents.rag import index_file
 from gateway.storage.sqlite_file import FileKind, begin, open_there, open_to_read
 from gateway.supervisor import audit_file, baselines, configurations, interactions, model_store, store
 
-pytestmark = pytest.mark.wires
-
 KINDS = {
     kind.name: kind
     for kind in (

@@ -111,6 +111,7 @@ def as_json(value: Any) -> bytes:
     return json.dumps(value).encode()  # with NaN and Infinity, as a hostile sender has it
 
 
+@pytest.mark.slow
 @given(st.lists(EVENTS, max_size=6))
 @settings(max_examples=120, deadline=None)
 def test_no_event_of_the_loop_blinds_the_status(events: list[dict[str, Any]]) -> None:
@@ -123,6 +124,7 @@ def test_no_event_of_the_loop_blinds_the_status(events: list[dict[str, Any]]) ->
     assert all(abs(event.wall_s - found.wall_s) < 40 * 86_400.0 for event in found.events)
 
 
+@pytest.mark.slow
 @given(st.lists(REPORT, max_size=4))
 @settings(max_examples=120, deadline=None)
 def test_no_report_of_a_bus_blinds_the_status(reports: list[dict[str, Any]]) -> None:
@@ -134,6 +136,7 @@ def test_no_report_of_a_bus_blinds_the_status(reports: list[dict[str, Any]]) -> 
     assert all(0 <= one.timeouts <= 2**53 for one in found.buses)
 
 
+@pytest.mark.slow
 @given(st.binary(min_size=frame_dtype(2).itemsize - 2, max_size=frame_dtype(2).itemsize - 2))
 @settings(max_examples=150, deadline=None)
 def test_no_frame_blinds_the_status(body: bytes) -> None:
@@ -145,6 +148,7 @@ def test_no_frame_blinds_the_status(body: bytes) -> None:
     assert bench.gateway.status().link.malformed >= 1
 
 
+@pytest.mark.slow
 def test_frames_of_times_that_never_grow_old_are_bounded() -> None:
     bench = Bench()
     for sequence in range(30_000):
@@ -152,6 +156,7 @@ def test_frames_of_times_that_never_grow_old_are_bounded() -> None:
     assert bench.status().timing.frames <= 20_000
 
 
+@pytest.mark.slow
 @given(VALUES, TEXTS)
 @settings(max_examples=150, deadline=None)
 def test_what_the_gateway_notes_itself_is_bounded_too(value: Any, text: str) -> None:
@@ -192,6 +197,7 @@ def test_the_most_that_a_loop_may_tell_of_its_buses_fits() -> None:
     assert [len(one.absent) for one in found.buses] == [201, 201, 201] and found.buses[0].absent[-1] == "and 4800 more"
 
 
+@pytest.mark.slow
 @given(TEXTS, TEXTS, TEXTS)
 @settings(max_examples=60, deadline=None)
 def test_a_proposal_of_an_agent_plays_with_no_terminal_and_no_page(author: str, why: str, reason: str) -> None:

@@ -108,6 +108,7 @@ def of(pid: int, payload: bytes, bench: Bench) -> Reply:
         PEER.reset(token)
 
 
+@pytest.mark.slow
 def test_whoever_floods_the_gateway_with_commands_puts_no_other_event_out_of_the_status_and_history() -> None:
     bench = Bench()
     bench.say("state", "RUN to STOP: tension 3 is beyond its limit")

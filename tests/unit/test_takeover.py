@@ -144,6 +144,7 @@ def test_every_law_begins_with_the_torque_that_every_other_ends_with(first, case
 laws = st.sampled_from(sorted(DESIGNS))
 
 
+@pytest.mark.slow
 @settings(max_examples=30, derandomize=True)
 @given(laws, laws, st.sampled_from(CASES), st.floats(0.0, 1.0), st.integers(0, 10_000), st.sampled_from([(), (1,)]))
 def test_any_law_takes_over_from_any_other(first, second, case, instant, seed, draw):

@@ -11,8 +11,6 @@ from gateway.core.questions import AGENTS
 from gateway.core.topics import AGENT_NAMES, AGENT_TOPICS, ASK_UNANSWERED, TOPICS
 from gateway.mailbox.port import what_to_start
 
-pytestmark = pytest.mark.wires
-
 
 def test_no_topic_is_another_one_and_each_is_a_key():
     topics = [*TOPICS, *(row.of(agent) for row in AGENT_TOPICS for agent in AGENT_NAMES)]

@@ -225,6 +225,7 @@ def test_a_file_open_to_others_is_not_written_over(place: list[str], anna: Users
     assert code == 2 and "chmod 600" in said
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("typed", "said", "code"), [((GOOD, GOOD), "may come in", 0), ((GOOD, GOOD + "?"), "the two differ", 2)]
 )

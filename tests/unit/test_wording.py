@@ -39,6 +39,7 @@ def test_each_language_has_the_same_codes():
         assert entries(language).keys() == entries("en").keys(), language
 
 
+@pytest.mark.slow
 def test_every_code_that_is_found_somewhere_is_in_the_catalogue_with_its_parameters():
     calls = [call for top in SOURCES for path in Path(top).rglob("*.py") for call in calls_in(path)]
     for where, code, names in calls:

@@ -12,6 +12,7 @@ import asyncio
 import itertools
 import selectors
 import socket
+from asyncio import futures
 from collections.abc import Callable
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextvars import Context
@@ -22,7 +23,9 @@ T = TypeVar("T")
 START_S = 1000.0  #: the loop's time at the start; not 0, so that it cannot pass for a time since the start
 LONGEST_RUN_S = 3600.0  #: virtual; a program that gets there has lost its way
 MOST_POLLS_AT_ONE_INSTANT = 200_000  #: more, and something keeps itself busy without ever waiting
-THREAD_PATIENCE_S = 30.0  #: real; a thread that takes longer does not come back
+TESTS_LONGEST_S = 120.0  #: virtual; no test's own loop waits as long for anything
+TURN_NS = 50_000  #: of virtual time; with less, idle turns spin for minutes until a time is over
+THREAD_PATIENCE_S = 120.0  #: real; a thread that takes longer does not come back
 DELIVERY_PATIENCE_S = 10.0  #: real, for one datagram on the loopback interface
 
 _NS_PER_S = 1_000_000_000
@@ -37,9 +40,10 @@ class TimeStuck(RuntimeError):
 class VirtualTimeLoop(asyncio.SelectorEventLoop):
     """Time is kept in whole nanoseconds, so that many small jumps end where one large one does."""
 
-    def __init__(self) -> None:
+    def __init__(self, longest_s: float | None = None) -> None:
+        self._longest_s = LONGEST_RUN_S if longest_s is None else longest_s
         self._now_ns = round(START_S * _NS_PER_S)
-        self._until_ns = self._now_ns + round(LONGEST_RUN_S * _NS_PER_S)
+        self._until_ns = self._now_ns + round(self._longest_s * _NS_PER_S)
         self._polls = 0  #: at this instant
         self._busy_threads = 0
         super().__init__(_Sockets(self._count_poll, self._is_busy, self._jump))
@@ -60,8 +64,11 @@ class VirtualTimeLoop(asyncio.SelectorEventLoop):
 
     def run_in_executor(self, executor: Executor | None, func: Callable[..., T], *args: Any) -> asyncio.Future[T]:
         """As asyncio's. Time stands still until `func` has returned, even when nobody waits for it any more."""
-        work: Future[T] = (executor or self._threads).submit(func, *args)
-        future = asyncio.wrap_future(work, loop=self)
+        return self.wrapped((executor or self._threads).submit(func, *args))
+
+    def wrapped(self, work: Future[T]) -> asyncio.Future[T]:
+        """As `asyncio.wrap_future`. Time stands still until `work` is done: a thread is busy with it."""
+        future = futures.wrap_future(work, loop=self)
         self._busy_threads += 1
         # After the callback of `wrap_future`: the result reaches the loop before time may go on.
         work.add_done_callback(lambda _: self.call_soon_threadsafe(self._thread_done))
@@ -90,14 +97,30 @@ class VirtualTimeLoop(asyncio.SelectorEventLoop):
         """Nothing is ready: on to the next timer, which is due in `timeout_s`; None if there is none."""
         if timeout_s is None:
             raise TimeStuck(f"nothing is ready, no timer is set, no thread is busy; {self._tasks()}")
-        self._now_ns += round(timeout_s * _NS_PER_S)
         self._polls = 0
+        self._pass(round(timeout_s * _NS_PER_S))
+
+    def _pass(self, ns: int) -> None:
+        self._now_ns += ns
         if self._now_ns > self._until_ns:
-            self._until_ns = self._now_ns + round(LONGEST_RUN_S * _NS_PER_S)  # for what has to be tidied up
-            raise TimeStuck(f"{LONGEST_RUN_S:g} s have passed; {self._tasks()}")
+            self._until_ns = self._now_ns + round(self._longest_s * _NS_PER_S)  # for what has to be tidied up
+            raise TimeStuck(f"{self._longest_s:g} s have passed; {self._tasks()}")
 
     def _tasks(self) -> str:
         return "pending: " + ("; ".join(sorted(_where(task) for task in asyncio.all_tasks(self))) or "no task")
+
+
+class TestsLoop(VirtualTimeLoop):
+    """What `asyncio.run` gives to a test that is not marked as living on the wall clock (`alone` in tests/conftest.py).
+
+    A little time passes in each turn: who waits by turns, and not by time, must come to its deadlines, too.
+    """
+
+    def __init__(self) -> None:
+        super().__init__(TESTS_LONGEST_S)
+
+    def _count_poll(self) -> None:
+        self._pass(TURN_NS)
 
 
 class _Sockets(selectors.EpollSelector):
