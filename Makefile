@@ -50,8 +50,8 @@ system-test: $(VENV)/.compiled ## a real CAN kernel and foreign protocol stacks;
 test-fast: $(VENV)/.compiled ## unit and safety, what takes no second each: at each save (a minute)
 	@$(PY) -m pytest tests/unit tests/safety -m "not slow and not wires and not realtime and not long" $(PARALLEL) --hypothesis-profile fast $(ARGS)
 
-ready: check test-fast ## whether a change will land, in ten minutes: then what is new in the tests ten times on a busy machine (ARGS="--since COMMIT")
-	@$(PY) -m tests.landing ready $(ARGS)
+ready: check test-fast ## whether a change will land, in ten minutes: then what is new in the tests ten times on a busy machine (SINCE=COMMIT)
+	@$(PY) -m tests.landing ready $(if $(SINCE),--since $(SINCE))
 
 landing: $(VENV)/.compiled ## what a change must pass: all tests in stages, what failed tried again alone (about 25 min; as root; ARGS="--stage wires")
 	@$(PY) -m tests.landing $(ARGS)
@@ -77,7 +77,7 @@ lint: setup
 	@$(PY) -m ruff format --check .
 	@mkdir -p out
 	@$(VENV)/bin/lint-imports --no-cache > out/lint-imports.txt 2>&1 || { cat out/lint-imports.txt; exit 1; }
-	@$(PY) -m tests.landing mended
+	@$(PY) -m tests.landing known
 
 format: setup ## format the code
 	@$(PY) -m ruff format .

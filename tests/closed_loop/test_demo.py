@@ -20,6 +20,7 @@ from gateway.cli.demo_result import DemoResult
 from gateway.operator.users import FILE_NAME, UsersFile
 from sim_plant.recorder import read_recording
 from tests.bench.figures import GOALS
+from tests.support.recorder import require_safe
 
 #: A demonstration takes three minutes where the machine is its own; on a shared one its line stops, and is tried again.
 LONGEST_S = 900
@@ -87,7 +88,7 @@ def test_the_demonstration_runs_both_cases_and_leaves_nothing_behind(tmp_path):
         goal = GOALS["wire"][f"ratio_{case.name}"]["value"]
         assert case.ratio_to_stepped <= goal == case.limit_ratio, output
         assert case.tension_min_n > 2.0 and case.tension_max_n < 60.0
-    assert not any(result.unsafe_events.values()), result.unsafe_events
+    require_safe(result.unsafe_events)
     assert result.timing.periods > 3000
     page = (folder / "report.html").read_text()
     assert all(f"{case.rmse_n:.4f}" in page for case in configuration.cases)

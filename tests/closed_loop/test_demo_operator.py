@@ -13,6 +13,7 @@ from gateway.control.design import design_lqg, task_of
 from gateway.core.controller import config_hash
 from gateway.core.line_file import load_line
 from tests.operator.real_line import OperatorLine
+from tests.support.recorder import require_safe
 
 pytestmark = [pytest.mark.long, pytest.mark.realtime, pytest.mark.timeout(600)]
 
@@ -76,4 +77,4 @@ def test_a_scripted_operator_approves_what_it_was_shown_and_the_audit_says_that_
         assert line.status().loop.state == "RUN"
         line.children.end("loop")
         line.recording()
-        assert not any(line.unsafe().values()), line.unsafe()
+        require_safe(line.unsafe())

@@ -14,6 +14,7 @@ from gateway.core.decisions import ProposalShown
 from gateway.supervisor.on_the_line import LEASE_S
 from tests.closed_loop.gate_line import GateLine, largest_step_nm
 from tests.closed_loop.wire import settled
+from tests.support.recorder import require_safe
 
 pytestmark = [pytest.mark.realtime, pytest.mark.timeout(180)]
 
@@ -63,7 +64,7 @@ def test_a_proposal_is_judged_approved_runs_is_kept_and_another_is_taken_back(li
     assert largest_step_nm(recording, began_s, ended_s) <= limits.torque_rate_nm_per_s * line.line.control.period_s
     tension_n = np.array(line.line.recipes[0].tension_n)
     assert np.abs(recording.tension_n[here] - tension_n).max() < NEAR_N
-    assert not any(line.unsafe().values()), line.unsafe()
+    require_safe(line.unsafe())
     assert "sound" in line.audit("verify")
     assert config_hash(better) in line.audit("show", "--kind", "archived")
     told = line.audit("show", "--id", proposal[:12])
@@ -91,7 +92,7 @@ def test_the_gateway_dies_on_probation_the_loop_goes_back_by_itself_and_the_audi
     recording = line.recording()
     limits = line.line.limits
     assert largest_step_nm(recording, began_s, ended_s) <= limits.torque_rate_nm_per_s * line.line.control.period_s
-    assert not any(line.unsafe().values()), line.unsafe()
+    require_safe(line.unsafe())
     assert "sound" in line.audit("verify")
     told = line.audit("show", "--id", proposal[:12])
     assert "rolled-back" in told and "was not renewed" in told

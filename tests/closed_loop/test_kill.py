@@ -12,6 +12,7 @@ import pytest
 
 from gateway.core.messages import Arm, SetSpeed, Start, Stop
 from tests.closed_loop.wire import WireLine, from_master, heard, settled, silent_periods_until_ramp
+from tests.support.recorder import require_safe
 
 pytestmark = pytest.mark.realtime
 
@@ -46,7 +47,7 @@ def test_killing_the_loop_the_drives_own_watchdog_takes_torque_off_and_the_resta
     assert max(event["time_s"] for event in trips) - killed_s <= WATCHDOG_S + 2 * PERIOD_S
     after = (recording.time_s > killed_s + WATCHDOG_S + 3 * PERIOD_S) & (recording.time_s < killed_s + 0.5)
     assert not recording.torque_nm[after].any()
-    assert not any(wire.unsafe().values()), wire.unsafe()
+    require_safe(wire.unsafe())
 
 
 def test_without_its_gateway_the_loop_runs_on_one_that_comes_back_finds_it_and_stop_goes_straight_to_it(wire):
@@ -67,7 +68,7 @@ def test_without_its_gateway_the_loop_runs_on_one_that_comes_back_finds_it_and_s
     assert np.abs(recording.tension_n[alone] - np.array([28, 36, 20, 40, 24, 32])).max() < 1.0
     assert not recording.of_kind("watchdog")
     assert not recording.torque_nm[-100:].any() and not recording.unwind_speed_m_per_s[-100:].any()
-    assert not any(wire.unsafe().values()), wire.unsafe()
+    require_safe(wire.unsafe())
 
 
 def test_killing_the_simulated_line_the_loop_ramps_after_three_silent_periods_and_takes_the_drives_off(wire):
@@ -106,7 +107,7 @@ def test_a_hang_is_ended_by_the_drives_own_watchdog_and_the_loop_finds_them_in_f
     recording = wire.recording()
     trips = recording.of_kind("watchdog")
     assert sorted(event["roller"] for event in trips) == [1, 2, 3, 4, 5, 6]
-    assert not any(wire.unsafe().values()), wire.unsafe()
+    require_safe(wire.unsafe())
 
 
 def test_an_orderly_end_in_mid_run_stops_the_line_and_leaves_no_drive_in_fault(wire):
@@ -120,7 +121,7 @@ def test_an_orderly_end_in_mid_run_stops_the_line_and_leaves_no_drive_in_fault(w
     assert not recording.torque_nm[-100:].any() and not recording.unwind_speed_m_per_s[-100:].any()
     stopped = recording.unwind_speed_m_per_s[recording.torque_nm.any(axis=1)]
     assert stopped[-1] < 0.005  # torque went off at standstill, not before
-    assert not any(wire.unsafe().values()), wire.unsafe()
+    require_safe(wire.unsafe())
 
 
 def test_a_loop_that_is_not_armed_sends_nothing_and_neither_does_a_second_one_that_ends(wire):

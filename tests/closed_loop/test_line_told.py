@@ -27,7 +27,7 @@ from tests.bench.control_plants import random_plant
 from tests.closed_loop.recorded import demonstration_line
 from tests.unit.supervisor_support import short_folder
 
-pytestmark = [pytest.mark.long, pytest.mark.timeout(900)]
+pytestmark = [pytest.mark.wires, pytest.mark.long, pytest.mark.timeout(900)]
 
 LINE, SEED = impatient(demonstration_line(2)), 72_000
 STIFFNESS = ("what is the stiffness of the web on this line", "How stiff is the web of this line?")

@@ -42,6 +42,9 @@ class _Recorder:
         if report.failed:
             self._write(test=report.nodeid, when="collect", outcome="failed", crash=_crash(report))
 
+    def pytest_sessionfinish(self, session: pytest.Session) -> None:
+        self._write(test="", when="end", collected=session.testscollected)
+
     def pytest_unconfigure(self) -> None:
         self._file.close()
 
@@ -54,24 +57,27 @@ def _crash(report: pytest.TestReport | pytest.CollectReport) -> str:
         return ""
     crash: Any = getattr(report.longrepr, "reprcrash", None)
     text = str(crash.message if crash else report.longrepr).strip()
-    # What failed to be imported says so in its last line.
     lines = text.splitlines() or [""]
-    return (lines[0] if crash else lines[-1])[:CRASH_LENGTH]
+    # What could not be imported says so in its last line.
+    return (lines[0] if crash else lines[-1].removeprefix("E").strip())[:CRASH_LENGTH]
 
 
 @dataclass
 class Recorded:
     """What a run of pytest came to.
 
-    `failed`: by test what it says of its crash; a test that fails where it is set up or torn down, a file that cannot
-    be collected and the test at which a worker died stand under their file: what failed there may be a fixture's.
-    `running`: begun, and not ended.
+    `failed`: by test, or by file where that could not be collected, what it says of its crash. `whole`: those of them
+    that failed elsewhere than in their own call: what failed may be what their file shares. `running`: begun, and not
+    ended. `complete`: it came to its end, and every test that was collected did.
     """
 
     passed: set[str] = field(default_factory=set)
     skipped: set[str] = field(default_factory=set)
     failed: dict[str, str] = field(default_factory=dict)
+    whole: set[str] = field(default_factory=set)
     running: set[str] = field(default_factory=set)
+    ended: set[str] = field(default_factory=set)
+    collected: int | None = None
     took_s: dict[str, float] = field(default_factory=dict)
 
     @classmethod
@@ -83,20 +89,31 @@ class Recorded:
         recorded.passed -= recorded.failed.keys()
         return recorded
 
+    @property
+    def complete(self) -> bool:
+        return len(self.ended) == self.collected and not self.running
+
     def _take(self, test: str, when: str, outcome: str, row: dict[str, Any]) -> None:
         if when == "start":
             self.running.add(test)
-            return
-        self.took_s[test] = self.took_s.get(test, 0.0) + row.get("took_s", 0.0)
+        elif when == "end":
+            self.collected = row["collected"]
+        else:
+            self.took_s[test] = self.took_s.get(test, 0.0) + row.get("took_s", 0.0)
+            self._count(test, when, outcome, row["crash"])
+
+    def _count(self, test: str, when: str, outcome: str, crash: str) -> None:
         if outcome == "failed":
-            unit = test if when == "call" else test.partition("::")[0]
-            self.failed.setdefault(unit, row["crash"])
+            self.failed.setdefault(test, crash)
+            if when != "call":
+                self.whole.add(test)
         elif outcome == "skipped":
             self.skipped.add(test)
         elif when == "call":
             self.passed.add(test)
-        if when not in ("setup", "call"):  # xdist says "???" of a test at which a worker died
+        if when not in ("setup", "call", "collect"):  # xdist says "???" of a test at which a worker died
             self.running.discard(test)
+            self.ended.add(test)
 
 
 def _rows(lines: Iterable[str]) -> Iterator[dict[str, Any]]:

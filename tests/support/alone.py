@@ -8,12 +8,12 @@ import asyncio
 import concurrent.futures
 import multiprocessing.process
 import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from typing import Any
 
 import pytest
+import zenoh
 
 from tests.support.virtual_time import TestsLoop, VirtualTimeLoop
 
@@ -45,8 +45,7 @@ def alone() -> Iterator[None]:
         patch.setattr(subprocess.Popen, "__init__", starting(subprocess.Popen.__init__))
         base = multiprocessing.process.BaseProcess
         patch.setattr(base, "start", starting(base.start))
-        if zenoh := sys.modules.get("zenoh"):
-            patch.setattr(zenoh, "open", _refuse)
+        patch.setattr(zenoh, "open", _refuse)
         yield
 
 
@@ -66,4 +65,4 @@ def _wrap_future(future: Any, *, loop: asyncio.AbstractEventLoop | None = None) 
 
 
 def _refuse(*_: object, **__: object) -> None:
-    raise AssertionError(f"a test beside whose loop another process runs carries a mark, one of {', '.join(MARKS)}")
+    pytest.fail(f"a test beside whose loop another process runs carries a mark, one of {', '.join(MARKS)}")

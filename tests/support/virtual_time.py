@@ -120,7 +120,8 @@ class TestsLoop(VirtualTimeLoop):
         super().__init__(TESTS_LONGEST_S)
 
     def _count_poll(self) -> None:
-        self._pass(TURN_NS)
+        if not self._is_busy():
+            self._pass(TURN_NS)
 
 
 class _Sockets(selectors.EpollSelector):
