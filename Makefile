@@ -53,7 +53,7 @@ test-fast: $(VENV)/.compiled ## unit and safety, what takes no second each: at e
 ready: check test-fast ## whether a change will land, in ten minutes: then what is new in the tests ten times on a busy machine (SINCE=COMMIT)
 	@$(PY) -m tests.landing ready $(if $(SINCE),--since $(SINCE))
 
-landing: $(VENV)/.compiled ## what a change must pass: all tests in stages, what failed tried again alone (about 25 min; as root; ARGS="--stage wires")
+landing: $(VENV)/.compiled ## what a change must pass: all but long tests in stages, what failed tried again alone (about 40 min; as root; ARGS="--stage wires")
 	@$(PY) -m tests.landing $(ARGS)
 
 search: $(VENV)/.compiled ## new draws and another order of the tests that draw: faults that no fixed draw shows (ARGS=tests/safety)
