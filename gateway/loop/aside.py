@@ -17,30 +17,34 @@ BEHIND_LOOPS = 1  #: real-time priority: below any loop's, above whatever has no
 
 
 def _stand_back() -> None:
-    """Off the loop's processor, behind every loop, and before all else.
+    """Behind every loop, and before all else, once the loop has real-time priority.
 
     A thread that holds the interpreter and has to wait for a processor keeps the loop waiting with it: on a busy
     computer for tens of milliseconds. So it goes before what has no real-time priority, where the loop has one itself.
     """
-    os.sched_setaffinity(0, range(os.cpu_count() or 1))
-    if os.sched_getscheduler(0) == os.SCHED_OTHER:
-        return
-    try:
-        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(BEHIND_LOOPS))
-    except PermissionError:  # it was granted once: then at least not as the loop itself
-        with suppress(PermissionError):
-            os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+    loops = os.sched_getscheduler(os.getpid())
+    if loops != os.SCHED_OTHER and os.sched_getscheduler(0) != os.SCHED_RR:
+        with suppress(PermissionError):  # it was granted once: then as whatever else has none
+            os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(BEHIND_LOOPS))
 
 
 class Aside:
-    """One piece of work after the other."""
+    """One piece of work after the other, in a thread that runs once this is made: before the loop takes its processor
+    and its priority (`realtime.become_punctual`). On a computer with one processor a thread that begins later may not
+    get as far as to say that it has, which the loop waits for."""
 
     def __init__(self) -> None:
         sys.setswitchinterval(SWITCH_S)
-        self._thread = ThreadPoolExecutor(1, "aside", _stand_back)
+        self._thread = ThreadPoolExecutor(1, "aside")
+        self._thread.submit(_stand_back).result()
 
     async def do(self, work: Callable[[], T]) -> T:
-        return await asyncio.get_running_loop().run_in_executor(self._thread, work)
+        return await asyncio.get_running_loop().run_in_executor(self._thread, _behind_loops, work)
 
     def close(self) -> None:
         self._thread.shutdown(wait=False, cancel_futures=True)
+
+
+def _behind_loops(work: Callable[[], T]) -> T:
+    _stand_back()
+    return work()

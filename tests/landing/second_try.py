@@ -8,7 +8,7 @@ from collections.abc import Callable, Collection
 from itertools import groupby
 
 TRIES = 2
-MOST_TRIED = 12  #: more, and it is no chance
+MOST_TRIED = 5  #: more, and it is no chance
 #: How what a crash says begins where one more try says nothing: a stall is exactly when such faults show.
 NEVER_AGAIN = ("SyntaxError", "ImportError", "ModuleNotFoundError", "IndentationError", "tests.support.recorder.")
 

@@ -19,6 +19,7 @@ from gateway.supervisor.peers import GATEWAY
 from tests.closed_loop.gate_line import GateLine
 from tests.closed_loop.wire import at_rest, settled
 from tests.operator.names import PANEL, PASSWORD, STRANGER, USERS
+from tests.support.patience import PATIENCE_S
 from tests.support.ports import free_port
 
 LOOK_S = 0.05
@@ -118,7 +119,7 @@ class OperatorLine(GateLine):
         assert done.returncode == 0, (done.stdout, done.stderr)
 
 
-def until(look: Callable[[], Any], enough: Callable[[Any], object], within_s: float = 60.0) -> Any:
+def until(look: Callable[[], Any], enough: Callable[[Any], object], within_s: float = PATIENCE_S) -> Any:
     deadline_s = time.monotonic() + within_s
     while not enough(found := look()):
         assert time.monotonic() < deadline_s, str(found)[:2000]

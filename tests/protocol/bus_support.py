@@ -17,6 +17,7 @@ from gateway.mailbox.bus import TlsEndpoint, connect, open_router, open_session,
 from gateway.mailbox.paths import BUS_SOCKET
 from gateway.mailbox.port import Unreachable
 from gateway.mailbox.zenoh_mailbox import ZenohMailbox
+from tests.support.patience import PATIENCE_S
 from tests.support.ports import free_port
 from tests.unit.supervisor_support import line_of, short_folder, until
 
@@ -77,7 +78,7 @@ def unguarded(folder: Path) -> dict[str, Any]:
 
 def run(story: Callable[[Path], Coroutine[Any, Any, None]]) -> None:
     async def bounded(folder: Path) -> None:
-        async with asyncio.timeout(60.0):
+        async with asyncio.timeout(PATIENCE_S):
             await story(folder)
 
     with short_folder() as folder:

@@ -25,6 +25,7 @@ from drivers.wiring import Wired
 from gateway.core.line import Line
 from gateway.core.signals import DriveRequest, Inputs, Outputs
 from tests.protocol import driver_support
+from tests.support.patience import PATIENCE_S
 from tests.support.ports import free_port
 
 NAMESPACE = "urn:r2rgate:devices"
@@ -156,7 +157,7 @@ class DeviceServer:
         self._started = threading.Event()
         self._thread = threading.Thread(target=self._run, name="opcua-test-server")
         self._thread.start()
-        assert self._started.wait(60.0)
+        assert self._started.wait(PATIENCE_S)
 
     @property
     def endpoint(self) -> str:
@@ -304,14 +305,14 @@ class Rig:
 
     async def until(self, condition: Callable[[], bool]) -> None:
         """Cycles until something has happened."""
-        async with asyncio.timeout(20.0):
+        async with asyncio.timeout(PATIENCE_S):
             while not condition():
                 await self.cycle()
                 await asyncio.sleep(0.005)  # a period, however short
 
     async def prepare(self) -> None:
         """Asked again where a stall of the machine has used up a question's time. Raises PrepareRefused."""
-        async with asyncio.timeout(20.0):
+        async with asyncio.timeout(PATIENCE_S):
             while True:
                 try:
                     return await self.link.prepare()

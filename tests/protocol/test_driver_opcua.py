@@ -395,6 +395,25 @@ def test_release_takes_torque_off_and_ends_supervision(server: DeviceServer) -> 
     run(server, scene)
 
 
+@pytest.mark.parametrize("word", [0x0237, 0x021F, 0x0207, 0x0235], ids="{:04X}h".format)
+def test_a_drive_that_does_not_say_that_its_torque_is_off_keeps_its_watchdog(server: DeviceServer, word: int) -> None:
+    """Enabled, in a fault reaction, in quick stop, or in what the profile does not know, after it was told to rest."""
+    devices = server.devices
+
+    async def scene(rig: Rig) -> None:
+        await rig.enable()
+        devices.deaf.add("Axis1")
+        devices.set("Axis1.Statusword", word)
+        devices.writes.clear()
+        await rig.link.release()
+        assert f"drive-1: was told to take torque off and does not say that it is (statusword {word:04X}h)" in (
+            rig.link.health.last_error
+        )
+        assert devices.written("Axis1.Watchdog") == [] and devices.written("Axis2.Watchdog") == [0, 100]
+
+    run(server, scene)
+
+
 @pytest.mark.parametrize("begin", [LAST_NUMBER - 20, 2**32 - 21])
 def test_a_connection_outlives_the_last_of_its_request_numbers(
     server: DeviceServer, monkeypatch: pytest.MonkeyPatch, begin: int

@@ -25,6 +25,7 @@ from drivers.opcua.worker import ADDRESS_SPACE_BYTES
 from gateway.core.signals import DriveState, Quality
 from tests.protocol.driver_opcua_support import DeviceServer, Rig, device_server, line, link_with_worker
 from tests.protocol.driver_support import until
+from tests.support.patience import PATIENCE_S
 
 pytestmark = pytest.mark.wires
 
@@ -226,16 +227,16 @@ def test_a_worker_whose_loop_closed_with_an_answer_unread_ends_in_silence() -> N
     with ours, subprocess.Popen(program, pass_fds=[theirs.fileno()], stderr=subprocess.PIPE) as worker:
         theirs.close()
         ours.send(Plan("opc.tcp://127.0.0.1:1", "none", "", "", "", []).to_json())
-        assert select.select([ours], [], [], 60.0)[0], "it says that it is ready"
+        assert select.select([ours], [], [], PATIENCE_S)[0], "it says that it is ready"
         ours.close()
-        _, said = worker.communicate(timeout=60.0)
+        _, said = worker.communicate(timeout=PATIENCE_S)
     assert (worker.returncode, said) == (0, b"")
 
 
 async def _readable(handle: int) -> bool:
     ended = asyncio.Event()
     asyncio.get_running_loop().add_reader(handle, ended.set)
-    async with asyncio.timeout(10.0):
+    async with asyncio.timeout(PATIENCE_S):
         await ended.wait()
     asyncio.get_running_loop().remove_reader(handle)
     return True

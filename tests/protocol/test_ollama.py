@@ -22,6 +22,7 @@ from gateway.core.questions import Question, wrong_with
 from tests.stand_in.engine import Engine, digest
 from tests.stand_in.personas import PERSONAS
 from tests.stand_in.server import StandIn
+from tests.support.patience import PATIENCE_S
 from tests.unit.language_model_support import PROMPT, QUESTION, says
 
 SKY = [Said("user", "Why is the sky blue?")]
@@ -281,6 +282,6 @@ def test_the_stand_in_as_a_process() -> None:
 
             assert option(asyncio.run(story())) == "mpc"
             process.terminate()
-            assert process.wait(30.0) == 0
+            assert process.wait(PATIENCE_S) == 0
         finally:
             process.kill()

@@ -24,6 +24,7 @@ from sim_plant.plant import plant_of
 from sim_plant.recorder import read_recording
 from sim_plant.wired import Settings, WiredLine
 from tests.protocol.driver_support import GROUP, Registers
+from tests.support.patience import PATIENCE_S
 from tests.support.ports import free_port
 
 pytestmark = pytest.mark.wires
@@ -111,7 +112,7 @@ def registers() -> Iterator[Registers]:
     thread = threading.Thread(target=lambda: asyncio.run(live()))
     thread.start()
     try:
-        assert started.wait(10.0)
+        assert started.wait(PATIENCE_S)
         yield peer
     finally:
         ending[0]()

@@ -31,6 +31,7 @@ from sim_plant.plant import PlantRefused, load_plant, plant_of
 from sim_plant.process import main, run_plant
 from sim_plant.recorder import read_recording
 from sim_plant.wired import WiredLine, WorldClock
+from tests.support.patience import PATIENCE_S
 from tests.support.ports import free_port
 
 pytestmark = pytest.mark.wires
@@ -59,7 +60,7 @@ class Line:
     def end(self, number: int) -> tuple[int, str]:
         """Exit code and standard error after a signal."""
         self.process.send_signal(number)
-        _, errors = self.process.communicate(timeout=10)
+        _, errors = self.process.communicate(timeout=PATIENCE_S)
         return self.process.returncode, errors
 
 
@@ -226,7 +227,7 @@ def test_roles_may_be_divided_between_wires(any_line: Callable[..., Line]) -> No
 def test_opc_ua_is_opened_when_it_is_used(any_line: Callable[..., Line]) -> None:
     line = any_line('drives = "opcua"\nload_cells = "opcua"\nplc = "opcua"')
     assert line.ready["can_port"] is None and line.ready["modbus_port"] is None
-    with socket.create_connection(("127.0.0.1", line.ready["opcua_port"]), timeout=5):
+    with socket.create_connection(("127.0.0.1", line.ready["opcua_port"]), timeout=PATIENCE_S):
         pass
     counts = faces(line)
     assert counts.keys() == {"opcua"} and counts["opcua"].keys() == {"requests", "malformed"}
@@ -476,7 +477,7 @@ def test_frames_of_a_bus_without_a_descriptor_come_through_a_thread() -> None:
         face = CanopenFace(there, [], 1, lambda: 0.0)
         face.attach(asyncio.get_running_loop())
         here.send(can.Message(arbitration_id=0x123, is_extended_id=False))
-        async with asyncio.timeout(5):
+        async with asyncio.timeout(PATIENCE_S):
             while not face.foreign:  # noqa: ASYNC110
                 await asyncio.sleep(0.001)
         face.detach()

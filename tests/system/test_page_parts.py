@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from gateway.core.messages import SetTension
+from gateway.core.messages import SetSpeed, SetTension
 from tests.operator.fake_line import PASSWORD, FakeGateway, alarm
 from tests.operator.real_line import until
 from tests.system.made_up_page import made_up_page
@@ -13,6 +13,7 @@ from tests.system.page_line import AtPage
 pytestmark = pytest.mark.timeout(180)
 
 SPANS = 3
+YES = "dialog[open] button.main"
 SPAN = "[data-focus=course-span]"
 
 
@@ -138,3 +139,22 @@ def test_what_is_written_while_an_answer_is_on_its_way_stays(gateway: FakeGatewa
     browser("click", button)
     until(lambda: [one.said.tension_n for one in gateway.said if isinstance(one.said, SetTension)], [21.0, 22.0].__eq__)
     browser("see", "#reply", "Done")
+
+
+def test_any_higher_speed_is_asked_for_once_more_and_a_lower_one_is_not(gateway: FakeGateway, browser: AtPage) -> None:
+    """The line runs at 0.01 m/s."""
+    field, button = (f"#operate form:has-text('Speed') {one}" for one in ("input", "button"))
+
+    def said() -> list[float]:
+        return [one.said.speed_m_per_s for one in gateway.said if isinstance(one.said, SetSpeed)]
+
+    browser("fill", field, "0.011")
+    browser("click", button)
+    browser("see", YES)
+    assert said() == []
+    browser("click", YES)
+    until(said, [0.011].__eq__)
+    browser("see", "#reply", "Done")
+    browser("fill", field, "0.009")
+    browser("click", button)
+    until(said, [0.011, 0.009].__eq__)

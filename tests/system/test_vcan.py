@@ -10,7 +10,7 @@ import pytest
 
 from tests.system.uml import LINKS, GuestFailed, Outcome, run_in_guest
 
-LIMIT_S = 1800.0  #: a boot and six lines; five to nine minutes, three times that on a slow machine
+LIMIT_S = 1800.0  #: a boot and three lines; three to five minutes, three times that on a slow machine
 FOLDER = Path("out/system/vcan")  #: what it left, for whoever must find out why
 TEST = "tests/system/on_vcan.py"
 

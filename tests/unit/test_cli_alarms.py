@@ -18,6 +18,7 @@ from gateway.core.topics import GATEWAY_STATUS
 from gateway.mailbox.paths import GATEWAY_SOCKET
 from gateway.mailbox.unix import UnixMailbox
 from gateway.supervisor.alarms import Alarms
+from tests.support.patience import PATIENCE_S
 from tests.unit.alarm_support import RECORDING, bus, span, status
 from tests.unit.supervisor_support import short_folder
 
@@ -62,11 +63,11 @@ def served() -> Iterator[Gateway]:
         thread = threading.Thread(target=lambda: loop.run_until_complete(gateway.serve(began.set, end)))
         thread.start()
         try:
-            assert began.wait(10.0)
+            assert began.wait(PATIENCE_S)
             yield gateway
         finally:
             loop.call_soon_threadsafe(end.set)
-            thread.join(10.0)
+            thread.join(PATIENCE_S)
             loop.close()
 
 

@@ -9,7 +9,8 @@ import pytest
 from typer.testing import CliRunner
 
 from gateway.cli.main import app
-from gateway.core.audit_record import Who
+from gateway.core.audit_export import RecordLine, line_text, parse_line
+from gateway.core.audit_record import Who, canonical, head_of
 from gateway.supervisor.audit_file import FILE_NAME
 from gateway.supervisor.audit_writer import AuditWriter, Draft
 from gateway.supervisor.baselines import begin_baselines
@@ -40,6 +41,15 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def folder(recorded: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(recorded, tmp_path / "data"))
+
+
+def relinked(text: str, begun: str) -> str:
+    """The line of a record after the first, made anew as if it followed `begun`."""
+    line = parse_line(text.encode())
+    if not isinstance(line, RecordLine) or line.record.sequence == 1:
+        return text
+    record = line.record.model_copy(update={"previous": json.loads(begun)["head"]})
+    return line_text(RecordLine(head=head_of(canonical(record)), record=record)) + "\n"
 
 
 def shown(folder: Path, *options: str) -> list[int]:
@@ -92,9 +102,11 @@ def test_an_export_is_verified_without_the_database(folder: Path, tmp_path: Path
     assert r2rgate("audit", "export", "--data-dir", folder, "--out", out)[0] == 2  # it is there
     assert r2rgate("audit", "export", "--data-dir", folder, "--out", "-")[1] == out.read_text()
     lines = out.read_text().splitlines(keepends=True)
+    another = [relinked(line, lines[0]) for line in lines]  # each as it should be, of a chain of its own
     for spoilt, why in (
         (lines[:3] + lines[4:], "does not follow record 1"),
         (lines[:1] + lines[2:], "is missing: blob"),
+        ([*lines[:4], *another[4:]], "record 3 does not follow record 2"),
         ([line.replace("p-000013", "p-000014") for line in lines], "is not the hash of its content"),
         ([line.replace('"phi"', '"psi"') for line in lines], "is not what was stored"),
     ):

@@ -14,8 +14,8 @@ import pytest
 
 from gateway.cli.background import in_background
 from gateway.core.line_template import line_template
+from tests.support.patience import PATIENCE_S
 
-PATIENCE_S = 30.0  #: for what takes a tenth of a second; what it ends would take minutes
 STORY = """
 import os, sys, time
 from gateway.cli.workers import Workers
