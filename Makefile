@@ -47,7 +47,7 @@ system-test: $(VENV)/.compiled ## a real CAN kernel and foreign protocol stacks;
 	@$(PY) -m tests.system.needs
 	@$(PY) -m pytest tests/system $(ARGS)
 
-test-fast: $(VENV)/.compiled ## unit and safety, what takes no second each: at each save (a minute)
+test-fast: $(VENV)/.compiled ## unit and safety, what takes no second each: at each save (some minutes)
 	@$(PY) -m pytest tests/unit tests/safety -m "not slow and not wires and not realtime and not long" $(PARALLEL) --hypothesis-profile fast $(ARGS)
 
 ready: check test-fast ## whether a change will land, in ten minutes: then what is new in the tests ten times on a busy machine (SINCE=COMMIT)

@@ -119,6 +119,14 @@ def _diverges(
     before_n.append(error_n)
     if len(before_n) > 3:
         before_n.pop(0)
+    setpoint_n = tension_n - error_n
+    is_up = state.above >= limits.window
+    near_n = FLOOR_SHARE * np.minimum(limits.high_n - setpoint_n, setpoint_n - limits.low_n).min()
+    if np.abs(error_n).max() <= near_n:  # as nearly always: nothing is away from its set-point
+        state.mean_nm = state.mean_nm + limits.forgets * (sent_nm - state.mean_nm)
+        state.above = np.where(is_up | (tension_n >= limits.low_n), state.above + 1, 0)
+        state.lasting.fill(0)
+        return []
     reached_nm = np.minimum(np.maximum(asked_nm, sent_nm - limits.reach_nm), sent_nm + limits.reach_nm)
     reached_nm = np.minimum(np.maximum(reached_nm, -limits.torque_nm), limits.torque_nm)
     moved = limits.lightness * (reached_nm - state.mean_nm)
@@ -126,9 +134,7 @@ def _diverges(
     pull_n = limits.stiffness_n_per_m * (moved - np.concatenate(((0.0,), moved[:-1])))  # a period squared
     ahead = limits.ahead
     leads_to_n = tension_n + limits.measured * (rate_n * ahead + 0.5 * pull_n * ahead**2)
-    setpoint_n = tension_n - error_n
     # What is still being brought up into the band cannot be too low.
-    is_up = state.above >= limits.window
     state.above = np.where(is_up | (tension_n >= limits.low_n), state.above + 1, 0)
     high, low = limits.high_n, np.where(is_up & (setpoint_n > limits.low_n), limits.low_n, -np.inf)
     way_n = np.where(error_n > 0.0, high - setpoint_n, setpoint_n - low)

@@ -14,7 +14,7 @@ Torque stays below a share of the tension that the line's file allows (`TENSION_
 radius; what a roller's momentum adds when slack ends is bounded by its speed, which stays below w.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import inf, pi
 
 import numpy as np
@@ -128,6 +128,12 @@ def proving_limits(line: Line) -> ProvingLimits:
         ),
         factor=FACTOR_ROOM / (1.0 - wide),
     )
+
+
+def slack_of_one_span(line: Line, limits: ProvingLimits) -> ProvingLimits:
+    """`limits` of a proof of few devices: a roller takes up no more than the greatest slack of one span before it."""
+    slack = np.array([span.slack_max_m for span in line.spans])
+    return replace(limits, far_m=limits.far_m - np.cumsum(slack) + np.maximum.accumulate(slack))
 
 
 @dataclass(frozen=True, slots=True)

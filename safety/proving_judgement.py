@@ -3,8 +3,12 @@
 A pull of drive i tensions spans 1 to i, span i most; spans behind it give way. So the first pull, counted from the
 unwinder, to which a load cell answers names its span. A tension is never below that of a slack web: the sign of what a
 load cell shows most is its own. The direction of torque to which the web answers is the drive's.
+
+Where few devices are proved anew the others count as they were proved: as the line's file says. They are not judged;
+what does not go together with them is found of the drive that pulled.
 """
 
+from collections.abc import Collection
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -49,9 +53,11 @@ def judge_zeros(line: Line, limits: ProvingLimits, zero_n: FloatArray) -> list[F
     ]  # fmt: skip
 
 
-def judge(line: Line, limits: ProvingLimits, noise: Noise, zero_n: FloatArray, pulls: list[Pull]) -> Judged:
-    """All pulls, one of every drive, in any order."""
-    return _Judgement(line, limits, noise, zero_n, pulls).judged()
+def judge(
+    line: Line, limits: ProvingLimits, noise: Noise, zero_n: FloatArray, pulls: list[Pull], only: Collection[str] = ()
+) -> Judged:
+    """All pulls, one of every drive, in any order; of a proof of `only` these devices one of each that it needs."""
+    return _Judgement(line, limits, noise, zero_n, pulls, only).judged()
 
 
 def _cell_names(line: Line) -> list[str]:
@@ -65,10 +71,15 @@ def _drive_names(line: Line) -> list[str]:
 
 
 class _Judgement:
-    def __init__(self, line: Line, limits: ProvingLimits, noise: Noise, zero_n: FloatArray, pulls: list[Pull]) -> None:
+    def __init__(
+        self, line: Line, limits: ProvingLimits, noise: Noise, zero_n: FloatArray, pulls: list[Pull],
+        only: Collection[str],
+    ) -> None:  # fmt: skip
         self._limits, self._noise, self._zero_n = limits, noise, zero_n
         self._pulls = {pull.drive: pull for pull in pulls}
         self._cells, self._drives = _cell_names(line), _drive_names(line)
+        self._trusted = [bool(only) and name not in only for name in self._cells]  #: load cells, as they were proved
+        self._trusted_drive = [bool(only) and name not in only for name in self._drives]
         self._shown = {pull.drive: pull for pull in pulls if pull.direction and not pull.held}
         self._sign = [self._sign_of(j) for j in range(line.n)]
         self._answered = {i: self._answers_to(pull) for i, pull in self._shown.items()}
@@ -78,10 +89,14 @@ class _Judgement:
 
     def judged(self) -> Judged:
         measured = np.flatnonzero(self._limits.measured).tolist()
-        self._judge_swaps(measured)
-        factors = {j: self._judge_cell(j) for j in measured}
+        anew = [j for j in measured if not self._trusted[j]]
+        self._judge_swaps(anew)
+        factors = {j: self._judge_cell(j) for j in anew}
         for i in sorted(self._pulls):
-            self._judge_drive(i)
+            if self._trusted_drive[i]:
+                self._judge_trusted(i)
+            elif not self._answers_otherwise(i):
+                self._judge_drive(i)
         drives = [
             DriveProved(
                 drive=self._drives[i],
@@ -91,6 +106,7 @@ class _Judgement:
                 answered=[j + 1 for j in self._answered.get(i, [])],
             )
             for i, pull in sorted(self._pulls.items())
+            if not self._trusted_drive[i]
         ]
         cells = [
             CellProved(
@@ -100,12 +116,14 @@ class _Judgement:
                 factor=factors[j].value,
                 answered_to=[i + 1 for i in self._answering(j)],
             )
-            for j in measured
+            for j in anew
         ]
         return Judged(self._findings, self._questions, drives, cells)
 
     def _sign_of(self, j: int) -> int:
         """Of load cell `j`; 0: it has shown nothing. A web shows a cell most in the pull of its own span."""
+        if self._trusted[j]:
+            return int(self._limits.measured[j])
         ends = [float(pull.end_n[j]) for pull in self._shown.values()]
         most = max(ends, key=abs, default=0.0)
         least = max((ANSWERS * self._limits.tension_n[i] for i in self._shown if i >= j), default=0.0)
@@ -128,6 +146,8 @@ class _Judgement:
         return sorted(i for i, answered in self._answered.items() if j in answered)
 
     def _span_of(self, j: int) -> int | None:
+        if self._trusted[j]:
+            return j if self._limits.measured[j] else None
         answering = [i for i in self._answering(j) if self._has_pulled(self._shown[i])]
         shown = {i: self._share(self._shown[i], j) for i in answering}
         own = (i for i in answering if shown[i] >= OWN * max(shown.values()))
@@ -150,10 +170,10 @@ class _Judgement:
         """The first pull that load cell `j` ought to answer to."""
         return min((i for i in self._shown if i >= j), default=None)
 
-    def _judge_swaps(self, measured: list[int]) -> None:
+    def _judge_swaps(self, anew: list[int]) -> None:
         wrong = {
             j: span
-            for j in measured
+            for j in anew
             if (span := self._of_span[j]) is not None and span != self._expected(j)
         }  # fmt: skip
         for j, span in wrong.items():
@@ -171,11 +191,17 @@ class _Judgement:
             return self._judge_silent(j)
         if self._sign[j] < 0:
             self._find("cell-inverted", cell=cell, span=j + 1)
+        return self._judge_factor(j, own, of_span)
+
+    def _judge_factor(self, j: int, own: Pull, of_span: int) -> Factor:
+        cell = self._cells[j]
         factor = factor_of(self._limits, self._noise, own, j, self._sign[j], self._behind(of_span))
         most = float(self._limits.factor[of_span])
         if factor.is_surely_off(most):
             drive = self._drives[of_span]
             self._find("cell-factor-off", cell=cell, span=j + 1, factor=factor.value, most=most, drive=drive)
+        elif not factor.is_told() and self._trusted[j]:
+            self._ask("drive-torque-unseen", drive=self._drives[of_span], roller=of_span + 1)
         elif not factor.is_told():
             self._ask("cell-factor-unseen", cell=cell, span=j + 1)
         return factor
@@ -198,6 +224,24 @@ class _Judgement:
             self._ask("cell-unseen", cell=self._cells[j], span=j + 1)
         return Factor(1.0, np.inf)
 
+    def _judge_trusted(self, i: int) -> None:
+        """The pull of a drive that is proved, for a load cell that is not: whether it says anything."""
+        pull = self._pulls[i]
+        if not self._answers_otherwise(i) and pull.moved and pull.direction == 0 and self._limits.measured[i]:
+            self._find("no-answer", drive=self._drives[i], roller=i + 1, way_m=abs(pull.way_m))
+
+    def _answers_otherwise(self, i: int) -> bool:
+        """Whether load cells that are proved answer to drive `i` as to that of another roller. It is found."""
+        pull, answered = self._pulls[i], [j for j in self._answered.get(i, []) if self._trusted[j]]
+        behind = [j for j in answered if j > i and self._has_pulled(pull) and self._share(pull, j) >= OWN]
+        tight = pull.held or pull.direction != 0  # whatever has answered, and with whatever sign
+        silent = tight and self._trusted[i] and bool(self._limits.measured[i]) and i not in answered
+        if not behind and not silent:
+            return False
+        shown = max((behind or [j for j in answered if j < i]), default=-1) + 1
+        self._find("drive-answered-otherwise", drive=self._drives[i], roller=i + 1, shown_span=shown)
+        return True
+
     def _judge_drive(self, i: int) -> None:
         pull, drive = self._pulls[i], self._drives[i]
         named = {"drive": drive, "roller": i + 1}
@@ -215,6 +259,8 @@ class _Judgement:
             self._find("torque-reversed" if speed_sign < 0 else "drive-reversed", **named)
         elif speed_sign < 0:
             self._find("speed-reversed", **named)
+        if self._trusted[i] and i in self._answered[i]:  # which tells the drive's own scale: gear and rated torque
+            self._judge_factor(i, pull, i)
 
     def _speed_sign(self, i: int, pull: Pull) -> int:
         own = next((j for j, span in enumerate(self._of_span) if span == i), None)

@@ -68,6 +68,7 @@ class DriveOptions(Strict):
     """Settings that decide what the rest of the map means."""
 
     abort_connection: ReactionObject | None = None  #: what it does when its watchdog fires; must take torque off
+    quick_stop: OptionObject | None = None  #: what it does then where that is a quick stop (CiA 402: 605Ah)
     fault_reaction: OptionObject | None = None
     speed_unit: OptionObject | None = None  #: the unit of `objects.speed`, where the device lets it be chosen
 
@@ -80,9 +81,12 @@ DriveEntry = Literal[
 ]
 
 
-_ABORT_CONNECTION = 0x6007
+_ABORT_CONNECTION, _QUICK_STOP = 0x6007, 0x605A
 #: Values of 6007h that take torque away (CiA 402; with 1 what a fault does is in 605Eh, and every value of that does).
 TORQUE_OFF_OPTIONS = {1: "fault", 2: "disable voltage", 3: "quick stop"}
+BY_QUICK_STOP = 3
+#: Values of 605Ah after which the power stage goes off; with 5 to 8 the drive stays in quick stop active, under torque.
+QUICK_STOP_OFF = range(5)
 _MODES_OF_OPERATION = range(0x6060, 0xA000, 0x800)  #: object of the profile, by axis
 
 
@@ -159,6 +163,7 @@ class DriveMap(CanMap):
             if option is not None:
                 problems += type_problems(f"options.{name}", option.type, INTEGERS)
         problems += _reaction_problems(self.watchdog, self.options.abort_connection)
+        problems += _quick_stop_problems(self.options)
         return refuse_together(self, problems + watchdog_problems(self.watchdog) + heartbeat_problems(self.heartbeat))
 
 
@@ -178,6 +183,24 @@ def _reaction_problems(watchdog: Watchdog, option: ReactionObject | None) -> lis
         return [f"{key}.required: false; when the heartbeat ends, nothing but this object says what the drive does"]
     if not option.required and not option.writable:
         return [f"{key}.required: false is only for an object that is set (writable = true)"]
+    return []
+
+
+def _quick_stop_problems(options: DriveOptions) -> list[str]:
+    """A reaction by quick stop takes torque away only where the drive leaves the quick stop by itself."""
+    reaction, key = options.abort_connection, "options.quick_stop"
+    axis = 0 if reaction is None else reaction.index - _ABORT_CONNECTION
+    if reaction is None or reaction.value != BY_QUICK_STOP or axis % 0x800:
+        return []
+    if options.quick_stop is None:
+        said = f'{{ index = {_QUICK_STOP + axis:#06x}, type = "i16", value = 2, writable = true }}'
+        return [f"{key}: is missing; with options.abort_connection.value = 3 it says whether torque goes: {said}"]
+    if options.quick_stop.index != _QUICK_STOP + axis:
+        return [f"{key}.index: {options.quick_stop.index:#06x}; allowed: {_QUICK_STOP + axis:#06x}"]
+    if options.quick_stop.value not in QUICK_STOP_OFF:
+        return [
+            f"{key}.value: {options.quick_stop.value} leaves the drive in quick stop, under torque; allowed: 0 to 4"
+        ]
     return []
 
 

@@ -18,10 +18,11 @@ from gateway.cli.audit_view import found_in, print_record, print_verification
 from gateway.cli.data_place import data_folder
 from gateway.cli.process_commands import REFUSED, DataFolder, read_line
 from gateway.core.audit_export import RecordLine, blob_line, line_text, wrong_in
-from gateway.core.audit_head import AuditHead, parse_head
+from gateway.core.audit_head import AuditHead, last_head_in, parse_head
 from gateway.core.audit_record import BEFORE_FIRST, NotRecordable, Who
 from gateway.core.line_problem import printable
 from gateway.core.nearest import nearest
+from gateway.files import MOST_BYTES, read_bytes
 from gateway.supervisor.audit_begin import begin_anew as begin_audit_anew
 from gateway.supervisor.audit_file import FILE_NAME, AuditFile, AuditUnavailable
 from gateway.supervisor.audit_verify import Chained, chained
@@ -52,7 +53,8 @@ def verify(
         typer.Option(
             "--against",
             "--head",
-            help="NUMBER:HASH as the log, the page, OPC UA or a report printed it. It must be there still.",
+            help="NUMBER:HASH as the log, the page, OPC UA or a report printed it, or a file that has it: the last "
+            "one there. It must be in the audit still.",
         ),
     ] = None,
     export_file: Annotated[
@@ -69,6 +71,8 @@ def verify(
     Example: r2rgate audit verify --line line.toml
 
     Example: r2rgate audit verify --against 301:39103...
+
+    Example: r2rgate audit verify --against report.html
     """
     head = _head_of(against)
     if export_file is not None:
@@ -237,8 +241,14 @@ def _verify_export(path: Path, head: AuditHead | None, as_json: bool) -> None:
 
 
 def _head_of(against: str | None) -> AuditHead | None:
+    if against is None:
+        return None
     try:
-        return None if against is None else parse_head(against)
+        if against.strip() and os.path.lexists(against):
+            return last_head_in(read_bytes(Path(against), MOST_BYTES).decode("utf-8", "replace"))
+        return parse_head(against)
+    except OSError as error:
+        refuse(f"--against {against}: the file cannot be read: {error.strerror}")
     except ValueError as error:
         refuse(f"--against {against}: {error}")
 

@@ -13,7 +13,7 @@ from gateway.cli.demo_cases import Window
 from gateway.cli.demo_line import STATED, Setup
 from gateway.cli.demo_result import PAPER_RMSE_N, ChainResult, ChangeResult, DemoResult, paper_improvement_pct
 from gateway.cli.demo_stepped import SEEDS
-from gateway.cli.line_records import verdicts_in
+from gateway.cli.line_records import read_records, unconfirmed_in, verdicts_in
 from gateway.cli.report import Chart, Page, Section, Series, Table, render_page
 from gateway.core.controller import config_hash
 from gateway.core.interactions import Interaction
@@ -73,6 +73,7 @@ def page(
                 "The first configuration is simulated on corners of the line's file that do not reach as far as the "
                 "true line lies: with the file's own defaults it would run no faster than 0.02 m/s until there is a "
                 "model. Here nobody can be hurt.",
+                *unconfirmed_in(read_records(setup.data).book),
                 *(f"Not run: {one}." for one in chain.left_out),
                 *(f"Begun anew after the line had stopped: {stop}" for stop in result.stops),
             ),

@@ -10,6 +10,7 @@ from gateway.cli.demo_cases import Window
 from gateway.cli.demo_line import Setup
 from gateway.cli.demo_result import CaseResult, DemoResult
 from gateway.cli.demo_stepped import SEEDS
+from gateway.cli.line_records import read_records, unconfirmed_in
 from gateway.cli.report import Case, Comparison, EventCount, Machine, Report, RunEvent, Timing, render_report
 
 PLOT_EVERY = 10  #: milliseconds between the samples of a chart
@@ -47,6 +48,7 @@ def page(setup: Setup, result: DemoResult, windows: list[Window], evidence: Evid
             "The controller is designed on the nominal model of the line file, which is wrong on purpose: stiffness, "
             "radius, inertia, friction and span length differ from the simulated line's by 5 to 33 %.",
             *(f"A case was repeated: {stop}" for stop in result.stops),
+            *unconfirmed_in(read_records(setup.data).book),
             f"In stepped time: the mean of {SEEDS} runs of the whole cycle without wires and without waiting.",
         ),
     )

@@ -187,6 +187,7 @@ def _phase(
     from gateway.cli.design_report import page_of
     from gateway.cli.design_result import result_of
     from gateway.cli.design_table import print_design
+    from gateway.cli.line_records import read_records, unconfirmed_in
     from gateway.cli.report.page_render import render_page
     from gateway.cli.scenarios import load_scenario
     from gateway.cli.waiting import interruptible
@@ -211,7 +212,9 @@ def _phase(
         _write(out, canonical(found.chosen.config) + b"\n")
     record, report = _beside(out)
     _write(record, (result.model_dump_json(indent=2) + "\n").encode())
-    page = replace(page_of(result, found), audit_head=head_in(default_data_folder(line)))
+    folder, page = default_data_folder(line), page_of(result, found)
+    in_service = unconfirmed_in(read_records(folder).book) if head_in(folder) else []
+    page = replace(page, audit_head=head_in(folder), notes=(*in_service, *page.notes))
     _write(report, render_page(page).encode())
     if as_json:
         typer.echo(result.model_dump_json(indent=2))

@@ -207,24 +207,30 @@ def _cell(line: Line, item: LoadCell, cell: CellFacts | None, *, explained: bool
     if max(map(abs, cell.samples_n)) > item.capacity_n:
         todo = "check capacity_n, the unit and scale of the map, zero and overload of the cell"
         return Check(group, name, "value", "FAIL", measured, wanted, todo)
-    odd, todo = _odd_reading(line, item, mean_n, spread_n, still=len(set(cell.samples_n)) == 1)
-    return Check(group, name, "value", "warning" if odd else "OK", measured + odd, wanted, todo)
+    status, odd, todo = _odd_reading(line, item, mean_n, spread_n, still=len(set(cell.samples_n)) == 1)
+    return Check(group, name, "value", status, measured + odd, wanted, todo)
 
 
-def _odd_reading(line: Line, item: LoadCell, mean_n: float, spread_n: float, *, still: bool) -> tuple[str, str]:
-    """What is odd about a reading that may be right, and what to do; empty where nothing is."""
+def _odd_reading(
+    line: Line, item: LoadCell, mean_n: float, spread_n: float, *, still: bool
+) -> tuple[Verdict, str, str]:
+    """What is odd about a reading that may be right, how bad that is, and what to do; empty where nothing is."""
     if still:
         stop = f"after {line.limits.stuck_s:g} s of one value the moving line is stopped (limits.stuck_s)"
-        return "; always the same value", f"press on the roller: does it move? {stop}"
+        return "warning", "; always the same value", f"press on the roller: does it move? {stop}"
     allowed_n, sure_n = float(zero_allowed_n(line)[item.span - 1]), abs(mean_n) - NOISE_DEVIATIONS * spread_n
     if sure_n > allowed_n:
         beyond = f"; a slack web shows at most {allowed_n:.2g} N, either way"
         if mean_n * (-1.0 if item.sign == "inverted" else 1.0) < 0.0:
-            return beyond, "take the web off and zero the cell; is it mounted the right way round?"
-        return beyond, "if the web is slack, zero the cell; if it is not, slacken it: `r2rgate prove` asks for it"
+            return "FAIL", beyond, "it is not armed: take the web off and zero it; is it mounted the right way round?"
+        return (
+            "warning",
+            beyond,
+            "if the web is slack, zero the cell; if it is not, slacken it: `r2rgate prove` asks for it",
+        )
     if spread_n > RESTLESS_SHARE * item.capacity_n:
-        return "; restless at rest", "check shield, ground and filter of the amplifier"
-    return "", ""
+        return "warning", "; restless at rest", "check shield, ground and filter of the amplifier"
+    return "OK", "", ""
 
 
 def _plc(line: Line, name: str, plc: PlcFacts) -> Iterator[Check]:

@@ -13,6 +13,7 @@ from pydantic import TypeAdapter, ValidationError
 from gateway.core.audit_record import BEFORE_FIRST, AuditRecord
 from gateway.core.decisions import ProposalShown
 from gateway.core.differences import of_controllers, of_experiment, of_models
+from gateway.core.finding import finding
 from gateway.core.judge_context import ContextRefused, JudgeContext, parse_context
 from gateway.core.proposal import ExperimentChange, GainsChange, Proposal, ProposalRefused, parse_proposal
 from gateway.core.verdict import Verdict
@@ -20,6 +21,7 @@ from gateway.supervisor.audit_file import AuditFile, AuditUnavailable
 from gateway.supervisor.audit_verify import Verification, chained, verify
 from gateway.supervisor.audit_writer import NOT_DONE
 from gateway.supervisor.lifecycle import PROPOSED, STEPS, Book, Impossible
+from gateway.wording.catalogue import sentence
 
 FAR_S = 4e9  #: beyond any wall clock
 _SEQUENCES: TypeAdapter[set[int]] = TypeAdapter(set[int])
@@ -77,6 +79,18 @@ def verdicts_in(folder: Path) -> dict[str, Verdict]:
     """By proposal, as far as they can be read."""
     proposals = read_records(folder).proposals
     return {one.hash: one.shown.verdict for one in proposals if one.shown.verdict is not None}
+
+
+def unconfirmed_in(book: Book) -> list[str]:
+    """That nobody answers for what is in service, as a sentence for a page; empty where somebody has."""
+    hash_ = book.in_service
+    if hash_ is None or not book.is_unconfirmed:
+        return []
+    if hash_ == book.unexplained:
+        one = finding("configuration-unexplained", configuration=hash_[:12], epoch=book.epoch)
+    else:
+        one = finding("configuration-unconfirmed", configuration=hash_[:12])
+    return [f"Unconfirmed: {sentence(one)}."]
 
 
 class _Lost(Exception):

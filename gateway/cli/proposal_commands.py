@@ -167,8 +167,9 @@ def confirm(
 ) -> None:
     """Answer for a configuration that nobody has judged: a first one, or one that no record explains.
 
-    A first one is guarded as such no more; one that no record explains may be armed. Either goes no further than a
-    first configuration until another one is approved.
+    A first one is guarded as such no more, once it has followed a move of a tension and a change of the speed in RUN;
+    one that no record explains may be armed. Either goes no further than a first configuration until another one is
+    approved. Where the line has a list of people, a person says it, as their own user of this computer.
 
     Example: r2rgate confirm 3f2a91 --because "exchanged by hand after the repair"
     """

@@ -1,7 +1,7 @@
 """The proof of a line's wiring from beginning to end, as a client of its gateway: drill, arm, pull, ask, keep."""
 
 import asyncio
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass, field
 
 from gateway.core.finding import Finding
@@ -31,17 +31,22 @@ class Proved:
         return self.reply.ok
 
 
-async def prove(tell: Tell, look: Look, ask: Ask, by: str, say: Callable[[str], None]) -> Proved:
-    """Prove the wiring. `ask` has a person look where no pull can show; `by` is who that is. Raises Unreachable."""
+async def prove(
+    tell: Tell, look: Look, ask: Ask, by: str, say: Callable[[str], None], only: Sequence[str] = ()
+) -> Proved:
+    """Prove the wiring. `ask` has a person look where no pull can show; `by` is who that is. Raises Unreachable.
+
+    `only`: devices that are proved anew while the stored proof stands for all others; empty: all are.
+    """
     begun = await _newest(look)
     say("every watchdog is drilled: its feed is withheld at rest")
-    for step in (Drill(), Arm(), Prove()):
+    for step in (Drill(), Arm(), Prove(only=list(only))):
         reply = await tell(step)
         if not reply.ok:
             return Proved(step.command, reply)
         say(reply.text)
     await _wait(look, begun, say)
-    reply = await tell(KeepProof())
+    reply = await tell(KeepProof(only=list(only)))
     if reply.ok or not reply.findings or reply.findings[0].code != ASKED:
         return Proved("keep-proof", reply)
     questions = reply.findings[1:]
@@ -49,7 +54,7 @@ async def prove(tell: Tell, look: Look, ask: Ask, by: str, say: Callable[[str], 
     if not all(ask(question) for question in questions):
         return Proved("keep-proof", reply)
     answers = [Answer(question=each.code, device=asked_of(each), by=by) for each in questions]
-    return Proved("keep-proof", await tell(KeepProof(answers=answers)), answers)
+    return Proved("keep-proof", await tell(KeepProof(answers=answers, only=list(only))), answers)
 
 
 async def _newest(look: Look) -> float:

@@ -4,14 +4,16 @@ import asyncio
 import getpass
 import sys
 from pathlib import Path
+from typing import Annotated
 
 import typer
+from pydantic import ValidationError
 
 from gateway.cli.operate_commands import ARM_TIME_S, REFUSED, REPLY_TIME_S, UNREACHABLE, Json, RunFolder, request
 from gateway.cli.prove import Proved, prove
 from gateway.cli.status_commands import ask_status, choose_run_folder
 from gateway.core.finding import Finding
-from gateway.core.messages import Arm, Command, Drill, Reply
+from gateway.core.messages import Arm, Command, Drill, Prove, Reply
 from gateway.core.status import GatewayStatus
 from gateway.mailbox.listener import PathTooLong
 from gateway.mailbox.port import Unreachable
@@ -20,18 +22,34 @@ from gateway.wording.catalogue import sentence
 DRILL_TIME_S = 90.0  #: with the longest warning
 
 
-def prove_wiring(run_dir: RunFolder = None, as_json: Json = False) -> None:
+def prove_wiring(
+    only: Annotated[
+        list[str] | None,
+        typer.Option("--only", help="Prove this device anew, and nothing else. May be given several times."),
+    ] = None,
+    run_dir: RunFolder = None,
+    as_json: Json = False,
+) -> None:
     """Prove the wiring: every watchdog reacts, every drive turns its own roller, every load cell sees its own span.
 
     The web is threaded, the unwinder stands, and nobody is at the line: one drive after the other pulls, with at most a
     fifth of the tension allowed. What no pull can show is asked. The proof is kept for this wiring, these device maps
     and these serial numbers; without it `start` is refused. Ctrl-C stops.
 
-    Example: r2rgate prove
+    Whoever has exchanged one drive, load cell or amplifier proves that alone, in some three minutes at most; the stored
+    proof stands for all others. It is refused where anything else has changed. Load cells on one amplifier are
+    exchanged together: name each.
+
+    Example: r2rgate prove --only drive-3
     """
+    try:
+        Prove(only=only or [])
+    except ValidationError:
+        typer.echo(f"not proved: no device has such a name: {', '.join(only or [])}", err=True)
+        raise typer.Exit(REFUSED) from None
     folder = choose_run_folder(run_dir)
     try:
-        proved = asyncio.run(_prove(folder, as_json))
+        proved = asyncio.run(_prove(folder, only or [], as_json))
     except (Unreachable, PathTooLong) as error:
         typer.echo(str(error), err=True)
         raise typer.Exit(UNREACHABLE) from None
@@ -40,7 +58,7 @@ def prove_wiring(run_dir: RunFolder = None, as_json: Json = False) -> None:
         raise typer.Exit(REFUSED)
 
 
-async def _prove(folder: Path, as_json: bool) -> Proved:
+async def _prove(folder: Path, only: list[str], as_json: bool) -> Proved:
     async def tell(command: Command) -> Reply:
         waits_s = {Drill: DRILL_TIME_S, Arm: ARM_TIME_S}.get(type(command), REPLY_TIME_S)
         return await request(folder, command, waits_s)
@@ -56,7 +74,7 @@ async def _prove(folder: Path, as_json: bool) -> Proved:
             typer.echo(text)
 
     try:
-        return await prove(tell, look, _asked, getpass.getuser(), say)
+        return await prove(tell, look, _asked, getpass.getuser(), say, only)
     except asyncio.CancelledError:  # Ctrl-C
         from gateway.cli.stop_line import stop_line
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from gateway.cli.asked_result import asked_result, interactions_in
 from gateway.cli.demo_asked_page import asked_section
-from gateway.cli.line_records import LineRecords, Recorded
+from gateway.cli.line_records import LineRecords, Recorded, unconfirmed_in
 from gateway.cli.origin import command_line, machine, now_iso, versions_of
 from gateway.cli.report import Page, Section, Table
 from gateway.cli.report_adaptations import (
@@ -172,6 +172,7 @@ def _answer(
         more = f" And {len(problems) - PROBLEMS_FIRST} more." if len(problems) > PROBLEMS_FIRST else ""
         first = " ".join(f"{one[0].upper()}{one[1:]}." for one in problems[:PROBLEMS_FIRST])
         said.append(f"▲ The audit is NOT SOUND: what follows is what can still be read. {first}{more}")
+    said += unconfirmed_in(told.records.book)
     said.append(_in_numbers(told))
     said += _came(chosen, cases, found)
     if not problems:
@@ -217,7 +218,7 @@ def _line_section(told: Told) -> Section:
         ("Torque per drive", f"up to {limits.torque_nm:g} Nm, {limits.torque_rate_nm_per_s:g} Nm/s"),
         ("Speed", f"up to {limits.speed_max_m_per_s:g} m/s"),
         ("Steps at once", f"{limits.tension_step_max_n:g} N, {limits.speed_step_max_m_per_s:g} m/s"),
-        ("In service", f"{in_service}, epoch {book.epoch}"),
+        ("In service", f"{in_service}, epoch {book.epoch}{', unconfirmed' if book.is_unconfirmed else ''}"),
         ("Model that judges", "none yet: the line's file" if book.model is None else book.model[:SHORT]),
     )
     problems = tuple(f"Caution: {text}." for text in told.problems)

@@ -33,7 +33,7 @@ def render(status: GatewayStatus, width: int, height: int | None = None) -> Rend
     spans, events = status.spans, len(status.events)
     if height is not None:
         height -= (status.change is not None) + bool(_agents(status)) + bool(status.alarms) + bool(status.unconfirmed)
-        height -= bool(_wiring(status))
+        height -= bool(_wiring(status)) + bool(status.audit_head)
         room = max(1, height - FIXED_LINES - LEAST_EVENTS)
         if len(spans) > room:
             spans = _urgent(spans, max(1, room - 1), status.limits)
@@ -193,6 +193,9 @@ def _health(status: GatewayStatus) -> RenderableType:
     if historian.moved_aside:
         stored += f"; a damaged one is kept as {historian.moved_aside}"
     grid.add_row("history", Text(stored, "" if historian.storing else "bold red"))
+    if status.audit_head:
+        number, _, hash_ = status.audit_head.partition(":")
+        grid.add_row("audit", f"head {number}:{hash_[:SHORT]}... (--json has it whole)")
     if agents := _agents(status):
         style = "" if status.agents_bus.open else "yellow"
         grid.add_row("agents", Text(agents, style, no_wrap=True, overflow="ellipsis"))

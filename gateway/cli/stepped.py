@@ -19,11 +19,12 @@ from gateway.core.scenario import Scenario
 from gateway.core.signals import FloatArray
 from gateway.core.states import Phase
 from gateway.core.telemetry import Frame, pack, unpack
-from gateway.core.wiring_proof import CellProved, DriveProved
+from gateway.core.wiring_proof import CellProved, DriveProved, WatchdogProved
 from gateway.loop.arming import not_armed, prepare_links, refusal_to_arm
 from gateway.loop.commands import carry_out
 from gateway.loop.cycle import Cycle
 from gateway.loop.deploy import NOT_DONE, Prepared, prepare, require
+from gateway.loop.drill import NO_WATCHDOG
 from gateway.loop.machine import Machine
 from gateway.loop.pacer import Tick
 from gateway.loop.refused import Refused
@@ -36,8 +37,8 @@ from sim_plant.stepped import SteppedLine
 T = TypeVar("T")
 
 
-def shown_as_described(line: Line) -> tuple[list[DriveProved], list[CellProved]]:
-    """What drives and load cells of a line that is wired as its file says have shown, at no torque."""
+def shown_as_described(line: Line) -> tuple[list[DriveProved], list[CellProved], list[WatchdogProved]]:
+    """What drives, load cells and watchdogs of a line that is wired as its file says have shown, at no torque."""
     drives = [
         DriveProved(drive=drive.name, roller=drive.roller, torque_nm=0.0, way_m=0.0, answered=[drive.roller])
         for drive in line.drives
@@ -46,13 +47,17 @@ def shown_as_described(line: Line) -> tuple[list[DriveProved], list[CellProved]]
         CellProved(cell=cell.name, span=cell.span, zero_n=0.0, factor=1.0, answered_to=[cell.span])
         for cell in line.load_cells
     ]
-    return drives, cells
+    watchdogs = [
+        WatchdogProved(device=name, deadline_s=line.limits.watchdog_s, reacted_s=None, how=NO_WATCHDOG)
+        for name in [*(drive.name for drive in line.drives), line.plc.name]
+    ]
+    return drives, cells, watchdogs
 
 
 def wired_as_described(line: Line) -> Wiring:
     """The wiring of a simulation in memory: its plant is made of numbers, and no cell can be another's."""
     wiring = Wiring(line, {})
-    wiring.write(wiring.proof_of(*shown_as_described(line), [], []))
+    wiring.write(wiring.proof_of(*shown_as_described(line), []))
     wiring.take_written()
     return wiring
 

@@ -3,7 +3,15 @@
 import re
 from typing import NamedTuple
 
-_HEAD = re.compile(r"([1-9][0-9]{0,17}):([0-9a-f]{64})")
+_DIGITS = r"([1-9][0-9]{0,17}):([0-9a-f]{64})"
+_HEAD = re.compile(_DIGITS)
+#: Alone on a line; behind what the log says, a field of JSON, or what `audit verify` says; on the page of a report.
+_PRINTED = re.compile(
+    r"(?:^[ \t]*|audit head: |\"audit_head\": ?\"|last record: |Head of the audit(?:\s|<[^<>]*>)*)"
+    + _DIGITS
+    + r"(?![0-9a-zA-Z])(?=[ \t]*\r?$|\"|<|\s)",
+    re.MULTILINE,
+)
 
 
 class AuditHead(NamedTuple):
@@ -18,5 +26,18 @@ def parse_head(text: str) -> AuditHead:
     """The head that `text` is, as it was printed. Raises ValueError: short forms prove less than they seem to."""
     match = _HEAD.fullmatch(text.strip())
     if match is None:
-        raise ValueError("allowed is NUMBER:HASH as it was printed, with all 64 digits of the hash (0-9, a-f)")
+        raise ValueError(
+            "allowed is NUMBER:HASH as it was printed, with all 64 digits of the hash (0-9, a-f), or a file that has it"
+        )
     return AuditHead(int(match[1]), match[2])
+
+
+def last_head_in(text: str) -> AuditHead:
+    """The last head that a log, `status --json`, a report or a note of it has. Raises ValueError: there is none."""
+    printed = list(_PRINTED.finditer(text))
+    if not printed:
+        raise ValueError(
+            "there is no head in it; allowed is a file with a line NUMBER:HASH, or what the log (`audit head: ...`), "
+            "`status --json` or a report has of it, with all 64 digits"
+        )
+    return AuditHead(int(printed[-1][1]), printed[-1][2])

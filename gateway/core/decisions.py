@@ -57,7 +57,8 @@ class LineChanged(Strict):
 
 
 class Confirm(Strict):
-    """A person knows what controls the line, though no record says how it came to that: it may be armed.
+    """A person answers for what controls the line: a first configuration that has followed a move of a tension and a
+    change of the speed, or one of which no record says how it came to be there, and which may be armed then.
 
     It goes no further by it than a first configuration: what is to go further is proposed and approved.
     """

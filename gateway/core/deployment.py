@@ -13,6 +13,7 @@ from gateway.core.controller import ControllerConfig
 from gateway.core.controller_laws import Feedforward, Matrix
 from gateway.core.finding import Finding
 from gateway.core.line import Line, NonNegative, Positive, Strict
+from gateway.core.line_scales import line_scales
 
 Hash = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]  #: `controller.config_hash`
 Epoch = Annotated[int, Field(ge=1, le=2**53)]  #: of deployments, one after the other, also over restarts
@@ -51,6 +52,19 @@ def first_region(line: Line) -> Region:
         tension_step_max_n=min(limits.tension_step_max_n, gate.first_step_max_n),
         speed_step_max_m_per_s=min(limits.speed_step_max_m_per_s, fastest),
     )
+
+
+SHARE_SHOWN = 0.1  #: of the first region's greatest speed, that a change of speed must have to show anything
+
+
+def least_shown(line: Line) -> tuple[float, float]:
+    """The smallest move (N) and the smallest change of speed (m/s) by which a first configuration shows that it holds.
+
+    At most what is small on the line; what is smaller still, noise would hide.
+    """
+    scales, most = line_scales(line), first_region(line).speed_max_m_per_s
+    least_m_per_s = scales.speed_m_per_s if most is None else min(scales.speed_m_per_s, SHARE_SHOWN * most)
+    return scales.tension_n, least_m_per_s
 
 
 class RecoveryNode(Strict):
@@ -143,4 +157,7 @@ class InService(Strict):
     watched: bool  #: a recovery prediction looks after it
     why: str  #: "start", "deployed", "kept", or "rolled back: .."
     confirmed: bool = True  #: a verdict has let it through, or a person has confirmed it; else it is guarded as a first
+    #: Since it controls the line, in RUN and without a stop in between, as far as this loop has seen (`least_shown`):
+    tension_moved: bool = False  #: a tension was moved to another set-point, and has followed
+    speed_changed: bool = False  #: the speed was changed from one at which the web moves to another, and has come there
     wiring: WiringStatus | None = None  #: of the line it controls; None: nobody has looked

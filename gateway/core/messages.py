@@ -11,7 +11,8 @@ from pydantic import Field, TypeAdapter, ValidationError
 from gateway.core.deployment import Deployment, Epoch, Hash, InService, RecoveryPrediction, Region
 from gateway.core.experiment import Experiment, experiment_hash
 from gateway.core.finding import Finding
-from gateway.core.line import Strict
+from gateway.core.line import Name, Strict
+from gateway.core.wiring_proof import MOST_DEVICES
 from gateway.core.wiring_proof import Answer as ProofAnswer
 
 
@@ -37,13 +38,15 @@ class Prove(Strict):
     """READY, and back to STOP: at standstill one drive at a time pulls a little, and what answers proves the wiring."""
 
     command: Literal["prove"] = "prove"
+    only: Annotated[list[Name], Field(max_length=MOST_DEVICES)] = []  #: devices that are proved anew; empty: all
 
 
 class KeepProof(Strict):
     """At rest, after a drill and pulls that found nothing: the wiring is proved by them from now on."""
 
     command: Literal["keep-proof"] = "keep-proof"
-    answers: Annotated[list[ProofAnswer], Field(max_length=200)] = []  #: to what no pull could show
+    answers: Annotated[list[ProofAnswer], Field(max_length=MOST_DEVICES)] = []  #: to what no pull could show
+    only: Annotated[list[Name], Field(max_length=MOST_DEVICES)] = []  #: as `Prove` had it
 
 
 class Hold(Strict):
@@ -192,8 +195,10 @@ def in_words(command: Command) -> str:
         return "narrow"
     if isinstance(command, WatchGood):
         return f"watch-good {command.watch.fallback[:12]}"
-    values = command.model_dump().items()
-    return " ".join(key if value is True else str(value) for key, value in values if value is not False)
+    values = command.model_dump()
+    only = [f"only {name}" for name in values.pop("only", [])]
+    told = [key if value is True else str(value) for key, value in values.items() if value is not False and value != []]
+    return " ".join(told + only)
 
 
 class Reply(Strict):

@@ -7,8 +7,8 @@ one of another line.
 """
 
 import hashlib
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Annotated, Any, Literal
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import Field
 
@@ -16,6 +16,8 @@ from gateway.core.canonical import hash_of
 from gateway.core.deployment import Hash
 from gateway.core.finding import Code, Finding, finding
 from gateway.core.line import Drive, Line, LinePlc, LoadCell, Name, NonNegative, Positive, Strict
+
+Device = TypeVar("Device", Drive, LoadCell, LinePlc)
 
 MOST_DEVICES = 200
 LONGEST_TEXT = 120  #: characters, of a serial number and of a person's name
@@ -131,12 +133,16 @@ def wiring_hash(line: Line, maps: Mapping[str, bytes], serials: Mapping[str, str
     A device without a serial number has "" or no entry. Keys that stand at their default do not count, so that a key
     that is new in a later version leaves a proof as it is. A map that is not there counts as an empty one.
     """
+    return _hash_of(line, device_identities(line, maps, serials))
+
+
+def _hash_of(line: Line, devices: Sequence[DeviceIdentity]) -> Hash:
     wiring = {
         "rollers": len(line.rollers),
         "spans": [span.control for span in line.spans],
         "watchdog_s": line.limits.watchdog_s,
         "tables": dict(_tables(line)),
-        "devices": [one.model_dump() for one in device_identities(line, maps, serials)],
+        "devices": [one.model_dump() for one in devices],
     }
     return hash_of(wiring)
 
@@ -157,8 +163,71 @@ def why_not_proved(
     if proof is None:
         return [finding("wiring-unproved")]
     if proof.wiring == wiring_hash(line, maps, serials):
-        return not_shown(line, proof.drives, proof.cells, proof.answers)
+        return not_shown(line, proof.drives, proof.cells, proof.answers) + undrilled(line, proof.watchdogs)
     return list(_changes(proof, device_identities(line, maps, serials))) or [finding("wiring-changed")]
+
+
+def more_than(
+    only: Collection[str],
+    proof: WiringProof | None,
+    line: Line,
+    maps: Mapping[str, bytes],
+    serials: Mapping[str, str],
+) -> list[Finding]:
+    """What speaks against proving nothing but `only` anew; empty: nothing else has changed since `proof`.
+
+    Of the devices named nothing need have changed: many tell no serial number, and a person knows what was exchanged.
+    """
+    if proof is None:
+        return [finding("wiring-unproved")]
+    today = device_identities(line, maps, serials)
+    others = [each for each in _changes(proof, today) if each.parameters["device"] not in only]
+    if not others and _hash_as_proved(proof, line, today, only) != proof.wiring:
+        others = [finding("wiring-changed")]
+    unshown = not_shown(line, proof.drives, proof.cells, proof.answers)
+    return others + [each for each in unshown if each.parameters["device"] not in only]
+
+
+def _hash_as_proved(proof: WiringProof, line: Line, today: Sequence[DeviceIdentity], only: Collection[str]) -> Hash:
+    """The hash of the wiring if the devices of `only` were still those that were proved, with the maps of then."""
+    proved = {one.device: one for one in proof.devices if one.device in only}
+
+    def mapped(device: Device) -> Device:
+        was = proved.get(device.name)
+        return device if was is None else device.model_copy(update={"map": was.map})
+
+    as_proved = line.model_copy(
+        update={
+            "drives": [mapped(drive) for drive in line.drives],
+            "load_cells": [mapped(cell) for cell in line.load_cells],
+            "plc": mapped(line.plc),
+        }
+    )
+    return _hash_of(as_proved, [proved.get(one.device, one) for one in today])
+
+
+def merged(
+    proof: WiringProof,
+    only: Collection[str],
+    drives: Sequence[DriveProved],
+    cells: Sequence[CellProved],
+    answers: Sequence[Answer],
+) -> tuple[list[DriveProved], list[CellProved], list[Answer]]:
+    """What `proof` says of all others, and what has been shown and answered now of those in `only`."""
+    said = {(answer.question, answer.device) for answer in answers}
+    kept = [one for one in proof.answers if one.device not in only and (one.question, one.device) not in said]
+    return (
+        sorted([*(one for one in proof.drives if one.drive not in only), *drives], key=lambda one: one.roller),
+        sorted([*(one for one in proof.cells if one.cell not in only), *cells], key=lambda one: one.span),
+        [*kept, *answers],
+    )
+
+
+def undrilled(line: Line, watchdogs: Sequence[WatchdogProved]) -> list[Finding]:
+    """Drives and the line PLC of which no drill says what their watchdogs do, or that they have none."""
+    drilled = {one.device for one in watchdogs}
+    names = [*(drive.name for drive in line.drives), line.plc.name]
+    return [finding("watchdog-unshown", device=name) for name in names if name not in drilled]
 
 
 def not_shown(

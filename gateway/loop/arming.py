@@ -2,6 +2,8 @@
 
 from drivers.port import PrepareRefused
 from gateway.core.finding import Finding
+from gateway.core.line import Device
+from gateway.core.line_problem import printable
 from gateway.core.messages import Reply
 from gateway.core.signals import Channel, Quality
 from gateway.core.states import LoopState, Phase
@@ -9,6 +11,7 @@ from gateway.loop.cycle import Cycle
 from gateway.loop.refused import Refused, coded, said
 from gateway.tasks.cleanup import finish_all
 
+LONGEST_TROUBLE = 300  #: characters of what a bus has told
 SILENT_PATIENCE_S = 0.25  #: without cyclic data (a silent CANopen link reads by SDO) samples are this old at most
 
 
@@ -57,7 +60,12 @@ def not_ready(cycle: Cycle) -> list[str | Finding]:
     """What speaks against arming, as far as the samples tell. One that is late is no reason to send a person away."""
     running = cycle.configurations.running
     unfit: list[str | Finding] = [f"controller {running.hash[:12]}: {running.unfit}"] if running.unfit else []
-    return unfit + (forbidden(cycle) or _turning(cycle)) + unheard(cycle)
+    return unfit + (forbidden(cycle) or _turning(cycle)) + unheard(cycle) + _below_zero(cycle)
+
+
+def _below_zero(cycle: Cycle) -> list[str | Finding]:
+    """Load cells with a wrong zero. Where the wiring is not proved the proof names them: nothing else is started."""
+    return [] if cycle.wiring.against else list(cycle.watch.below_zero(cycle.inputs))
 
 
 def _turning(cycle: Cycle) -> list[str | Finding]:
@@ -78,13 +86,24 @@ def forbidden(cycle: Cycle) -> list[str | Finding]:
 
 def unheard(cycle: Cycle) -> list[str | Finding]:
     """Devices without a usable sample lately."""
+    plc = cycle.line.plc
     reasons: list[str | Finding] = (
-        [] if plc_heard(cycle) else [f"the line PLC ({cycle.line.plc.name}) gives no usable answer"]
+        [] if plc_heard(cycle) else [f"the line PLC ({plc.name}) gives no usable answer{_trouble(cycle, plc)}"]
     )
     for cell in cycle.line.load_cells:
         if not heard(cycle, cycle.inputs.tension, cell.span - 1):
-            reasons.append(f"load cell {cell.name} (span {cell.span}) gives no usable value")
+            reasons.append(f"load cell {cell.name} (span {cell.span}) gives no usable value{_trouble(cycle, cell)}")
     return reasons
+
+
+def _trouble(cycle: Cycle, device: Device) -> str:
+    """What the bus of `device` has told last, to be appended; empty: nothing, or it was about another device."""
+    line = cycle.line
+    told = next((link.health.last_error for link in cycle.links if link.name == device.bus), "")
+    others = {one.name for one in (line.plc, *line.drives, *line.load_cells)} - {device.name}
+    if not told or told.partition(":")[0] in others:
+        return ""
+    return f"; its bus told last: {printable(told)[:LONGEST_TROUBLE]}"
 
 
 def plc_heard(cycle: Cycle) -> bool:

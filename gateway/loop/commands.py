@@ -28,7 +28,7 @@ from gateway.core.messages import (
 from gateway.core.nearest import nearest
 from gateway.core.proof import Proof
 from gateway.core.states import OPERATORS_STOP, LoopState, Phase
-from gateway.core.wiring_proof import WiringProof, asked_of, not_shown
+from gateway.core.wiring_proof import WiringProof, asked_of, devices_of, merged, not_shown, undrilled
 from gateway.loop import machine as machines
 from gateway.loop.arming import heard, not_ready, require_rest
 from gateway.loop.cycle import Cycle
@@ -68,6 +68,8 @@ def _do(cycle: Cycle, command: Operating, now_s: float) -> str:
     if plain := PLAIN.get(type(command)):
         return plain(cycle, now_s)
     match command:
+        case Prove():
+            return _prove(cycle, command, now_s)
         case KeepProof():
             return cycle.wiring.take_written()
         case SetTension():
@@ -137,15 +139,40 @@ def _require_remote(cycle: Cycle) -> None:
         raise Refused("not started; mend what is named and start again", [finding("line-local")])
 
 
-def _prove(cycle: Cycle, now_s: float) -> str:
+def _prove(cycle: Cycle, command: Prove, now_s: float) -> str:
     machine = cycle.machine
-    if machine.phase is not Phase.READY:
+    if machine.phase is not Phase.READY:  # until then nobody knows the devices of today
         raise Refused(f"the line is {machine.state.name}: arm it first; the wiring is proved from READY")
+    _require_only(cycle, command.only)
     # A drive that nothing is known of is given torque only once its watchdog has been seen to take it off.
-    undrilled: list[str | Finding] = [] if cycle.drill.watchdogs else [finding("not-drilled")]
-    if reasons := undrilled + _against_torque(cycle):
+    without_drill: list[str | Finding] = [] if cycle.drill.watchdogs else [finding("not-drilled")]
+    if reasons := without_drill + _against_torque(cycle):
         raise Refused("not proved; mend what is named and prove again", reasons)
-    return f"{_warn(cycle, now_s, proves=True)}one drive after the other pulls a little; the line stands meanwhile"
+    cycle.proving.choose(command.only)
+    warned = _warn(cycle, now_s, proves=True)
+    if command.only:
+        drives = ", ".join(_pulled(cycle)) or "none"
+        return f"{warned}drives that pull a little: {drives}; the line stands meanwhile"
+    return f"{warned}one drive after the other pulls a little; the line stands meanwhile"
+
+
+def _pulled(cycle: Cycle) -> list[str]:
+    names = {drive.roller - 1: drive.name for drive in cycle.line.drives}
+    return [names[i] for i in cycle.proving.pulled()]
+
+
+def _require_only(cycle: Cycle, only: list[str]) -> None:
+    """That a proof is restricted to devices that are there, and that nothing else has changed since the last one."""
+    names = [device.name for device in devices_of(cycle.line)]
+    unknown = [
+        finding("device-unknown", device=name, nearest=nearest(name, names) or ", ".join(names))
+        for name in only
+        if name not in names
+    ]
+    if unknown:
+        raise Refused("not proved; name devices of the line's file", unknown)
+    if only and (more := cycle.wiring.more_than(only)):
+        raise Refused("not proved; name whatever has changed, or prove the whole wiring: `r2rgate prove`", more)
 
 
 def proof_to_keep(cycle: Cycle, command: KeepProof) -> WiringProof:
@@ -154,8 +181,9 @@ def proof_to_keep(cycle: Cycle, command: KeepProof) -> WiringProof:
     judged, watchdogs = cycle.proving.judged, cycle.drill.watchdogs
     if not watchdogs:
         raise Refused("nothing is kept", [finding("not-drilled")])
-    if judged is None:
+    if judged is None or cycle.proving.only != frozenset(command.only):
         raise Refused("nothing is kept", [finding("not-pulled")])
+    _require_only(cycle, command.only)
     if judged.findings:
         coded = [data for each in judged.findings if (data := each.as_data()) is not None]
         raise Refused("the wiring is not as the line's file says; mend what is named and prove again", coded)
@@ -165,9 +193,13 @@ def proof_to_keep(cycle: Cycle, command: KeepProof) -> WiringProof:
     # An answer to what nobody has asked stands for nothing.
     asked = {(each.code, asked_of(each)) for each in judged.questions}
     answers = [each for each in command.answers if (each.question, each.device) in asked]
-    if unshown := not_shown(cycle.line, judged.drives, judged.cells, answers):
+    drives, cells = judged.drives, judged.cells
+    if command.only and cycle.wiring.proof is not None:
+        drives, cells, answers = merged(cycle.wiring.proof, command.only, drives, cells, answers)
+    # The drill has seen every device, whatever has pulled.
+    if unshown := not_shown(cycle.line, drives, cells, answers) + undrilled(cycle.line, watchdogs):
         raise Refused("nothing is kept of a proof that leaves something out", unshown)
-    return cycle.wiring.proof_of(judged.drives, judged.cells, watchdogs, answers)
+    return cycle.wiring.proof_of(drives, cells, watchdogs, answers)
 
 
 def _against_torque(cycle: Cycle) -> list[str | Finding]:
@@ -214,7 +246,7 @@ def _stop(cycle: Cycle, now_s: float) -> str:
 
 #: Commands that say nothing but what they are.
 PLAIN: dict[type[Operating], Callable[[Cycle, float], str]] = {
-    Arm: _arm, Drill: _drill, Start: _start, Prove: _prove, Hold: _hold, Stop: _stop,
+    Arm: _arm, Drill: _drill, Start: _start, Hold: _hold, Stop: _stop,
 }  # fmt: skip
 
 

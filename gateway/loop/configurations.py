@@ -21,6 +21,7 @@ from gateway.loop.experiment import Tell
 from gateway.loop.kept import Durable, OnTop
 from gateway.loop.setpoints import Setpoints
 from gateway.loop.torque import TorquePath
+from gateway.loop.trial import Trial
 from safety.recoverability import Recovery
 
 ROUNDING_S = 1e-6  #: a lease of twenty periods ends with the twentieth, whatever their sum is rounded to
@@ -67,6 +68,7 @@ class Configurations:
         self.probation: Probation | None = None
         self.why = "start"
         self.changes = 0  #: how often what outlives this loop has changed
+        self.trial = Trial(line, setpoints)  #: of what runs
         self._line = line
         self._setpoints = setpoints
         self._tell = tell
@@ -80,6 +82,7 @@ class Configurations:
     def take(self, candidate: Configuration, deployment: Deployment, now_s: float) -> None:
         """`candidate` controls the line from now on, on probation."""
         self.running = candidate
+        self.trial.begin()
         self.epoch = deployment.epoch
         self.changes += 1
         self.probation = Probation(deployment.lease_s, now_s + deployment.lease_s, deployment.shaped_first)
@@ -170,6 +173,7 @@ class Configurations:
             return False
         self.changes += 1
         given_up, self.running = self.running, self.good
+        self.trial.begin()
         self.probation = None
         self.why = f"rolled back: {reason}"
         self.path.take_over(self.good.law)
@@ -215,6 +219,8 @@ class Configurations:
             watched=running.recovery is not None,
             why=self.why,
             confirmed=running.confirmed,
+            tension_moved=self.trial.tension_moved,
+            speed_changed=self.trial.speed_changed,
         )
 
     def _say(self, kind: str, text: str, **data: object) -> None:

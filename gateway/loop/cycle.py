@@ -92,9 +92,12 @@ PERIOD, ENVELOPE = Part("the control period"), Part("the envelope")
 DRIVES = Part("the comparison of the drives")
 ESTIMATE = Part("the estimate of tensions without a load cell")
 JUMPS, STUCK = Part("the check for jumps"), Part("the check for stuck signals")
+CELLS = Part("the watch for load cells that are contradicted")
+ZEROS = Part("the look at the zeros of load cells", of_configuration=False)
 FIRST = Part("the guards of a first configuration")
 LEASE, MONITOR, DOUBTS = Part("the lease"), Part("the monitor"), Part("the watch for doubts")
 EXPERIMENT = Part("the experiment")
+TRIAL = Part("the look at what a configuration has shown", of_configuration=False)
 TENSIONING = Part("the watch for a missing web", of_configuration=False)
 DRILL = Part("the drill of the watchdogs", of_configuration=False)
 PROOF = Part("the proof of the wiring", of_configuration=False)
@@ -214,6 +217,7 @@ class Cycle:
             self._alarm(run(DOUBTS, [], controlled, self.inputs, self.setpoints, before_nm, saturated))
         self._alarm(run(DRIVES, [], self.watch.drives.find_told, self.inputs))
         run(EXPERIMENT, None, self.experiments.look, self.inputs, torque_nm, self.account.held, tick.due_s)
+        run(TRIAL, None, self.configurations.trial.step, self.machine, self.inputs, seen.usable)
 
     def _end_what_lapsed(self, now_s: float) -> None:
         configurations = self.configurations
@@ -310,7 +314,10 @@ class Cycle:
         if self.machine.resumes:  # its rollers are controlled
             return local
         turning = self.standstill.turning(self.inputs, self.clock())
-        return local + [Finding(data.code, Action.NONE, sentence(data), data.parameters) for data in turning]
+        against = (
+            turning if self.machine.proves else [*turning, *self.watch.below_zero(self.inputs)]
+        )  # a proof names it
+        return local + [Finding(data.code, Action.NONE, sentence(data), data.parameters) for data in against]
 
     def change(self, machine: Machine) -> None:
         """Take over what a command decided. Between two periods only."""
@@ -361,8 +368,11 @@ class Cycle:
         if seen is None:
             return Assessment(unlike, usable=False, feedback_lost=True, plc_lost=True)
         seen.findings.extend(unlike)
+        below_zero = run(ZEROS, [], self.watch.find_below_zero, self.inputs)
         if phase in BEFORE_RUNNING and self.inputs.plc.local:
             seen.findings.append(found("line-local", Action.STOP))
+        if phase not in TRANSPORTING:
+            self.watch.forget_balance()
         if supervision.feedback:
             seen.findings.extend(jumps)
             if seen.usable and phase is not Phase.PROVING:
@@ -370,10 +380,20 @@ class Cycle:
                 floor, acted_nm = supervision.tension_floor, self.outputs.torque_nm
                 set_n, find = self.setpoints.tension_n, self.watch.find_estimated
                 seen.findings.extend(run(ESTIMATE, [], find, self.inputs, acted_nm, set_n, floor=floor))
+                seen.findings.extend(below_zero)
+                if phase in TRANSPORTING:  # also while it brakes: a cell that fell to nothing looked like a broken web
+                    seen.findings.extend(run(CELLS, [], self._find_contradicted, acted_nm))
                 if phase is Phase.TENSIONING:
                     target_n = self.setpoints.tension_target_n
                     seen.findings.extend(run(TENSIONING, [], self.stage.watch, self.inputs, target_n))
         return seen
+
+    def _find_contradicted(self, applied_nm: FloatArray) -> list[Finding]:
+        """Their proof holds no more: only `prove` leads back."""
+        found = self.watch.find_contradicted(self.inputs, applied_nm, doubted=self.torque_path.any_lost())
+        if found and self.wiring.contradict(found) and self.machine.phase is Phase.BRAKING:
+            self._alarm(found)  # its phase does not change, so that nobody would hear of it
+        return found
 
     def _reject_jumps(self, supervision: Supervision) -> list[Finding]:
         # A web that whips moves its rollers by more than any torque explains; so does a drive that turns backwards.

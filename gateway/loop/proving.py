@@ -5,6 +5,7 @@ far as slack may let it. What came of it is judged as a whole (`safety.proving_j
 first, so that what one has taken up leaves no slack to the next; who answers to whom makes a triangle.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,7 +15,7 @@ from gateway.core.signals import FloatArray, Inputs
 from gateway.core.states import OPERATORS_STOP
 from gateway.loop.pull import BLIND_RAMPS, End, PullRun, Release, Ways, longest_pull_s, slowed_where_blind
 from safety.actions import Finding
-from safety.proving import ZERO_S, Noise, Pull, proving_limits
+from safety.proving import ZERO_S, Noise, Pull, proving_limits, slack_of_one_span
 from safety.proving_judgement import Judged, judge, judge_zeros
 
 SETTLE_S = 2.0  #: from a release to the next pull, at most: its roller's drift is looked at meanwhile
@@ -43,6 +44,10 @@ class Begun:
 
 
 LEGS = (Leg(1, False), Leg(-1, False), Leg(1, True), Leg(-1, True))
+ANEW_LEGS = (Leg(1, True), Leg(-1, True))  #: of a drive that alone is proved anew: most are wired as the one before
+#: Of a drive that is proved its direction is known; again where slack that ended with a jerk was taken for an answer.
+PROVED_LEGS = (Leg(1, True), Leg(1, True))
+ANEW_S = 180.0  #: for one device that is proved anew, where what pulls is answered to at once
 
 
 class ProvingStage:
@@ -58,8 +63,44 @@ class ProvingStage:
         self.longest_s = ZERO_S + sum(each)  #: of a whole proof, with all the slack that may be there
         self.over = True
         self.judged: Judged | None = None
+        self.only: frozenset[str] = frozenset()  #: devices that are proved anew; empty: all
         self._line = line
         self._reset()
+
+    def choose(self, only: Iterable[str]) -> None:
+        """The next proof is of these devices alone; of none: of all."""
+        self.only = frozenset(only)
+
+    def pulled(self) -> list[int]:
+        """Drives (from 0) that pull, the last roller first.
+
+        For a load cell those of the roller at the end of its span, to which it answers, and of the one before, to which
+        it does not.
+        """
+        if not self.only:
+            return list(reversed(range(self._line.n)))
+        rollers = {drive.roller for drive in self._line.drives if drive.name in self.only}
+        spans = {cell.span for cell in self._line.load_cells if cell.name in self.only}
+        return sorted((r - 1 for r in rollers | spans | {span - 1 for span in spans} if r > 0), reverse=True)
+
+    def _legs(self, i: int) -> tuple[Leg, ...]:
+        if not self.only:
+            return LEGS
+        named = any(drive.roller == i + 1 and drive.name in self.only for drive in self._line.drives)
+        return ANEW_LEGS if named else PROVED_LEGS
+
+    def _longest_pull_s(self, leg: Leg) -> float:
+        """For a device that is proved anew one or two drives pull; one that pulls back has a way to go back first."""
+        longest_s = longest_pull_s(self.limits, self._drive, self._reach_m(leg))
+        if not self.only:
+            return longest_s
+        ramp_s, hold_s = float(self.limits.ramp_s[self._drive]), float(self.limits.hold_s[self._drive])
+        forwards_s = (ANEW_S - ZERO_S) / min(2, len(self.pulled())) - ramp_s - hold_s - SETTLE_S
+        forwards_s = max(forwards_s, longest_pull_s(self.limits, self._drive, 0.0))  # where friction is heavy
+        return min(longest_s, forwards_s if leg.direction > 0 else 2.0 * forwards_s)
+
+    def _reach_m(self, leg: Leg) -> float:
+        return float((self.limits.far_m if leg.far else self.limits.near_m)[self._drive])
 
     def _reset(self) -> None:
         n = self._line.n
@@ -69,7 +110,8 @@ class ProvingStage:
         self._release: Release | None = None
         self._pulls: list[Pull] = []
         self._tried: list[PullRun] = []  #: legs of the drive at work
-        self._drive = n - 1
+        self._next = self.pulled()
+        self._drive = self._next.pop(0) if self._next else 0
         self._settled: list[float] = []  #: speeds of the roller of the drive that is next, since the release before
         self._settle_s = 0.0
         self._news: list[Begun] = []
@@ -109,10 +151,13 @@ class ProvingStage:
         mean, spread = samples.mean(axis=0), samples.std(axis=0)
         ways_m = np.abs(np.cumsum(samples[:, n:], axis=0)).max(axis=0) * self.limits.period_s
         self._zero_n, self._noise = mean[:n], Noise(spread[:n], spread[n:], ways_m)
-        self.limits = slowed_where_blind(self._all_limits, self._noise)
+        limits = slack_of_one_span(self._line, self._all_limits) if self.only else self._all_limits
+        self.limits = slowed_where_blind(limits, self._noise)
         findings = judge_zeros(self._line, self.limits, self._zero_n)
         if findings:
             self._end(Judged(findings))
+        elif not self.pulled():
+            self._judge()
 
     def _drive_torque(self, tension_n: FloatArray, speed_m_per_s: FloatArray) -> float:
         i = self._drive
@@ -124,7 +169,7 @@ class ProvingStage:
             return torque
         if self._settle_s > 0.0:
             self._settle_s -= self.limits.period_s
-            self._settled.append(float(speed_m_per_s[max(0, i - 1)]))
+            self._settled.append(float(speed_m_per_s[self._next[0] if self._next else 0]))
             return 0.0
         if self._run is None:
             if not self._next_leg():
@@ -139,21 +184,23 @@ class ProvingStage:
 
     def _next_leg(self) -> bool:
         """Begin the next pull, of this drive or of the next one. False: there is none."""
-        if self._tried and (self._is_decided() or self._is_shown(self._tried[-1]) or len(self._tried) == len(LEGS)):
+        legs, tried = self._legs(self._drive), self._tried
+        if tried and (self._is_decided() or self._is_shown(tried[-1]) or len(tried) == len(legs)):
             self._pulls.append(self._best())
             # Found where a load cell ought to have shown it; else a person is asked, and the others have their turn.
-            no_web = all(run.end is End.AWAY for run in self._tried) and bool(self.limits.measured[self._drive])
+            no_web = all(run.end is End.AWAY for run in tried) and bool(self.limits.measured[self._drive])
             self._tried = []
-            if self._drive == 0 or no_web:
-                self._end(judge(self._line, self.limits, self._noise, self._zero_n, self._pulls))
+            if not self._next or no_web:
+                self._judge()
                 return False
-            self._drive -= 1
+            self._drive = self._next.pop(0)
+            legs = self._legs(self._drive)
         i, limits = self._drive, self.limits
-        leg = LEGS[len(self._tried)]
+        leg = legs[len(self._tried)]
         before = self._tried[-1].ways if self._tried else Ways(speed_m_per_s=self._drift_m_per_s())
-        reach_m = float((limits.far_m if leg.far else limits.near_m)[i])
-        self._run = PullRun(limits, self._noise, i, leg.direction, reach_m, before)
-        self._news.append(Begun(i, leg.direction, reach_m, longest_pull_s(limits, i, reach_m)))
+        reach_m, longest_s = self._reach_m(leg), self._longest_pull_s(leg)
+        self._run = PullRun(limits, self._noise, i, leg.direction, reach_m, before, longest_s)
+        self._news.append(Begun(i, leg.direction, reach_m, longest_s))
         return True
 
     def _settles_s(self) -> float:
@@ -172,6 +219,8 @@ class ProvingStage:
 
     def _is_shown(self, run: PullRun) -> bool:
         """Whether the other direction need not be tried: a span before the roller answers, or nothing moves."""
+        if self._legs(run.i) is PROVED_LEGS and run.end is not End.ANSWERED:
+            return True
         if run.end is End.STUCK:
             return len(self._tried) >= 2  # either way
         if run.end is End.HELD:
@@ -209,6 +258,9 @@ class ProvingStage:
         if not before and held:
             return held[0].result()
         return max(before or answered or self._tried[-1:], key=lambda run: float(run.risen_n().max())).result()
+
+    def _judge(self) -> None:
+        self._end(judge(self._line, self.limits, self._noise, self._zero_n, self._pulls, self.only))
 
     def _end(self, judged: Judged) -> None:
         self.judged, self.over = judged, True

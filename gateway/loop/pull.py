@@ -6,7 +6,7 @@ roller has moved by more than noise explains, its speed is limited, and damped, 
 
 from dataclasses import dataclass, replace
 from enum import Enum
-from math import cos, pi
+from math import cos, inf, pi
 
 import numpy as np
 
@@ -95,10 +95,12 @@ class PullRun:
     """Of drive `i` (from 0), in `direction` of its torque command. Tensions are less the zeros."""
 
     def __init__(
-        self, limits: ProvingLimits, noise: Noise, i: int, direction: int, reach_m: float, before: Ways
-    ) -> None:
+        self, limits: ProvingLimits, noise: Noise, i: int, direction: int, reach_m: float, before: Ways,
+        longest_s: float = inf,
+    ) -> None:  # fmt: skip
         """`before`: what earlier pulls of this drive have shown; its way goes on from there."""
         self.i, self.direction, self.reach_m, self.ways = i, direction, reach_m, before
+        self._longest_s = min(longest_s, longest_pull_s(limits, i, reach_m))
         self.end: End | None = None
         self.start_n: FloatArray | None = None
         self.end_n: FloatArray = np.zeros(len(limits.torque_nm))
@@ -250,7 +252,7 @@ class PullRun:
             self.end = End.ANSWERED
         elif self._tight_s is None and stands:
             self.end = End.HELD if self.ways.sign else End.STUCK
-        elif self._time_s >= self._longest_s():
+        elif self._time_s >= self._longest_s:
             answered = End.ANSWERED if self._tight_s is not None else End.STUCK
             self.end = End.AWAY if self.ways.sign else answered
 
@@ -292,9 +294,6 @@ class PullRun:
 
     def _shows(self, cell: int) -> int:
         return 1 if self.end_n[cell] > 0.0 else -1
-
-    def _longest_s(self) -> float:
-        return longest_pull_s(self._limits, self.i, self.reach_m)
 
     def result(self) -> Pull:
         """As it is now."""

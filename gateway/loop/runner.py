@@ -34,7 +34,7 @@ from gateway.loop.cycle import SUPERVISED, Cycle
 from gateway.loop.deploy import NOT_DONE, Prepared, durable_after, prepare, require
 from gateway.loop.kept import Durable, Store
 from gateway.loop.pacer import Tick
-from gateway.loop.persistence import NotPersisted, Persistence
+from gateway.loop.persistence import AGAIN_S, NotPersisted, Persistence
 from gateway.loop.refused import Refused, coded, said
 from gateway.tasks.cleanup import end
 from gateway.wording.catalogue import sentences
@@ -77,6 +77,7 @@ class Runner:
         self._armed: asyncio.Task[Reply] | None = None  #: the arming that was asked for last
         self._stops = 0  #: that were asked for
         self._ending = False
+        self._settling: asyncio.Task[None] | None = None  #: the disk hears of load cells that are contradicted
         self._over = False  #: there will be no boundary any more
 
     async def period(self, tick: Tick) -> None:
@@ -86,6 +87,8 @@ class Runner:
         self._carry_out_waiting(tick.now_s)
         await self.cycle.period(tick)
         self._persistence.look()
+        if self.cycle.wiring.behind and (self._settling is None or self._settling.done()):
+            self._settling = asyncio.create_task(self._settle_wiring())
         self._passed.set()
         self._passed.clear()  # whoever waited goes on all the same
 
@@ -130,6 +133,8 @@ class Runner:
             if not (answer := waiting.answer).done():
                 answer.set_result(self.refused("the loop is ending"))
         await self.persisted(within_s)
+        if self._settling is not None:
+            await end(self._settling)  # what is being written is written to its end
 
     async def persisted(self, within_s: float) -> str:
         """Once the disk has what was decided last; else why it has not. Empty: it has."""
@@ -208,7 +213,7 @@ class Runner:
         cycle = self.cycle
         try:
             proof = proof_to_keep(cycle, command)
-            await self._disk.do(lambda: cycle.wiring.write(proof))
+            await self._disk.do(lambda: cycle.wiring.write(proof, command.only))
         except Refused as refused:
             return self.refused(str(refused), refused.told)
         except OSError as error:
@@ -337,6 +342,12 @@ class Runner:
             return None
         await release_links(cycle)
         return not_armed(cycle, reasons)
+
+    async def _settle_wiring(self) -> None:
+        wiring = self.cycle.wiring
+        while wiring.behind:
+            if not await self._disk.do(wiring.settle):
+                await asyncio.sleep(AGAIN_S)
 
     def _look_at_wiring(self) -> None:
         """The devices have been prepared. Whoever looks on need not wait until they ask whether it is proved still."""

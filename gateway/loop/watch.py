@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from gateway.core import finding as data
 from gateway.core.doubts import Doubt
 from gateway.core.drive_tells import DriveTells
 from gateway.core.line import Line
@@ -10,8 +11,9 @@ from gateway.core.signals import BoolArray, FloatArray, Inputs
 from gateway.core.tension_estimate import MEAN_PERIODS
 from gateway.loop.drive_watch import DriveWatch
 from gateway.loop.setpoints import Setpoints
-from safety import frozen
+from safety import cell_zero, frozen
 from safety.actions import Action, Finding
+from safety.cell_balance import CellState, cell_limits, find_contradicted
 from safety.drift import DriftState, drift_limits, restart, watch_balance
 from safety.estimated_tension import EstimateState, estimate_limits, find_estimated, steady_n
 from safety.impossible import ValueState, reject_impossible, value_limits
@@ -45,6 +47,8 @@ class Watch:
         self._stuck_limits, self._stuck = stuck_limits(line), StuckState()
         self._turning_m_per_s, self._frozen = frozen.turning_m_per_s(line), frozen.FrozenState()
         self._estimate_limits, self._estimate = estimate_limits(line, envelope_limits(line)), EstimateState()
+        self._cell_limits, self._balance = cell_limits(line), CellState()
+        self._zero = cell_zero.zero_state(line)
         self._unreliable = MEAN_PERIODS  #: periods until the estimate is of drives and cells that were reliable alone
         self._drift_limits, self._drift = drift_limits(line), DriftState()
         self._creeping_m_per_s = CREEPING * line.limits.speed_max_m_per_s
@@ -104,6 +108,29 @@ class Watch:
         if self._estimate_limits is None:
             return []
         return find_estimated(self._estimate_limits, self._estimate, inputs, applied_nm, set_n, floor=floor)
+
+    def find_contradicted(self, inputs: Inputs, applied_nm: FloatArray, *, doubted: bool) -> list[Finding]:
+        """Load cells that torques and the cells beside them contradict: what stops the line.
+
+        `applied_nm` (n,) acted while the samples were taken. `doubted`: a drive is lost, or nobody knows.
+        """
+        if doubted or self.silent or any(self.drives.suspected.tobytes()):
+            self._balance = CellState()
+            return []
+        return find_contradicted(self._cell_limits, self._balance, inputs, applied_nm)
+
+    def forget_balance(self) -> None:
+        """Torques say nothing of load cells now."""
+        if self._balance.block.size:
+            self._balance = CellState()
+
+    def below_zero(self, inputs: Inputs) -> list[data.Finding]:
+        """Load cells that show less than a slack web can: nothing is armed, nor started, on them."""
+        return cell_zero.below_zero(self._zero, inputs)
+
+    def find_below_zero(self, inputs: Inputs) -> list[Finding]:
+        """The same, once a period, and what it does while the web is controlled."""
+        return cell_zero.find_below_zero(self._zero, inputs)
 
     def estimated_n(self, *, doubted: bool) -> FloatArray | None:
         """Once a period: the least and the most (2, n) that tensions may be, by torques and speeds where no cell is.

@@ -5,10 +5,10 @@ file, the device maps and the serial numbers of the devices each time that these
 """
 
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from pathlib import Path
 
-from pydantic import ValidationError
+from pydantic import TypeAdapter, ValidationError
 
 from drivers.port import Link
 from gateway.core.deployment import WiringStatus
@@ -22,6 +22,7 @@ from gateway.core.wiring_proof import (
     WatchdogProved,
     WiringProof,
     device_identities,
+    more_than,
     proof_hash,
     why_not_proved,
     wiring_hash,
@@ -31,6 +32,8 @@ from safety import actions
 from safety.actions import Action, found
 
 FILE = "wiring-proof.json"
+CONTRADICTED = "contradicted-cells.json"  #: beside it, by span, what was found of them since they were proved
+_FINDINGS = TypeAdapter(dict[int, Finding])
 
 
 class Wiring:
@@ -43,7 +46,10 @@ class Wiring:
         self._serials: dict[str, str] | None = None  #: of today; None: no device has been prepared yet
         self.proof: WiringProof | None = None
         self._written: WiringProof | None = None
+        self._anew: frozenset[str] = frozenset()  #: devices that it proves anew; empty: all
         self.unusable: list[actions.Finding] = []  #: a file that `read` could not use, for the line's events
+        self._contradicted: dict[int, Finding] = {}  #: by span, load cells that were, since they were proved
+        self.behind = False  #: the disk does not know of all of them, or still of one that is proved anew
         self.against: list[Finding] = []  #: what speaks against closing the loop on it; empty: it is proved
         self._hold_against()
 
@@ -60,7 +66,19 @@ class Wiring:
             reason = str(error.strerror) if isinstance(error, OSError) else "; ".join(problems(error, WiringProof)[:5])
             self.unusable.append(found("file-unusable", Action.NONE, file=str(self.path), reason=reason))
             say(f"{self.path} is not used, and the wiring counts as not proved: {reason}")
+        self._read_contradicted(self.path.with_name(CONTRADICTED), say)
         self._hold_against()
+
+    def _read_contradicted(self, path: Path, say: Callable[[str], None]) -> None:
+        """A file that is not used stood for a cell that nobody has looked at: nothing is proved then."""
+        try:
+            self._contradicted = _FINDINGS.validate_json(read_bytes(path, MOST_BYTES))
+        except FileNotFoundError:
+            return
+        except (OSError, ValidationError) as error:
+            self.proof = None
+            self.unusable.append(found("file-unusable", Action.NONE, file=str(path), reason=type(error).__name__))
+            say(f"{path} is not used, and the wiring counts as not proved")
 
     def look(self, links: Iterable[Link]) -> bool:
         """The devices have been prepared: their serial numbers are those of today.
@@ -76,7 +94,38 @@ class Wiring:
         serials = self._serials
         if serials is None:  # until they are known they may be those that were proved
             serials = {} if self.proof is None else {one.device: one.serial for one in self.proof.devices}
-        self.against = why_not_proved(self.proof, self._line, self._maps, serials)
+        unproved = why_not_proved(self.proof, self._line, self._maps, serials)
+        self.against = [*unproved, *self._contradicted.values()]
+
+    def contradict(self, found: Iterable[actions.Finding]) -> bool:
+        """Load cells show what torques and the cells beside them say is not so: what was proved of them is over.
+
+        Whether that is news of one of them.
+        """
+        before = set(self._contradicted)
+        for one in found:
+            if (told := one.as_data()) is not None:
+                self._contradicted[int(told.parameters["span"])] = told
+        is_news = before != set(self._contradicted)
+        self.behind |= is_news
+        self._hold_against()
+        return is_news
+
+    def settle(self) -> bool:
+        """The disk knows which cells are contradicted. Takes its time: never in a period. False: not now."""
+        contradicted = dict(self._contradicted)
+        try:
+            if self.path is not None:
+                path = self.path.with_name(CONTRADICTED)
+                if contradicted:
+                    path.parent.mkdir(parents=True, exist_ok=True)
+                    written_beside(path, _FINDINGS.dump_json(contradicted) + b"\n", 0o644).replace(path)
+                else:
+                    path.unlink(missing_ok=True)
+        except OSError:
+            return False
+        self.behind = contradicted != self._contradicted
+        return True
 
     def status(self) -> WiringStatus:
         """For whoever looks on."""
@@ -105,9 +154,16 @@ class Wiring:
             drives=drives, cells=cells, watchdogs=watchdogs, answers=answers,
         )  # fmt: skip
 
-    def write(self, proof: WiringProof) -> None:
-        """On the disk when it returns. Takes its time: never in a period. Raises OSError."""
-        self._written = proof
+    def more_than(self, only: Collection[str]) -> list[Finding]:
+        """What speaks against proving nothing but the devices of `only` anew; empty: nothing else has changed."""
+        return more_than(only, self.proof, self._line, self._maps, self._serials or {})
+
+    def write(self, proof: WiringProof, only: Collection[str] = ()) -> None:
+        """On the disk when it returns. Takes its time: never in a period. Raises OSError.
+
+        Of it the devices of `only` were proved anew; empty: all.
+        """
+        self._written, self._anew = proof, frozenset(only)
         if self.path is None:
             return
         self.path.parent.mkdir(parents=True, exist_ok=True)
@@ -120,6 +176,10 @@ class Wiring:
         """
         assert self._written is not None
         self.proof, self._written = self._written, None
+        for cell in self._line.load_cells:
+            if not self._anew or cell.name in self._anew:
+                self._contradicted.pop(cell.span, None)
+        self.behind = True
         self._hold_against()
         nameless = ", ".join(one.device for one in self.proof.devices if not one.serial)
         unseen = f"; these tell no serial number, prove again when one is exchanged: {nameless}" if nameless else ""

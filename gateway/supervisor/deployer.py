@@ -14,7 +14,7 @@ from typing import Any
 
 from gateway.core.audit_record import Who
 from gateway.core.decisions import MOST_LISTED, Confirm, Decide, ProposalLine, ProposalList, ProposalShown, shown_hash
-from gateway.core.deployment import InService, Region, WiringStatus
+from gateway.core.deployment import InService, Region, WiringStatus, least_shown
 from gateway.core.finding import Finding, finding
 from gateway.core.judge_context import JudgeContext
 from gateway.core.line import Line
@@ -53,7 +53,7 @@ from gateway.supervisor.lifecycle import (
 from gateway.supervisor.on_the_line import OnTheLine
 from gateway.supervisor.peers import GATEWAY
 from gateway.supervisor.proposal_inbox import Inbox
-from gateway.supervisor.proposal_records import ProposalRecords, done, not_known, refused
+from gateway.supervisor.proposal_records import ProposalRecords, done, not_known, refused, refused_by
 from gateway.supervisor.small_changes import SmallChanges
 from gateway.supervisor.store import boot_id
 
@@ -227,21 +227,41 @@ class Deployer:
         )
 
     async def confirm(self, said: Confirm, who: Who) -> Reply:
-        """What is in service may be armed, though no record says how it came to be: a person knows it."""
-        if self._line.gate.approvals > 1 and (reason := why_no_person(who, self._own_uid)):
-            return refused("nothing is confirmed", [reason])
+        """A person answers for what is in service: an unjudged one that has shown itself, or one no record explains."""
+        told_apart = self._line.gate.approvals > 1 or self._roles()
+        if told_apart and why_no_person(who, self._own_uid):
+            return refused_by("nothing is confirmed", [finding("confirm-by-no-person", who=who.name)])
         async with self._records.one_step:
             try:
                 await self._on_the_line.look_after()
                 what = {"configuration": said.configuration, "because": said.because}
+                if missing := await self._not_shown(what):
+                    return refused_by("nothing is confirmed", missing)
                 await self._records.step(CONFIRMED, what, who)
                 self._on_the_line.settled = False  # the loop is told with the next look
             except (AuditUnavailable, Unreachable, Impossible) as error:
                 return refused("nothing is confirmed", [str(error)])
         return done(
-            f"{said.configuration[:12]} may be armed; it goes no further than a first configuration until one is "
+            f"{said.configuration[:12]} is confirmed; it goes no further than a first configuration until one is "
             "proposed for more, and approved"
         )
+
+    async def _not_shown(self, what: Mapping[str, Any]) -> list[Finding]:
+        """What a first configuration has not been seen to do since it controls the line. Raises as `settle`.
+
+        One that no record explains is not armed before it is confirmed: it cannot have shown anything.
+        """
+        hash_ = str(what["configuration"])
+        if hash_ == self.book.unexplained or self.book.why_not(CONFIRMED, what):
+            return []
+        found = await self._on_the_line.settle()
+        least_n, least_m_per_s = least_shown(self._line)
+        missing: list[Finding] = []
+        if not found.tension_moved:
+            missing.append(finding("move-not-shown", configuration=hash_[:12], least_n=least_n))
+        if not found.speed_changed:
+            missing.append(finding("speed-change-not-shown", configuration=hash_[:12], least_m_per_s=least_m_per_s))
+        return missing
 
     async def hold_against_records(self, within_s: float) -> str:
         """Why what the loop runs is not held against the records yet; empty: it is. Raises Unreachable.

@@ -7,6 +7,7 @@ from math import inf
 from typing import Any
 
 from gateway.core.audit_record import Who
+from gateway.core.finding import Finding
 from gateway.core.judge_context import JudgeContext
 from gateway.core.messages import Reply
 from gateway.core.proposal import Proposal
@@ -15,6 +16,7 @@ from gateway.core.verdict import Verdict
 from gateway.supervisor.audit_file import AuditUnavailable
 from gateway.supervisor.deployer_sides import AuditSide
 from gateway.supervisor.lifecycle import Book, Entry, Impossible, clock_fields
+from gateway.wording.catalogue import sentence
 
 
 class ProposalRecords:
@@ -87,6 +89,11 @@ def done(text: str) -> Reply:
 
 def refused(text: str, reasons: list[str]) -> Reply:
     return Reply(ok=False, state="", text=text, reasons=reasons)
+
+
+def refused_by(text: str, findings: list[Finding]) -> Reply:
+    reasons = [sentence(one) for one in findings]
+    return Reply(ok=False, state="", text=text, reasons=reasons, findings=findings)
 
 
 def not_known(text: str, reasons: list[str]) -> Reply:

@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 
 from tests.bench.figures import Bench
+from tests.bench.harm_cells import decimals, in_service, tared, zeroed_at_rest
 from tests.bench.harm_drives import drill_of_dead_watchdog, wrong_mode
 from tests.bench.harm_lines import DRAW_SPANS, Drawn, drawn
 from tests.bench.harm_runs import NEVER_S, NotStarted, Outcome, at_start, drawable, healthy, in_production, rest_bound_s
@@ -39,6 +40,7 @@ WIRED_RIGHT = "wired-right"  #: a line without a mistake: nothing may be found
 PROVED_WITHIN_S = 3000.0
 DRILLED_WITHIN_S = 5.0  #: of virtual time: named, and nothing else with it
 NO_WEB_S = 2.0  #: until it is told, from when the slack that may be there, and what radii leave open, is used up
+CELL_S = 1.0  #: from a cell that changes to the stop
 BREAK_S = 0.05  #: five periods: from a web break to the first reaction
 HEALTHY_ROWS = ("healthy", "healthy-draw")
 ON_DRAW_LINES = ("web-break-draw", "healthy-draw")  #: on lines with draw-controlled spans that nothing measures
@@ -127,6 +129,9 @@ ROWS = {
     ),
     "mode-wrong": Row(partial(wrong_mode, "mode-wrong"), 1.0),
     "watchdog-dead": Row(partial(drill_of_dead_watchdog, "watchdog-dead"), DRILLED_WITHIN_S),
+    "cell-tared": Row(partial(in_service, "cell-tared", fault=tared), CELL_S),
+    "cell-decimals": Row(partial(in_service, "cell-decimals", fault=decimals), CELL_S),
+    "cell-zeroed": Row(partial(zeroed_at_rest, "cell-zeroed"), 0.0),
     "cell-drift": Row(partial(in_production, "cell-drift", fault=_cell_drift, within_s=90.0), 60.0),
     # Named, and nothing else with it, before the proof is over: late is what was not.
     **{

@@ -276,7 +276,7 @@ def test_a_proof_that_is_cut_off_is_none_and_that_is_told(tmp_path):
 def test_what_is_kept_is_on_the_disk_and_proves_the_line(tmp_path):
     line = stepped(2).line
     wiring = Wiring(line, map_files(line), tmp_path)
-    wiring.write(wiring.proof_of(*shown_as_described(line), [], []))
+    wiring.write(wiring.proof_of(*shown_as_described(line), []))
     assert [each.code for each in wiring.against] == ["wiring-unproved"]  # before it takes effect
     wiring.take_written()
     again = Wiring(line, map_files(line), tmp_path)

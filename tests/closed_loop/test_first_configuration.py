@@ -7,8 +7,10 @@ from gateway.cli.stepped import SteppedLoop
 from gateway.control.design import design_lqg, design_lqi, design_pid, task_of
 from gateway.core.controller import Controller, config_hash
 from gateway.core.deployment import first_region
-from gateway.core.messages import Confirmed, SetSpeed, Start
+from gateway.core.messages import Confirmed, Hold, Operating, SelectRecipe, SetSpeed, SetTension, Start, Stop
+from gateway.core.signals import Inputs
 from gateway.core.states import LoopState, Phase
+from gateway.loop.machine import stop
 from gateway.loop.process import begin
 from safety.tensioning import longest_tensioning_s
 from tests.bench.harm_lines import drawn
@@ -118,6 +120,81 @@ def test_what_a_person_has_confirmed_is_guarded_as_a_first_one_no_more() -> None
     assert reply.ok and reply.in_service is not None and reply.in_service.confirmed
     assert loop.command(Confirmed(configuration=here)).ok  # again, as after a gateway's start
     assert loop.cycle.configurations.good is loop.cycle.configurations.running
+
+
+def shown(loop: SteppedLoop) -> tuple[bool, bool]:
+    """Whether what runs has followed a move of a tension and a change of the speed."""
+    found = loop.cycle.in_service()
+    return found.tension_moved, found.speed_changed
+
+
+def told(loop: SteppedLoop, *commands: Operating) -> SteppedLoop:
+    """One after the other, with three seconds after each."""
+    for command in commands:
+        assert loop.command(command).ok
+        loop.step(round(3.0 / loop.line.control.period_s))
+    return loop
+
+
+MOVE, SPEED = SetTension(span=2, tension_n=39.0), SetSpeed(speed_m_per_s=0.007)
+
+
+@pytest.mark.parametrize("shape", ["ramp", "minimum-jerk"])
+def test_a_move_and_a_change_of_speed_are_seen_once_they_have_come_to_their_end(shape: str) -> None:
+    line = LINE.model_copy(update={"moves": LINE.moves.model_copy(update={"shape": shape})})
+    loop = started(SteppedLoop(line, DESIGNS["lqi"], PLANT, 1))
+    assert shown(loop) == (False, False)  # by the tensioning of the web and the first ramp
+    told(loop, SetTension(span=2, tension_n=36.4), SetSpeed(speed_m_per_s=0.0095), Hold(), Start())
+    assert shown(loop) == (False, False)  # nor by what noise would hide, nor by a hold
+    assert loop.command(MOVE).ok
+    loop.step(20)
+    assert shown(loop) == (False, False)  # it is on its way
+    loop.step(300)
+    assert shown(loop) == (True, False)
+    told(loop, SPEED)
+    assert shown(loop) == (True, True)
+    told(loop, Stop())  # a person's: what has been seen was seen
+    assert loop.cycle.machine.state is LoopState.STOP and shown(loop) == (True, True)
+
+
+def test_a_step_is_a_move_and_a_recipe_is_both() -> None:
+    other = {"name": "b", "speed_m_per_s": 0.015, "tension_n": (TENSION_N + [3.0, 0.0, 0.0, 0.0, 0.0, 0.0]).tolist()}
+    line = LINE.model_copy(update={"recipes": [*LINE.recipes, LINE.recipes[0].model_copy(update=other)]})
+    loop = started(SteppedLoop(line, DESIGNS["lqi"], PLANT, 1))
+    told(loop, SetTension(span=2, tension_n=39.0, step=True))
+    assert shown(loop) == (True, False)
+    loop = told(started(SteppedLoop(line, DESIGNS["lqi"], PLANT, 1)), SelectRecipe(name="b"))
+    assert shown(loop) == (True, True)
+
+
+def test_a_stop_before_both_were_seen_begins_anew_and_so_does_whatever_stops_the_line_by_itself() -> None:
+    loop = told(started(SteppedLoop(LINE, DESIGNS["lqi"], PLANT, 1)), MOVE, Stop())
+    assert loop.cycle.machine.phase is Phase.OFF and shown(loop) == (False, False)
+    told(started(loop), SPEED)
+    assert shown(loop) == (False, True)
+    told(loop, SetTension(span=2, tension_n=36.0))
+    assert shown(loop) == (True, True)
+    told(loop, Stop())
+    assert loop.arm().ok
+    loop.cycle.change(stop(loop.cycle.machine, loop.now_s, "a drive does not become ready"))
+    loop.step(10)
+    assert loop.cycle.machine.state is LoopState.STOP and shown(loop) == (True, True)  # it led nothing
+    started(loop)
+    loop.cycle.change(stop(loop.cycle.machine, loop.now_s, "the line PLC does not answer"))
+    loop.step(300)
+    assert loop.cycle.machine.state is LoopState.STOP and shown(loop) == (False, False)
+
+
+def test_a_set_point_that_what_is_measured_does_not_follow_shows_nothing() -> None:
+    loop = started(SteppedLoop(LINE, DESIGNS["lqi"], PLANT, 1))
+    cycle = loop.cycle
+    stuck = cycle.inputs.tension.value.copy()
+    trial, inputs = cycle.configurations.trial, Inputs(LINE.n)
+    inputs.tension.value[:], inputs.unwind_speed.value[:] = stuck, cycle.setpoints.speed_m_per_s
+    cycle.setpoints.step_tension(1, 39.0, loop.now_s)
+    for _ in range(1000):
+        trial.step(cycle.machine, inputs, usable=True)
+    assert shown(loop) == (False, False)
 
 
 def test_what_a_loop_is_given_goes_no_further_than_a_first_configuration() -> None:

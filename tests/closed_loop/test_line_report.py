@@ -300,7 +300,8 @@ def test_a_line_on_which_nothing_was_ever_proposed_shows_what_controls_it(tmp_pa
     assert code == 0, said
     words = Page(text).words
     assert "Nothing has been proposed on this line: how it is controlled has not changed." in words
-    assert f"Initial {hash_[:12]}, epoch 0" in words and "Initial LQI" in words
+    assert f"Initial {hash_[:12]}, epoch 0, unconfirmed" in words and "Initial LQI" in words
+    assert f"Unconfirmed: {hash_[:12]} controls the line as a first configuration" in words
     assert "Caution: of alarms, and of tensions around deployments, nothing is told: there is no history at" in words
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from gateway.core.messages import Arm, Start, Stop
+from gateway.core.wiring_proof import WiringProof, proof_hash
 from gateway.loop.wiring import FILE
 from gateway.supervisor.audit_file import AuditFile
 from sim_plant.recording import Recording
@@ -69,6 +70,27 @@ def test_no_start_before_the_proof_and_one_after_it_also_of_a_loop_that_starts_a
         assert {event["roller"] for event in trips} == set(range(1, SPANS + 1))
         assert all(event["time_s"] < first_torque_s(recording) for event in trips)
         assert not recording.of_kind("unsafe")
+
+
+def test_one_drive_alone_is_proved_anew_and_the_line_starts(tmp_path):
+    with WireLine(tmp_path, spans=SPANS) as wire:
+        wire.start_gateway()
+        wire.start_loop()
+        wire.wait(lambda status: status.loop.running)
+        said = prove(wire, "--only", "drive-x")
+        assert said.returncode == 2 and "drive-" in said.stderr, said
+        assert wire.order(Stop()).ok
+        wire.wait(at_rest)
+        before = WiringProof.model_validate_json((tmp_path / "data" / FILE).read_text())
+        said = prove(wire, "--only", before.drives[0].drive)
+        assert said.returncode == 0, said
+        after = WiringProof.model_validate_json((tmp_path / "data" / FILE).read_text())
+        assert after.drives[1:] == before.drives[1:] and after.drives[0].torque_nm > 0.0
+        shown = wire.wait(lambda status: status.wiring is not None and status.wiring.proof == proof_hash(after))
+        assert not shown.unexplained
+        wire.arm_and_start()
+        assert wire.order(Stop()).ok
+        wire.wait(at_rest)
 
 
 def test_a_load_cell_that_shows_less_where_the_web_pulls_more_is_named_and_the_line_stays_unproved(tmp_path):

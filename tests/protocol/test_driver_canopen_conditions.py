@@ -297,6 +297,38 @@ def test_a_watchdog_whose_reaction_is_none_is_refused_by_name(tmp_path: Path, sa
     bench(body, changed_map(tmp_path, with_option(2, "false")))
 
 
+QUICK_STOP = 'quick_stop = {{ index = {index}, type = "i16", value = {value}, writable = true }}'
+
+
+@pytest.mark.parametrize(
+    ("quick_stop", "named"),
+    [
+        ("", "options.quick_stop: is missing"),
+        (QUICK_STOP.format(index="0x605A", value=6), "options.quick_stop.value: 6"),
+        (QUICK_STOP.format(index="0x605E", value=2), "options.quick_stop.index: 0x605e"),
+    ],
+)
+def test_a_map_whose_drive_reacts_by_a_quick_stop_says_that_it_ends_without_torque(
+    tmp_path: Path, quick_stop: str, named: str
+) -> None:
+    shipped, reacts = with_option(3, "true")
+    assert named in refusal_of(changed_map(tmp_path, (shipped, f"{reacts}\n{quick_stop}")))
+
+
+@pytest.mark.parametrize("value", [0, 4])
+def test_a_drive_that_reacts_by_a_quick_stop_is_told_to_leave_it(tmp_path: Path, value: int) -> None:
+    async def body(link: CanopenLink, drives: Drives, drive: Drive) -> None:
+        drive.objects[0x605A, 0] = struct.pack("<h", 6)
+        drive.objects[0x6007, 0] = struct.pack("<h", 0)
+        await link.prepare()
+        assert drive.objects[0x605A, 0] == struct.pack("<h", value)
+        assert drive.objects[0x6007, 0] == struct.pack("<h", 3)
+
+    shipped, reacts = with_option(3, "true")
+    quick_stop = QUICK_STOP.format(index="0x605A", value=value)
+    bench(body, changed_map(tmp_path, (shipped, f"{reacts}\n{quick_stop}")))
+
+
 def refusal_of(folder: Path) -> str:
     with pytest.raises(MapRefused) as refusal:
         load_map(folder / "cia402-torque.toml")

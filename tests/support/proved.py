@@ -20,10 +20,10 @@ def proof_of_wiring(line: Line, *, serials: bool = True) -> WiringProof:
     buses = {bus.name for bus in line.buses if isinstance(bus, CanopenBus)} if serials else set[str]()
     numbers = {each.name: f"{SERIAL_OF_NODE_0 + each.address:#x}" for each in devices_of(line) if each.bus in buses}
     maps = map_files(line)
-    drives, cells = shown_as_described(line)
+    drives, cells, watchdogs = shown_as_described(line)
     return WiringProof(
         wiring=wiring_hash(line, maps, numbers), wall_s=0.0, devices=device_identities(line, maps, numbers),
-        drives=drives, cells=cells, watchdogs=[],
+        drives=drives, cells=cells, watchdogs=watchdogs,
     )  # fmt: skip
 
 

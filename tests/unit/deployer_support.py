@@ -127,6 +127,7 @@ class FakeLoop:
         self.narrows = True
         self.watches: list[tuple[str, RecoveryPrediction | None]] = []  #: by command
         self.watched = self.good_watched = False
+        self.tension_moved = self.speed_changed = False  #: what the configuration has shown
         self.confirmed: set[str] | None = None  #: hashes, of a loop that guards what nobody has confirmed
         self.watch_refusal = ""  #: why it does not take a watch of what is good
 
@@ -170,6 +171,7 @@ class FakeLoop:
             good_if_kept=self.good if self.runs in self.predictive else self.runs,
             region=self.region, watched=self.watched, why=self.why,
             confirmed=self.confirmed is None or self.runs in self.confirmed,
+            tension_moved=self.tension_moved, speed_changed=self.speed_changed,
         )  # fmt: skip
 
     def go_back(self, why: str) -> None:

@@ -124,6 +124,48 @@ def test_a_head_is_read_as_it_was_printed() -> None:
     assert str(parse_head(f" 17:{HASH}\n")) == f"17:{HASH}"
 
 
+LOG = "Nov 22 r2rgate[7]: audit head: {}\nNov 22 r2rgate[7]: configuration 7:" + HASH + " is odd\n"
+
+
+@pytest.mark.parametrize(
+    "printed",
+    [
+        "{}", "  {}  \r\nbelow it\n", "#a note\n{}", LOG, '{{"audit_head": "{}", "alarms": []}}',
+        '{{\n  "audit_head":"{}"\n}}', "<dt>Head of the audit</dt>\n<dd><code>{}</code></dd>",
+        "  1 blobs; last record: {}",
+    ],
+)  # fmt: skip
+def test_a_file_that_has_a_head_stands_for_the_last_one_in_it(tmp_path: Path, printed: str) -> None:
+    data = tmp_path / "data"
+    audit_of(data, ["one"])
+    head = audit_of(data, ["two"])
+    file = tmp_path / "noted"
+    file.write_text(f"audit head: 1:{HASH}\n" + printed.format(head))
+    code, said = verified(data, str(file))
+    assert code == 0 and f"it contains {head}" in said, said
+    file.write_text(printed.format(head) + f"\naudit head: 1:{HASH}\n")
+    assert verified(data, str(file))[0] == 1
+
+
+@pytest.mark.parametrize("content", ["", "nothing", f"3:{HASH[:-1]}", f"3:{HASH}0", f"record 3:{HASH} is not one"])
+def test_a_file_without_a_head_is_refused_with_what_is_allowed(tmp_path: Path, content: str) -> None:
+    audit_of(tmp_path, ["one"])
+    (tmp_path / "noted").write_text(content)
+    code, said = verified(tmp_path, str(tmp_path / "noted"))
+    assert code == 2 and "NUMBER:HASH" in said and "all 64 digits" in said
+
+
+def test_what_is_there_and_no_file_is_refused_and_a_file_goes_before_a_head(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    head = audit_of(tmp_path, ["one"])
+    code, said = verified(tmp_path, str(tmp_path))
+    assert code == 2 and "cannot be read" in said
+    monkeypatch.chdir(tmp_path)
+    Path(f"3:{HASH}").write_text(head)
+    assert verified(tmp_path, f"3:{HASH}")[0] == 0
+
+
 class Told:
     """A state that a test sets, a clock, and what was told."""
 

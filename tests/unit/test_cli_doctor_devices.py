@@ -118,7 +118,7 @@ def test_a_watchdog(watchdog: WatchdogFacts, verdict: Verdict, says: str) -> Non
         (CELL._replace(samples_n=(100.0, 99.9)), "warning", "99.95 N"),
         (CELL._replace(samples_n=(100.1, 99.9)), "FAIL", "100.00 N"),
         (CELL._replace(samples_n=(-100.1, -99.9)), "FAIL", "-100.00 N"),
-        (CELL._replace(samples_n=(-3.1, -3.2)), "warning", "a slack web shows at most 2.9 N"),
+        (CELL._replace(samples_n=(-3.1, -3.2)), "FAIL", "a slack web shows at most 2.9 N"),
         (CELL._replace(samples_n=(3.1, 3.2)), "warning", "a slack web shows at most 2.9 N"),
         (CELL._replace(samples_n=(-2.8, -2.7)), "OK", "-2.75 N"),
         (CELL._replace(samples_n=(3.4, 2.8)), "OK", "3.10 N"),  # its noise leaves it open

@@ -8,7 +8,7 @@ from gateway.core.decisions import Confirm
 from gateway.core.deployment import Region, first_region
 from gateway.mailbox.port import Unreachable
 from gateway.supervisor.lifecycle import book_of
-from tests.unit.deployer_gateway import LINE, PROBATION_S, Gateway, deployed, run, started
+from tests.unit.deployer_gateway import LINE, OPERATORS_UID, PROBATION_S, Gateway, deployed, run, started
 from tests.unit.deployer_support import FIRST, Death, FakeLoop, hash_of, proposal
 
 STRANGE = "5" * 64
@@ -297,6 +297,7 @@ async def test_a_first_configuration_is_told_until_a_person_confirms_it_and_each
     assert found.code == "configuration-unconfirmed" and found.parameters["configuration"] == first[:12]
     assert not gateway.deployer.unexplained and not loop.confirmed
     said = Confirm(configuration=first, because="it has held for a week")
+    loop.tension_moved = loop.speed_changed = True
     assert (await gateway.deployer.confirm(said, ANNA)).ok
     await look(gateway)
     assert loop.confirmed == {first} and not gateway.deployer.unconfirmed
@@ -305,6 +306,40 @@ async def test_a_first_configuration_is_told_until_a_person_confirms_it_and_each
     gateway.begin()  # and so is the gateway
     await look(gateway)
     assert loop.confirmed == {first} and not gateway.deployer.unconfirmed
+
+
+@run
+async def test_a_first_configuration_is_confirmed_only_after_a_move_and_a_speed_change():
+    gateway = await started()
+    loop, said = gateway.loop, Confirm(configuration=config_hash(FIRST), because="it holds")
+    loop.confirmed = set()
+    await look(gateway)
+    both = ["move-not-shown", "speed-change-not-shown"]
+    for moved, changed, missing in ((False, False, both), (True, False, both[1:]), (False, True, both[:1])):
+        loop.tension_moved, loop.speed_changed = moved, changed
+        reply = await gateway.deployer.confirm(said, ANNA)
+        assert not reply.ok and [one.code for one in reply.findings] == missing
+        assert len(reply.reasons) == len(missing) and gateway.deployer.unconfirmed
+    assert "confirmed" not in gateway.audit.kinds and not loop.confirmed
+    loop.tension_moved = loop.speed_changed = True
+    loop.reachable = False  # what it has shown is asked for anew, and not remembered
+    assert not (await gateway.deployer.confirm(said, ANNA)).ok
+    loop.reachable = True
+    assert (await gateway.deployer.confirm(said, ANNA)).ok and not gateway.deployer.unconfirmed
+
+
+@run
+async def test_where_the_line_has_people_one_of_them_confirms():
+    gateway = await started()
+    loop, said = gateway.loop, Confirm(configuration=config_hash(FIRST), because="it holds")
+    loop.confirmed, loop.tension_moved, loop.speed_changed = set(), True, True
+    await look(gateway)
+    gateway.roles = {"anna": "engineer"}
+    for nobody in (Who(name="root", uid=0, pid=1), Who(name="r2rgate", uid=OPERATORS_UID, pid=1)):
+        reply = await gateway.deployer.confirm(said, nobody)
+        assert not reply.ok and [one.code for one in reply.findings] == ["confirm-by-no-person"]
+    assert gateway.deployer.unconfirmed
+    assert (await gateway.deployer.confirm(said, ANNA)).ok
 
 
 @run

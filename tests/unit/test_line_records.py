@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from gateway.cli.line_records import LineRecords, read_records, verdicts_in
+from gateway.cli.line_records import LineRecords, read_records, unconfirmed_in, verdicts_in
 from gateway.cli.report import Story
 from gateway.cli.report_adaptations import adaptations_section, changes_of, named_of, proposals_section, started_with
 from gateway.core.audit_record import Who, head_of
@@ -216,3 +216,16 @@ def test_without_an_audit_there_is_nothing_but_that(tmp_path: Path) -> None:
     records = read_records(tmp_path)
     assert not records.found.sound and records.proposals == [] and verdicts_in(tmp_path) == {}
     assert list(tmp_path.iterdir()) == []
+
+
+def test_who_answers_for_what_is_in_service_is_told_until_somebody_does(tmp_path: Path) -> None:
+    recording = Recording(tmp_path)
+    (said,) = unconfirmed_in(read_records(tmp_path).book)
+    assert said.startswith("Unconfirmed: ") and BASE[:12] in said and "r2rgate confirm" in said
+    recording.append("confirmed", ANNA, {"configuration": BASE, "because": "it holds"})
+    assert unconfirmed_in(read_records(tmp_path).book) == []
+    other = {"configuration": "5" * 64, "last_known_good": BASE, "epoch": 3, "explained": False, "confined": True}
+    recording.append("found-in-service", GATEWAY, other)
+    (said,) = unconfirmed_in(read_records(tmp_path).book)
+    assert "no record says" in said
+    assert recording.audit.close()

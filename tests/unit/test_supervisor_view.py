@@ -97,6 +97,16 @@ def test_agents_are_shown_or_that_their_bus_is_closed_and_the_screen_still_fits(
     ]
 
 
+def test_the_audits_head_is_one_row_that_says_where_the_whole_of_it_is_and_the_screen_still_fits() -> None:
+    known = running(20).model_copy(update={"audit_head": f"301:{'39' * 32}"})
+    lines = text_of(known, 80, 24)
+    assert len(lines) <= 24 and max(map(len, lines)) <= 80
+    assert [line.split() for line in lines if line.startswith("audit")] == [
+        ["audit", "head", "301:393939393939...", "(--json", "has", "it", "whole)"]
+    ]
+    assert not [line for line in text_of(running(20), 80, 24) if line.startswith("audit")]
+
+
 def test_the_reason_of_the_newest_state_is_told_to_its_end() -> None:
     bench = Bench(6)
     bench.run_loop(100, spans=6)

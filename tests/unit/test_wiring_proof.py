@@ -14,6 +14,8 @@ from gateway.core.wiring_proof import (
     WiringProof,
     device_identities,
     devices_of,
+    merged,
+    more_than,
     why_not_proved,
     wiring_hash,
 )
@@ -24,10 +26,10 @@ SERIALS = {"drive-1": "4711", "drive-2": "4712"}
 
 
 def proof(line: Line = LINE, maps=MAPS, serials=SERIALS) -> WiringProof:
-    drives, cells = shown_as_described(line)
+    drives, cells, watchdogs = shown_as_described(line)
     return WiringProof(
         wiring=wiring_hash(line, maps, serials), wall_s=1.8e9, devices=device_identities(line, maps, serials),
-        drives=drives, cells=cells, watchdogs=[],
+        drives=drives, cells=cells, watchdogs=watchdogs,
     )  # fmt: skip
 
 
@@ -158,6 +160,76 @@ def test_a_person_may_answer_for_a_load_cell_that_no_drive_could_show():
     assert codes(why_not_proved(of_another, LINE, MAPS, SERIALS)) == [("device-unshown", CELL)]
     unseen = factor.model_copy(update={"question": "cell-unseen"})
     assert why_not_proved(partial.model_copy(update={"answers": [unseen]}), LINE, MAPS, SERIALS) == []
+
+
+@pytest.mark.parametrize("name", [LINE.drives[0].name, LINE.plc.name])
+def test_a_proof_that_was_kept_without_the_drill_of_a_device_is_none(name):
+    watchdogs = [one for one in proof().watchdogs if one.device != name]
+    undrilled = proof().model_copy(update={"watchdogs": watchdogs})
+    assert codes(why_not_proved(undrilled, LINE, MAPS, SERIALS)) == [("watchdog-unshown", name)]
+    assert more_than([DRIVE], undrilled, LINE, MAPS, SERIALS) == [], "the drill that comes before it has all devices"
+
+
+# Few devices are proved anew
+
+
+def mapped_anew() -> Line:
+    """The second drive is of another make: the file names another map for it."""
+    return changed("drives", 1, map="cia402-torque" if LINE.drives[1].map != "cia402-torque" else "other-torque")
+
+
+@pytest.mark.parametrize(
+    ("line", "maps", "serials"),
+    [
+        (LINE, MAPS, SERIALS),  # tells no number: a person says that it is another one
+        (LINE, MAPS, SERIALS | {DRIVE: "4799"}),
+        (LINE, MAPS, {"drive-1": "4711"}),
+        (mapped_anew(), MAPS | {mapped_anew().drives[1].map: b"another map"}, SERIALS | {DRIVE: "4799"}),
+    ],
+    ids=["nothing", "number", "no number", "map"],
+)
+def test_what_is_named_may_have_been_exchanged(line, maps, serials):
+    assert more_than([DRIVE], proof(), line, maps, serials) == []
+    # and for any other one what differs is named
+    others = codes(more_than([CELL], proof(), line, maps, serials))
+    assert len(others) == (why_not_proved(proof(), line, maps, serials) != [])
+
+
+@pytest.mark.parametrize(
+    ("line", "maps", "serials", "found"),
+    [
+        (LINE, MAPS, SERIALS | {DRIVE: "4799", "drive-1": "4798"}, ("device-exchanged", "drive-1")),
+        (changed("load_cells", 1, address=99), MAPS, SERIALS | {DRIVE: "4799"}, ("wiring-changed", None)),
+        (changed("drives", 1, channel=2), MAPS, SERIALS, ("wiring-changed", None)),
+        (changed("drives", 1, direction="reversed"), MAPS, SERIALS, ("wiring-changed", None)),
+        (changed("limits", watchdog_s=0.15), MAPS, SERIALS, ("wiring-changed", None)),
+    ],
+    ids=["another number", "node of a cell", "its own channel", "its own direction", "deadline"],
+)
+def test_whatever_else_has_changed_asks_for_a_whole_proof(line, maps, serials, found):
+    assert codes(more_than([DRIVE], proof(), line, maps, serials)) == [found]
+
+
+def test_a_map_that_others_have_too_asks_for_them():
+    name = LINE.drives[1].map
+    found = more_than([DRIVE], proof(), LINE, MAPS | {name: b"edited"}, SERIALS)
+    assert codes(found) == [("map-changed", drive.name) for drive in LINE.drives if drive.name != DRIVE]
+
+
+def test_there_is_nothing_to_add_to_without_a_proof_or_with_one_that_leaves_something_out():
+    assert codes(more_than([DRIVE], None, LINE, MAPS, SERIALS)) == [("wiring-unproved", None)]
+    partial = leaving_out(drives=None, cells=None)
+    assert codes(more_than([DRIVE], partial, LINE, MAPS, SERIALS)) == [("device-unshown", CELL)]
+
+
+def test_of_what_is_named_nothing_old_stays_and_of_others_everything():
+    asked = [Answer(question=code, device=name, by="then") for name in (DRIVE, CELL) for code in ("cell-unseen",)]
+    before = proof().model_copy(update={"answers": asked})
+    drive = before.drives[1].model_copy(update={"torque_nm": 2.0})
+    now = Answer(question="drive-torque-unseen", device=DRIVE, by="now")
+    drives, cells, answers = merged(before, [DRIVE], [drive], [], [now])
+    assert drives == [before.drives[0], drive, before.drives[2]] and cells == before.cells
+    assert answers == [asked[1], now]
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -1.0, "0.1"])
