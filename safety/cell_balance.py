@@ -8,7 +8,7 @@ line does in between:
 with each parameter anywhere in its tolerance, and a dry friction (`gateway.core.tension_estimate`). A cell that shows
 d too much contradicts both rollers of its span by d, in the same direction; a drive, an encoder or a bearing that is
 not as it should be contradicts two cells, each from one side, and blames none. Nothing is known of the unwinder's
-torque: cell 1 is told by roller 1 alone, later, and only where cell 2 is not to blame.
+torque: cell 1 is told by roller 1 alone, later, where roller 2 excludes that it is cell 2; it may be drive 1 as well.
 
 Windows are compared twice: as they are, which finds a cell whose zero was wrong when control began, as far as friction
 and zeros leave it open; and with what was before, which finds a zero, a factor or decimals that change while the line
@@ -31,6 +31,7 @@ BLOCK_MOMENTS = 10.0  #: that samples are averaged over
 WINDOWS = (1, 4, 16)  #: blocks: soon where noise allows, within a second, and as exactly as heavy rollers need
 EACH = (1, 1, 2)  #: so many blocks a window is looked at
 LOOKS = (3, 2, 2)  #: in a row, at one window, until a cell is told
+END_SAMPLES = 3  #: whose mean stands for the end of a block
 ALONE = 2  #: times as many for cell 1
 SURELY = 0.15  #: of a span's tension band, beyond all noise: one look counts for all
 STEADY = 4  #: blocks, from which on a window is looked at as it is
@@ -97,7 +98,9 @@ class CellState:
     residual_n: FloatArray = field(default_factory=lambda: np.zeros(0))  #: of the block before
     usual_n: FloatArray = field(default_factory=lambda: np.zeros(0))  #: by which residuals differ
     waiting: list[int] = field(default_factory=list[int])  #: windows that are still to be looked at
-    beyond: CountArray = field(default_factory=lambda: np.zeros((0, 0), np.int64))  #: (windows, n), looks in a row
+    beyond: CountArray = field(
+        default_factory=lambda: np.zeros((0, 0), np.int64)
+    )  #: (windows, n), looks in a row, negative where less is shown
 
 
 def find_contradicted(limits: CellLimits, state: CellState, inputs: Inputs, applied_nm: FloatArray) -> list[Finding]:
@@ -137,7 +140,7 @@ def _end_block(limits: CellLimits, state: CellState) -> None:
     means, ends = state.means, state.ends
     means[:-1], ends[:-1] = means[1:], ends[1:]
     means[-1] = state.block.mean(axis=0)
-    ends[-1] = state.block[-1]
+    ends[-1] = state.block[-END_SAMPLES:].mean(axis=0)  # of one that is torn little is left
     state.in_block = 0
     state.blocks += 1
     state.waiting = [k for k, blocks in enumerate(WINDOWS) if state.blocks >= blocks and state.blocks % EACH[k] == 0]
@@ -151,7 +154,7 @@ def _end_block(limits: CellLimits, state: CellState) -> None:
 
 
 def _look(limits: CellLimits, state: CellState, window: int) -> list[Finding]:
-    """At one window, as it is where it is the longest, and beside what was before it."""
+    """At one window, as it is unless it is short, and beside what was before it."""
     blocks = WINDOWS[window]
     now, change = state.means[-blocks:].mean(axis=0), state.ends[-1] - state.ends[-1 - blocks]
     window_s = blocks * limits.block_s
@@ -173,13 +176,13 @@ def _look(limits: CellLimits, state: CellState, window: int) -> list[Finding]:
         changed_n = _off_n(limits, limits.changes, now - before, acceleration, noise_n, lag_n, BAND_SHARE, CHANGE_SHARE)
         off_n = np.where(off_n == 0.0, changed_n, off_n)
     counts = state.beyond[window]
-    counted = np.where(np.abs(off_n) > SURELY * limits.band_n, LOOKS[window], 1)
-    counts[:] = np.where(off_n == 0.0, 0, counts + counted)
+    counted = np.sign(off_n).astype(np.int64) * np.where(np.abs(off_n) > SURELY * limits.band_n, LOOKS[window], 1)
+    counts[:] = np.where(counts * counted > 0, counts + counted, counted)
     if not np.count_nonzero(counts):
         return []
     needed = np.full(len(counts), LOOKS[window])
     needed[0] *= ALONE
-    spans = np.flatnonzero(counts >= needed).tolist()
+    spans = np.flatnonzero(np.abs(counts) >= needed).tolist()
     shown_n = state.ends[-1, _TENSION]
     return [found(CODE, Action.BRAKE, span=i + 1, shown_n=shown_n.item(i), off_n=off_n.item(i)) for i in spans]
 

@@ -53,6 +53,7 @@ from safety.limits import envelope_limits
 READ_SHARE = 0.5  #: of a period, for samples to arrive; the rest is for control and writing
 _ENABLED = int(DriveState.ENABLED)
 _BAD = int(Quality.BAD)
+LONGEST_GAP = 2  #: periods without samples, until averages of forces begin anew
 STILL_ON_PERIODS = 10  #: a drive that is told OFF and still says ENABLED is told to stop quickly
 
 CONTROLLED = (Phase.TENSIONING, Phase.RUNNING, Phase.HOLDING, Phase.SLOWING)
@@ -314,9 +315,8 @@ class Cycle:
         if self.machine.resumes:  # its rollers are controlled
             return local
         turning = self.standstill.turning(self.inputs, self.clock())
-        against = (
-            turning if self.machine.proves else [*turning, *self.watch.below_zero(self.inputs)]
-        )  # a proof names it
+        below_zero = [] if self.machine.proves else self.watch.below_zero(self.inputs)  # a proof names them
+        against = [*turning, *below_zero]
         return local + [Finding(data.code, Action.NONE, sentence(data), data.parameters) for data in against]
 
     def change(self, machine: Machine) -> None:
@@ -371,7 +371,7 @@ class Cycle:
         below_zero = run(ZEROS, [], self.watch.find_below_zero, self.inputs)
         if phase in BEFORE_RUNNING and self.inputs.plc.local:
             seen.findings.append(found("line-local", Action.STOP))
-        if phase not in TRANSPORTING:
+        if phase not in CONTROLLED or max(self.account.held, tick.skipped) > LONGEST_GAP:
             self.watch.forget_balance()
         if supervision.feedback:
             seen.findings.extend(jumps)
@@ -381,7 +381,7 @@ class Cycle:
                 set_n, find = self.setpoints.tension_n, self.watch.find_estimated
                 seen.findings.extend(run(ESTIMATE, [], find, self.inputs, acted_nm, set_n, floor=floor))
                 seen.findings.extend(below_zero)
-                if phase in TRANSPORTING:  # also while it brakes: a cell that fell to nothing looked like a broken web
+                if phase in CONTROLLED:
                     seen.findings.extend(run(CELLS, [], self._find_contradicted, acted_nm))
                 if phase is Phase.TENSIONING:
                     target_n = self.setpoints.tension_target_n
@@ -391,8 +391,8 @@ class Cycle:
     def _find_contradicted(self, applied_nm: FloatArray) -> list[Finding]:
         """Their proof holds no more: only `prove` leads back."""
         found = self.watch.find_contradicted(self.inputs, applied_nm, doubted=self.torque_path.any_lost())
-        if found and self.wiring.contradict(found) and self.machine.phase is Phase.BRAKING:
-            self._alarm(found)  # its phase does not change, so that nobody would hear of it
+        if found:
+            self.wiring.contradict(found)
         return found
 
     def _reject_jumps(self, supervision: Supervision) -> list[Finding]:

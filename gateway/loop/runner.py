@@ -4,6 +4,7 @@ import asyncio
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 from gateway.core.controller import ControllerRefused
 from gateway.core.finding import Finding
@@ -87,8 +88,7 @@ class Runner:
         self._carry_out_waiting(tick.now_s)
         await self.cycle.period(tick)
         self._persistence.look()
-        if self.cycle.wiring.behind and (self._settling is None or self._settling.done()):
-            self._settling = asyncio.create_task(self._settle_wiring())
+        self._begin_to_settle()
         self._passed.set()
         self._passed.clear()  # whoever waited goes on all the same
 
@@ -133,8 +133,9 @@ class Runner:
             if not (answer := waiting.answer).done():
                 answer.set_result(self.refused("the loop is ending"))
         await self.persisted(within_s)
+        await self._wiring_settled(within_s)
         if self._settling is not None:
-            await end(self._settling)  # what is being written is written to its end
+            await end(self._settling)
 
     async def persisted(self, within_s: float) -> str:
         """Once the disk has what was decided last; else why it has not. Empty: it has."""
@@ -220,6 +221,7 @@ class Runner:
             return self.refused(f"nothing could be kept at {cycle.wiring.path}: {error.strerror or error}")
         reply = await self._at_boundary(command)
         if reply.ok:
+            await self._wiring_settled(PERSISTED_S)
             cycle.tell("wiring-proved", reply.text, proof=proof.model_dump(mode="json"))
         return reply
 
@@ -343,11 +345,24 @@ class Runner:
         await release_links(cycle)
         return not_armed(cycle, reasons)
 
+    def _begin_to_settle(self) -> None:
+        if self.cycle.wiring.behind and (self._settling is None or self._settling.done()):
+            self._settling = asyncio.create_task(self._settle_wiring())
+
     async def _settle_wiring(self) -> None:
+        """Until the disk knows which load cells are contradicted."""
         wiring = self.cycle.wiring
         while wiring.behind:
-            if not await self._disk.do(wiring.settle):
+            wiring.behind, contradicted = False, wiring.contradicted
+            if not await self._disk.do(partial(wiring.settle, contradicted)):
+                wiring.behind = True
                 await asyncio.sleep(AGAIN_S)
+
+    async def _wiring_settled(self, within_s: float) -> None:
+        """Once it does, or after `within_s`."""
+        self._begin_to_settle()
+        if self._settling is not None:
+            await asyncio.wait([self._settling], timeout=within_s)
 
     def _look_at_wiring(self) -> None:
         """The devices have been prepared. Whoever looks on need not wait until they ask whether it is proved still."""

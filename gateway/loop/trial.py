@@ -103,7 +103,8 @@ class Trial:
             return
         asked_n = now.target_n - first.target_n
         gone = (now.tension_n - first.tension_n) * np.sign(asked_n) >= GONE_ALONG * np.abs(asked_n)
-        gone |= self._measured == 0.0  # a span without a load cell shows nothing that could be asked for
+        if not self._measured.any():  # then nothing shows that it went along
+            gone[:] = True
         self.tension_moved |= bool(np.any(gone & (np.abs(asked_n) >= self._least_n)))
         asked_m_per_s = now.target_m_per_s - first.target_m_per_s
         gone_m_per_s = now.speed_m_per_s - first.speed_m_per_s

@@ -48,8 +48,9 @@ class Wiring:
         self._written: WiringProof | None = None
         self._anew: frozenset[str] = frozenset()  #: devices that it proves anew; empty: all
         self.unusable: list[actions.Finding] = []  #: a file that `read` could not use, for the line's events
-        self._contradicted: dict[int, Finding] = {}  #: by span, load cells that were, since they were proved
+        self.contradicted: dict[int, Finding] = {}  #: by span, load cells that were, since they were proved
         self.behind = False  #: the disk does not know of all of them, or still of one that is proved anew
+        self._unproved: list[Finding] = []  #: what else speaks against it
         self.against: list[Finding] = []  #: what speaks against closing the loop on it; empty: it is proved
         self._hold_against()
 
@@ -72,7 +73,9 @@ class Wiring:
     def _read_contradicted(self, path: Path, say: Callable[[str], None]) -> None:
         """A file that is not used stood for a cell that nobody has looked at: nothing is proved then."""
         try:
-            self._contradicted = _FINDINGS.validate_json(read_bytes(path, MOST_BYTES))
+            found_ = _FINDINGS.validate_json(read_bytes(path, MOST_BYTES))
+            spans = {cell.span for cell in self._line.load_cells}
+            self.contradicted = {span: one for span, one in found_.items() if span in spans}
         except FileNotFoundError:
             return
         except (OSError, ValidationError) as error:
@@ -94,37 +97,34 @@ class Wiring:
         serials = self._serials
         if serials is None:  # until they are known they may be those that were proved
             serials = {} if self.proof is None else {one.device: one.serial for one in self.proof.devices}
-        unproved = why_not_proved(self.proof, self._line, self._maps, serials)
-        self.against = [*unproved, *self._contradicted.values()]
+        self._unproved = why_not_proved(self.proof, self._line, self._maps, serials)
+        self.against = [*self._unproved, *self.contradicted.values()]
 
     def contradict(self, found: Iterable[actions.Finding]) -> bool:
         """Load cells show what torques and the cells beside them say is not so: what was proved of them is over.
 
         Whether that is news of one of them.
         """
-        before = set(self._contradicted)
-        for one in found:
-            if (told := one.as_data()) is not None:
-                self._contradicted[int(told.parameters["span"])] = told
-        is_news = before != set(self._contradicted)
-        self.behind |= is_news
-        self._hold_against()
-        return is_news
+        told = {int(one.parameters["span"]): one for each in found if (one := each.as_data()) is not None}
+        news = {span: one for span, one in told.items() if span not in self.contradicted}
+        if news:  # the numbers are those that stopped the line
+            self.contradicted = self.contradicted | news
+            self.behind = True
+            self.against = [*self._unproved, *self.contradicted.values()]  # no hash is made within a period
+        return bool(news)
 
-    def settle(self) -> bool:
-        """The disk knows which cells are contradicted. Takes its time: never in a period. False: not now."""
-        contradicted = dict(self._contradicted)
+    def settle(self, contradicted: Mapping[int, Finding]) -> bool:
+        """The disk knows which cells are contradicted. Takes its time: never in a period. False: it does not."""
         try:
             if self.path is not None:
                 path = self.path.with_name(CONTRADICTED)
                 if contradicted:
                     path.parent.mkdir(parents=True, exist_ok=True)
-                    written_beside(path, _FINDINGS.dump_json(contradicted) + b"\n", 0o644).replace(path)
+                    written_beside(path, _FINDINGS.dump_json(dict(contradicted)) + b"\n", 0o644).replace(path)
                 else:
                     path.unlink(missing_ok=True)
         except OSError:
             return False
-        self.behind = contradicted != self._contradicted
         return True
 
     def status(self) -> WiringStatus:
@@ -176,10 +176,10 @@ class Wiring:
         """
         assert self._written is not None
         self.proof, self._written = self._written, None
-        for cell in self._line.load_cells:
-            if not self._anew or cell.name in self._anew:
-                self._contradicted.pop(cell.span, None)
-        self.behind = True
+        proved = {cell.span for cell in self._line.load_cells if cell.name in self._anew}
+        left = {span: one for span, one in self.contradicted.items() if self._anew and span not in proved}
+        self.behind |= left != self.contradicted
+        self.contradicted = left
         self._hold_against()
         nameless = ", ".join(one.device for one in self.proof.devices if not one.serial)
         unseen = f"; these tell no serial number, prove again when one is exchanged: {nameless}" if nameless else ""

@@ -64,7 +64,7 @@ def zeroed_at_rest(row: str, seed: int) -> Outcome:
     reply = loop.arm()
     outcome = watched.outcome(0.0)
     codes = [one.code for one in reply.findings]
-    refused = not reply.ok and loop.cycle.machine.phase is Phase.SILENT
+    refused = "load-cell-below-zero" in codes and loop.cycle.machine.phase is Phase.SILENT
     return replace(outcome, code=codes[0] if codes else "", found_s=0.0 if refused else NEVER_S, note=reply.text)
 
 

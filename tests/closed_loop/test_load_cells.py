@@ -79,13 +79,13 @@ def test_on_a_stiff_web_where_any_jump_may_be_true_torques_name_the_cell(seed, s
     assert np.sign(told[0].parameters["off_n"]) == np.sign(share)
     assert loop.step_until(Phase.OFF, loop.line.longest_stop_s)
     assert [one.code for one in wiring.against] == [CODE]
-    assert wiring.settle() and not wiring.behind
+    assert wiring.behind and wiring.settle(wiring.contradicted)
     anew = Wiring(loop.line, {}, tmp_path)
     anew.read(lambda text: None)
     assert CODE in [one.code for one in anew.against]
     wiring.write(wiring.proof)
     wiring.take_written()
-    assert not wiring.against and wiring.settle() and not (tmp_path / CONTRADICTED).exists()
+    assert not wiring.against and wiring.settle(wiring.contradicted) and not (tmp_path / CONTRADICTED).exists()
 
 
 @pytest.mark.parametrize("span", [1, 4])
