@@ -50,6 +50,7 @@ class Wiring:
         self.unusable: list[actions.Finding] = []  #: a file that `read` could not use, for the line's events
         self.contradicted: dict[int, Finding] = {}  #: by span, load cells that were, since they were proved
         self.behind = False  #: the disk does not know of all of them, or still of one that is proved anew
+        self._unread = False  #: the file of those could not be used
         self._unproved: list[Finding] = []  #: what else speaks against it
         self.against: list[Finding] = []  #: what speaks against closing the loop on it; empty: it is proved
         self._hold_against()
@@ -79,9 +80,10 @@ class Wiring:
         except FileNotFoundError:
             return
         except (OSError, ValidationError) as error:
-            self.proof = None
-            self.unusable.append(found("file-unusable", Action.NONE, file=str(path), reason=type(error).__name__))
-            say(f"{path} is not used, and the wiring counts as not proved")
+            self.proof, self._unread = None, True
+            reason = str(error.strerror) if isinstance(error, OSError) else "it is not as this program wrote it"
+            self.unusable.append(found("file-unusable", Action.NONE, file=str(path), reason=reason))
+            say(f"{path} is not used, and the wiring counts as not proved until it is proved again: {reason}")
 
     def look(self, links: Iterable[Link]) -> bool:
         """The devices have been prepared: their serial numbers are those of today.
@@ -100,18 +102,14 @@ class Wiring:
         self._unproved = why_not_proved(self.proof, self._line, self._maps, serials)
         self.against = [*self._unproved, *self.contradicted.values()]
 
-    def contradict(self, found: Iterable[actions.Finding]) -> bool:
-        """Load cells show what torques and the cells beside them say is not so: what was proved of them is over.
-
-        Whether that is news of one of them.
-        """
+    def contradict(self, found: Iterable[actions.Finding]) -> None:
+        """Load cells show what torques and the cells beside them say is not so: what was proved of them is over."""
         told = {int(one.parameters["span"]): one for each in found if (one := each.as_data()) is not None}
         news = {span: one for span, one in told.items() if span not in self.contradicted}
         if news:  # the numbers are those that stopped the line
             self.contradicted = self.contradicted | news
             self.behind = True
             self.against = [*self._unproved, *self.contradicted.values()]  # no hash is made within a period
-        return bool(news)
 
     def settle(self, contradicted: Mapping[int, Finding]) -> bool:
         """The disk knows which cells are contradicted. Takes its time: never in a period. False: it does not."""
@@ -178,7 +176,8 @@ class Wiring:
         self.proof, self._written = self._written, None
         proved = {cell.span for cell in self._line.load_cells if cell.name in self._anew}
         left = {span: one for span, one in self.contradicted.items() if self._anew and span not in proved}
-        self.behind |= left != self.contradicted
+        self.behind |= left != self.contradicted or self._unread  # a file that nobody can read goes, too
+        self._unread = False
         self.contradicted = left
         self._hold_against()
         nameless = ", ".join(one.device for one in self.proof.devices if not one.serial)

@@ -26,7 +26,7 @@ import numpy as np
 from tests.bench.figures import Bench
 from tests.bench.harm_cells import decimals, in_service, tared, zeroed_at_rest
 from tests.bench.harm_drives import drill_of_dead_watchdog, wrong_mode
-from tests.bench.harm_lines import DRAW_SPANS, Drawn, drawn
+from tests.bench.harm_lines import DRAW_SPANS, Drawn, any_span, drawn
 from tests.bench.harm_runs import NEVER_S, NotStarted, Outcome, at_start, drawable, healthy, in_production, rest_bound_s
 from tests.bench.harm_wiring import MISTAKES, proof
 from tests.bench.kept_rows import KeptRows
@@ -63,12 +63,8 @@ class Row:
         return one.found_s > self.found_bound_s, one.rest_s > rest_bound_s
 
 
-def _span(draw: Drawn, dice: np.random.Generator) -> int:
-    return int(dice.integers(1, draw.size.spans + 1))
-
-
 def _web_break(draw: Drawn, dice: np.random.Generator) -> str:
-    return f"web {_span(draw, dice)} web-break"
+    return f"web {any_span(draw, dice)} web-break"
 
 
 def _unmeasured_break(draw: Drawn, dice: np.random.Generator) -> str:
@@ -77,26 +73,26 @@ def _unmeasured_break(draw: Drawn, dice: np.random.Generator) -> str:
 
 def _cell_drift(draw: Drawn, dice: np.random.Generator) -> str:
     rate = 0.0036 * draw.size.tension_n * float(dice.choice((-1.0, 1.0)))  # 0.1 N/s of 28 N
-    return f"load-cell {_span(draw, dice)} drift rate_n_per_s={rate:.6g}"
+    return f"load-cell {any_span(draw, dice)} drift rate_n_per_s={rate:.6g}"
 
 
 def _torn(draw: Drawn, dice: np.random.Generator) -> str:
     """The low word of a value is that of the one before: off by a share of the cell's capacity, within it."""
     height_n = draw.size.tension_n * float(dice.uniform(0.6, 1.5)) * float(dice.choice((-1.0, 1.0)))
-    return f"load-cell {_span(draw, dice)} spike height_n={height_n:.6g}"
+    return f"load-cell {any_span(draw, dice)} spike height_n={height_n:.6g}"
 
 
 def _torque_share(draw: Drawn, dice: np.random.Generator) -> str:
-    return f"drive {_span(draw, dice)} torque-share share={float(dice.choice((0.0, 0.1, 0.3, 0.5, 2.0, 3.0))):g}"
+    return f"drive {any_span(draw, dice)} torque-share share={float(dice.choice((0.0, 0.1, 0.3, 0.5, 2.0, 3.0))):g}"
 
 
 def _mode_lost(draw: Drawn, dice: np.random.Generator) -> str:
-    return f"drive {_span(draw, dice)} mode-lost for 0.6"
+    return f"drive {any_span(draw, dice)} mode-lost for 0.6"
 
 
 def _web_missing(seed: int) -> Outcome:
     dice = np.random.default_rng([seed, 35])
-    return at_start("web-missing", seed, [_span(drawn(seed), dice)])
+    return at_start("web-missing", seed, [any_span(drawn(seed), dice)])
 
 
 def _no_web(seed: int) -> Outcome:

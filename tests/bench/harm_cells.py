@@ -10,7 +10,7 @@ from math import isfinite
 import numpy as np
 
 from gateway.core.states import LoopState, Phase
-from tests.bench.harm_lines import Drawn, drawn
+from tests.bench.harm_lines import Drawn, any_span, drawn
 from tests.bench.harm_runs import NEVER_S, Outcome, Watched, begun, threaded
 
 STEADY_S = 3.0  #: of production before
@@ -21,13 +21,13 @@ ZEROED_SHARE = 0.9  #: of the working tension, that was taken for nothing
 def tared(draw: Drawn, dice: np.random.Generator) -> str:
     """Zeroed, or a tare that was pressed, by a good part of the working tension either way."""
     by_n = float(dice.choice((-1.0, 1.0)) * dice.uniform(0.3, 0.9)) * draw.size.tension_n
-    return f"load-cell {_span(draw, dice)} offset by_n={by_n:.6g}"
+    return f"load-cell {any_span(draw, dice)} offset by_n={by_n:.6g}"
 
 
 def decimals(draw: Drawn, dice: np.random.Generator) -> str:
     """Another factor, or other decimals at the terminal."""
     factor = float(dice.choice((0.1, 0.5, 2.0, 10.0)))
-    return f"load-cell {_span(draw, dice)} cell-factor factor={factor:g}"
+    return f"load-cell {any_span(draw, dice)} cell-factor factor={factor:g}"
 
 
 def in_service(row: str, seed: int, fault: Callable[[Drawn, np.random.Generator], str]) -> Outcome:
@@ -59,14 +59,10 @@ def zeroed_at_rest(row: str, seed: int) -> Outcome:
     loop, dice = threaded(seed), np.random.default_rng([seed, 38])
     draw = drawn(seed)
     by_n = -ZEROED_SHARE * draw.size.tension_n
-    watched = Watched(row, seed, loop, [f"load-cell {_span(draw, dice)} offset by_n={by_n:.6g}"])
+    watched = Watched(row, seed, loop, [f"load-cell {any_span(draw, dice)} offset by_n={by_n:.6g}"])
     loop.step(10)
     reply = loop.arm()
     outcome = watched.outcome(0.0)
     codes = [one.code for one in reply.findings]
     refused = "load-cell-below-zero" in codes and loop.cycle.machine.phase is Phase.SILENT
     return replace(outcome, code=codes[0] if codes else "", found_s=0.0 if refused else NEVER_S, note=reply.text)
-
-
-def _span(draw: Drawn, dice: np.random.Generator) -> int:
-    return int(dice.integers(1, draw.size.spans + 1))

@@ -75,6 +75,11 @@ def draw_size(seed: int) -> Size:
     )  # fmt: skip
 
 
+def any_span(draw: Drawn, dice: np.random.Generator) -> int:
+    """A span, or the roller at its end, from 1."""
+    return int(dice.integers(1, draw.size.spans + 1))
+
+
 @lru_cache(maxsize=8)
 def drawn(seed: int) -> Drawn:
     """A line of a size of its own, threaded and slack at the start. Its file may be one that `check` refuses."""

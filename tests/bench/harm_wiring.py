@@ -10,7 +10,7 @@ import numpy as np
 
 from gateway.core.messages import Drill, Prove
 from gateway.core.states import Phase
-from tests.bench.harm_lines import Drawn, drawn
+from tests.bench.harm_lines import Drawn, any_span, drawn
 from tests.bench.harm_runs import NEVER_S, NotStarted, Outcome, Watched, armed, threaded
 
 OVER_SHARE = 0.25  #: of tension_max_n: a fifth, and what overshoots; more counts as unsafe
@@ -68,13 +68,9 @@ def _number(parameters: object) -> object:
     return values.get("span", values.get("roller"))
 
 
-def _any(draw: Drawn, dice: np.random.Generator) -> int:
-    return int(dice.integers(1, draw.size.spans + 1))
-
-
 def _cell_factor(factor: float, code: str) -> Callable[[Drawn, np.random.Generator], Mistake]:
     def mistake(draw: Drawn, dice: np.random.Generator) -> Mistake:
-        span = _any(draw, dice)
+        span = any_span(draw, dice)
         return Mistake(f"load-cell {span} cell-factor factor={factor:g}", code, span)
 
     return mistake
@@ -82,7 +78,7 @@ def _cell_factor(factor: float, code: str) -> Callable[[Drawn, np.random.Generat
 
 def _zero(share: float) -> Callable[[Drawn, np.random.Generator], Mistake]:
     def mistake(draw: Drawn, dice: np.random.Generator) -> Mistake:
-        span = _any(draw, dice)
+        span = any_span(draw, dice)
         return Mistake(f"load-cell {span} offset by_n={share * draw.size.tension_n:.6g}", "cell-zero-off", span)
 
     return mistake
@@ -94,7 +90,7 @@ def _swapped(draw: Drawn, dice: np.random.Generator) -> Mistake:
 
 
 def _reversed(draw: Drawn, dice: np.random.Generator) -> Mistake:
-    roller = _any(draw, dice)
+    roller = any_span(draw, dice)
     return Mistake(f"drive {roller} reversed", "drive-reversed", roller)
 
 

@@ -88,6 +88,25 @@ def test_on_a_stiff_web_where_any_jump_may_be_true_torques_name_the_cell(seed, s
     assert not wiring.against and wiring.settle(wiring.contradicted) and not (tmp_path / CONTRADICTED).exists()
 
 
+def test_a_file_of_contradicted_cells_that_is_spoilt_asks_for_a_proof_once(at_rest, tmp_path):
+    proved = at_rest.cycle.wiring.proof
+
+    def read() -> Wiring:
+        wiring = Wiring(at_rest.line, {}, tmp_path)
+        wiring.read(lambda text: None)
+        return wiring
+
+    read().write(proved)
+    assert read().proof == proved
+    (tmp_path / CONTRADICTED).write_text("{")
+    spoilt = read()
+    assert [one.code for one in spoilt.against] == ["wiring-unproved"]
+    assert [one.rule for one in spoilt.unusable] == ["file-unusable"]
+    spoilt.write(proved)
+    spoilt.take_written()
+    assert spoilt.behind and spoilt.settle(spoilt.contradicted) and read().proof == proved
+
+
 @pytest.mark.parametrize("span", [1, 4])
 def test_what_shows_less_than_nothing_is_not_armed_nor_started(at_rest, span):
     inject(at_rest, f"load-cell {span} offset by_n=-8 for 0.2")
