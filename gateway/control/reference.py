@@ -1,11 +1,14 @@
 """Where the line shall be: set-points that stand, or move along minimum-jerk polynomials."""
 
 from dataclasses import dataclass
+from math import copysign
 from typing import Protocol
 
 import numpy as np
 
 from gateway.core.signals import FloatArray
+
+HAIR_S = 1e-9  #: to the end of a move that no sum of periods meets exactly
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,6 +56,7 @@ class MinimumJerk:
     """Values (m,), each on its own way to a target: the quintic from where it is, with its rate and acceleration.
 
     Of all curves that take a given time from rest to rest it has the least mean squared jerk (Flash and Hogan 1985).
+    A value may also go to its target on a ramp, or be put somewhere.
     """
 
     PEAK = 15.0 / 8.0  #: greatest rate, in units of distance over time, from rest to rest
@@ -62,13 +66,14 @@ class MinimumJerk:
         self._time_s: FloatArray = np.zeros(len(value))  #: that the move takes; 0: it stands
         self._polynomial: FloatArray = np.zeros((6, len(value)))  #: of the time since the beginning, lowest power first
         self._polynomial[0] = value
+        self._rate_before: FloatArray = np.zeros(len(value))  #: at which it came to where its way begins
         self.target: FloatArray = np.array(value, dtype=np.float64)
 
     def put(self, index: int | slice, value: float | FloatArray) -> None:
         """It is there at once, and stands; or several are."""
         self._polynomial[:, index] = 0.0
         self._polynomial[0, index] = self.target[index] = value
-        self._time_s[index] = 0.0
+        self._time_s[index] = self._rate_before[index] = 0.0
 
     def move(self, index: int, target: float, greatest_rate: float, now_s: float, least_s: float = 0.0) -> None:
         """Set out for `target` at once; from rest the rate stays at `greatest_rate` or below, in units per second.
@@ -95,8 +100,19 @@ class MinimumJerk:
             6.0 * rest - 3.0 * slope + 0.5 * bend,
         )
         self._polynomial[:, index] = [value, v / T, a / T**2, c3 / T**3, c4 / T**4, c5 / T**5]
-        self._begin_s[index], self._time_s[index] = now_s, time_s
+        self._begin(index, now_s, time_s, rate)
         self.target[index] = target
+
+    def ramp(self, index: int, target: float, rate: float, now_s: float) -> None:
+        """Set out for `target` at a constant rate (positive, units per second), whatever its rate is now."""
+        value, before, _ = self.at(now_s)[:, index].tolist()
+        self._polynomial[:, index] = 0.0
+        self._polynomial[:2, index] = value, copysign(rate, target - value)
+        self._begin(index, now_s, abs(target - value) / rate, before)
+        self.target[index] = target
+
+    def _begin(self, index: int, now_s: float, time_s: float, rate_before: float) -> None:
+        self._begin_s[index], self._time_s[index], self._rate_before[index] = now_s, time_s, rate_before
 
     def moving(self, now_s: float) -> bool:
         """Whether any value is on its way."""
@@ -107,13 +123,18 @@ class MinimumJerk:
         return bool(self._time_s[index] > 0.0 and self._begin_s[index] + self._time_s[index] > now_s)
 
     def at(self, now_s: float) -> FloatArray:
-        """Value, rate and acceleration (3, m) at a time; before a move began, as at its beginning."""
-        s: FloatArray = np.clip(now_s - self._begin_s, 0.0, self._time_s)
+        """Value, rate and acceleration (3, m) at a time; before a move began, at the rate that led to its beginning."""
+        since: FloatArray = now_s - self._begin_s
+        s: FloatArray = np.clip(since, 0.0, self._time_s)
         c = self._polynomial
         found = np.empty((3, len(s)))
         found[0] = c[0] + s * (c[1] + s * (c[2] + s * (c[3] + s * (c[4] + s * c[5]))))
         found[1] = c[1] + s * (2.0 * c[2] + s * (3.0 * c[3] + s * (4.0 * c[4] + s * 5.0 * c[5])))
         found[2] = 2.0 * c[2] + s * (6.0 * c[3] + s * (12.0 * c[4] + s * 20.0 * c[5]))
-        over = s >= self._time_s
+        over = s >= self._time_s - HAIR_S
         found[0, over], found[1:, over] = self.target[over], 0.0
+        before = since < 0.0
+        if before.any():
+            rate = self._rate_before[before]
+            found[:, before] = c[0, before] + since[before] * rate, rate, np.zeros(len(rate))
         return found

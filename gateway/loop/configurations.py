@@ -88,7 +88,6 @@ class Configurations:
         self.probation = Probation(deployment.lease_s, now_s + deployment.lease_s, deployment.shaped_first)
         self.why = "deployed"
         if deployment.shaped_first and self._line.moves.shape == "ramp":
-            self._setpoints.stand()
             self._shaped = True
         self.path.take_over(candidate.law)
         self._say("deployed", f"on probation for as long as its lease of {deployment.lease_s:g} s is renewed")

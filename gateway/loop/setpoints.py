@@ -1,4 +1,8 @@
-"""Set-points on their way: where they are now, where they shall be, and how fast they may move. Pure."""
+"""Set-points on their way: where they are now, where they shall be, and how fast they may move. Pure.
+
+Control is told of every change of speed but a step, also of ramps: rollers that are accelerated with the web need a
+torque for it, which on heavy ones comes to as much as the tension.
+"""
 
 from dataclasses import dataclass
 from math import inf
@@ -51,6 +55,7 @@ class Setpoints:
         self._curve = MinimumJerk(np.zeros(n + 1))
         self._time_s = 0.0  #: on the curve
         self._ramped: BoolArray = np.zeros(n + 1, dtype=np.bool_)  #: values that go to their target on a ramp
+        self._ramp: tuple[float, float] | None = None  #: that the speed is on, or was last: goal in m/s, rate in m/s^2
         self._excited = False  #: an experiment says where tensions stand, and their targets where they go back to
 
     def aim_at(self, recipe: Recipe) -> None:
@@ -106,15 +111,9 @@ class Setpoints:
         """Whether nothing moves: every set-point at its target, or while `held` the speed at standstill."""
         return self._there() and self.speed_m_per_s == (0.0 if held else self.speed_target_m_per_s)
 
-    def stand(self) -> None:
-        """The curves begin where set-points are, after these have moved on ramps."""
-        for i, value in enumerate([*self.tension_n.tolist(), self.speed_m_per_s]):
-            self._curve.put(i, value)
-        self._ramped[:] = False
-
     def begin_at_speed(self, speed_m_per_s: float) -> None:
         """It is what is asked of the line PLC from now on. The target stays."""
-        self.speed_m_per_s = speed_m_per_s
+        self.speed_m_per_s, self._ramp = speed_m_per_s, None
         self._curve.put(len(self.tension_n), speed_m_per_s)
 
     def tension_step_pause_s(self, span: int, now_s: float) -> float:
@@ -150,6 +149,7 @@ class Setpoints:
         elif not self._there():
             reach = moves.tension_rate_n_per_s * period_s
             self.tension_n = self.tension_n + np.clip(self.tension_target_n - self.tension_n, -reach, reach)
+            self._curve.put(slice(len(self.tension_n)), self.tension_n)
 
     def _advance_smoothly(self, moves: Moves, period_s: float) -> None:
         """Tensions along their curves. To a target that changes on the way on a ramp: a curve would overshoot."""
@@ -173,11 +173,16 @@ class Setpoints:
                 self._ramp_speed(period_s, goal_m_per_s, rate_m_per_s2)
                 return
             self._curve.move(i, goal_m_per_s, rate_m_per_s2, self._time_s, self._least_move_s)
+            self._ramp = None
         self.speed_m_per_s = float(self._curve.at(self._time_s)[0, i])
 
     def _ramp_speed(self, period_s: float, goal_m_per_s: float, rate_m_per_s2: float) -> None:
-        reach = rate_m_per_s2 * period_s
-        self.begin_at_speed(self.speed_m_per_s + max(-reach, min(reach, goal_m_per_s - self.speed_m_per_s)))
+        """On the curve, too: rollers have to be accelerated with the web, and control is told by how much."""
+        i, before_s, wanted = len(self.tension_n), self._time_s - period_s, (goal_m_per_s, rate_m_per_s2)
+        if self._ramp != wanted:
+            self._curve.ramp(i, goal_m_per_s, rate_m_per_s2, before_s)
+            self._ramp = wanted
+        self.speed_m_per_s = float(self._curve.at(self._time_s)[0, i])
         self._ramped[-1] = self.speed_m_per_s != goal_m_per_s
 
     def followed_by(self, tension_n: FloatArray, measured: FloatArray) -> bool:

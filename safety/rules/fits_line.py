@@ -1,6 +1,13 @@
-"""The controller is one for this line: size, period, latency, spans without a load cell, limits that it plans with."""
+"""The controller is one for this line: size, period, latency, spans without a load cell, limits that it plans with.
+
+And so is what its feed-forward takes rollers and web for. That acts while speed or set-points move along a ramp or a
+curve, where simulated courses have steps: what is far too large would drive the web as no rule has seen it. What is too
+small leaves the work to the feedback, which is simulated.
+"""
 
 from collections.abc import Iterator
+
+import numpy as np
 
 from gateway.core.controller_laws import MpcConfig
 from gateway.core.verdict import RuleFinding
@@ -8,6 +15,7 @@ from safety.case import Case
 from safety.findings import told
 
 RULE = "fits the line"
+MOST_OVER = 2.0  #: of what is believed at most: a feed-forward that is twice too large is as wrong as none at all
 PERIODS_OFF = 1.0  #: by which a law's latency may differ from the measured one: torque lag is taken as dead time
 
 
@@ -36,8 +44,31 @@ def _wrong(case: Case) -> Iterator[str]:
     draw = [i for i, span in enumerate(line.spans) if span.control == "draw"]
     if config.draw_spans != draw:
         yield f"the controller takes spans {config.draw_spans} (from 0) for draw-controlled; allowed: {draw}"
+    if config.n == line.n:
+        yield from _wrong_feedforward(case)
     if isinstance(config, MpcConfig):
         yield from _wrong_plan(case, config)
+
+
+def _wrong_feedforward(case: Case) -> Iterator[str]:
+    """J/R multiplies a roller's acceleration, L/EA the rates of a tension (see `gateway.control.deviation`)."""
+    own, webs = case.controller.feedforward, [theta.web for theta in case.corners]
+    parts = {
+        "J/R": (
+            "kg m", np.divide(own.inertia_kg_m2, own.radius_m),
+            np.max([web.inertia_kg_m2 / web.radius_m for web in webs], axis=0),
+        ),
+        "L/EA": (
+            "m/N", np.array(own.length_m) / own.stiffness_n,
+            np.max([web.length_m / web.stiffness_n for web in webs], axis=0),
+        ),
+    }  # fmt: skip
+    for name, (unit, taken, believed) in parts.items():
+        for i in np.flatnonzero(~(taken <= MOST_OVER * believed)).tolist():
+            yield (
+                f"its feed-forward takes {name} of section {i + 1} for {taken[i]:.4g} {unit}; allowed: up to "
+                f"{MOST_OVER * believed[i]:.4g}, twice the most that is believed"
+            )
 
 
 def _wrong_plan(case: Case, config: MpcConfig) -> Iterator[str]:

@@ -17,6 +17,7 @@ from tests.bench.harm_runs import armed, healthy, ordered, threaded
     70019, 70021,  # the law began at what noise had last made of the torque: spans went slack
     80036,  # noise of the speed before, kept above 0, pulled the web on
     70012, 70020,  # default weights: torques at their limits
+    73010, 73024,  # heavy rollers: to be accelerated on the ramp they take half of the web's tension
 ])  # fmt: skip
 def test_a_line_with_noisy_encoders_starts_changes_its_grade_and_stops(seed):
     found = healthy("healthy", seed)

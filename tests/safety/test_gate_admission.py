@@ -167,6 +167,21 @@ def test_a_controller_of_another_line(of, context, redesigned):
     assert "is for 2 spans" in found(design_lqi(small))[0]
 
 
+@pytest.mark.parametrize(("name", "told"), [("inertia_kg_m2", "J/R of section 3"), ("length_m", "L/EA of section 3")])
+def test_a_feed_forward_far_too_large_would_drive_the_web_on_ramps_as_no_course_shows(
+    name, told, of, context, redesigned
+):
+    def found(factor):
+        own = redesigned.feedforward
+        values = [value * (factor if i == 2 else 1.0) for i, value in enumerate(getattr(own, name))]
+        changed = redesigned.model_copy(update={"feedforward": own.model_copy(update={name: values})})
+        return refused(fits_line.check(case_of(gains(changed, context), context, of)))
+
+    assert found(1.5) == found(0.1) == []
+    (text,) = found(3.0)
+    assert told in text
+
+
 def first_spans(line, n):
     model = task_of(line).model
     return {name: getattr(model, name)[:n] for name in

@@ -12,7 +12,7 @@ MOVES = Moves(shape="minimum-jerk", tension_rate_n_per_s=20.0, speed_rate_m_per_
 PERIOD_S = 0.01
 
 
-def setpoints():
+def setpoints() -> Setpoints:
     found = Setpoints(Recipe(name="a", tension_n=[30.0, 30.0], speed_m_per_s=0.1), moment_s=0.02)
     found.begin_at(np.array([30.0, 30.0]))
     found.begin_at_speed(0.1)
@@ -73,3 +73,43 @@ def test_a_ramp_has_no_curve_behind_it():
         moving.advance(ramp, PERIOD_S, 0.1, 0.05)
         assert not moving.reference(2.0).moving
     assert moving.tension_n[0] == pytest.approx(34.0)
+
+
+def asked_of_rollers(moving: Setpoints, lag_s: float) -> float:
+    """The acceleration of the web that control is told of, in m/s^2."""
+    return moving.reference(lag_s).ahead(0.0).unwind_acceleration_m_per_s2
+
+
+def test_control_is_told_of_a_ramp_when_it_has_reached_the_unwinder() -> None:
+    ramp, moving, lag_s = MOVES.model_copy(update={"shape": "ramp"}), setpoints(), 2.5 * PERIOD_S
+    told = []
+    for _ in range(30):
+        moving.advance(ramp, PERIOD_S, 0.11, 0.05)
+        told.append(asked_of_rollers(moving, lag_s))
+    assert told == pytest.approx([0.0] * 2 + [0.05] * 20 + [0.0] * 8)
+    assert moving.speed_m_per_s == 0.11 and not moving.reference(lag_s).moving
+
+
+def test_so_it_is_of_a_stop_in_the_middle_of_a_ramp_and_of_the_speed_that_is_added_until_then() -> None:
+    ramp, moving, lag_s = MOVES.model_copy(update={"shape": "ramp"}), setpoints(), 2.5 * PERIOD_S
+    for _ in range(10):
+        moving.advance(ramp, PERIOD_S, 0.2, 0.05)
+    moving.advance(ramp, PERIOD_S, 0.0, 0.1)
+    reference = moving.reference(lag_s)
+    assert reference.ahead(0.0).unwind_acceleration_m_per_s2 == pytest.approx(0.05)  # not yet at the unwinder
+    later = reference.ahead(2.5 * PERIOD_S)
+    assert later.unwind_acceleration_m_per_s2 == pytest.approx(-0.1)
+    assert later.unwind_speed_change_m_per_s == pytest.approx(1.5 * 0.05 * PERIOD_S - 0.1 * PERIOD_S)
+
+
+def test_each_stop_is_a_ramp_also_the_second_one() -> None:
+    moving = setpoints()
+    for _ in range(2):
+        for _ in range(120):
+            moving.advance(MOVES, PERIOD_S, 0.0, 0.1, "ramp")
+        assert moving.speed_m_per_s == 0.0
+        for _ in range(100):
+            moving.advance(MOVES, PERIOD_S, 0.1, 0.05, "minimum-jerk")
+        on_its_way = moving.speed_m_per_s
+        moving.advance(MOVES, PERIOD_S, 0.0, 0.1, "ramp")
+        assert moving.speed_m_per_s == pytest.approx(on_its_way - 0.1 * PERIOD_S)
