@@ -7,6 +7,7 @@ from drivers.modbus.maps import LoadCellMap
 from drivers.modbus.plan import Wish
 from drivers.modbus.registers import Field
 from drivers.scaling import si_per_count
+from gateway.core.finding import Finding, finding
 from gateway.core.line import LoadCell
 from gateway.core.signals import Inputs, Outputs
 
@@ -14,7 +15,7 @@ from gateway.core.signals import Inputs, Outputs
 class Amplifier:
     """The load cells of one amplifier."""
 
-    gives_torque = False
+    gives_torque = disobeys = False
 
     def __init__(self, device: LoadCellMap, cells: list[LoadCell]) -> None:
         self.name = ", ".join(cell.name for cell in cells)
@@ -83,9 +84,6 @@ class Amplifier:
     def rest(self) -> list[int]:
         return []
 
-    def disobeys(self) -> str:
-        return ""
-
     def forget(self) -> None:
         """What it measures is true whether it is commanded or not."""
 
@@ -97,9 +95,9 @@ class Amplifier:
         for cell in self._cells:
             inputs.tension.reject(cell.span - 1)
 
-    def _against_channel_count(self, found: float) -> list[str]:
+    def _against_channel_count(self, found: float) -> list[Finding]:
         return [
-            f"{cell.name}: channel {cell.channel}, the amplifier has {int(found)}"
+            finding("channel-missing", device=cell.name, channel=cell.channel, channels=int(found))
             for cell in self._cells
             if cell.channel > found
         ]

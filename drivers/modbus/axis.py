@@ -22,12 +22,13 @@ from drivers.modbus.registers import Field, RegisterBlock
 from drivers.mode_display import ModeDisplay
 from drivers.power_stage import PowerStage
 from drivers.scaling import speed_per_count, torque_per_count
+from drivers.torque_rules import against_max_torque, against_rated_torque
+from gateway.core.finding import Finding, finding
 from gateway.core.line import Drive
 from gateway.core.signals import DriveCondition, DriveState, Inputs, Outputs
 
 _LARGEST = {"i16": 2**15 - 1, "i32": 2**31 - 1, "f32": 3.4e38}  #: counts of a target torque, either way
 _WARNS = int(DriveCondition.WARNS)
-_RATED_TORQUE_TOLERANCE = 1e-3  #: of the line's figure; more would scale every torque wrongly
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,48 +96,38 @@ class Axis:
             identity.append(Check(self._block([device.rated_torque]), self._against_rated_torque))
         maximum = self._block([device.max_torque])
         counts = watchdog_counts(device.watchdog, settings.watchdog_s, "the drive")
-        name = f"{self.name}: its communication watchdog"
-        watchdog = Setting(name, self._block([device.watchdog]), counts, WATCHDOG_OFF)
+        watchdog = Setting(self.name, "watchdog", self._block([device.watchdog]), counts, WATCHDOG_OFF)
         trust: list[Check] = []
         written = [watchdog]
         if device.max_torque.writable:
-            written.insert(0, Setting(f"{self.name}: its max torque", maximum, self._torque_limit_counts()))
+            written.insert(0, Setting(self.name, "max_torque", maximum, self._torque_limit_counts()))
         else:
             identity.append(Check(maximum, self._against_max_torque))
         statusword = RegisterBlock([self._read_field(device.read.statusword)], device.word_order)
         trust.append(Check(statusword, self._against_enabled))
         return Proofs(identity, trust, written)
 
-    def _against_axis_count(self, found: float) -> list[str]:
+    def _against_axis_count(self, found: float) -> list[Finding]:
         channel = self._settings.channel
-        return [] if channel <= found else [f"{self.name}: channel {channel}, the device has {int(found)} axes"]
+        if channel <= found:
+            return []
+        return [finding("channel-missing", device=self.name, channel=channel, channels=int(found))]
 
-    def _against_rated_torque(self, found: float) -> list[str]:
+    def _against_rated_torque(self, found: float) -> list[Finding]:
         entry, wanted_nm = self._device.rated_torque, self._settings.rated_torque_nm
         assert entry is not None
         found_nm = found * torque_per_count(entry.unit, entry.scale, wanted_nm)
-        if abs(found_nm - wanted_nm) <= _RATED_TORQUE_TOLERANCE * wanted_nm:
-            return []
-        return [
-            f"{self.name}: has a rated torque of {found_nm:g} Nm, the line says {wanted_nm:g} Nm; "
-            "correct rated_torque_nm"
-        ]
+        return against_rated_torque(self.name, found_nm, wanted_nm)
 
-    def _against_max_torque(self, found: float) -> list[str]:
+    def _against_max_torque(self, found: float) -> list[Finding]:
         entry, settings = self._device.max_torque, self._settings
         nm_per_count = torque_per_count(entry.unit, entry.scale, settings.rated_torque_nm)
-        found_nm = found * nm_per_count
-        if found_nm + nm_per_count >= settings.torque_limit_nm:
-            return []
-        return [
-            f"{self.name}: gives at most {found_nm:g} Nm, limits.torque_nm is {settings.torque_limit_nm:g}; "
-            "lower the limit"
-        ]
+        return against_max_torque(self.name, found * nm_per_count, settings.torque_limit_nm, nm_per_count)
 
-    def _against_enabled(self, found: float) -> list[str]:
+    def _against_enabled(self, found: float) -> list[Finding]:
         if drive_state(power_state(int(found))) not in (DriveState.ENABLED, DriveState.STOPPING):
             return []
-        return [f"{self.name}: is still enabled (statusword {int(found):04X}h); take its torque off first"]
+        return [finding("still-enabled", drive=self.name, statusword=int(found))]
 
     def _torque_limit_counts(self) -> int:
         entry, limit_nm = self._device.max_torque, self._settings.torque_limit_nm
@@ -231,10 +222,9 @@ class Axis:
         counts = torque_nm * self._counts_per_nm
         return self._write.encode((controlword, round(counts) if self._whole_counts else counts))
 
-    def disobeys(self) -> str:
-        if not self.stage.disobeys:
-            return ""
-        return f"{self.name}: is told to take torque off and stays enabled; only its watchdog can stop it"
+    @property
+    def disobeys(self) -> bool:
+        return self.stage.disobeys
 
     def forget(self) -> None:
         self.stage.forget()

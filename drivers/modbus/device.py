@@ -13,11 +13,12 @@ from drivers.modbus.maps import ModbusMap, Register, RegisterCheck, TimeRegister
 from drivers.modbus.plan import Wish
 from drivers.modbus.registers import RegisterBlock
 from drivers.scaling import si_per_count
+from gateway.core.finding import Finding, finding
 from gateway.core.signals import Inputs, Outputs
 
 ANSWERS_ALLOWED = 3  #: cycles in a row without an answer until a device counts as absent
 
-Judge = Callable[[float], list[str]]  #: what speaks against a number that was read
+Judge = Callable[[float], list[Finding]]  #: what speaks against a number that was read
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,8 +31,9 @@ class Check:
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """A number that `prepare` writes and reads back. `name` says of which device it is what."""
+    """A number that `prepare` writes and reads back. `name` is its key in the map of `device`."""
 
+    device: str
     name: str
     register: RegisterBlock
     counts: float
@@ -40,15 +42,22 @@ class Setting:
     @property
     def wish(self) -> Wish:
         """To read it with a transaction."""
-        return Wish(self.name, self.register.fields, self.register.word_order)
+        return Wish(f"{self.device}: {self.name}", self.register.fields, self.register.word_order)
 
     @property
     def kept(self) -> Check:
         """That it still is what it was set to."""
         return Check(self.register, self.against)
 
-    def against(self, found: float) -> list[str]:
-        return [] if found == self.counts else [f"{self.name} reads {found:g}, {self.counts:g} was set"]
+    def against(self, found: float) -> list[Finding]:
+        if found == self.counts:
+            return []
+        return [finding("setting-changed", **self.named, set_counts=self.counts, found_counts=found)]
+
+    @property
+    def named(self) -> dict[str, str]:
+        """What every finding of it says."""
+        return {"device": self.device, "setting": self.name}
 
 
 @dataclass(slots=True)
@@ -58,8 +67,8 @@ class Standing:
     active: bool = False  #: it is commanded, not only read
     wrote: bool = False  #: the transaction of this cycle carried a command
     missed: int = 0  #: cycles in a row without an answer
-    doubt: str = ""  #: why nothing of it is believed
-    distrust: str = ""  #: why it is not commanded although it is active; stays until that is mended
+    doubt: Sequence[Finding] = ()  #: why nothing of it is believed
+    distrust: Sequence[Finding] = ()  #: why it is not commanded although it is active; stays until that is mended
     refused: str = ""  #: the same for what it was commanded in this cycle
 
     @property
@@ -100,8 +109,9 @@ class Device(Protocol):
         """The same for a device that is left: no torque, no transport."""
         ...
 
-    def disobeys(self) -> str:
-        """Why it is fed no longer: it was told to take torque off, and has not. Empty when all is well."""
+    @property
+    def disobeys(self) -> bool:
+        """Whether it was told to take torque off, and has not: it is fed no longer."""
         ...
 
     def forget(self) -> None:
@@ -130,9 +140,9 @@ def identity_check(name: str, device_id: RegisterCheck, device: ModbusMap) -> Ch
     """That the device is of the type of its map, or set up as the map needs it."""
     wanted, mask = device_id.value, device_id.mask if device_id.mask is not None else -1
 
-    def judge(found: float) -> list[str]:
+    def judge(found: float) -> list[Finding]:
         bits = int(found) & mask
-        return [] if bits == wanted else [f"{name}: device id {bits:#x}, the map says {wanted:#x}"]
+        return [] if bits == wanted else [finding("device-id-differs", device=name, found=bits, wanted=wanted)]
 
     return Check(register_block([device_id], device), judge)
 

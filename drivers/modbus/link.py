@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence, Set
 from drivers.modbus.session import Session
 from drivers.modbus.unit import Unit
 from drivers.port import PrepareRefused
+from gateway.core.finding import Finding, finding
 from gateway.core.signals import Inputs, LinkHealth, Outputs
 from gateway.tasks.cleanup import finish, finish_all
 
@@ -42,7 +43,7 @@ class ModbusLink:
         self.silence()
         connected = await asyncio.gather(*(session.ensure_connected() for session in self._sessions))
         reasons = [
-            f"{device.name}: no connection to {self._where}"
+            finding("device-not-connected", device=device.name, where=self._where)
             for session, there in zip(self._sessions, connected, strict=True)
             if not there
             for device in session.unit.devices
@@ -62,7 +63,7 @@ class ModbusLink:
         for session in self._sessions:
             session.activate()
 
-    async def _undo(self) -> list[str]:
+    async def _undo(self) -> list[Finding]:
         return [failure for session in reversed(self._sessions) for failure in await session.settings.undo()]
 
     @property

@@ -27,7 +27,7 @@ from gateway.core.signals import Inputs, Outputs, Quality
 class Plc:
     """Raises ValueError when the line asks for a watchdog that it cannot do."""
 
-    gives_torque = False
+    gives_torque = disobeys = False
 
     def __init__(self, device: PlcMap, plc: LinePlc, watchdog_s: float) -> None:
         self.name = plc.name
@@ -44,7 +44,7 @@ class Plc:
         watchdog = register_block([device.watchdog], device)
         self.proofs = Proofs(
             [identity_check(self.name, device.device_id, device)],
-            settings=[Setting(f"{self.name}: its command watchdog", watchdog, counts, WATCHDOG_OFF)],
+            settings=[Setting(self.name, "watchdog", watchdog, counts, WATCHDOG_OFF)],
         )
         self._life = LifeCounter()
 
@@ -102,9 +102,6 @@ class Plc:
         inputs.unwind_speed.miss(0)
         if inputs.plc.quality != Quality.MISSING:
             inputs.plc.quality = Quality.STALE
-
-    def disobeys(self) -> str:
-        return ""
 
     def forget(self) -> None:
         self._life.forget()

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 from drivers.modbus.client import ModbusConnection, ModbusFailed, ModbusTimeout
 from drivers.modbus.device import Check
+from gateway.core.finding import Finding, finding
 
 
 class Proof:
@@ -34,7 +35,7 @@ class Proof:
         """All of it is proven, in another way."""
         self._passed = len(self.groups)
 
-    async def go_on(self, connection: ModbusConnection, deadline_s: float) -> list[str]:
+    async def go_on(self, connection: ModbusConnection, deadline_s: float) -> list[Finding]:
         """The checks that are left; what speaks against the unit. Raises ModbusTimeout."""
         while not self.complete:
             at = self._passed
@@ -44,7 +45,7 @@ class Proof:
                 self._passed = at + 1
         return []
 
-    async def judge(self, group: int, connection: ModbusConnection, deadline_s: float) -> list[str]:
+    async def judge(self, group: int, connection: ModbusConnection, deadline_s: float) -> list[Finding]:
         """What speaks against the unit in one group of checks. Raises ModbusTimeout."""
         (address, count), checks = self.groups[group]
         try:
@@ -53,4 +54,8 @@ class Proof:
         except ModbusTimeout:
             raise
         except (ModbusFailed, ValueError) as error:
-            return [f"{self._name}: unit {self._unit} at {connection.where}: {error}"]
+            return [unit_not_read(self._name, self._unit, connection, error)]
+
+
+def unit_not_read(name: str, unit: int, connection: ModbusConnection, error: Exception) -> Finding:
+    return finding("unit-not-read", device=name, unit=unit, where=connection.where, error=str(error))

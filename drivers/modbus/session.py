@@ -16,10 +16,13 @@ from drivers.modbus.client import ModbusConnection, ModbusFailed, ModbusTimeout
 from drivers.modbus.device import ANSWERS_ALLOWED
 from drivers.modbus.looks import Looks
 from drivers.modbus.plan import Request
+from drivers.modbus.proof import unit_not_read
 from drivers.modbus.settings import REQUEST_TIMEOUT_S, SettingsWriter
 from drivers.modbus.unit import Payloads, Unit
+from gateway.core.finding import Finding, finding
 from gateway.core.signals import Inputs, LinkHealth
 from gateway.tasks.cleanup import end, finish_all
+from gateway.wording.catalogue import sentence, sentences
 
 EXCHANGE_SHARE = 0.8  #: of a period; what has not come by then leaves room for the next request
 LEAVE_TIMEOUT_S = 0.2
@@ -82,9 +85,9 @@ class Session:
             await end(self._task)  # it would take the new connection for its own
         return await self.connect()
 
-    async def check(self) -> list[str]:
+    async def check(self) -> list[Finding]:
         """What speaks against the unit before anything is written. Reads only."""
-        unit, reasons = self.unit, list[str]()
+        unit, reasons = self.unit, list[Finding]()
         unit.identity.void()
         if self._checked_on != self._connection.number:
             self.settings.forget()  # what was written, and not undone, may have been another device's
@@ -96,18 +99,18 @@ class Session:
                     if reasons and proof is unit.identity and k == 0:
                         return reasons  # another device: what else it says means nothing
         except ModbusTimeout as error:
-            return [*reasons, self._in_words(error)]
+            return [*reasons, unit_not_read(unit.name, unit.address, self._connection, error)]
         reasons = reasons or self.lost_since_check()
         if not reasons:
             unit.identity.confirm()
-            unit.standing.doubt = ""
+            unit.standing.doubt = ()
         return reasons
 
-    def lost_since_check(self) -> list[str]:
+    def lost_since_check(self) -> list[Finding]:
         """What speaks against a unit that may be another, or was restarted, since it was checked."""
         if self._connection.connected and self._connection.number == self._checked_on:
             return []
-        return [f"{self.unit.name}: the connection was lost meanwhile; arm again"]
+        return [finding("connection-lost-meanwhile", device=self.unit.name)]
 
     def activate(self) -> None:
         """Its settings are proven: from now on it is commanded."""
@@ -135,8 +138,8 @@ class Session:
                 await self._rest()
             for k in range(len(unit.trust.groups)):
                 if reasons := await unit.trust.judge(k, self._connection, _now_s() + LEAVE_TIMEOUT_S):
-                    raise ModbusFailed("; ".join(reasons))
-            failures = await self.settings.undo()
+                    raise ModbusFailed(sentences(reasons))
+            failures = [sentence(failure) for failure in await self.settings.undo()]
             if commanded and not failures:
                 await self._rest()  # a watchdog that was changed counts from the next command: only now it is off
         except (ModbusFailed, ValueError) as error:
@@ -237,9 +240,9 @@ class Session:
         unit, standing = self.unit, self.unit.standing
         if not unit.identity.complete:
             if reasons := await unit.identity.go_on(self._connection, deadline_s):
-                standing.doubt = "not proven: " + "; ".join(reasons)
-                raise ModbusFailed(standing.doubt)
-            standing.doubt = ""
+                standing.doubt = reasons
+                raise ModbusFailed(f"not proven: {sentences(reasons)}")
+            standing.doubt = ()
         if standing.active and not unit.dropped and not unit.kept_settings.complete:
             unit.distrust(await unit.kept_settings.go_on(self._connection, deadline_s))
         active = standing.active  # what is read now was sent after the settings were
@@ -264,10 +267,10 @@ class Session:
         unit = self.unit
         group = self._looks.next_group(_now_s())
         try:
-            reasons = await unit.unseen_settings.judge(group, self._connection, until_s)
-        except ModbusTimeout as error:
-            reasons = [str(error)]
-        if reasons and unit.standing.active:
+            kept = not await unit.unseen_settings.judge(group, self._connection, until_s)
+        except ModbusTimeout:
+            kept = False
+        if not kept and unit.standing.active:
             unit.doubt_settings()
 
     async def _transact(
@@ -320,9 +323,6 @@ class Session:
             self._health.reconnects += 1
         else:
             self._health.last_error = f"{self.unit.name}: no connection to {self.where}"
-
-    def _in_words(self, error: ModbusFailed) -> str:
-        return f"{self.unit.name}: unit {self.unit.address} at {self.where}: {error}"
 
     def _discard(self, reason: str) -> None:
         self._health.malformed += 1

@@ -5,6 +5,7 @@ import asyncio
 from drivers.modbus.client import ModbusConnection, ModbusFailed
 from drivers.modbus.device import Setting
 from drivers.modbus.unit import Unit
+from gateway.core.finding import Finding, finding
 
 REQUEST_TIMEOUT_S = 0.5
 
@@ -22,17 +23,17 @@ class SettingsWriter:
         """Whether there is something to undo."""
         return bool(self._before)
 
-    async def configure(self) -> list[str]:
+    async def configure(self) -> list[Finding]:
         """Write every setting and read it back. Returns the first that fails; `undo` takes back what was written.
 
         Where that was not done after an earlier call, what is restored is what stood there before that one.
         """
         for setting in self._unit.settings:
-            if reason := await self._set(setting):
-                return [reason]
+            if reasons := await self._set(setting):
+                return reasons
         return []
 
-    async def _set(self, setting: Setting) -> str:
+    async def _set(self, setting: Setting) -> list[Finding]:
         try:
             found = await self._read(setting)
             # What is as we want it was left behind by a gateway that could not restore it.
@@ -45,10 +46,10 @@ class SettingsWriter:
                 await self._write_noted(setting)
             found = await self._read(setting)
         except (ModbusFailed, ValueError) as error:
-            return f"{setting.name} cannot be set: {error}"
+            return [finding("setting-not-set", **setting.named, error=str(error))]
         if found == setting.counts:
-            return ""
-        return f"{setting.name} was set to {setting.counts:g} and reads back {found:g}"
+            return []
+        return [finding("setting-reads-back", **setting.named, set_counts=setting.counts, found_counts=found)]
 
     async def _write_noted(self, setting: Setting) -> None:
         try:
@@ -58,15 +59,15 @@ class SettingsWriter:
                 self._before.pop()  # it has said that it did not take it
             raise
 
-    async def undo(self) -> list[str]:
+    async def undo(self) -> list[Finding]:
         """Write back what was there before `configure`, the last first; returns what could not be restored."""
-        failures: list[str] = []
+        failures: list[Finding] = []
         while self._before:
             setting, before = self._before[-1]
             try:
                 await self._write(setting, before)
             except (ModbusFailed, ValueError) as error:
-                failures.append(f"{setting.name} was not restored: {error}")
+                failures.append(finding("setting-not-restored", **setting.named, error=str(error)))
             self._before.pop()  # not before: cut here, it is written back by the next call
         return failures
 

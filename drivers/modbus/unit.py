@@ -13,7 +13,10 @@ from drivers.modbus.device import Check, Device, Setting, Standing
 from drivers.modbus.plan import Plan, Wish
 from drivers.modbus.proof import Proof
 from drivers.modbus.registers import spans
+from drivers.power_stage import ORDERS_IGNORED
+from gateway.core.finding import Finding, finding
 from gateway.core.signals import Inputs, Outputs
+from gateway.wording.catalogue import sentences
 
 RESTS = 5  #: cycles in which a unit that has not kept its settings is told to rest; some may not arrive
 
@@ -62,13 +65,13 @@ class Unit:
         self.kept_settings.confirm()
         self.standing.active = True
         self.standing.missed = 0
-        self.standing.distrust, self.dropped, self._rests = "", False, 0
+        self.standing.distrust, self.dropped, self._rests = (), False, 0
         self.owes_rest = self.was_lost = False
 
     def silence(self) -> None:
         """Nothing is written from now on, and nothing of the last command is left but that it has to be taken back."""
         standing = self.standing
-        standing.active, standing.wrote, standing.distrust, standing.refused = False, False, "", ""
+        standing.active, standing.wrote, standing.distrust, standing.refused = False, False, (), ""
         self.owes_rest |= self.commanded
         self.was_lost |= self.dropped
         self.dropped = self.commanded = self.withheld = False
@@ -82,7 +85,7 @@ class Unit:
         self.identity.void()
         self.kept_settings.void()
         if not self.identity.complete:
-            self.standing.doubt = "not proven on this connection"
+            self.standing.doubt = [finding("unit-not-proven", device=self.name)]
 
     def command(self, outputs: Outputs) -> str:
         """What the next transaction writes. Returns why that is nothing; empty when all is well."""
@@ -143,30 +146,29 @@ class Unit:
         """They are proven again before anything else is written: a single answer may have been damaged."""
         self.kept_settings.void()
 
-    def distrust(self, reasons: Sequence[str]) -> None:
+    def distrust(self, reasons: Sequence[Finding]) -> None:
         """It has not kept its settings; none: it has. Who gives torque does not come back by itself."""
         if reasons and not self.standing.distrust:
             self._rests = RESTS
-        self.standing.distrust = "; ".join(reasons)
-        if self._gives_torque and reasons:
-            self._drop(self.standing.distrust)
+        self.standing.distrust = reasons
+        self.dropped |= self._gives_torque and bool(reasons)
 
-    def _drop(self, reason: str) -> None:
+    def _drop(self, reason: Finding) -> None:
         self.dropped = True
-        self.standing.distrust = f"{reason}; arm again"
+        self.standing.distrust = [reason]
 
     def fill(self, inputs: Inputs, numbers: Sequence[Sequence[float]] | None, time_s: float) -> list[str]:
         """What came in this cycle into `inputs`, device by device; returns what was wrong. None: no answer."""
         standing = self.standing
         standing.missed = 0 if numbers is not None else standing.missed + 1
         if standing.absent and standing.active and self._gives_torque and not self.dropped:
-            self._drop(f"no answer in {standing.missed} cycles")
+            self._drop(finding("device-unanswered", device=self.name, cycles=standing.missed))
         troubles: list[str] = []
         for k, device in enumerate(self.devices):
             troubles += device.fill(inputs, numbers[k] if numbers is not None else None, standing, time_s)
-            if not self.dropped and (reason := device.disobeys()):
-                self._drop(reason)
-        if mute := standing.distrust or standing.refused:
+            if not self.dropped and device.disobeys:
+                self._drop(finding("orders-ignored", drive=device.name, orders=ORDERS_IGNORED))
+        if mute := sentences(standing.distrust) or standing.refused:
             troubles.append(f"{self.name}: {mute}; it is not written to")
         return troubles
 
@@ -179,8 +181,8 @@ def _settings(devices: Sequence[Device]) -> list[Setting]:
             other = settings.setdefault((setting.register.address, setting.register.count), setting)
             if other.counts != setting.counts:
                 raise ValueError(
-                    f"{setting.name} should be {setting.counts:g}, but in the same register "
-                    f"{other.name} should be {other.counts:g}"
+                    f"{setting.device}: {setting.name} should be {setting.counts:g}, but in the same register "
+                    f"{other.device}: {other.name} should be {other.counts:g}"
                 )
     return list(settings.values())
 

@@ -9,6 +9,7 @@ import pytest
 
 from drivers.modbus.link import ModbusLink
 from drivers.port import PrepareRefused
+from gateway.core.finding import Finding, finding
 from gateway.core.signals import Inputs, Quality
 from tests.protocol.driver_support import Registers, cycle, frame, line, until
 from tests.protocol.modbus_support import bench, command, modbus_links, until_good
@@ -450,7 +451,7 @@ def test_an_amplifier_is_proven_again_after_a_reconnection() -> None:
                     await asyncio.sleep(0)
             assert list(inputs.tension.quality) == [Quality.BAD] * 2
         await cycle(link, inputs)
-        assert "not proven: cell-2: channel 2, the amplifier has 1" in link.health.last_error
+        assert "not proven: cell-2: channel 2, the device has 1" in link.health.last_error
         peer.amplifier[:2] = [0x5201, 2]
         await cycle(link, inputs)
         assert inputs.tension.good()
@@ -521,7 +522,7 @@ def test_open_says_what_to_do_and_the_link_goes_on_trying() -> None:
             (link,) = modbus_links(line(modbus_port=peer.port))
             with pytest.raises(OSError, match="check host and port"):
                 await link.open()
-            with pytest.raises(PrepareRefused, match="no connection"):
+            with pytest.raises(PrepareRefused, match="device-not-connected"):
                 await link.prepare()
             await peer.start()
             inputs = Inputs(2)
@@ -551,8 +552,8 @@ def test_two_addresses_are_two_links() -> None:
 # what prepare refuses
 
 
-def refusal(arrange: Callable[[Registers], None], channels: int = 2) -> tuple[list[str], Registers]:
-    seen: list[tuple[list[str], Registers]] = []
+def refusal(arrange: Callable[[Registers], None], channels: int = 2) -> tuple[list[Finding], Registers]:
+    seen: list[tuple[list[Finding], Registers]] = []
 
     async def body(link: ModbusLink, peer: Registers) -> None:
         arrange(peer)
@@ -574,14 +575,16 @@ def test_every_wrong_device_is_named() -> None:
         peer.amplifier[0], peer.plc[0] = 0x1111, 0x2222
 
     reasons, peer = refusal(arrange)
-    assert len(reasons) == 2 and peer.plc[14] == 0
-    assert "0x1111" in reasons[0] and "0x5201" in reasons[0] and "cell-1" in reasons[0]
-    assert "0x2222" in reasons[1] and "0x5202" in reasons[1] and reasons[1].startswith("plc:")
+    assert peer.plc[14] == 0
+    assert reasons == [
+        finding("device-id-differs", device="cell-1, cell-2", found=0x1111, wanted=0x5201),
+        finding("device-id-differs", device="plc", found=0x2222, wanted=0x5202),
+    ]
 
 
 def test_a_missing_channel_is_named() -> None:
     reasons, _ = refusal(lambda peer: None, channels=1)
-    assert reasons == ["cell-2: channel 2, the amplifier has 1"]
+    assert reasons == [finding("channel-missing", device="cell-2", channel=2, channels=1)]
 
 
 def test_a_watchdog_that_does_not_stick_is_refused_and_undone() -> None:
@@ -597,7 +600,7 @@ def test_a_watchdog_that_does_not_stick_is_refused_and_undone() -> None:
         peer.script = stubborn
 
     reasons, peer = refusal(arrange)
-    assert len(reasons) == 1 and "100" in reasons[0] and "77" in reasons[0]
+    assert reasons == [finding("setting-reads-back", device="plc", setting="watchdog", set_counts=100, found_counts=77)]
     assert peer.plc[14] == 500
 
 
@@ -609,4 +612,5 @@ def test_a_plc_that_refuses_the_watchdog_is_refused() -> None:
         peer.script = refuses
 
     reasons, _ = refusal(arrange)
-    assert len(reasons) == 1 and reasons[0].startswith("plc:") and "exception 3" in reasons[0]
+    error = "exception 3 to function 16"
+    assert reasons == [finding("setting-not-set", device="plc", setting="watchdog", error=error)]

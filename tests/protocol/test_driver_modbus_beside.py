@@ -63,7 +63,7 @@ def test_half_an_answer_to_a_cycle_is_waited_for_whatever_is_asked_beside_it(
         arming = asyncio.create_task(link.prepare())
         await asyncio.sleep(0)
         halves.begins.set()
-        with pytest.raises(PrepareRefused, match="no answer in time"):
+        with pytest.raises(PrepareRefused, match="unit-not-read"):
             await arming
         assert half_is_there(link)
         halves.go_on()

@@ -9,6 +9,7 @@ import pytest
 
 from drivers.modbus.link import ModbusLink
 from drivers.port import PrepareRefused
+from gateway.core.finding import Finding, finding
 from gateway.core.signals import DriveRequest, DriveState, Inputs, Quality
 from tests.protocol.driver_support import ENABLED, FAULT, READY, SWITCH_ON_DISABLED, Registers, cycle, until
 from tests.protocol.modbus_support import ModbusDrive, drive_bench, enabled, interrupt, torques
@@ -150,7 +151,7 @@ def test_a_drive_that_was_restarted_in_between_gets_no_torque() -> None:
         await cycle(link, inputs)
         assert len(drives[1].power.commands) > fed[1]
         assert list(inputs.drive_state) == [DriveState.FAULT, DriveState.ENABLED]
-        assert "watchdog reads 0, 100 was set; arm again" in link.health.last_error
+        assert "watchdog reads 0, 100 was set" in link.health.last_error
         drives[0].registers[23] = 100  # whoever set it: nothing comes back by itself
         for _ in range(8):
             link.write(torques(ENABLE, 8.0, 8.0))
@@ -217,8 +218,8 @@ def test_periods_go_on_while_the_line_is_armed() -> None:
 # what prepare refuses
 
 
-def refusal(arrange: Callable[[list[ModbusDrive]], None]) -> tuple[list[str], list[ModbusDrive]]:
-    seen: list[tuple[list[str], list[ModbusDrive]]] = []
+def refusal(arrange: Callable[[list[ModbusDrive]], None]) -> tuple[list[Finding], list[ModbusDrive]]:
+    seen: list[tuple[list[Finding], list[ModbusDrive]]] = []
 
     async def body(link: ModbusLink, drives: list[ModbusDrive], peer: Registers) -> None:
         arrange(drives)
@@ -242,20 +243,26 @@ def set_register(register: int, value: int) -> Callable[[list[ModbusDrive]], Non
 
 
 @pytest.mark.parametrize(
-    ("arrange", "words"),
+    ("arrange", "found"),
     [
-        (set_register(0, 0x5201), ["0x5201", "0x5203"]),
-        (set_register(20, 2), ["rated torque", "80 Nm"]),
-        (set_register(22, 700), ["at most 56 Nm", "60"]),
-        (lambda drives: setattr(drives[1].power, "statusword", ENABLED), ["still enabled", "1237h"]),
-        (lambda drives: setattr(drives[1].power, "statusword", 0x0217), ["still enabled"]),
+        (set_register(0, 0x5201), finding("device-id-differs", device="drive-2", found=0x5201, wanted=0x5203)),
+        (set_register(20, 2), finding("rated-torque-differs", drive="drive-2", found_nm=145.536, wanted_nm=80.0)),
+        (set_register(22, 700), finding("max-torque-too-low", drive="drive-2", found_nm=56.0, limit_nm=60.0)),
+        (
+            lambda drives: setattr(drives[1].power, "statusword", ENABLED),
+            finding("still-enabled", drive="drive-2", statusword=0x1237),
+        ),
+        (
+            lambda drives: setattr(drives[1].power, "statusword", 0x0217),
+            finding("still-enabled", drive="drive-2", statusword=0x0217),
+        ),
     ],
 )
 def test_what_speaks_against_a_drive_is_named_before_anything_is_written(
-    arrange: Callable[[list[ModbusDrive]], None], words: list[str]
+    arrange: Callable[[list[ModbusDrive]], None], found: Finding
 ) -> None:
     reasons, drives = refusal(arrange)
-    assert len(reasons) == 1 and reasons[0].startswith("drive-2: ") and all(word in reasons[0] for word in words)
+    assert reasons == [found]
     assert not drives[0].writes and not drives[1].writes
 
 
@@ -266,7 +273,11 @@ def test_all_reasons_come_at_once() -> None:
         drives[1].power.statusword = ENABLED
 
     reasons, _ = refusal(arrange)
-    assert [reason.split(":")[0] for reason in reasons] == ["drive-1", "drive-2", "drive-2"]
+    assert [(reason.code, reason.parameters["drive"]) for reason in reasons] == [
+        ("max-torque-too-low", "drive-1"),
+        ("rated-torque-differs", "drive-2"),
+        ("still-enabled", "drive-2"),
+    ]
 
 
 @pytest.mark.parametrize("mode", ["stubborn", "refuses"])
@@ -279,14 +290,20 @@ def test_a_watchdog_that_cannot_be_set_undoes_all(mode: str) -> None:
             drives[1].refuses[23] = 3
 
     reasons, drives = refusal(arrange)
-    assert len(reasons) == 1 and "drive-2: its communication watchdog" in reasons[0]
-    assert "reads back 0" in reasons[0] if mode == "stubborn" else "exception 3" in reasons[0]
+    watchdog = {"device": "drive-2", "setting": "watchdog"}
+    assert reasons == [
+        finding("setting-reads-back", **watchdog, set_counts=100, found_counts=0)
+        if mode == "stubborn"
+        else finding("setting-not-set", **watchdog, error="exception 3 to function 16")
+    ]
     assert drives[0].registers[23] == 700, "the drive that took it has its own again"
 
 
 def test_a_silent_drive_is_named() -> None:
     reasons, _ = refusal(lambda drives: setattr(drives[1], "silent", True))
-    assert len(reasons) == 1 and reasons[0].startswith("drive-2: unit 12") and "no answer" in reasons[0]
+    (reason,) = reasons
+    assert reason.code == "unit-not-read"
+    assert (reason.parameters["device"], reason.parameters["unit"]) == ("drive-2", 12)
 
 
 def test_a_drive_that_is_ready_may_be_armed() -> None:

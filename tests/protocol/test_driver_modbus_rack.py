@@ -9,6 +9,7 @@ import pytest
 
 from drivers.modbus.link import ModbusLink
 from drivers.port import PrepareRefused
+from gateway.core.finding import finding
 from gateway.core.line import Line
 from gateway.core.signals import DriveRequest, DriveState, Inputs, Outputs, Quality
 from tests.protocol.driver_support import FAULT, SWITCH_ON_DISABLED, Registers, cycle, frame, until
@@ -189,8 +190,8 @@ def test_a_rack_with_fewer_axes_is_refused() -> None:
         with pytest.raises(PrepareRefused) as refused:
             await link.prepare()
         assert refused.value.reasons == [
-            "drive-3: channel 3, the device has 2 axes",
-            "cell-3: channel 3, the amplifier has 2",
+            finding("channel-missing", device="drive-3", channel=3, channels=2),
+            finding("channel-missing", device="cell-3", channel=3, channels=2),
         ]
 
     rack_bench(body)
@@ -201,7 +202,7 @@ def test_a_refused_watchdog_undoes_the_other() -> None:
         rack.registers[300:302] = [40, 50]
         for refused_at in (300, 301):
             rack.refuses = {refused_at: 3}
-            with pytest.raises(PrepareRefused, match="watchdog cannot be set: exception 3"):
+            with pytest.raises(PrepareRefused, match="setting-not-set"):
                 await link.prepare()
             assert rack.registers[300:302] == [40, 50]
 
@@ -235,7 +236,7 @@ def test_settings_out_of_reach_are_looked_at_beside_the_cycle(monkeypatch: pytes
         async with asyncio.timeout(5.0):
             while inputs.drive_state[0] != DriveState.FAULT:
                 await period(link, inputs)
-        assert "its communication watchdog reads 1000, 100 was set; arm again" in link.health.last_error
+        assert "watchdog reads 1000, 100 was set" in link.health.last_error
         assert all(power.commands[-1] == (0x00, 0) for power in rack.powers), "told to rest, all of them"
         assert rack.registers[200] == 0 and inputs.plc.quality == Quality.STALE
 

@@ -8,6 +8,7 @@ import pytest
 from drivers.modbus.client import ModbusConnection, ModbusFailed, ModbusTimeout
 from drivers.modbus.link import ModbusLink
 from drivers.port import PrepareRefused
+from gateway.core.finding import finding
 from gateway.core.signals import DriveRequest, DriveState, Inputs, Outputs, Quality
 from tests.protocol.driver_support import Registers, cycle, frame, until
 from tests.protocol.modbus_support import ModbusDrive, bench, command, drive_bench, enabled, interrupt, torques
@@ -46,7 +47,7 @@ def test_a_drive_whose_connection_was_lost_while_arming_is_not_armed(function: i
             await asyncio.sleep(0)
         with pytest.raises(PrepareRefused) as refused:
             await arming
-        assert refused.value.reasons == ["drive-1: the connection was lost meanwhile; arm again"]
+        assert refused.value.reasons == [finding("connection-lost-meanwhile", device="drive-1")]
         await cycles(link, inputs, 3, torques(ENABLE, 8.0, 8.0))
         assert not drives[0].power.commands and not drives[1].power.commands
         assert drives[1].registers[23] == 0, "nobody waits for a command"
@@ -69,7 +70,7 @@ def test_an_identity_read_on_an_earlier_connection_confirms_nothing(monkeypatch:
 
     async def body(link: ModbusLink, drives: list[ModbusDrive], peer: Registers) -> None:
         monkeypatch.setattr(ModbusConnection, "read", loses)
-        with pytest.raises(PrepareRefused, match="drive-1: the connection was lost meanwhile"):
+        with pytest.raises(PrepareRefused, match="connection-lost-meanwhile"):
             await link.prepare()
         assert lost
         peer.requests.clear()
@@ -87,7 +88,7 @@ def test_a_drive_that_ignores_orders_to_take_torque_off_is_fed_no_longer() -> No
         fed = len(drives[0].power.commands)
         await cycles(link, inputs, 20, torques(OFF, 0.0, 0.0))
         assert drives[0].power.commands[fed:] == [(0x00, 0)] * 6, "its watchdog has the last word"
-        assert "drive-1: is told to take torque off and stays enabled" in link.health.last_error
+        assert "drive-1 has ignored 5 orders" in link.health.last_error
         assert list(inputs.drive_state) == [DriveState.ENABLED, DriveState.OFF], "what gives torque is shown to"
         assert len(drives[1].power.commands) == len(drives[0].power.commands) + 14
         drives[0].power.obeys = True
@@ -107,7 +108,7 @@ def test_a_drive_whose_watchdog_is_changed_while_it_runs_loses_torque() -> None:
         # The first is that with whose answer it was seen. Without a watchdog silence would keep its torque on.
         assert drives[0].power.commands[fed:] == [(0x0F, 100)] + [(0x00, 0)] * 5
         assert list(inputs.drive_state) == [DriveState.FAULT, DriveState.ENABLED]
-        assert "drive-1: its communication watchdog reads 0, 100 was set; arm again" in link.health.last_error
+        assert "drive-1: watchdog reads 0, 100 was set" in link.health.last_error
         drives[0].registers[23] = 100
         await cycles(link, inputs, 3, torques(ENABLE, 8.0, 8.0))
         assert len(drives[0].power.commands) == fed + 6, "it does not come back by itself"
@@ -124,7 +125,7 @@ def test_a_plc_whose_watchdog_is_changed_while_it_runs_is_told_to_rest() -> None
         peer.plc[14] = 0
         await cycles(link, inputs, 2, command(True, 0.1))
         assert peer.plc[10:13] == [0, 0, 0] and inputs.plc.quality == Quality.STALE
-        assert "plc: its command watchdog reads 0" in link.health.last_error
+        assert "plc: watchdog reads 0" in link.health.last_error
 
     bench(body)
 

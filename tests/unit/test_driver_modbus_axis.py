@@ -14,6 +14,7 @@ from drivers.device_map import MAPS, MapRefused, load_map
 from drivers.modbus.axis import Axis, AxisSettings
 from drivers.modbus.device import Standing
 from drivers.modbus.maps import DriveMap
+from gateway.core.finding import finding
 from gateway.core.signals import DriveRequest, DriveState, Inputs, Outputs, Quality
 
 SINGLE, RACK = (load_map(MAPS / f"{name}.toml") for name in ("r2r-drive-modbus", "r2r-rack-drive"))
@@ -79,7 +80,7 @@ def test_states() -> None:
         of.fill(inputs, None, Standing(active=True, missed=missed), 1.0)
         expected = DriveState.ENABLED if missed < 3 else DriveState.ABSENT
         assert inputs.drive_state[0] == expected and inputs.speed.quality[0] == Quality.MISSING
-    distrusted = Standing(active=True, distrust="restarted")
+    distrusted = Standing(active=True, distrust=[finding("device-unanswered", device="drive-1", cycles=3)])
     assert heard(of, 0x1237, 0, 0, 0, 0, standing=distrusted).drive_state[0] == DriveState.FAULT
 
 
