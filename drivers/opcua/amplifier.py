@@ -2,11 +2,13 @@
 
 from drivers.opcua.maps import LoadCellMap
 from drivers.opcua.nodes import DeviceNodes, NodeTable, Reading
-from drivers.opcua.proof import ANSWERS_ALLOWED, Proof
+from drivers.opcua.proof import ANSWERS_ALLOWED, Proof, not_read
 from drivers.opcua.source_time import STANDS_STILL, SourceTime
 from drivers.scaling import si_per_count
+from gateway.core.finding import Finding, finding
 from gateway.core.line import LoadCell
 from gateway.core.signals import Inputs, Outputs
+from gateway.wording.catalogue import sentence
 
 _SHARED = 2  #: readings ahead of those of the channels: health and sample counter
 
@@ -58,15 +60,15 @@ class Amplifier:
         """Whatever answers on the next connection has to prove itself; until then nothing of it is believed."""
         self.proof.void()
 
-    def against(self, readings: tuple[Reading, ...]) -> list[str]:
+    def against(self, readings: tuple[Reading, ...]) -> list[Finding]:
         """What `prepare_reads` say against it: another device, too few channels."""
         identity, count = readings
         if reasons := self.proof.against_identity(identity):
             return reasons
         if not count.good:
-            return [f"{self.name}: its number of channels cannot be read: {count.trouble}"]
+            return [not_read(self.name, "channel_count", count)]
         return [
-            f"{cell.name}: channel {cell.channel}, the amplifier has {int(count.value)}"
+            finding("channel-missing", device=cell.name, channel=cell.channel, channels=int(count.value))
             for cell in self._cells
             if cell.channel > count.value
         ]
@@ -80,7 +82,7 @@ class Amplifier:
         self.missed = 0
         if not self.proof.known:
             self._reject(inputs)
-            return list(self.proof.doubts)
+            return [sentence(doubt) for doubt in self.proof.doubts]
         healthy, count = readings[:_SHARED]
         if not (healthy.good and count.good):
             self._reject(inputs)

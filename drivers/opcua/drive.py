@@ -6,6 +6,7 @@ off. One whose watchdog is found to be another than was set would keep its torqu
 off, without a life counter.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from drivers.cia402 import DISABLE_VOLTAGE, PowerState, power_state
@@ -13,15 +14,17 @@ from drivers.life import LifeCounter
 from drivers.mode_display import ModeDisplay
 from drivers.opcua.maps import DriveMap
 from drivers.opcua.nodes import DeviceNodes, NodeTable, Reading, to_type
-from drivers.opcua.proof import ANSWERS_ALLOWED, Proof, Watchdog
+from drivers.opcua.proof import ANSWERS_ALLOWED, Proof, Watchdog, not_read
 from drivers.opcua.source_time import STANDS_STILL, SourceTime
 from drivers.opcua.status import describe, is_done
-from drivers.power_stage import PowerStage
+from drivers.power_stage import ORDERS_IGNORED, PowerStage
 from drivers.scaling import speed_per_count, torque_per_count
+from drivers.torque_rules import against_max_torque, against_rated_torque
+from gateway.core.finding import Finding, finding
 from gateway.core.signals import Channel, DriveCondition, DriveState, Inputs, Outputs
+from gateway.wording.catalogue import sentence, sentences
 
 _WARNS = int(DriveCondition.WARNS)
-_RATED_TORQUE_TOLERANCE = 1e-3  #: of the line's figure; more would scale every torque wrongly
 _TORQUE_ON = (PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE, PowerState.FAULT_REACTION)
 _TORQUE_OFF = (
     PowerState.SWITCH_ON_DISABLED,
@@ -57,7 +60,7 @@ class Axis:
         self.stage = PowerStage(device.follows_command, device.voltage_enabled)
         self.missed = ANSWERS_ALLOWED  #: cycles in a row without a usable answer; nothing was heard yet
         self.active = False  #: the link is not silent
-        self.distrust = ""
+        self.distrust: Sequence[Finding] = ()
         self._settings = settings
         self._index = settings.index
         entries = device.nodes
@@ -108,7 +111,7 @@ class Axis:
         """What the next write says. Raises ValueError when the torque cannot be commanded; nothing is written then."""
         self._command = None
         if self.state == DriveState.ABSENT:
-            self._drop("it did not answer")
+            self._drop(finding("device-unanswered", device=self.name, cycles=self.missed))
         if self.distrust:
             return
         request, torque_nm = int(outputs.drive_request[self._index]), float(outputs.torque_nm[self._index])
@@ -116,7 +119,7 @@ class Axis:
         self._torque_counts(torque_nm)
         word, given_nm = self.stage.command(request, torque_nm, self.state, trusted=True)
         if self.stage.disobeys:
-            self._drop("it was told to take torque off and has not")
+            self._drop(finding("orders-ignored", drive=self.name, orders=ORDERS_IGNORED))
             return
         self._command = (word, self._torque_counts(given_nm))
 
@@ -146,13 +149,15 @@ class Axis:
         if not refused:
             return ""
         self._refused = True
-        self._drop(f"its command was refused ({', '.join(dict.fromkeys(refused))})")
-        return f"{self.name}: {self.distrust}"
+        self._drop(finding("command-refused", device=self.name, status=", ".join(dict.fromkeys(refused))))
+        return self._why_dropped()
 
-    def _drop(self, why: str) -> None:
+    def _drop(self, *why: Finding) -> None:
         """It cannot be commanded: a life counter that goes on would keep a watchdog fed that nobody listens behind."""
-        if not self.distrust:
-            self.distrust = f"{why}; {_TOLD_OFF if self._tells_off() else _LEFT_ALONE}; arm again"
+        self.distrust = self.distrust or why
+
+    def _why_dropped(self) -> str:
+        return f"{sentences(self.distrust)}; {_TOLD_OFF if self._tells_off() else _LEFT_ALONE}"
 
     def connection_lost(self) -> None:
         """Whatever answers on the next connection has to prove itself before it is believed or written to."""
@@ -162,10 +167,10 @@ class Axis:
         """Speed, torque and state into `inputs`; returns what was wrong. Without an answer they are missed."""
         index = self._index
         if self.active and self.proof.doubts:
-            self._drop("; ".join(self.proof.doubts).removeprefix(f"{self.name}: "))
+            self._drop(*self.proof.doubts)
         if readings is None or not self.proof.known:
             self._miss(inputs)
-            return list(self.proof.doubts) if readings is not None else []
+            return [sentence(doubt) for doubt in self.proof.doubts] if readings is not None else []
         statusword, speed, torque, *optional = readings
         watched = zip(self._sampled, (statusword, speed, torque), strict=True)
         old_status, old_speed, old_torque = [sampled.stands_still(of.source_us) for sampled, of in watched]
@@ -179,7 +184,7 @@ class Axis:
             inputs.drive_state[index], inputs.power_barred[index] = self.state, False
             return [f"{self.name}: statusword: {statusword.trouble}"]
         self.missed = 0
-        troubles = [f"{self.name}: {self.distrust}"] if self.distrust else []
+        troubles = [self._why_dropped()] if self.distrust else []
         troubles += self._hear(inputs, int(statusword.value), optional)
         for channel, what, reading, si_per_count, is_old in (
             (inputs.speed, "speed", speed, self._m_per_s_per_count, old_speed),
@@ -252,49 +257,41 @@ class Axis:
         self.stage.forget()
         if self._mode is not None:
             self._mode.forget()
-        self.distrust = ""
+        self.distrust = ()
         self._refused = False
         self._command = None
         self._life.forget()
 
-    def against(self, readings: tuple[Reading, ...]) -> list[str]:
+    def against(self, readings: tuple[Reading, ...]) -> list[Finding]:
         """What `prepare_reads` say against giving it torque."""
         identity, watchdog, statusword, *torques = readings
         if reasons := self.proof.against_identity(identity):
             return reasons
-        reasons = [f"{self.name}: its watchdog cannot be read: {watchdog.trouble}"] if not watchdog.good else []
+        reasons = [] if watchdog.good else [not_read(self.name, "watchdog", watchdog)]
         if not statusword.good:
-            reasons.append(f"{self.name}: its statusword cannot be read: {statusword.trouble}")
+            reasons.append(not_read(self.name, "statusword", statusword))
         elif power_state(word := int(statusword.value)) in _TORQUE_ON:
-            reasons.append(f"{self.name}: is still enabled (statusword {word:04X}h); take its torque off first")
+            reasons.append(finding("still-enabled", drive=self.name, statusword=word))
         reasons += self._against_max_torque(torques[0])
         if self._rated_torque is not None:
             reasons += self._against_rated_torque(torques[1])
         return reasons
 
-    def _against_max_torque(self, found: Reading) -> list[str]:
+    def _against_max_torque(self, found: Reading) -> list[Finding]:
         if not found.good:
-            return [f"{self.name}: its max torque cannot be read: {found.trouble}"]
+            return [not_read(self.name, "max_torque", found)]
         entry, limit_nm = self._max_torque, self._settings.torque_limit_nm
         nm_per_count = torque_per_count(entry.unit, entry.scale, self._settings.rated_torque_nm)
-        found_nm = found.value * nm_per_count
         rounding_nm = 1e-6 * limit_nm if entry.type in ("f32", "f64") else nm_per_count
-        if found_nm + rounding_nm >= limit_nm:
-            return []
-        return [f"{self.name}: gives at most {found_nm:g} Nm, limits.torque_nm is {limit_nm:g}; lower the limit"]
+        return against_max_torque(self.name, found.value * nm_per_count, limit_nm, rounding_nm)
 
-    def _against_rated_torque(self, found: Reading) -> list[str]:
+    def _against_rated_torque(self, found: Reading) -> list[Finding]:
         if not found.good:
-            return [f"{self.name}: its rated torque cannot be read: {found.trouble}"]
+            return [not_read(self.name, "rated_torque", found)]
         entry, wanted_nm = self._rated_torque, self._settings.rated_torque_nm
         assert entry is not None
         found_nm = found.value * torque_per_count(entry.unit, entry.scale, wanted_nm)
-        if abs(found_nm - wanted_nm) <= _RATED_TORQUE_TOLERANCE * wanted_nm:
-            return []
-        return [
-            f"{self.name}: has a rated torque of {found_nm:g} Nm, the line says {wanted_nm:g} Nm; "
-            "correct rated_torque_nm"
-        ]
+        return against_rated_torque(self.name, found_nm, wanted_nm)
 
     def farewell(self) -> list[tuple[int, float]]:
         """A last command: torque off."""

@@ -18,8 +18,10 @@ from drivers.opcua.proof import ANSWERS_ALLOWED
 from drivers.opcua.release import release_axes
 from drivers.opcua.status import BAD_TRANSACTION_FAILED, is_done
 from drivers.port import PrepareRefused
+from gateway.core.finding import finding
 from gateway.core.signals import Inputs, LinkHealth, Outputs
 from gateway.tasks.cleanup import finish
+from gateway.wording.catalogue import sentence
 
 ANSWER_TIMEOUT_S = 0.3  #: without an answer the connection is dropped
 PREPARE_TIMEOUT_S = 0.5  #: per question
@@ -81,15 +83,17 @@ class OpcUaLink:
         try:
             await self._ask_patiently(CONNECT_PATIENCE_S)
         except NoAnswer as error:
-            why = f"no connection to {self._endpoint}: {error}"
-            raise PrepareRefused([f"{device.name}: {why}" for device in self._devices]) from error
+            why = {"where": self._endpoint, "error": str(error)}
+            reasons = [finding("server-not-connected", device=device.name, **why) for device in self._devices]
+            raise PrepareRefused(reasons) from error
         connection = self._connection
         if self._noted_on != connection:  # they are of devices that may be others now
             self._noted.clear()
         self._noted_on = connection
         reasons = await prepare_devices(self._ask, self._devices, self._noted)
         if not reasons and self._connection != connection:
-            reasons = [f"bus {self.name}: the connection was lost meanwhile; arm again"]
+            names = ", ".join(device.name for device in self._devices)
+            reasons = [finding("connection-lost-meanwhile", device=names)]
         if reasons:
             raise PrepareRefused(reasons)
         self._to_leave.clear()
@@ -136,7 +140,7 @@ class OpcUaLink:
             axes = []
         troubles = await release_axes(self._ask, axes)
         if self._noted_on == self._connection:
-            troubles += await restore(self._ask, self._noted)
+            troubles += [sentence(failure) for failure in await restore(self._ask, self._noted)]
         elif names := ", ".join(device.name for device in self._noted):
             troubles.append(f"connected anew since an arming was cancelled: the watchdogs of {names} stay as they are")
         self._noted.clear()

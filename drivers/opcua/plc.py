@@ -11,21 +11,23 @@ from math import isfinite
 from drivers.life import LifeCounter
 from drivers.opcua.maps import PlcMap
 from drivers.opcua.nodes import DeviceNodes, NodeTable, Reading, to_type
-from drivers.opcua.proof import ANSWERS_ALLOWED, Proof, Watchdog
+from drivers.opcua.proof import ANSWERS_ALLOWED, Proof, Watchdog, not_read
 from drivers.opcua.status import describe, is_done
 from drivers.scaling import si_per_count
+from gateway.core.finding import Finding, finding
 from gateway.core.line import LinePlc
 from gateway.core.signals import Inputs, Outputs, Quality
+from gateway.wording.catalogue import sentence, sentences
 
 
 class Plc:
-    """`refusal` is why it is not written to until the next `prepare`, empty while there is no reason."""
+    """`refusal` is why it is not written to until the next `prepare`, None while there is no reason."""
 
     def __init__(self, device: PlcMap, plc: LinePlc, watchdog_s: float, table: NodeTable) -> None:
         self.name = plc.name
         self.missed = ANSWERS_ALLOWED  #: cycles in a row without an answer; nothing was heard yet
         self.active = False  #: the link is not silent
-        self.refusal = ""
+        self.refusal: Finding | None = None
         self._device = device
         nodes = DeviceNodes(table, device.namespace, plc.address)
         self.watchdog = Watchdog(device.watchdog, watchdog_s, nodes)
@@ -86,8 +88,8 @@ class Plc:
         refused = [describe(status) for status in statuses if not is_done(status)]
         if not refused:
             return ""
-        self.refusal = f"{self.name}: its command was refused ({', '.join(dict.fromkeys(refused))})"
-        return self.refusal
+        self.refusal = finding("command-refused", device=self.name, status=", ".join(dict.fromkeys(refused)))
+        return sentence(self.refusal)
 
     def connection_lost(self) -> None:
         """A PLC that was restarted has lost its watchdog: it is not written to before that is read back."""
@@ -102,16 +104,16 @@ class Plc:
     def forget(self) -> None:
         """Silence: nothing of the last command is left."""
         self.active = False
-        self.refusal = self._unsaid = ""
+        self.refusal, self._unsaid = None, ""
         self._command = None
         self._life.forget()
 
-    def against(self, readings: tuple[Reading, ...]) -> list[str]:
+    def against(self, readings: tuple[Reading, ...]) -> list[Finding]:
         """What `prepare_reads` say against commanding it."""
         identity, watchdog = readings
         if reasons := self.proof.against_identity(identity):
             return reasons
-        return [] if watchdog.good else [f"{self.name}: its watchdog cannot be read: {watchdog.trouble}"]
+        return [] if watchdog.good else [not_read(self.name, "watchdog", watchdog)]
 
     def fill(self, inputs: Inputs, time_s: float, readings: tuple[Reading, ...] | None) -> list[str]:
         """Status and v0 into `inputs`; returns what was wrong. Without an answer they are missed."""
@@ -122,7 +124,7 @@ class Plc:
         self.missed = 0
         if not self.proof.known:
             self._miss(inputs)
-            return list(self.proof.doubts)
+            return [sentence(doubt) for doubt in self.proof.doubts]
         flags, (speed, echo) = readings[: len(self._flags)], readings[len(self._flags) :]
         if echo.good and self._life.stands_still(echo.value, moving=self._wrote):
             self._miss(inputs)
@@ -148,7 +150,7 @@ class Plc:
         troubles = [f"{self.name}: its command watchdog has tripped"] if tripped else []
         if mute:
             unsaid = f"{self.name}: {self._unsaid or 'it has yet to prove itself'}"
-            why = "; ".join(self.proof.doubts) or self.refusal or unsaid
+            why = sentences(self.proof.doubts) or (sentence(self.refusal) if self.refusal else unsaid)
             told = "told to stop" if self.proof.unguarded and not self.refusal else "not written to"
             troubles.append(f"{why}; it is {told}")
         return troubles

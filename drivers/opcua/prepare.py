@@ -7,8 +7,9 @@ from drivers.opcua.amplifier import Amplifier
 from drivers.opcua.drive import Axis
 from drivers.opcua.messages import Answer
 from drivers.opcua.plc import Plc
-from drivers.opcua.proof import Watchdog
+from drivers.opcua.proof import Watchdog, not_read
 from drivers.opcua.status import describe, is_done
+from gateway.core.finding import Finding, finding
 from gateway.tasks.cleanup import finish
 
 Device = Axis | Amplifier | Plc
@@ -29,19 +30,19 @@ class Ask(Protocol):
     ) -> Answer: ...
 
 
-async def prepare_devices(ask: Ask, devices: Sequence[Device], noted: dict[Device, float]) -> list[str]:
+async def prepare_devices(ask: Ask, devices: Sequence[Device], noted: dict[Device, float]) -> list[Finding]:
     """Check every device, set every watchdog and read it back. What speaks against it; it is undone then.
 
     What a watchdog was before it was written is in `noted` (counts) while it may have to be restored: also when this
     is cancelled half-way.
     """
-    reasons: list[str] = []
+    reasons: list[Finding] = []
     before: dict[Device, float] = {}
     for device in devices:
         try:
             readings = (await ask((), device.prepare_reads)).readings
         except NoAnswer as error:
-            return [*reasons, f"{device.name}: {error}"]
+            return [*reasons, finding("server-silent", device=device.name, error=str(error))]
         reasons += device.against(readings)
         before[device] = readings[1].value  # of those that have one, the watchdog
     if reasons:
@@ -53,7 +54,7 @@ async def prepare_devices(ask: Ask, devices: Sequence[Device], noted: dict[Devic
             try:
                 reasons += await _set_watchdog(ask, device.name, device.watchdog)
             except NoAnswer as error:
-                reasons.append(f"{device.name}: its watchdog cannot be set: {error}")
+                reasons.append(finding("setting-not-set", **_watchdog_of(device.name), error=str(error)))
                 break
     if reasons:
         return reasons + await finish(restore(ask, noted))
@@ -61,36 +62,45 @@ async def prepare_devices(ask: Ask, devices: Sequence[Device], noted: dict[Devic
     return []
 
 
-async def restore(ask: Ask, noted: dict[Device, float]) -> list[str]:
+async def restore(ask: Ask, noted: dict[Device, float]) -> list[Finding]:
     """Set the watchdogs to what they were; the last that was written is the first. What went wrong.
 
     A server that does not answer is asked once.
     """
-    reasons: list[str] = []
+    reasons: list[Finding] = []
     for device in reversed(list(noted)):
         assert device.watchdog is not None
         try:
             reasons += await _undo(ask, device.name, device.watchdog, noted[device])
         except NoAnswer as error:
-            reasons += [f"{left.name}: its watchdog could not be restored: {error}" for left in reversed(list(noted))]
+            reasons += [_not_restored(left.name, str(error)) for left in reversed(list(noted))]
             noted.clear()
             break
         del noted[device]  # not before: cut here, the next call goes on
     return reasons
 
 
-async def _set_watchdog(ask: Ask, name: str, watchdog: Watchdog) -> list[str]:
+async def _set_watchdog(ask: Ask, name: str, watchdog: Watchdog) -> list[Finding]:
     status = (await ask(((watchdog.node, float(watchdog.counts)),), ())).written[0]
     if not is_done(status):
-        return [f"{name}: its watchdog cannot be set to {watchdog.counts}: {describe(status)}"]
+        return [finding("setting-not-set", **_watchdog_of(name), error=describe(status))]
     found = (await ask((), (watchdog.node,))).readings[0]
     if not found.good:
-        return [f"{name}: its watchdog cannot be read back: {found.trouble}"]
+        return [not_read(name, "watchdog", found)]
     if found.value != watchdog.counts:
-        return [f"{name}: its watchdog was set to {watchdog.counts} and reads back {found.value:g}"]
+        counts = {"set_counts": watchdog.counts, "found_counts": found.value}
+        return [finding("setting-reads-back", **_watchdog_of(name), **counts)]
     return []
 
 
-async def _undo(ask: Ask, name: str, watchdog: Watchdog, before: float) -> list[str]:
+async def _undo(ask: Ask, name: str, watchdog: Watchdog, before: float) -> list[Finding]:
     status = (await ask(((watchdog.node, before),), ())).written[0]
-    return [] if is_done(status) else [f"{name}: its watchdog could not be restored: {describe(status)}"]
+    return [] if is_done(status) else [_not_restored(name, describe(status))]
+
+
+def _not_restored(name: str, error: str) -> Finding:
+    return finding("setting-not-restored", **_watchdog_of(name), error=error)
+
+
+def _watchdog_of(name: str) -> dict[str, str]:
+    return {"device": name, "setting": "watchdog"}

@@ -10,6 +10,7 @@ from math import floor
 from drivers.opcua.maps import Identity, WatchdogNode
 from drivers.opcua.nodes import DeviceNodes, Reading
 from drivers.scaling import si_per_count
+from gateway.core.finding import Finding, finding
 
 ANSWERS_ALLOWED = 3  #: cycles in a row without a usable answer until a device counts as absent
 
@@ -42,7 +43,7 @@ class Proof:
         self.name = name
         self.nodes = (nodes.place(identity, identity.type), *((watchdog.node,) if watchdog else ()))  #: to be read
         self.known = self.proven = self.unguarded = False
-        self.doubts: list[str] = []
+        self.doubts: list[Finding] = []
         self._unread = 0  #: answers in a row without a usable one, since it was proven
         self._wanted = identity.value
         self._watchdog = watchdog
@@ -78,19 +79,23 @@ class Proof:
         self.doubts = []
         self._unread = 0
 
-    def against_identity(self, found: Reading) -> list[str]:
+    def against_identity(self, found: Reading) -> list[Finding]:
         if not found.good:
-            return [f"{self.name}: its device id cannot be read: {found.trouble}"]
+            return [not_read(self.name, "identity", found)]
         if found.value != self._wanted:
-            return [
-                f"{self.name}: device id {int(found.value):#x}, its map says {self._wanted:#x}; "
-                "correct `map`, `address` or `channel`"
-            ]
+            return [finding("device-id-differs", device=self.name, found=int(found.value), wanted=self._wanted)]
         return []
 
-    def against_watchdog(self, found: Reading) -> list[str]:
+    def against_watchdog(self, found: Reading) -> list[Finding]:
         assert self._watchdog is not None
-        if found.good and found.value == self._watchdog.counts:
+        if not found.good:
+            return [not_read(self.name, "watchdog", found)]
+        if found.value == self._watchdog.counts:
             return []
-        says = f"reads {found.value:g}, {self._watchdog.counts} was set" if found.good else f"reads {found.trouble}"
-        return [f"{self.name}: its watchdog {says}"]
+        counts = {"set_counts": self._watchdog.counts, "found_counts": found.value}
+        return [finding("setting-changed", device=self.name, setting="watchdog", **counts)]
+
+
+def not_read(device: str, node: str, found: Reading) -> Finding:
+    """Of a node by its key in the map."""
+    return finding("node-not-read", device=device, node=node, status=found.trouble)

@@ -317,7 +317,7 @@ class Rig:
                 try:
                     return await self.link.prepare()
                 except PrepareRefused as refused:
-                    if not any(str(reason).endswith(": no answer in time") for reason in refused.reasons):
+                    if not any(reason.parameters.get("error") == "no answer in time" for reason in refused.reasons):
                         raise
 
     async def enable(self, torque_nm: float = 5.0) -> None:

@@ -11,6 +11,7 @@ from asyncua import ua
 from drivers.opcua.messages import Plan
 from drivers.opcua.session import LAST_NUMBER, Session
 from drivers.port import PrepareRefused
+from gateway.core.finding import Finding, finding
 from gateway.core.signals import DriveRequest, DriveState, Quality
 from tests.protocol.driver_opcua_support import U32, DeviceServer, Rig, device_server, line, link_in_process
 
@@ -255,7 +256,7 @@ def test_a_drive_that_refuses_a_command_is_named_and_left_to_its_watchdog(server
         devices.bystander = bystander
         devices.refuses["Axis1.TargetTorque"] = CODES.BadNotWritable
         await rig.until(lambda: rig.inputs.drive_state[0] == DriveState.FAULT)
-        assert "drive-1: its command was refused (BadNotWritable)" in rig.link.health.last_error
+        assert "drive-1: its command was refused: BadNotWritable" in rig.link.health.last_error
         devices.writes.clear()
         await rig.until(lambda: len(devices.written("Axis2.Life")) > 2)
         assert devices.written("Axis1.Life") == []
@@ -314,31 +315,61 @@ def test_a_torque_that_is_not_finite_is_not_written(server: DeviceServer) -> Non
     run(server, scene)
 
 
-REFUSALS: list[tuple[Callable[[DeviceServer], object], str]] = [
-    (lambda s: s.devices.set("Axis2.DeviceId", 0x5203), "drive-2: device id 0x5203, its map says 0x5205"),
-    (lambda s: s.devices.set("Line.DeviceId", 1), "plc: device id 0x1, its map says 0x5207"),
-    (lambda s: s.devices.nodes.pop("Axis1.DeviceId"), "drive-1: its device id cannot be read: BadNodeIdUnknown"),
-    (lambda s: s.devices.set("Axis1.Statusword", 0x1237), "drive-1: is still enabled (statusword 1237h)"),
-    (lambda s: s.devices.set("Axis1.RatedTorque", 40.0), "drive-1: has a rated torque of 40 Nm, the line says 80 Nm"),
-    (lambda s: s.devices.set("Axis1.RatedTorque", nan), "drive-1: has a rated torque of nan Nm, the line says 80 Nm"),
-    (lambda s: s.devices.set("Axis2.MaxTorque", 59.0), "drive-2: gives at most 59 Nm, limits.torque_nm is 60"),
-    (lambda s: s.devices.set("Axis2.MaxTorque", nan), "drive-2: gives at most nan Nm, limits.torque_nm is 60"),
-    (lambda s: s.devices.set("Amplifier.Channels", 1), "cell-2: channel 2, the amplifier has 1"),
+REFUSALS: list[tuple[Callable[[DeviceServer], object], Finding]] = [
+    (
+        lambda s: s.devices.set("Axis2.DeviceId", 0x5203),
+        finding("device-id-differs", device="drive-2", found=0x5203, wanted=0x5205),
+    ),
+    (
+        lambda s: s.devices.set("Line.DeviceId", 1),
+        finding("device-id-differs", device="plc", found=1, wanted=0x5207),
+    ),
+    (
+        lambda s: s.devices.nodes.pop("Axis1.DeviceId"),
+        finding("node-not-read", device="drive-1", node="identity", status="BadNodeIdUnknown"),
+    ),
+    (
+        lambda s: s.devices.set("Axis1.Statusword", 0x1237),
+        finding("still-enabled", drive="drive-1", statusword=0x1237),
+    ),
+    (
+        lambda s: s.devices.set("Axis1.RatedTorque", 40.0),
+        finding("rated-torque-differs", drive="drive-1", found_nm=40.0, wanted_nm=80.0),
+    ),
+    (
+        lambda s: s.devices.set("Axis1.RatedTorque", nan),
+        finding("rated-torque-differs", drive="drive-1", found_nm=nan, wanted_nm=80.0),
+    ),
+    (
+        lambda s: s.devices.set("Axis2.MaxTorque", 59.0),
+        finding("max-torque-too-low", drive="drive-2", found_nm=59.0, limit_nm=60.0),
+    ),
+    (
+        lambda s: s.devices.set("Axis2.MaxTorque", nan),
+        finding("max-torque-too-low", drive="drive-2", found_nm=nan, limit_nm=60.0),
+    ),
+    (
+        lambda s: s.devices.set("Amplifier.Channels", 1),
+        finding("channel-missing", device="cell-2", channel=2, channels=1),
+    ),
     (
         lambda s: s.devices.refuses.update({"Axis2.Watchdog": CODES.BadOutOfRange}),
-        "drive-2: its watchdog cannot be set to 100: BadOutOfRange",
+        finding("setting-not-set", device="drive-2", setting="watchdog", error="BadOutOfRange"),
     ),
-    (lambda s: s.devices.stubborn.add("Line.Watchdog"), "plc: its watchdog was set to 100 and reads back 0"),
+    (
+        lambda s: s.devices.stubborn.add("Line.Watchdog"),
+        finding("setting-reads-back", device="plc", setting="watchdog", set_counts=100, found_counts=0.0),
+    ),
     (
         lambda s: s.devices.nodes.update({"Axis1.Watchdog": (U32, 0)}),
-        "drive-1: its watchdog cannot be read: BadTypeMismatch",
+        finding("node-not-read", device="drive-1", node="watchdog", status="BadTypeMismatch"),
     ),
 ]
 
 
-@pytest.mark.parametrize(("spoil", "reason"), REFUSALS, ids=[reason for _, reason in REFUSALS])
+@pytest.mark.parametrize(("spoil", "found"), REFUSALS, ids=[found.code for _, found in REFUSALS])
 def test_prepare_refuses_by_name_and_leaves_no_watchdog_set(
-    server: DeviceServer, spoil: Callable[[DeviceServer], object], reason: str
+    server: DeviceServer, spoil: Callable[[DeviceServer], object], found: Finding
 ) -> None:
     devices = server.devices
     spoil(server)
@@ -346,7 +377,7 @@ def test_prepare_refuses_by_name_and_leaves_no_watchdog_set(
     async def scene(rig: Rig) -> None:
         with pytest.raises(PrepareRefused) as refused:
             await rig.prepare()
-        assert any(given.startswith(reason) for given in refused.value.reasons), refused.value.reasons
+        assert found in refused.value.reasons
         assert [devices.value(f"{name}.Watchdog") for name in ("Axis1", "Axis2", "Line")] == [0] * 3
         devices.writes.clear()
         for _ in range(3):
@@ -364,7 +395,11 @@ def test_every_reason_is_named(server: DeviceServer) -> None:
     async def scene(rig: Rig) -> None:
         with pytest.raises(PrepareRefused) as refused:
             await rig.prepare()
-        assert [reason.split(":")[0] for reason in refused.value.reasons] == ["drive-1", "drive-2", "plc"]
+        assert [reason.code for reason in refused.value.reasons] == [
+            "device-id-differs",
+            "rated-torque-differs",
+            "device-id-differs",
+        ]
 
     run(server, scene)
 
