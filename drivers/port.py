@@ -17,10 +17,10 @@ from gateway.core.signals import Inputs, LinkHealth, Outputs
 
 
 class PrepareRefused(Exception):
-    """A device cannot be trusted with torque. `reasons` name device, what was found, and what to do."""
+    """A device cannot be trusted with torque. `reasons` name the device and what was found."""
 
-    def __init__(self, reasons: Sequence[str | Finding]) -> None:
-        super().__init__("; ".join(reason if isinstance(reason, str) else reason.code for reason in reasons))
+    def __init__(self, reasons: Sequence[Finding]) -> None:
+        super().__init__("; ".join(reason.code for reason in reasons))
         self.reasons = list(reasons)
 
 

@@ -10,12 +10,14 @@ from drivers.canopen.configure import cell_expected, cell_steps
 from drivers.canopen.counts import end_values, n_per_count
 from drivers.canopen.map_cell import COB_ID_STEP, LoadCellMap
 from drivers.canopen.pdo import MalformedPdo, PdoLayout
-from drivers.canopen.prepare import check_identity
+from drivers.canopen.prepare import check_fixed, check_identity
 from drivers.canopen.sdo import SdoBus
 from drivers.canopen.station import Station
-from drivers.canopen.transaction import Step, differences, read_number
+from drivers.canopen.transaction import Step, read_number
+from gateway.core.finding import Finding, finding
 from gateway.core.line import LoadCell
 from gateway.core.signals import Inputs, Outputs
+from gateway.wording.catalogue import sentence
 
 
 @dataclass(slots=True)
@@ -46,7 +48,7 @@ class AmplifierNode:
     def __init__(self, device: LoadCellMap, cells: list[LoadCell]) -> None:
         node = cells[0].address
         self.identity = device.identity
-        self.watchdog, self.defies, self.shows_torque = None, "", False  # it is not commanded
+        self.watchdog, self.defies, self.shows_torque = None, None, False  # it is not commanded
         self._device = device
         self._ends = end_values(device.objects.tension.type)
         pdos, each = device.transmit_pdos, device.transmit_pdos.channels_each
@@ -104,7 +106,7 @@ class AmplifierNode:
     def absent(self, now_s: float) -> bool:
         return self.station.absent(now_s, self.station.supervised)
 
-    def trouble(self, now_s: float) -> str:
+    def trouble(self, now_s: float) -> Finding | None:
         return self.station.trouble(now_s, self.station.supervised)
 
     def fill(self, inputs: Inputs, now_s: float, *, active: bool) -> list[str]:
@@ -123,7 +125,7 @@ class AmplifierNode:
                 elif trouble := self._fill_cell(inputs, cell, now_s if active else self._read_s):
                     troubles.append(trouble)
         if refused:
-            troubles.append(f"{self.station.name}: {refused}")
+            troubles.append(sentence(refused))
         if not active:  # a reading counts once; an answer to SYNC is used up by the next SYNC
             for cell in self._cells:
                 cell.fresh = None
@@ -155,11 +157,11 @@ class AmplifierNode:
     def reading_due(self, now_s: float, *, active: bool) -> bool:
         return not active
 
-    async def read(self, sdo: SdoBus, now_s: float) -> list[str]:
+    async def read(self, sdo: SdoBus, now_s: float) -> list[Finding]:
         """Tensions and states while there is no SYNC. Raises SdoFailed."""
         node, objects = self.station.node, self._device.objects
         if self._boot_ups != self.station.boot_ups and (
-            reasons := await check_identity(sdo, node, self.identity) or await self._learn(sdo)
+            reasons := await check_identity(sdo, self.station, self.identity) or await self._learn(sdo)
         ):
             return reasons
         counter = int(await read_number(sdo, node, objects.sample_counter))
@@ -175,23 +177,23 @@ class AmplifierNode:
         self._read_s = now_s
         return []
 
-    async def check(self, sdo: SdoBus) -> list[str]:
+    async def check(self, sdo: SdoBus) -> list[Finding]:
         """Its channels, and that they are healthy. Raises SdoFailed."""
         if reasons := await self._learn(sdo):
             return reasons
         healthy = self._device.objects.healthy
-        reasons = await differences(sdo, self.station.node, cell_expected(self._device, self.station.node, self._pdos))
+        reasons = await check_fixed(sdo, self.station, cell_expected(self._device, self.station.node, self._pdos))
         if healthy is not None and not healthy.is_set(int(await read_number(sdo, self.station.node, healthy))):
-            reasons.append("is not healthy, as it says; see its own display or manual")
+            reasons.append(finding("amplifier-not-healthy", device=self.station.name))
         return reasons
 
-    async def _learn(self, sdo: SdoBus) -> list[str]:
+    async def _learn(self, sdo: SdoBus) -> list[Finding]:
         """That it has these channels, and what a count of each is worth. Raises SdoFailed."""
         self._boot_ups = -1
         boot_ups, node, objects = self.station.boot_ups, self.station.node, self._device.objects
         count = int(await read_number(sdo, node, objects.channel_count))
         reasons = [
-            f"{cell.item.name}: channel {cell.item.channel}, the amplifier has {count}"
+            finding("channel-missing", device=cell.item.name, channel=cell.item.channel, channels=count)
             for cell in self._cells
             if cell.item.channel > count
         ]
@@ -201,19 +203,19 @@ class AmplifierNode:
             self._boot_ups = boot_ups
         return reasons
 
-    async def _learn_unit(self, sdo: SdoBus, cell: _Cell) -> list[str]:
+    async def _learn_unit(self, sdo: SdoBus, cell: _Cell) -> list[Finding]:
         tension, unit = self._device.objects.tension, self._device.objects.physical_unit
         digits = 0
         if unit is not None:
             found = int(await read_number(sdo, self.station.node, unit.of_channel(cell.item.channel)))
             if found != unit.value:
-                return [f"{cell.item.name}: is set to unit {found:#010x}, its map says {unit.value:#010x}"]
+                return [finding("cell-unit-differs", cell=cell.item.name, found=found, wanted=unit.value)]
         if tension.digits is not None:
             digits = int(await read_number(sdo, self.station.node, tension.digits.of_channel(cell.item.channel)))
-        try:
-            cell.n_per_count = n_per_count(self._device, cell.item, digits)
-        except ValueError as error:
-            return [f"{cell.item.name}: {error}"]
+        worth = n_per_count(self._device, cell.item, digits)
+        if isinstance(worth, Finding):
+            return [worth]
+        cell.n_per_count = worth
         return []
 
     def steps(self) -> list[Step]:

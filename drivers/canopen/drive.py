@@ -6,18 +6,19 @@ from drivers.canopen.configure import DriveSettings, drive_expected, drive_steps
 from drivers.canopen.map_drive import DriveMap
 from drivers.canopen.map_parts import CanObject
 from drivers.canopen.pdo import DriveSample, MalformedPdo, PdoCodec
+from drivers.canopen.prepare import check_fixed
 from drivers.canopen.sdo import SdoBus, SdoFailed, SdoNoObject
 from drivers.canopen.station import Station
-from drivers.canopen.transaction import Step, differences, place, read_number
+from drivers.canopen.transaction import Step, place, read_number
 from drivers.cia402 import DISABLE_VOLTAGE, PowerState, is_barred, power_state
 from drivers.mode_display import ModeDisplay
 from drivers.power_stage import ORDERS_IGNORED, PowerStage
 from drivers.scaling import torque_per_count
+from drivers.torque_rules import against_max_torque, against_rated_torque
 from gateway.core.finding import Finding, finding
 from gateway.core.signals import DriveState, Inputs, Outputs
 
 STO_POLL_S = 0.2  #: how often a drive that may not switch on is asked whether safe torque off is why
-_RATED_TORQUE_TOLERANCE = 1e-3  #: of the line's figure; more would scale every torque wrongly
 _ENABLED = PowerState.OPERATION_ENABLED  # looked up in every cycle
 _IN_FAULT = (PowerState.FAULT_REACTION, PowerState.FAULT)
 _WITH_TORQUE = (PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE, PowerState.FAULT_REACTION)
@@ -89,12 +90,14 @@ class DriveNode:
     def absent(self, now_s: float) -> bool:
         return self.station.absent(now_s, self.stage.gives_torque)
 
-    def trouble(self, now_s: float) -> str:
+    def trouble(self, now_s: float) -> Finding | None:
         return self.station.trouble(now_s, self.stage.gives_torque)
 
     @property
-    def defies(self) -> str:
-        return f"ignored {ORDERS_IGNORED} orders to take its torque off" if self.stage.disobeys else ""
+    def defies(self) -> Finding | None:
+        if not self.stage.disobeys:
+            return None
+        return finding("orders-ignored", drive=self.station.name, orders=ORDERS_IGNORED)
 
     @property
     def shows_torque(self) -> bool:
@@ -168,7 +171,7 @@ class DriveNode:
             return False
         return now_s - self._mode_asked_s >= self.mode.read_after_s(enabled=self.stage.power is _ENABLED)
 
-    async def read(self, sdo: SdoBus, now_s: float) -> list[str]:
+    async def read(self, sdo: SdoBus, now_s: float) -> list[Finding]:
         """Whether safe torque off is why it may not switch on, and its mode, as it is due. Raises SdoFailed.
 
         Of one that is mute, its statusword.
@@ -201,15 +204,15 @@ class DriveNode:
         found = int(await read_number(sdo, self.station.node, statusword))
         return power_state(found) not in _WITH_TORQUE
 
-    async def check(self, sdo: SdoBus) -> list[str | Finding]:
+    async def check(self, sdo: SdoBus) -> list[Finding]:
         """Off, and what its map and the line say of it. Raises SdoFailed."""
         objects = self.device.objects
         statusword = int(await read_number(sdo, self.station.node, objects.statusword))
-        reasons: list[str | Finding] = []
+        reasons: list[Finding] = []
         if power_state(statusword) in _WITH_TORQUE:
-            reasons.append(f"is still enabled (statusword {statusword:04X}h); take its torque off first")
+            reasons.append(finding("still-enabled", drive=self.station.name, statusword=statusword))
         reasons += await self._check_rated_torque(sdo) + await self._check_max_torque(sdo)
-        reasons += await differences(sdo, self.station.node, drive_expected(self.device, self.station.node))
+        reasons += await check_fixed(sdo, self.station, drive_expected(self.device, self.station.node))
         reasons += await self._check_reaction(sdo)
         self.stage.on_safe_torque_off(await self._read_safe_torque_off(sdo))
         return reasons
@@ -249,7 +252,7 @@ class DriveNode:
             return True
         return False
 
-    async def _check_rated_torque(self, sdo: SdoBus) -> list[str]:
+    async def _check_rated_torque(self, sdo: SdoBus) -> list[Finding]:
         entry = self.device.objects.rated_torque
         if entry is None:
             return []
@@ -257,21 +260,15 @@ class DriveNode:
         found_nm = await read_number(sdo, self.station.node, entry) * torque_per_count(
             entry.unit, entry.scale, wanted_nm
         )
-        if abs(found_nm - wanted_nm) <= _RATED_TORQUE_TOLERANCE * wanted_nm:
-            return []
-        return [f"has a rated torque of {found_nm:g} Nm, the line says {wanted_nm:g} Nm; correct rated_torque_nm"]
+        return against_rated_torque(self.station.name, found_nm, wanted_nm)
 
-    async def _check_max_torque(self, sdo: SdoBus) -> list[str]:
+    async def _check_max_torque(self, sdo: SdoBus) -> list[Finding]:
         entry, settings = self.device.objects.max_torque, self.settings
         if entry is None or entry.writable:
             return []
         nm_per_count = torque_per_count(entry.unit, entry.scale, settings.rated_torque_nm)
         found_nm = await read_number(sdo, self.station.node, entry) * nm_per_count
-        if found_nm + nm_per_count >= settings.torque_limit_nm:
-            return []
-        limit_nm = settings.torque_limit_nm
-        at = place(entry.index, entry.sub)
-        return [f"gives at most {found_nm:g} Nm ({at}), limits.torque_nm is {limit_nm:g}; lower the limit"]
+        return against_max_torque(self.station.name, found_nm, settings.torque_limit_nm, nm_per_count)
 
     def forget(self) -> None:
         self.station.forget()

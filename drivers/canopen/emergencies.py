@@ -11,6 +11,7 @@ from typing import NamedTuple
 from canopen.emcy import EmcyError
 
 from drivers.canopen.map_parts import EmergencyClasses
+from gateway.core.finding import Finding, finding
 
 GENERIC_ERROR = 0x01  #: bit of the error register
 
@@ -26,10 +27,11 @@ class Emergency(NamedTuple):
     register: int
     data: bytes = b""
 
-    @property
-    def text(self) -> str:
-        words = EmcyError(self.code, self.register, self.data, 0.0).get_desc()
-        return f"EMCY {self.code:04X}h {words}".rstrip() + f", error register {self.register:02X}h"
+    def of(self, device: str) -> Finding:
+        """With what the profile says of its code."""
+        meaning = EmcyError(self.code, self.register, self.data, 0.0).get_desc() or "?"
+        message = {"error_code": self.code, "meaning": meaning, "register": self.register}
+        return finding("emergency-message", device=device, **message)
 
     @property
     def number(self) -> int:

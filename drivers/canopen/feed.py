@@ -15,7 +15,9 @@ from drivers.canopen.heartbeat import HeartbeatProducer
 from drivers.canopen.node import Node
 from drivers.canopen.questions import Questions
 from drivers.canopen.station import ENTER_PRE_OPERATIONAL, nmt_frame
+from gateway.core.finding import Finding
 from gateway.core.signals import LinkHealth, Outputs
+from gateway.wording.catalogue import sentence
 
 Send = Callable[[int, bytes], bool]
 
@@ -49,12 +51,12 @@ class Feed:
             if self._send(heartbeat.cob_id, heartbeat.payload):
                 heartbeat.sent(now_s)
 
-    def drop(self, node: Node, trouble: str) -> None:
+    def drop(self, node: Node, trouble: Finding) -> None:
         """It is not fed any more, and that is told."""
         self._drop(node, trouble)
-        self._health.last_error = f"{node.station.name}: {node.station.distrust}"
+        self._health.last_error = sentence(trouble)
 
-    def _drop(self, node: Node, trouble: str) -> None:
+    def _drop(self, node: Node, trouble: Finding) -> None:
         node.station.drop(trouble)
         self._questions.doubt(node)  # what it confirmed before is over
 
@@ -83,8 +85,8 @@ class Feed:
         return self._is_off(node) if station.distrust else sent
 
     def _judge(self, node: Node, now_s: float) -> None:
-        if node.absent(now_s):
-            self._drop(node, node.trouble(now_s))  # the link tells who is absent
+        if node.absent(now_s) and (trouble := node.trouble(now_s)):
+            self._drop(node, trouble)  # the link tells who is absent
         elif node.defies:
             self.drop(node, node.defies)
 

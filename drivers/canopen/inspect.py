@@ -34,7 +34,9 @@ from drivers.inspection import (
 )
 from drivers.scaling import si_per_count, torque_per_count
 from drivers.wiring import Wired
+from gateway.core.finding import Finding
 from gateway.core.line import CanopenBus, Drive, LoadCell
+from gateway.wording.catalogue import sentence
 
 _TIME_BITS = 0xFFFF  #: of an entry of 1016h: node number and milliseconds in one
 _ERROR_CODE = CanObject(index=0x603F, type="u16")  #: of every CiA 402 drive (IEC 61800-7-201, 10.1)
@@ -229,10 +231,11 @@ class _Inspector:
         if digits.value is None:
             problems.append(digits.trouble)
         elif not problems:
-            try:
-                self._n_per_count = n_per_count(device, item, int(digits.value))
-            except ValueError as error:
-                problems.append(str(error))
+            worth = n_per_count(device, item, int(digits.value))
+            if isinstance(worth, Finding):
+                problems.append(sentence(worth))
+            else:
+                self._n_per_count = worth
         pdo = (item.channel - 1) // device.transmit_pdos.channels_each
         problems += await self._differences(cell_expected(device, self._node, [pdo]))
         return replace(facts, differences=tuple(problems))
@@ -262,7 +265,8 @@ class _Inspector:
 
     async def _differences(self, expected: Sequence[Expected]) -> tuple[str, ...]:
         try:
-            return tuple(await differences(self._reading.sdo, self._node, expected))
+            found = await differences(self._reading.sdo, self._node, expected)
+            return tuple(f"{at} is {is_now:#x}, its map says {wanted:#x}" for at, is_now, wanted in found)
         except SdoSilent:
             raise
         except SdoFailed as error:

@@ -23,9 +23,11 @@ from drivers.canopen.sdo import SdoBus, SdoFailed
 from drivers.canopen.station import ENTER_PRE_OPERATIONAL, OPERATIONAL, START, nmt_frame
 from drivers.canopen.transaction import Transaction
 from drivers.port import PrepareRefused
+from gateway.core.finding import Finding, finding
 from gateway.core.line import CanopenBus
 from gateway.core.signals import Inputs, LinkHealth, Outputs
 from gateway.tasks.cleanup import finish, finish_all
+from gateway.wording.catalogue import sentence
 
 SYNC, EMERGENCY = 0x080, 0x080  #: COB-IDs, the last of node 0
 START_HEARTBEATS = 3  #: producer times within which a started node must say that it is operational
@@ -80,7 +82,8 @@ class CanopenLink:
             await self._bus.restore()
             self._bus.open()
         except OSError as error:
-            raise PrepareRefused([str(error)]) from error
+            told = str(error).removeprefix(f"bus {self.name}: ")
+            raise PrepareRefused([finding("can-bus-not-open", bus=self.name, error=told)]) from error
         for node in self._nodes:
             node.station.boot_ups = 0
         await self._leave_operational()  # a node that is stopped does not answer SDO
@@ -101,7 +104,7 @@ class CanopenLink:
         self._questions.stop()  # what a silent link asked for must not come among the answers to SYNC
         self._active = self._prepared = True
 
-    async def _start(self) -> list[str]:
+    async def _start(self) -> list[Finding]:
         """NMT start, and every node's own word that it is operational and was not restarted meanwhile."""
         stations = [node.station for node in self._nodes]
         for node in self._nodes:
@@ -115,10 +118,10 @@ class CanopenLink:
                     await self._heartbeat_came.wait()
         except TimeoutError:
             pass
-        late = [station for station in stations if station.nmt_state != OPERATIONAL]
-        reasons = [f"{station.name}: started, but not operational within {patience_s:g} s" for station in late]
+        late = [station.name for station in stations if station.nmt_state != OPERATIONAL]
+        reasons = [finding("node-not-operational", device=name, waited_s=patience_s) for name in late]
         return reasons + [
-            f"{station.name}: restarted while it was configured" for station in stations if station.boot_ups
+            finding("restarted-meanwhile", device=station.name) for station in stations if station.boot_ups
         ]
 
     def _command_nmt(self, command: int, node: Node) -> None:
@@ -127,7 +130,7 @@ class CanopenLink:
     def _send(self, cob_id: int, data: bytes) -> bool:
         return self._bus.send(cob_id, data)
 
-    def _on_altered(self, node: Node, trouble: str) -> None:
+    def _on_altered(self, node: Node, trouble: Finding) -> None:
         self._feed.drop(node, trouble)
 
     @property
@@ -168,7 +171,7 @@ class CanopenLink:
         async with self._releasing:
             await self._leave_operational()
             for failure in await undo_all(self._unfinished):
-                self.health.last_error = f"bus {self.name}: {failure}"
+                self.health.last_error = sentence(failure)
 
     async def _leave_operational(self) -> None:
         for node in self._nodes:
@@ -248,8 +251,8 @@ class CanopenLink:
         if absent != self.health.absent:
             self.health.absent = absent
             for node in self._nodes:
-                if node.station.name in absent:
-                    self.health.last_error = f"{node.station.name}: {node.trouble(self._sync_s)}"
+                if node.station.name in absent and (trouble := node.trouble(self._sync_s)):
+                    self.health.last_error = sentence(trouble)
         self.health.reconnects = self._bus.reopened
         if self._bus.gone:
             self.health.last_error = self._bus.gone
@@ -297,7 +300,7 @@ class CanopenLink:
             self._discard(f"{node.station.name}: {error}")
             return
         if node.station.distrust:
-            self.health.last_error = f"{node.station.name}: {node.station.distrust}"
+            self.health.last_error = sentence(node.station.distrust)
         self._heartbeat_came.set()
 
     def _on_emergency(self, node: Node, cob_id: int, data: bytes | bytearray, now_s: float) -> None:
@@ -306,8 +309,8 @@ class CanopenLink:
         except ValueError as error:
             self._discard(f"{node.station.name}: {error}")
             return
-        if node.station.emergency_told:
-            self.health.last_error = f"{node.station.name}: {node.station.emergency_told}"
+        if told := node.station.emergency_told:
+            self.health.last_error = sentence(told)
 
     def _discard(self, reason: str) -> None:
         self.health.malformed += 1

@@ -1,6 +1,5 @@
 """What the link asks of a node, whatever its role: a drive, a load-cell amplifier, a line PLC."""
 
-from collections.abc import Sequence
 from typing import Protocol
 
 from drivers.canopen.map_parts import CanIdentity
@@ -46,13 +45,13 @@ class Node(Protocol):
         """Whether it was never heard, or is lost."""
         ...
 
-    def trouble(self, now_s: float) -> str:
-        """What is wrong with it, for a person; empty when nothing is."""
+    def trouble(self, now_s: float) -> Finding | None:
+        """What is wrong with it; None when nothing is."""
         ...
 
     @property
-    def defies(self) -> str:
-        """How it defies its commands, so that only its watchdog can stop it; empty while it does not."""
+    def defies(self) -> Finding | None:
+        """How it defies its commands, so that only its watchdog can stop it; None while it does not."""
         ...
 
     @property
@@ -71,14 +70,14 @@ class Node(Protocol):
         """Whether `read` has something to ask for."""
         ...
 
-    async def read(self, sdo: SdoBus, now_s: float) -> list[str]:
+    async def read(self, sdo: SdoBus, now_s: float) -> list[Finding]:
         """Ask by SDO for what no PDO brings, beside the cycle. Changes nothing at the node.
 
         Returns what speaks against believing it. Raises SdoFailed.
         """
         ...
 
-    async def check(self, sdo: SdoBus) -> Sequence[str | Finding]:
+    async def check(self, sdo: SdoBus) -> list[Finding]:
         """What speaks against the node, before anything is written. Reads only. Raises SdoFailed."""
         ...
 

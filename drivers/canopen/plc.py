@@ -11,14 +11,16 @@ from typing import NamedTuple
 from drivers.canopen.configure import plc_expected, plc_steps, watchdog_step
 from drivers.canopen.map_plc import PlcMap
 from drivers.canopen.pdo import MalformedPdo, PdoLayout
-from drivers.canopen.prepare import check_identity
+from drivers.canopen.prepare import check_fixed, check_identity
 from drivers.canopen.sdo import SdoBus
 from drivers.canopen.station import Station
-from drivers.canopen.transaction import Step, differences, read_number
+from drivers.canopen.transaction import Step, read_number
 from drivers.life import LifeCounter
 from drivers.scaling import si_per_count
+from gateway.core.finding import Finding, finding
 from gateway.core.line import LinePlc
 from gateway.core.signals import Inputs, Outputs, Quality
+from gateway.wording.catalogue import sentence
 
 
 class _Status(NamedTuple):
@@ -38,7 +40,7 @@ class PlcNode:
         self._device = device
         self._steps = plc_steps(device, plc.address, watchdog_s)
         self.watchdog = watchdog_step(device.watchdog, watchdog_s)
-        self.defies, self.shows_torque = "", False  # its echo and its watchdog answer for it
+        self.defies, self.shows_torque = None, False  # its echo and its watchdog answer for it
         self._read_scale = si_per_count(device.read.speed.unit, device.read.speed.scale)
         self._write_scale = si_per_count(device.write.speed.unit, device.write.speed.scale)
         self._transmit = PdoLayout(device.objects_of(device.transmit_pdo))
@@ -53,7 +55,7 @@ class PlcNode:
         self._fresh: _Status | None = None  #: not used yet
         self._read_s = 0.0  #: when the last reading by SDO was asked for
         self._commanded = False  #: the last cycle had a command for it
-        self._refusal = ""  #: why it had none
+        self._refusal: Finding | None = None  #: why it had none
         self._runs = False  #: transport is asked for
         self._boot_ups = -1  #: of the station, when it was last found to be what its map says
 
@@ -81,7 +83,7 @@ class PlcNode:
     def absent(self, now_s: float) -> bool:
         return self.station.absent(now_s, self._runs)
 
-    def trouble(self, now_s: float) -> str:
+    def trouble(self, now_s: float) -> Finding | None:
         return self.station.trouble(now_s, self._runs)
 
     def fill(self, inputs: Inputs, now_s: float, *, active: bool) -> list[str]:
@@ -96,8 +98,8 @@ class PlcNode:
             self._miss(inputs)
             return [f"{self.station.name}: answers, but its echo of the life counter stands still"]
         time_s = now_s if active else self._read_s
-        doubt = self.station.distrust or self.station.emergency or (active and self._refusal)
-        troubles = [f"{self.station.name}: {doubt}"] if doubt else []
+        doubt = self.station.distrust or self.station.emergency or (self._refusal if active else None)
+        troubles = [sentence(doubt)] if doubt else []
         plc, read, word = inputs.plc, self._device.read, status.word
         plc.quality, plc.time_s = Quality.STALE if doubt else Quality.GOOD, time_s
         plc.permissive = read.permissive.is_set(word)
@@ -131,7 +133,7 @@ class PlcNode:
 
         Raises ValueError; nothing is sent then, and the life counter stops.
         """
-        self._commanded, self._runs, self._refusal = False, outputs.run, ""
+        self._commanded, self._runs, self._refusal = False, outputs.run, None
         if self.station.distrust:
             return None
         try:
@@ -139,7 +141,7 @@ class PlcNode:
             numbers["life"] = self._life.next()
             payload = self._receive.encode([numbers[name] for name in self._device.receive_pdo.objects])
         except ValueError as error:
-            self._refusal = f"its command was refused: {error}"
+            self._refusal = finding("command-refused", device=self.station.name, error=str(error))
             raise
         self._commanded = True
         return self._receive_cob_id, payload
@@ -163,12 +165,12 @@ class PlcNode:
     def reading_due(self, now_s: float, *, active: bool) -> bool:
         return not active
 
-    async def read(self, sdo: SdoBus, now_s: float) -> list[str]:
+    async def read(self, sdo: SdoBus, now_s: float) -> list[Finding]:
         """Status and v0 while there is no SYNC. Raises SdoFailed."""
         node, read = self.station.node, self._device.read
         boot_ups = self.station.boot_ups
         if self._boot_ups != boot_ups:
-            if reasons := await check_identity(sdo, node, self.identity):
+            if reasons := await check_identity(sdo, self.station, self.identity):
                 return reasons
             self._boot_ups = boot_ups
         word = int(await read_number(sdo, node, read.status))
@@ -177,9 +179,9 @@ class PlcNode:
         self._read_s = now_s
         return []
 
-    async def check(self, sdo: SdoBus) -> list[str]:
+    async def check(self, sdo: SdoBus) -> list[Finding]:
         """That its fixed objects are those of its map. Raises SdoFailed."""
-        return await differences(sdo, self.station.node, plc_expected(self._device, self.station.node))
+        return await check_fixed(sdo, self.station, plc_expected(self._device, self.station.node))
 
     def steps(self) -> list[Step]:
         return self._steps
@@ -194,5 +196,5 @@ class PlcNode:
     def forget(self) -> None:
         self.station.forget()
         self._fresh = None
-        self._commanded, self._runs, self._refusal = False, False, ""
+        self._commanded, self._runs, self._refusal = False, False, None
         self._life.forget()

@@ -6,7 +6,8 @@ from collections.abc import Sequence
 from drivers.canopen.map_parts import CanIdentity
 from drivers.canopen.node import Node
 from drivers.canopen.sdo import SdoBus, SdoFailed, SdoSilent
-from drivers.canopen.transaction import Transaction
+from drivers.canopen.station import Station
+from drivers.canopen.transaction import Expected, Transaction, differences
 from gateway.core.finding import Finding, finding
 
 WAKING_S = 5.0  #: that a node whose heartbeat is there is waited for until its SDO server answers
@@ -16,15 +17,21 @@ SERIAL_READINGS = 2  #: an abort may be of the moment
 _IDENTITY = 0x1018
 
 
-async def check_identity(sdo: SdoBus, node: int, wanted: CanIdentity) -> list[str]:
+async def check_identity(sdo: SdoBus, station: Station, wanted: CanIdentity) -> list[Finding]:
     """What speaks against the node being the device of its map. Raises SdoFailed."""
-    vendor = int.from_bytes(await sdo.upload(node, _IDENTITY, 1, 4), "little")
-    product = int.from_bytes(await sdo.upload(node, _IDENTITY, 2, 4), "little")
+    vendor = int.from_bytes(await sdo.upload(station.node, _IDENTITY, 1, 4), "little")
+    product = int.from_bytes(await sdo.upload(station.node, _IDENTITY, 2, 4), "little")
     if (vendor, product) == (wanted.vendor_id, wanted.product_code):
         return []
+    should = {"wanted_vendor": wanted.vendor_id, "wanted_product": wanted.product_code}
+    return [finding("node-is-another", device=station.name, vendor=vendor, product=product, **should)]
+
+
+async def check_fixed(sdo: SdoBus, station: Station, expected: Sequence[Expected]) -> list[Finding]:
+    """What the node has otherwise than its map says. Raises SdoFailed."""
     return [
-        f"is another device: vendor {vendor:#x} product {product:#x}, its map says "
-        f"vendor {wanted.vendor_id:#x} product {wanted.product_code:#x}; correct `map` or the node number"
+        finding("object-differs", device=station.name, object=at, found=found, wanted=wanted)
+        for at, found, wanted in await differences(sdo, station.node, expected)
     ]
 
 
@@ -44,26 +51,24 @@ async def read_serial(sdo: SdoBus, node: int) -> str:
     return ""
 
 
-async def check_nodes(sdo: SdoBus, nodes: Sequence[Node]) -> list[str | Finding]:
-    """What speaks against the nodes, before anything is written, each with its name. Reads only."""
+async def check_nodes(sdo: SdoBus, nodes: Sequence[Node]) -> list[Finding]:
+    """What speaks against the nodes, before anything is written. Reads only."""
     found = await asyncio.gather(*(_check_awake(sdo, node) for node in nodes))
     return [reason for reasons in found for reason in reasons]
 
 
-async def _check_awake(sdo: SdoBus, node: Node) -> list[str | Finding]:
+async def _check_awake(sdo: SdoBus, node: Node) -> list[Finding]:
     """The same of one. A node that was just switched on may send heartbeats before its SDO server answers."""
     station, now_s = node.station, asyncio.get_running_loop().time
     began_s = now_s()
     while True:
         heartbeats = station.heartbeats
         try:
-            reasons = await _check(sdo, node)
-            return [reason if isinstance(reason, Finding) else f"{station.name}: {reason}" for reason in reasons]
+            return await _check(sdo, node)
         except SdoSilent:
             pass
         if not await _is_alive(node, heartbeats):
-            hint = "check its power, node number, bit rate and wiring"
-            return [f"{station.name}: node {station.node} does not answer; {hint}"]
+            return [finding("node-silent", device=station.name, node=station.node)]
         waited_s = now_s() - began_s
         if waited_s >= WAKING_S:
             return [finding("sdo-silent", device=station.name, state=station.state_name, waited_s=waited_s)]
@@ -79,38 +84,38 @@ async def _is_alive(node: Node, heartbeats: int) -> bool:
     return station.heartbeats != heartbeats
 
 
-async def _check(sdo: SdoBus, node: Node) -> Sequence[str | Finding]:
+async def _check(sdo: SdoBus, node: Node) -> list[Finding]:
     """Raises SdoSilent."""
     try:
-        if reasons := await check_identity(sdo, node.station.node, node.identity):
+        if reasons := await check_identity(sdo, node.station, node.identity):
             return reasons
         node.station.serial = await read_serial(sdo, node.station.node)
         return await node.check(sdo)
     except SdoSilent:
         raise
     except SdoFailed as error:
-        return [str(error)]
+        return [finding("sdo-refused", device=node.station.name, error=str(error))]
 
 
-async def configure_nodes(sdo: SdoBus, nodes: Sequence[Node], transactions: list[Transaction]) -> list[str]:
+async def configure_nodes(sdo: SdoBus, nodes: Sequence[Node], transactions: list[Transaction]) -> list[Finding]:
     """Write every node's settings and read them back; what went wrong.
 
     What has to be undone is in `transactions`: also when this is cancelled half-way.
     """
-    reasons: list[str] = []
+    reasons: list[Finding] = []
     for node in nodes:
-        transaction = Transaction(sdo, node.station.node)
+        transaction = Transaction(sdo, node.station)
         transactions.append(transaction)
         try:
-            await transaction.run(node.steps())
+            reasons += await transaction.run(node.steps())
         except (SdoFailed, ValueError) as error:
-            reasons.append(f"{node.station.name}: {error}")
+            reasons.append(finding("node-not-configured", device=node.station.name, error=str(error)))
     return reasons
 
 
-async def undo_all(transactions: list[Transaction]) -> list[str]:
+async def undo_all(transactions: list[Transaction]) -> list[Finding]:
     """Take every transaction back, the last first; returns what could not be restored. None is left then."""
-    failures: list[str] = []
+    failures: list[Finding] = []
     while transactions:
         failures += await transactions[-1].undo()
         transactions.pop()

@@ -6,8 +6,10 @@ from typing import Any, TypeVar
 
 from drivers.canopen.node import Node
 from drivers.canopen.sdo import SdoBus, SdoFailed, SdoSilent
-from drivers.canopen.transaction import Step
+from drivers.canopen.transaction import Step, set_and_found
+from gateway.core.finding import Finding, finding
 from gateway.core.signals import LinkHealth
+from gateway.wording.catalogue import sentences
 
 VERIFY_S = 1.0  #: in which every watchdog is read once
 READINGS = 2  #: that show another value than was set, one after the other, until a watchdog counts as altered
@@ -19,7 +21,7 @@ class Questions:
     """`on_altered(node, trouble)` is called when a watchdog is not what `prepare` has set it to."""
 
     def __init__(
-        self, sdo: SdoBus, nodes: Sequence[Node], health: LinkHealth, on_altered: Callable[[Node, str], None]
+        self, sdo: SdoBus, nodes: Sequence[Node], health: LinkHealth, on_altered: Callable[[Node, Finding], None]
     ) -> None:
         self._sdo = sdo
         self._health = health
@@ -100,7 +102,7 @@ class Questions:
     async def _read(self, node: Node, now_s: float, *, silent: bool) -> None:
         reasons = await self._answer(node, node.read(self._sdo, now_s))
         if reasons:
-            self._health.last_error = f"{node.station.name}: {'; '.join(reasons)}"
+            self._health.last_error = sentences(reasons)
         elif reasons is not None and silent:
             node.station.heard(now_s)  # a sign of life: its heartbeat may be off until `prepare` sets it
 
@@ -112,8 +114,8 @@ class Questions:
             found = await self._answer(node, question)
             if found is None or found == wanted:
                 return
-        was, now = (int.from_bytes(data, "little") for data in (wanted, found))
-        self._on_altered(node, f"its watchdog, {watchdog.name}, was set to {was:#x} and is {now:#x}")
+        counts = set_and_found(wanted, found)
+        self._on_altered(node, finding("object-changed", device=node.station.name, object=watchdog.name, **counts))
 
     async def _answer(self, node: Node, question: Coroutine[Any, Any, T]) -> T | None:
         """None, and why in `health`, where there is no answer."""

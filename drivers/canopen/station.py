@@ -5,6 +5,7 @@ import struct
 from drivers.canopen.emergencies import Emergency, EmergencyClass, class_of
 from drivers.canopen.map_parts import EmergencyClasses, HeartbeatObject, Watchdog
 from drivers.scaling import si_per_count
+from gateway.core.finding import Finding, finding
 
 HEARTBEATS_ALLOWED = 1.5  #: producer times without a heartbeat until a node that the line depends on counts as lost
 HEARTBEATS_ALLOWED_AT_REST = 3.0  #: the same while nothing moves by it
@@ -26,7 +27,7 @@ def nmt_frame(command: int, node: int) -> tuple[int, bytes]:
 class Station:
     """One node. `frames` are the PDOs that it sends with every SYNC; with `has_statusword` its statusword says whether
 
-    it is in fault. `distrust` is why it is not relied on until the next `prepare`, empty while there is no reason.
+    it is in fault. `distrust` is why it is not relied on until the next `prepare`, None while there is no reason.
     """
 
     def __init__(
@@ -53,13 +54,13 @@ class Station:
         self.boot_ups = 0
         self.heartbeats = 0  #: heard, boot-ups among them
         self.supervised = False  #: must stay operational
-        self.emergency = ""  #: of the class fault
+        self.emergency: Finding | None = None  #: of the class fault
         self.warning: Emergency | None = None  #: of the class warning
         self._classes = EmergencyClasses() if classes is None else classes
         self._has_statusword = has_statusword
         self.undecided: Emergency | None = None  #: its statusword has to say what it means
         self._statuswords = 0  #: since
-        self.distrust = ""
+        self.distrust: Finding | None = None
         self.dropped = False  #: was lost while supervised: not fed any more, so that its own watchdog can fire
         self.withheld = False  #: not fed, to see its watchdog fire
         self.serial = ""  #: number, as it was read last; empty: it tells none
@@ -92,9 +93,9 @@ class Station:
         if not self.supervised or self.dropped:
             return
         if self.nmt_state == BOOT_UP:
-            self.distrust = "restarted: its settings are lost, arm again"
+            self.distrust = finding("device-restarted", device=self.name)
         elif self.nmt_state != OPERATIONAL:
-            self.distrust = f"left operational for {_NMT_NAMES.get(self.nmt_state, hex(self.nmt_state))}, arm again"
+            self.distrust = finding("node-left-operational", device=self.name, state=self.state_name)
 
     def heard(self, now_s: float) -> None:
         """It showed life in another way than by its heartbeat."""
@@ -107,11 +108,11 @@ class Station:
         emergency = Emergency(*_EMCY.unpack(data))
         self.undecided, self._statuswords = None, 0
         if not emergency.code >> 8:
-            self.emergency, self.warning = "", None
+            self.emergency = self.warning = None
             return
         match class_of(emergency, self._classes, has_statusword=self._has_statusword):
             case EmergencyClass.FAULT:
-                self.emergency = emergency.text
+                self.emergency = emergency.of(self.name)
             case EmergencyClass.WARNING:
                 self.warning = emergency
             case EmergencyClass.AS_STATUSWORD:
@@ -123,15 +124,15 @@ class Station:
             return
         self._statuswords += 1
         if in_fault:
-            self.emergency, self.undecided = self.undecided.text, None
+            self.emergency, self.undecided = self.undecided.of(self.name), None
         elif self._statuswords >= STATUSWORDS_AWAITED:
             self.warning, self.undecided = self.undecided, None
 
     @property
-    def emergency_told(self) -> str:
-        """What its last emergency message said, whatever it means; empty where that is over."""
+    def emergency_told(self) -> Finding | None:
+        """What its last emergency message said, whatever it means; None where that is over."""
         said = self.undecided or self.warning
-        return self.emergency or (said.text if said is not None else "")
+        return self.emergency or (said.of(self.name) if said is not None else None)
 
     @property
     def state_name(self) -> str:
@@ -140,7 +141,7 @@ class Station:
 
     def recover(self) -> None:
         """What it told in emergency messages is over."""
-        self.emergency, self.warning, self.undecided = "", None, None
+        self.emergency = self.warning = self.undecided = None
 
     # the cycle
 
@@ -165,24 +166,24 @@ class Station:
         """Never heard, or lost. `relied_on`: something moves by it, so its heartbeats count strictly."""
         return self.missed >= ANSWERS_ALLOWED or self.heartbeat_lost(now_s, relied_on)
 
-    def trouble(self, now_s: float, relied_on: bool) -> str:
-        """What is wrong with it, for a person; empty when nothing is."""
+    def trouble(self, now_s: float, relied_on: bool) -> Finding | None:
+        """What is wrong with it; None when nothing is."""
         if self.heartbeat_lost(now_s, relied_on):
-            return "no heartbeat"
+            return finding("heartbeat-lost", device=self.name)
         if self.missed >= ANSWERS_ALLOWED:
-            return f"no answer to {self.missed} SYNCs in a row"
+            return finding("sync-unanswered", device=self.name, syncs=self.missed)
         return self.distrust or self.emergency
 
-    def drop(self, trouble: str) -> None:
+    def drop(self, trouble: Finding) -> None:
         """It is lost, or cannot be relied on: not fed until the next `prepare`, so that its watchdog fires."""
-        self.distrust = f"{trouble}; it was told to stop, arm again"
+        self.distrust = trouble
         self.dropped = True
 
     def forget(self) -> None:
         """Nothing that was true of the node before counts any more, except that it was heard."""
         self.supervised = False
         self.missed = 0
-        self.distrust = ""
+        self.distrust = None
         self.dropped = self.withheld = False
         self.undecided = None
         self._came = 0

@@ -7,7 +7,9 @@ from dataclasses import dataclass
 from drivers.canopen.map_parts import CanObject, Pdo
 from drivers.canopen.pdo import mapping_entries, type_code
 from drivers.canopen.sdo import SdoBus, SdoFailed, SdoSilent
+from drivers.canopen.station import Station
 from drivers.map_rules import BYTES
+from gateway.core.finding import Finding, finding
 
 _PDO_INVALID = 1 << 31
 _NO_REMOTE_REQUEST = 1 << 30  #: a bit of a COB-ID that is the device's own business
@@ -84,27 +86,28 @@ async def read_number(sdo: SdoBus, node: int, entry: CanObject | Expected) -> in
         raise SdoFailed(f"{place(entry.index, entry.sub)}: {len(data)} bytes are no {entry.type}") from error
 
 
-async def differences(sdo: SdoBus, node: int, expected: Sequence[Expected]) -> list[str]:
-    """What a node has otherwise than its map says. Reads only. Raises SdoFailed."""
-    reasons: list[str] = []
+async def differences(sdo: SdoBus, node: int, expected: Sequence[Expected]) -> list[tuple[str, int, int]]:
+    """What a node has otherwise than its map says: place, found, wanted. Reads only. Raises SdoFailed."""
+    different: list[tuple[str, int, int]] = []
     for entry in expected:
         found = int(await read_number(sdo, node, entry))
         if (found ^ entry.value) & ~entry.ignore:
-            reasons.append(f"{place(entry.index, entry.sub)} is {found:#x}, its map says {entry.value:#x}")
-    return reasons
+            different.append((place(entry.index, entry.sub), found, entry.value))
+    return different
 
 
 class Transaction:
     """Writes to one node that can be taken back. Undone in reverse, each object gets what it had before its step,
     so that a PDO mapping passes through the same legal states backwards."""
 
-    def __init__(self, sdo: SdoBus, node: int) -> None:
+    def __init__(self, sdo: SdoBus, station: Station) -> None:
         self._sdo = sdo
-        self._node = node
+        self._name, self._node = station.name, station.node
         self._before: list[tuple[Step, bytes]] = []
 
-    async def run(self, steps: list[Step]) -> None:
-        """Write every step, then read back what must stand in the end. Raises SdoFailed at the first that fails."""
+    async def run(self, steps: list[Step]) -> list[Finding]:
+        """Write every step, then read back what must stand in the end; what does not. Raises SdoFailed at the first
+        that fails."""
         final: dict[tuple[int, int], tuple[Step, bytes]] = {}
         for step in steps:
             present = await self._sdo.upload(self._node, step.index, step.sub, BYTES[step.type])
@@ -119,23 +122,32 @@ class Transaction:
                 self._before.pop()  # it has said that it did not take it
                 raise
             final[step.index, step.sub] = (step, wanted)
+        reasons: list[Finding] = []
         for step, wanted in final.values():
             found = await self._sdo.upload(self._node, step.index, step.sub, len(wanted))
             if found != wanted:
-                raise SdoFailed(f"{step.name}: written {wanted.hex()}, read back {found.hex()} (bytes, low first)")
+                counts = set_and_found(wanted, found)
+                reasons.append(finding("object-reads-back", device=self._name, object=step.name, **counts))
+        return reasons
 
-    async def undo(self) -> list[str]:
+    async def undo(self) -> list[Finding]:
         """Write back what was there before; returns what could not be restored. A node that is silent is left."""
-        failures: list[str] = []
+        failures: list[Finding] = []
         while self._before:
             step, present = self._before[-1]
             try:
                 await self._sdo.download(self._node, step.index, step.sub, present)
             except SdoSilent as error:
+                left = {"objects": len(self._before), "error": str(error)}
                 self._before.clear()
-                failures.append(f"{error}; the rest could not be restored")
+                failures.append(finding("node-not-restored", device=self._name, **left))
                 break
             except SdoFailed as error:
-                failures.append(f"not restored: {error}")
+                failures.append(finding("object-not-restored", device=self._name, error=str(error)))
             self._before.pop()  # not before: cut here, it is written back by the next call
         return failures
+
+
+def set_and_found(wanted: bytes, found: bytes) -> dict[str, int]:
+    """Of an object, as parameters of a finding."""
+    return {"set_counts": int.from_bytes(wanted, "little"), "found_counts": int.from_bytes(found, "little")}

@@ -149,7 +149,7 @@ class Axis:
         if not refused:
             return ""
         self._refused = True
-        self._drop(finding("command-refused", device=self.name, status=", ".join(dict.fromkeys(refused))))
+        self._drop(finding("command-refused", device=self.name, error=", ".join(dict.fromkeys(refused))))
         return self._why_dropped()
 
     def _drop(self, *why: Finding) -> None:

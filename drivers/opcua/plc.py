@@ -88,7 +88,7 @@ class Plc:
         refused = [describe(status) for status in statuses if not is_done(status)]
         if not refused:
             return ""
-        self.refusal = finding("command-refused", device=self.name, status=", ".join(dict.fromkeys(refused)))
+        self.refusal = finding("command-refused", device=self.name, error=", ".join(dict.fromkeys(refused)))
         return sentence(self.refusal)
 
     def connection_lost(self) -> None:

@@ -1,5 +1,7 @@
 """Whether the line may be armed, the links' way there, and back to silence however an arming ends."""
 
+from collections.abc import Sequence
+
 from drivers.port import PrepareRefused
 from gateway.core.finding import Finding
 from gateway.core.line import Device
@@ -25,19 +27,19 @@ def refusal_to_arm(cycle: Cycle) -> Reply | None:
     return not_armed(cycle, reasons) if reasons else None
 
 
-def not_armed(cycle: Cycle, reasons: list[str | Finding]) -> Reply:
+def not_armed(cycle: Cycle, reasons: Sequence[str | Finding]) -> Reply:
     text = "not armed; mend what is named and arm again"
     state = cycle.machine.state.name
     return Reply(ok=False, state=state, text=text, reasons=said(reasons), findings=coded(reasons))
 
 
-async def prepare_links(cycle: Cycle) -> list[str | Finding]:
+async def prepare_links(cycle: Cycle) -> list[Finding]:
     """Prove everything that must hold before torque is possible, on links that are released; periods go on meanwhile.
 
     Returns every reason of every link that refuses. Whoever calls releases all links where there is one, and where
     this is cancelled or raises.
     """
-    reasons: list[str | Finding] = []
+    reasons: list[Finding] = []
     for link in cycle.links:
         try:
             await link.prepare()

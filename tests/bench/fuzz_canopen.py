@@ -203,7 +203,7 @@ class Emergency:
             return REFUSED
         assert len(data) == 8, "an EMCY of a wrong length was accepted"
         code = struct.unpack_from("<H", data)[0]
-        assert (f"{code:04X}h" in station.emergency) == (code >= 0x100), station.emergency
+        assert bool(station.emergency_told) == (code >= 0x100), station.emergency_told
         return ACCEPTED
 
 

@@ -16,6 +16,7 @@ from drivers.canopen.link import CanopenLink
 from drivers.port import PrepareRefused
 from drivers.power_stage import ORDERS_IGNORED
 from drivers.registry import build_links
+from gateway.core.finding import Finding, finding
 from gateway.core.signals import DriveRequest, DriveState, Inputs, Outputs, Quality
 from tests.protocol.driver_support import (
     ENABLED,
@@ -492,8 +493,8 @@ def test_a_drive_that_ignores_its_orders_is_dropped() -> None:
 # what prepare refuses
 
 
-def refusal(arrange: Callable[[Drive, Drive], None]) -> tuple[list[str], Drive, Drive]:
-    seen: list[tuple[list[str], Drive, Drive]] = []
+def refusal(arrange: Callable[[Drive, Drive], None]) -> tuple[list[Finding], Drive, Drive]:
+    seen: list[tuple[list[Finding], Drive, Drive]] = []
 
     async def body(link: CanopenLink, drives: Drives, first: Drive, second: Drive) -> None:
         arrange(first, second)
@@ -518,9 +519,13 @@ def test_every_reason_is_given_with_its_device() -> None:
         second.statusword = ENABLED
 
     reasons, first, second = refusal(arrange)
-    assert [reason.split(":")[0] for reason in reasons] == ["drive-1", "drive-2", "drive-2", "drive-2"]
-    assert "0x999" in reasons[0] and "0x402" in reasons[0]
-    assert "still enabled" in reasons[1] and "60 Nm" in reasons[2] and "40 Nm" in reasons[3]
+    vendors = {"vendor": 0x520, "wanted_vendor": 0x520}
+    assert reasons == [
+        finding("node-is-another", device="drive-1", product=0x999, wanted_product=0x402, **vendors),
+        finding("still-enabled", drive="drive-2", statusword=ENABLED),
+        finding("rated-torque-differs", drive="drive-2", found_nm=60.0, wanted_nm=80.0),
+        finding("max-torque-too-low", drive="drive-2", found_nm=40.0, limit_nm=60.0),
+    ]
     assert first.writes == second.writes == [] and first.nmt == second.nmt == [0x80]
 
 
@@ -529,7 +534,7 @@ def test_a_missing_drive_is_refused() -> None:
         second.sdo_answers = False
 
     reasons, first, _ = refusal(arrange)
-    assert len(reasons) == 1 and reasons[0].startswith("drive-2: node 2 does not answer")
+    assert reasons == [finding("node-silent", device="drive-2", node=2)]
     assert first.writes == []
 
 
@@ -540,7 +545,10 @@ def test_an_sdo_abort_undoes_the_whole_transaction() -> None:
         second.aborts[0x1400, 5] = 0x06090030
 
     reasons, first, second = refusal(arrange)
-    assert len(reasons) == 1 and "drive-2" in reasons[0] and "1400h sub 5" in reasons[0] and "06090030" in reasons[0]
+    (reason,) = reasons
+    error = str(reason.parameters["error"])
+    assert (reason.code, reason.parameters["device"]) == ("node-not-configured", "drive-2")
+    assert "1400h sub 5" in error and "06090030" in error, "what the library says"
     assert (first.objects, second.objects) == pristine
     assert first.writes and second.writes, "there was something to undo"
     assert first.nmt[-1] == second.nmt[-1] == 0x80 and 0x01 not in first.nmt
@@ -551,7 +559,8 @@ def test_a_watchdog_that_does_not_stick_is_found_by_reading_it_back() -> None:
         first.stubborn.add((0x1400, 5))
 
     reasons, first, second = refusal(arrange)
-    assert len(reasons) == 1 and "drive-1" in reasons[0] and "1400h sub 5" in reasons[0] and "read back" in reasons[0]
+    reads_back = {"object": "object 1400h sub 5", "set_counts": 100, "found_counts": 0}
+    assert reasons == [finding("object-reads-back", device="drive-1", **reads_back)]
     assert second.objects == Drive(2).objects
 
 
@@ -560,7 +569,7 @@ def test_a_drive_that_does_not_start_is_refused() -> None:
         second.starts = False
 
     reasons, first, second = refusal(arrange)
-    assert len(reasons) == 1 and "drive-2" in reasons[0] and "operational" in reasons[0]
+    assert [(one.code, one.parameters["device"]) for one in reasons] == [("node-not-operational", "drive-2")]
     assert first.objects == Drive(1).objects and second.objects == Drive(2).objects
 
 
@@ -571,7 +580,7 @@ def test_a_drive_that_restarts_meanwhile_is_refused() -> None:
         await until(lambda: 0x01 in second.nmt)
         drives.heartbeat(2, 0)
         drives.heartbeat(2, 5)
-        with pytest.raises(PrepareRefused, match="drive-2: restarted"):
+        with pytest.raises(PrepareRefused, match="restarted-meanwhile"):
             await preparing
 
     bench(body)
@@ -590,8 +599,10 @@ def test_a_bus_that_cannot_be_opened_says_what_to_do(number: int, advice: str, m
         link = build_links(line(can_bus={"interface": "socketcan", "channel": "nocan9"}))[0]
         with pytest.raises(OSError, match=advice):
             await link.open()
-        with pytest.raises(PrepareRefused, match=advice):
+        with pytest.raises(PrepareRefused) as refused:
             await link.prepare()
+        assert refused.value.reasons[0].code == "can-bus-not-open"
+        assert advice in str(refused.value.reasons[0].parameters["error"])
         await link.close()
 
     asyncio.run(run())
@@ -668,7 +679,7 @@ def test_surplus_bytes_that_are_not_zero_are_refused() -> None:
         first.objects[0x6072, 0] = struct.pack("<HH", 1000, 1)
 
     reasons, _, _ = refusal(arrange)
-    assert reasons == ["drive-1: object 6072h sub 0: 4 bytes are no u16"]
+    assert reasons == [finding("sdo-refused", device="drive-1", error="object 6072h sub 0: 4 bytes are no u16")]
 
 
 def test_garbage_on_the_bus_is_counted_and_harmless() -> None:

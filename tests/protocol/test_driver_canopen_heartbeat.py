@@ -14,6 +14,7 @@ from drivers.device_map import MapRefused, load_map
 from drivers.map_fields import MAPS
 from drivers.port import PrepareRefused
 from drivers.registry import LinksRefused, build_links
+from gateway.core.finding import finding
 from gateway.core.line import Line
 from gateway.core.signals import DriveRequest, DriveState, Inputs, Outputs
 from tests.protocol.driver_support import (
@@ -142,17 +143,17 @@ def test_the_watchdog_is_an_entry_of_1016h_and_its_reaction_is_set() -> None:
 
 
 @pytest.mark.parametrize(
-    ("place", "value", "words"),
+    ("place", "value", "code"),
     [
-        ((0x60A9, 0), struct.pack("<I", 0xFDB44700), "60A9h sub 0 is 0xfdb44700"),
-        ((0x6076, 0), struct.pack("<I", 512_871_000), "rated torque of 512.871 Nm"),
-        ((0x1018, 2), struct.pack("<I", 0x61500000), "product 0x61500000"),
+        ((0x60A9, 0), struct.pack("<I", 0xFDB44700), "object-differs"),
+        ((0x6076, 0), struct.pack("<I", 512_871_000), "rated-torque-differs"),
+        ((0x1018, 2), struct.pack("<I", 0x61500000), "node-is-another"),
     ],
 )
-def test_what_would_scale_wrongly_is_refused(place: tuple[int, int], value: bytes, words: str) -> None:
+def test_what_would_scale_wrongly_is_refused(place: tuple[int, int], value: bytes, code: str) -> None:
     async def body(link: CanopenLink, bus: Bus, first: Epos, second: Epos) -> None:
         first.objects[place] = value
-        with pytest.raises(PrepareRefused, match=words):
+        with pytest.raises(PrepareRefused, match=f"^{code}$"):
             await link.prepare()
         assert first.writes == second.writes == []
 
@@ -162,8 +163,10 @@ def test_what_would_scale_wrongly_is_refused(place: tuple[int, int], value: byte
 def test_a_watchdog_that_does_not_stick_is_refused_and_undone() -> None:
     async def body(link: CanopenLink, bus: Bus, first: Epos, second: Epos) -> None:
         second.stubborn.add((0x1016, 1))
-        with pytest.raises(PrepareRefused, match=r"drive-2: object 1016h sub 1: written 64007f00, read back 00000000"):
+        with pytest.raises(PrepareRefused) as refused:
             await link.prepare()
+        reads_back = {"object": "object 1016h sub 1", "set_counts": 0x7F0064, "found_counts": 0}
+        assert refused.value.reasons == [finding("object-reads-back", device="drive-2", **reads_back)]
         assert first.objects == Epos(1).objects and second.objects == Epos(2).objects
 
     bench(body)

@@ -9,7 +9,9 @@ import pytest
 from drivers.canopen import questions
 from drivers.canopen.link import CanopenLink
 from drivers.canopen.sdo import SdoBus, SdoSilent
+from gateway.core.finding import finding
 from gateway.core.signals import DriveRequest, DriveState, Inputs
+from gateway.wording.catalogue import sentence
 from tests.protocol.driver_support import ENABLED, Drive, Drives, cycle, until
 from tests.protocol.test_driver_canopen import bench, settle, write
 
@@ -36,8 +38,10 @@ def test_a_watchdog_that_was_altered_drops_its_drive(value: int, monkeypatch: py
         first.statusword = second.statusword = ENABLED
         second.objects[0x1400, 5] = struct.pack("<H", value)
         await dropped(link, drives, inputs)
-        assert link.health.last_error.startswith("drive-2: its watchdog, object 1400h sub 5, was set to 0x64 and is ")
-        assert f"is {value:#x};" in link.health.last_error
+        altered = {"object": "object 1400h sub 5", "set_counts": 100, "found_counts": value}
+        distrust = link._nodes[1].station.distrust  # noqa: SLF001
+        assert distrust == finding("object-changed", device="drive-2", **altered)
+        assert link.health.last_error == sentence(distrust)
         first.rpdos.clear()
         second.rpdos.clear()
         await cycle(link, inputs)

@@ -11,6 +11,7 @@ from drivers.canopen import questions
 from drivers.canopen.link import CanopenLink
 from drivers.port import PrepareRefused
 from drivers.registry import LinksRefused, build_links
+from gateway.core.finding import Finding, finding
 from gateway.core.line import Line
 from gateway.core.signals import DriveRequest, DriveState, Inputs, Outputs, Quality
 from tests.protocol.driver_support import ENABLED, GROUP, READY, Drive, Drives, cycle, line, until
@@ -232,8 +233,7 @@ def test_a_node_that_is_dead_at_the_start_is_named_and_the_others_are_heard() ->
         assert list(inputs.drive_state[:2]) == [DriveState.OFF] * 2 and set(qualities(inputs)) == {MISSING}
         with pytest.raises(PrepareRefused) as refusal:
             await link.prepare()
-        assert len(refusal.value.reasons) == 1
-        assert refusal.value.reasons[0].startswith("cell-1, cell-2, cell-3: node 20 does not answer")
+        assert refusal.value.reasons == [finding("node-silent", device="cell-1, cell-2, cell-3", node=20)]
         assert not any(drive.writes for drive in bus.drives.values())
 
     bench(body)
@@ -248,7 +248,7 @@ def test_a_reading_that_is_under_way_ends_when_the_link_becomes_active() -> None
     async def body(link: CanopenLink, bus: Bus) -> None:
         began, ended = asyncio.Event(), asyncio.Event()
 
-        async def read(*_: object) -> list[str]:
+        async def read(*_: object) -> list[Finding]:
             began.set()
             try:
                 await asyncio.Event().wait()
@@ -283,8 +283,20 @@ def test_prepare_writes_the_watchdog_and_compares_what_is_fixed() -> None:
     bench(body)
 
 
-def refusal(arrange: Callable[[Bus], None]) -> list[str]:
-    seen: list[str] = []
+CELLS = "cell-1, cell-2, cell-3"
+
+
+def differs(at: str, found: int, wanted: int, device: str = CELLS) -> Finding:
+    return finding("object-differs", device=device, object=f"object {at}", found=found, wanted=wanted)
+
+
+def another(device: str, product: int, wanted: int) -> Finding:
+    vendors = {"vendor": 0x520, "wanted_vendor": 0x520}
+    return finding("node-is-another", device=device, product=product, wanted_product=wanted, **vendors)
+
+
+def refusal(arrange: Callable[[Bus], None]) -> list[Finding]:
+    seen: list[Finding] = []
 
     async def body(link: CanopenLink, bus: Bus) -> None:
         arrange(bus)
@@ -302,38 +314,50 @@ def refusal(arrange: Callable[[Bus], None]) -> list[str]:
 
 
 @pytest.mark.parametrize(
-    ("node", "place", "value", "words"),
+    ("node", "place", "value", "found"),
     [
-        ("amplifier", (0x1A01, 1), struct.pack("<I", 0x71300410), ["cell-1", "1A01h sub 1", "0x71300310"]),
-        ("amplifier", (0x1800, 1), struct.pack("<I", 0xC0000194), ["1800h sub 1", "0xc0000194"]),
-        ("amplifier", (0x1800, 2), b"\xff", ["1800h sub 2", "0xff"]),
-        ("amplifier", (0x2131, 0), b"\x02", ["cell-3: channel 3, the amplifier has 2"]),
-        ("amplifier", (0x6131, 2), struct.pack("<I", 0x00470000), ["cell-2", "unit 0x00470000"]),
-        ("amplifier", (0x6132, 1), b"\x07", ["cell-1", "7 decimal digits; allowed: 0 to 6"]),
-        ("amplifier", (0x6132, 3), b"\xc8", ["cell-3", "200 decimal digits; allowed: 0 to 6"]),
-        ("amplifier", (0x6132, 2), b"\x03", ["cell-2: can say 32.767 N at most, its capacity_n is 100"]),
-        ("amplifier", (0x2132, 0), b"\x00", ["not healthy"]),
-        ("amplifier", (0x1018, 2), struct.pack("<I", 0x402), ["product 0x402", "0x404"]),
-        ("plc", (0x1600, 3), struct.pack("<I", 0x20010210), ["plc", "1600h sub 3"]),
-        ("plc", (0x1A00, 0), b"\x02", ["plc", "1A00h sub 0"]),
-        ("plc", (0x1018, 2), struct.pack("<I", 0x404), ["plc", "another device"]),
+        ("amplifier", (0x1A01, 1), struct.pack("<I", 0x71300410), differs("1A01h sub 1", 0x71300410, 0x71300310)),
+        ("amplifier", (0x1800, 1), struct.pack("<I", 0xC0000194), differs("1800h sub 1", 0xC0000194, 0x194)),
+        ("amplifier", (0x1800, 2), b"\xff", differs("1800h sub 2", 0xFF, 1)),
+        ("amplifier", (0x2131, 0), b"\x02", finding("channel-missing", device="cell-3", channel=3, channels=2)),
+        (
+            "amplifier",
+            (0x6131, 2),
+            struct.pack("<I", 0x00470000),
+            finding("cell-unit-differs", cell="cell-2", found=0x00470000, wanted=0x00210000),
+        ),
+        ("amplifier", (0x6132, 1), b"\x07", finding("cell-digits", cell="cell-1", digits=7, most_digits=6)),
+        ("amplifier", (0x6132, 3), b"\xc8", finding("cell-digits", cell="cell-3", digits=200, most_digits=6)),
+        (
+            "amplifier",
+            (0x6132, 2),
+            b"\x03",
+            finding("cell-range-short", cell="cell-2", full_scale_n=32.767, capacity_n=100.0),
+        ),
+        ("amplifier", (0x2132, 0), b"\x00", finding("amplifier-not-healthy", device=CELLS)),
+        ("amplifier", (0x1018, 2), struct.pack("<I", 0x402), another(CELLS, 0x402, 0x404)),
+        ("plc", (0x1600, 3), struct.pack("<I", 0x20010210), differs("1600h sub 3", 0x20010210, 0x20010310, "plc")),
+        ("plc", (0x1A00, 0), b"\x02", differs("1A00h sub 0", 2, 3, "plc")),
+        ("plc", (0x1018, 2), struct.pack("<I", 0x404), another("plc", 0x404, 0x401)),
     ],
 )
 def test_what_is_not_as_the_map_says_is_refused(
-    node: str, place: tuple[int, int], value: bytes, words: list[str]
+    node: str, place: tuple[int, int], value: bytes, found: Finding
 ) -> None:
-    reasons = refusal(lambda bus: getattr(bus, node).objects.update({place: value}))
-    assert len(reasons) == 1 and all(word in reasons[0] for word in words), reasons
+    assert refusal(lambda bus: getattr(bus, node).objects.update({place: value})) == [found]
 
 
 def test_the_plcs_watchdog_is_undone_when_another_node_fails() -> None:
-    assert "drive-1" in refusal(lambda bus: bus.first.aborts.update({(0x1400, 5): 0x06090030}))[0]
-    assert "restored" not in refusal(lambda bus: setattr(bus.amplifier, "starts", False))[0]
+    (reason,) = refusal(lambda bus: bus.first.aborts.update({(0x1400, 5): 0x06090030}))
+    assert (reason.code, reason.parameters["device"]) == ("node-not-configured", "drive-1")
+    (reason,) = refusal(lambda bus: setattr(bus.amplifier, "starts", False))
+    assert reason.code == "node-not-operational"
 
 
 def test_a_watchdog_that_the_plc_does_not_keep_is_refused() -> None:
+    reads_back = {"object": "object 2002h sub 0", "set_counts": 100, "found_counts": 0}
     reasons = refusal(lambda bus: bus.plc.stubborn.add((0x2002, 0)))
-    assert len(reasons) == 1 and "2002h sub 0" in reasons[0] and "read back 0000" in reasons[0]
+    assert reasons == [finding("object-reads-back", device="plc", **reads_back)]
 
 
 # tensions

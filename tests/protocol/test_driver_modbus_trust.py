@@ -88,7 +88,7 @@ def test_a_drive_that_ignores_orders_to_take_torque_off_is_fed_no_longer() -> No
         fed = len(drives[0].power.commands)
         await cycles(link, inputs, 20, torques(OFF, 0.0, 0.0))
         assert drives[0].power.commands[fed:] == [(0x00, 0)] * 6, "its watchdog has the last word"
-        assert "drive-1 has ignored 5 orders" in link.health.last_error
+        assert "drive-1: ignored 5 orders" in link.health.last_error
         assert list(inputs.drive_state) == [DriveState.ENABLED, DriveState.OFF], "what gives torque is shown to"
         assert len(drives[1].power.commands) == len(drives[0].power.commands) + 14
         drives[0].power.obeys = True

@@ -22,6 +22,7 @@ from drivers.canopen.plc import PlcNode
 from drivers.canopen.station import ANSWERS_ALLOWED, Station
 from drivers.canopen.wire import FetchedWire
 from drivers.device_map import MAPS, MapRefused, load_map
+from gateway.core.finding import Finding, finding
 from gateway.core.line import LinePlc, LoadCell
 from gateway.core.signals import Inputs, Outputs, Quality
 
@@ -89,7 +90,8 @@ def test_an_answer_of_several_frames_counts_when_it_is_complete() -> None:
     node = station(frames=2)
     for _ in range(ANSWERS_ALLOWED):
         sync(node, 1)
-    assert node.absent(0.0, relied_on=True) and "no answer to 3 SYNCs" in node.trouble(0.0, relied_on=True)
+    assert node.absent(0.0, relied_on=True)
+    assert node.trouble(0.0, relied_on=True) == finding("sync-unanswered", device="node", syncs=3)
     sync(node, 2)
     assert not node.absent(0.0, relied_on=True)
 
@@ -209,7 +211,7 @@ def test_where_a_type_ends(kind: str, ends: tuple[int, ...]) -> None:
 def test_a_saturated_channel_is_no_tension_whatever_its_capacity(counts: int) -> None:
     amplifier, inputs = AmplifierNode(cell_map(), [cell(capacity_n=327.67)]), Inputs(1)
     amplifier.station.on_heartbeat(b"\x05", 0.0)
-    amplifier._cells[0].n_per_count = n_per_count(cell_map(), cell(327.67), 2)  # noqa: SLF001
+    amplifier._cells[0].n_per_count = 0.01  # noqa: SLF001
     for value, counter, quality in ((counts, 1, Quality.BAD), (0x7FFE, 2, Quality.GOOD)):
         amplifier.begin_sync()
         amplifier.on_answer(0x180 + 20, struct.pack("<hBhBH", value, 0, 0, 1, counter))
@@ -222,11 +224,14 @@ def test_digits_and_full_scale() -> None:
     device = cell_map()
     assert [n_per_count(device, cell(0.03), digits) for digits in (0, 2, 6)] == pytest.approx([1.0, 0.01, 1e-6])
     assert n_per_count(device, cell(327.67), 2) == 0.01
-    with pytest.raises(ValueError, match=r"can say 327\.67 N at most, its capacity_n is 327\.68"):
-        n_per_count(device, cell(327.68), 2)
+    short = {"full_scale_n": pytest.approx(327.67), "capacity_n": 327.68}
+    refused = n_per_count(device, cell(327.68), 2)
+    assert isinstance(refused, Finding) and refused.code == "cell-range-short"
+    assert refused.parameters == {"cell": cell().name, **short}
     for digits in (-1, 7, 200):
-        with pytest.raises(ValueError, match=f"{digits} decimal digits; allowed: 0 to 6"):
-            n_per_count(device, cell(), digits)
+        assert n_per_count(device, cell(), digits) == finding(
+            "cell-digits", cell=cell().name, digits=digits, most_digits=6
+        )
     objects = device.objects.model_copy(update={"tension": device.objects.tension.model_copy(update={"type": "f32"})})
     assert n_per_count(device.model_copy(update={"objects": objects}), cell(1e9), 0) == 1.0, "a float has no end"
 

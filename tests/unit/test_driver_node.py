@@ -10,6 +10,7 @@ from drivers.canopen.maps import DriveMap
 from drivers.device_map import MAPS, load_map
 from drivers.map_fields import Bit
 from drivers.power_stage import ORDERS_IGNORED
+from gateway.core.finding import finding
 from gateway.core.signals import DriveRequest, DriveState
 
 CIA402 = load_map(MAPS / "cia402-torque.toml")
@@ -81,7 +82,8 @@ def test_an_emergency_ends_with_its_reset() -> None:
     drive = node()
     answer(drive, ENABLED)
     drive.station.on_emergency(bytes.fromhex("5082 11 0000000000"))
-    assert drive.state(0.0) == DriveState.FAULT and "8250h" in drive.trouble(0.0)
+    trouble = drive.trouble(0.0)
+    assert drive.state(0.0) == DriveState.FAULT and trouble is not None and trouble.parameters["error_code"] == 0x8250
     assert drive.payload(DriveRequest.ENABLE, 8.0, DriveState.FAULT)[:4] == bytes(4)
     drive.station.on_emergency(bytes(8))
     assert drive.state(0.0) == DriveState.ENABLED
@@ -94,7 +96,7 @@ def test_wrong_lengths_are_refused(size: int) -> None:
         drive.station.on_emergency(bytes(size))
     with pytest.raises(ValueError, match="heartbeat"):
         drive.station.on_heartbeat(bytes(size), 0.0)
-    assert drive.station.emergency == drive.station.distrust == ""
+    assert drive.station.emergency is drive.station.distrust is None
 
 
 def test_before_the_first_answer_no_word_enables() -> None:
@@ -109,7 +111,7 @@ def test_a_drive_that_ignores_its_orders_defies() -> None:
         answer(drive, ENABLED)
         assert drive.shows_torque and not drive.defies
         drive.payload(DriveRequest.OFF, 0.0, drive.state(0.0))
-    assert f"ignored {ORDERS_IGNORED} orders" in drive.defies
+    assert drive.defies == finding("orders-ignored", drive="drive-1", orders=ORDERS_IGNORED)
     drive.forget()
     assert not drive.defies and not drive.shows_torque
 

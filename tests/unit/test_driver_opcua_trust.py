@@ -62,7 +62,7 @@ def test_an_axis_that_does_not_obey_is_not_written_to_any_more() -> None:
         assert not any(node.startswith("Axis1.") for node in left)
         assert {"Axis2.Life", "Line.Life"} <= left
         assert rig.inputs.drive_state[0] == DriveState.FAULT
-        assert f"drive-1 has ignored {ORDERS_IGNORED} orders" in rig.link.health.last_error
+        assert f"drive-1: ignored {ORDERS_IGNORED} orders" in rig.link.health.last_error
         rig.channel.devices.deaf.clear()
         rig.channel.devices.set("Axis1.Statusword", 0x0250)  # its watchdog's doing
         await rig.link.prepare()
