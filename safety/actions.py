@@ -25,20 +25,23 @@ class Action(IntEnum):
 class Finding:
     """One rule that is not met, with the measured numbers and what to do next."""
 
-    rule: str  #: its code, where `parameters` are there
+    rule: str  #: its code
     action: Action
-    text: str
-    parameters: Mapping[str, Value] | None = None  #: None: it is told in words only
+    parameters: Mapping[str, Value]
 
-    def as_data(self) -> data.Finding | None:
-        """Code and parameters; None where it is told in words only."""
-        return None if self.parameters is None else data.Finding(code=self.rule, parameters=dict(self.parameters))
+    @property
+    def text(self) -> str:
+        """The English sentence: made where somebody is told, which most periods of a lasting finding are not."""
+        return sentence(self.as_data())
+
+    def as_data(self) -> data.Finding:
+        """Code and parameters."""
+        return data.Finding(code=self.rule, parameters=dict(self.parameters))
 
 
 def found(code: str, action: Action, **parameters: float | str) -> Finding:
     """A finding of the catalogue, by its code; numbers in SI, the unit in the name."""
-    coded = data.finding(code, **parameters)
-    return Finding(code, action, sentence(coded), coded.parameters)
+    return Finding(code, action, data.finding(code, **parameters).parameters)
 
 
 def most_severe(findings: list[Finding]) -> Action:

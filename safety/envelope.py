@@ -75,9 +75,7 @@ def check_inputs(
     plc_lost = after.plc_missing >= limits.hold_periods
     findings = _signal_findings(limits, after, missing) if supervision.feedback else []
     if plc_lost:
-        findings.append(
-            Finding("line PLC", Action.STOP, f"the line PLC has not answered for {after.plc_missing} periods")
-        )
+        findings.append(found("line-plc-silent", Action.STOP, periods=after.plc_missing))
     findings += _plc_findings(limits, after, inputs)
     findings += _drive_findings(inputs, supervision)
     findings += [_out_of_band(limits, i, inputs) for i in _beyond(after.outside, limits)]
@@ -93,14 +91,8 @@ def check_timing(limits: EnvelopeLimits, state: EnvelopeState, skipped: int) -> 
     overruns = state.overruns + 1 if skipped else 0
     findings: list[Finding] = []
     if overruns >= limits.overruns_in_a_row or skipped > limits.skipped_periods:
-        findings.append(
-            Finding(
-                "overrun",
-                Action.STOP,
-                f"missed {skipped} periods of {limits.period_s * 1e3:g} ms at once, {overruns} times in a row: "
-                "take load off this computer or give the loop real-time priority",
-            )
-        )
+        late = {"skipped": skipped, "period_s": limits.period_s, "in_a_row": overruns}
+        findings.append(found("overrun", Action.STOP, **late))
     return findings, replace(state, overruns=overruns)
 
 
@@ -109,7 +101,7 @@ def check_torque(asked_nm: FloatArray) -> list[Finding]:
     if all(map(isfinite, asked_nm.tolist())):
         return []
     rollers = ", ".join(str(i + 1) for i in np.flatnonzero(~np.isfinite(asked_nm)))
-    return [Finding("finite torque", Action.TORQUE_OFF, f"the control law gave no finite torque for roller {rollers}")]
+    return [found("torque-not-finite", Action.TORQUE_OFF, rollers=rollers)]
 
 
 def limit_torque(limits: EnvelopeLimits, asked_nm: FloatArray, applied_nm: FloatArray, interval_s: float) -> FloatArray:
@@ -129,15 +121,14 @@ def _missing_signals(limits: EnvelopeLimits, inputs: Inputs) -> list[str]:
         return []
     tensions = [i + 1 for i in range(inputs.n) if limits.measured[i] and inputs.tension.quality[i]]
     speeds = [i + 1 for i in range(inputs.n) if inputs.speed.quality[i]]
-    names = [f"{what} {_in_words(numbers)}" for what, numbers in (("tension", tensions), ("speed", speeds)) if numbers]
-    return names + (["unwinder speed"] if inputs.unwind_speed.quality[0] else [])
+    return _named("T", tensions) + _named("v", speeds) + (["v0"] if inputs.unwind_speed.quality[0] else [])
 
 
-def _in_words(numbers: list[int]) -> str:
-    """ "3", "1 and 4", or "1 to 6" for what is without a gap."""
+def _named(symbol: str, numbers: list[int]) -> list[str]:
+    """ "T1", "T4"; or "T1-T6" for more than two without a gap."""
     if len(numbers) > 2 and numbers[-1] - numbers[0] == len(numbers) - 1:
-        return f"{numbers[0]} to {numbers[-1]}"
-    return " and ".join(map(str, numbers))
+        return [f"{symbol}{numbers[0]}-{symbol}{numbers[-1]}"]
+    return [f"{symbol}{number}" for number in numbers]
 
 
 def _signal_findings(limits: EnvelopeLimits, state: EnvelopeState, missing: list[str]) -> list[Finding]:
@@ -145,16 +136,12 @@ def _signal_findings(limits: EnvelopeLimits, state: EnvelopeState, missing: list
     often = state.missing_history.bit_count()
     if not missing:
         return []
-    if state.missing >= limits.hold_periods:
-        action, text = Action.STOP, f"in {state.missing} periods of {limits.hold_periods}"
-    elif often > 2 * limits.hold_periods:
-        action, text = Action.STOP, f"in {often} of the last {limits.miss_window} periods"
-    else:
-        action, text = Action.HOLD_OUTPUTS, f"in {state.missing} periods of {limits.hold_periods}"
-    named = ", ".join(missing)
-    return [
-        Finding("signals", action, f"no usable sample of {named} {text}: check the device, its cable and its supply")
-    ]
+    signals, stops = ", ".join(missing), state.missing >= limits.hold_periods
+    if not stops and often > 2 * limits.hold_periods:
+        counts = {"missed": often, "periods": limits.miss_window}
+        return [found("signals-missing-often", Action.STOP, signals=signals, **counts)]
+    action, counts = Action.STOP if stops else Action.HOLD_OUTPUTS, {"missed": state.missing}
+    return [found("signals-missing", action, signals=signals, periods=limits.hold_periods, **counts)]
 
 
 def _plc_findings(limits: EnvelopeLimits, state: EnvelopeState, inputs: Inputs) -> list[Finding]:
@@ -162,11 +149,11 @@ def _plc_findings(limits: EnvelopeLimits, state: EnvelopeState, inputs: Inputs) 
     if plc.quality != Quality.GOOD:
         return []
     if plc.emergency_stop:
-        return [Finding("emergency stop", Action.TORQUE_OFF, "the emergency stop circuit is open")]
+        return [found("emergency-stop", Action.TORQUE_OFF)]
     if not plc.permissive:
-        return [Finding("permissive", Action.STOP, "the line PLC has withdrawn its permissive")]
+        return [found("no-permissive", Action.STOP)]
     if state.stopped >= limits.transport_periods:
-        return [Finding("transport", Action.STOP, "the line PLC has stopped the transport: read its fault")]
+        return [found("transport-stopped", Action.STOP)]
     return []
 
 
@@ -177,9 +164,8 @@ def _drive_findings(inputs: Inputs, supervision: Supervision) -> list[Finding]:
     wrong = [(i, state) for i, state in enumerate(inputs.drive_state.tolist()) if state != wanted]
     if not wrong:
         return []
-    texts = [f"{i + 1} {DriveState(state).name}" for i, state in wrong]
-    text = f"drives that are not {supervision.drives.name}: {', '.join(texts)}: read their fault"
-    return [Finding("drives", Action.STOP, text)]
+    drives = ", ".join(f"{i + 1} {DriveState(state).name}" for i, state in wrong)
+    return [found("drive-state", Action.STOP, wanted=supervision.drives.name, drives=drives)]
 
 
 def _count(before: Sequence[int], now: list[bool], channel: Channel) -> Sequence[int]:
@@ -209,14 +195,13 @@ def _out_of_band(limits: EnvelopeLimits, span: int, inputs: Inputs) -> Finding:
     # Over-tension: the law itself relieves it best, while the line slows down. Slack or a broken web: a tension loop
     # would only spin its roller up, and a heavy one would coast: all are braked on one ramp (`braking`).
     tension_n = float(inputs.tension.value[span])
-    low, high = limit_of(limits.tension_min_n, span), limit_of(limits.tension_max_n, span)
-    text = f"tension {span + 1} is {tension_n:.2f} N, allowed is {low:g} to {high:g} N"
-    if tension_n > high:
-        return Finding("tension band", Action.STOP, text)
+    low_n, high_n = limit_of(limits.tension_min_n, span), limit_of(limits.tension_max_n, span)
+    values = {"span": span + 1, "tension_n": tension_n, "low_n": low_n, "high_n": high_n}
+    if tension_n > high_n:
+        return found("tension-high", Action.STOP, **values)
     if _rollers_part(limits, span, inputs):
-        text += f", and roller {span + 1} runs away from the one before: the web has broken"
-        return Finding("web break", Action.BRAKE, text)
-    return Finding("slack", Action.BRAKE, text)
+        return found("web-break", Action.BRAKE, **values)
+    return found("slack", Action.BRAKE, **values)
 
 
 def limit_of(limit: float | FloatArray, span: int) -> float:
@@ -257,11 +242,8 @@ def _fast_roller(limits: EnvelopeLimits, supervision: Supervision, i: int, speed
         allowed = _roller_limit(limits, supervision)
         values = {"roller": i + 1, "speed_m_per_s": speed, "allowed_m_per_s": allowed}
         return found("tensioning-roller-speed", Action.TORQUE_OFF, **values)
-    text = (
-        f"roller {i + 1} runs at {speed:.3f} m/s, the line's greatest speed is {limits.speed_max_m_per_s:g} m/s: "
-        "is the web threaded and whole?"
-    )
-    return Finding("roller speed", Action.TORQUE_OFF, text)
+    values = {"roller": i + 1, "speed_m_per_s": speed, "line_most_m_per_s": limits.speed_max_m_per_s}
+    return found("roller-speed", Action.TORQUE_OFF, **values)
 
 
 def _speed_findings(
@@ -271,6 +253,6 @@ def _speed_findings(
     findings = [_fast_roller(limits, supervision, i, float(inputs.speed.value[i])) for i in _beyond(state.fast, limits)]
     speed, greatest = inputs.unwind_speed.value.item(0), limits.unwinder_overspeed * limits.speed_max_m_per_s
     if not abs(speed) <= greatest and inputs.unwind_speed.good():
-        text = f"the unwinder runs at {speed:.4f} m/s, allowed is {limits.speed_max_m_per_s:g} m/s"
-        findings.append(Finding("overspeed", Action.STOP, text))
+        values = {"speed_m_per_s": speed, "allowed_m_per_s": limits.speed_max_m_per_s}
+        findings.append(found("overspeed", Action.STOP, **values))
     return findings

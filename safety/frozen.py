@@ -13,7 +13,7 @@ from math import log2, nan
 
 from gateway.core.line import Line
 from gateway.core.signals import Inputs, Quality
-from safety.actions import Action, Finding
+from safety.actions import Action, Finding, found
 
 REPEATS = 7  #: of one sample until a drive counts as frozen
 LEARNT_REVERSALS = 150  #: of the speed, until a drive is judged
@@ -100,8 +100,5 @@ def find_frozen(turning_from_m_per_s: float, state: FrozenState, inputs: Inputs)
 
 
 def _finding(encoder: Encoder, i: int) -> Finding:
-    text = (
-        f"the drive of roller {i + 1} has shown {encoder.speed_m_per_s:.6f} m/s {encoder.same + 1} times in a row "
-        "while the line runs: its samples are frozen; restart the drive, and check what lies between"
-    )
-    return Finding("drive frozen", Action.STOP, text)
+    values = {"speed_m_per_s": encoder.speed_m_per_s, "in_a_row": encoder.same + 1}
+    return found("drive-frozen", Action.STOP, roller=i + 1, **values)

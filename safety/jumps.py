@@ -16,7 +16,7 @@ import numpy as np
 from gateway.core.line import Line
 from gateway.core.line_scales import line_scales
 from gateway.core.signals import CountArray, FloatArray, Inputs, Quality
-from safety.actions import Action, Finding
+from safety.actions import Action, Finding, found
 from safety.rejections import Impossible
 
 MEMORY_MOMENTS = 50.0  #: a second jump within so long is no coincidence
@@ -156,8 +156,5 @@ def reject_unwinder(limits: JumpLimits, state: JumpState, inputs: Inputs, reques
 
 
 def _second(inputs: Inputs, state: JumpState, i: int) -> Finding:
-    text = (
-        f"the speed of roller {i + 1} jumped twice, to {inputs.speed.value[i]:.4f} from "
-        f"{state.speed_m_per_s[i]:.4f} m/s: check its encoder and the encoder's cable"
-    )
-    return Finding("encoder jump", Action.STOP, text)
+    values = {"speed_m_per_s": inputs.speed.value.item(i), "before_m_per_s": state.speed_m_per_s.item(i)}
+    return found("encoder-jump", Action.STOP, roller=i + 1, **values)

@@ -13,13 +13,14 @@ from gateway.control.deviation import Measured
 from gateway.core.line import Line
 from gateway.core.line_scales import line_scales
 from gateway.core.signals import BoolArray, FloatArray
-from safety.actions import Action, Finding
+from safety.actions import Action, Finding, found
 from safety.recoverability import Recovery
 
 WINDOW_MOMENTS = 25.0
 REVERSAL_SHARE_OF_STEP = 0.5  #: of the most that a torque may change by in a period: moves of more count
 REVERSALS = 0.3  #: share of the window's periods in which a drive turns round: it chatters
 CUT = 0.5  #: share of the window's periods in which a torque is cut
+UNRECOVERABLE = {"span": "unrecoverable-tension", "roller": "unrecoverable-speed"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,14 +69,11 @@ def look(limits: MonitorLimits, state: MonitorState, torque_nm: FloatArray, cut:
     findings: list[Finding] = []
     if state.counts.max() >= limits.reversals:
         i = int(state.counts.argmax())
-        text = (
-            f"the torque of roller {i + 1} turned round {state.counts[i]:.0f} times by more than "
-            f"{limits.reversal_nm:g} Nm in {len(state.cut)} periods, allowed: {limits.reversals - 1}"
-        )
-        findings.append(Finding("chattering", Action.NONE, text))
+        counts = {"reversals": int(state.counts[i]), "periods": len(state.cut), "allowed": limits.reversals - 1}
+        findings.append(found("chattering", Action.NONE, roller=i + 1, reversal_nm=limits.reversal_nm, **counts))
     if state.cuts >= limits.cuts:
-        text = f"a limit cut a torque in {state.cuts} of {len(state.cut)} periods, allowed: {limits.cuts - 1}"
-        findings.append(Finding("torque cut", Action.NONE, text))
+        counts = {"cuts": state.cuts, "periods": len(state.cut), "allowed": limits.cuts - 1}
+        findings.append(found("torque-cut", Action.NONE, **counts))
     return findings
 
 
@@ -91,7 +89,7 @@ def recoverable(
     if recovery is None:
         return []
     short = recovery.shortfall(measured, setpoint_n, in_flight_nm[: recovery.depth], torque_nm, remembered)
-    return [] if short is None else [Finding("recoverability", Action.STOP, str(short))]
+    return [] if short is None else [found(UNRECOVERABLE[short.what], Action.STOP, **short.parameters)]
 
 
 def _turns(way: FloatArray, move_nm: FloatArray, reversal_nm: float) -> tuple[FloatArray, BoolArray]:

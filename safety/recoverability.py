@@ -47,26 +47,11 @@ class Shortfall:
     allowed: float
     ahead_s: float
 
-    def __str__(self) -> str:
-        return f"{self._comes_to} if the fallback took over now, {self._allows}"
-
     @property
-    def foreseen(self) -> str:
-        """Of what runs already."""
-        return f"{self._comes_to}, {self._allows}"
-
-    @property
-    def _comes_to(self) -> str:
-        value = f"{self.value:.1f}" if self.what == "span" else f"{self.value:.3f}"
-        return f"{self.what} {self.index + 1} would come to {value} {self._unit} in {self.ahead_s:.2f} s"
-
-    @property
-    def _allows(self) -> str:
-        return f"allowed: {self.allowed:g} {self._unit}"
-
-    @property
-    def _unit(self) -> str:
-        return "N" if self.what == "span" else "m/s"
+    def parameters(self) -> dict[str, float]:
+        """Of a finding."""
+        value, allowed = ("tension_n", "allowed_n") if self.what == "span" else ("speed_m_per_s", "allowed_m_per_s")
+        return {self.what: self.index + 1, value: self.value, allowed: self.allowed, "ahead_s": self.ahead_s}
 
 
 class Recovery:

@@ -16,7 +16,7 @@ import numpy as np
 
 from gateway.core.line import Line
 from gateway.core.signals import BoolArray, Inputs, Quality
-from safety.actions import Action, Finding
+from safety.actions import Action, Finding, found
 
 COUNTS = 3.0  #: that a usual change of a fine cell spans; the same value 60 times in a row is then beyond chance
 SILENT_PERIODS = 10  #: of one value; by the noise of a fine cell in one of ten million
@@ -113,8 +113,4 @@ def find_stuck(limits: StuckLimits, state: StuckState, inputs: Inputs) -> list[F
 
 
 def _finding(cell: Cell, i: int) -> Finding:
-    text = (
-        f"the load cell of span {i + 1} has shown {cell.tension_n:.2f} N {cell.same} times in a row while "
-        "rollers move: check it, its amplifier and its cable"
-    )
-    return Finding("load cell stuck", Action.STOP, text)
+    return found("load-cell-stuck", Action.STOP, span=i + 1, tension_n=cell.tension_n, in_a_row=cell.same)

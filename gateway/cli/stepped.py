@@ -1,7 +1,7 @@
 """Stepped time: the whole cycle over an in-memory link against the simulated line, as fast as the machine goes."""
 
 import time
-from collections.abc import Awaitable
+from collections.abc import Awaitable, Sequence
 from dataclasses import dataclass, field
 from math import ceil, inf
 from typing import Any, TypeVar
@@ -12,6 +12,7 @@ from drivers.memory import MemoryLink
 from gateway.cli.timed_law import TimedLaw
 from gateway.control.laws import make_law, untimed
 from gateway.core.controller import Controller, ControllerRefused
+from gateway.core.finding import Finding as Coded
 from gateway.core.line import Line, Recipe
 from gateway.core.messages import Arm, Command, Deploy, Drill, Event, Keep, Reply, WatchGood
 from gateway.core.metrics import RunMetrics, run_metrics
@@ -27,7 +28,7 @@ from gateway.loop.deploy import NOT_DONE, Prepared, prepare, require
 from gateway.loop.drill import NO_WATCHDOG
 from gateway.loop.machine import Machine
 from gateway.loop.pacer import Tick
-from gateway.loop.refused import Refused
+from gateway.loop.refused import Refused, coded, said
 from gateway.loop.watch import Watch
 from gateway.loop.wiring import Wiring
 from safety.actions import Finding
@@ -131,13 +132,14 @@ class SteppedLoop:
             except Refused:
                 pass  # and is refused with the same words below
             except ControllerRefused as refused:
-                return self._not_done(NOT_DONE[type(command)], [str(refused)])
+                return self._not_done(NOT_DONE[type(command)], refused.findings or [str(refused)])
         return carry_out(self.cycle, command, self.now_s, prepared)
 
-    def _not_done(self, text: str, reasons: list[str]) -> Reply:
+    def _not_done(self, text: str, reasons: Sequence[str | Coded]) -> Reply:
         in_service = self.cycle.configurations.in_service(self.now_s)
         return Reply(
-            ok=False, state=self.cycle.machine.state.name, text=text, reasons=reasons, in_service=in_service
+            ok=False, state=self.cycle.machine.state.name, text=text, reasons=said(reasons), findings=coded(reasons),
+            in_service=in_service,
         )  # fmt: skip
 
     def _release_links(self) -> None:

@@ -1,6 +1,7 @@
 """Controller configurations phi as data that can be stored, hashed and compared."""
 
 import hashlib
+from collections.abc import Sequence
 from typing import Annotated
 
 from pydantic import Field, TypeAdapter, ValidationError
@@ -9,6 +10,7 @@ from pydantic_core import ErrorDetails
 from gateway.core.canonical import canonical_bytes
 from gateway.core.controller_laws import MpcConfig
 from gateway.core.controller_schedule import LinearConfig, ScheduledConfig
+from gateway.core.finding import Finding
 
 Controller = LinearConfig | MpcConfig | ScheduledConfig
 ControllerConfig = Annotated[Controller, Field(discriminator="kind")]
@@ -16,7 +18,11 @@ _adapter: TypeAdapter[Controller] = TypeAdapter(ControllerConfig)
 
 
 class ControllerRefused(Exception):
-    """A configuration that must not be used; the text names every reason."""
+    """A configuration that must not be used; the text names every reason, `findings` those that are data."""
+
+    def __init__(self, text: str, findings: Sequence[Finding] = ()) -> None:
+        super().__init__(text)
+        self.findings = list(findings)
 
 
 def canonical(config: Controller) -> bytes:

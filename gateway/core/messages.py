@@ -208,7 +208,7 @@ class Reply(Strict):
     state: str  #: the loop's state after the command
     text: str  #: one sentence for a person, with what to do next where it was refused
     reasons: list[str] = []  #: every reason of a refusal
-    findings: list[Finding] = []  #: those of them that are data
+    findings: list[Finding] = []  #: the same as data; a driver's may be in words only
     in_service: InService | None = None  #: after a command about the configuration
     known: bool = True  #: False: whether it was done is not known yet; the events tell it once it is
 
@@ -219,7 +219,7 @@ class Event(Strict):
     time_s: float  #: monotonic
     kind: str
     text: str
-    findings: list[Finding] = []  #: what led to it, as far as it is data
+    findings: list[Finding] = []  #: what led to it
     data: dict[str, Any] = {}
 
 

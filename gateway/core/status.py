@@ -88,7 +88,7 @@ class EventStatus(Strict):
     wall_s: float  #: Unix time
     kind: str
     text: str
-    findings: list[Finding] = []  #: what led to it, as far as it is data
+    findings: list[Finding] = []  #: what led to it
 
 
 class LimitsStatus(Strict):

@@ -20,10 +20,12 @@ from gateway.control.reference import Steady
 from gateway.core.controller import Controller, ControllerRefused, config_hash
 from gateway.core.controller_fit import misfits
 from gateway.core.deployment import Deployment, RecoveryPrediction
+from gateway.core.finding import Finding, finding
 from gateway.core.line import Line
 from gateway.core.signals import FloatArray
 from gateway.loop.configurations import Configuration
 from gateway.loop.kept import Kept
+from gateway.wording.catalogue import sentences
 from safety.recoverability import Recovery
 
 #: Of every period, for the law and the prediction that watches it: samples may take half of it, and writing the rest.
@@ -58,9 +60,9 @@ class Admission:
         config = deployment.controller
         found = config_hash(config)
         if found != deployment.hash:
-            raise ControllerRefused(f"its hash is {found[:12]}.., not {deployment.hash[:12]}..: it was altered")
+            raise _refused(finding("configuration-altered", hash=found[:12], expected=deployment.hash[:12]))
         if reasons := misfits(config, self._line):
-            raise ControllerRefused("; ".join(reasons))
+            raise _refused(*(finding("configuration-misfit", because=reason) for reason in reasons))
         law = self._law_of(config)
         law_s = self._law_s(law, config)
         recovery, watch_s = None, 0.0
@@ -133,40 +135,33 @@ class Admission:
         except ControllerRefused:
             raise
         except Exception as error:  # whatever a law may raise: here it costs nothing
-            raise ControllerRefused(f"it cannot be run: {type(error).__name__}: {error}") from error
+            raise _refused(finding("configuration-fails", error=f"{type(error).__name__}: {error}")) from error
 
     def _recovery(self, watch: RecoveryPrediction, fallback: Controller) -> tuple[Recovery, float]:
         """Made, and what a look of it takes, in processor seconds."""
         if watch.fallback != config_hash(fallback):
-            raise ControllerRefused(
-                f"it is watched for the fallback {watch.fallback[:12]}, but {config_hash(fallback)[:12]} is what the "
-                "line would go back to"
-            )
+            hashes = {"watched": watch.fallback[:12], "fallback": config_hash(fallback)[:12]}
+            raise _refused(finding("prediction-of-another-fallback", **hashes))
         if watch.n != self._line.n or abs(watch.period_s - self._line.control.period_s) > 1e-9:
-            raise ControllerRefused("its recovery prediction is for another number of spans or another period")
+            raise _refused(finding("prediction-of-another-line"))
         try:
             recovery = Recovery(watch, fallback, self._line)
             situations = _situations(fallback, self._line)
             return recovery, max(_look_s(recovery, *situation, self._periods) for situation in situations)
         except Exception as error:  # of a prediction that fits its format and not its fallback
-            reason = f"{type(error).__name__}: {error}"
-            raise ControllerRefused(f"its recovery prediction cannot be used: {reason}") from error
+            raise _refused(finding("prediction-fails", error=f"{type(error).__name__}: {error}")) from error
 
     def _require_time(self, law_s: float, watch_s: float = 0.0, good_s: float = 0.0) -> None:
         """Every period has law and prediction in it, the one in which the law is taken back also the good one."""
-        taken = f"its law takes {1e3 * law_s:.3g} ms of each period of {1e3 * self._period_s:g} ms"
-        if watch_s:
-            taken += f", its recovery prediction {1e3 * watch_s:.3g} ms"
-        if not law_s + watch_s <= SHARE * self._period_s:
-            raise ControllerRefused(
-                f"{taken}, on this computer; allowed: {1e3 * SHARE * self._period_s:.3g} ms: a simpler law, a longer "
-                "control.period_s, or a faster computer"
-            )
-        if not law_s + watch_s + good_s <= TAKEN_BACK_SHARE * self._period_s:
-            raise ControllerRefused(
-                f"{taken}, and what the line would go back to {1e3 * good_s:.3g} ms; allowed: "
-                f"{1e3 * TAKEN_BACK_SHARE * self._period_s:.3g} ms in all: a simpler law, or a longer control.period_s"
-            )
+        taken = {"law_s": law_s, "prediction_s": watch_s, "period_s": self._period_s}
+        if not law_s + watch_s <= (allowed_s := SHARE * self._period_s):
+            raise _refused(finding("law-too-slow", **taken, allowed_s=allowed_s))
+        if not law_s + watch_s + good_s <= (allowed_s := TAKEN_BACK_SHARE * self._period_s):
+            raise _refused(finding("law-too-slow-to-take-back", **taken, fallback_s=good_s, allowed_s=allowed_s))
+
+
+def _refused(*findings: Finding) -> ControllerRefused:
+    return ControllerRefused(sentences(findings), findings)
 
 
 def _situations(config: Controller, line: Line) -> list[tuple[Measured, Steady, FloatArray]]:
@@ -206,7 +201,7 @@ def _law_s(law: Law[Any], measured: Measured, reference: Steady, torque_nm: Floa
 def _ask(law: Law[Any], state: Any, measured: Measured, reference: Steady, torque_nm: FloatArray) -> Any:
     decision = law.ask(state, measured, reference)
     if not np.isfinite(decision.torque_nm).all():
-        raise ControllerRefused("it gives no finite torque on the line's own set-points")
+        raise _refused(finding("configuration-not-finite"))
     return law.commit(state, decision, torque_nm)
 
 

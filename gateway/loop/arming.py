@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from drivers.port import PrepareRefused
-from gateway.core.finding import Finding
+from gateway.core.finding import Finding, finding
 from gateway.core.line import Device
 from gateway.core.line_problem import printable
 from gateway.core.messages import Reply
@@ -13,7 +13,6 @@ from gateway.loop.cycle import Cycle
 from gateway.loop.refused import Refused, coded, said
 from gateway.tasks.cleanup import finish_all
 
-LONGEST_TROUBLE = 300  #: characters of what a bus has told
 SILENT_PATIENCE_S = 0.25  #: without cyclic data (a silent CANopen link reads by SDO) samples are this old at most
 
 
@@ -22,7 +21,7 @@ def refusal_to_arm(cycle: Cycle) -> Reply | None:
     try:
         require_rest(cycle)
     except Refused as refusal:
-        return Reply(ok=False, state=cycle.machine.state.name, text=str(refusal), findings=refusal.findings)
+        return refusal.reply(cycle.machine.state.name)
     reasons = not_ready(cycle)
     return not_armed(cycle, reasons) if reasons else None
 
@@ -58,54 +57,54 @@ async def release_links(cycle: Cycle) -> None:
         raise failures[0]
 
 
-def not_ready(cycle: Cycle) -> list[str | Finding]:
+def not_ready(cycle: Cycle) -> list[Finding]:
     """What speaks against arming, as far as the samples tell. One that is late is no reason to send a person away."""
     running = cycle.configurations.running
-    unfit: list[str | Finding] = [f"controller {running.hash[:12]}: {running.unfit}"] if running.unfit else []
+    unfit = [finding("controller-unfit", controller=running.hash[:12], because=running.unfit)] if running.unfit else []
     return unfit + (forbidden(cycle) or _turning(cycle)) + unheard(cycle) + _below_zero(cycle)
 
 
-def _below_zero(cycle: Cycle) -> list[str | Finding]:
+def _below_zero(cycle: Cycle) -> list[Finding]:
     """Load cells with a wrong zero. Where the wiring is not proved the proof names them: nothing else is started."""
-    return [] if cycle.wiring.against else list(cycle.watch.below_zero(cycle.inputs))
+    return [] if cycle.wiring.against else cycle.watch.below_zero(cycle.inputs)
 
 
-def _turning(cycle: Cycle) -> list[str | Finding]:
-    return list(cycle.standstill.turning(cycle.inputs, cycle.clock()))
+def _turning(cycle: Cycle) -> list[Finding]:
+    return cycle.standstill.turning(cycle.inputs, cycle.clock())
 
 
-def forbidden(cycle: Cycle) -> list[str | Finding]:
+def forbidden(cycle: Cycle) -> list[Finding]:
     """What the line PLC says against arming, as far as it has been heard."""
     inputs = cycle.inputs
     if not plc_heard(cycle):
         return []
     if inputs.plc.emergency_stop:
-        return ["the emergency stop circuit is open: release it"]
+        return [finding("emergency-stop")]
     if not inputs.plc.permissive:
-        return ["the line PLC gives no permissive"]
+        return [finding("no-permissive")]
     return _turning(cycle)
 
 
-def unheard(cycle: Cycle) -> list[str | Finding]:
-    """Devices without a usable sample lately."""
-    plc = cycle.line.plc
-    reasons: list[str | Finding] = (
-        [] if plc_heard(cycle) else [f"the line PLC ({plc.name}) gives no usable answer{_trouble(cycle, plc)}"]
-    )
+def unheard(cycle: Cycle) -> list[Finding]:
+    """Devices without a usable sample lately, and what their buses have told last."""
+    plc, findings = cycle.line.plc, list[Finding]()
+    if not plc_heard(cycle):
+        findings += [finding("plc-unheard", plc=plc.name), *_trouble(cycle, plc)]
     for cell in cycle.line.load_cells:
         if not heard(cycle, cycle.inputs.tension, cell.span - 1):
-            reasons.append(f"load cell {cell.name} (span {cell.span}) gives no usable value{_trouble(cycle, cell)}")
-    return reasons
+            findings.append(finding("load-cell-unheard", cell=cell.name, span=cell.span))
+            findings += [one for one in _trouble(cycle, cell) if one not in findings]
+    return findings
 
 
-def _trouble(cycle: Cycle, device: Device) -> str:
-    """What the bus of `device` has told last, to be appended; empty: nothing, or it was about another device."""
+def _trouble(cycle: Cycle, device: Device) -> list[Finding]:
+    """What the bus of `device` has told last, unless it was about another device."""
     line = cycle.line
     told = next((link.health.last_error for link in cycle.links if link.name == device.bus), "")
     others = {one.name for one in (line.plc, *line.drives, *line.load_cells)} - {device.name}
     if not told or told.partition(":")[0] in others:
-        return ""
-    return f"; its bus told last: {printable(told)[:LONGEST_TROUBLE]}"
+        return []
+    return [finding("bus-told", bus=device.bus, told=printable(told))]
 
 
 def plc_heard(cycle: Cycle) -> bool:
@@ -123,6 +122,6 @@ def heard(cycle: Cycle, channel: Channel, index: int) -> bool:
 def require_rest(cycle: Cycle) -> None:
     machine = cycle.machine
     if machine.state not in (LoopState.SILENT, LoopState.STOP):
-        raise Refused(f"the line is {machine.state.name} already")
+        raise Refused(finding("not-at-rest", state=machine.state.name))
     if machine.phase not in (Phase.SILENT, Phase.OFF):
-        raise Refused(f"the line is still {machine.phase.name.lower()}: wait until torque is off")
+        raise Refused(finding("torque-not-off", phase=machine.phase.name.lower()))

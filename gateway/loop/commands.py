@@ -4,7 +4,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from math import isfinite
 
-from gateway.core.doubts import in_words
 from gateway.core.finding import Finding, finding
 from gateway.core.line import Recipe
 from gateway.core.line_limits import setpoint_bands_n
@@ -35,6 +34,11 @@ from gateway.loop.cycle import Cycle
 from gateway.loop.deploy import Prepared, configure
 from gateway.loop.judged import least, on_probation, require_judged, unjudged
 from gateway.loop.refused import Refused, said
+from safety.recoverability import Shortfall
+
+NOT_STARTED = "not started; mend what is named and start again"
+NOTHING_KEPT = "nothing is kept"
+STEP_UNSAFE = {"span": "step-unsafe-tension", "roller": "step-unsafe-speed"}
 
 
 def carry_out(
@@ -49,10 +53,7 @@ def carry_out(
     try:
         text = configure(cycle, command, prepared, now_s, proof) if configuring else _do(cycle, command, now_s)
     except Refused as refusal:
-        reply = Reply(
-            ok=False, state=cycle.machine.state.name, text=str(refusal), reasons=refusal.reasons,
-            findings=refusal.findings,
-        )  # fmt: skip
+        reply = refusal.reply(cycle.machine.state.name)
     else:
         reply = Reply(ok=True, state=cycle.machine.state.name, text=text)
     if configuring:
@@ -94,7 +95,7 @@ def _arm(cycle: Cycle, now_s: float) -> str:
 def _drill(cycle: Cycle, now_s: float) -> str:
     require_rest(cycle)
     if cycle.inputs.plc.local:
-        raise Refused("not drilled; mend what is named and try again", [finding("line-local")])
+        raise Refused(finding("line-local"), title="not drilled; mend what is named and try again")
     cycle.change(machines.to_phase(cycle.machine, Phase.DRILLING, now_s, ""))
     return "the feed of every watchdog is withheld at rest, and its reaction seen"
 
@@ -105,7 +106,7 @@ def _start(cycle: Cycle, now_s: float) -> str:
         case Phase.READY:
             require_judged(cycle, cycle.setpoints.speed_target_m_per_s)
             if reasons := [*cycle.wiring.against, *_against_torque(cycle)]:
-                raise Refused("not started; mend what is named and start again", reasons)
+                raise Refused(*reasons, title=NOT_STARTED)
             warned = _warn(cycle, now_s, proves=False)
             return f"{warned}tensioning the web, then {cycle.setpoints.speed_target_m_per_s:g} m/s"
         case Phase.HOLDING:
@@ -115,11 +116,11 @@ def _start(cycle: Cycle, now_s: float) -> str:
             warned = _resume(cycle, now_s, stands=cycle.setpoints.speed_m_per_s == 0.0)
             return f"{warned}back to {cycle.setpoints.speed_target_m_per_s:g} m/s"
         case Phase.PROVING:
-            raise Refused("the wiring is being proved; wait for its end, or stop it")
+            raise Refused(finding("wiring-being-proved"))
         case Phase.WARNING | Phase.ENABLING | Phase.TENSIONING | Phase.RUNNING:
             return "running already" if machine.phase is not Phase.WARNING else "started already: the warning lasts"
         case _:
-            raise Refused(f"the line is {machine.state.name}: arm it first")
+            raise Refused(finding("arm-first", state=machine.state.name))
 
 
 def _resume(cycle: Cycle, now_s: float, *, stands: bool) -> str:
@@ -136,18 +137,18 @@ def _resume(cycle: Cycle, now_s: float, *, stands: bool) -> str:
 def _require_remote(cycle: Cycle) -> None:
     """Nobody who does not see the line sets it in motion from standstill while the line PLC says "local"."""
     if cycle.inputs.plc.local:
-        raise Refused("not started; mend what is named and start again", [finding("line-local")])
+        raise Refused(finding("line-local"), title=NOT_STARTED)
 
 
 def _prove(cycle: Cycle, command: Prove, now_s: float) -> str:
     machine = cycle.machine
     if machine.phase is not Phase.READY:  # until then nobody knows the devices of today
-        raise Refused(f"the line is {machine.state.name}: arm it first; the wiring is proved from READY")
+        raise Refused(finding("arm-first", state=machine.state.name))
     _require_only(cycle, command.only)
     # A drive that nothing is known of is given torque only once its watchdog has been seen to take it off.
-    without_drill: list[str | Finding] = [] if cycle.drill.watchdogs else [finding("not-drilled")]
+    without_drill = [] if cycle.drill.watchdogs else [finding("not-drilled")]
     if reasons := without_drill + _against_torque(cycle):
-        raise Refused("not proved; mend what is named and prove again", reasons)
+        raise Refused(*reasons, title="not proved; mend what is named and prove again")
     cycle.proving.choose(command.only)
     warned = _warn(cycle, now_s, proves=True)
     if command.only:
@@ -170,9 +171,9 @@ def _require_only(cycle: Cycle, only: list[str]) -> None:
         if name not in names
     ]
     if unknown:
-        raise Refused("not proved; name devices of the line's file", unknown)
+        raise Refused(*unknown, title="not proved; name devices of the line's file")
     if only and (more := cycle.wiring.more_than(only)):
-        raise Refused("not proved; name whatever has changed, or prove the whole wiring: `r2rgate prove`", more)
+        raise Refused(*more, title="not proved; name whatever has changed, or prove the whole wiring: `r2rgate prove`")
 
 
 def proof_to_keep(cycle: Cycle, command: KeepProof) -> WiringProof:
@@ -180,16 +181,16 @@ def proof_to_keep(cycle: Cycle, command: KeepProof) -> WiringProof:
     require_rest(cycle)
     judged, watchdogs = cycle.proving.judged, cycle.drill.watchdogs
     if not watchdogs:
-        raise Refused("nothing is kept", [finding("not-drilled")])
+        raise Refused(finding("not-drilled"), title=NOTHING_KEPT)
     if judged is None or cycle.proving.only != frozenset(command.only):
-        raise Refused("nothing is kept", [finding("not-pulled")])
+        raise Refused(finding("not-pulled"), title=NOTHING_KEPT)
     _require_only(cycle, command.only)
     if judged.findings:
-        coded = [data for each in judged.findings if (data := each.as_data()) is not None]
-        raise Refused("the wiring is not as the line's file says; mend what is named and prove again", coded)
+        against = [each.as_data() for each in judged.findings]
+        raise Refused(*against, title="the wiring is not as the line's file says; mend what is named and prove again")
     answered = {(answer.question, answer.device) for answer in command.answers}
     if open_ := [each for each in judged.questions if (each.code, asked_of(each)) not in answered]:
-        raise Refused("nothing is kept before a person has answered", [finding("person-asked"), *open_])
+        raise Refused(finding("person-asked"), *open_, title="nothing is kept before a person has answered")
     # An answer to what nobody has asked stands for nothing.
     asked = {(each.code, asked_of(each)) for each in judged.questions}
     answers = [each for each in command.answers if (each.question, each.device) in asked]
@@ -198,11 +199,11 @@ def proof_to_keep(cycle: Cycle, command: KeepProof) -> WiringProof:
         drives, cells, answers = merged(cycle.wiring.proof, command.only, drives, cells, answers)
     # The drill has seen every device, whatever has pulled.
     if unshown := not_shown(cycle.line, drives, cells, answers) + undrilled(cycle.line, watchdogs):
-        raise Refused("nothing is kept of a proof that leaves something out", unshown)
+        raise Refused(*unshown, title="nothing is kept of a proof that leaves something out")
     return cycle.wiring.proof_of(drives, cells, watchdogs, answers)
 
 
-def _against_torque(cycle: Cycle) -> list[str | Finding]:
+def _against_torque(cycle: Cycle) -> list[Finding]:
     """What speaks against a first torque now."""
     reasons = not_ready(cycle) + _unknown_rollers(cycle)
     return [*reasons, finding("line-local")] if cycle.inputs.plc.local else reasons
@@ -216,7 +217,7 @@ def _warn(cycle: Cycle, now_s: float, *, proves: bool) -> str:
     return f"warning for {warning_s:g} s, then " if warning_s else ""
 
 
-def _unknown_rollers(cycle: Cycle) -> list[str | Finding]:
+def _unknown_rollers(cycle: Cycle) -> list[Finding]:
     speed = cycle.inputs.speed
     return [finding("roller-speed-unknown", roller=i + 1) for i in range(cycle.line.n) if not heard(cycle, speed, i)]
 
@@ -229,7 +230,7 @@ def _hold(cycle: Cycle, now_s: float) -> str:
             return "the warning ends, and the line stays held"
         return "held already"
     if machine.phase is not Phase.RUNNING:
-        raise Refused(f"only a running line can be held; this one is {machine.phase.name.lower()}")
+        raise Refused(finding("needs-running", phase=machine.phase.name.lower()))
     cycle.change(machines.to_phase(machine, Phase.HOLDING, now_s, ""))
     return "the line ramps to standstill, tension control stays on; start leads back to speed"
 
@@ -253,17 +254,19 @@ PLAIN: dict[type[Operating], Callable[[Cycle, float], str]] = {
 def _set_tension(cycle: Cycle, command: SetTension, now_s: float) -> str:
     line, setpoints = cycle.line, cycle.setpoints
     if command.span > line.n:
-        raise Refused(f"there is no span {command.span}; allowed: 1 to {line.n}")
+        raise Refused(finding("no-such-span", span=command.span, spans=line.n))
     # Noise and overshoot need room: a set-point at the limit would trip the line.
     low, high = (float(bound[command.span - 1]) for bound in setpoint_bands_n(line))
     if not (isfinite(command.tension_n) and low <= command.tension_n <= high):
-        raise Refused(f"{command.tension_n:g} N is too near a limit or beyond it; allowed: {low:g} to {high:g} N")
+        raise Refused(finding("tension-out-of-range", tension_n=command.tension_n, low_n=low, high_n=high))
     i = command.span - 1
     if command.step:
         size = abs(command.tension_n - setpoints.tension_n[i])
         judged = cycle.configurations.running.region.tension_step_max_n
         largest = least(line.limits.tension_step_max_n, judged)
-        _require_step(cycle, size, largest, "N", setpoints.tension_step_pause_s(i, now_s))
+        _require_step(cycle, setpoints.tension_step_pause_s(i, now_s))
+        if size > largest * (1.0 + 1e-9):
+            raise Refused(finding("step-too-large-tension", step_n=size, allowed_n=largest))
         _require_few(
             size, line.limits.steps_together * largest, setpoints.stepped_lately_n(now_s), setpoints.step_pause_s
         )
@@ -280,18 +283,20 @@ def _set_speed(cycle: Cycle, command: SetSpeed, now_s: float) -> str:
     line, setpoints = cycle.line, cycle.setpoints
     high = line.limits.speed_max_m_per_s
     if not (isfinite(command.speed_m_per_s) and 0.0 <= command.speed_m_per_s <= high):
-        raise Refused(f"{command.speed_m_per_s:g} m/s is outside the limits; allowed: 0 to {high:g} m/s")
+        raise Refused(finding("speed-out-of-range", speed_m_per_s=command.speed_m_per_s, allowed_m_per_s=high))
     require_judged(cycle, command.speed_m_per_s)
     departs = _departs(cycle, command.speed_m_per_s)
     if departs:
         _require_remote(cycle)
     if command.step:
         if departs and line.stages.start_warning_s:
-            raise Refused("a web that stands moves after a warning, and then on a ramp; leave out the step")
+            raise Refused(finding("step-from-standstill"))
         size = abs(command.speed_m_per_s - setpoints.speed_m_per_s)
         judged = cycle.configurations.running.region.speed_step_max_m_per_s
         largest = least(line.limits.speed_step_max_m_per_s, judged)
-        _require_step(cycle, size, largest, "m/s", setpoints.speed_step_pause_s(now_s))
+        _require_step(cycle, setpoints.speed_step_pause_s(now_s))
+        if size > largest * (1.0 + 1e-9):
+            raise Refused(finding("step-too-large-speed", step_m_per_s=size, allowed_m_per_s=largest))
         _require_safe(cycle.foreseen(setpoints.tension_n, command.speed_m_per_s))
         setpoints.step_speed(command.speed_m_per_s, now_s)
     setpoints.speed_target_m_per_s = command.speed_m_per_s
@@ -311,42 +316,38 @@ def _pace(cycle: Cycle, rate: str) -> str:
     return rate if cycle.machine.state in (LoopState.RUN, LoopState.HOLD) else "from the next start on"
 
 
-def _require_step(cycle: Cycle, size: float, largest: float, unit: str, pause_s: float) -> None:
+def _require_step(cycle: Cycle, pause_s: float) -> None:
     if cycle.machine.phase is not Phase.RUNNING:
-        raise Refused(f"a step needs a running line, this one is {cycle.machine.state.name}; leave out the step")
+        raise Refused(finding("step-needs-running", state=cycle.machine.state.name))
     if cycle.experiments.run is not None:
-        raise Refused("an experiment moves the set-points; abort it first, or leave out the step, which ends it")
+        raise Refused(finding("step-in-experiment"))
     probation = cycle.configurations.probation
     if probation is not None and probation.shaped_first:
-        raise Refused(f"epoch {cycle.configurations.epoch} is on probation: set-points move shaped; leave out the step")
-    if size > largest * (1.0 + 1e-9):
-        raise Refused(f"a step of {size:g} {unit} is too large; allowed: {largest:g} {unit}, or a ramp of any size")
+        raise Refused(finding("step-on-probation", epoch=cycle.configurations.epoch))
     if pause_s > 0.0:
-        raise Refused(f"the last step was just now; the next one may come in {pause_s:.1f} s, a ramp at any time")
+        raise Refused(finding("step-too-soon", pause_s=pause_s))
 
 
 def _require_few(size_n: float, largest_n: float, lately_n: float, pause_s: float) -> None:
     """Steps of several spans add up in the speed of the rollers behind them."""
-    if lately_n + size_n > largest_n * (1.0 + 1e-9):
-        raise Refused(
-            f"with this step of {size_n:g} N those of the last {pause_s:g} s come to {lately_n + size_n:g} N; "
-            f"allowed: {largest_n:g} N together (limits.steps_together), or a ramp at any time"
-        )
+    together_n = lately_n + size_n
+    if together_n > largest_n * (1.0 + 1e-9):
+        values = {"step_n": size_n, "together_n": together_n, "allowed_n": largest_n, "within_s": pause_s}
+        raise Refused(finding("steps-too-large-together", **values))
 
 
-def _require_safe(foreseen: str) -> None:
+def _require_safe(foreseen: Shortfall | None) -> None:
     """The monitor would stop the line for it."""
-    if foreseen:
-        raise Refused(f"this step is too large at this speed: {foreseen}; a smaller step, or a ramp at any time")
+    if foreseen is not None:
+        raise Refused(finding(STEP_UNSAFE[foreseen.what], **foreseen.parameters))
 
 
 def _select_recipe(cycle: Cycle, command: SelectRecipe, now_s: float) -> str:
     recipes: dict[str, Recipe] = {recipe.name: recipe for recipe in cycle.line.recipes}
     recipe = recipes.get(command.name)
     if recipe is None:
-        close = nearest(command.name, recipes)
-        hint = f"; did you mean {close}?" if close else ""
-        raise Refused(f"there is no recipe {command.name!r}{hint} Known: {', '.join(recipes)}")
+        close = nearest(command.name, recipes) or ", ".join(recipes)
+        raise Refused(finding("no-such-recipe", recipe=command.name, nearest=close))
     require_judged(cycle, recipe.speed_m_per_s)
     departs = _departs(cycle, recipe.speed_m_per_s)
     if departs:
@@ -359,26 +360,24 @@ def _select_recipe(cycle: Cycle, command: SelectRecipe, now_s: float) -> str:
 def _run_experiment(cycle: Cycle, command: RunExperiment) -> str:
     experiment = command.experiment
     if cycle.experiments.run is not None:
-        raise Refused("an experiment is under way; it can be aborted")
+        raise Refused(finding("experiment-under-way"))
     if cycle.machine.phase is not Phase.RUNNING:
-        raise Refused(f"an experiment needs a running line, this one is {cycle.machine.phase.name.lower()}")
-    reasons = cycle.experiments.why_not(experiment, cycle.line, judged=command.proposal is not None)
-    reasons += on_probation(cycle)
+        raise Refused(finding("needs-running", phase=cycle.machine.phase.name.lower()))
+    why_not = cycle.experiments.why_not(experiment, cycle.line, judged=command.proposal is not None)
+    reasons = [finding("experiment-unfit", because=reason) for reason in why_not] + on_probation(cycle)
     warns = cycle.line.stages.start_warning_s > 0.0
     if warns and any(_departs(cycle, leg.speed_m_per_s or 0.0) for leg in experiment.legs):
-        reasons.append("it would set a web in motion that stands: set a speed first, of which the line PLC warns")
+        reasons.append(finding("experiment-departs"))
     if command.proposal is None:
         reasons += unjudged(cycle, experiment)
-    if doubts := in_words(int(cycle.watch.doubts)):
-        reasons.append(f"the loop doubts what it measures: {', '.join(doubts)}")
-    if reasons:
-        raise Refused("the experiment is not run", reasons)
+    if reasons := reasons + cycle.watch.doubted():
+        raise Refused(*reasons, title="the experiment is not run")
     cycle.experiments.begin(experiment)
     return f"experiment {experiment.name} runs for {experiment.duration_s:g} s; abort, hold, stop and set end it"
 
 
 def _abort_experiment(cycle: Cycle) -> str:
     if cycle.experiments.run is None:
-        raise Refused("no experiment is under way")
+        raise Refused(finding("no-experiment"))
     cycle.experiments.end("operator's abort")
     return "set-points go back to where they stood"

@@ -37,7 +37,6 @@ from gateway.loop.tensioning import TensioningStage
 from gateway.loop.torque import LawFailed, TorquePath
 from gateway.loop.watch import Watch
 from gateway.loop.wiring import Wiring
-from gateway.wording.catalogue import sentence
 from safety.actions import Action, Finding, found, most_severe
 from safety.envelope import (
     NOTHING,
@@ -49,6 +48,7 @@ from safety.envelope import (
     limit_torque,
 )
 from safety.limits import envelope_limits
+from safety.recoverability import Shortfall
 
 READ_SHARE = 0.5  #: of a period, for samples to arrive; the rest is for control and writing
 _ENABLED = int(DriveState.ENABLED)
@@ -295,8 +295,8 @@ class Cycle:
         if (tell := self._tell) is not None:
             self.containment.run(EVENTS, None, tell, kind, text, **data)
 
-    def foreseen(self, setpoint_n: FloatArray, unwind_speed_m_per_s: float | None = None) -> str:
-        """What would come of these set-points (n,), or this speed, at once, as the accepted model has it; or nothing.
+    def foreseen(self, setpoint_n: FloatArray, unwind_speed_m_per_s: float | None = None) -> Shortfall | None:
+        """What would come of these set-points (n,), or this speed, at once, as the accepted model has it; or None.
 
         Between two periods only.
         """
@@ -317,7 +317,7 @@ class Cycle:
         turning = self.standstill.turning(self.inputs, self.clock())
         below_zero = [] if self.machine.proves else self.watch.below_zero(self.inputs)  # a proof names them
         against = [*turning, *below_zero]
-        return local + [Finding(data.code, Action.NONE, sentence(data), data.parameters) for data in against]
+        return local + [found(data.code, Action.NONE, **data.parameters) for data in against]
 
     def change(self, machine: Machine) -> None:
         """Take over what a command decided. Between two periods only."""
@@ -529,10 +529,10 @@ class Cycle:
         self._advance_setpoints()
         before, path = self.torque_path.fallback, self.torque_path
         try:
-            found = self._governed(applied_nm, interval_s, tick.now_s)
+            governed = self._governed(applied_nm, interval_s, tick.now_s)
             if path.fallback and not before:
-                self._alarm([Finding("fallback", Action.NONE, f"the law has no solution of its own: {path.fallback}")])
-            return found
+                self._alarm([found("law-fallback", Action.NONE, because=path.fallback)])
+            return governed
         except LawFailed as failed:
             self._move_to(self._given_up(tick.now_s, failed.finding.text), [failed.finding])
             return self._torque(seen, tick)
@@ -579,7 +579,7 @@ class Cycle:
         try:
             found = controlled()
         except LawFailed as failed:
-            if not self.roll_back(f"the law failed: {failed.finding.text}"):
+            if not self.roll_back(failed.finding.text):
                 raise
             return self._after_roll_back(controlled)
         guard, setpoint_n = self.guard, self.setpoints.tension_n
@@ -735,8 +735,7 @@ class Cycle:
         on = self.inputs.drive_state == _ENABLED
         self._still_on = np.where(on, self._still_on + 1, 0)
         for i in np.flatnonzero(self._still_on == STILL_ON_PERIODS):
-            text = f"drive {i + 1} stays enabled though it was told off; it is told to stop quickly: cut its power"
-            self._alarm([Finding("drive stays on", Action.TORQUE_OFF, text)])
+            self._alarm([found("drive-stays-on", Action.TORQUE_OFF, roller=int(i) + 1)])
         return self._still_on >= STILL_ON_PERIODS
 
     def _frame(self, tick: Tick, saturated: bool, cycle_s: float) -> None:

@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 from gateway.core.deployment import Deployment, RecoveryPrediction
-from gateway.core.doubts import in_words
+from gateway.core.finding import Finding, finding
 from gateway.core.messages import (
     AskConfiguration,
     Configuring,
@@ -36,7 +36,7 @@ def require(cycle: Cycle, command: Deploy | Keep | WatchGood) -> None:
     match command:
         case Deploy():
             if reasons := against(cycle, command.deployment):
-                raise Refused(NOT_DONE[Deploy], reasons)
+                raise Refused(*reasons, title=NOT_DONE[Deploy])
         case Keep():
             _require_probation(cycle, command.epoch)
         case WatchGood():
@@ -88,7 +88,7 @@ def configure(cycle: Cycle, command: Configuring, prepared: Prepared, now_s: flo
             return _narrow(cycle, command)
         case Confirmed():
             if not configurations.confirm(command.configuration):
-                raise Refused(f"{command.configuration[:12]} does not control the line: nothing is confirmed")
+                raise Refused(finding("not-in-service", configuration=command.configuration[:12]))
             return f"{command.configuration[:12]} is guarded as a first configuration no more"
         case Rollback():
             done = cycle.roll_back(command.reason)
@@ -113,30 +113,33 @@ def _change(
             return _watch_good(cycle.configurations, command.watch, _recovery(prepared), proof)
 
 
-def against(cycle: Cycle, deployment: Deployment) -> list[str]:
+def against(cycle: Cycle, deployment: Deployment) -> list[Finding]:
     """What speaks against a swap now, but for the configuration itself."""
     configurations, setpoints, phase = cycle.configurations, cycle.setpoints, cycle.machine.phase
-    reasons: list[str] = []
-    if configurations.probation is not None:
-        reasons.append(f"epoch {configurations.epoch} is on probation: keep it or roll it back first")
+    reasons = _not_on_probation(configurations)
     if deployment.epoch != configurations.epoch + 1:
-        reasons.append(f"its epoch is {deployment.epoch}; allowed: {configurations.epoch + 1}, the next one")
+        reasons.append(finding("epoch-not-next", epoch=deployment.epoch, next=configurations.epoch + 1))
     if phase not in CHANGEABLE:
-        reasons.append(f"the line is {phase.name.lower()}; allowed: silent, ready, running, holding")
+        reasons.append(finding("no-change-now", phase=phase.name.lower()))
     if cycle.experiments.run is not None:
-        reasons.append("an experiment is under way: wait for its end, or abort it")
+        reasons.append(finding("experiment-under-way"))
     elif phase in (Phase.RUNNING, Phase.HOLDING) and not setpoints.stands(phase is Phase.HOLDING):
-        reasons.append("set-points are on their way: wait until they stand")
+        reasons.append(finding("setpoints-move"))
     if cycle.account.held:
-        reasons.append(f"signals have been missing for {cycle.account.held} periods")
-    if doubts := in_words(int(cycle.watch.doubts)):
-        reasons.append(f"the loop doubts what it measures: {', '.join(doubts)}")
-    most = deployment.region.speed_max_m_per_s
-    if most is not None and setpoints.speed_target_m_per_s > most and phase is not Phase.SILENT:
-        reasons.append(
-            f"the line shall run at {setpoints.speed_target_m_per_s:g} m/s; the configuration was judged up to {most:g}"
-        )
-    return reasons
+        reasons.append(finding("signals-held", periods=cycle.account.held))
+    return reasons + cycle.watch.doubted() + _too_fast(cycle, deployment.region.speed_max_m_per_s)
+
+
+def _not_on_probation(configurations: Configurations) -> list[Finding]:
+    return [] if configurations.probation is None else [finding("on-probation", epoch=configurations.epoch)]
+
+
+def _too_fast(cycle: Cycle, most_m_per_s: float | None) -> list[Finding]:
+    """The line is to run faster than the region would let it."""
+    speed = cycle.setpoints.speed_target_m_per_s
+    if most_m_per_s is None or speed <= most_m_per_s or cycle.machine.phase is Phase.SILENT:
+        return []
+    return [finding("line-too-fast", speed_m_per_s=speed, allowed_m_per_s=most_m_per_s)]
 
 
 def _deploy(cycle: Cycle, deployment: Deployment, candidate: Configuration, now_s: float) -> str:
@@ -165,26 +168,20 @@ def _watch_good(
 def _narrow(cycle: Cycle, command: Narrow) -> str:
     configurations = cycle.configurations
     if reasons := _against_narrowing(cycle, command):
-        raise Refused("not narrowed", reasons)
+        raise Refused(*reasons, title="not narrowed")
     if command.confine:
         cycle.experiments.end("no record explains what controls the line")
     configurations.narrow(command.region)  # the set-point of the speed goes down with it
     return f"{configurations.running.hash[:12]} goes no further than a first configuration"
 
 
-def _against_narrowing(cycle: Cycle, command: Narrow) -> list[str]:
-    configurations, speed = cycle.configurations, cycle.setpoints.speed_target_m_per_s
-    reasons: list[str] = []
-    if configurations.probation is not None:
-        reasons.append(f"epoch {configurations.epoch} is on probation: keep it or roll it back first")
+def _against_narrowing(cycle: Cycle, command: Narrow) -> list[Finding]:
+    reasons = _not_on_probation(cycle.configurations)
     if command.confine:
         return reasons
     if cycle.experiments.run is not None:
-        reasons.append("an experiment is under way: wait for its end, or abort it")
-    most = command.region.speed_max_m_per_s
-    if most is not None and speed > most and cycle.machine.phase is not Phase.SILENT:
-        reasons.append(f"the line shall run at {speed:g} m/s; allowed: up to {most:g} m/s, `r2rgate speed {most:g}`")
-    return reasons
+        reasons.append(finding("experiment-under-way"))
+    return reasons + _too_fast(cycle, command.region.speed_max_m_per_s)
 
 
 def _recovery(prepared: Prepared) -> Recovery | None:
@@ -194,17 +191,16 @@ def _recovery(prepared: Prepared) -> Recovery | None:
 def _require_still(recovery: Recovery | None, good: Configuration, refused: str) -> None:
     """What was prepared aside is for what the line goes back to now, too."""
     if recovery is not None and recovery.fallback != good.hash:
-        raise Refused(refused, ["what the line would go back to has changed meanwhile"])
+        raise Refused(finding("fallback-changed"), title=refused)
 
 
 def _require_nothing_on_probation(configurations: Configurations) -> None:
     """For what belongs to the last known good one. Raises Refused."""
-    if configurations.probation is not None:
-        raise Refused(f"epoch {configurations.epoch} is on probation: it is kept by the newest model, or not")
+    if reasons := _not_on_probation(configurations):
+        raise Refused(*reasons)
 
 
 def _require_probation(cycle: Cycle, epoch: int) -> None:
     configurations = cycle.configurations
     if configurations.probation is None or configurations.epoch != epoch:
-        now = f"epoch {configurations.epoch} is" if configurations.probation else "nothing is"
-        raise Refused(f"epoch {epoch} is not on probation ({now}); {configurations.why}")
+        raise Refused(finding("not-on-probation", epoch=epoch, at=configurations.epoch, because=configurations.why))

@@ -102,7 +102,7 @@ class DriveWatch:
 
     def standing_as_data(self) -> list[Coded]:
         """`standing`, for a reply."""
-        return [coded for finding in self.standing if (coded := finding.as_data()) is not None]
+        return [finding.as_data() for finding in self.standing]
 
     def armed(self) -> None:
         """A person arms: everything begins anew."""

@@ -14,6 +14,7 @@ from gateway.loop.torque import TorquePath
 from safety.actions import Finding
 from safety.first_configuration import FirstState, first_limits, look_at_first
 from safety.monitor import MonitorState, look, monitor_limits, recoverable
+from safety.recoverability import Shortfall
 
 LAG_S = 0.05  #: of the drives, for which there is room from the beginning: as much as the gate lets a model have
 
@@ -81,23 +82,20 @@ class Guard:
 
     def foresees(
         self, configurations: Configurations, path: TorquePath, measured: Measured, setpoint_n: FloatArray
-    ) -> str:
-        """What would come of set-points (n,), and an unwinder's speed, at once; empty: nothing that is not allowed.
+    ) -> Shortfall | None:
+        """What would come of set-points (n,), and an unwinder's speed, at once; None: nothing that is not allowed.
 
         `against` would stop the line for it, or give up the law that runs. Without a prediction nothing is foreseen.
         """
         running = configurations.running
         recovery = running.recovery
         if recovery is None or configurations.probation is not None or path.state is None:
-            return ""
+            return None
         self._remember(recovery.depth + 1)
         remembered = memory(path.state) if recovery.fallback == running.hash else None
         in_flight, sent = self._sent_nm[1 : 1 + recovery.depth], self._sent_nm[0]
-        short = recovery.shortfall_of_step(measured, setpoint_n, in_flight, sent, remembered)
-        if short is None:
-            return ""
         # Under predictive control it is the linear law behind it that is looked at.
-        return str(short) if remembered is None else short.foreseen
+        return recovery.shortfall_of_step(measured, setpoint_n, in_flight, sent, remembered)
 
     def _remember(self, periods: int) -> None:
         """Keep what was sent for so long: a model may say that it acts later than the line's file does.

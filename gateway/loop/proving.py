@@ -283,9 +283,8 @@ class ProvingStage:
         Where something was found, those are what they have shown, and no proof.
         """
         judged = self.judged or Judged([])
-        coded = [data for finding in judged.findings if (data := finding.as_data()) is not None]
         return {
-            "findings": [each.model_dump(mode="json") for each in coded],
+            "findings": [each.as_data().model_dump(mode="json") for each in judged.findings],
             "questions": [each.model_dump(mode="json") for each in judged.questions],
             "drives": [each.model_dump(mode="json") for each in judged.drives],
             "cells": [each.model_dump(mode="json") for each in judged.cells],

@@ -3,21 +3,25 @@
 from collections.abc import Iterable
 
 from gateway.core.finding import Finding
-from gateway.wording.catalogue import sentence
+from gateway.core.messages import Reply
+from gateway.wording.catalogue import sentence, sentences
 
 
 class Refused(Exception):
-    """Nothing was changed. The text is one sentence; `reasons` has every one where there are several."""
+    """Nothing was changed. The text is what was found; or a title, and what was found are its `reasons`."""
 
-    def __init__(self, text: str, reasons: Iterable[str | Finding] = ()) -> None:
-        super().__init__(text)
-        self.told = told = list(reasons)
-        self.reasons = said(told)
-        self.findings = coded(told)
+    def __init__(self, *findings: Finding, title: str = "") -> None:
+        super().__init__(title or sentences(findings))
+        self.findings = list(findings)
+        self.reasons = said(findings) if title else []
+
+    def reply(self, state: str) -> Reply:
+        """What the loop answers, in `state`."""
+        return Reply(ok=False, state=state, text=str(self), reasons=self.reasons, findings=self.findings)
 
 
 def said(reasons: Iterable[str | Finding]) -> list[str]:
-    """Reasons as sentences."""
+    """Reasons as sentences; those of drivers may be sentences already."""
     return [reason if isinstance(reason, str) else sentence(reason) for reason in reasons]
 
 

@@ -216,7 +216,7 @@ class Runner:
             proof = proof_to_keep(cycle, command)
             await self._disk.do(lambda: cycle.wiring.write(proof, command.only))
         except Refused as refused:
-            return self.refused(str(refused), refused.told)
+            return refused.reply(cycle.machine.state.name)
         except OSError as error:
             return self.refused(f"nothing could be kept at {cycle.wiring.path}: {error.strerror or error}")
         reply = await self._at_boundary(command)
@@ -257,7 +257,7 @@ class Runner:
         cycle = self.cycle
         if self.at_rest:
             await release_links(cycle)
-        data = [data for each in cycle.drill.findings if (data := each.as_data()) is not None]
+        data = [each.as_data() for each in cycle.drill.findings]
         if data or not cycle.drill.watchdogs:
             text = "not drilled; mend what is named and try again" if data else f"not drilled: {cycle.machine.reason}"
             return self.refused(text, data)
@@ -287,13 +287,13 @@ class Runner:
             await self._signals_are_there(command)
             return await self._persistence.write_ahead(ahead, lambda: self._at_boundary(command, prepared, proof))
         except ControllerRefused as refused:
-            return self._not_done(NOT_DONE[type(command)], [str(refused)])
+            return self._not_done(NOT_DONE[type(command)], refused.findings or [str(refused)])
         except NotPersisted as failed:
             return self._not_done(NOT_DONE[type(command)], [str(failed)])
         except Refused as refused:
-            return self._not_done(str(refused), refused.reasons)
+            return refused.reply(cycle.machine.state.name).model_copy(update={"in_service": cycle.in_service()})
 
-    def _not_done(self, text: str, reasons: list[str]) -> Reply:
+    def _not_done(self, text: str, reasons: Sequence[str | Finding]) -> Reply:
         """A refusal says what is in service, as every answer to such a command does."""
         return self.refused(text, reasons).model_copy(update={"in_service": self.cycle.in_service()})
 

@@ -9,7 +9,7 @@ from gateway.control.law import Law, Measured
 from gateway.core.line import Line
 from gateway.core.signals import BoolArray, FloatArray
 from gateway.loop.setpoints import Setpoints
-from safety.actions import Action, Finding
+from safety.actions import Action, Finding, found
 from safety.envelope import check_torque, limit_torque
 from safety.limits import EnvelopeLimits
 
@@ -85,8 +85,8 @@ class TorquePath:
         except LawFailed:
             raise
         except Exception as error:
-            text = f"the control law failed: {type(error).__name__}: {error}"
-            raise LawFailed(Finding("control law", Action.TORQUE_OFF, text)) from error
+            said = f"{type(error).__name__}: {error}"
+            raise LawFailed(found("law-failed", Action.TORQUE_OFF, error=said)) from error
 
     def _control(
         self,

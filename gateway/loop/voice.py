@@ -65,7 +65,7 @@ class Voice:
 
 
 def _event(kind: str, text: str, findings: Sequence[Finding], data: dict[str, object]) -> bytes:
-    coded = [found for finding in findings if (found := finding.as_data()) is not None]
+    coded = [finding.as_data() for finding in findings]
     return Event(time_s=monotonic(), kind=kind, text=text, findings=coded, data=data).model_dump_json().encode()
 
 

@@ -12,7 +12,7 @@ from gateway.core.tension_estimate import MEAN_PERIODS
 from gateway.loop.drive_watch import DriveWatch
 from gateway.loop.setpoints import Setpoints
 from safety import cell_zero, frozen
-from safety.actions import Action, Finding
+from safety.actions import Action, Finding, found
 from safety.cell_balance import CellState, cell_limits, find_contradicted
 from safety.drift import DriftState, drift_limits, restart, watch_balance
 from safety.estimated_tension import EstimateState, estimate_limits, find_estimated, steady_n
@@ -25,6 +25,18 @@ from safety.stuck import StuckState, find_stuck, stuck_limits
 CREEPING = 0.02  #: of the greatest speed; below it torques say nothing about load cells
 _AVERAGED_PERIODS = 6 * MEAN_PERIODS  #: after which averages of averages hold 2 % of what was before
 SATURATED = 100.0  #: moments at a limit, net of the time away from it, until proposals are blocked
+CODES = {
+    Doubt.SATURATED: "saturated",
+    Doubt.CELL_STUCK: "cell-stuck",
+    Doubt.CELL_DRIFTS: "cell-drifts",
+    Doubt.TORQUE_UNCOMPARED: "torque-not-compared",
+}
+DOUBTED = {
+    Doubt.SATURATED: "doubt-saturated",
+    Doubt.CELL_STUCK: "doubt-cell-stuck",
+    Doubt.CELL_DRIFTS: "doubt-cell-drifts",
+    Doubt.TORQUE_UNCOMPARED: "doubt-torque-not-compared",
+}
 
 
 class Watch:
@@ -182,6 +194,10 @@ class Watch:
         self._drifts = False
         return self._tell(Doubt.NONE)
 
+    def doubted(self) -> list[data.Finding]:
+        """What is doubted now, and what a person can do: for a refusal."""
+        return [data.finding(DOUBTED[doubt]) for doubt in self.doubts]
+
     @property
     def silent(self) -> list[int]:
         """Spans, from 0, whose load cell has shown one value for longer than its noise allows."""
@@ -207,31 +223,25 @@ class Watch:
         return doubts
 
     def _tell(self, doubts: Doubt) -> list[Finding]:
-        """What has changed, once, in words."""
+        """What has changed, once."""
         if doubts == self.doubts:
             return []
         came, went = doubts & ~self.doubts, self.doubts & ~doubts
         self.doubts = doubts
-        told = [Finding(_name(doubt), Action.NONE, self._text(doubt)) for doubt in came]
-        return told + [Finding(_name(doubt), Action.NONE, f"over: {_name(doubt)}") for doubt in went]
+        over = [found("doubt-over", Action.NONE, doubt=CODES[doubt]) for doubt in went]
+        return [finding for doubt in came for finding in self._found(doubt)] + over
 
-    def _text(self, doubt: Doubt) -> str:
+    def _found(self, doubt: Doubt) -> list[Finding]:
+        """What is told of a doubt that comes; drives that are not compared are told one by one (`uncompared`)."""
         if doubt == Doubt.SATURATED:
-            return f"torques have been at their limits for {self._saturated_s:g} s: proposals are blocked"
+            return [found(CODES[doubt], Action.NONE, lasted_s=self._saturated_s)]
         if doubt == Doubt.CELL_STUCK:
-            cells = ", ".join(self._cell(int(i)) for i in np.flatnonzero(self.stuck))
-            return f"stuck: {cells}; proposals are blocked: check cell, amplifier and cable"
-        if doubt == Doubt.TORQUE_UNCOMPARED:
-            names = ", ".join(self.drives.names_of(self.drives.uncompared))
-            return f"torque asked and torque given are not compared any more: {names}; proposals are blocked"
-        drift_n = self._drift.drift_n
-        cells = ", ".join(f"{self._cell(int(i))} by about {drift_n[i]:+.1f} N" for i in np.flatnonzero(drift_n))
-        first = " (or the friction of roller 1 has changed)" if drift_n[0] else ""
-        return f"drifting: {cells}{first}; proposals are blocked: check the zero when the line stands"
+            stuck = np.flatnonzero(self.stuck).tolist()
+            return [found(CODES[doubt], Action.NONE, span=i + 1, cell=self._cell(i)) for i in stuck]
+        if doubt == Doubt.CELL_DRIFTS:
+            drifts = [(i, drift_n) for i, drift_n in enumerate(self._drift.drift_n.tolist()) if drift_n]
+            return [found(CODES[doubt], Action.NONE, span=i + 1, cell=self._cell(i), drift_n=n) for i, n in drifts]
+        return []
 
     def _cell(self, i: int) -> str:
-        return f"{self._cells.get(i + 1, 'load cell')} (span {i + 1})"
-
-
-def _name(doubt: Doubt) -> str:
-    return (doubt.name or "doubt").lower().replace("_", " ")
+        return self._cells.get(i + 1, "?")

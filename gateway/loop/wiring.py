@@ -104,7 +104,7 @@ class Wiring:
 
     def contradict(self, found: Iterable[actions.Finding]) -> None:
         """Load cells show what torques and the cells beside them say is not so: what was proved of them is over."""
-        told = {int(one.parameters["span"]): one for each in found if (one := each.as_data()) is not None}
+        told = {int(one.parameters["span"]): one.as_data() for one in found}
         news = {span: one for span, one in told.items() if span not in self.contradicted}
         if news:  # the numbers are those that stopped the line
             self.contradicted = self.contradicted | news

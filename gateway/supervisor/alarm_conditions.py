@@ -24,7 +24,7 @@ class Conditions:
 
     def __init__(self) -> None:
         self._told = ""  #: with the last change of state
-        self.stopped_by: list[Finding] = []  #: what led to the last change of state, as far as it is data
+        self.stopped_by: list[Finding] = []  #: what led to the last change of state
         self.false_loop: list[Finding] = []  #: what was found last of one that is none
 
     def look(self, status: GatewayStatus, audit: AuditState) -> dict[str, str]:
@@ -42,7 +42,7 @@ class Conditions:
         return {name: text[:LONGEST_TEXT] for name, text in found.items() if text}
 
     def findings_of(self, alarm: str) -> list[Finding]:
-        """What led to an alarm, as far as it is data."""
+        """What led to an alarm, by code and number."""
         return {"line-stopped": self.stopped_by, "false-loop": self.false_loop}.get(alarm, [])
 
     def _hear(self, status: GatewayStatus) -> None:

@@ -24,6 +24,11 @@ class Entry:
     text: str
     do: str  #: what to do next; empty: the text says it
 
+    @property
+    def said(self) -> str:
+        """Both, with the fields in it."""
+        return f"{self.text}: {self.do}" if self.do else self.text
+
 
 @dataclass(frozen=True)
 class Catalogue:
@@ -65,8 +70,7 @@ def sentence(found: Finding, language: str = ENGLISH) -> str:
     """What was found and what to do next, for a person."""
     for one in _in_order(language):
         if (entry := one.entries.get(found.code)) is not None:
-            said = f"{entry.text}: {entry.do}" if entry.do else entry.text
-            return filled(said, found.parameters, one.decimal)
+            return filled(entry.said, found.parameters, one.decimal)
     return _plain(found)
 
 
@@ -88,6 +92,19 @@ def filled(template: str, parameters: Mapping[str, Value], decimal: str = ".") -
 def fields(template: str) -> set[str]:
     """The names of the parameters that a template says."""
     return {match.group(1) for match in _FIELD.finditer(template)}
+
+
+def templates(language: str) -> dict[str, str]:
+    """By the English sentence that of `language`, with names in braces and no formats.
+
+    For reasons that are told on as text: why a configuration was rolled back, say.
+    """
+    there = catalogue(language).entries
+    return {_bare(one.said): _bare(there[code].said) for code, one in _english.entries.items() if code in there}
+
+
+def _bare(template: str) -> str:
+    return _FIELD.sub(r"{\1}", template)
 
 
 def _in_order(language: str) -> list[Catalogue]:

@@ -74,7 +74,7 @@ def drill_of_dead_watchdog(row: str, seed: int) -> Outcome:
         found_s = line.now_s - begun_s
         line.step(3)
         unsafe = {kind: count for kind, count in line.truth.recorder.unsafe_events.items() if count}
-    told = [(each.code, (each.parameters or {}).get("device")) for each in reply.findings]
+    told = [(each.code, each.parameters.get("device")) for each in reply.findings]
     wanted = DEAD_WATCHDOGS[fault][roller == 0]
     named = not reply.ok and told == [(wanted, names[roller])]
     code = wanted if named else f"not named: {told}"

@@ -164,17 +164,15 @@ def judge(case: Break, waited_s: float = 60.0) -> Judged:
     over = float((recording.tension_n[after] / line.limits.tension_max_n).max())
     counts = {kind: count for kind, count in loop.truth.recorder.unsafe_events.items() if kind != "tension-band"}
     counts |= {"web-pulled": int(over > 1.0), "reversed": reversed_, "driven": _driven(case, recording, reaction_s)}
-    rule = loop.transitions[0][2] if loop.transitions else "nothing"
+    rule = loop.stopped_by[0][1].rule if loop.stopped_by else "nothing"
     phases = " ".join(phase.name for _, phase, _ in loop.transitions)
     notes = "; ".join(finding.text for _, finding in loop.alarms)
     note = (
         f"n {line.n} span {truth.span} {case.speed_m_per_s:.2f} of {line.limits.speed_max_m_per_s:.2f} m/s J "
-        f"{max(r.inertia_kg_m2.value for r in line.rollers):.1f} over {over:.2f} {phases} | {rule} | {notes} "
+        f"{max(r.inertia_kg_m2.value for r in line.rollers):.1f} over {over:.2f} {phases} | {notes} "
         f"| at {begun.max():.2f}"
     )
-    return Judged(
-        case.number, _rule(rule), reaction_s, rest_s, possible_s, {k: c for k, c in counts.items() if c}, note
-    )
+    return Judged(case.number, rule, reaction_s, rest_s, possible_s, {k: c for k, c in counts.items() if c}, note)
 
 
 def least_possible_s(case: Break, speed_m_per_s: FloatArray) -> float:
@@ -206,10 +204,6 @@ def _driven(case: Break, recording: Any, reaction_s: float) -> int:
     turns = np.abs(speed) > RESTS * limits.speed_max_m_per_s
     driven = turns & (recording.torque_nm[late] * np.sign(speed) > 1.7 * friction_nm + least_nm)
     return int(driven.any(axis=0).sum())
-
-
-def _rule(reason: str) -> str:
-    return "web break" if "has broken" in reason else "slack" if reason.startswith("tension ") else reason[:60]
 
 
 def _line(

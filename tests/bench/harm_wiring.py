@@ -50,7 +50,10 @@ def proof(row: str, seed: int, mistake: Callable[[Drawn, np.random.Generator], M
         return loop.cycle.machine.phase is Phase.OFF
 
     rest_s = watched.step_until(over, LONGEST_S)
-    told = {(finding.rule, _number(finding.parameters or {})) for _, finding in loop.stopped_by}
+    told = {
+        (finding.rule, finding.parameters.get("span", finding.parameters.get("roller")))
+        for _, finding in loop.stopped_by
+    }
     named = told == ({(wrong.code, wrong.number)} if wrong else set())
     codes = "+".join(sorted(f"{code} {number}" for code, number in told))
     outcome = watched.outcome(rest_s, ("tension-band",))
@@ -61,11 +64,6 @@ def proof(row: str, seed: int, mistake: Callable[[Drawn, np.random.Generator], M
     note = f"{most_n / draw.line.limits.tension_max_n:.3f} of tension_max_n, {len(asked)} asked; {outcome.note}"
     code = (wrong.code if wrong else "") if named else f"not named: {codes or 'nothing'}"
     return Outcome(row, seed, unsafe, code, rest_s if named and wrong else NEVER_S, rest_s, outcome.fastest, note[:300])
-
-
-def _number(parameters: object) -> object:
-    values = parameters if isinstance(parameters, dict) else {}
-    return values.get("span", values.get("roller"))
 
 
 def _cell_factor(factor: float, code: str) -> Callable[[Drawn, np.random.Generator], Mistake]:

@@ -47,7 +47,7 @@ def test_the_rule_that_found_a_fault_is_told_with_its_time():
     watched = Watched("web-break", SMALL, loop, ["web 1 web-break"])
     assert watched.first() == ("", NEVER_S)
     assert watched.step_until(lambda: bool(watched.first()[0]), 1.0) <= 0.05
-    assert watched.first()[0] in ("web break", "slack")
+    assert watched.first()[0] in ("web-break", "slack")
 
 
 def test_a_healthy_life_ends_at_rest_with_nothing_found():

@@ -30,7 +30,7 @@ def codes(line: VirtualLine) -> list[str]:
 
 
 def found(line: VirtualLine, code: str) -> dict:
-    return next(dict(finding.parameters or {}) for finding in line.findings if finding.rule == code)
+    return next(dict(finding.parameters) for finding in line.findings if finding.rule == code)
 
 
 def stopped_within(line: VirtualLine, seconds: float) -> float:

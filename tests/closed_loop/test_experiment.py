@@ -107,15 +107,17 @@ def test_a_real_line_refuses():
 def test_it_begins_only_in_run_at_rest_and_alone():
     loop = stepped()
     loop.step(3)
-    assert "needs a running line, this one is silent" in loop.command(RunExperiment(experiment=asked())).text
-    assert "no experiment is under way" in loop.command(AbortExperiment()).text
+    asked_here = loop.command(RunExperiment(experiment=asked()))
+    assert [(one.code, one.parameters) for one in asked_here.findings] == [("needs-running", {"phase": "silent"})]
+    assert [one.code for one in loop.command(AbortExperiment()).findings] == ["no-experiment"]
     loop = producing()
     assert loop.command(SetTension(span=1, tension_n=30.0)).ok
     loop.step()
     assert "still on their way" in loop.command(RunExperiment(experiment=asked())).reasons[0]
     loop.step(100)
     begin(loop)
-    assert "under way" in loop.command(RunExperiment(experiment=asked())).text
+    twice = loop.command(RunExperiment(experiment=asked()))
+    assert [one.code for one in twice.findings] == ["experiment-under-way"]
     held = producing()
     held.command(Hold())
     assert "holding" in held.command(RunExperiment(experiment=asked())).text
@@ -161,11 +163,13 @@ def test_what_is_refused_does_not_end_it_and_a_step_is():
     loop.step(30)
     assert not loop.command(SetTension(span=2, tension_n=99.0)).ok
     reply = loop.command(SetTension(span=2, tension_n=37.0, step=True))
-    assert not reply.ok and "abort it first" in reply.text
+    assert not reply.ok and [one.code for one in reply.findings] == ["step-in-experiment"]
     assert loop.cycle.experiments.run is not None
     assert loop.command(AbortExperiment()).ok
     reply = loop.command(SetTension(span=2, tension_n=37.0, step=True))
-    assert not reply.ok and "the last step was just now" in reply.text  # or it would add to the experiment's own
+    assert not reply.ok and [one.code for one in reply.findings] == [
+        "step-too-soon"
+    ]  # or it would add to the experiment's own
 
 
 def blind(loop, monkeypatch, periods, span=2):

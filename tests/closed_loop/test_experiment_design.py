@@ -148,7 +148,7 @@ def test_on_plants_of_the_tolerances_tensions_go_no_further_than_was_foreseen(de
 def test_a_line_that_cannot_bear_it_ends_it_and_stepped_time_says_so(designed):
     with pytest.raises(CommandRefused, match="aborted: "):
         run_experiment(producing(plant=swinging()), designed.experiment)
-    with pytest.raises(CommandRefused, match="the experiment is not run; the experiment has 1 amplitudes"):
+    with pytest.raises(CommandRefused, match="the experiment is not run; .*the experiment has 1 amplitudes"):
         run_experiment(producing(), asked(amplitude_n=[1.0]))
 
 

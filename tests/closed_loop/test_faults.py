@@ -33,7 +33,7 @@ def test_arm_during_a_stop_is_refused_and_touches_no_link(running, phase, monkey
     for name in ("prepare", "silence", "release"):
         monkeypatch.setattr(running.cycle.links[0], name, lambda: pytest.fail("a link was touched"))
     reply = running.arm()
-    assert not reply.ok and "wait until torque is off" in reply.text
+    assert not reply.ok and [one.code for one in reply.findings] == ["torque-not-off"]
     assert running.step_until(Phase.OFF, 5.0)
     assert running.truth.recorder.unsafe_total == 0
 
@@ -82,7 +82,8 @@ def test_a_line_without_a_web_does_not_run_away(reading_n, monkeypatch):
 def test_steps_do_not_add_up_to_a_larger_one(running):
     assert running.command(SetTension(span=3, tension_n=44.0, step=True)).ok
     refused = running.command(SetTension(span=3, tension_n=58.0, step=True))
-    assert not refused.ok and "the next one may come in 2.0 s" in refused.text
+    assert not refused.ok and refused.findings[0].code == "step-too-soon"
+    assert refused.findings[0].parameters["pause_s"] == pytest.approx(2.0, abs=0.05)
     assert running.command(SetTension(span=2, tension_n=40.0, step=True)).ok  # another span may step
     assert running.command(SetSpeed(speed_m_per_s=0.1, step=True)).ok
     assert not running.command(SetSpeed(speed_m_per_s=0.12, step=True)).ok
@@ -96,7 +97,7 @@ def test_transport_that_the_plc_stops_stops_the_line_and_does_not_come_back_by_i
     running.truth.plc.poll(running.now_s)
     running.truth.plc.permissive = True  # gone and back between two samples: only the transport tells
     running.step(12)
-    assert running.cycle.machine.state is LoopState.STOP and "transport" in running.cycle.machine.reason
+    assert running.cycle.machine.state is LoopState.STOP and running.stopped_by[-1][1].rule == "transport-stopped"
 
 
 def test_arming_and_starting_want_to_know_that_the_line_stands_still(loop, monkeypatch):

@@ -29,7 +29,8 @@ def adapted(speed_m_per_s: float):
 def test_it_is_refused_while_the_line_shall_run_faster_and_says_how_to_go_on():
     loop = adapted(0.05)
     reply = loop.command(Narrow(region=FIRST))
-    assert not reply.ok and f"r2rgate speed {FIRST.speed_max_m_per_s:g}" in reply.reasons[0]
+    assert not reply.ok and [one.code for one in reply.findings] == ["line-too-fast"]
+    assert reply.findings[0].parameters["allowed_m_per_s"] == FIRST.speed_max_m_per_s
     assert in_service(loop).region == WIDE and in_service(loop).watched
 
 
@@ -74,7 +75,7 @@ def test_not_while_something_is_on_probation():
     loop = producing(speed_m_per_s=0.01)
     assert loop.command(deployment(region=WIDE)).ok
     reply = loop.command(Narrow(region=FIRST))
-    assert not reply.ok and "on probation" in reply.reasons[0]
+    assert not reply.ok and [one.code for one in reply.findings] == ["on-probation"]
 
 
 def test_it_only_ever_goes_less_far():

@@ -65,10 +65,8 @@ class Proved:
     @property
     def found(self) -> list[tuple[str, object]]:
         """Code and number (span or roller) of everything that ended it."""
-        told = [finding for _, finding in self.loop.stopped_by if finding.parameters]
-        return [
-            (each.rule, (each.parameters or {}).get("span", (each.parameters or {}).get("roller"))) for each in told
-        ]
+        told = [finding for _, finding in self.loop.stopped_by]
+        return [(each.rule, each.parameters.get("span", each.parameters.get("roller"))) for each in told]
 
     @property
     def outcome(self) -> dict[str, list[dict[str, object]]]:

@@ -239,8 +239,8 @@ def test_so_do_lines_that_are_drawn(seed: int) -> None:
     [
         (nothing, None, 0), (operators_day, None, 0), (from_standstill, None, 0),
         (torn_tension, "value-impossible", 1), (torn_tensions, "value-impossible", 4),
-        (unit_changed, "signals", 3), (jump, "encoder jump", 30), (stuck, "load cell stuck", 110),
-        (web_break, "web break", 5), (drive_lost, "drives", 1), (emergency_stop, "emergency stop", 1),
+        (unit_changed, "signals-missing", 3), (jump, "encoder-jump", 30), (stuck, "load-cell-stuck", 110),
+        (web_break, "web-break", 5), (drive_lost, "drive-state", 1), (emergency_stop, "emergency-stop", 1),
     ],
 )  # fmt: skip
 def test_what_is_found_and_when(change, codes: str | None, within: int) -> None:

@@ -8,6 +8,7 @@ import pytest
 from gateway.cli.rehearse_designs import truth_of
 from gateway.cli.stepped import SteppedLoop, run_scenario
 from gateway.control.design import design_lqg, design_lqi, design_lqr, design_pid, design_scheduled, task_of
+from gateway.core.finding import finding
 from gateway.core.line import Line
 from gateway.core.messages import Arm, Hold, SelectRecipe, SetSpeed, SetTension, Start, Stop
 from gateway.core.scenario import PAPER, TENSION
@@ -84,23 +85,23 @@ def test_setpoints_ramp_or_step_within_the_limits(running):
 
 
 @pytest.mark.parametrize(
-    ("command", "reason"),
+    ("command", "told"),
     [
-        (SetTension(span=7, tension_n=30.0), "there is no span 7; allowed: 1 to 6"),
-        (SetTension(span=1, tension_n=59.1), "59.1 N is too near a limit or beyond it; allowed: 3 to 59 N"),
-        (SetTension(span=1, tension_n=2.9), "allowed: 3 to 59 N"),
-        (SetTension(span=1, tension_n=-30.0), "allowed: 3 to 59 N"),
-        (SetTension(span=3, tension_n=44.1, step=True), "a step of 24.1 N is too large; allowed: 24 N"),
-        (SetSpeed(speed_m_per_s=0.121), "0.121 m/s is outside the limits; allowed: 0 to 0.12 m/s"),
-        (SetSpeed(speed_m_per_s=-0.01), "outside the limits"),
-        (SetSpeed(speed_m_per_s=0.11, step=True), "a step of 0.1 m/s is too large; allowed: 0.09 m/s"),
-        (SelectRecipe(name="velocty"), "there is no recipe 'velocty'; did you mean velocity?"),
+        (SetTension(span=7, tension_n=30.0), finding("no-such-span", span=7, spans=6)),
+        (SetTension(span=1, tension_n=59.1), finding("tension-out-of-range", tension_n=59.1, low_n=3.0, high_n=59.0)),
+        (SetTension(span=1, tension_n=2.9), finding("tension-out-of-range", tension_n=2.9, low_n=3.0, high_n=59.0)),
+        (SetTension(span=1, tension_n=-30.0), finding("tension-out-of-range", tension_n=-30.0, low_n=3.0, high_n=59.0)),
+        (SetTension(span=3, tension_n=44.1, step=True), "step-too-large-tension"),
+        (SetSpeed(speed_m_per_s=0.121), finding("speed-out-of-range", speed_m_per_s=0.121, allowed_m_per_s=0.12)),
+        (SetSpeed(speed_m_per_s=-0.01), finding("speed-out-of-range", speed_m_per_s=-0.01, allowed_m_per_s=0.12)),
+        (SetSpeed(speed_m_per_s=0.11, step=True), "step-too-large-speed"),
+        (SelectRecipe(name="velocty"), finding("no-such-recipe", recipe="velocty", nearest="velocity")),
     ],
 )
-def test_what_is_outside_the_limits_is_refused_and_changes_nothing(running, command, reason):
+def test_what_is_outside_the_limits_is_refused_and_changes_nothing(running, command, told):
     before = running.cycle.setpoints.tension_target_n.copy(), running.cycle.setpoints.speed_target_m_per_s
     reply = running.command(command)
-    assert not reply.ok and reason in reply.text
+    assert not reply.ok and told in (reply.findings[0], reply.findings[0].code)
     assert (before[0] == running.cycle.setpoints.tension_target_n).all()
     assert before[1] == running.cycle.setpoints.speed_target_m_per_s
 
@@ -111,7 +112,9 @@ def test_steps_of_several_spans_add_up_until_they_are_over(running):
     said = [SetTension(span=i, tension_n=goal, step=True) for i, goal in enumerate(goals[:5], 1)]
     assert all(running.command(one).ok for one in said[:4])
     refused = running.command(said[4])
-    assert not refused.ok and "come to 120 N; allowed: 96 N together" in refused.text
+    assert not refused.ok and refused.findings[0].code == "steps-too-large-together"
+    told = {"step_n": 24.0, "together_n": 120.0, "allowed_n": 96.0, "within_s": running.cycle.setpoints.step_pause_s}
+    assert refused.findings[0].parameters == pytest.approx(told)
     assert running.command(SetTension(span=5, tension_n=goals[4])).ok, "a ramp at any time"
 
 
@@ -120,10 +123,10 @@ def test_the_line_plc_takes_its_permissive_back(running):
     running.step(200)
     running.truth.plc.permissive = False
     running.step(2)
-    assert running.cycle.machine.phase is Phase.SLOWING and "permissive" in running.cycle.machine.reason
+    assert running.cycle.machine.phase is Phase.SLOWING and running.stopped_by[-1][1].rule == "no-permissive"
     assert running.step_until(Phase.OFF, 5.0)
     reply = running.arm()
-    assert not reply.ok and "permissive" in reply.reasons[0]
+    assert not reply.ok and [one.code for one in reply.findings] == ["no-permissive"]
 
 
 def test_emergency_stop_takes_torque_off_without_waiting_for_standstill(running):
@@ -141,7 +144,7 @@ def test_a_law_that_gives_nan_never_reaches_the_drives(running, monkeypatch):
     broken = Decision(np.full(6, np.nan), np.zeros(6), np.zeros(6))
     monkeypatch.setattr(running.cycle.torque_path.law, "ask", lambda *_: broken)
     running.step(1)
-    assert running.cycle.machine.phase is Phase.UNLOADING and "finite" in running.cycle.machine.reason
+    assert running.cycle.machine.phase is Phase.UNLOADING and running.stopped_by[-1][1].rule == "torque-not-finite"
     assert running.step_until(Phase.OFF, 1.0)
     assert np.isfinite(running.truth.recorder.recording().torque_nm).all()
     assert running.truth.recorder.unsafe_total == 0
@@ -161,7 +164,8 @@ def test_a_missing_load_cell_holds_for_two_periods_and_stops_at_the_third(runnin
     assert running.cycle.machine.phase is Phase.RUNNING and (running.cycle.outputs.torque_nm == held).all()
     assert running.recorded()[-1].held == 2
     running.step(1)
-    assert running.cycle.machine.state is LoopState.STOP and "tension 4" in running.cycle.machine.reason
+    assert running.cycle.machine.state is LoopState.STOP
+    assert running.stopped_by[-1][1].parameters == {"signals": "T4", "missed": 3, "periods": 3}
     assert running.step_until(Phase.OFF, 1.0)
 
 

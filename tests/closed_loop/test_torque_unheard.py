@@ -33,7 +33,7 @@ def test_a_torque_whose_status_goes_bad_at_speed_is_told_and_then_not_compared_b
     link.collect = collected
     assert not status_of(loop)[0].doubts
     loop.step(100)
-    told = [(finding.rule, (finding.parameters or {}).get("drive")) for _, finding in loop.alarms]
+    told = [(finding.rule, finding.parameters.get("drive")) for _, finding in loop.alarms]
     assert told[:2] == [(code, "drive-2") for code in TOLD]
     assert Doubt.TORQUE_UNCOMPARED in loop.cycle.watch.doubts, "and proposals are blocked"
     status, spans = status_of(loop)

@@ -131,7 +131,7 @@ def test_a_drive_that_stops_answering_stops_the_line_in_the_third_period(line):
     assert fault.slowed_in() == 4.0  # what period 3 decided reaches the PLC with the next transaction
     recording = fault.finish()
     assert not recording.torque_nm[recording.time_s > left[0]["time_s"] + 1e-3, ROLLER - 1].any()
-    assert f"{ROLLER} ABSENT" in line.cycle.machine.reason
+    assert line.findings[0].parameters["drives"] == f"{ROLLER} ABSENT"
 
 
 def test_a_lost_drive_that_does_not_hear_the_nmt_command_either_is_left_to_its_watchdog(line):
@@ -200,7 +200,7 @@ def test_a_load_cell_without_a_number_holds_in_the_same_cycle_and_stops_in_the_t
     line.step(2)
     assert line.cycle.machine.phase is Phase.RUNNING
     line.step(1)
-    assert line.cycle.machine.state is LoopState.STOP and f"tension {ROLLER}" in line.cycle.machine.reason
+    assert line.cycle.machine.state is LoopState.STOP and line.findings[0].parameters["signals"] == f"T{ROLLER}"
     line.step(5)
     for roller in range(1, line.line.n + 1):
         assert_held_for_two_then_unloaded(fault.commanded_nm(roller))
@@ -223,7 +223,7 @@ def test_a_stall_of_six_periods_stops_the_line_and_one_of_five_does_not(line, sk
         assert line.truth.recorder.unsafe_total == 0
         return
     assert fault.slowed_in() == skipped + 2.0
-    assert f"missed {skipped} periods" in line.cycle.machine.reason
+    assert [(one.rule, one.parameters["skipped"]) for one in line.findings] == [("overrun", skipped)]
     fault.finish()
     assert {event["cause"] for event in fault.events("drive_state")} == {"command"}
 

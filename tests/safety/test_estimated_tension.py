@@ -222,7 +222,7 @@ def breaking(line, tension, span, way, *, moved_n=0.0):
             if i in seen:
                 inputs.tension.put(i, true_n[i], 0.01 * k)
         found = find_estimated(limits, state, inputs, torque, set_n, floor=True)
-        told += [(k - 300, one.rule, one.action, (one.parameters or {})["span"]) for one in found]
+        told += [(k - 300, one.rule, one.action, one.parameters["span"]) for one in found]
     return told
 
 

@@ -135,13 +135,8 @@ def test_a_frozen_drive_is_told_with_its_speed_and_how_often_it_came() -> None:
         for i, speed in enumerate(speeds):
             inputs.speed.put(i, float(speed), 0.0)
         found = find_frozen(TURNING_FROM_M_PER_S, state, inputs)
-    assert found == [
-        Finding(
-            "drive frozen",
-            Action.STOP,
-            "the drive of roller 2 has shown 0.051234 m/s 8 times in a row while the line runs: its samples are "
-            "frozen; restart the drive, and check what lies between",
-        )
+    assert [(one.rule, one.action, one.parameters) for one in found] == [
+        ("drive-frozen", Action.STOP, {"roller": 2, "speed_m_per_s": 0.051234, "in_a_row": 8})
     ]
 
 

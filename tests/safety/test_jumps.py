@@ -49,8 +49,8 @@ def jumping(values: list[float], torque_nm: FloatArray = TORQUE_NM) -> tuple[lis
         if inputs.speed.quality[1] == Quality.BAD:
             discarded.append(k)
         found += [k] * len(findings)
-        assert all((finding.rule, finding.action) == ("encoder jump", Action.STOP) for finding in findings)
-        assert all("roller 2 jumped twice, to" in finding.text for finding in findings)
+        assert all((finding.rule, finding.action) == ("encoder-jump", Action.STOP) for finding in findings)
+        assert all(finding.parameters["roller"] == 2 for finding in findings)
     return found, inputs, discarded
 
 
@@ -280,9 +280,8 @@ def test_a_second_jump_says_from_where_to_where() -> None:
     limits, state, inputs = jump_limits(LINE, np.zeros(6)), JumpState(), at_30_n()
     for value in (0.05, 0.5, 0.6):
         findings = reject_jumps(limits, state, speeds(inputs, [*[0.05] * 5, value]), [TORQUE_NM])
-    assert [finding.text for finding in findings] == [
-        "the speed of roller 6 jumped twice, to 0.6000 from 0.0500 m/s: check its encoder and the encoder's cable"
-    ]
+    told = {"roller": 6, "speed_m_per_s": 0.6, "before_m_per_s": 0.05}
+    assert [finding.parameters for finding in findings] == [told]
 
 
 @pytest.mark.parametrize("speed_max_m_per_s", [0.12, 8.0])

@@ -178,7 +178,7 @@ def test_the_envelope_takes_a_good_sample_that_is_no_number_for_one_outside(supe
     assert findings_after(LIMITS.band_periods, inputs, supervision)
     getattr(inputs, channel).quality[i] = Quality.MISSING  # what was never heard is another rule's
     named = {one.rule for one in findings_after(1, inputs, supervision)}
-    assert not named & {"tension band", "slack", "web break", "roller speed"}
+    assert not named & {"tension-high", "slack", "web-break", "roller-speed"}
 
 
 def test_an_unwinder_whose_good_speed_is_no_number_is_too_fast() -> None:

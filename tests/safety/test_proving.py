@@ -72,7 +72,7 @@ def judged(pulls: list[Pull], line: Line = LINE, limits: ProvingLimits = LIMITS)
 
 
 def codes(of: Judged) -> list[tuple[str, object]]:
-    told = [(finding.rule, finding.parameters or {}) for finding in of.findings]
+    told = [(finding.rule, finding.parameters) for finding in of.findings]
     return [(code, parameters.get("span", parameters.get("roller"))) for code, parameters in told]
 
 
@@ -107,7 +107,7 @@ def test_a_zero_is_off_either_way_from_its_bound_on(sign: float) -> None:
     allowed = zero_allowed_n(LINE)
     assert judge_zeros(LINE, LIMITS, sign * allowed) == []
     found = judge_zeros(LINE, LIMITS, np.array([0.0, sign * 8.0, 0.0]))
-    assert [(each.rule, (each.parameters or {})["cell"]) for each in found] == [("cell-zero-off", "load-cell-2")]
+    assert [(each.rule, each.parameters["cell"]) for each in found] == [("cell-zero-off", "load-cell-2")]
     unmeasured = replace(LIMITS, measured=np.array([True, False, True]))
     assert judge_zeros(LINE, unmeasured, np.array([0.0, sign * 8.0, 0.0])) == []
 

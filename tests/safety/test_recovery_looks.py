@@ -179,7 +179,8 @@ def test_the_monitor_asks_with_what_a_running_fallback_remembers():
     measured, setpoint_n, *sent = given = at_rest()
     stepped = (measured, setpoint_n + 6.0, *sent)
     (finding,) = recoverable(recovery_of(), *stepped, running(LAWS["lqi"], *given))
-    assert (finding.rule, finding.action) == ("recoverability", Action.STOP) and "roller 6" in finding.text
+    assert (finding.rule, finding.action) == ("unrecoverable-speed", Action.STOP)
+    assert finding.parameters["roller"] == 6
     assert recoverable(recovery_of(), *stepped, None) == []
 
 

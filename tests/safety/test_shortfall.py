@@ -75,10 +75,8 @@ def test_a_tension_may_come_to_its_bound_itself(span, tension_n, below):
     assert recovery_of(line=slow, margin_n=margin_n).shortfall(away, *rest).what == "roller"
 
 
-def test_a_shortfall_is_told_in_words():
+def test_a_shortfall_is_told_in_its_unit():
     span, roller = Shortfall("span", 2, 1.26, 8.0, 0.135), Shortfall("roller", 0, -0.18, -0.153, 0.02)
-    assert str(span) == "span 3 would come to 1.3 N in 0.14 s if the fallback took over now, allowed: 8 N"
-    assert span.foreseen == "span 3 would come to 1.3 N in 0.14 s, allowed: 8 N"
-    assert str(roller) == (
-        "roller 1 would come to -0.180 m/s in 0.02 s if the fallback took over now, allowed: -0.153 m/s"
-    )
+    assert span.parameters == {"span": 3, "tension_n": 1.26, "allowed_n": 8.0, "ahead_s": 0.135}
+    told = {"roller": 1, "speed_m_per_s": -0.18, "allowed_m_per_s": -0.153, "ahead_s": 0.02}
+    assert roller.parameters == told

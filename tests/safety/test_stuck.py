@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gateway.core.signals import Inputs
-from safety.actions import Action
+from safety.actions import Action, Finding, found
 from safety.stuck import LEARNT_REVERSALS, SILENT_PERIODS, Cell, StuckLimits, StuckState, find_stuck, stuck_limits
 from tests.closed_loop.conftest import demo_line
 
@@ -22,17 +22,16 @@ def test_cells_of_tension_spans_are_judged_after_the_time_of_the_lines_file() ->
 STUCK = StuckLimits(np.array([True, True, False]), stuck_periods=5)
 
 
-def stuck_after(tensions: list[tuple[float, float, float]], alive: bool = True) -> tuple[StuckState, list[str]]:
+def stuck_after(tensions: list[tuple[float, float, float]], alive: bool = True) -> tuple[StuckState, list[Finding]]:
     state, inputs = StuckState(), Inputs(3)
-    texts: list[str] = []
+    stuck: list[Finding] = []
     for k, values in enumerate(tensions):
         for i, value in enumerate(values):
             inputs.tension.put(i, value, 0.0)
             inputs.speed.put(i, 0.05 + (1e-4 * (k % 2) if alive else 0.0), 0.0)
         findings = find_stuck(STUCK, state, inputs)
-        assert all((finding.rule, finding.action) == ("load cell stuck", Action.STOP) for finding in findings)
-        texts += [finding.text for finding in findings]
-    return state, texts
+        stuck += findings
+    return state, stuck
 
 
 def noisy(count: int) -> list[tuple[float, float, float]]:
@@ -44,12 +43,9 @@ def noisy(count: int) -> list[tuple[float, float, float]]:
 def test_a_cell_that_stands_still_while_rollers_move_is_stuck_after_its_time() -> None:
     still = [(40.0 + 0.1 * k, 31.0, 30.0 + 0.1 * k) for k in range(6)]
     assert not stuck_after(noisy(300) + still[:5])[0].stuck.any()
-    state, texts = stuck_after(noisy(300) + still)
+    state, stuck = stuck_after(noisy(300) + still)
     assert list(state.stuck) == [False, True, False], "span 3 is not controlled by its cell"
-    assert texts == [
-        "the load cell of span 2 has shown 31.00 N 5 times in a row while rollers move: check it, its amplifier and "
-        "its cable"
-    ]
+    assert stuck == [found("load-cell-stuck", Action.STOP, span=2, tension_n=31.0, in_a_row=5)]
 
 
 def test_a_fine_cell_that_shows_one_value_is_silent_until_it_shows_another() -> None:

@@ -63,7 +63,7 @@ def inputs_of(tension_n: FloatArray, speed_m_per_s: FloatArray) -> Inputs:
 
 
 def spans_of(found: list[Finding]) -> list[object]:
-    return [(finding.parameters or {})["span"] for finding in found]
+    return [finding.parameters["span"] for finding in found]
 
 
 def found_after(

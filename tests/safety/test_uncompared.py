@@ -32,7 +32,7 @@ class Watched:
                 self.inputs.torque.reject(1)
             self.period += 1
             for finding in find_uncompared(LIMITS, self.state, self.inputs, lost):
-                self.found.append((self.period, finding.rule, (finding.parameters or {})["drive"], finding.action))
+                self.found.append((self.period, finding.rule, finding.parameters["drive"], finding.action))
         return self
 
 

@@ -20,14 +20,14 @@ def rules(torques_nm, cuts=None):
     for k, torque in enumerate(torques_nm):
         findings = look(LIMITS, state, np.full(6, 20.0) + np.eye(6)[2] * torque, bool(cuts is not None and cuts[k]))
         if findings:
-            return [finding.rule for finding in findings], k, findings[0].text
-    return [], None, ""
+            return [finding.rule for finding in findings], k, findings[0].parameters
+    return [], None, {}
 
 
 def test_a_torque_that_turns_round_every_other_period_chatters():
-    found, when, text = rules([0.0, 6.0] * 30)
+    found, when, told = rules([0.0, 6.0] * 30)
     assert found == ["chattering"] and when <= LIMITS.window
-    assert "roller 3" in text and "5 Nm" in text
+    assert (told["roller"], told["reversal_nm"]) == (3, 5.0)
 
 
 @pytest.mark.parametrize(
@@ -62,8 +62,8 @@ def test_a_torque_that_is_cut_in_half_of_the_window():
     still = [0.0] * 200
     few = [k < LIMITS.cuts - 1 for k in range(200)]
     assert rules(still, [False, *few[:-1]])[0] == []
-    assert rules(still, [True] * 200)[0] == ["torque cut"]
-    assert rules(still, [k % 2 == 0 for k in range(200)])[0] == ["torque cut"]
+    assert rules(still, [True] * 200)[0] == ["torque-cut"]
+    assert rules(still, [k % 2 == 0 for k in range(200)])[0] == ["torque-cut"]
     assert rules(still, [k % 3 == 0 for k in range(200)])[0] == []
 
 
@@ -79,12 +79,11 @@ def test_what_is_said_names_roller_count_and_limit_and_stops_nothing_by_itself()
     first = next(findings for findings in found if findings)
     assert [(one.rule, one.action) for one in first] == [("chattering", Action.NONE)]
     # Two moves before the first turn is told: the first period moves nothing, and the first move has no way before.
-    assert first[0].text == (
-        "the torque of roller 3 turned round 15 times by more than 5 Nm in 16 periods, allowed: 14"
-    )
+    told = {"roller": 3, "reversals": 15, "reversal_nm": 5.0, "periods": 16, "allowed": 14}
+    assert first[0].parameters == told
     cut = next(findings[-1] for findings in found if len(findings) == 2)
-    assert (cut.rule, cut.action) == ("torque cut", Action.NONE)
-    assert cut.text == "a limit cut a torque in 25 of 25 periods, allowed: 24"
+    assert (cut.rule, cut.action) == ("torque-cut", Action.NONE)
+    assert cut.parameters == {"cuts": 25, "periods": 25, "allowed": 24}
 
 
 def test_a_move_of_exactly_half_a_step_does_not_count():
@@ -105,4 +104,4 @@ def test_turns_and_cuts_are_those_of_the_last_window(moves):
         cuts.append(cut)
         found = [one.rule for one in look(limits, state, np.array([1.0, torque]), cut)]
         assert ("chattering" in found) is (sum(turned[-8:]) >= 3)
-        assert ("torque cut" in found) is (sum(cuts[-8:]) >= 4)
+        assert ("torque-cut" in found) is (sum(cuts[-8:]) >= 4)

@@ -43,7 +43,7 @@ def without_web(line: Line) -> ProvingStage:
 def found(stage: ProvingStage) -> tuple[list[tuple[str, object]], list[int]]:
     """Codes and rollers of what was found, and the rollers of the drives that have pulled."""
     assert stage.judged is not None
-    told = [(one.rule, (one.parameters or {})["roller"]) for one in stage.judged.findings]
+    told = [(one.rule, one.parameters["roller"]) for one in stage.judged.findings]
     return told, [drive.roller for drive in stage.judged.drives]
 
 

