@@ -131,7 +131,7 @@ def test_a_drive_that_stops_answering_stops_the_line_in_the_third_period(line):
     assert fault.slowed_in() == 4.0  # what period 3 decided reaches the PLC with the next transaction
     recording = fault.finish()
     assert not recording.torque_nm[recording.time_s > left[0]["time_s"] + 1e-3, ROLLER - 1].any()
-    assert line.findings[0].parameters["drives"] == f"{ROLLER} ABSENT"
+    assert f"{ROLLER} ABSENT" in {one.parameters.get("drives") for one in line.findings}
 
 
 def test_a_lost_drive_that_does_not_hear_the_nmt_command_either_is_left_to_its_watchdog(line):
