@@ -11,7 +11,7 @@ from gateway.core.finding import Finding
 from gateway.core.line import Line
 from gateway.core.line_limits import setpoint_bands_n
 from gateway.core.status import EventStatus, GatewayStatus, LimitsStatus, SpanStatus, band_n
-from gateway.wording.catalogue import languages, sentence, sentences
+from gateway.wording.catalogue import languages, sentence
 
 DRIVES_THAT_FAIL = frozenset({"ABSENT", "STOPPING", "FAULT", "STO"})
 IN_MOTION = frozenset({"RUN", "HOLD"})  #: states in which tensions are controlled
@@ -83,11 +83,17 @@ def _in_words(one: Finding) -> dict[str, Any]:
 
 
 def _told(one: EventStatus | AlarmStatus) -> dict[str, Any]:
-    """With its text in the other languages, `said`, where what was found is data and stands whole at its end."""
-    found, said = sentences(one.findings), dict[str, str]()
-    if found and one.text.endswith(found):
-        before = one.text.removesuffix(found)
-        said = {language: before + sentences(one.findings, language) for language in languages()[1:]}
+    """With its text in the other languages, `said`, where what was found stands in it.
+
+    Not all need stand there: what stops the line is told with what was found beside it.
+    """
+    said = dict[str, str]()
+    for language in languages()[1:]:
+        text = one.text
+        for found in one.findings:
+            text = text.replace(sentence(found), sentence(found, language))
+        if text != one.text:
+            said[language] = text
     return {**one.model_dump(), "said": said}
 
 
