@@ -11,6 +11,7 @@ from gateway.core.audit_record import AuditRecord
 from gateway.core.line_problem import printable
 from gateway.supervisor.audit_verify import Chained, Verification
 from gateway.supervisor.find_version import LEAST_PREFIX
+from gateway.supervisor.record_words import IN_EVERY_LANGUAGE, in_a_sentence
 
 SHORT = 12  #: letters of a hash
 
@@ -33,6 +34,8 @@ def print_record(one: Chained) -> None:
         return
     when = datetime.fromtimestamp(record.wall_s, UTC).strftime("%Y-%m-%d %H:%M:%S")
     typer.echo(f"#{record.sequence}  {when} UTC  {record.kind}  by {printable(_who(record))}  {one.row.head[:SHORT]}")
+    if record.kind in IN_EVERY_LANGUAGE:
+        typer.echo(f"    {in_a_sentence(record.kind, record.who.name, record.what)}")
     for key, value in record.what.items():
         text = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
         typer.echo(f"    {printable(key)}: {printable(text)}")

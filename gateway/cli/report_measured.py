@@ -29,7 +29,7 @@ BEFORE_S, AFTER_S = 5.0, 20.0  #: of a deployment, that are drawn
 POINTS = 600
 MOST_CHARTS, MOST_ALARMS = 12, 200
 ALARM_EVENTS = ("alarm", "alarm-ended")
-ALARM_RECORDS = ("acknowledged", "shelved")
+ALARM_RECORDS = ("acknowledged", "shelved", "line-stopped")
 
 
 @dataclass

@@ -37,6 +37,7 @@ class RecordTold(Strict):
     who: str
     text: str  #: in a sentence, made here, never by a language model
     what: dict[str, Any]
+    said: dict[str, str] = {}  #: the same in other languages, as far as there is one
 
 
 class RecordsTold(Strict):

@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from typing import Protocol
 
 from gateway.core.finding import Finding, finding
-from gateway.core.messages import MAX_COMMAND, Command, Deploy, Keep, MalformedMessage, Reply, parse_command
+from gateway.core.messages import MAX_COMMAND, Command, Deploy, Keep, MalformedMessage, Reply, Stop, parse_command
 from gateway.core.proof import Introduction, Proof, is_sealed, opened
 from gateway.loop.aside import Aside
 from gateway.mailbox.allowance import Allowance
@@ -56,6 +56,7 @@ class Door:
     ) -> None:
         """`is_open`: whether the loop has started; until `open` only what anybody may say is taken."""
         self.nonce = secrets.token_hex(16)
+        self.stopper: Peer | None = None  #: who asks for the stop that is being carried out
         self._behind = behind
         self._of = of
         self._find_key = key
@@ -98,7 +99,16 @@ class Door:
             return self._turn_away(command.command, finding("no-proof", command=command.command))
         if command.command in OVERTAKES:
             self._numbers.note_stop(self._clock())
-        return await self._behind.submit(command)
+        return await self._submit(command, None)
+
+    async def _submit(self, command: Command, proof: Proof | None) -> Reply:
+        if not isinstance(command, Stop):
+            return await self._behind.submit(command, proof)
+        self.stopper = PEER.get()
+        try:
+            return await self._behind.submit(command, proof)
+        finally:
+            self.stopper = None
 
     async def _of_gateway(self, payload: bytes) -> Reply:
         if not self._is_open:  # its devices may not be there yet; nobody has done anything wrong
@@ -119,7 +129,7 @@ class Door:
             return against
         self._numbers.use(proof.statement.number)
         self._gateway = PEER.get()
-        return await self._behind.submit(found, proof)
+        return await self._submit(found, proof)
 
     def _why_not_now(self, proof: Proof) -> Reply | None:
         """The refusal of a number that was used, is of another time, or was made before a stop; None: it is good."""

@@ -112,6 +112,7 @@ async def _main(
     door = Door(
         runner, LineName(line.site, line.line), lambda: key or gateways_key(), monotonic, voice.tell, is_open=False
     )
+    voice.stopper = lambda: door.stopper
     identity = _identity(run_folder, cycle, say)
     ending = asyncio.Event()
     for number in (signal.SIGTERM, signal.SIGINT):

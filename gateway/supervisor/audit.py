@@ -33,6 +33,7 @@ OFTEN = frozenset(
         "received",
         "refused",
         "judged",
+        "line-stopped",
     )
 )  # fmt: skip
 MOST_WAITING = 1000

@@ -39,6 +39,8 @@ from gateway.supervisor.in_service import InServiceView
 from gateway.supervisor.intrusions import Intrusions
 from gateway.supervisor.kept_audit import KeptAudit
 from gateway.supervisor.lifecycle import WIRING_PROVED
+from gateway.supervisor.line_stops import hear_stop
+from gateway.supervisor.loop_records import LoopRecords
 from gateway.supervisor.model_store import ModelsError
 from gateway.supervisor.models import Models, begin_repository
 from gateway.supervisor.patience import Patience
@@ -91,6 +93,7 @@ class Gate:
         self.deployer: Deployer | None = None
         #: Of the people who may come in; None: nobody has told yet.
         self.roles: Callable[[], Mapping[str, Role] | None] = lambda: None
+        self.stop_asked: Callable[[], Who | None] = lambda: None  #: who asked the gateway for the last stop
         self._line = line
         self._folder = folder
         self._judge = judge
@@ -109,7 +112,8 @@ class Gate:
         self._told = ""
         self._proofs: set[str] = set()  #: of the wiring, that are or are being recorded since this process began
         self._refusals = Bounded(clock)
-        self._intrusions = Intrusions(self.audit.append, note, clock)
+        self._loop_records = LoopRecords(self.audit.append, note, clock)
+        self._intrusions = Intrusions(self._loop_records, clock)
         self._rates = RateLimiter(clock)
         self._turned_away = Bounded(clock)
         self._decisions = SaidInbox(DECISION_EVENT, OF_DECISIONS, clock, note)
@@ -148,6 +152,7 @@ class Gate:
     def hear(self, event: Event) -> None:
         """What the loop tells: that an experiment is over, or that it runs something else, is for the records."""
         self._intrusions.hear(event)
+        hear_stop(event, self._loop_records, lambda: self.stop_asked())
         if event.kind == PROVED:
             self._spawn(self._proved(event))
         if self.deployer is None:
@@ -238,7 +243,7 @@ class Gate:
         for task in self._telling:
             task.cancel()
         await asyncio.gather(*self._telling, return_exceptions=True)
-        await self._intrusions.close()
+        await self._loop_records.close()
         if self.deployer is not None:
             await self.deployer.close()
         for store in self._stores or ():

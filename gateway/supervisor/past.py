@@ -21,7 +21,8 @@ from gateway.storage.sqlite_file import open_to_read, told
 from gateway.supervisor.audit_file import FILE_NAME, KIND, AuditFile, AuditUnavailable, Row
 from gateway.supervisor.history import History, HistoryError
 from gateway.supervisor.past_tensions import NotTold, thinned
-from gateway.supervisor.record_words import in_a_sentence
+from gateway.supervisor.record_words import IN_EVERY_LANGUAGE, in_a_sentence
+from gateway.wording.catalogue import languages
 
 BUSY_MS = 500
 _HEAD_BYTES = 200  #: of an answer, beside its records
@@ -122,9 +123,13 @@ def _record(file: AuditFile, row: Row) -> RecordTold:
         text = f"this record is damaged: {error}; `r2rgate audit verify` tells more"
         return RecordTold(sequence=row.sequence, wall_s=0.0, kind="damaged", who="", text=text, what={})
     text = in_a_sentence(record.kind, record.who.name, record.what, _reason(file, record))
+    said = {
+        language: in_a_sentence(record.kind, record.who.name, record.what, language=language)
+        for language in languages()[1:] if record.kind in IN_EVERY_LANGUAGE
+    }  # fmt: skip
     return RecordTold(
         sequence=record.sequence, wall_s=record.wall_s, kind=record.kind, who=record.who.name, text=text,
-        what=dict(record.what),
+        what=dict(record.what), said=said,
     )  # fmt: skip
 
 

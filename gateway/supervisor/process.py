@@ -145,6 +145,7 @@ async def serve(
     gateway.on_event, gateway.change, gateway.unexplained = gate.hear, gate.change, gate.unexplained
     gateway.not_to_be_armed, gateway.hold_against_records = gate.not_to_be_armed, gate.hold_against_records
     gateway.unconfirmed, gateway.wiring = gate.unconfirmed, gate.wiring
+    gate.stop_asked = lambda: gateway.stop_asked
     heads = HeadTold(gate.audit.state, lambda text: print(text, flush=True), clock)
     gateway.audit_head = lambda: heads.head
     alarms = Alarms(mailbox, data_folder, gate.audit.append, gateway.note, clock, wall_clock, gate.shelvings)

@@ -6,7 +6,11 @@ What people and agents wrote themselves is told as a quotation, shortened, and w
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from pydantic import ValidationError
+
+from gateway.core.finding import Finding, finding
 from gateway.core.line_problem import printable
+from gateway.wording.catalogue import ENGLISH, sentence, sentences
 
 LONGEST_QUOTE = 200  #: characters
 LONGEST_TOLD = 400  #: of what this program has found itself
@@ -15,8 +19,13 @@ SHORT = 12  #: letters of a hash
 What = Mapping[str, Any]
 
 
-def in_a_sentence(kind: str, who: str, what: What, reason: str = "") -> str:
-    """`reason`: of a proposal, by whoever made it. A kind that is not known here is told as it is called."""
+def in_a_sentence(kind: str, who: str, what: What, reason: str = "", language: str = ENGLISH) -> str:
+    """`reason`: of a proposal, by whoever made it. A kind that is not known here is told as it is called.
+
+    Of another language than English only where `IN_EVERY_LANGUAGE` has the kind.
+    """
+    if (told := IN_EVERY_LANGUAGE.get(kind)) is not None:
+        return told(_clean(who, 200), what, language)
     tell = SENTENCES.get(kind)
     if tell is None:
         return _clean(f"{kind}, by {who}", LONGEST_TOLD)
@@ -160,9 +169,28 @@ def _users(_: str, what: What) -> str:
     return _clean(f"users are {', '.join(named) or 'nobody'}", LONGEST_TOLD)
 
 
+def _line_stopped(who: str, what: What, language: str) -> str:
+    """What was found in words only stands at the end of what the loop said then."""
+    code = "line-stopped-by-person" if what.get("by_person") else "line-stopped"
+    said = sentence(finding(code, who=who, phase=_of(what, "phase")), language)
+    coded = _findings(what)
+    told = sentences(coded, language) if coded else ", ".join(map(str, what.get("rules") or ()))
+    return f"{said}{': ' if told else ''}{_clean(told, 2 * LONGEST_TOLD)}{_left_out(what)}"
+
+
+def _findings(what: What) -> list[Finding]:
+    try:
+        return [Finding.model_validate(one) for one in what.get("findings") or ()]
+    except (TypeError, ValidationError):  # a record of another version
+        return []
+
+
 def _of_proposal(text: str) -> Callable[[str, What], str]:
     return lambda who, what: f"proposal {_hash(what)} {text}{_because(what)}"
 
+
+#: Kinds that are told in the language that is asked for.
+IN_EVERY_LANGUAGE: dict[str, Callable[[str, What, str], str]] = {"line-stopped": _line_stopped}
 
 #: By kind. What is written down of a person's own words is quoted.
 SENTENCES: dict[str, Callable[[str, What], str]] = {

@@ -59,9 +59,18 @@ class SaidInbox:
 
 def is_never_held_back(payload: bytes) -> bool:
     """Whether a command takes the line to the safe side."""
+    return _name_of(payload) in OVERTAKES
+
+
+def is_stop(payload: bytes) -> bool:
+    return _name_of(payload) == "stop"
+
+
+def _name_of(payload: bytes) -> str:
+    """Of a short command; of any other nothing."""
     if len(payload) > MAX_COMMAND or payload[:1] == b"\x78":  # packed: none of these is
-        return False
+        return ""
     try:
-        return parse_command(payload).command in OVERTAKES
+        return parse_command(payload).command
     except MalformedMessage:
-        return False
+        return ""

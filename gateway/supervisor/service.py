@@ -49,7 +49,14 @@ from gateway.supervisor.historian import Historian
 from gateway.supervisor.intake import bounded_event, bus_reports_of, event_of
 from gateway.supervisor.peers import who_of
 from gateway.supervisor.recent import Recent
-from gateway.supervisor.said_inbox import CAUSED_BY_ANYBODY, COMMAND_EVENT, OF_COMMANDS, SaidInbox, is_never_held_back
+from gateway.supervisor.said_inbox import (
+    CAUSED_BY_ANYBODY,
+    COMMAND_EVENT,
+    OF_COMMANDS,
+    SaidInbox,
+    is_never_held_back,
+    is_stop,
+)
 from gateway.supervisor.status import known, loop_status, span_statuses, timing_status
 from gateway.supervisor.status_payload import status_payload
 from gateway.supervisor.telemetry_sink import TelemetrySink
@@ -121,6 +128,7 @@ class Gateway:
         self.wiring: Callable[[], WiringStatus | None] = lambda: None  #: whether it is as it was proved to be
         self.unexplained: Callable[[], list[Finding]] = list  #: what was changed or tried at the loop
         self.task_faults: Callable[[], list[TaskFault]] = list
+        self.stop_asked: Who | None = None  #: who asked for the last stop that was handed on
         #: With their number, in which order they came.
         self._events: deque[tuple[int, EventStatus]] = deque(maxlen=EVENTS_SHOWN)
         self._said: deque[tuple[int, EventStatus]] = deque(maxlen=SAID_SHOWN)  #: those that any local process can cause
@@ -297,6 +305,8 @@ class Gateway:
 
     async def command(self, payload: bytes, who: Who) -> Reply:
         """Hand a command on to the loop, and note who gave it; what is said again and again is counted."""
+        if is_stop(payload):
+            self.stop_asked = who
         reply = await self._pass_on(payload)
         said = payload[:1000].decode("utf-8", "replace")
         answered = "done" if reply.ok else "refused" if reply.known else "not known"

@@ -5,6 +5,7 @@ import asyncio
 from gateway.core.finding import finding
 from gateway.core.messages import Event
 from gateway.supervisor.intrusions import MOST_SHOWN, SHOWN_S, Intrusions
+from gateway.supervisor.loop_records import LoopRecords
 
 
 def test_however_many_are_refused_at_the_door_what_was_set_aside_is_told_first_until_its_time_is_over() -> None:
@@ -15,7 +16,8 @@ def test_however_many_are_refused_at_the_door_what_was_set_aside_is_told_first_u
 
     async def story() -> None:
         nonlocal now_s
-        told = Intrusions(append, print, lambda: now_s)
+        records = LoopRecords(append, print, lambda: now_s)
+        told = Intrusions(records, lambda: now_s)
         aside = finding("configuration-unproven", configuration="c0ffee")
         told.hear(Event(time_s=0.0, kind="configuration-set-aside", text="", findings=[aside]))
         for pid in range(10 * MOST_SHOWN):
@@ -26,7 +28,7 @@ def test_however_many_are_refused_at_the_door_what_was_set_aside_is_told_first_u
         assert found[-1].parameters["command"] == f"arm {10 * MOST_SHOWN - 1}"
         now_s = 1.01 * SHOWN_S
         assert not told.recent()
-        await told.close()
+        await records.close()
         assert "set-aside" in recorded
 
     asyncio.run(story())

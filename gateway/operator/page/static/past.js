@@ -1,6 +1,6 @@
 // What has been proposed and what became of it, and what the audit tells.
 import { $, coded, h, replaced } from "./dom.js";
-import { translatedWhy } from "./sentences.js";
+import { toldOf, translatedWhy } from "./sentences.js";
 import { instant, time, word } from "./words.js";
 
 // Each part by itself: a new record leaves what has the focus among the proposals alone.
@@ -22,8 +22,10 @@ function proposals(list) {
         h("td", {}, h("a", { class: "button", href: `#change/${one.proposal}`, "data-focus": `open-${one.proposal}`, "aria-label": `${word("history.open")} ${one.proposal.slice(0, 12)}` }, word("history.open"))))))))];
 }
 
+const toldPlain = (tag, { text }) => coded(tag, text);
+
 function told(records) {
   return [h("h2", {}, word("history.records")),
     !records.length ? h("p", {}, word("history.no-records")) : h("ol", { class: "plain records" }, [...records].reverse().slice(0, 60).map((record) =>
-      h("li", {}, h("span", { class: "muted" }, `${time(record.wall_s, true)} · ${record.who}`), coded("p", record.text))))];
+      h("li", {}, h("span", { class: "muted" }, `${time(record.wall_s, true)} · ${record.who}`), (record.said?.[document.documentElement.lang] ? toldOf : toldPlain)("p", record))))];
 }
