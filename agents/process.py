@@ -19,6 +19,7 @@ from pydantic import ValidationError
 from agents.answering import Agent, Keep, NotTheirs, Search
 from agents.code.agent import CodeAgent
 from agents.code.materials import Materials
+from agents.heads import Heads
 from agents.known import Knowledge
 from agents.language_model.budget import Budget
 from agents.language_model.client import LanguageModel
@@ -49,20 +50,23 @@ Tell = Callable[[str], None]
 T = TypeVar("T", bound=Strict)
 
 
-def run_agents(line: Line, where: Path | TlsEndpoint, folder: Path) -> int:
-    """Serve until SIGTERM or SIGINT. `folder`: of the knowledge. Returns the process's exit code."""
+def run_agents(line: Line, where: Path | TlsEndpoint, folder: Path, heads: Path) -> int:
+    """Serve until SIGTERM or SIGINT. `folder`: of the knowledge; `heads`: where those of the audit are kept.
+
+    Returns the process's exit code.
+    """
 
     def tell(text: str) -> None:
         print(text, flush=True)
 
     try:
-        return asyncio.run(serve(line, where, folder, tell))
+        return asyncio.run(serve(line, where, folder, heads, tell))
     except BusUnavailable as error:
         print(f"the agents cannot reach the line: {error}", file=sys.stderr)
         return EXIT_NO_BUS
 
 
-async def serve(line: Line, where: Path | TlsEndpoint, folder: Path, tell: Tell) -> int:
+async def serve(line: Line, where: Path | TlsEndpoint, folder: Path, heads: Path, tell: Tell) -> int:
     """All agents of `line`. Raises BusUnavailable."""
     stop = asyncio.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
@@ -75,7 +79,9 @@ async def serve(line: Line, where: Path | TlsEndpoint, folder: Path, tell: Tell)
         known = await held.enter_async_context(Knowledge(folder, LineOnBus(bus, LOOKS), find, tell))
         await known.begin()
         begin(bus, line, known.search, model, tell, LineOnBus(bus, CODE))
-        held.push_async_callback(_stopped, asyncio.create_task(known.keep_up()))
+        kept = Heads(bus, LOOKS, f"{line.site}/{line.line}", heads, tell)
+        for work in (known.keep_up(), kept.keep_up()):
+            held.push_async_callback(_stopped, asyncio.create_task(work))
         tell(f"agents of {line.site}/{line.line}: {', '.join(ROLES)}")
         await stop.wait()
     return EXIT_OK

@@ -33,20 +33,22 @@ def agents(
     """The agents: they answer what the phases leave to judgement, with a language model if the line's file names one.
 
     They reach the line by its bus alone, look things up in its knowledge (`r2rgate ask`), and each answer with all that
-    led to it is kept (`r2rgate log`). Without them, and wherever they fail, the rules decide.
+    led to it is kept (`r2rgate log`). The heads of the line's audit are kept as well, in audit-heads.txt in the data
+    folder (`r2rgate audit verify --against audit-heads.txt`). Without them, and wherever they fail, the rules decide.
 
     Example: r2rgate agents line.toml
 
     Example, on another machine: r2rgate agents line.toml --gateway 192.168.0.5:7447 --certificate pki/agents.pem
     """
+    from agents.heads import FILE as HEADS
     from agents.process import run_agents
     from gateway.cli.ask_run import FOLDER
     from gateway.mailbox.paths import default_run_folder
 
     line = read_line(file)
-    knowledge = (data_dir or default_data_folder(line)) / FOLDER
+    data = data_dir or default_data_folder(line)
     where = run_dir or default_run_folder(line)
-    raise typer.Exit(run_agents(line, _remote(gateway, certificate) or where, knowledge))
+    raise typer.Exit(run_agents(line, _remote(gateway, certificate) or where, data / FOLDER, data / HEADS))
 
 
 def _remote(address: str | None, certificate: Path | None) -> "TlsEndpoint | None":

@@ -18,7 +18,7 @@ from gateway.cli.audit_view import found_in, print_record, print_verification
 from gateway.cli.data_place import data_folder
 from gateway.cli.process_commands import REFUSED, DataFolder, read_line
 from gateway.core.audit_export import RecordLine, blob_line, line_text, wrong_in
-from gateway.core.audit_head import AuditHead, last_head_in, parse_head
+from gateway.core.audit_head import AuditHead, heads_in, parse_head
 from gateway.core.audit_record import BEFORE_FIRST, NotRecordable, Who
 from gateway.core.line_problem import printable
 from gateway.core.nearest import nearest
@@ -54,7 +54,7 @@ def verify(
             "--against",
             "--head",
             help="NUMBER:HASH as the log, the page, OPC UA or a report printed it, or a file that has it: the last "
-            "one there. It must be in the audit still.",
+            "one there, and of audit-heads.txt, which the agents keep, every one. It must be in the audit still.",
         ),
     ] = None,
     export_file: Annotated[
@@ -74,24 +74,25 @@ def verify(
 
     Example: r2rgate audit verify --against report.html
     """
-    head = _head_of(against)
+    heads = _heads_of(against)
     if export_file is not None:
-        _verify_export(export_file, head, as_json)
+        _verify_export(export_file, heads, as_json)
         return
     folder = audit_folder(line, data_dir)
     found = verify_audit(folder)
-    missing = "" if head is None else why_not_contained(folder, head)
-    if missing:
-        found.problem(missing)
+    missing = [why for head in heads if (why := why_not_contained(folder, head))]
+    for why in missing:
+        found.problem(why)
     if as_json:
         anchor = found.anchor and vars(found.anchor).copy()
-        held = {} if head is None else {"against": str(head), "contained": not missing}
+        held = {"against": str(heads[-1]), "heads": len(heads), "contained": not missing} if heads else {}
         document = {"folder": str(folder), "sound": found.sound, **vars(found), "anchor": anchor, **held}
         typer.echo(json.dumps(document, indent=2))
     else:
         print_verification(found, folder)
-        if head is not None and not missing:
-            typer.echo(f"  it contains {head}")
+        if heads and not missing:
+            more = f", and {len(heads) - 1} heads before" if len(heads) > 1 else ""
+            typer.echo(f"  it contains {heads[-1]}{more}")
     raise typer.Exit(0 if found.sound else UNSOUND)
 
 
@@ -223,12 +224,11 @@ def _lines(file: AuditFile, last: int) -> Iterator[str]:
         yield line_text(RecordLine(head=row.head, record=record))
 
 
-def _verify_export(path: Path, head: AuditHead | None, as_json: bool) -> None:
+def _verify_export(path: Path, heads: list[AuditHead], as_json: bool) -> None:
     try:
         with path.open("rb") as stream:
             wrong = list(wrong_in(stream))
-        if head is not None and (missing := why_not_exported(path, head)):
-            wrong.append(missing)
+        wrong += [missing for head in heads if (missing := why_not_exported(path, head))]
     except OSError as error:
         refuse(f"{path} cannot be read: {error.strerror}")
     if as_json:
@@ -240,13 +240,13 @@ def _verify_export(path: Path, head: AuditHead | None, as_json: bool) -> None:
     raise typer.Exit(UNSOUND if wrong else 0)
 
 
-def _head_of(against: str | None) -> AuditHead | None:
+def _heads_of(against: str | None) -> list[AuditHead]:
     if against is None:
-        return None
+        return []
     try:
         if against.strip() and os.path.lexists(against):
-            return last_head_in(read_bytes(Path(against), MOST_BYTES).decode("utf-8", "replace"))
-        return parse_head(against)
+            return heads_in(read_bytes(Path(against), MOST_BYTES).decode("utf-8", "replace"))
+        return [parse_head(against)]
     except OSError as error:
         refuse(f"--against {against}: the file cannot be read: {error.strerror}")
     except ValueError as error:

@@ -1,6 +1,8 @@
 """The audit's head as people carry it elsewhere: NUMBER:HASH of its last record, which stands for all before it."""
 
 import re
+from datetime import UTC, datetime
+from itertools import pairwise
 from typing import NamedTuple
 
 _DIGITS = r"([1-9][0-9]{0,17}):([0-9a-f]{64})"
@@ -12,6 +14,9 @@ _PRINTED = re.compile(
     + r"(?![0-9a-zA-Z])(?=[ \t]*\r?$|\"|<|\s)",
     re.MULTILINE,
 )
+#: A line of the file of heads that was kept elsewhere: when, the head, of which line.
+_KEPT = re.compile(r"^(\d{4}-\d\d-\d\d)T\d\d:\d\d:\d\dZ " + _DIGITS + r" .*$", re.MULTILINE)
+NEWEST_KEPT = 1000  #: lines that stay as they are where a file is thinned out, and as many of days before
 
 
 class AuditHead(NamedTuple):
@@ -41,3 +46,29 @@ def last_head_in(text: str) -> AuditHead:
             "`status --json` or a report has of it, with all 64 digits"
         )
     return AuditHead(int(printed[-1][1]), printed[-1][2])
+
+
+def heads_in(text: str) -> list[AuditHead]:
+    """Every head of a file that has kept them one after the other; of any other the last. Raises ValueError."""
+    return [_kept(match) for match in _KEPT.finditer(text)] or [last_head_in(text)]
+
+
+def kept_line(head: AuditHead, line: str, wall_s: float) -> str:
+    """As `heads_in` reads it."""
+    return f"{datetime.fromtimestamp(wall_s, UTC):%Y-%m-%dT%H:%M:%SZ} {head} {' '.join(line.split())}\n"
+
+
+def last_kept(text: str) -> AuditHead | None:
+    found = list(_KEPT.finditer(text))
+    return _kept(found[-1]) if found else None
+
+
+def thinned(text: str) -> str:
+    """The newest lines, and before them the last of each day."""
+    found = list(_KEPT.finditer(text))
+    older = [one for one, after in pairwise(found[: -NEWEST_KEPT + 1]) if one[1] != after[1]]
+    return "".join(f"{one[0]}\n" for one in [*older[-NEWEST_KEPT:], *found[-NEWEST_KEPT:]])
+
+
+def _kept(match: re.Match[str]) -> AuditHead:
+    return AuditHead(int(match[2]), match[3])

@@ -1,4 +1,4 @@
-"""Each stop of a line in its processes is one record: who asked for it, or what was found; and the audit stays sound."""
+"""Each stop of a line in its processes is one record: who asked for it, or what was found; the audit stays sound."""
 
 import os
 from typing import Any

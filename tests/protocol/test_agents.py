@@ -30,7 +30,7 @@ import sys
 from pathlib import Path
 from agents.process import run_agents
 from tests.protocol.bus_support import LINE
-sys.exit(run_agents(LINE, Path(sys.argv[1]), Path(sys.argv[2])))
+sys.exit(run_agents(LINE, Path(sys.argv[1]), Path(sys.argv[2]), Path(sys.argv[1]) / "heads.txt"))
 """
 
 

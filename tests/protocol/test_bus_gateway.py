@@ -6,11 +6,17 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import apsw
 import pytest
+from typer.testing import CliRunner
 
 from gateway.cli.asked_agents import AskedAgents
+from gateway.cli.audit_against import head_in
+from gateway.cli.main import app
 from gateway.control.design import design_lqi, task_of
-from gateway.core.audit_record import Who
+from gateway.core.audit_head import parse_head
+from gateway.core.audit_record import BEFORE_FIRST, Who, head_of
+from gateway.core.audit_record import canonical as canonical_record
 from gateway.core.decisions import ProposalList
 from gateway.core.messages import Reply
 from gateway.core.proposal import Proposal, canonical
@@ -20,7 +26,8 @@ from gateway.mailbox.paths import BUS_SOCKET, GATEWAY_SOCKET
 from gateway.mailbox.port import RemoteError
 from gateway.mailbox.unix import UnixMailbox
 from gateway.mailbox.zenoh_mailbox import ZenohMailbox
-from gateway.supervisor.audit_file import AuditFile
+from gateway.supervisor.audit_anchor import Anchor, write_anchor
+from gateway.supervisor.audit_file import FILE_NAME, AuditFile
 from gateway.supervisor.proposal_records import iso
 from tests.protocol.bus_support import AGENT, LINE, LONG_S, client, is_here, run
 from tests.unit.language_model_support import QUESTION
@@ -40,6 +47,14 @@ if len(sys.argv) > 2:
                       authority="/no/c.pem", names=["agents"])
 line = LINE.model_copy(update={"network": network})
 sys.exit(run_gateway(line, Path(sys.argv[1]), Path(sys.argv[1]) / "data"))
+"""
+
+AGENTS = """
+import sys
+from pathlib import Path
+from agents.process import run_agents
+from tests.protocol.bus_support import LINE
+sys.exit(run_agents(LINE, Path(sys.argv[1]), Path(sys.argv[2]) / "knowledge", Path(sys.argv[2]) / "heads.txt"))
 """
 
 
@@ -247,3 +262,53 @@ def test_after_a_gateway_was_killed_the_next_one_takes_its_socket_and_its_agents
                     await status_with(folder, lambda status: status.agents_bus.agents == ["sysid"])
 
     run(story)
+
+
+def test_the_heads_that_a_peer_has_kept_show_a_history_that_was_made_anew_from_some_record_on(tmp_path: Path) -> None:
+    kept = tmp_path / "heads.txt"
+
+    async def story(folder: Path) -> None:
+        data = folder / "data"
+        with gateway(folder):
+            await status_with(folder, lambda status: bool(status.audit_head))
+            with child(AGENTS, folder, tmp_path):
+                await until(kept.exists)
+            async with client(folder) as agents:
+                assert (await proposed(agents)).ok
+            await status_with(folder, lambda status: status.audit_head not in kept.read_text())
+            with child(AGENTS, folder, tmp_path):  # as one that was started anew: what was kept before stays
+                await until(lambda: len(kept.read_text().splitlines()) == 2)
+        assert verified(data, kept) == verified(data) == 0
+        first = parse_head(kept.read_text().split()[1])
+        made_anew(data, from_=first.sequence + 1)  # it holds the older head still
+        assert (verified(data), verified(data, kept)) == (0, 1)
+        line, *_ = kept.read_text().splitlines()
+        kept.write_text(f"{line}\n")
+        assert verified(data, kept) == 0
+        made_anew(data, from_=first.sequence)
+        kept.write_text(f"{line}\n2026-01-01T00:00:00Z {head_in(data)} demo/line-1\n")  # the last one is good
+        assert (verified(data), verified(data, kept)) == (0, 1)
+
+    run(story)
+
+
+def verified(data: Path, *against: Path) -> int:
+    options = [word for path in against for word in ("--against", str(path))]
+    return CliRunner().invoke(app, ["audit", "verify", "--data-dir", str(data), *options]).exit_code
+
+
+def made_anew(data: Path, from_: int) -> None:
+    """As whoever may write both files can: sound, and another from this record on."""
+    with AuditFile(data) as file:
+        rows = list(file.rows())
+    previous = rows[from_ - 2].head if from_ > 1 else BEFORE_FIRST
+    with apsw.Connection(str(data / FILE_NAME)) as file:
+        file.execute("DROP TRIGGER IF EXISTS record_stays")
+        for row in rows[from_ - 1 :]:
+            record = row.record()
+            what = {**record.what, "version": "another"}
+            content = canonical_record(record.model_copy(update={"what": what, "previous": previous}))
+            previous = head_of(content)
+            set_ = "UPDATE record SET content = ?, head = ? WHERE sequence = ?"
+            file.execute(set_, (content, previous, row.sequence))
+    write_anchor(data, Anchor(len(rows), previous))

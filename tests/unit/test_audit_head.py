@@ -6,10 +6,12 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from agents.heads import Heads
 from gateway.cli.audit_against import head_in
 from gateway.cli.main import app
-from gateway.core.audit_head import AuditHead, parse_head
+from gateway.core.audit_head import AuditHead, heads_in, kept_line, parse_head
 from gateway.core.audit_record import Who
+from gateway.mailbox.inprocess import Hub, InProcessMailbox
 from gateway.supervisor.audit import Audit, AuditState
 from gateway.supervisor.audit_anchor import NOTHING_YET, Anchor
 from gateway.supervisor.audit_begin import begin_anew
@@ -218,3 +220,19 @@ def test_what_comes_often_is_no_decision(tmp_path: Path) -> None:
     at = audit.append_and_wait("approved", WHO, {"proposal": "x"})
     assert audit.close() and (before, audit.state().decided) == (0, at.sequence)
     assert audit.state().last == at
+
+
+def test_a_file_of_kept_heads_that_has_grown_keeps_the_newest_and_one_of_each_day_before(tmp_path: Path) -> None:
+    told: list[str] = []
+    path, day_s = tmp_path / "audit-heads.txt", 86400.0
+    lines = [kept_line(AuditHead(k, HASH), "demo/line", k / 1000.0 * day_s) for k in range(1, 5001)]
+    path.write_text("".join(lines))
+    heads = Heads(InProcessMailbox(Hub()), "monitoring", "demo/line", path, told.append)
+    heads.keep(AuditHead(5000, HASH), 5.0 * day_s)
+    assert path.read_text() == "".join(lines)  # it has that one
+    heads.keep(AuditHead(5001, HASH), 5.001 * day_s)
+    found = heads_in(path.read_text())
+    assert [one.sequence for one in found] == [999, 1999, 2999, 3999, *range(4001, 5002)]
+    assert not told
+    heads.keep(AuditHead(17, HASH), 5.002 * day_s)
+    assert "was 5001:" in told[0]
