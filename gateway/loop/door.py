@@ -14,8 +14,18 @@ from collections.abc import Callable, Sequence
 from typing import Protocol
 
 from gateway.core.finding import Finding, finding
-from gateway.core.messages import MAX_COMMAND, Command, Deploy, Keep, MalformedMessage, Reply, Stop, parse_command
-from gateway.core.proof import Introduction, Proof, is_sealed, opened
+from gateway.core.messages import (
+    MAX_COMMAND,
+    Command,
+    Deploy,
+    Keep,
+    MalformedMessage,
+    Reply,
+    RunExperiment,
+    Stop,
+    parse_command,
+)
+from gateway.core.proof import Grounds, Introduction, Proof, is_sealed, opened
 from gateway.loop.aside import Aside
 from gateway.mailbox.allowance import Allowance
 from gateway.mailbox.keys import PublicKey
@@ -147,7 +157,7 @@ class Door:
         if against := why_not_addressed(statement, content, self._of, self.nonce) or why_not_signed(proof, self._key):
             return against
         command = parse_command(content)
-        if isinstance(command, Deploy | Keep) and not statement.grounds.are_complete:
+        if not _is_grounded(command, statement.grounds):
             return finding("no-grounds", command=command.command)
         return why_not_claimed(statement, command) or command
 
@@ -178,3 +188,17 @@ class Door:
             left_out=untold,
         )  # fmt: skip
         self._tell(REFUSED, told.text, findings=[told], command=command, uid=peer.uid, pid=peer.pid)
+
+
+def _is_grounded(command: Command, grounds: Grounds) -> bool:
+    """Whether what needs a proposal, a verdict and an approval has them.
+
+    An experiment that names no proposal is for a simulated line; any other refuses it (`Experiments.why_not`).
+    """
+    match command:
+        case Deploy() | Keep():
+            return grounds.are_complete
+        case RunExperiment(proposal=str() as proposal):
+            return grounds.are_complete and grounds.proposal == proposal
+        case _:
+            return True

@@ -51,6 +51,8 @@ CONTROLLER, OTHER = (design(task_of(LINE)) for design in (design_lqi, design_pid
 NOW_S = 5000.0
 EXPERIMENT = Experiment.model_validate_json(Path("docs/examples/experiment.json").read_text())
 
+JUDGED = RunExperiment(experiment=EXPERIMENT, proposal=GROUNDS.proposal)
+
 
 def deploy(controller=CONTROLLER, epoch=1, region=None):
     hash_ = config_hash(controller)
@@ -208,9 +210,16 @@ def test_what_takes_the_line_to_the_safe_side_or_holds_what_was_approved_is_over
 @pytest.mark.parametrize("lacks", ["proposal", "verdict", "approval"])
 def test_what_changes_how_the_line_is_controlled_is_not_taken_without_its_grounds(lacks):
     less = GROUNDS.model_copy(update={lacks: None})
-    said = [signed(one, NOW_S - k * 0.1, grounds=less) for k, one in enumerate((deploy(), Keep(epoch=1), Arm()))]
+    grounded = (deploy(), Keep(epoch=1), JUDGED)
+    said = [signed(one, NOW_S - k * 0.1, grounds=less) for k, one in enumerate((*grounded, Arm()))]
     answers, loop = at_door(said)
-    assert answers == ["no-grounds", "no-grounds", "done"] and loop.done == [Arm()]
+    assert answers == ["no-grounds"] * 3 + ["done"] and loop.done == [Arm()]
+
+
+def test_an_experiment_runs_by_the_grounds_of_its_own_proposal_and_no_other():
+    other = GROUNDS.model_copy(update={"proposal": "d" * 64})
+    answers, loop = at_door([signed(JUDGED, NOW_S - 0.1, grounds=other), signed(JUDGED)])
+    assert answers == ["no-grounds", "done"] and loop.done == [JUDGED]
 
 
 def test_the_proof_of_one_command_carries_no_other():
