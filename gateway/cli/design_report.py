@@ -13,17 +13,13 @@ from gateway.commissioning.architectures import ARCHITECTURES
 from gateway.commissioning.decisions import RULES
 from gateway.commissioning.records import Attempt, DecisionRecord
 from gateway.commissioning.selection import TERMS
+from gateway.core.finding import finding
 from gateway.core.line import Priorities
 from gateway.core.scenario import Scenario
 from gateway.core.signals import FloatArray
+from gateway.wording.catalogue import sentence
 
 BEFORE_S, AFTER_S = 0.5, 2.5  #: of the change, that the charts show
-
-UNCONFIRMED = (
-    "Nobody has judged or confirmed what was chosen. A line that is started with it runs it as a first configuration: "
-    "unconfirmed, and no further than the first speed and step of its file, until it is proposed and approved, or one "
-    "of the line's people says `r2rgate confirm` after a move of a tension and a change of the speed."
-)
 
 HEADS = (
     "Law", "RMSE, N", "t_s, s", "Overshoot, %", "Effort, (Nm)² s", "R, N", "Step, µs", "Delay margin, ms", "J, N² s",
@@ -53,7 +49,7 @@ def page_of(result: DesignResult, found: Design) -> Page:
             *(_attempts(one) for one in result.tuning),
         ),
         notes=(
-            *([UNCONFIRMED] if result.chosen else []),
+            *([f"Unconfirmed: {sentence(finding('design-unconfirmed'))}."] if result.chosen else []),
             f"Candidates run on the {model} and on {result.plants} lines drawn evenly from {within} (MPC is tuned on "
             "fewer of them), with noise, torque limits and latency. RMSE, settling time, overshoot and effort are "
             f"those of the {model}; R is how far any of the other lines is from it at any time.",

@@ -3,8 +3,9 @@
 from collections.abc import Callable
 from dataclasses import replace
 from math import isfinite
+from textwrap import shorten
 
-from gateway.core.finding import Finding, finding
+from gateway.core.finding import LONGEST_PARAMETER, Finding, finding
 from gateway.core.line import Recipe
 from gateway.core.line_limits import setpoint_bands_n
 from gateway.core.messages import (
@@ -166,7 +167,12 @@ def _require_only(cycle: Cycle, only: list[str]) -> None:
     """That a proof is restricted to devices that are there, and that nothing else has changed since the last one."""
     names = [device.name for device in devices_of(cycle.line)]
     unknown = [
-        finding("device-unknown", device=name, nearest=nearest(name, names) or ", ".join(names))
+        finding(
+            "device-unknown",
+            device=name,
+            names=shorten(", ".join(names), LONGEST_PARAMETER),
+            nearest=nearest(name, names) or "-",
+        )
         for name in only
         if name not in names
     ]

@@ -350,13 +350,22 @@ class Runner:
             self._settling = asyncio.create_task(self._settle_wiring())
 
     async def _settle_wiring(self) -> None:
-        """Until the disk knows which load cells are contradicted."""
-        wiring = self.cycle.wiring
+        """Until the disk knows which load cells are contradicted; that it does not take them is told once."""
+        wiring, told = self.cycle.wiring, False
         while wiring.behind:
             wiring.behind, contradicted = False, wiring.contradicted
             if not await self._disk.do(partial(wiring.settle, contradicted)):
                 wiring.behind = True
+                if not told:
+                    self._tell_of_disk("alarm", "contradicted-cells-not-kept", because=wiring.unkept)
+                told = True
                 await asyncio.sleep(AGAIN_S)
+        if told:
+            self._tell_of_disk("file", "contradicted-cells-kept")
+
+    def _tell_of_disk(self, kind: str, code: str, **parameters: str) -> None:
+        one = found(code, Action.NONE, **parameters)
+        self.cycle.tell(kind, one.text, findings=[one])
 
     async def _wiring_settled(self, within_s: float) -> None:
         """Once it does, or after `within_s`."""

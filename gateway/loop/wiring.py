@@ -50,6 +50,7 @@ class Wiring:
         self.unusable: list[actions.Finding] = []  #: a file that `read` could not use, for the line's events
         self.contradicted: dict[int, Finding] = {}  #: by span, load cells that were, since they were proved
         self.behind = False  #: the disk does not know of all of them, or still of one that is proved anew
+        self.unkept = ""  #: why the disk did not take them when it was tried last
         self._unread = False  #: the file of those could not be used
         self._unproved: list[Finding] = []  #: what else speaks against it
         self.against: list[Finding] = []  #: what speaks against closing the loop on it; empty: it is proved
@@ -113,15 +114,17 @@ class Wiring:
 
     def settle(self, contradicted: Mapping[int, Finding]) -> bool:
         """The disk knows which cells are contradicted. Takes its time: never in a period. False: it does not."""
+        if self.path is None:
+            return True
+        path = self.path.with_name(CONTRADICTED)
         try:
-            if self.path is not None:
-                path = self.path.with_name(CONTRADICTED)
-                if contradicted:
-                    path.parent.mkdir(parents=True, exist_ok=True)
-                    written_beside(path, _FINDINGS.dump_json(dict(contradicted)) + b"\n", 0o644).replace(path)
-                else:
-                    path.unlink(missing_ok=True)
-        except OSError:
+            if contradicted:
+                path.parent.mkdir(parents=True, exist_ok=True)
+                written_beside(path, _FINDINGS.dump_json(dict(contradicted)) + b"\n", 0o644).replace(path)
+            else:
+                path.unlink(missing_ok=True)
+        except OSError as error:
+            self.unkept = f"{path}: {error.strerror or error}"
             return False
         return True
 

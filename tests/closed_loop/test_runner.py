@@ -16,6 +16,8 @@ from gateway.loop.machine import Machine
 from gateway.loop.pacer import Tick
 from gateway.loop.process import run_until
 from gateway.loop.runner import MAX_WAITING, Runner
+from gateway.loop.wiring import CONTRADICTED, FILE
+from safety.actions import Action, found
 from tests.closed_loop.conftest import start, stepped
 from tests.support.gateway_key import door_of
 
@@ -358,5 +360,32 @@ def test_an_arming_that_is_refused_while_the_line_stops_gives_what_failed_no_oth
         assert not (await told.until(told.order(Arm()))).ok
         await told.periods(3)
         assert cycle.containment.failed and len(asked) == 1
+
+    asyncio.run(story())
+
+
+def test_a_disk_that_does_not_take_which_cells_are_contradicted_is_told_once_until_it_does(tmp_path, monkeypatch):
+    monkeypatch.setattr("gateway.loop.runner.AGAIN_S", 0.001)
+
+    async def story():
+        told = Story(stepped())
+        wiring, folder = told.loop.cycle.wiring, tmp_path / "data"
+        tries, settle = [], wiring.settle
+
+        def tried(contradicted):
+            tries.append(contradicted)
+            return settle(contradicted)
+
+        wiring.path, wiring.settle = folder / FILE, tried
+        folder.write_text("no folder")
+        wiring.contradict([found("load-cell-contradicted", Action.BRAKE, span=1)])
+        while len(tries) < 3:
+            await told.periods(1)
+        folder.unlink()
+        while wiring.behind or len(told.loop.events) < 2:
+            await told.periods(1)
+        codes = [(one.kind, one.data["findings"][0].rule) for one in told.loop.events]
+        assert codes == [("alarm", "contradicted-cells-not-kept"), ("file", "contradicted-cells-kept")]
+        assert (folder / CONTRADICTED).exists()
 
     asyncio.run(story())
