@@ -10,7 +10,7 @@ from pydantic import Field, TypeAdapter
 
 from gateway.core.alarms import AcknowledgeAlarm, ShelveAlarm
 from gateway.core.audit_record import Digest
-from gateway.core.decisions import Archive, Decide, LineChanged, RollBackNow
+from gateway.core.decisions import Archive, Confirm, Decide, LineChanged, RollBackNow
 from gateway.core.line import Strict
 from gateway.core.messages import (
     AbortExperiment,
@@ -31,7 +31,7 @@ SCRIPTS = "script-"  #: so begin the names of programs: nobody takes their word 
 
 Said = (
     Arm | Start | Hold | Stop | SetTension | SetSpeed | SelectRecipe | RunExperiment | AbortExperiment
-    | Decide | RollBackNow | Archive | LineChanged | AcknowledgeAlarm | ShelveAlarm
+    | Decide | RollBackNow | Archive | LineChanged | Confirm | AcknowledgeAlarm | ShelveAlarm
 )  # fmt: skip
 
 #: By command the least role that may say it. What is no row here nobody may say through OPC UA or the page.
@@ -46,6 +46,7 @@ LEAST: dict[str, Role] = {
     "experiment-abort": "operator",
     "decide": "operator",
     "roll-back": "operator",
+    "confirm": "operator",
     "acknowledge": "operator",
     "shelve": "operator",
     "experiment": "engineer",

@@ -7,7 +7,7 @@ from pydantic import ValidationError
 
 from gateway.core.alarms import AlarmSaid
 from gateway.core.audit_record import Who
-from gateway.core.decisions import Archive, Decide, LineChanged, RollBackNow
+from gateway.core.decisions import Archive, Confirm, Decide, LineChanged, RollBackNow
 from gateway.core.messages import Command, Reply, command_bytes, in_words
 from gateway.core.people import FOR_PERSON, why_may_not
 from gateway.core.topics import GATEWAY_FOR_PERSON
@@ -22,7 +22,7 @@ from gateway.supervisor.said_inbox import COMMAND_EVENT, OF_PEOPLE, SaidInbox
 MOST_SAID, SAID_EVERY_S = 600, 1.0
 A_PROGRAM = "a program"  #: that decides in a person's place, as the audit has it before its user's name
 
-Decision = Decide | RollBackNow | Archive | LineChanged
+Decision = Decide | RollBackNow | Archive | LineChanged | Confirm
 
 
 class PersonsDesk:

@@ -43,6 +43,7 @@ ARGUMENTS = {
     "ShelveAlarm": lambda _: [text("tension-low"), real(30.0), text("being mended")],
     "Archive": lambda _: [text("12"), text("phi_stable"), text("it held all week")],
     "LineChanged": lambda _: [text("a thinner web")],
+    "Confirm": lambda _: [text("ab" * 32), text("it followed")],
 }  # fmt: skip
 
 

@@ -115,7 +115,8 @@ def test_it_finds_everything_of_the_line_by_browsing(panel: Panel, policy: str) 
     assert methods == {
         f"Line.{name}"
         for name in ("Decide", "Rollback", "Arm", "Start", "Hold", "Stop", "SetTension", "SetSpeed", "SelectRecipe",
-                     "AcknowledgeAlarm", "ShelveAlarm", "Archive", "LineChanged")
+                     "AcknowledgeAlarm", "ShelveAlarm", "Archive", "LineChanged",
+                     "Confirm")
     }  # fmt: skip
     assert all(node.endswith(f";s={path}") for path, (_, node) in found.items() if path in MEASURED)
 

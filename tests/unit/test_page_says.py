@@ -28,6 +28,7 @@ SAID: dict[str, dict[str, object]] = {
     "shelve": {"alarm": "device-absent", "for_s": 60.0, "because": "fitter is there"},
     "archive": {"configuration": "abc", "name": "spring", "because": "it was good"},
     "line-changed": {"because": "new web"},
+    "confirm": {"configuration": HASH, "because": "it followed"},
 }
 
 

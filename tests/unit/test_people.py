@@ -5,7 +5,7 @@ import asyncio
 import pytest
 
 from gateway.core.alarms import AcknowledgeAlarm, ShelveAlarm
-from gateway.core.decisions import Archive, Decide, LineChanged, RollBackNow
+from gateway.core.decisions import Archive, Confirm, Decide, LineChanged, RollBackNow
 from gateway.core.messages import (
     AbortExperiment,
     Arm,
@@ -32,6 +32,7 @@ COMMANDS = [
 ]  # fmt: skip
 DECISIONS = [
     Decide(proposal=HASH, shown=HASH, approve=True), RollBackNow(comment="it squeals"),
+    Confirm(configuration=HASH, because="it followed"),
     AcknowledgeAlarm(alarm="load-cell"), ShelveAlarm(alarm="load-cell", for_s=60.0, because="being mended"),
 ]  # fmt: skip
 FOR_ENGINEERS = [

@@ -16,7 +16,7 @@ from asyncua.server.server import Server
 from pydantic import ValidationError
 
 from gateway.core.alarms import AcknowledgeAlarm, ShelveAlarm
-from gateway.core.decisions import Archive, Decide, LineChanged, RollBackNow
+from gateway.core.decisions import Archive, Confirm, Decide, LineChanged, RollBackNow
 from gateway.core.messages import Arm, Hold, Reply, SelectRecipe, SetSpeed, SetTension, Start, Stop
 from gateway.core.people import Person, Said, why_may_not
 from gateway.operator.line_side import LineSide, NotTold
@@ -113,6 +113,9 @@ METHODS = (
            _plain(lambda which, name, why: Archive(configuration=which, name=name, because=why))),
     Method("LineChanged", "line-changed", "Another web, a new part: what was learned counts no more", (_WHY,),
            _plain(lambda why: LineChanged(because=why))),
+    Method("Confirm", "confirm", "Answer for a first configuration that has shown a move and a change of speed", (
+        Input("configuration", STRING, "The whole hash of what is in service"), _WHY),
+           _plain(lambda which, why: Confirm(configuration=which, because=why))),
 )  # fmt: skip
 
 

@@ -47,6 +47,7 @@ def tick_of(status: GatewayStatus, proposals: ProposalList | None, revision: int
         "speed_setpoint": _short(status.speed_setpoint_m_per_s),
         "stands": status.stands,
         "before_more": [_in_words(one) for one in _before_more(status)],
+        "unconfirmed": bool(status.unconfirmed),
         "wiring_not_read": status.wiring is not None and status.wiring.not_read,
         "proved_wall_s": None if status.wiring is None else status.wiring.proved_wall_s,
         "change": None if status.change is None else status.change.model_dump(),

@@ -19,6 +19,7 @@ export class Operate {
       this.tension(), this.speed(), this.recipe(),
       h("div", { class: "buttons apart" },
         h("button", { type: "button", onclick: () => this.back() }, word("operate.roll-back")),
+        this.may("confirm") && h("button", { type: "button", id: "confirm", hidden: true, onclick: () => this.confirm() }, word("operate.confirm")),
         h("button", { type: "button", id: "abort", hidden: true, onclick: () => this.say({ command: "experiment-abort" }) }, word("operate.abort"))),
       this.may("archive") && h("div", { class: "buttons" },
         h("button", { type: "button", onclick: () => this.archive() }, word("operate.archive")),
@@ -31,6 +32,15 @@ export class Operate {
     const lines = [word("operate.then-archive"), word("history.in-service", { hash: configuration.slice(0, 12) })];
     const because = await confirmed({ title: word("operate.sure-archive"), lines, yes: word("operate.yes-archive"), comment: true, needed: true });
     if (because) await this.say({ command: "archive", configuration, name: BASELINE, because });
+  }
+
+  // A first configuration: whoever says it answers for it, and what has not been seen of it yet is told.
+  async confirm() {
+    const configuration = this.runs();
+    if (!configuration) return;
+    const lines = [word("operate.then-confirm"), word("history.in-service", { hash: configuration.slice(0, 12) })];
+    const because = await confirmed({ title: word("operate.sure-confirm"), lines, yes: word("operate.yes-confirm"), comment: true, needed: true });
+    if (because) await this.say({ command: "confirm", configuration, because });
   }
 
   async lineChanged() {
@@ -148,6 +158,7 @@ export class Operate {
     const state = $("operate-state");
     if (!state) return;
     setText(state, word(`next.${tick.loop.state}`));
+    if ($("confirm")) show($("confirm"), tick.unconfirmed);
     show($("abort"), tick.change?.kind === "experiment" && tick.change.stage === "running");
     for (const follow of this.follows) follow();
   }
