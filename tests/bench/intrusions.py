@@ -34,6 +34,7 @@ from tests.bench.figures import Bench
 from tests.bench.intrusions_families import Attempt, Family, Site, draw
 from tests.bench.intrusions_files import KEPT
 from tests.bench.intrusions_restarts import Restarts, with_audit
+from tests.bench.intrusions_torques import unexplained_torques
 from tests.bench.kept_rows import KeptRows
 from tests.closed_loop.gate_line import GateLine
 from tests.closed_loop.wire import at_rest
@@ -210,6 +211,7 @@ class Ground:
         self._lines = 0
         self._undo = ExitStack()
         self.older: Path  #: a copy of what was kept first
+        self._looked_s = 0.0  #: up to which (world) torques have been held against the records
         self.line: GateLine
         self.watcher: Watcher
         self.site: Site
@@ -229,6 +231,11 @@ class Ground:
         unsafe = sum(self.line.unsafe().values())
         self._undo.close()
         return unsafe
+
+    def unexplained_ms(self) -> int:
+        """Of torque since the last look that no record explains."""
+        odd, self._looked_s = unexplained_torques(self.line, self._looked_s)
+        return odd
 
     def has_kept(self) -> bool:
         return (self.older / KEPT).exists()
@@ -257,6 +264,7 @@ class Ground:
 
     def begin(self) -> None:
         self._lines += 1
+        self._looked_s = 0.0
         self._undo = ExitStack()
         folder = self._folder / str(self._lines)
         folder.mkdir()
@@ -288,12 +296,16 @@ def attack(seeds: Sequence[int], families: Sequence[Family], kept: KeptRows) -> 
                 wrong, seen, taken = Judge(ground.line, ground.watcher, ground.older).try_out(attempt)
             except (AssertionError, Unreachable, ChildFailed, ValueError) as error:
                 wrong, seen, taken = [f"the line is not as it was: {error}"[:300]], ground.watcher.anew(), 0
+            odd = ground.unexplained_ms()
+            if odd:
+                wrong.append(f"{odd} ms of torque that no record explains")
             unsafe = ground.end() if wrong or seed == seeds[-1] else 0
             if unsafe:
                 wrong.append(f"{unsafe} unsafe events at the drives of this line")
             row = {
                 "seed": seed, "point": family.point, "family": family.name, "attempt": attempt.name,
                 "outcome": "; ".join(wrong) or HELD, "told": sorted(seen.codes), "taken": taken, "unsafe": unsafe,
+                "unexplained_ms": odd,
                 "status_worst_s": round(seen.worst_s, 3),
             }  # fmt: skip
             kept.add(row)
@@ -312,6 +324,7 @@ def told(bench: Bench, rows: Sequence[dict[str, Any]]) -> None:
     """Figures and tables."""
     wrong = [row for row in rows if row["outcome"] != HELD]
     bench.figure("unsafe_events", sum(row["unsafe"] for row in rows), "", len(rows))
+    bench.figure("unexplained_torques", sum(row.get("unexplained_ms", 0) for row in rows), "ms", len(rows))
     bench.figure("attempts_wrong", len(wrong), "", len(rows))
     bench.figure("status_worst_s", max(row["status_worst_s"] for row in rows), "s", len(rows))
     bench.figure("proposals_taken", sum(row["taken"] for row in rows), "", len(rows))

@@ -14,6 +14,7 @@ from typing import Any
 from tests.bench.intrusions_families import Attempt, Family, Site
 
 KEPT, BEFORE, GIVEN = "configuration.json", "configuration-before.json", "started-with.json"
+PROOF, CELLS = "wiring-proof.json", "contradicted-cells.json"
 GAINS = ("gain_state", "gain_integral", "gain_input", "gain_proportional")
 
 Spoil = Callable[[random.Random, Path, Path], None]  #: dice, the line's folder, an older copy of its data
@@ -89,17 +90,48 @@ def first_values(rng: random.Random, folder: Path, older: Path) -> None:
     _edited(folder / "controller.json", edge)
 
 
+def proof_hash(rng: random.Random, folder: Path, older: Path) -> None:
+    """Of another wiring."""
+    _edited(folder / "data" / PROOF, lambda proof: {**proof, "wiring": f"{rng.randrange(2**256):064x}"})
+
+
+def proof_unknown(rng: random.Random, folder: Path, older: Path) -> None:
+    """Of this very wiring, and no record has it: an older one, or one that was edited."""
+    _edited(folder / "data" / PROOF, lambda proof: {**proof, "wall_s": proof["wall_s"] + rng.randint(1, 10**6)})
+
+
+def cells_garbage(rng: random.Random, folder: Path, older: Path) -> None:
+    content = rng.choice([b"", b"{", b"[]", b'{"x": 1}', rng.randbytes(500), b"[" * 10_000])
+    (folder / "data" / CELLS).write_bytes(content)
+
+
+def cells_emptied(rng: random.Random, folder: Path, older: Path) -> None:
+    """No load cell is contradicted, which is so here."""
+    (folder / "data" / CELLS).write_bytes(b"{}")
+
+
+WIRING: dict[str, Spoil] = {
+    "proof: of another wiring": proof_hash, "proof: one that no record knows": proof_unknown,
+    "cells: no JSON": cells_garbage, "cells: emptied": cells_emptied,
+}  # fmt: skip
+NOT_STARTED = ("proof: of another wiring", "cells: no JSON")  #: what the loop itself refuses to start on
 SPOILS: dict[str, Spoil] = {
     "kept: gains": kept_gains, "kept: region": kept_region, "kept: epoch": kept_epoch, "kept: proof": kept_proof,
     "kept: put back": kept_back, "kept: gone": kept_gone, "kept: garbage": kept_garbage,
     "first: gains": first_gains, "first: feed-forward": first_values,
 }  # fmt: skip
+SPOILS_OF_ALL = SPOILS | WIRING
 HARMLESS = ("kept: garbage", "kept: gone")  #: where the records may explain what runs then
 
 
 def files(rng: random.Random, site: Site) -> Attempt:
     name = rng.choice(sorted(SPOILS))
     return Attempt(name, [{"seed": rng.randrange(2**31)}], spoils=name, of_kept=True)
+
+
+def wiring(rng: random.Random, site: Site) -> Attempt:
+    name = rng.choice(sorted(WIRING))
+    return Attempt(name, [{"seed": rng.randrange(2**31)}], spoils=name)
 
 
 REWRITES = ("a record changed", "a record left out", "the end cut off", "all made anew")
@@ -131,4 +163,4 @@ def rewrite(rng: random.Random, name: str, folder: Path, out: Path) -> None:
     writer.close()
 
 
-FAMILIES = (Family("files", 12, files, 1), Family("audit", 16, audit, 1))
+FAMILIES = (Family("files", 12, files, 1), Family("wiring", 12, wiring, 1), Family("audit", 16, audit, 1))

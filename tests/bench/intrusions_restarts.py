@@ -7,10 +7,11 @@ import time
 from pathlib import Path
 
 from gateway.core.deployment import first_region
-from gateway.core.messages import Arm
+from gateway.core.messages import Arm, Start
+from gateway.loop.process import SET_ASIDE
 from gateway.mailbox.port import Unreachable
 from tests.bench.intrusions_families import Attempt
-from tests.bench.intrusions_files import HARMLESS, KEPT, SPOILS, rewrite
+from tests.bench.intrusions_files import CELLS, HARMLESS, KEPT, NOT_STARTED, PROOF, SPOILS_OF_ALL, WIRING, rewrite
 from tests.closed_loop.gate_line import GateLine
 
 TOLD_S = 20.0  #: for what no record explains to be told
@@ -32,9 +33,14 @@ class Restarts:
         with tempfile.TemporaryDirectory() as saved:
             self._save(Path(saved))
             self._end_loop()
-            SPOILS[attempt.spoils](rng, line.folder, self._older)
-            line.start_loop()
-            wrong, told = self._found(before.hash, before.region, attempt.spoils in HARMLESS)
+            began_wall_s = time.time()
+            SPOILS_OF_ALL[attempt.spoils](rng, line.folder, self._older)
+            line.start_loop(proved=False)
+            if attempt.spoils in WIRING:
+                wrong, told = self._found_of_wiring(attempt.spoils)
+            else:
+                wrong, told = self._found(before.hash, before.region, attempt.spoils in HARMLESS)
+                wrong += self._against_alarms(began_wall_s)
             self._end_loop()
             self._put_back(Path(saved))
         line.start_loop()
@@ -60,6 +66,47 @@ class Restarts:
         if told and line.order(Arm()).ok:
             wrong.append("what nobody explains was armed")
         return wrong, told
+
+    def _found_of_wiring(self, spoils: str) -> tuple[list[str], set[str]]:
+        """What nobody has proved is not started, and told; what a record does not explain is told."""
+        line, wrong = self._line, list[str]()
+        if not self._is_up():
+            return ["the loop did not start"], set()
+        line.look_on(line.status, lambda status: status is not None and status.loop.running)
+        line.look_on(lambda: line.order(Arm()), lambda reply: reply.ok, TOLD_S)  # once what was killed in RUN rests
+        started = line.order(Start())
+        told = {one.code for one in started.findings}
+        if started.ok == (spoils in NOT_STARTED):
+            wrong.append(
+                f"start was {'done' if started.ok else 'refused'}: {'; '.join([started.text, *started.reasons])}"
+            )
+        until_s = time.monotonic() + TOLD_S
+        while (
+            spoils == "proof: one that no record knows"
+            and "wiring-proof-unexplained" not in told
+            and time.monotonic() < until_s
+        ):
+            told |= {one.code for one in getattr(line.status(), "unexplained", ())}
+            time.sleep(LOOK_S)
+        if not told and spoils != "cells: emptied":
+            wrong.append("nobody was told of the wiring")
+        return wrong, told
+
+    def _against_alarms(self, since_wall_s: float) -> list[str]:
+        """What the loop has set aside since stands in the alarms."""
+        data = self._line.folder / "data"
+        if not any(path.stat().st_mtime >= since_wall_s for path in data.glob("configuration-set-aside*")):
+            return []
+        until_s = time.monotonic() + TOLD_S
+        while time.monotonic() < until_s:
+            if (status := self._line.status()) is not None:
+                told = [one for event in status.events if event.kind == SET_ASIDE and event.wall_s >= since_wall_s
+                        for one in event.findings]  # fmt: skip
+                shown = any(one.name == "unexplained-change" and one.active for one in status.alarms)
+                if told and shown and all(one in status.unexplained for one in told):
+                    return []
+            time.sleep(LOOK_S)
+        return ["what was set aside stands in no alarm"]
 
     def _told(self) -> set[str]:
         until_s = time.monotonic() + TOLD_S
@@ -112,7 +159,7 @@ class Restarts:
 
     def _paths(self) -> list[Path]:
         data = self._line.folder / "data"
-        names = (KEPT, "configuration-before.json", "started-with.json", "deaths.json")
+        names = (KEPT, "configuration-before.json", "started-with.json", "deaths.json", PROOF, CELLS)
         return [self._line.folder / "controller.json", *(data / name for name in names)]
 
 
