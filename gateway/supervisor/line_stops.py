@@ -29,7 +29,6 @@ def hear_stop(event: Event, records: LoopRecords, asked: Callable[[], Who | None
         "state": str(stopped.get("state")),
         "phase": str(stopped.get("phase")),
         "findings": [one.model_dump(mode="json") for one in event.findings[:MOST_FINDINGS]],
-        "rules": [str(rule)[:80] for rule in event.data.get("rules", [])[:MOST_FINDINGS]],
         "because": event.text[:400],
         "monotonic_s": event.time_s,
     }

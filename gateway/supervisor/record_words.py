@@ -173,8 +173,7 @@ def _line_stopped(who: str, what: What, language: str) -> str:
     """What was found in words only stands at the end of what the loop said then."""
     code = "line-stopped-by-person" if what.get("by_person") else "line-stopped"
     said = sentence(finding(code, who=who, phase=_of(what, "phase")), language)
-    coded = _findings(what)
-    told = sentences(coded, language) if coded else ", ".join(map(str, what.get("rules") or ()))
+    told = sentences(_findings(what), language)
     return f"{said}{': ' if told else ''}{_clean(told, 2 * LONGEST_TOLD)}{_left_out(what)}"
 
 

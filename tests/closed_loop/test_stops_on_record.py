@@ -32,7 +32,7 @@ def test_a_persons_stop_and_a_web_break_are_one_record_each(tmp_path) -> None:
         line.wait(at_rest)
         _, broke = line.look_on(lambda: stops(line), lambda found: len(found) > 1)
         assert (broke.who.name, broke.what["by_person"], broke.what["state"]) == ("loop", False, "RUN")
-        assert broke.what["rules"], broke.what
+        assert {one["code"] for one in broke.what["findings"]} & {"web-break", "slack"}, broke.what
         assert "von selbst" in in_a_sentence(broke.kind, broke.who.name, broke.what, language="de")
         shown = line.audit("show", "--kind", STOPPED)
         assert "the line has stopped by itself, from RUNNING: " in shown
