@@ -24,6 +24,7 @@ A fault is asked for in these words:
   of the recording, which `r2rgate sim` and `r2rgate run --plant` name at their start. Put the words in quotes.
 - The recording has an event `fault-injected` for each, and one `fault-cleared`, which tells of frames how many were
   affected.
+- A fault that stops the line is one record of the audit (`line-stopped`, [audit.md](audit.md)) with what was found.
 - The same fault of the same target cannot be there twice at one time, nor two that change the same reading. Others act
   together; on frames in the order in which they came.
 - Faults of frames may be asked of a whole wire, of one address on it, or of a device. Devices that share an address
