@@ -53,21 +53,17 @@ def _wrong(case: Case) -> Iterator[str]:
 def _wrong_feedforward(case: Case) -> Iterator[str]:
     """J/R multiplies a roller's acceleration, L/EA the rates of a tension (see `gateway.control.deviation`)."""
     own, webs = case.controller.feedforward, [theta.web for theta in case.corners]
+    heaviest = np.max([web.inertia_kg_m2 / web.radius_m for web in webs], axis=0)
+    softest = np.max([web.length_m / web.stiffness_n for web in webs], axis=0)
     parts = {
-        "J/R": (
-            "kg m", np.divide(own.inertia_kg_m2, own.radius_m),
-            np.max([web.inertia_kg_m2 / web.radius_m for web in webs], axis=0),
-        ),
-        "L/EA": (
-            "m/N", np.array(own.length_m) / own.stiffness_n,
-            np.max([web.length_m / web.stiffness_n for web in webs], axis=0),
-        ),
-    }  # fmt: skip
-    for name, (unit, taken, believed) in parts.items():
-        for i in np.flatnonzero(~(taken <= MOST_OVER * believed)).tolist():
+        "J/R": np.divide(own.inertia_kg_m2, own.radius_m) / heaviest,
+        "L/EA": np.array(own.length_m) / own.stiffness_n / softest,
+    }
+    for name, times in parts.items():
+        for i in np.flatnonzero(~(times <= MOST_OVER)).tolist():
             yield (
-                f"its feed-forward takes {name} of section {i + 1} for {taken[i]:.4g} {unit}; allowed: up to "
-                f"{MOST_OVER * believed[i]:.4g}, twice the most that is believed"
+                f"its feed-forward takes {name} of section {i + 1} for {times[i]:.3g} times the most that is believed; "
+                f"allowed: up to {MOST_OVER:g}"
             )
 
 
