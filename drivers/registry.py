@@ -8,6 +8,7 @@ from drivers.canopen import build as canopen
 from drivers.canopen.map_drive import DriveMap as CanopenDriveMap
 from drivers.device_map import MAPS, DeviceMap, MapRefused, load_map, map_names
 from drivers.modbus import build as modbus
+from drivers.modbus.maps import ModbusMap
 from drivers.opcua import build as opcua
 from drivers.port import Link
 from drivers.scaling import speed_step, torque_step
@@ -102,6 +103,12 @@ def unnamed_reactions(line: Line, folder: Path = MAPS) -> list[str]:
         if not isinstance(item, LoadCell) and not (isinstance(device, CanopenDriveMap) and device.names_reaction):
             found.setdefault(item.map, []).append(item.name)
     return [f"{name} ({', '.join(names)})" for name, names in found.items()]
+
+
+def nameless(line: Line, folder: Path = MAPS) -> list[str]:
+    """Devices whose maps name no serial number: nobody sees that one of them is exchanged. A CANopen node has 1018h."""
+    wired = _Lookup(line, folder).devices()[0]
+    return [each.item.name for each in wired if isinstance(each.device, ModbusMap) and each.device.serial is None]
 
 
 class _Lookup:

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from drivers.modbus.device import Check, Proofs, Standing, identity_check, register_block
 from drivers.modbus.maps import LoadCellMap
 from drivers.modbus.plan import Wish
-from drivers.modbus.registers import Field
+from drivers.modbus.registers import Field, SerialNumber
 from drivers.scaling import si_per_count
 from gateway.core.finding import Finding, finding
 from gateway.core.line import LoadCell
@@ -41,7 +41,7 @@ class Amplifier:
             identity.append(identity_check(self.name, device.device_id, device))
         if device.channel_count is not None:
             identity.append(Check(register_block([device.channel_count], device), self._against_channel_count))
-        self.proofs = Proofs(identity)
+        self.proofs = Proofs(identity, serial=SerialNumber.of(device))
         self._counter: float | None = None
 
     def fill(self, inputs: Inputs, numbers: Sequence[float] | None, standing: Standing, time_s: float) -> list[str]:

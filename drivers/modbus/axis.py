@@ -18,7 +18,7 @@ from drivers.modbus.device import (
 from drivers.modbus.frozen import FrozenAnswers
 from drivers.modbus.maps import DriveMap, Register
 from drivers.modbus.plan import Wish
-from drivers.modbus.registers import Field, RegisterBlock
+from drivers.modbus.registers import Field, RegisterBlock, SerialNumber
 from drivers.mode_display import ModeDisplay
 from drivers.power_stage import PowerStage
 from drivers.scaling import speed_per_count, torque_per_count
@@ -105,7 +105,7 @@ class Axis:
             identity.append(Check(maximum, self._against_max_torque))
         statusword = RegisterBlock([self._read_field(device.read.statusword)], device.word_order)
         trust.append(Check(statusword, self._against_enabled))
-        return Proofs(identity, trust, written)
+        return Proofs(identity, trust, written, SerialNumber.of(device))
 
     def _against_axis_count(self, found: float) -> list[Finding]:
         channel = self._settings.channel

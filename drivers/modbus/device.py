@@ -11,7 +11,7 @@ from typing import Protocol
 
 from drivers.modbus.maps import ModbusMap, Register, RegisterCheck, TimeRegister
 from drivers.modbus.plan import Wish
-from drivers.modbus.registers import RegisterBlock
+from drivers.modbus.registers import RegisterBlock, SerialNumber
 from drivers.scaling import si_per_count
 from gateway.core.finding import Finding, finding
 from gateway.core.signals import Inputs, Outputs
@@ -83,6 +83,7 @@ class Proofs:
     identity: list[Check]  #: before anything of it is believed: on every connection
     trust: list[Check] = field(default_factory=list[Check])  #: before there may be torque: in `prepare`
     settings: list[Setting] = field(default_factory=list[Setting])  #: before it is written to: on every connection
+    serial: SerialNumber | None = None  #: read in `prepare`
 
 
 class Device(Protocol):

@@ -68,8 +68,8 @@ class ModbusLink:
 
     @property
     def serials(self) -> Mapping[str, str]:
-        """None: no register of it is common to devices."""
-        return {}
+        """An amplifier's is that of each load cell on it: it is called by all of them."""
+        return {name: number for session in self._sessions for name, number in session.serials.items()}
 
     @property
     def watched(self) -> Set[str]:

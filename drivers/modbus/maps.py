@@ -30,6 +30,7 @@ from drivers.map_rules import (
 )
 from gateway.core.drive_tells import INVERTER_ACCURACY, TORQUE_FILTER_S
 from gateway.core.line import Name, Positive, Strict
+from gateway.core.wiring_proof import LONGEST_TEXT
 
 MAX_READ_REGISTERS = 125
 MAX_WRITE_REGISTERS = 121  #: of function 23; function 16 would take two more
@@ -46,6 +47,21 @@ class Register(Strict):
 class RegisterCheck(Register):
     value: int  #: what a device of this type has there, in the bits of `mask`
     mask: Annotated[int, Field(ge=1)] | None = None  #: all bits where it is left out
+
+
+class SerialRegister(Strict):
+    address: Address
+    type: Literal["u16", "u32", "u64", "text"] = "u16"  #: a text is ASCII, two characters a register
+    registers: Annotated[int, Field(ge=1, le=LONGEST_TEXT // 2)] | None = None  #: of a text
+
+    @property
+    def count(self) -> int:
+        return self.registers or {"u16": 1, "u32": 2, "u64": 4}[self.type]
+
+    @model_validator(mode="after")
+    def _length(self) -> "SerialRegister":
+        wrong = (self.type == "text") != (self.registers is not None)
+        return refuse_together(self, ["registers: a text needs it, a number has none"] if wrong else [])
 
 
 class StatusRegister(Register):
@@ -103,6 +119,18 @@ class ModbusMap(Strict):
     function_23: bool = True  #: false: the device does not know it, and is written with 16 before it is read
     #: Devices of one family may share a unit identifier; they are exchanged in one transaction then.
     family: Name | None = None
+    serial: SerialRegister | None = None  #: its serial number; without it nobody sees that it was exchanged
+
+    def serial_problems(self, fields: dict[str, tuple[int, str]]) -> list[str]:
+        """The serial number has registers of its own, like every field."""
+        if (serial := self.serial) is None:
+            return []
+        end = serial.address + serial.count
+        return base_problems({"serial": (serial.address, "")}, self.address_base) + [
+            f"serial.address: {serial.address} overlaps {name}"
+            for name, (address, kind) in fields.items()
+            if address < end and serial.address < address + registers_of(kind)
+        ]
 
 
 class LoadCellMap(ModbusMap):
@@ -125,6 +153,7 @@ class LoadCellMap(ModbusMap):
         if channels.status is not None:
             inside["channels.status"] = (channels.status.offset, channels.status.type)
         problems = overlap_problems(fields) + overlap_problems(inside) + base_problems(fields, self.address_base)
+        problems += self.serial_problems(fields)
         for name, (offset, kind) in inside.items():
             if offset + registers_of(kind) > channels.stride:
                 problems.append(f"{name}.offset: {offset} does not fit channels.stride {channels.stride}")
@@ -174,7 +203,7 @@ class PlcMap(ModbusMap):
         fields |= {"watchdog": (self.watchdog.address, self.watchdog.type)}
         fields |= _register_fields("read", self.read) | written
         problems = overlap_problems(fields) + base_problems(fields, self.address_base)
-        problems += _side_by_side("write", written)
+        problems += _side_by_side("write", written) + self.serial_problems(fields)
         if self.read_function != 3:
             problems.append(f"read_function: {self.read_function}; allowed: 3, the registers that function 23 reads")
         problems += _plc_type_problems(self)
@@ -298,7 +327,7 @@ class DriveMap(ModbusMap):
         }
         everything = fields | read | write
         problems = overlap_problems(_apart(everything)) + base_problems(everything, self.address_base)
-        problems += _side_by_side("write", write)
+        problems += _side_by_side("write", write) + self.serial_problems(everything)
         problems += _drive_type_problems(self) + _axes_problems(self, read, write)
         problems += range_problems("watchdog", self.watchdog.range) + fit_problems("watchdog", *self.watchdog.written())
         return refuse_together(self, problems)

@@ -19,6 +19,7 @@ from drivers.modbus.device import (
 )
 from drivers.modbus.maps import PlcMap
 from drivers.modbus.plan import Wish
+from drivers.modbus.registers import SerialNumber
 from drivers.scaling import si_per_count
 from gateway.core.line import LinePlc
 from gateway.core.signals import Inputs, Outputs, Quality
@@ -45,6 +46,7 @@ class Plc:
         self.proofs = Proofs(
             [identity_check(self.name, device.device_id, device)],
             settings=[Setting(self.name, "watchdog", watchdog, counts, WATCHDOG_OFF)],
+            serial=SerialNumber.of(device),
         )
         self._life = LifeCounter()
 

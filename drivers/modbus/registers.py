@@ -6,14 +6,45 @@ high word comes first or last, as the map says. Addresses in a map count from it
 
 import struct
 from collections.abc import Sequence
+from dataclasses import dataclass
 from math import isfinite
 
 from drivers.map_rules import BYTES
-from drivers.modbus.maps import MAX_READ_REGISTERS
+from drivers.modbus.maps import MAX_READ_REGISTERS, ModbusMap
+from gateway.core.line_problem import printable
 
 _CODE = {"u16": "H", "i16": "h", "u32": "I", "i32": "i", "f32": "f"}
 
 Field = tuple[int, str]  #: address (from 0, as on the wire) and type
+
+
+@dataclass(frozen=True, slots=True)
+class SerialNumber:
+    """Registers that hold a serial number; `printed` is where by the manual, `address` where on the wire."""
+
+    printed: int
+    address: int
+    count: int
+    is_text: bool
+    word_order: str
+
+    @classmethod
+    def of(cls, device: ModbusMap) -> "SerialNumber | None":
+        """None: the map names none."""
+        if (entry := device.serial) is None:
+            return None
+        address, is_text = entry.address - device.address_base, entry.type == "text"
+        return cls(entry.address, address, entry.count, is_text, device.word_order)
+
+    def decode(self, registers: Sequence[int]) -> str:
+        """As a nameplate prints it; empty: none. Raises ValueError for a wrong count."""
+        if len(registers) != self.count:
+            raise ValueError(f"{len(registers)} registers, asked for {self.count}")
+        swapped = self.word_order == "low-first" and not self.is_text
+        data = struct.pack(f">{self.count}H", *(reversed(registers) if swapped else registers))
+        if self.is_text:
+            return printable(data.decode("ascii", "backslashreplace").strip("\0 "))
+        return str(int.from_bytes(data)) if any(data) else ""
 
 
 class RegisterBlock:

@@ -17,6 +17,7 @@ from drivers.modbus.device import ANSWERS_ALLOWED
 from drivers.modbus.looks import Looks
 from drivers.modbus.plan import Request
 from drivers.modbus.proof import unit_not_read
+from drivers.modbus.registers import SerialNumber
 from drivers.modbus.settings import REQUEST_TIMEOUT_S, SettingsWriter
 from drivers.modbus.unit import Payloads, Unit
 from gateway.core.finding import Finding, finding
@@ -62,6 +63,7 @@ class Session:
         self._pause_s = FIRST_PAUSE_S
         self._checked_on = 0  #: number of the connection on which the unit was checked
         self._looks = Looks(unit, period_s)
+        self.serials: dict[str, str] = {}  #: by device, as they were read last; one that tells none has no entry
 
     @property
     def where(self) -> str:
@@ -100,11 +102,29 @@ class Session:
                         return reasons  # another device: what else it says means nothing
         except ModbusTimeout as error:
             return [*reasons, unit_not_read(unit.name, unit.address, self._connection, error)]
-        reasons = reasons or self.lost_since_check()
+        reasons = reasons or await self._read_serials() or self.lost_since_check()
         if not reasons:
             unit.identity.confirm()
             unit.standing.doubt = ()
         return reasons
+
+    async def _read_serials(self) -> list[Finding]:
+        """Devices of one unit that name the same registers share them. What speaks against the unit."""
+        unit, connection, told = self.unit, self._connection, dict[SerialNumber, str]()
+        for device in unit.devices:
+            serial = device.proofs.serial
+            if serial is None or serial in told:
+                continue
+            deadline_s = _now_s() + REQUEST_TIMEOUT_S
+            try:
+                read = await connection.read(unit.read_function, unit.address, serial.address, serial.count, deadline_s)
+                told[serial] = serial.decode(read)
+            except (ModbusFailed, ValueError) as error:
+                error = ModbusFailed(f"serial number, register {serial.printed}: {error}")
+                return [unit_not_read(device.name, unit.address, connection, error)]
+        numbered = [(d, told[s]) for d in unit.devices if (s := d.proofs.serial) is not None and told[s]]
+        self.serials = {name: number for device, number in numbered for name in device.name.split(", ")}
+        return []
 
     def lost_since_check(self) -> list[Finding]:
         """What speaks against a unit that may be another, or was restarted, since it was checked."""

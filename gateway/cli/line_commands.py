@@ -13,7 +13,7 @@ import numpy as np
 import typer
 
 from drivers.device_map import Maps, load_maps
-from drivers.registry import unnamed_reactions, unseen
+from drivers.registry import nameless, unnamed_reactions, unseen
 from gateway.cli.plc_signals import missing_plc_signals
 from gateway.core.can_load import REFUSED_LOAD, bus_load
 from gateway.core.line import Bus, CanopenBus, Line, OpcUaBus
@@ -94,8 +94,8 @@ def check(
         warnings = [asdict(warning) for warning in checked.warnings]
         summary = summary_of(checked.line)
         result = {"file": source, "valid": True, "problems": [], "warnings": warnings, "summary": summary}
-        drilled_only = unnamed_reactions(checked.line)
-        _print_json({**result, "unseen": unseen(checked.line), "reaction_unnamed": drilled_only})
+        more = {"unseen": unseen(checked.line), "reaction_unnamed": unnamed_reactions(checked.line)}
+        _print_json({**result, **more, "serial_unnamed": nameless(checked.line)})
     else:
         typer.echo(_valid_in_words(source, checked))
 
@@ -212,6 +212,11 @@ def _valid_in_words(source: str, checked: CheckedLine) -> str:
         text.append(
             f"note: no option code says what a watchdog does in device map {', '.join(maps)}: "
             "only the drill of `r2rgate prove` shows it"
+        )
+    if names := nameless(checked.line):
+        text.append(
+            f"warning: the device maps of {', '.join(names)} name no serial number: that one of these is exchanged is "
+            "not seen; prove it again by hand then: `r2rgate prove --only`"
         )
     text.append(f"{source}: valid. {summary['site']}/{summary['line']}: {spans}; {timing}")
     text += [f"  {row}" for row in _bus_rows(summary["buses"])]

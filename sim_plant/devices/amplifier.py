@@ -8,6 +8,8 @@ from sim_plant.devices.misreading import Misreading
 from sim_plant.physics import FloatArray
 from sim_plant.world import World
 
+SERIAL = 0x52540000
+
 
 class ChannelStatus(IntEnum):
     OK = 0
@@ -21,6 +23,7 @@ class Amplifier:
 
     def __init__(self, world: World) -> None:
         self.healthy = True
+        self.serial = SERIAL
         self.channels = world.n
         self._world = world
         self._status = [ChannelStatus.OK] * world.n

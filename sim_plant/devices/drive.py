@@ -16,6 +16,7 @@ from sim_plant.world import World
 
 WATCHDOG_ERROR = 0x8250  #: RPDO deadline missed
 WATCHDOG_REGISTER = 0x11  #: 1001h with it: generic error, communication error
+FIRST_SERIAL = 0x52530001  #: of roller 1, on Modbus and OPC UA
 QUICK_STOP_TIME_S = 0.1  #: the quick stop ramp takes this long from rated torque to zero
 
 
@@ -46,6 +47,7 @@ class Drive:
         torque_rate_nm_per_s: float = inf,
     ) -> None:
         self.index = index
+        self.serial = FIRST_SERIAL + index
         self.rated_torque_nm = rated_torque_nm
         self.max_torque_nm = max_torque_nm
         self.error_code = 0  #: 603Fh; 0 is no fault

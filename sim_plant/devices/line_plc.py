@@ -11,6 +11,7 @@ from sim_plant.devices.drive import Drive
 from sim_plant.recorder import Recorder
 from sim_plant.world import World
 
+SERIAL = 0x52550000
 _EMERGENCY_STOP = "emergency stop"
 
 
@@ -42,6 +43,7 @@ class LinePlc:
         sto_delay_s: float = 0.5,
     ) -> None:
         self.interpolation_s = 0.0  #: in which v0 goes straight to each new request, as fast as its ramp lets it
+        self.serial = SERIAL
         self.watchdog_is_dead = False  #: it takes its setting, and never acts on it
         self._frozen: LinePlcStatus | None = None
         self.watchdog_s = 0.0  #: v0 ramps to zero this long after the life counter's last change; 0 is off

@@ -23,7 +23,7 @@ _COMMAND = range(10, 12)  #: controlword and target torque
 _WATCHDOG = 23
 _END = 24
 _HEAD = struct.Struct(">HHihHH6x")
-_SETTINGS = struct.Struct(">HH16xIHH")
+_SETTINGS = struct.Struct(">HHI12xIHH")
 
 
 class AxisReading(NamedTuple):
@@ -107,7 +107,8 @@ class DriveRegisters:
             shown.flags,
             axis.drive.shown_code,
         )
-        settings = _SETTINGS.pack(*self._command, axis.rated_torque_word, axis.max_torque_word, self._watchdog_ms)
+        limits = axis.rated_torque_word, axis.max_torque_word
+        settings = _SETTINGS.pack(*self._command, axis.drive.serial, *limits, self._watchdog_ms)
         return (told + settings)[2 * address : 2 * (address + count)]
 
     def write(self, address: int, values: tuple[int, ...], now_s: float) -> None:

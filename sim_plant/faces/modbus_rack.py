@@ -28,8 +28,10 @@ from sim_plant.faces.words import (
 )
 
 RACK_ID = 0x5204
+RACK_SERIAL = 0x52560000
 
 _INPUTS = range(128)
+_SERIAL = 120  #: behind the registers of 14 spans
 _OUTPUTS = range(200, 232)
 _SETTINGS = range(300, 305)
 _LINE = range(200, 204)
@@ -62,6 +64,7 @@ class RackRegisters:
         cells: Collection[int],
         plc: LinePlc | None,
     ) -> None:
+        self.serial = RACK_SERIAL
         self._spans = spans
         self._axes = dict(axes)
         self._amplifier = amplifier
@@ -133,7 +136,7 @@ class RackRegisters:
         counter = amplifier.counter(now_s)
         data = _HEAD.pack(RACK_ID, self._spans, line, speed_um_per_s, life, counter, amplifier.healthy)
         data += b"".join(self._span(number, now_s) for number in range(1, self._spans + 1))
-        return data.ljust(2 * len(_INPUTS), b"\0")
+        return data.ljust(2 * _SERIAL, b"\0") + struct.pack(">I12x", self.serial)
 
     def _span(self, number: int, now_s: float) -> bytes:
         axis = self._axes.get(number)

@@ -32,13 +32,13 @@ PLC_ID = 0x5202
 
 _FIRST_CHANNEL = 16
 _REGISTERS_PER_CHANNEL = 4
-_AMPLIFIER_HEAD = struct.Struct(">4H24x")
+_AMPLIFIER_HEAD = struct.Struct(">4H16s8x")
 _CHANNEL = struct.Struct(">fHH")
 
 _COMMAND = range(10, 15)  #: the registers that can be written
 _REQUEST = (11, 12)
 _WATCHDOG = 14
-_PLC_STATUS = struct.Struct(">HHiH10x")
+_PLC_STATUS = struct.Struct(">HHiHI6x")
 _PLC_COMMAND = struct.Struct(">HiHH")
 _FIVE_WORDS = struct.Struct(">5H")
 
@@ -75,7 +75,8 @@ class AmplifierRegisters:
 
     def _head(self, now_s: float) -> bytes:
         amplifier = self._amplifier
-        return _AMPLIFIER_HEAD.pack(AMPLIFIER_ID, amplifier.channels, amplifier.healthy, amplifier.counter(now_s))
+        counter, serial = amplifier.counter(now_s), str(amplifier.serial).encode()
+        return _AMPLIFIER_HEAD.pack(AMPLIFIER_ID, amplifier.channels, amplifier.healthy, counter, serial)
 
     def _channel(self, channel: int, now_s: float) -> bytes:
         return _CHANNEL.pack(*channel_words(self._amplifier, channel, channel in self._cells, now_s), 0)
@@ -119,7 +120,8 @@ class PlcRegisters:
 
     def _status(self, now_s: float) -> bytes:
         status = self._plc.status(now_s)
-        return _PLC_STATUS.pack(PLC_ID, status_word(status), speed_word(status.unwind_speed_m_per_s), status.life_echo)
+        speed = speed_word(status.unwind_speed_m_per_s)
+        return _PLC_STATUS.pack(PLC_ID, status_word(status), speed, status.life_echo, self._plc.serial)
 
 
 def channel_words(amplifier: Amplifier, channel: int, connected: bool, now_s: float) -> tuple[float, int]:

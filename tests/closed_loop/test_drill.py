@@ -9,10 +9,10 @@ from drivers.map_fields import MAPS
 from drivers.registry import map_files
 from gateway.cli.stepped import shown_as_described
 from gateway.core.deployment import WiringStatus
-from gateway.core.messages import Arm, Drill, KeepProof, Start, Stop
+from gateway.core.messages import Arm, Drill, KeepProof, Prove, Start, Stop
 from gateway.core.signals import DriveState
 from gateway.core.states import Phase
-from gateway.core.wiring_proof import proof_hash
+from gateway.core.wiring_proof import devices_of, proof_hash
 from gateway.loop.drill import ROOM_PERIODS, Stage
 from gateway.loop.wiring import FILE, Wiring
 from tests.bench import lines
@@ -198,6 +198,43 @@ def test_who_was_proved_is_known_once_its_devices_are_prepared():
         assert {drive.name for drive in line.line.drives} <= line.links[0].serials.keys()
 
 
+def exchange_drive(line, wiring, number=0x4711):
+    """Another drive in place of the third; of the rack, all that is in it. Returns who, and what it tells now."""
+    name = line.line.drives[2].name
+    if line.truth.canopen is not None and wiring in ("canopen", "mixed", DEMO):
+        line.truth.canopen.nodes[2].objects.readers[0x1018, 4] = lambda: number
+        return {name}, f"{number:#x}"
+    if wiring != "modbus":
+        line.truth.drives[2].serial = number
+        return {name}, str(number)
+    (rack,) = line.truth.modbus.units.values()
+    rack.serial = number
+    return {each.name for each in devices_of(line.line)}, str(number)
+
+
+@pytest.mark.parametrize("wiring", sorted(set(WIRES) - {"opcua"}))
+def test_an_exchanged_drive_is_named_at_start_and_may_be_proved_alone(wiring):
+    with virtual_line(wiring, 1) as line:
+        assert drilled(line).ok
+        line.step(5)
+        assert line.command(Arm()).ok and line.cycle.wiring.against == []
+        assert line.command(Stop()).ok
+        names, number = exchange_drive(line, wiring)
+        line.step(5)
+        assert line.command(Arm()).ok
+        told = {(each.code, each.parameters["device"], each.parameters["now"]) for each in line.start().findings}
+        assert told == {("device-exchanged", name, number) for name in names}
+        assert line.command(Stop()).ok
+        assert drilled(line).ok
+        line.step(5)
+        assert line.command(Arm()).ok
+        only = sorted(names)
+        assert [each.code for each in line.command(Prove(only=only[1:] or [line.line.plc.name])).findings] == [
+            "device-exchanged"
+        ]
+        assert line.command(Prove(only=only)).ok
+
+
 def test_a_drill_does_not_outlive_a_device_that_is_exchanged():
     with virtual_line("canopen", 1) as line:
         assert drilled(line).ok
@@ -206,7 +243,7 @@ def test_a_drill_does_not_outlive_a_device_that_is_exchanged():
         assert line.cycle.drill.watchdogs, "they are the same devices"
         assert line.command(Stop()).ok
         line.step(5)
-        line.truth.canopen.nodes[2].objects.readers[0x1018, 4] = lambda: 0x4711
+        exchange_drive(line, "canopen")
         assert line.command(Arm()).ok
         assert line.links[0].serials[line.line.drives[2].name] == "0x4711"
         assert not line.cycle.drill.watchdogs

@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 
 from drivers.modbus.link import ModbusLink
+from drivers.port import PrepareRefused
 from gateway.core.line import Line
 from gateway.core.signals import DriveRequest, DriveState, Inputs, Quality
 from sim_plant.devices.amplifier import Amplifier
 from sim_plant.devices.drive import Drive
 from sim_plant.devices.line_plc import LinePlc
 from sim_plant.faces.modbus import ModbusFace
-from sim_plant.faces.modbus_codec import Registers
+from sim_plant.faces.modbus_codec import Refused, Registers
 from sim_plant.faces.modbus_drive import DriveRegisters, ModbusAxis
 from sim_plant.faces.modbus_rack import RackRegisters
 from sim_plant.faces.modbus_units import AmplifierRegisters, PlcRegisters
@@ -95,6 +96,45 @@ def test_torque_acts_and_goes_off_when_the_gateway_falls_silent(wiring: str) -> 
         assert (inputs.drive_state == DriveState.FAULT).all()
 
     asyncio.run(on_wire(wiring, body))
+
+
+@pytest.mark.parametrize(
+    ("wiring", "changed"), [("drives", ["drive-1"]), ("rack", ["drive-1", "drive-2", "cell-1", "plc"])]
+)
+def test_an_exchanged_device_tells_another_number(wiring: str, changed: list[str]) -> None:
+    async def body(link: ModbusLink, plant: SimulatedLine, inputs: Inputs) -> None:
+        await link.prepare()
+        before = dict(link.serials)
+        assert len(before) == 2 * inputs.n + 1 and before["cell-1"] == before["cell-2"]
+        plant.drives[0].serial = 4711
+        if isinstance(rack := plant.face.units.get(3), RackRegisters):
+            rack.serial = 4711
+        await link.prepare()
+        assert {name for name, number in link.serials.items() if number != before[name]} >= set(changed)
+        assert {link.serials[name] for name in changed} == {"4711"}
+        assert (link.serials["drive-2"] == before["drive-2"]) == (wiring == "drives")
+
+    asyncio.run(on_wire(wiring, body))
+
+
+def test_a_serial_number_that_cannot_be_read_refuses_its_device(monkeypatch: pytest.MonkeyPatch) -> None:
+    check = DriveRegisters.check_read
+
+    def without(registers: DriveRegisters, address: int, count: int) -> None:
+        if address == 12:
+            raise Refused(2)
+        check(registers, address, count)
+
+    monkeypatch.setattr(DriveRegisters, "check_read", without)
+
+    async def body(link: ModbusLink, plant: SimulatedLine, inputs: Inputs) -> None:
+        with pytest.raises(PrepareRefused) as refusal:
+            await link.prepare()
+        told = refusal.value.reasons[0]
+        assert (told.code, told.parameters["device"], told.parameters["unit"]) == ("unit-not-read", "drive-1", 11)
+        assert "serial number, register 12: " in str(told.parameters["error"])
+
+    asyncio.run(on_wire("drives", body))
 
 
 @pytest.mark.parametrize("wiring", LINES)

@@ -136,7 +136,7 @@ def test_a_drive_says_who_it_is_and_is_remote() -> None:
         registers = await bench.read(0, 24, DRIVE)
         assert registers[0] == 0x5203
         assert registers[1] & 0x4F == SWITCH_ON_DISABLED and registers[1] & 1 << 9
-        assert registers[7:10] == [0] * 3 and registers[12:20] == [0] * 8
+        assert registers[7:10] == [0] * 3 and registers[12:20] == [0x5253, 1] + [0] * 6
         assert long(*registers[20:22]) == round(1000 * RATED_NM)
         assert registers[22:] == [round(1000 * PLANT.drives.max_torque_nm / RATED_NM), 0]
 
@@ -372,7 +372,7 @@ def test_a_rack_shows_what_is_in_it_and_what_is_not() -> None:
         for number in (1, 2, 5, 6):
             span = spans[number - 1]
             assert span[:5] == [0] * 5 and math.isnan(float32(*span[5:7])) and span[7] == 2
-        assert registers[8 + 8 * 6 :] == [0] * (INPUTS - 56)
+        assert registers[8 + 8 * 6 :] == [0] * (120 - 56) + [0x5256] + [0] * (INPUTS - 121)
         assert await bench.read(200, 32, RACK) == [0] * 32
         settings = await bench.read(300, 5, RACK)
         assert settings == [0, 0, *divmod(round(1000 * RATED_NM), 0x10000), 1000]

@@ -4,27 +4,41 @@ from pathlib import Path
 
 from drivers.registry import map_files
 from gateway.cli.stepped import shown_as_described
-from gateway.core.line import CanopenBus, Line
+from gateway.core.line import CanopenBus, Drive, Line, LinePlc, LoadCell, OpcUaBus
 from gateway.core.wiring_proof import WiringProof, device_identities, devices_of, proof_hash, wiring_hash
 from gateway.loop.wiring import FILE, Wiring
 from gateway.supervisor.audit import Audit
 from gateway.supervisor.audit_file import FILE_NAME
 from gateway.supervisor.lifecycle import WIRING_PROVED
 from gateway.supervisor.peers import GATEWAY
+from sim_plant.devices import amplifier, drive, line_plc
+from sim_plant.faces import modbus_rack
 
 SERIAL_OF_NODE_0 = 0x52520000  #: of a simulated CANopen node; its number is added
 
 
 def proof_of_wiring(line: Line, *, serials: bool = True) -> WiringProof:
     """Of `line` on simulated devices. Without `serials`: in memory, where nothing has a number."""
-    buses = {bus.name for bus in line.buses if isinstance(bus, CanopenBus)} if serials else set[str]()
-    numbers = {each.name: f"{SERIAL_OF_NODE_0 + each.address:#x}" for each in devices_of(line) if each.bus in buses}
+    canopen = {bus.name for bus in line.buses if isinstance(bus, CanopenBus)}
+    opcua = {bus.name for bus in line.buses if isinstance(bus, OpcUaBus)}
+    numbered = [each for each in devices_of(line) if serials and each.bus not in opcua]
+    numbers = {each.name: _serial(each, on_canopen=each.bus in canopen) for each in numbered}
     maps = map_files(line)
     drives, cells, watchdogs = shown_as_described(line)
     return WiringProof(
         wiring=wiring_hash(line, maps, numbers), wall_s=0.0, devices=device_identities(line, maps, numbers),
         drives=drives, cells=cells, watchdogs=watchdogs,
     )  # fmt: skip
+
+
+def _serial(device: Drive | LoadCell | LinePlc, *, on_canopen: bool) -> str:
+    if on_canopen:
+        return f"{SERIAL_OF_NODE_0 + device.address:#x}"
+    if device.map.startswith("r2r-rack"):
+        return str(modbus_rack.RACK_SERIAL)
+    if isinstance(device, Drive):
+        return str(drive.FIRST_SERIAL + device.roller - 1)
+    return str(amplifier.SERIAL if isinstance(device, LoadCell) else line_plc.SERIAL)
 
 
 def store_proof(line: Line, folder: Path) -> None:

@@ -1,6 +1,7 @@
 """`init` and `check` as a person in a terminal meets them."""
 
 import json
+import re
 from itertools import product
 from pathlib import Path
 
@@ -135,6 +136,18 @@ def test_every_shipped_map_has_a_role_that_the_line_knows() -> None:
     assert set(known_maps()) >= {"cia402-torque", "loadcell-amp", "line-plc"}
     protocols, roles = ("canopen", "modbus-tcp", "opcua"), ("drive", "load-cell", "line-plc")
     assert {(protocol, role) for protocol, role, _ in known_maps().values()} <= set(product(protocols, roles))
+
+
+def test_check_warns_once_of_devices_whose_exchange_is_not_seen(tmp_path: Path) -> None:
+    path = tmp_path / "line.toml"
+    path.write_text(line_template(), encoding="utf-8")
+    assert "serial number" not in run("check", path).output
+    assert json.loads(run("check", path, "--json").output)["serial_unnamed"] == []
+    text = re.sub(r"address = 1\b(.*)\nchannel = (\d+)", r"address = 3\2\1", line_template())
+    path.write_text(text.replace('"loadcell-amp"', '"hbm-wtx"'), encoding="utf-8")
+    said = run("check", path).output
+    (told,) = [row for row in said.splitlines() if "serial number" in row]
+    assert told.startswith("warning: the device maps of load-cell-1, load-cell-2, ") and "plc" not in told
 
 
 def test_check_tells_which_device_maps_name_no_option_code(tmp_path: Path) -> None:
