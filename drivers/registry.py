@@ -10,6 +10,7 @@ from drivers.device_map import MAPS, DeviceMap, MapRefused, load_map, map_names
 from drivers.modbus import build as modbus
 from drivers.modbus.maps import ModbusMap
 from drivers.opcua import build as opcua
+from drivers.opcua.maps import OpcUaMap
 from drivers.port import Link
 from drivers.scaling import speed_step, torque_step
 from drivers.wiring import Builder, Wired
@@ -108,7 +109,9 @@ def unnamed_reactions(line: Line, folder: Path = MAPS) -> list[str]:
 def nameless(line: Line, folder: Path = MAPS) -> list[str]:
     """Devices whose maps name no serial number: nobody sees that one of them is exchanged. A CANopen node has 1018h."""
     wired = _Lookup(line, folder).devices()[0]
-    return [each.item.name for each in wired if isinstance(each.device, ModbusMap) and each.device.serial is None]
+    return [
+        each.item.name for each in wired if isinstance(each.device, ModbusMap | OpcUaMap) and each.device.serial is None
+    ]
 
 
 class _Lookup:

@@ -25,6 +25,7 @@ class Amplifier:
         self._cells = cells
         nodes = DeviceNodes(table, device.namespace, cells[0].address)
         self.proof = Proof(self.name, device.identity, None, nodes)
+        self.serial = nodes.serial(device.serial)  #: its node
         tension, status = device.channels.tension, device.channels.status
         self._n_per_count = si_per_count(tension.unit, tension.scale)
         entries = [tension] if status is None else [tension, status]

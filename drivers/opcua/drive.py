@@ -67,6 +67,7 @@ class Axis:
         nodes = DeviceNodes(table, device.namespace, settings.address, settings.channel)
         self.watchdog = Watchdog(device.watchdog, settings.watchdog_s, nodes)
         self.proof = Proof(settings.name, device.identity, self.watchdog, nodes)
+        self.serial = nodes.serial(device.serial)  #: its node
         rated_nm = settings.rated_torque_nm
         speed, torque, target = entries.speed, entries.torque, entries.target_torque
         self._m_per_s_per_count = speed_per_count(speed.unit, speed.scale, settings.radius_m)

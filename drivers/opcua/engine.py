@@ -48,6 +48,7 @@ class Engine:
             return Answer(question.number, Outcome.TOO_LATE, self._connection, text="the command came too late")
         written: tuple[int, ...] = ()
         readings: tuple[Reading, ...] = ()
+        text = ""
         asked: list[asyncio.Future[Any]] = []
         try:
             requests = [self._services.write(question.writes)] if question.writes else []
@@ -57,7 +58,9 @@ class Engine:
                 if question.writes:
                     written = statuses(bytes(await asked[0]), len(question.writes))
                 if question.reads:
-                    readings = self._services.readings(bytes(await asked[-1]), question.reads)
+                    answer = bytes(await asked[-1])
+                    readings = self._services.readings(answer, question.reads)
+                    text = self._services.serial(answer, question.reads)
         except TimeoutError:
             why = "no answer in time"
         # asyncua's side of the connection raises whatever Python does on bytes that are none of OPC UA's.
@@ -65,7 +68,7 @@ class Engine:
             why = _in_words(error)
         else:
             self._pause_s = FIRST_PAUSE_S
-            return Answer(question.number, Outcome.DONE, self._connection, written, readings)
+            return Answer(question.number, Outcome.DONE, self._connection, written, readings, text)
         finally:
             _forget(asked)
         await self._drop(why)

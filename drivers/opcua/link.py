@@ -41,6 +41,7 @@ class OpcUaLink:
         self._devices = list(devices)
         self._channel = channel
         self._period_s = period_s
+        self._serials: dict[str, str] = {}  #: by device, as `prepare` has read them
         self._noted: dict[Device, float] = {}  #: watchdogs before a `prepare` that has not come to an end, counts
         self._noted_on = 0  #: the connection of that
         self._to_leave: list[Axis] = []  #: that were written to before the silence, and were not released since
@@ -90,7 +91,8 @@ class OpcUaLink:
         if self._noted_on != connection:  # they are of devices that may be others now
             self._noted.clear()
         self._noted_on = connection
-        reasons = await prepare_devices(self._ask, self._devices, self._noted)
+        self._serials = {}
+        reasons = await prepare_devices(self._ask, self._devices, self._noted, self._serials)
         if not reasons and self._connection != connection:
             names = ", ".join(device.name for device in self._devices)
             reasons = [finding("connection-lost-meanwhile", device=names)]
@@ -102,8 +104,7 @@ class OpcUaLink:
 
     @property
     def serials(self) -> Mapping[str, str]:
-        """None: numbers are read of devices, and these are texts."""
-        return {}
+        return self._serials
 
     @property
     def watched(self) -> Set[str]:

@@ -140,6 +140,12 @@ class OpcUaMap(Strict):
     family: Name | None = None  #: devices of one family may share an address: they are instances of one machine
     namespace: Annotated[str, Field(min_length=1, max_length=200)]  #: its URI
     identity: Identity
+    serial: NodeRef | None = None  #: its serial number, a String or an integer; without it no exchange is seen
+
+    @property
+    def told(self) -> dict[str, NodeRef]:
+        """What says which device it is."""
+        return {"identity": self.identity} | ({} if self.serial is None else {"serial": self.serial})
 
 
 class ModeNode(NodeRef):
@@ -194,7 +200,7 @@ class DriveMap(OpcUaMap):
 
     @model_validator(mode="after")
     def _layout(self) -> "DriveMap":
-        problems = _twice_problems({"identity": self.identity, "watchdog": self.watchdog} | _named("nodes", self.nodes))
+        problems = _twice_problems(self.told | {"watchdog": self.watchdog} | _named("nodes", self.nodes))
         problems += self.watchdog.problems()
         for key, bit in (("follows_command", self.follows_command), ("voltage_enabled", self.voltage_enabled)):
             if bit is not None:
@@ -223,7 +229,7 @@ class LoadCellMap(OpcUaMap):
 
     @model_validator(mode="after")
     def _layout(self) -> "LoadCellMap":
-        shared = {"identity": self.identity, "channel_count": self.channel_count}
+        shared = self.told | {"channel_count": self.channel_count}
         shared |= {"sample_counter": self.sample_counter, "healthy": self.healthy}
         problems = _twice_problems(shared | _named("channels", self.channels))
         problems += [
@@ -264,7 +270,7 @@ class PlcMap(OpcUaMap):
 
     @model_validator(mode="after")
     def _layout(self) -> "PlcMap":
-        named = {"identity": self.identity, "watchdog": self.watchdog}
+        named = self.told | {"watchdog": self.watchdog}
         named |= _named("read", self.read) | _named("write", self.write)
         problems = _twice_problems(named) + self.watchdog.problems()
         problems += [

@@ -71,7 +71,8 @@ class Outcome(IntEnum):
 class Answer(NamedTuple):
     """`connection` counts connections, over all engines of a link. `written` are StatusCodes, in order of the writes.
 
-    Without DONE there may be `written`, when the read failed after it; there are no readings then.
+    Without DONE there may be `written`, when the read failed after it; there are no readings then. `text` says why, or
+    is the serial number that was asked for: numbers alone are readings.
     """
 
     number: int

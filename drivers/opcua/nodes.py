@@ -18,11 +18,12 @@ _LIMITS = {
     "u32": (0, 0xFFFFFFFF),
     "i32": (-0x80000000, 0x7FFFFFFF),
 }
+SERIAL = "serial"  #: in place of a type: of a node that is read as text
 _LARGEST_F32 = 3.4028234663852886e38
 
 
 class Node(NamedTuple):
-    """`namespace` is a URI, `identifier` a name or i=NUMBER, `type` a type of a map."""
+    """`namespace` is a URI, `identifier` a name or i=NUMBER, `type` a type of a map, or SERIAL."""
 
     namespace: str
     identifier: str
@@ -76,6 +77,10 @@ class DeviceNodes:
         """Where the node of a map's entry stands. Raises ValueError for an identifier that cannot be."""
         identifier = entry.identifier(self._address, self._channel if channel is None else channel)
         return self._table.place(Node(self._namespace, identifier, kind))
+
+    def serial(self, entry: NodeRef | None) -> int | None:
+        """Where the node of a serial number stands. None: the map names none."""
+        return None if entry is None else self.place(entry, SERIAL)
 
 
 def to_type(number: float, kind: str) -> float:

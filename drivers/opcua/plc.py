@@ -32,6 +32,7 @@ class Plc:
         nodes = DeviceNodes(table, device.namespace, plc.address)
         self.watchdog = Watchdog(device.watchdog, watchdog_s, nodes)
         self.proof = Proof(plc.name, device.identity, self.watchdog, nodes)
+        self.serial = nodes.serial(device.serial)  #: its node
         self.prepare_reads = self.proof.nodes
         read, write = device.read, device.write
         self._read_m_per_s_per_count = si_per_count(read.speed.unit, read.speed.scale)

@@ -10,6 +10,7 @@ from drivers.opcua.plc import Plc
 from drivers.opcua.proof import Watchdog, not_read
 from drivers.opcua.status import describe, is_done
 from gateway.core.finding import Finding, finding
+from gateway.core.line_problem import printable
 from gateway.tasks.cleanup import finish
 
 Device = Axis | Amplifier | Plc
@@ -30,20 +31,23 @@ class Ask(Protocol):
     ) -> Answer: ...
 
 
-async def prepare_devices(ask: Ask, devices: Sequence[Device], noted: dict[Device, float]) -> list[Finding]:
+async def prepare_devices(
+    ask: Ask, devices: Sequence[Device], noted: dict[Device, float], serials: dict[str, str]
+) -> list[Finding]:
     """Check every device, set every watchdog and read it back. What speaks against it; it is undone then.
 
     What a watchdog was before it was written is in `noted` (counts) while it may have to be restored: also when this
-    is cancelled half-way.
+    is cancelled half-way. What devices tell of their serial numbers is in `serials`.
     """
     reasons: list[Finding] = []
     before: dict[Device, float] = {}
     for device in devices:
         try:
             readings = (await ask((), device.prepare_reads)).readings
+            against = device.against(readings) or await _read_serial(ask, device, serials)
         except NoAnswer as error:
             return [*reasons, finding("server-silent", device=device.name, error=str(error))]
-        reasons += device.against(readings)
+        reasons += against
         before[device] = readings[1].value  # of those that have one, the watchdog
     if reasons:
         return reasons
@@ -59,6 +63,18 @@ async def prepare_devices(ask: Ask, devices: Sequence[Device], noted: dict[Devic
     if reasons:
         return reasons + await finish(restore(ask, noted))
     noted.clear()
+    return []
+
+
+async def _read_serial(ask: Ask, device: Device, serials: dict[str, str]) -> list[Finding]:
+    """A question of its own: its answer's text is the number. An amplifier's is that of each load cell on it."""
+    if device.serial is None:
+        return []
+    answer = await ask((), (device.serial,))
+    if not answer.readings[0].good:
+        return [not_read(device.name, "serial", answer.readings[0])]
+    if answer.text:
+        serials.update(dict.fromkeys(device.name.split(", "), printable(answer.text)))
     return []
 
 

@@ -11,7 +11,7 @@ import time
 from collections.abc import Sequence
 
 from drivers.opcua.extent import behind_variant
-from drivers.opcua.nodes import Reading
+from drivers.opcua.nodes import SERIAL, Reading
 from drivers.opcua.status import BAD_TYPE_MISMATCH, describe, is_good
 
 READ, READ_ANSWER = 631, 634  #: numbers of the binary encodings (OPC 10000-6, annex A)
@@ -55,6 +55,10 @@ _TYPES = {
     "f64": (11, struct.Struct("<d")),
 }
 _FLOATS = ("f32", "f64")
+_STRING = 12
+_INTEGERS = {2: "<b", 3: "<B", 4: "<h", 5: "<H", 6: "<i", 7: "<I", 8: "<q", 9: "<Q"}
+_SERIALS = (0, _STRING, *_INTEGERS)  #: what a serial number may be: nothing at all, a text, a number
+_TYPES[SERIAL] = (_STRING, struct.Struct(""))
 
 
 class Misfit(Exception):
@@ -89,6 +93,7 @@ class Services:
             node + _WRITE_TAIL.pack(_VALUE, -1, _HAS_VALUE, number)
             for node, (number, _) in zip(nodes, self._types, strict=True)
         ]
+        self._serials = {(place,) for place, kind in enumerate(kinds) if kind == SERIAL}
         self._is_float = [kind in _FLOATS for kind in kinds]
 
     def read(self, places: tuple[int, ...]) -> Request:
@@ -130,6 +135,21 @@ class Services:
             raise Misfit(f"the server answered with {error}, result {len(readings) + 1} of {len(places)}") from error
         _check_end(answer, at, len(places))
         return tuple(readings)
+
+    def serial(self, answer: bytes, places: tuple[int, ...]) -> str:
+        """The serial number that was read alone, of an answer that `readings` took; empty: none."""
+        if places not in self._serials:
+            return ""
+        at = _results(answer, READ_ANSWER, 1)
+        mask, kind = answer[at], answer[at + 1]
+        if not mask & _HAS_VALUE or kind not in (_STRING, *_INTEGERS):
+            return ""
+        if kind != _STRING:
+            [number] = struct.unpack_from(_INTEGERS[kind], answer, at + 2)
+            return str(number) if number else ""
+        end = at + 2 + _COUNT.size
+        length = max(_COUNT.unpack_from(answer, at + 2)[0], 0)
+        return answer[end : end + length].decode(errors="backslashreplace").strip("\0 ")
 
 
 def statuses(answer: bytes, count: int) -> tuple[int, ...]:
@@ -185,7 +205,10 @@ def _reading(answer: bytes, at: int, number: int, layout: struct.Struct) -> tupl
     if mask & _HAS_VALUE:
         kind = answer[at]
         at += 1
-        if kind == number:
+        if number == _STRING:  # a number is read of all others
+            value = 0.0 if kind in _SERIALS else None
+            at = behind_variant(answer, at, kind)
+        elif kind == number:
             [value] = layout.unpack_from(answer, at)
             at += layout.size
         else:

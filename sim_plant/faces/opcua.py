@@ -228,7 +228,7 @@ def _data_value(variable: Variable, stamp: datetime) -> Any:
     return ua.DataValue(value, ua.StatusCode(int(status)), SourceTimestamp=stamp)
 
 
-def _variant(variable: Variable, value: Scalar) -> Any:
+def _variant(variable: Variable, value: Scalar | str) -> Any:
     return ua.Variant(value, ua.VariantType(variable.kind))
 
 

@@ -101,7 +101,7 @@ def plan_read(body: bytes, variables: Mapping[str, Variable], namespace: int) ->
             variable, at = _take_node(body, at, variables, namespace)
             attribute, index_range, encoding_namespace, encoding = _READ_TAIL.unpack_from(body, at)
             at += _READ_TAIL.size
-            if variable is None or attribute != VALUE:
+            if variable is None or variable.kind is Kind.STRING or attribute != VALUE:
                 return None
             if index_range not in _NO_STRING or encoding not in _NO_STRING or encoding_namespace:
                 return None

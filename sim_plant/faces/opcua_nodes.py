@@ -30,10 +30,12 @@ class Kind(IntEnum):
     UINT16 = 5
     UINT32 = 7
     DOUBLE = 11
+    STRING = 12
 
     @property
-    def zero(self) -> "Scalar":
-        return {Kind.BOOLEAN: False, Kind.DOUBLE: 0.0}.get(self, 0)
+    def zero(self) -> "Scalar | str":
+        zeros: dict[Kind, Scalar | str] = {Kind.BOOLEAN: False, Kind.DOUBLE: 0.0, Kind.STRING: ""}
+        return zeros.get(self, 0)
 
 
 class Status(IntEnum):
@@ -85,7 +87,7 @@ class Variable:
     device: Device
     name: str
     kind: Kind
-    read: Callable[[], Scalar]
+    read: Callable[[], Scalar | str]
     unit: str = ""
     accepts: Callable[[Scalar], bool] | None = None  #: whether a written value is in range; None: read only
     status: Callable[[], Status] = lambda: Status.GOOD
@@ -150,6 +152,7 @@ class _Axis:
         drive, written = self._drive, self._written
         return (
             Variable(self, "DeviceId", Kind.UINT32, lambda: AXIS_ID),
+            Variable(self, "SerialNumber", Kind.STRING, lambda: str(drive.serial)),
             Variable(self, "Statusword", Kind.UINT16, lambda: self._sample.statusword),
             Variable(self, "Speed", Kind.DOUBLE, lambda: self._sample.speed_m_per_s, "m/s"),
             Variable(self, "Torque", Kind.DOUBLE, lambda: self._sample.torque_nm, "Nm"),
@@ -188,6 +191,7 @@ class _Amplifier:
         amplifier = self._amplifier
         return (
             Variable(self, "DeviceId", Kind.UINT32, lambda: AMPLIFIER_ID),
+            Variable(self, "SerialNumber", Kind.STRING, lambda: str(amplifier.serial)),
             Variable(self, "Channels", Kind.UINT16, lambda: amplifier.channels),
             Variable(self, "SampleCounter", Kind.UINT16, lambda: self._counter),
             Variable(self, "Healthy", Kind.BOOLEAN, lambda: amplifier.healthy),
@@ -237,6 +241,7 @@ class _Line:
         written = self._written
         return (
             Variable(self, "DeviceId", Kind.UINT32, lambda: LINE_ID),
+            Variable(self, "SerialNumber", Kind.UINT32, lambda: self._plc.serial),
             Variable(self, "Permissive", Kind.BOOLEAN, lambda: self._status.permissive),
             Variable(self, "EmergencyStopHealthy", Kind.BOOLEAN, lambda: not self._status.emergency_stop),
             Variable(self, "Running", Kind.BOOLEAN, lambda: self._status.running),

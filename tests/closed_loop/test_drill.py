@@ -212,7 +212,7 @@ def exchange_drive(line, wiring, number=0x4711):
     return {each.name for each in devices_of(line.line)}, str(number)
 
 
-@pytest.mark.parametrize("wiring", sorted(set(WIRES) - {"opcua"}))
+@pytest.mark.parametrize("wiring", WIRES)
 def test_an_exchanged_drive_is_named_at_start_and_may_be_proved_alone(wiring):
     with virtual_line(wiring, 1) as line:
         assert drilled(line).ok

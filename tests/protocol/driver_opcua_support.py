@@ -32,6 +32,7 @@ NAMESPACE = "urn:r2rgate:devices"
 EPOCH = datetime(1601, 1, 1, tzinfo=UTC)
 GOOD, OUT_OF_RANGE, TYPE_MISMATCH = 0, ua.StatusCodes.BadOutOfRange, ua.StatusCodes.BadTypeMismatch
 U16, U32, F64, BOOL = (getattr(ua.VariantType, name) for name in ("UInt16", "UInt32", "Double", "Boolean"))
+STRING = ua.VariantType.String
 AFTER = {0x00: 0x0250, 0x06: 0x0231, 0x07: 0x0233, 0x0F: 0x1237, 0x02: 0x0217}  #: controlword: statusword
 
 
@@ -44,10 +45,12 @@ class Devices:
     def reset(self, axes: int = 2) -> None:
         self.nodes: dict[str, tuple[ua.VariantType, Any]] = {
             "Amplifier.DeviceId": (U32, 0x5206),
+            "Amplifier.SerialNumber": (STRING, " AMP-7\0"),
             "Amplifier.Channels": (U16, axes),
             "Amplifier.SampleCounter": (U16, 0),
             "Amplifier.Healthy": (BOOL, True),
             "Line.DeviceId": (U32, 0x5207),
+            "Line.SerialNumber": (ua.VariantType.UInt64, 2**63 + 1),
             "Line.Permissive": (BOOL, True),
             "Line.EmergencyStopHealthy": (BOOL, True),
             "Line.Running": (BOOL, False),
@@ -66,6 +69,7 @@ class Devices:
                 f"Cell{k}.Tension": (F64, 10.0 * k),
                 f"Cell{k}.Status": (U16, 0),
                 f"Axis{k}.DeviceId": (U32, 0x5205),
+                f"Axis{k}.SerialNumber": (STRING, f"AX-{k}"),
                 f"Axis{k}.Statusword": (U16, 0x0250),
                 f"Axis{k}.Speed": (F64, 0.1 * k),
                 f"Axis{k}.Torque": (F64, 1.0 * k),

@@ -329,6 +329,14 @@ REFUSALS: list[tuple[Callable[[DeviceServer], object], Finding]] = [
         finding("node-not-read", device="drive-1", node="identity", status="BadNodeIdUnknown"),
     ),
     (
+        lambda s: s.devices.nodes.pop("Axis2.SerialNumber"),
+        finding("node-not-read", device="drive-2", node="serial", status="BadNodeIdUnknown"),
+    ),
+    (
+        lambda s: s.devices.nodes.update({"Line.SerialNumber": (ua.VariantType.Double, 4711.0)}),
+        finding("node-not-read", device="plc", node="serial", status="BadTypeMismatch"),
+    ),
+    (
         lambda s: s.devices.set("Axis1.Statusword", 0x1237),
         finding("still-enabled", drive="drive-1", statusword=0x1237),
     ),

@@ -134,6 +134,8 @@ def test_a_round_trip_and_an_ordered_end(server: DeviceServer) -> None:
         await rig.enable(torque_nm=5.0)
         await rig.until(lambda: server.devices.value("Axis2.TargetTorque") == 5.0)
         assert list(rig.inputs.tension.value) == [10.0, 20.0]
+        cells = dict.fromkeys(("cell-1", "cell-2"), "AMP-7")
+        assert rig.link.serials == {"drive-1": "AX-1", "drive-2": "AX-2", "plc": str(2**63 + 1), **cells}
         assert of_process(pids[0], "limits", r"Max address space +\d+ +(\d+)") == ADDRESS_SPACE_BYTES
         assert os.sched_getaffinity(pids[0]) == set(processors_without(None))
 

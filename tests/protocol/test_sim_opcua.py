@@ -26,6 +26,7 @@ V, S = ua.VariantType, ua.StatusCodes
 
 AXIS = {
     "DeviceId": (V.UInt32, "r"),
+    "SerialNumber": (V.String, "r"),
     "Statusword": (V.UInt16, "r"),
     "Speed": (V.Double, "r"),
     "Torque": (V.Double, "r"),
@@ -40,6 +41,7 @@ AXIS = {
 }
 AMPLIFIER = {
     "DeviceId": (V.UInt32, "r"),
+    "SerialNumber": (V.String, "r"),
     "Channels": (V.UInt16, "r"),
     "SampleCounter": (V.UInt16, "r"),
     "Healthy": (V.Boolean, "r"),
@@ -47,6 +49,7 @@ AMPLIFIER = {
 CELL = {"Tension": (V.Double, "r"), "Status": (V.UInt16, "r")}
 LINE = {
     "DeviceId": (V.UInt32, "r"),
+    "SerialNumber": (V.UInt32, "r"),
     "Permissive": (V.Boolean, "r"),
     "EmergencyStopHealthy": (V.Boolean, "r"),
     "Running": (V.Boolean, "r"),

@@ -23,6 +23,8 @@ V = ua.VariantType
 HELLO = struct.pack("<4sIIIIIIi", b"HELF", 32, 0, 65536, 65536, 0, 0, -1)
 TOO_LARGE = 0x80800000  # BadTcpMessageTooLarge
 
+PLAIN = [kind for kind in Kind if kind is not Kind.STRING]  #: the stack answers for texts
+
 
 class _Bare:
     """A device that takes everything and shows what it was given."""
@@ -30,7 +32,7 @@ class _Bare:
     name = "Bare"
 
     def __init__(self) -> None:
-        self.values: dict[str, Scalar] = {kind.name: kind.zero for kind in Kind}
+        self.values: dict[str, Scalar] = {kind.name: kind.zero for kind in PLAIN}
         self.status = Status.GOOD
 
     def variables(self) -> list[Variable]:
@@ -39,7 +41,7 @@ class _Bare:
 
         return [
             Variable(self, kind.name, kind, reader(kind), accepts=lambda _: True, status=lambda: self.status)
-            for kind in Kind
+            for kind in PLAIN
         ]
 
     def sample(self, now_s: float) -> None: ...
@@ -55,7 +57,7 @@ VALUES = {
     Kind.UINT32: st.integers(0, 0xFFFFFFFF),
     Kind.DOUBLE: st.floats(allow_nan=False),
 }
-written = st.sampled_from(list(Kind)).flatmap(lambda kind: st.tuples(st.just(kind), VALUES[kind]))
+written = st.sampled_from(list(VALUES)).flatmap(lambda kind: st.tuples(st.just(kind), VALUES[kind]))
 stamp = st.none() | st.just(datetime(2024, 1, 1, tzinfo=UTC))
 
 
@@ -82,7 +84,7 @@ def test_written_values_are_read_from_the_bytes(
 
 
 @given(
-    st.fixed_dictionaries({kind: VALUES[kind] for kind in Kind}),
+    st.fixed_dictionaries(VALUES),
     st.lists(st.sampled_from(list(VARIABLES)), min_size=1),
     st.sampled_from(list(ua.TimestampsToReturn)[:4]),
     st.sampled_from([Status.GOOD, Status.UNCERTAIN_SENSOR_NOT_ACCURATE, Status.BAD_SENSOR_FAILURE]),
@@ -119,7 +121,9 @@ def test_the_answer_to_a_write() -> None:
 
 @given(st.data())
 def test_no_bytes_break_the_short_way(data: st.DataObject) -> None:
-    good = data.draw(st.sampled_from([read_body(list(VARIABLES)), write_body([(k, k.zero) for k in Kind], None, None)]))
+    good = data.draw(
+        st.sampled_from([read_body(list(VARIABLES)), write_body([(k, k.zero) for k in PLAIN], None, None)])
+    )
     body = bytearray(good)
     for _ in range(data.draw(st.integers(1, 6))):
         body[data.draw(st.integers(0, len(body) - 1))] = data.draw(st.integers(0, 255))

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from drivers.registry import map_files
 from gateway.cli.stepped import shown_as_described
-from gateway.core.line import CanopenBus, Drive, Line, LinePlc, LoadCell, OpcUaBus
+from gateway.core.line import CanopenBus, Drive, Line, LinePlc, LoadCell
 from gateway.core.wiring_proof import WiringProof, device_identities, devices_of, proof_hash, wiring_hash
 from gateway.loop.wiring import FILE, Wiring
 from gateway.supervisor.audit import Audit
@@ -20,9 +20,7 @@ SERIAL_OF_NODE_0 = 0x52520000  #: of a simulated CANopen node; its number is add
 def proof_of_wiring(line: Line, *, serials: bool = True) -> WiringProof:
     """Of `line` on simulated devices. Without `serials`: in memory, where nothing has a number."""
     canopen = {bus.name for bus in line.buses if isinstance(bus, CanopenBus)}
-    opcua = {bus.name for bus in line.buses if isinstance(bus, OpcUaBus)}
-    numbered = [each for each in devices_of(line) if serials and each.bus not in opcua]
-    numbers = {each.name: _serial(each, on_canopen=each.bus in canopen) for each in numbered}
+    numbers = {each.name: _serial(each, on_canopen=each.bus in canopen) for each in devices_of(line) if serials}
     maps = map_files(line)
     drives, cells, watchdogs = shown_as_described(line)
     return WiringProof(

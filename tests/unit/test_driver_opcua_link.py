@@ -85,7 +85,11 @@ class ScriptedChannel:
         self.devices.begin_read()
         nodes = [self._nodes[place] for place in question.reads]
         readings = tuple(
-            Reading(self.devices.status.get(node, 0), float(self.devices.value(node)), self.devices.source_us(node))
+            Reading(
+                self.devices.status.get(node, 0),
+                0.0 if "Serial" in node else float(self.devices.value(node)),
+                self.devices.source_us(node),
+            )
             for node in nodes
         )
         self._on_answer(Answer(question.number, outcome, self.connection, tuple(written), readings))

@@ -12,7 +12,7 @@ from asyncua.ua.ua_binary import nodeid_to_binary, struct_from_binary, struct_to
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.opcua.nodes import Reading
+from drivers.opcua.nodes import SERIAL, Reading
 from drivers.opcua.services import READ_VARIANTS, Misfit, Services, statuses
 from drivers.opcua.status import BAD_TYPE_MISMATCH
 
@@ -103,6 +103,27 @@ def test_readings_are_what_a_server_says(said: list[tuple[tuple[int, Any], int |
         Reading(status or 0, float(value), 0 if source is None else (source - EPOCH) // timedelta(microseconds=1))
         for (_, value), status, source, _ in said
     )
+
+
+@pytest.mark.parametrize(
+    ("value", "told"),
+    [
+        (ua.Variant(" SN-7\0", V.String), "SN-7"),
+        (ua.Variant("", V.String), ""),
+        (ua.Variant(None, V.String), ""),
+        (ua.Variant(None, V.Null), ""),
+        (ua.Variant(2**64 - 1, V.UInt64), str(2**64 - 1)),
+        (ua.Variant(-7, V.Int16), "-7"),
+        (ua.Variant(0, V.UInt32), ""),
+    ],
+)
+def test_a_serial_number_is_a_text_or_a_whole_number(value: ua.Variant, told: str) -> None:
+    asked = Services([nodeid_to_binary(IDS[0])], [SERIAL])
+    answer = answer_of([ua.DataValue(value, StatusCode=None)])
+    assert asked.readings(answer, (0,)) == (Reading(0, 0.0),) and asked.serial(answer, (0,)) == told
+    for other in (ua.Variant(4711.0, V.Double), ua.Variant(["SN-7"], V.String)):
+        (reading,) = asked.readings(answer_of([ua.DataValue(other, StatusCode=None)]), (0,))
+        assert reading.status == BAD_TYPE_MISMATCH
 
 
 NODE_IDS = [
