@@ -43,7 +43,7 @@ class Heads:
                 pass  # nothing is recorded that could be kept
             except OSError as error:
                 trouble = f"the heads of the audit are not kept: {self._path}: {error.strerror}"
-            except (ValueError, KeyError, TypeError):
+            except (ValueError, KeyError, TypeError, RecursionError):
                 trouble = "the heads of the audit are not kept: the gateway tells none as this version does"
             if trouble and trouble != self._told:
                 self._tell(trouble)
@@ -63,8 +63,9 @@ class Heads:
         if self._path.exists() and self._path.stat().st_size > MOST_BYTES:
             written_beside(self._path, thinned(self._read()).encode(), 0o644).replace(self._path)
         flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+        torn = self._read()[-1:] not in ("", "\n")  # a line that a cut of the power left unfinished
         with os.fdopen(os.open(self._path, flags, 0o644), "wb") as stream:
-            stream.write(kept_line(head, self._line, wall_s).encode())
+            stream.write(b"\n" * torn + kept_line(head, self._line, wall_s).encode())
             stream.flush()
             os.fsync(stream.fileno())
         self._last = head

@@ -122,6 +122,19 @@ class MinimumJerk:
         """Whether this value is on its way."""
         return bool(self._time_s[index] > 0.0 and self._begin_s[index] + self._time_s[index] > now_s)
 
+    def of(self, index: int, now_s: float) -> tuple[float, float]:
+        """Value and rate of one of them at a time, as `at` has them, sooner."""
+        since = now_s - float(self._begin_s[index])
+        c0, c1, c2, c3, c4, c5 = self._polynomial[:, index].tolist()
+        if since < 0.0:
+            rate = float(self._rate_before[index])
+            return c0 + since * rate, rate
+        if since >= float(self._time_s[index]) - HAIR_S:
+            return float(self.target[index]), 0.0
+        s = since
+        value = c0 + s * (c1 + s * (c2 + s * (c3 + s * (c4 + s * c5))))
+        return value, c1 + s * (2.0 * c2 + s * (3.0 * c3 + s * (4.0 * c4 + s * 5.0 * c5)))
+
     def at(self, now_s: float) -> FloatArray:
         """Value, rate and acceleration (3, m) at a time; before a move began, at the rate that led to its beginning."""
         since: FloatArray = now_s - self._begin_s

@@ -32,7 +32,7 @@ def finding(code: str, **parameters: float | str) -> Finding:
 
 def _value(value: float | str) -> Value:
     if isinstance(value, str):
-        return value[:LONGEST_PARAMETER]
+        return value[:LONGEST_PARAMETER].encode("utf-8", "replace").decode("utf-8")  # a lone surrogate is no text
     if isinstance(value, int) and not isinstance(value, bool):
         return value
     number = float(value)  # of numpy, too

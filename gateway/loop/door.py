@@ -114,11 +114,14 @@ class Door:
     async def _submit(self, command: Command, proof: Proof | None) -> Reply:
         if not isinstance(command, Stop):
             return await self._behind.submit(command, proof)
-        self.stopper = PEER.get()
+        peer = PEER.get()
+        if self.stopper is None:  # of several at once the first one stops the line
+            self.stopper = peer
         try:
             return await self._behind.submit(command, proof)
         finally:
-            self.stopper = None
+            if self.stopper is peer:
+                self.stopper = None
 
     async def _of_gateway(self, payload: bytes) -> Reply:
         if not self._is_open:  # its devices may not be there yet; nobody has done anything wrong

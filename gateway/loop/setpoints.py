@@ -28,12 +28,17 @@ class OnTheWay:
     curve: MinimumJerk  #: tensions (n,), then the speed
     now_s: float  #: on the curve
     speed_lag_s: float  #: from the speed that is asked for to that which the unwinder has
+    tensions_move: bool  #: not the speed alone
     moving: bool = True
 
     def ahead(self, time_s: float) -> Motion:
-        tension, rate, acceleration = self.curve.at(self.now_s + time_s)[:, :-1]
-        now, then = (self.curve.at(self.now_s - self.speed_lag_s + t)[:, -1] for t in (0.0, time_s))
-        return Motion(tension, rate, acceleration, float(then[1]), float(then[0] - now[0]))
+        if self.tensions_move:
+            tension, rate, acceleration = self.curve.at(self.now_s + time_s)[:, :-1]
+        else:
+            tension, rate, acceleration = self.tension_n, (none := np.zeros(len(self.tension_n))), none
+        i, now_s = len(self.tension_n), self.now_s - self.speed_lag_s
+        speed, unwind_acceleration = self.curve.of(i, now_s + time_s)
+        return Motion(tension, rate, acceleration, unwind_acceleration, speed - self.curve.of(i, now_s)[0])
 
 
 class Setpoints:
@@ -74,9 +79,11 @@ class Setpoints:
 
     def reference(self, speed_lag_s: float) -> Reference:
         """What control is told; `speed_lag_s` is from a speed that is asked for to that which the unwinder has."""
-        if not self._curve.moving(self._time_s - speed_lag_s):
+        curve, before_s = self._curve, self._time_s - speed_lag_s
+        if not curve.moving(before_s):
             return Steady(self.tension_n)
-        return OnTheWay(self.tension_n, self._curve, self._time_s, speed_lag_s)
+        tensions_move = any(curve.is_moving(i, before_s) for i in range(len(self.tension_n)))
+        return OnTheWay(self.tension_n, curve, self._time_s, speed_lag_s, tensions_move)
 
     def step_tension(self, span: int, tension_n: float, now_s: float) -> None:
         """Make a change at once. Span from 0."""
@@ -182,7 +189,7 @@ class Setpoints:
         if self._ramp != wanted:
             self._curve.ramp(i, goal_m_per_s, rate_m_per_s2, before_s)
             self._ramp = wanted
-        self.speed_m_per_s = float(self._curve.at(self._time_s)[0, i])
+        self.speed_m_per_s = self._curve.of(i, self._time_s)[0]
         self._ramped[-1] = self.speed_m_per_s != goal_m_per_s
 
     def followed_by(self, tension_n: FloatArray, measured: FloatArray) -> bool:

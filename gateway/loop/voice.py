@@ -75,7 +75,7 @@ class Voice:
         """That the line is being stopped from now on, from where, and who wanted it; None: it is not."""
         if after.state is not LoopState.STOP or before.state is LoopState.STOP:
             return None
-        asked = after.reason.startswith(OPERATORS_STOP)
+        asked = after.reason == OPERATORS_STOP  # a proof that is over has it in its words, too
         if not asked and most_severe(findings) < Action.STOP and before.phase not in _MOVING:
             return None  # a drill or a proof that is over, an arming that came to nothing
         peer = self.stopper() if asked else None

@@ -1,7 +1,7 @@
 """Stops of the line on record: each once, with what led to it and who asked, as far as the loop and the kernel know."""
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 from gateway.core.audit_record import Who
 from gateway.core.messages import Event
@@ -16,7 +16,7 @@ MOST_FINDINGS = 8
 
 def hear_stop(event: Event, records: LoopRecords, asked: Callable[[], Who | None]) -> None:
     """An event of the loop; most are no stop. `asked`: who asked the gateway for the last one."""
-    if event.kind != "state" or (stopped := event.data.get("stopped")) is None:
+    if event.kind != "state" or not isinstance(stopped := event.data.get("stopped"), Mapping):
         return
     by_person, pid, uid = (stopped.get(key) for key in ("by_person", "pid", "uid"))
     who = NOT_KNOWN if by_person else LOOP

@@ -1,10 +1,11 @@
 """What the loop tells of a stop: each event on the way has what led to it, as data."""
 
 from gateway.core.messages import Event
-from gateway.core.states import Phase
+from gateway.core.states import OPERATORS_STOP, Phase
 from gateway.core.telemetry import Frame, unpack
 from gateway.core.topics import LOOP_EVENT
 from gateway.loop.machine import Machine
+from gateway.loop.proving import PROVED
 from gateway.loop.voice import Voice
 from safety.actions import Action, Finding, found
 from tests.unit.supervisor_support import frame_of
@@ -41,6 +42,23 @@ def test_what_led_to_a_stop_is_told_until_the_line_is_armed_again():
 
 def test_what_a_person_wanted_has_no_code():
     assert told((Phase.SLOWING, []), (Phase.OFF, [])) == [[], []]
+
+
+def stopped(before: Phase, after: Machine, findings: list[Finding]) -> object:
+    """What the event says of a stop that begins; None: it is none."""
+    heard = Heard()
+    Voice(heard, [], 0.01).announce(Machine(before), after, findings)
+    (event,) = heard.events
+    return event.data.get("stopped")
+
+
+def test_a_stop_is_a_persons_where_a_person_wants_it_and_the_end_of_a_proof_is_none() -> None:
+    by_person = stopped(Phase.RUNNING, Machine(Phase.SLOWING, 0.0, OPERATORS_STOP), [])
+    assert by_person == {"state": "RUN", "phase": "RUNNING", "by_person": True}
+    by_itself = stopped(Phase.RUNNING, Machine(Phase.SLOWING, 0.0, WHY.text), [WHY])
+    assert by_itself == {"state": "RUN", "phase": "RUNNING", "by_person": False}
+    assert stopped(Phase.PROVING, Machine(Phase.UNLOADING, 0.0, PROVED), []) is None
+    assert stopped(Phase.SLOWING, Machine(Phase.UNLOADING, 0.0, OPERATORS_STOP), []) is None
 
 
 class Deaf(Heard):

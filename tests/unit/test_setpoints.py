@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gateway.core.line import Moves, Recipe
-from gateway.loop.setpoints import Setpoints
+from gateway.loop.setpoints import OnTheWay, Setpoints
 
 MOVES = Moves(shape="minimum-jerk", tension_rate_n_per_s=20.0, speed_rate_m_per_s2=0.05)
 PERIOD_S = 0.01
@@ -113,3 +113,18 @@ def test_each_stop_is_a_ramp_also_the_second_one() -> None:
         on_its_way = moving.speed_m_per_s
         moving.advance(MOVES, PERIOD_S, 0.0, 0.1, "ramp")
         assert moving.speed_m_per_s == pytest.approx(on_its_way - 0.1 * PERIOD_S)
+
+
+def test_one_value_of_the_curves_is_what_all_of_them_say() -> None:
+    moving = setpoints()
+    moving.tension_target_n[0] = 40.0
+    for goal, rate in ((0.08, 0.05), (0.02, 0.1), (0.1, 0.05)):
+        for _ in range(40):
+            moving.advance(MOVES, PERIOD_S, goal, rate, "ramp")
+            reference = moving.reference(0.02)
+            if isinstance(reference, OnTheWay):
+                curve, times_s = reference.curve, reference.now_s + np.array([-0.05, -0.02, 0.0, 0.015, 3.0])
+                for time_s in times_s.tolist():
+                    assert curve.of(2, time_s) == pytest.approx(tuple(curve.at(time_s)[:2, 2]), abs=1e-12)
+                ahead = reference.ahead(0.015)
+                assert ahead.tension_n == pytest.approx(curve.at(reference.now_s + 0.015)[0, :-1])

@@ -9,6 +9,8 @@ const MOST_STEPS = 2000 // after a pause of the process
 const STIFFNESS_N = 2200, LENGTH_M = 1.2, RADIUS_M = 0.035, INERTIA_KG_M2 = 1.0, FRICTION_NMS = 15.0
 const NOISE_N = 0.1
 const RATED_TORQUE_NM = 60.0
+// Of the first drive (the next ones follow), the amplifier and the line PLC: those that the wiring is proved with.
+const SERIALS = { drive: 0x52530001, amplifier: 0x52540000, plc: 0x52550000 }
 const STATUSWORD = { DISABLED: 0x0250, READY: 0x0231, SWITCHED_ON: 0x0233, ENABLED: 0x1237, QUICK_STOP: 0x0217, FAULT: 0x0218 }
 const WATCHDOG_ERROR = 0x8250
 
@@ -170,4 +172,4 @@ class LineModel {
   }
 }
 
-module.exports = { LineModel, Watchdog, RATED_TORQUE_NM }
+module.exports = { LineModel, Watchdog, RATED_TORQUE_NM, SERIALS }

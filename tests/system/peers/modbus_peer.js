@@ -3,7 +3,7 @@
 
 const modbus = require('modbus-stream')
 const { serve } = require('./control')
-const { LineModel, Watchdog, RATED_TORQUE_NM } = require('./line_model')
+const { LineModel, Watchdog, RATED_TORQUE_NM, SERIALS } = require('./line_model')
 
 const AMPLIFIER = 1, PLC = 2, FIRST_DRIVE = 11
 const MOST_REGISTERS = 125
@@ -16,6 +16,7 @@ const uint16 = (bytes) => bytes.readUInt16BE(0)
 const int32 = (bytes) => Buffer.concat(bytes).readInt32BE(0)
 const um = (metres) => Math.round(1e6 * metres)
 const words32 = (value) => [high(value), word(value)]
+const text = (value, count) => Array.from({ length: count }, (_, k) => Buffer.from(String(value).padEnd(2 * count, '\0').slice(2 * k, 2 * k + 2)))
 const zeros = (count) => Array.from({ length: count }, () => word(0))
 function float32 (value) {
   const bytes = Buffer.alloc(4)
@@ -26,7 +27,7 @@ function float32 (value) {
 const units = new Map([[AMPLIFIER, {
   functions: [3, 4],
   read: () => [
-    word(0x5201), word(line.spans), word(1), word(line.measured.counter), ...zeros(12),
+    word(0x5201), word(line.spans), word(1), word(line.measured.counter), ...text(SERIALS.amplifier, 8), ...zeros(4),
     ...Array.from(line.measured.tension).flatMap((tension, i) => {
       return line.broken.has(i) ? [...float32(NaN), word(2), word(0)] : [...float32(tension), word(0), word(0)]
     })
@@ -39,7 +40,7 @@ const units = new Map([[AMPLIFIER, {
     const { plc } = line
     const status = plc.permissive | plc.emergencyStopHealthy << 1 | plc.running << 2 | plc.tripped << 3
     return [
-      word(0x5202), word(status), ...words32(um(plc.speed)), word(plc.life), ...zeros(5),
+      word(0x5202), word(status), ...words32(um(plc.speed)), word(plc.life), ...words32(SERIALS.plc), ...zeros(3),
       word(plc.commanded), ...words32(um(plc.request)), word(plc.life), word(plc.watchdog.ms)
     ]
   },
@@ -58,7 +59,7 @@ line.axes.forEach((axis, i) => units.set(FIRST_DRIVE + i, {
   read: () => [
     word(0x5203), word(axis.statusword), ...words32(um(axis.speed)), word(Math.round(1000 * axis.torqueNm / RATED_TORQUE_NM)),
     word(0), word(axis.error), ...zeros(3), word(axis.controlword), word(Math.round(1000 * axis.torqueNm / RATED_TORQUE_NM)),
-    ...zeros(8), ...words32(1000 * RATED_TORQUE_NM), word(1000), word(axis.watchdog.ms)
+    ...words32(SERIALS.drive + i), ...zeros(6), ...words32(1000 * RATED_TORQUE_NM), word(1000), word(axis.watchdog.ms)
   ],
   write: (registers, written) => {
     if (!Watchdog.allows(uint16(registers[23]))) return 'IllegalDataValue'

@@ -9,7 +9,7 @@ const { DataValue } = require('node-opcua-data-value')
 const { OPCUAServer } = require('node-opcua-server')
 const { StatusCodes } = require('node-opcua-status-code')
 const { DataType, Variant } = require('node-opcua-variant')
-const { LineModel, Watchdog, RATED_TORQUE_NM } = require('./line_model')
+const { LineModel, Watchdog, RATED_TORQUE_NM, SERIALS } = require('./line_model')
 
 const line = new LineModel(Number(process.argv[2]))
 const { plc } = line
@@ -58,9 +58,9 @@ const written = (dataType, device, key, act, value, allowed = () => true) => ({
     return StatusCodes.Good
   }
 })
-const { Boolean: BOOLEAN, UInt16: UINT16, UInt32: UINT32, Double: DOUBLE } = DataType
+const { Boolean: BOOLEAN, UInt16: UINT16, UInt32: UINT32, Double: DOUBLE, String: STRING } = DataType
 
-function axisNodes (axis) {
+function axisNodes (axis, i) {
   let life = 0
   let torqueNm = 0
   const act = (values) => {
@@ -71,6 +71,7 @@ function axisNodes (axis) {
   }
   return {
     DeviceId: read(UINT32, () => 0x5205),
+    SerialNumber: read(STRING, () => String(SERIALS.drive + i)),
     Statusword: read(UINT16, () => axis.statusword),
     Speed: read(DOUBLE, () => axis.speed),
     Torque: read(DOUBLE, () => axis.torqueNm),
@@ -94,6 +95,7 @@ function lineNodes () {
   }
   return {
     DeviceId: read(UINT32, () => 0x5207),
+    SerialNumber: read(UINT32, () => SERIALS.plc),
     Permissive: read(BOOLEAN, () => plc.permissive),
     EmergencyStopHealthy: read(BOOLEAN, () => plc.emergencyStopHealthy),
     Running: read(BOOLEAN, () => plc.running),
@@ -111,6 +113,7 @@ function lineNodes () {
 
 const amplifierNodes = () => ({
   DeviceId: read(UINT32, () => 0x5206),
+  SerialNumber: read(STRING, () => String(SERIALS.amplifier)),
   Channels: read(UINT16, () => line.spans),
   SampleCounter: read(UINT16, () => line.measured.counter),
   Healthy: read(BOOLEAN, () => true)
@@ -134,7 +137,7 @@ function build (addressSpace) {
       })
     }
   }
-  line.axes.forEach((axis, i) => add(`Axis${i + 1}`, axisNodes(axis)))
+  line.axes.forEach((axis, i) => add(`Axis${i + 1}`, axisNodes(axis, i)))
   add('Amplifier', amplifierNodes())
   line.axes.forEach((_, i) => add(`Cell${i + 1}`, cellNodes(i)))
   add('Line', lineNodes())
