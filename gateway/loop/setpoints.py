@@ -28,7 +28,7 @@ class OnTheWay:
     curve: MinimumJerk  #: tensions (n,), then the speed
     now_s: float  #: on the curve
     speed_lag_s: float  #: from the speed that is asked for to that which the unwinder has
-    tensions_move: bool  #: not the speed alone
+    tensions_move: bool = True  #: not the speed alone
     moving: bool = True
 
     def ahead(self, time_s: float) -> Motion:
