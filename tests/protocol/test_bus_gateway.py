@@ -272,7 +272,7 @@ def test_the_heads_that_a_peer_has_kept_show_a_history_that_was_made_anew_from_s
         with gateway(folder):
             await status_with(folder, lambda status: bool(status.audit_head))
             with child(AGENTS, folder, tmp_path):
-                await until(kept.exists)
+                await until(lambda: kept.exists() and kept.read_text().endswith("\n"))
             async with client(folder) as agents:
                 assert (await proposed(agents)).ok
             await status_with(folder, lambda status: status.audit_head not in kept.read_text())
