@@ -1,6 +1,7 @@
 """What belongs to another program is left as it is, whichever of our files it lies in the place of."""
 
 import hashlib
+import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -133,17 +134,38 @@ def test_whoever_opens_it_in_the_same_process_does_not_take_the_writers_lock_alo
     writer.close()
 
 
-def test_the_lock_of_a_write_ahead_log_outlives_whoever_reads_it_in_the_same_process(tmp_path: Path) -> None:
-    """It says that somebody has the file open. Without it another process takes itself for the only one."""
-    path = tmp_path / "file.sqlite"
-    writer = begin(path, store.KIND)
+def refused(path: Path, kind: FileKind) -> Any:
+    """It was looked at to see whose it is."""
+    with pytest.raises(kind.anothers or kind.error, match="belongs to another program"):
+        open_there(path, replace(kind, application_id=77))
+    return open_to_read(path, kind)
+
+
+LOOKS = {"begun": begin, "opened": open_there, "read": open_to_read, "refused": refused}
+
+
+@pytest.mark.parametrize("name", KINDS)
+@pytest.mark.parametrize("opened", LOOKS.values(), ids=LOOKS)
+def test_the_locks_of_a_process_outlive_whoever_opens_the_file_in_it(
+    tmp_path: Path, name: str, opened: Callable[[Path, FileKind], Any]
+) -> None:
+    """As the kernel lists them. Without them another process takes itself for the only one that has the file open."""
+    path, kind = tmp_path / "file.sqlite", KINDS[name]
+    holder = begin(path, kind)
+    holder.execute("BEGIN; SELECT count(*) FROM sqlite_schema").fetchall()
     before = locks_on(path)
-    open_to_read(path, store.KIND).close()
-    assert locks_on(path) == before != set()
-    writer.close()
+    assert before
+    opened(path, kind).close()
+    assert locks_on(path) == before
+    holder.close()
 
 
 def locks_on(path: Path) -> set[tuple[str, ...]]:
-    """What the kernel says: kind, first and last byte."""
+    """What this process holds of a database and what lies beside it: kind, file, first and last byte."""
+    files = {str(one.stat().st_ino) for one in path.parent.glob(f"{path.name}*")}
     rows = [row.split() for row in Path("/proc/locks").read_text().splitlines()]
-    return {(row[3], *row[6:]) for row in rows if row[5].endswith(f":{path.stat().st_ino}")}
+    return {
+        (row[3], inode, *row[6:])
+        for row in rows
+        if row[4] == str(os.getpid()) and (inode := row[5].rpartition(":")[2]) in files
+    }

@@ -3,23 +3,33 @@
 import asyncio
 import os
 import signal
+import sqlite3
 import subprocess
 import time
 from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
-from contextlib import asynccontextmanager, contextmanager
+from contextlib import asynccontextmanager, closing, contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from gateway.core.line_past import RecordsAfter, TensionsBetween
 from gateway.core.messages import Event, Reply
 from gateway.core.states import LoopState, Phase
 from gateway.core.status import GatewayStatus
-from gateway.core.topics import GATEWAY_COMMAND, GATEWAY_STATUS, LOOP_COMMAND, LOOP_EVENT, LOOP_SHOWN, LOOP_TELEMETRY
+from gateway.core.topics import (
+    GATEWAY_COMMAND,
+    GATEWAY_PAST,
+    GATEWAY_STATUS,
+    LOOP_COMMAND,
+    LOOP_EVENT,
+    LOOP_SHOWN,
+    LOOP_TELEMETRY,
+)
 from gateway.mailbox.port import RemoteError, Unreachable
 from gateway.mailbox.unix import UnixMailbox
 from gateway.supervisor.history import History
-from tests.unit.supervisor_support import ShowsWho, child, frame_of, short_folder
+from tests.unit.supervisor_support import ShowsWho, child, frame_of, short_folder, until
 
 pytestmark = pytest.mark.wires
 
@@ -307,3 +317,32 @@ def test_a_handler_that_raises_ends_no_connection_and_is_not_silent() -> None:
                 assert "LookupError: nothing like it" in found.task_faults[0].text
 
     run(story)
+
+
+def test_a_question_of_the_past_costs_the_gateway_no_lock_and_another_program_no_row() -> None:
+    """Where nobody holds a lock, an SQLite before 3.51 takes itself for the last one and deletes the log."""
+
+    async def story(folder: Path) -> None:
+        history = folder / "data" / "history.sqlite"
+        with gateway(folder) as process:
+            async with loop_and_client(folder) as (loop, client):
+                client.connect((GATEWAY_PAST,), folder / "gateway.sock")
+                await heard(loop, client)
+                await until(lambda: locks_of(process.pid, history) != set())
+                before = locks_of(process.pid, history)
+                now_s = time.time()
+                for asked in (TensionsBetween(from_wall_s=now_s - 60.0, to_wall_s=now_s), RecordsAfter()):
+                    await client.request(GATEWAY_PAST, asked.model_dump_json().encode(), 10.0)
+                assert locks_of(process.pid, history) == before
+                with closing(sqlite3.connect(history)) as another:
+                    another.execute("SELECT count(*) FROM blob").fetchone()
+                assert history.with_name("history.sqlite-wal").exists()
+
+    run(story)
+
+
+def locks_of(pid: int, path: Path) -> set[tuple[str, ...]]:
+    """What a process holds of a file, as the kernel lists it: kind, first and last byte."""
+    rows = [row.split() for row in Path("/proc/locks").read_text().splitlines()]
+    inode = f":{path.stat().st_ino}" if path.exists() else "of none"
+    return {(row[3], *row[6:]) for row in rows if row[4] == str(pid) and row[5].endswith(inode)}
