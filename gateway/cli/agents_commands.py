@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 import typer
 
 from gateway.cli.operate_commands import RunFolder
-from gateway.cli.process_commands import REFUSED, DataFolder, LineFile, default_data_folder, read_line
+from gateway.cli.process_commands import REFUSED, DataFolder, LineFile, begin_process, read_line
 from gateway.core.topics import AGENT_NAMES
 
 if TYPE_CHECKING:
@@ -43,11 +43,9 @@ def agents(
     from agents.heads import FILE as HEADS
     from agents.process import run_agents
     from gateway.cli.ask_run import FOLDER
-    from gateway.mailbox.paths import default_run_folder
 
     line = read_line(file)
-    data = data_dir or default_data_folder(line)
-    where = run_dir or default_run_folder(line)
+    where, data = begin_process(line, run_dir, data_dir)
     raise typer.Exit(run_agents(line, _remote(gateway, certificate) or where, data / FOLDER, data / HEADS))
 
 

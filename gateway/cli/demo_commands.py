@@ -56,7 +56,7 @@ def demo(
         _refuse(f"--url {url} says where a language model answers; name it with --model")
     if model is not None and quick:
         _refuse(f"--model {model} is for the whole demonstration; with --quick nothing is asked of the agents")
-    writable_folder(out, "--out")
+    writable_folder(out, "--out", 0o777)
     asked = None if model is None else LanguageModelAsked(url or Agents().url, model)
     end_as_by_ctrl_c()
     raise typer.Exit(run_demo(out, seed, (law or "lqi") if quick else None, asked, stay))

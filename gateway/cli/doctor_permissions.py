@@ -9,6 +9,8 @@ from pathlib import Path
 from gateway.cli.doctor_check import Check
 from gateway.cli.doctor_machine import existing
 from gateway.core.line import CanopenBus, Line
+from gateway.mailbox.who_serves import owners, unsafe_place
+from gateway.wording.catalogue import sentence
 
 ROOT = Path("/")
 _GROUP = "permissions"
@@ -16,17 +18,17 @@ _GROUP = "permissions"
 
 def permissions(line: Line, run_folder: Path, data_folder: Path, root: Path = ROOT) -> Iterator[Check]:
     """`root` is where /sys is found."""
-    yield _folder("run folder", run_folder, private=True)
-    yield _folder("data folder", data_folder, private=False)
+    yield _folder("run folder", run_folder, of_sockets=True)
+    yield _folder("data folder", data_folder, of_sockets=False)
     for bus in line.buses:
         if isinstance(bus, CanopenBus) and bus.interface == "socketcan":
             yield _can_interface(bus, root)
 
 
-def _folder(subject: str, folder: Path, *, private: bool) -> Check:
-    """It exists and may be written, or may be made. `private`: nobody else may put a socket into it."""
+def _folder(subject: str, folder: Path, *, of_sockets: bool) -> Check:
+    """It exists and may be written, or may be made; nobody else may put a socket into it, or read data in it."""
     there = existing(folder)
-    wanted = "may be written by this user" + (", by no other" if private else "")
+    wanted = f"may be written by this user, {'written' if of_sockets else 'read'} by no other"
     option = f"--{subject.split()[0]}-dir"
     found = there.stat()
     owner, mode = found.st_uid, stat.S_IMODE(found.st_mode)
@@ -38,10 +40,12 @@ def _folder(subject: str, folder: Path, *, private: bool) -> Check:
     if not os.access(there, os.W_OK | os.X_OK):
         todo = f"`chown {os.geteuid()} {there}`, or choose another with {option}"
         return Check(_GROUP, subject, "", "FAIL", f"{measured}: may not be written", wanted, todo)
-    made = there == folder.absolute()
-    if private and made and (owner not in (os.geteuid(), 0) or mode & (stat.S_IWGRP | stat.S_IWOTH)):
-        todo = f"`chmod 700 {folder}` as its owner, or choose another with {option}"
-        return Check(_GROUP, subject, "", "FAIL", f"{measured}: others may write it", wanted, todo)
+    if of_sockets and (unsafe := unsafe_place(folder, owners(folder))) is not None:
+        todo = f"`chmod 700 {unsafe.parameters['place']}` as its owner, or choose another with {option}"
+        return Check(_GROUP, subject, "", "FAIL", sentence(unsafe), wanted, todo)
+    if not of_sockets and there == folder.absolute() and mode & (stat.S_IRWXG | stat.S_IRWXO):
+        todo = f"`chmod 700 {folder}` as its owner: whoever may read a database may also lock it"
+        return Check(_GROUP, subject, "", "warning", f"{measured}: others may come in", wanted, todo)
     return Check(_GROUP, subject, "", "OK", measured, wanted)
 
 

@@ -22,6 +22,7 @@ from gateway.cli.model_place import (
 from gateway.cli.process_commands import REFUSED, DataFolder, data_base
 from gateway.core.line_model import LineModel, canonical
 from gateway.core.line_problem import printable
+from gateway.mailbox.paths import folder_in
 from gateway.supervisor.model_store import ModelsError
 from gateway.supervisor.models import FILE_NAME, Entry, begin_repository, open_repository
 
@@ -213,7 +214,7 @@ def _stored(place: Place) -> list[Entry]:
 def _place_for(model: LineModel, line: Path | None, data_dir: Path | None) -> Place:
     """Where a model goes: it names its line itself."""
     if line is None and data_dir is None:
-        return Place(data_base() / f"{model.site}-{model.line}" / FILE_NAME)
+        return Place(folder_in(data_base(), model.site, model.line) / FILE_NAME)
     return place_of(line, data_dir)
 
 

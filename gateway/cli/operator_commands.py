@@ -6,7 +6,7 @@ from gateway.cli.process_commands import (
     DataFolder,
     LineFile,
     RunFolder,
-    default_data_folder,
+    begin_process,
     read_line,
     writable_folder,
 )
@@ -22,9 +22,8 @@ def operator(file: LineFile, run_dir: RunFolder = None, data_dir: DataFolder = N
 
     Example: r2rgate operator line.toml
     """
-    from gateway.mailbox.paths import default_run_folder
     from gateway.operator.process import run_operator
 
     line = read_line(file)
-    data = writable_folder(data_dir or default_data_folder(line), "--data-dir")
-    raise typer.Exit(run_operator(line, run_dir or default_run_folder(line), data))
+    run_folder, data = begin_process(line, run_dir, data_dir)
+    raise typer.Exit(run_operator(line, run_folder, writable_folder(data, "--data-dir")))

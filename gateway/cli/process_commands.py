@@ -1,9 +1,11 @@
 """The processes of r2rgate, each in the foreground, and `run`, which starts them together."""
 
+import os
+import stat
 import sys
 import traceback
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING, Annotated, NoReturn
@@ -16,7 +18,7 @@ from gateway.core.line import Line
 from gateway.core.line_file import load_line
 from gateway.core.line_problem import LineRefused, printable
 from gateway.files import MOST_BYTES, read_bytes
-from gateway.mailbox.paths import default_run_folder
+from gateway.mailbox.paths import default_run_folder, folder_in, take
 
 if TYPE_CHECKING:
     from gateway.core.controller import Controller
@@ -46,16 +48,38 @@ def read_line(file: Path) -> Line:
 
 def data_base() -> Path:
     """Where the lines' folders lie: /var/lib/r2rgate where it may be written, else the user's own state folder."""
-    from os import W_OK, access, environ
-
     service = Path("/var/lib/r2rgate")
-    own = Path(environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state") / "r2rgate"
-    return service if access(service, W_OK) else own
+    own = Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state") / "r2rgate"
+    return service if os.access(service, os.W_OK) else own
 
 
 def default_data_folder(line: Line) -> Path:
-    """site-line in `data_base`."""
-    return data_base() / f"{line.site}-{line.line}"
+    """site_line in `data_base`."""
+    return folder_in(data_base(), line.site, line.line)
+
+
+def begin_process(line: Line, run_dir: Path | None, data_dir: Path | None) -> tuple[Path, Path]:
+    """Run folder and data folder of a process of the line. All that it makes from now on is its user's alone."""
+    os.umask(0o077)
+    folders = run_dir or default_run_folder(line), data_dir or default_data_folder(line)
+    _close_to_others(folders[1], always=data_dir is None)
+    if run_dir is None:
+        take(folders[0], line.site, line.line)
+    if data_dir is None:
+        take(folders[1], line.site, line.line)
+    return folders
+
+
+def _close_to_others(data: Path, *, always: bool) -> None:
+    """A data folder as an earlier version has made it: whoever may read a database may lock it.
+
+    One that was named, and may be of other things, too, is closed where databases lie in it.
+    """
+    with suppress(OSError):  # it is not there yet, or whoever needs it says that it cannot be used
+        found = data.stat()
+        open_to_others = found.st_uid == os.geteuid() and found.st_mode & (stat.S_IRWXG | stat.S_IRWXO)
+        if open_to_others and (always or any(data.glob("*.sqlite"))):
+            data.chmod(0o700)
 
 
 def loop(
@@ -80,7 +104,8 @@ def loop(
     from gateway.mailbox.listener import AlreadyRunning, CannotListen, PathTooLong
 
     line = read_line(file)
-    path = controller or (data_dir or default_data_folder(line)) / "controller.json"
+    run_folder, data = begin_process(line, run_dir, data_dir)
+    path = controller or data / "controller.json"
     way_out = f"r2rgate design {quote(str(file))} --out {quote(str(path))}"
     try:
         config = parse_controller(read_bytes(path, MOST_BYTES))
@@ -96,9 +121,9 @@ def loop(
             run_loop(
                 line,
                 config,
-                run_dir or default_run_folder(line),
+                run_folder,
                 lambda text: print(text, file=sys.stderr, flush=True),
-                data_dir or default_data_folder(line),
+                data,
                 simulated=simulated,
             )
     except AlreadyRunning as error:
@@ -115,9 +140,10 @@ def gateway(file: LineFile, run_dir: RunFolder = None, data_dir: DataFolder = No
     from gateway.supervisor.process import run_gateway
 
     line = read_line(file)
-    data = writable_folder(data_dir or default_data_folder(line), "--data-dir")
+    run_folder, data = begin_process(line, run_dir, data_dir)
+    writable_folder(data, "--data-dir")
     with _a_crash_is_no_refusal():
-        code = run_gateway(line, run_dir or default_run_folder(line), data)
+        code = run_gateway(line, run_folder, data)
     raise typer.Exit(code)
 
 
@@ -190,10 +216,9 @@ def run(
     line = read_line(file)
     if plant is not None:
         _require_plant(line, file, plant)
-    data = data_dir or default_data_folder(line)
-    run_folder = run_dir or default_run_folder(line)
+    run_folder, data = begin_process(line, run_dir, data_dir)
     _require_alone(run_folder)
-    writable_folder(run_folder, "--run-dir", 0o700)
+    writable_folder(run_folder, "--run-dir")
     writable_folder(data, "--data-dir")
     _require_key(data)
     opening: list[str] = []
@@ -210,13 +235,11 @@ def run(
     raise typer.Exit(run_together(file, line, controller, plant, run_folder, data, opening))
 
 
-def writable_folder(path: Path, option: str, mode: int = 0o777) -> Path:
-    """`path` as a folder that exists and may be written."""
-    from os import W_OK, X_OK, access
-
+def writable_folder(path: Path, option: str, mode: int = 0o700) -> Path:
+    """`path` as a folder that exists and may be written; one that is made has `mode`."""
     try:
         path.mkdir(parents=True, exist_ok=True, mode=mode)
-        why = "" if access(path, W_OK | X_OK) else "Permission denied"
+        why = "" if os.access(path, os.W_OK | os.X_OK) else "Permission denied"
     except FileExistsError:
         why = "it is a file"
     except OSError as error:

@@ -20,6 +20,7 @@ from gateway.mailbox.loop_proof import AskShown, NoKey, NotTheLoop, new_challeng
 from gateway.mailbox.paths import GATEWAY_SOCKET, LOOP_SOCKET
 from gateway.mailbox.port import ANSWERED, Peer, RemoteError, Unreachable
 from gateway.mailbox.unix import UnixMailbox
+from gateway.mailbox.who_serves import ServedByStranger
 from gateway.wording.catalogue import sentence, sentences
 
 SHOWN_S = 1.0  #: for the loop to show that the line stops
@@ -63,9 +64,9 @@ async def _told(straight: "asyncio.Task[_Straight]", through: "asyncio.Task[Repl
     """What is known once the way straight to the loop has come to its end. Raises Unreachable."""
     try:
         reply, why = await straight
-    except Unreachable:
+    except Unreachable as error:
         if (relayed := await through) is not None and relayed.ok:
-            return relayed
+            return _through(relayed, [error.found]) if isinstance(error, ServedByStranger) else relayed
         raise
     if not why:
         return reply

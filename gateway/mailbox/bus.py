@@ -20,6 +20,7 @@ from gateway.core.topics import AGENT_TOPICS, AgentTopic
 from gateway.mailbox.listener import PathTooLong, check_path
 from gateway.mailbox.paths import BUS_SOCKET
 from gateway.mailbox.port import MAX_PAYLOAD, Unreachable
+from gateway.mailbox.who_serves import ServedByStranger, require_socket
 from gateway.mailbox.zenoh_mailbox import ZenohMailbox
 
 MOST_SESSIONS = 32
@@ -86,6 +87,10 @@ async def connect(where: Path | TlsEndpoint, site: str, line: str) -> ZenohMailb
         settings = client_settings(f"tls/{where.address}") | _under("transport/link/tls", tls)
         return await _opened(settings, site, line, f"no gateway takes this certificate on {where.address}")
     path = where / BUS_SOCKET
+    try:
+        require_socket(path)
+    except (OSError, ServedByStranger) as error:
+        raise BusUnavailable(str(error)) from error
     return await _opened(
         client_settings(_local(path)), site, line, f"no gateway on {path}: start it with `r2rgate gateway LINE.toml`"
     )

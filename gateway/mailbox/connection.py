@@ -10,25 +10,29 @@ from pathlib import Path
 
 from gateway.mailbox.codec import MAX_DATAGRAM, Envelope, MalformedEnvelope, decode
 from gateway.mailbox.listener import new_socket
-from gateway.mailbox.port import Counters, Peer, Unreachable
+from gateway.mailbox.port import Counters, Unreachable
 from gateway.mailbox.turns import Turns
+from gateway.mailbox.who_serves import peer_of, require_server
 
 #: What may lie unread in the kernel for one peer. About 250 telemetry frames of six spans, and one longest message.
 SEND_BUFFER = 262_144
 #: Datagrams taken from one peer before everybody else in the event loop has a turn.
 READ_BUDGET = 8
 _TIMEVAL = struct.Struct("ll")  # seconds, microseconds: socket(7), SO_SNDTIMEO
-_UCRED = struct.Struct("3i")  # pid, uid, gid: unix(7), SO_PEERCRED
 #: The datagram is lost, the connection is not.
 _DROPPED = frozenset((errno.EAGAIN, errno.ENOBUFS, errno.EMSGSIZE, errno.ENOMEM))
 
 
 def dial(path: Path) -> socket.socket:
-    """A socket connected to `path`. Never blocks; raises OSError (BlockingIOError where the backlog is full)."""
+    """A socket connected to `path`, at which one listens who may serve the line. Never blocks.
+
+    Raises OSError (BlockingIOError where the backlog is full), ServedByStranger.
+    """
     connecting = new_socket()
     try:
         connecting.connect(os.fspath(path))
-    except OSError:
+        require_server(connecting, path)
+    except BaseException:
         connecting.close()
         raise
     return connecting
@@ -43,7 +47,8 @@ def dial_patiently(path: Path, within_s: float) -> socket.socket:
         waiting.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, _TIMEVAL.pack(int(seconds), int(fraction_s * 1e6)))
         waiting.connect(os.fspath(path))
         waiting.setblocking(False)
-    except OSError:
+        require_server(waiting, path)
+    except BaseException:
         waiting.close()
         raise
     return waiting
@@ -85,8 +90,7 @@ class Connection:
         turns: Turns,
     ) -> None:
         connected.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
-        pid, uid, _ = _UCRED.unpack(connected.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _UCRED.size))
-        self.peer = Peer(uid, pid)
+        self.peer = peer_of(connected)
         self.pending: dict[int, asyncio.Future[bytes]] = {}  #: requests that wait for an answer from this peer
         self.in_flight = 0  #: requests of this peer that are being answered
         self.open = True
@@ -96,7 +100,7 @@ class Connection:
         self._closed = closed
         self._buffer = buffer
         self._turns = turns
-        turns.come(pid)
+        turns.come(self.pid)
         self._loop = asyncio.get_running_loop()
         self.heard_s = self._loop.time()
         self._loop.add_reader(connected, self._readable)

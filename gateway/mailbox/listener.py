@@ -12,6 +12,9 @@ from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
+from gateway.mailbox.who_serves import owners, unsafe_place
+from gateway.wording.catalogue import sentence
+
 MAX_PATH = 107  #: bytes of `sun_path` before its closing zero, unix(7)
 BACKLOG = 128  #: that may wait to be taken
 AT_ONCE = 4  #: that are taken before everybody else in the event loop has a turn
@@ -86,14 +89,11 @@ class Listener:
 def _private_folder(folder: Path) -> None:
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        found = folder.stat()
+        unsafe = unsafe_place(folder, owners(folder))
     except OSError as error:
         raise CannotListen(f"the run folder {folder} cannot be made: {error.strerror}") from error
-    if found.st_uid not in (os.geteuid(), 0) or found.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
-        raise CannotListen(
-            f"the run folder {folder} may be written by others (owner {found.st_uid},"
-            f" mode {stat.S_IMODE(found.st_mode):o}): `chmod 700` it, or choose another"
-        )
+    if unsafe is not None:
+        raise CannotListen(sentence(unsafe))
 
 
 def _lock(path: Path) -> int:

@@ -25,6 +25,7 @@ from gateway.core.finding import Finding, finding
 from gateway.core.line import Strict
 from gateway.files import written_beside
 from gateway.mailbox.port import Peer
+from gateway.mailbox.who_serves import may_serve
 from gateway.wording.catalogue import sentence
 
 KEY_FILE = "loop.key"
@@ -80,7 +81,7 @@ def read_key(run_folder: Path) -> bytes:
         raise NoKey(finding("loop-key-unreadable", path=str(path), error=str(error.strerror))) from error
     try:
         found = os.fstat(descriptor)
-        if not stat.S_ISREG(found.st_mode) or found.st_uid not in (os.geteuid(), 0) or found.st_mode & 0o077:
+        if not stat.S_ISREG(found.st_mode) or not may_serve(found.st_uid, run_folder) or found.st_mode & 0o077:
             mode = f"{stat.S_IMODE(found.st_mode):o}"
             raise NoKey(finding("loop-key-not-private", path=str(path), owner_uid=found.st_uid, mode=mode))
         key = os.read(descriptor, KEY_BYTES + 1)

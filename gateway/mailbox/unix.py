@@ -34,6 +34,7 @@ from gateway.mailbox.port import (
     what_to_start,
 )
 from gateway.mailbox.turns import MAX_PER_WINDOW, Turns
+from gateway.mailbox.who_serves import ServedByStranger
 
 RECONNECT_S = 1.0  #: a publisher looks for a lost listener at most this often
 MAX_CONNECTIONS = 32
@@ -101,7 +102,7 @@ class UnixMailbox:
         self._servers[topic.name] = handler
 
     async def request(self, topic: Topic, payload: bytes, timeout_s: float) -> bytes:
-        """Raises Unreachable, and RemoteError where the other side is there but could not answer."""
+        """Raises Unreachable, RemoteError where the other side is there but could not answer, and ServedByStranger."""
         number = next(self._ids)
         try:
             datagram = encode(Envelope(Kind.REQUEST, topic.name, number, payload))
@@ -191,6 +192,9 @@ class UnixMailbox:
             return self._dial(path)
         except OSError as error:
             self.counters.last_error = f"{path}: {error.strerror}"
+            return None
+        except ServedByStranger as error:
+            self.counters.last_error = str(error)
             return None
 
     def _lost(self, path: Path, connection: Connection) -> None:

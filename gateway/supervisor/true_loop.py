@@ -16,6 +16,7 @@ from gateway.core.messages import Command, Reply, Stop
 from gateway.core.states import LoopState, shows_stop
 from gateway.mailbox.loop_proof import AskShown, LoopShown, NoKey, NotTheLoop, new_challenge, proven, read_key
 from gateway.mailbox.port import ANSWERED, PEER, Peer, RemoteError, Unreachable
+from gateway.mailbox.who_serves import ServedByStranger
 from gateway.supervisor.audit_file import AuditUnavailable
 from gateway.supervisor.bounded import Bounded
 from gateway.wording.catalogue import sentence
@@ -168,6 +169,8 @@ class TrueLoop:
             shown = proven(read_key(self._run_folder), challenge, answer, peer)
         except RemoteError as error:
             self.found_false(finding("false-loop-mute", error=str(error)))
+        except ServedByStranger as error:
+            self.found_false(error.found)
         except Unreachable:
             return  # nobody is there: the age of its frames says so
         except NotTheLoop as error:

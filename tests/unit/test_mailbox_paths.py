@@ -4,7 +4,7 @@ from pathlib import Path
 import pytest
 
 from gateway.mailbox import paths
-from gateway.mailbox.paths import default_run_folder, running_lines
+from gateway.mailbox.paths import default_run_folder, folder_in, running_lines, take
 from tests.unit.supervisor_support import line_of, short_folder
 
 
@@ -12,7 +12,7 @@ def test_the_run_folder_of_a_session_a_service_and_a_plain_user(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     line = line_of(1, "coater-2")
-    leaf = f"{line.site}-coater-2"
+    leaf = f"{line.site}_coater-2"
     service = tmp_path / "r2rgate"
     monkeypatch.setattr(paths, "_SERVICE", service)
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
@@ -48,3 +48,25 @@ def test_only_lines_that_answer_are_listed(monkeypatch: pytest.MonkeyPatch) -> N
         finally:
             for listening in living:
                 listening.close()
+
+
+def test_no_two_lines_share_a_folder(tmp_path: Path) -> None:
+    """The one that earlier versions gave both goes on where it lies, for the line that starts first."""
+    first, second = ("a-b", "c"), ("a", "b-c")
+    assert folder_in(tmp_path, *first) != folder_in(tmp_path, *second)
+    earlier = tmp_path / "a-b-c"
+    earlier.mkdir()
+    assert folder_in(tmp_path, *first) == folder_in(tmp_path, *second) == earlier
+    for site, line in (first, second):
+        take(folder_in(tmp_path, site, line), site, line)
+    assert folder_in(tmp_path, *first) == earlier
+    assert folder_in(tmp_path, *second) == tmp_path / "a_b-c"
+
+
+def test_a_folder_of_an_earlier_version_goes_on_being_used_and_nothing_is_put_into_it(tmp_path: Path) -> None:
+    (tmp_path / "demo-coater").mkdir()
+    found = folder_in(tmp_path, "demo", "coater")
+    take(found, "demo", "coater")
+    assert found == tmp_path / "demo-coater" and list(found.iterdir()) == []
+    (tmp_path / "demo_coater").mkdir()
+    assert folder_in(tmp_path, "demo", "coater") == tmp_path / "demo_coater"
