@@ -61,10 +61,10 @@ class Heads:
             self._tell(f"the audit's head is {head} now, and was {last}: it was made anew, or records are lost")
         self._path.parent.mkdir(parents=True, exist_ok=True)
         if self._path.exists() and self._path.stat().st_size > MOST_BYTES:
-            written_beside(self._path, thinned(self._read()).encode(), 0o644).replace(self._path)
+            written_beside(self._path, thinned(self._read()).encode(), 0o600).replace(self._path)
         flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
         torn = self._read()[-1:] not in ("", "\n")  # a line that a cut of the power left unfinished
-        with os.fdopen(os.open(self._path, flags, 0o644), "wb") as stream:
+        with os.fdopen(os.open(self._path, flags, 0o600), "wb") as stream:
             stream.write(b"\n" * torn + kept_line(head, self._line, wall_s).encode())
             stream.flush()
             os.fsync(stream.fileno())

@@ -25,10 +25,12 @@ settings.load_profile("any machine")
 
 @pytest.fixture(autouse=True, scope="module")
 def _leaves_nothing_behind() -> Iterator[None]:
-    """What a module leaks is told in it, not in whichever comes next; nor does its thread switching stay."""
-    before_s = sys.getswitchinterval()
+    """What a module leaks is told in it, not in the next one; nor do its thread switching and its umask stay."""
+    before_s, umask = sys.getswitchinterval(), os.umask(0o022)
+    os.umask(umask)
     yield
     sys.setswitchinterval(before_s)
+    os.umask(umask)
     gc.collect()
 
 

@@ -120,7 +120,7 @@ class Wiring:
         try:
             if contradicted:
                 path.parent.mkdir(parents=True, exist_ok=True)
-                written_beside(path, _FINDINGS.dump_json(dict(contradicted)) + b"\n", 0o644).replace(path)
+                written_beside(path, _FINDINGS.dump_json(dict(contradicted)) + b"\n", 0o600).replace(path)
             else:
                 path.unlink(missing_ok=True)
         except OSError as error:
@@ -168,7 +168,7 @@ class Wiring:
         if self.path is None:
             return
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        written_beside(self.path, proof.model_dump_json().encode() + b"\n", 0o644).replace(self.path)
+        written_beside(self.path, proof.model_dump_json().encode() + b"\n", 0o600).replace(self.path)
 
     def take_written(self) -> str:
         """From now on the line is proved by what was written last. Returns which that is, in words.

@@ -163,7 +163,7 @@ def change(path: Path, how: Callable[[Users], Users]) -> None:
 
     Raises UsersRefused, OSError, and what `how` raises; then nothing is changed.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
+    path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     lock = os.open(path.with_name(LOCK), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
     try:
         fcntl.flock(lock, fcntl.LOCK_EX)

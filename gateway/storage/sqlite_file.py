@@ -76,7 +76,7 @@ def open_there(path: Path, kind: FileKind) -> apsw.Connection:
 def begin(path: Path, kind: FileKind) -> apsw.Connection:
     """Open a file, or begin one. Raises `kind.error`."""
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     except OSError as error:
         raise kind.error(f"a folder for {path} cannot be made: {error.strerror}; name another") from error
     with told(path, kind):

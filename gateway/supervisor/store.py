@@ -130,7 +130,7 @@ def boot_id() -> str:
 
 def open_store(path: Path) -> apsw.Connection:
     """Open or begin a history. Raises NotOurs, OSError, and apsw.CorruptError or NotADBError for a damaged file."""
-    path.parent.mkdir(parents=True, exist_ok=True)
+    path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     return connect(path, KIND)
 
 

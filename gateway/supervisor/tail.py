@@ -67,7 +67,7 @@ class Tail:
         """An empty one, in place of what was there."""
         self._path = path
         path.unlink(missing_ok=True)
-        self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND | os.O_CLOEXEC, 0o644)
+        self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND | os.O_CLOEXEC, 0o600)
         self._length = 0
         head = {"run": run_id, "frame_bytes": frame_dtype(run.spans).itemsize, **asdict(run)}
         self._write(_MAGIC + _framed(json.dumps(head).encode()))
