@@ -19,10 +19,9 @@ from gateway.cli.model_place import (
     read_model,
     reasons_against_line,
 )
-from gateway.cli.process_commands import REFUSED, DataFolder, data_base
+from gateway.cli.process_commands import REFUSED, DataFolder, data_folder_of
 from gateway.core.line_model import LineModel, canonical
 from gateway.core.line_problem import printable
-from gateway.mailbox.paths import folder_in
 from gateway.supervisor.model_store import ModelsError
 from gateway.supervisor.models import FILE_NAME, Entry, begin_repository, open_repository
 
@@ -214,7 +213,7 @@ def _stored(place: Place) -> list[Entry]:
 def _place_for(model: LineModel, line: Path | None, data_dir: Path | None) -> Place:
     """Where a model goes: it names its line itself."""
     if line is None and data_dir is None:
-        return Place(folder_in(data_base(), model.site, model.line) / FILE_NAME)
+        return Place(data_folder_of(model.site, model.line) / FILE_NAME)
     return place_of(line, data_dir)
 
 

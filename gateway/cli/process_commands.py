@@ -18,7 +18,7 @@ from gateway.core.line import Line
 from gateway.core.line_file import load_line
 from gateway.core.line_problem import LineRefused, printable
 from gateway.files import MOST_BYTES, read_bytes
-from gateway.mailbox.paths import default_run_folder, folder_in, take
+from gateway.mailbox.paths import default_run_folder, name_of
 
 if TYPE_CHECKING:
     from gateway.core.controller import Controller
@@ -55,7 +55,16 @@ def data_base() -> Path:
 
 def default_data_folder(line: Line) -> Path:
     """site_line in `data_base`."""
-    return folder_in(data_base(), line.site, line.line)
+    return data_folder_of(line.site, line.line)
+
+
+def data_folder_of(site: str, line: str) -> Path:
+    """site_line in `data_base`. One of an earlier version may be of another line: a person knows."""
+    folder, earlier = data_base() / name_of(site, line), data_base() / f"{site}-{line}"
+    if earlier.is_dir() and not folder.exists():
+        way_out = f"mv {quote(str(earlier))} {quote(str(folder))}"
+        _refuse(f"the data of {site}/{line} lie in {folder} from this version on; move what is its own: `{way_out}`")
+    return folder
 
 
 def begin_process(line: Line, run_dir: Path | None, data_dir: Path | None) -> tuple[Path, Path]:
@@ -63,10 +72,6 @@ def begin_process(line: Line, run_dir: Path | None, data_dir: Path | None) -> tu
     os.umask(0o077)
     folders = run_dir or default_run_folder(line), data_dir or default_data_folder(line)
     _close_to_others(folders[1], always=data_dir is None)
-    if run_dir is None:
-        take(folders[0], line.site, line.line)
-    if data_dir is None:
-        take(folders[1], line.site, line.line)
     return folders
 
 

@@ -2,56 +2,20 @@
 
 import asyncio
 import errno
-import os
 import socket
-import struct
 from collections.abc import Callable
-from pathlib import Path
 
 from gateway.mailbox.codec import MAX_DATAGRAM, Envelope, MalformedEnvelope, decode
-from gateway.mailbox.listener import new_socket
 from gateway.mailbox.port import Counters, Unreachable
 from gateway.mailbox.turns import Turns
-from gateway.mailbox.who_serves import peer_of, require_server
+from gateway.mailbox.who_serves import peer_of
 
 #: What may lie unread in the kernel for one peer. About 250 telemetry frames of six spans, and one longest message.
 SEND_BUFFER = 262_144
 #: Datagrams taken from one peer before everybody else in the event loop has a turn.
 READ_BUDGET = 8
-_TIMEVAL = struct.Struct("ll")  # seconds, microseconds: socket(7), SO_SNDTIMEO
 #: The datagram is lost, the connection is not.
 _DROPPED = frozenset((errno.EAGAIN, errno.ENOBUFS, errno.EMSGSIZE, errno.ENOMEM))
-
-
-def dial(path: Path) -> socket.socket:
-    """A socket connected to `path`, at which one listens who may serve the line. Never blocks.
-
-    Raises OSError (BlockingIOError where the backlog is full), ServedByStranger.
-    """
-    connecting = new_socket()
-    try:
-        connecting.connect(os.fspath(path))
-        require_server(connecting, path)
-    except BaseException:
-        connecting.close()
-        raise
-    return connecting
-
-
-def dial_patiently(path: Path, within_s: float) -> socket.socket:
-    """As `dial`, but waits for a place in the backlog, in the order in which others do. Blocks for so long at most."""
-    waiting = new_socket()
-    try:
-        seconds, fraction_s = divmod(within_s, 1.0)
-        waiting.setblocking(True)
-        waiting.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, _TIMEVAL.pack(int(seconds), int(fraction_s * 1e6)))
-        waiting.connect(os.fspath(path))
-        waiting.setblocking(False)
-        require_server(waiting, path)
-    except BaseException:
-        waiting.close()
-        raise
-    return waiting
 
 
 def receive_buffer() -> memoryview:

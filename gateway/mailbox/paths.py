@@ -1,22 +1,15 @@
-"""Where the files of a line lie: a folder a line, site_line, in the first base for sockets that may be written.
-
-No name has an underscore, so that no two lines share a folder. Earlier versions said site-line, which a-b/c and a/b-c
-share: such a folder goes on being used where it lies, by the line that has taken it first.
-"""
+"""Where the sockets of a line lie: one run folder a line, named site_line, under the first base that may be written."""
 
 import os
-from contextlib import suppress
 from pathlib import Path
 
 from gateway.core.line import Line
-from gateway.files import NotText, read_text
-from gateway.mailbox.connection import dial
+from gateway.mailbox.dial import dial
 from gateway.mailbox.who_serves import ServedByStranger
 
 GATEWAY_SOCKET = "gateway.sock"
 BUS_SOCKET = "bus.sock"  #: the agents'
 LOOP_SOCKET = "loop.sock"
-TAKEN_BY = "line"  #: file in a folder of an earlier version: whose it is, as site/line
 _SERVICE = Path("/run/r2rgate")  # made by the service manager for its user
 
 
@@ -34,30 +27,12 @@ def _usable(base: Path) -> bool:
 
 def default_run_folder(line: Line) -> Path:
     """$XDG_RUNTIME_DIR/r2rgate, else /run/r2rgate where it may be written, else /tmp/r2rgate-UID; then site_line."""
-    return folder_in(run_base(), line.site, line.line)
+    return run_base() / name_of(line.site, line.line)
 
 
-def folder_in(base: Path, site: str, line: str) -> Path:
-    """The line's folder in `base`, which may not be there yet."""
-    own, earlier = base / f"{site}_{line}", base / f"{site}-{line}"
-    if os.path.exists(own) or not os.path.isdir(earlier) or _taken_by(earlier) not in ("", f"{site}/{line}"):
-        return own
-    return earlier
-
-
-def take(folder: Path, site: str, line: str) -> None:
-    """Keep a folder of an earlier version for this line, whose name is not its alone."""
-    if folder.name == f"{site}-{line}" and folder.name.count("-") > 1:
-        with suppress(OSError), (folder / TAKEN_BY).open("x", encoding="ascii") as file:
-            file.write(f"{site}/{line}\n")
-
-
-def _taken_by(folder: Path) -> str:
-    """As site/line; empty: no line has taken it."""
-    try:
-        return read_text(folder / TAKEN_BY, 200).strip()
-    except (OSError, NotText):
-        return ""
+def name_of(site: str, line: str) -> str:
+    """Of the line's folders: no name has an underscore, so that no two lines share one (a-b/c and a/b-c)."""
+    return f"{site}_{line}"
 
 
 def run_base() -> Path:

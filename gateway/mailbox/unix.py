@@ -17,8 +17,9 @@ from pathlib import Path
 
 from gateway.core.topics import Topic
 from gateway.mailbox.codec import Envelope, Kind, MalformedEnvelope, encode
-from gateway.mailbox.connection import Connection, dial, dial_patiently, receive_buffer
+from gateway.mailbox.connection import Connection, receive_buffer
 from gateway.mailbox.crowd import who_makes_room
+from gateway.mailbox.dial import dial, dial_patiently
 from gateway.mailbox.listener import Listener, accepted_at_once, check_path
 from gateway.mailbox.port import (
     ANSWERED,

@@ -4,7 +4,7 @@ from pathlib import Path
 import pytest
 
 from gateway.mailbox import paths
-from gateway.mailbox.paths import default_run_folder, folder_in, running_lines, take
+from gateway.mailbox.paths import default_run_folder, name_of, running_lines
 from tests.unit.supervisor_support import line_of, short_folder
 
 
@@ -50,23 +50,5 @@ def test_only_lines_that_answer_are_listed(monkeypatch: pytest.MonkeyPatch) -> N
                 listening.close()
 
 
-def test_no_two_lines_share_a_folder(tmp_path: Path) -> None:
-    """The one that earlier versions gave both goes on where it lies, for the line that starts first."""
-    first, second = ("a-b", "c"), ("a", "b-c")
-    assert folder_in(tmp_path, *first) != folder_in(tmp_path, *second)
-    earlier = tmp_path / "a-b-c"
-    earlier.mkdir()
-    assert folder_in(tmp_path, *first) == folder_in(tmp_path, *second) == earlier
-    for site, line in (first, second):
-        take(folder_in(tmp_path, site, line), site, line)
-    assert folder_in(tmp_path, *first) == earlier
-    assert folder_in(tmp_path, *second) == tmp_path / "a_b-c"
-
-
-def test_a_folder_of_an_earlier_version_goes_on_being_used_and_nothing_is_put_into_it(tmp_path: Path) -> None:
-    (tmp_path / "demo-coater").mkdir()
-    found = folder_in(tmp_path, "demo", "coater")
-    take(found, "demo", "coater")
-    assert found == tmp_path / "demo-coater" and list(found.iterdir()) == []
-    (tmp_path / "demo_coater").mkdir()
-    assert folder_in(tmp_path, "demo", "coater") == tmp_path / "demo_coater"
+def test_no_two_lines_share_a_folder() -> None:
+    assert name_of("a-b", "c") != name_of("a", "b-c")

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import typer
 
 from gateway.cli.process_commands import begin_process
 from gateway.core.line_template import line_template
@@ -97,7 +98,19 @@ def test_a_folder_that_is_named_is_closed_where_databases_lie_in_it(tmp_path: Pa
 @pytest.mark.usefixtures("umask")
 def test_the_lines_own_folder_is_closed_whatever_lies_in_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("gateway.cli.process_commands.data_base", lambda: tmp_path)
-    data = tmp_path / f"{LINE.site}-{LINE.line}"
+    data = tmp_path / f"{LINE.site}_{LINE.line}"
     data.mkdir(mode=0o755)
     assert begin_process(LINE, tmp_path / "run", None)[1] == data
     assert mode_of(data) == 0o700
+
+
+def test_a_folder_of_an_earlier_version_is_not_passed_over(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A line would begin a new audit beside its own."""
+    monkeypatch.setattr("gateway.cli.process_commands.data_base", lambda: tmp_path)
+    earlier = tmp_path / f"{LINE.site}-{LINE.line}"
+    earlier.mkdir()
+    with pytest.raises(typer.Exit):
+        begin_process(LINE, tmp_path / "run", None)
+    assert f"mv {earlier} {tmp_path / f'{LINE.site}_{LINE.line}'}" in capsys.readouterr().err

@@ -17,7 +17,7 @@ from gateway.core.topics import GATEWAY_COMMAND, LOOP_COMMAND, LOOP_TELEMETRY
 from gateway.mailbox import paths, who_serves
 from gateway.mailbox.bus import BusUnavailable, connect
 from gateway.mailbox.codec import Envelope, Kind, encode
-from gateway.mailbox.connection import dial, dial_patiently
+from gateway.mailbox.dial import dial, dial_patiently
 from gateway.mailbox.listener import CannotListen, Listener
 from gateway.mailbox.loop_proof import KEY_FILE, NoKey, keep_key, new_key, read_key
 from gateway.mailbox.paths import BUS_SOCKET, LOOP_SOCKET, running_lines
