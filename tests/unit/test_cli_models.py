@@ -72,7 +72,6 @@ def test_an_import_tells_machines_what_it_did(tmp_path: Path) -> None:
 def test_without_a_folder_a_model_goes_to_its_line_and_is_found_there(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("gateway.cli.models_commands.data_base", lambda: tmp_path)
     monkeypatch.setattr("gateway.cli.data_place.data_base", lambda: tmp_path)
     monkeypatch.setattr("gateway.cli.process_commands.data_base", lambda: tmp_path)
     code, _, err = r2rgate("list")
