@@ -52,6 +52,7 @@ class DriveFacts(NamedTuple):
     supplied: bool | None = None  #: its power stage, as its statusword says; None: its map does not know where
     mode: Number | None = None  #: of operation, as it displays it; None: it does not
     mode_wanted: int | None = None  #: that arming sets; None: it has but one mode
+    max_torque_step_nm: float = 0.0  #: that its greatest torque moves by at least; 0: by any number
 
 
 class CellFacts(NamedTuple):

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from drivers.canopen.amplifier import AmplifierNode
-from drivers.canopen.configure import DriveSettings, check_target_range, torque_limit_counts, watchdog_counts
+from drivers.canopen.configure import DriveSettings, check_target_range, torque_limit_counts
 from drivers.canopen.drive import DriveNode
 from drivers.canopen.heartbeat import HeartbeatProducer
 from drivers.canopen.link import CanopenLink
@@ -52,7 +52,6 @@ def _drive_node(line: Line, drive: Drive, device: DriveMap) -> DriveNode:
     settings = DriveSettings(
         drive.address, drive.rated_torque_nm, motor_torque_limit_nm(line, drive), limits.watchdog_s
     )
-    watchdog_counts(device.watchdog, limits.watchdog_s)
     check_target_range(device, settings)
     if device.objects.max_torque is not None and device.objects.max_torque.writable:
         torque_limit_counts(device, settings)

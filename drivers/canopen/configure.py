@@ -2,13 +2,13 @@
 
 import struct
 from dataclasses import dataclass
-from math import floor
 
 from drivers.canopen.map_parts import CanObject, HeartbeatObject, Watchdog
 from drivers.canopen.maps import DriveMap, LoadCellMap, PlcMap
 from drivers.canopen.pdo import type_code
 from drivers.canopen.transaction import Expected, Step, expected_pdo, mapping_steps, pdo_off, pdo_on
-from drivers.scaling import si_per_count, torque_per_count
+from drivers.scaling import as_type, torque_per_count, watchdog_counts
+from drivers.torque_rules import limit_counts
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,23 +21,11 @@ class DriveSettings:
     watchdog_s: float
 
 
-def watchdog_counts(watchdog: Watchdog, watchdog_s: float) -> int:
-    """The value of the watchdog object: at most the time asked for. Raises ValueError when the device cannot do it."""
-    counts = floor(watchdog_s / si_per_count(watchdog.unit, watchdog.scale) + 1e-9)
-    low, high = watchdog.range
-    if counts < 1 or not low <= counts * watchdog.scale <= high:
-        raise ValueError(
-            f"limits.watchdog_s = {watchdog_s} s is outside what it can do ({low:g} to {high:g} {watchdog.unit})"
-        )
-    return watchdog.node << 16 | counts if watchdog.kind == "heartbeat-consumer" else counts
-
-
-def torque_limit_counts(device: DriveMap, settings: DriveSettings) -> int:
+def torque_limit_counts(device: DriveMap, settings: DriveSettings) -> float:
     """The value of the max torque object: at most the line's limit. Raises ValueError when it does not fit."""
     entry = device.objects.max_torque
     assert entry is not None
-    nm_per_count = torque_per_count(entry.unit, entry.scale, settings.rated_torque_nm)
-    counts = floor(settings.torque_limit_nm / nm_per_count + 1e-9)
+    counts = limit_counts(entry, settings.torque_limit_nm, settings.rated_torque_nm)
     try:
         struct.pack(type_code(entry.type), counts)
     except struct.error as error:
@@ -119,13 +107,14 @@ def cell_expected(device: LoadCellMap, node: int, pdos: list[int]) -> list[Expec
 
 
 def heartbeat_step(heartbeat: HeartbeatObject) -> Step:
-    return _write(heartbeat, round(heartbeat.value / heartbeat.scale))
+    return _write(heartbeat, as_type(heartbeat.value / heartbeat.scale, heartbeat.type))
 
 
 def watchdog_step(watchdog: Watchdog, watchdog_s: float) -> Step:
     """Raises ValueError when the device cannot do it."""
-    return _write(watchdog, watchdog_counts(watchdog, watchdog_s))
+    counts = watchdog_counts(watchdog, watchdog_s)
+    return _write(watchdog, watchdog.node << 16 | int(counts) if watchdog.kind == "heartbeat-consumer" else counts)
 
 
-def _write(entry: CanObject, value: int) -> Step:
+def _write(entry: CanObject, value: float) -> Step:
     return Step(entry.index, entry.sub, entry.type, value)

@@ -13,7 +13,7 @@ from drivers.canopen.transaction import Step, place, read_number
 from drivers.cia402 import DISABLE_VOLTAGE, PowerState, is_barred, power_state
 from drivers.mode_display import ModeDisplay
 from drivers.power_stage import ORDERS_IGNORED, PowerStage
-from drivers.scaling import torque_per_count
+from drivers.scaling import torque_per_count, torque_step
 from drivers.torque_rules import against_max_torque, against_rated_torque
 from gateway.core.finding import Finding, finding
 from gateway.core.signals import DriveState, Inputs, Outputs
@@ -268,7 +268,8 @@ class DriveNode:
             return []
         nm_per_count = torque_per_count(entry.unit, entry.scale, settings.rated_torque_nm)
         found_nm = await read_number(sdo, self.station.node, entry) * nm_per_count
-        return against_max_torque(self.station.name, found_nm, settings.torque_limit_nm, nm_per_count)
+        step_nm = torque_step(entry.type, entry.unit, entry.scale, settings.rated_torque_nm)
+        return against_max_torque(self.station.name, found_nm, settings.torque_limit_nm, step_nm)
 
     def forget(self) -> None:
         self.station.forget()

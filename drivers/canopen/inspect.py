@@ -32,7 +32,8 @@ from drivers.inspection import (
     is_supplied,
     sample_cells,
 )
-from drivers.scaling import si_per_count, torque_per_count
+from drivers.scaling import si_per_count, torque_per_count, torque_step
+from drivers.torque_rules import scaling_rated_nm
 from drivers.wiring import Wired
 from gateway.core.finding import Finding
 from gateway.core.line import CanopenBus, Drive, LoadCell
@@ -145,12 +146,13 @@ class _Inspector:
         power = None if status.value is None else power_state(int(status.value))
         sto = objects.safe_torque_off
         active = None if sto is None else await self._number(sto)
-        rated = maximum = None
+        rated, maximum, step_nm = None, None, 0.0
         if (entry := objects.rated_torque) is not None:
             rated = (await self._number(entry)).scaled(torque_per_count(entry.unit, entry.scale, rated_nm))
-            rated_nm = rated.value or rated_nm  # "rated torque" is the drive's own, whatever the line's file says
+            rated_nm = scaling_rated_nm(rated.value, rated_nm)
         if (entry := objects.max_torque) is not None and not entry.writable:
             maximum = (await self._number(entry)).scaled(torque_per_count(entry.unit, entry.scale, rated_nm))
+            step_nm = torque_step(entry.type, entry.unit, entry.scale, rated_nm)
         return replace(
             facts,
             watchdog=await self._watchdog(device),
@@ -164,6 +166,7 @@ class _Inspector:
                 error=await self._error() if power in _FAULTS else "",
                 rated_torque_nm=rated,
                 max_torque_nm=maximum,
+                max_torque_step_nm=step_nm,
                 supplied=is_supplied(device.voltage_enabled, status),
                 mode=await self._mode(device),
                 mode_wanted=device.cyclic_torque_mode,

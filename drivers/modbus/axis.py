@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import floor
 
 from drivers.cia402 import DISABLE_VOLTAGE, PowerState, drive_state, power_state
 from drivers.modbus.device import (
@@ -13,7 +12,6 @@ from drivers.modbus.device import (
     Standing,
     identity_check,
     register_block,
-    watchdog_counts,
 )
 from drivers.modbus.frozen import FrozenAnswers
 from drivers.modbus.maps import DriveMap, Register
@@ -21,8 +19,8 @@ from drivers.modbus.plan import Wish
 from drivers.modbus.registers import Field, RegisterBlock, SerialNumber
 from drivers.mode_display import ModeDisplay
 from drivers.power_stage import PowerStage
-from drivers.scaling import speed_per_count, torque_per_count
-from drivers.torque_rules import against_max_torque, against_rated_torque
+from drivers.scaling import speed_per_count, torque_per_count, torque_step, watchdog_counts
+from drivers.torque_rules import against_max_torque, against_rated_torque, limit_counts
 from gateway.core.finding import Finding, finding
 from gateway.core.line import Drive
 from gateway.core.signals import DriveCondition, DriveState, Inputs, Outputs
@@ -95,7 +93,7 @@ class Axis:
         if device.rated_torque is not None:
             identity.append(Check(self._block([device.rated_torque]), self._against_rated_torque))
         maximum = self._block([device.max_torque])
-        counts = watchdog_counts(device.watchdog, settings.watchdog_s, "the drive")
+        counts = watchdog_counts(device.watchdog, settings.watchdog_s)
         watchdog = Setting(self.name, "watchdog", self._block([device.watchdog]), counts, WATCHDOG_OFF)
         trust: list[Check] = []
         written = [watchdog]
@@ -122,17 +120,17 @@ class Axis:
     def _against_max_torque(self, found: float) -> list[Finding]:
         entry, settings = self._device.max_torque, self._settings
         nm_per_count = torque_per_count(entry.unit, entry.scale, settings.rated_torque_nm)
-        return against_max_torque(self.name, found * nm_per_count, settings.torque_limit_nm, nm_per_count)
+        step_nm = torque_step(entry.type, entry.unit, entry.scale, settings.rated_torque_nm)
+        return against_max_torque(self.name, found * nm_per_count, settings.torque_limit_nm, step_nm)
 
     def _against_enabled(self, found: float) -> list[Finding]:
         if drive_state(power_state(int(found))) not in (DriveState.ENABLED, DriveState.STOPPING):
             return []
         return [finding("still-enabled", drive=self.name, statusword=int(found))]
 
-    def _torque_limit_counts(self) -> int:
+    def _torque_limit_counts(self) -> float:
         entry, limit_nm = self._device.max_torque, self._settings.torque_limit_nm
-        nm_per_count = torque_per_count(entry.unit, entry.scale, self._settings.rated_torque_nm)
-        counts = floor(limit_nm / nm_per_count + 1e-9)
+        counts = limit_counts(entry, limit_nm, self._settings.rated_torque_nm)
         try:
             self._block([entry]).encode([counts])
         except ValueError as error:

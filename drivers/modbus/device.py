@@ -6,13 +6,11 @@ many requests is no business of theirs.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from math import floor
 from typing import Protocol
 
-from drivers.modbus.maps import ModbusMap, Register, RegisterCheck, TimeRegister
+from drivers.modbus.maps import ModbusMap, Register, RegisterCheck
 from drivers.modbus.plan import Wish
 from drivers.modbus.registers import RegisterBlock, SerialNumber
-from drivers.scaling import si_per_count
 from gateway.core.finding import Finding, finding
 from gateway.core.signals import Inputs, Outputs
 
@@ -121,20 +119,6 @@ class Device(Protocol):
 
 
 WATCHDOG_OFF = 0  #: counts
-
-
-def watchdog_counts(watchdog: TimeRegister, watchdog_s: float, what: str) -> int:
-    """The value of a watchdog register: at most the time asked for.
-
-    Raises ValueError when `what` ("the PLC", "the drive") cannot do it.
-    """
-    counts = floor(watchdog_s / si_per_count(watchdog.unit, watchdog.scale) + 1e-9)
-    low, high = watchdog.range
-    if counts < 1 or not low <= counts * watchdog.scale <= high:
-        raise ValueError(
-            f"limits.watchdog_s = {watchdog_s} s is outside what {what} can do ({low:g} to {high:g} {watchdog.unit})"
-        )
-    return counts
 
 
 def identity_check(name: str, device_id: RegisterCheck, device: ModbusMap) -> Check:

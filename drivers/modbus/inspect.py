@@ -32,7 +32,8 @@ from drivers.modbus.maps import (
     TimeRegister,
 )
 from drivers.modbus.registers import Field, RegisterBlock
-from drivers.scaling import si_per_count, torque_per_count
+from drivers.scaling import si_per_count, torque_per_count, torque_step
+from drivers.torque_rules import scaling_rated_nm
 from drivers.wiring import Wired
 from gateway.core.line import Drive, LinePlc, LoadCell, ModbusTcpBus
 
@@ -123,12 +124,13 @@ class _Inspector:
                 return replace(facts, differences=(f"channel {drive.channel}: the device has {int(count.value)} axes",))
         status = await self._number(read.statusword, offset)
         power = None if status.value is None else power_state(int(status.value))
-        rated = maximum = None
+        rated, maximum, step_nm = None, None, 0.0
         if (entry := device.rated_torque) is not None:
             rated = (await self._number(entry)).scaled(torque_per_count(entry.unit, entry.scale, rated_nm))
-            rated_nm = rated.value or rated_nm  # "rated torque" is the drive's own, whatever the line's file says
+            rated_nm = scaling_rated_nm(rated.value, rated_nm)
         if not (entry := device.max_torque).writable:
             maximum = (await self._number(entry)).scaled(torque_per_count(entry.unit, entry.scale, rated_nm))
+            step_nm = torque_step(entry.type, entry.unit, entry.scale, rated_nm)
         return replace(
             facts,
             watchdog=await self._watchdog(device.watchdog),
@@ -139,6 +141,7 @@ class _Inspector:
                 error=await self._error(read.error_code, offset) if power in _FAULTS else "",
                 rated_torque_nm=rated,
                 max_torque_nm=maximum,
+                max_torque_step_nm=step_nm,
                 supplied=is_supplied(device.voltage_enabled, status),
                 mode=None if (entry := read.mode_displayed) is None else await self._number(entry, offset),
                 mode_wanted=device.torque_mode,

@@ -15,12 +15,11 @@ from drivers.modbus.device import (
     Standing,
     identity_check,
     register_block,
-    watchdog_counts,
 )
 from drivers.modbus.maps import PlcMap
 from drivers.modbus.plan import Wish
 from drivers.modbus.registers import SerialNumber
-from drivers.scaling import si_per_count
+from drivers.scaling import si_per_count, watchdog_counts
 from gateway.core.line import LinePlc
 from gateway.core.signals import Inputs, Outputs, Quality
 
@@ -41,7 +40,7 @@ class Plc:
         entries = (read.status, read.speed, read.life_echo)
         fields = [(entry.address - device.address_base, entry.type) for entry in entries]
         self.wish = Wish(self.name, fields, device.word_order, (self._write.address, self._write.count))
-        counts = watchdog_counts(device.watchdog, watchdog_s, "the PLC")
+        counts = watchdog_counts(device.watchdog, watchdog_s)
         watchdog = register_block([device.watchdog], device)
         self.proofs = Proofs(
             [identity_check(self.name, device.device_id, device)],

@@ -18,7 +18,7 @@ from drivers.opcua.proof import ANSWERS_ALLOWED, Proof, Watchdog, not_read
 from drivers.opcua.source_time import STANDS_STILL, SourceTime
 from drivers.opcua.status import describe, is_done
 from drivers.power_stage import ORDERS_IGNORED, PowerStage
-from drivers.scaling import speed_per_count, torque_per_count
+from drivers.scaling import speed_per_count, torque_per_count, torque_step
 from drivers.torque_rules import against_max_torque, against_rated_torque
 from gateway.core.finding import Finding, finding
 from gateway.core.signals import Channel, DriveCondition, DriveState, Inputs, Outputs
@@ -281,10 +281,10 @@ class Axis:
     def _against_max_torque(self, found: Reading) -> list[Finding]:
         if not found.good:
             return [not_read(self.name, "max_torque", found)]
-        entry, limit_nm = self._max_torque, self._settings.torque_limit_nm
-        nm_per_count = torque_per_count(entry.unit, entry.scale, self._settings.rated_torque_nm)
-        rounding_nm = 1e-6 * limit_nm if entry.type in ("f32", "f64") else nm_per_count
-        return against_max_torque(self.name, found.value * nm_per_count, limit_nm, rounding_nm)
+        entry, settings = self._max_torque, self._settings
+        found_nm = found.value * torque_per_count(entry.unit, entry.scale, settings.rated_torque_nm)
+        step_nm = torque_step(entry.type, entry.unit, entry.scale, settings.rated_torque_nm)
+        return against_max_torque(self.name, found_nm, settings.torque_limit_nm, step_nm)
 
     def _against_rated_torque(self, found: Reading) -> list[Finding]:
         if not found.good:

@@ -23,7 +23,8 @@ from drivers.opcua.engine import Engine
 from drivers.opcua.maps import DriveMap, Flag, LoadCellMap, NodeRef, OpcUaMap, PlcMap, WatchdogNode
 from drivers.opcua.messages import Outcome, Plan, Question
 from drivers.opcua.nodes import DeviceNodes, NodeTable
-from drivers.scaling import si_per_count, torque_per_count
+from drivers.scaling import si_per_count, torque_per_count, torque_step
+from drivers.torque_rules import scaling_rated_nm
 from drivers.wiring import Wired
 from gateway.core.line import Drive, LinePlc, LoadCell, OpcUaBus
 
@@ -144,7 +145,7 @@ class _Inspector:
         rated = None
         if (entry := nodes.rated_torque) is not None:
             rated = (await self._number(server, entry)).scaled(torque_per_count(entry.unit, entry.scale, rated_nm))
-            rated_nm = rated.value or rated_nm  # "rated torque" is the drive's own, whatever the line's file says
+            rated_nm = scaling_rated_nm(rated.value, rated_nm)
         entry = nodes.max_torque
         maximum = (await self._number(server, entry)).scaled(torque_per_count(entry.unit, entry.scale, rated_nm))
         displayed = nodes.mode_displayed
@@ -158,6 +159,7 @@ class _Inspector:
             supplied=is_supplied(device.voltage_enabled, status),
             mode=None if displayed is None else await self._number(server, displayed),
             mode_wanted=device.torque_mode,
+            max_torque_step_nm=torque_step(entry.type, entry.unit, entry.scale, rated_nm),
         )
         return replace(facts, drive=drive_facts, watchdog=await self._watchdog(server, device.watchdog))
 

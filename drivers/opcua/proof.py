@@ -5,11 +5,9 @@ set: a server that was restarted has lost it. It is asked again now and then on 
 restarted, exchanged or set behind a server that goes on.
 """
 
-from math import floor
-
 from drivers.opcua.maps import Identity, WatchdogNode
 from drivers.opcua.nodes import DeviceNodes, Reading
-from drivers.scaling import si_per_count
+from drivers.scaling import watchdog_counts
 from gateway.core.finding import Finding, finding
 
 ANSWERS_ALLOWED = 3  #: cycles in a row without a usable answer until a device counts as absent
@@ -24,12 +22,7 @@ class Watchdog:
     def __init__(self, entry: WatchdogNode, watchdog_s: float, nodes: DeviceNodes) -> None:
         self.node = nodes.place(entry, entry.type)
         self.time_s = watchdog_s
-        self.counts = floor(watchdog_s / si_per_count(entry.unit, entry.scale) + 1e-9)
-        low, high = entry.range
-        if self.counts < 1 or not low <= self.counts * entry.scale <= high:
-            raise ValueError(
-                f"limits.watchdog_s = {watchdog_s} s is outside what it can do ({low:g} to {high:g} {entry.unit})"
-            )
+        self.counts = watchdog_counts(entry, watchdog_s)
 
 
 class Proof:

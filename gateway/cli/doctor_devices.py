@@ -9,6 +9,7 @@ from statistics import fmean, pstdev
 
 from drivers.cia402 import PowerState
 from drivers.inspection import BusFacts, CellFacts, DeviceFacts, DriveFacts, PlcFacts, WatchdogFacts
+from drivers.torque_rules import allows_torque, is_rated
 from gateway.cli.doctor_check import Check, Verdict
 from gateway.core.can_load import ODD_LOAD, REFUSED_LOAD, bus_load
 from gateway.core.line import Bus, CanopenBus, Drive, Line, LinePlc, LoadCell, ModbusTcpBus
@@ -16,7 +17,6 @@ from gateway.core.line_limits import motor_torque_limit_nm, torque_limit_key
 from gateway.core.line_problem import printable
 from safety.proving import zero_allowed_n
 
-RATED_TOLERANCE = 1e-3  #: of rated and max torque: the drivers refuse to arm beyond it
 NOISE_DEVIATIONS = 2.0  #: of the readings, that a zero is not sure by
 RESTLESS_SHARE = 0.02  #: of a cell's capacity, standard deviation at rest
 AT_REST_SHARE = 0.01  #: of limits.speed_max_m_per_s
@@ -130,13 +130,13 @@ def _drive(line: Line, item: Drive, drive: DriveFacts) -> Iterator[Check]:
     name, limit_nm, key = item.name, motor_torque_limit_nm(line, item), torque_limit_key(line, item.roller)
     if (rated := drive.rated_torque_nm) is not None:
         wanted = f"{item.rated_torque_nm:g} Nm (rated_torque_nm)"
-        wrong = rated.value is None or abs(rated.value - item.rated_torque_nm) > RATED_TOLERANCE * item.rated_torque_nm
+        wrong = rated.value is None or not is_rated(rated.value, item.rated_torque_nm)
         measured = f"{rated.value:g} Nm" if rated.value is not None else f"cannot be read: {rated.trouble}"
         todo = "correct rated_torque_nm: every torque is scaled by it" if wrong else ""
         yield Check("drives", name, "rated torque", "FAIL" if wrong else "OK", measured, wanted, todo)
     if (most := drive.max_torque_nm) is not None:
         wanted = f"{limit_nm:g} Nm or more ({key})"
-        wrong = most.value is None or most.value < (1.0 - RATED_TOLERANCE) * limit_nm
+        wrong = most.value is None or not allows_torque(most.value, limit_nm, drive.max_torque_step_nm)
         measured = f"{most.value:g} Nm" if most.value is not None else f"cannot be read: {most.trouble}"
         todo = f"lower {key}, or raise it in the drive" if wrong else ""
         yield Check("drives", name, "max torque", "FAIL" if wrong else "OK", measured, wanted, todo)
