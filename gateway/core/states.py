@@ -57,6 +57,3 @@ def shows_stop(phase: int | str) -> bool:
     if isinstance(phase, str):
         return phase in Phase.__members__ and Phase[phase] in STOPPING
     return phase in STOPPING
-
-
-OPERATORS_STOP = "operator's stop"  #: the reason of a stop that a person wanted

@@ -27,7 +27,7 @@ from gateway.core.messages import (
 )
 from gateway.core.nearest import nearest
 from gateway.core.proof import Proof
-from gateway.core.states import OPERATORS_STOP, LoopState, Phase
+from gateway.core.states import LoopState, Phase
 from gateway.core.wiring_proof import WiringProof, asked_of, devices_of, merged, not_shown, undrilled
 from gateway.loop import machine as machines
 from gateway.loop.arming import heard, not_ready, require_rest
@@ -39,6 +39,7 @@ from safety.recoverability import Shortfall
 
 NOT_STARTED = "not started; mend what is named and start again"
 NOTHING_KEPT = "nothing is kept"
+OPERATORS_STOP = "operator's stop"  #: for people to read; what tells it from others is `Machine.by_person`
 STEP_UNSAFE = {"span": "step-unsafe-tension", "roller": "step-unsafe-speed"}
 
 
@@ -243,7 +244,7 @@ def _hold(cycle: Cycle, now_s: float) -> str:
 
 def _stop(cycle: Cycle, now_s: float) -> str:
     before = cycle.machine
-    cycle.change(machines.stop(before, now_s, OPERATORS_STOP))
+    cycle.change(machines.stop(before, now_s, OPERATORS_STOP, by_person=True))
     if cycle.machine is before:
         return "nothing is sent to the drives" if before.state is LoopState.SILENT else "stopping or stopped already"
     if cycle.machine.phase is Phase.OFF:

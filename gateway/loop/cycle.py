@@ -15,7 +15,7 @@ from gateway.core.deployment import Deployment, InService, Region, first_region
 from gateway.core.line import Line
 from gateway.core.line_scales import line_scales
 from gateway.core.signals import BoolArray, DriveRequest, DriveState, FloatArray, Inputs, Outputs, Quality
-from gateway.core.states import OPERATORS_STOP, LoopState, Phase
+from gateway.core.states import LoopState, Phase
 from gateway.core.telemetry import Frame
 from gateway.loop import machine as machines
 from gateway.loop.admission import Admission, LawOf
@@ -462,6 +462,7 @@ class Cycle:
             taking_up_s=self.stage.taking_up_s() if phase is Phase.TENSIONING else 0.0,
             drilled=self.drill.ending() if phase is Phase.DRILLING else "",
             proved=self.proving.ending() if phase is Phase.PROVING else "",
+            proved_well=not self.proving.findings(),
         )
         unfit = drives.standing if phase in (Phase.ARMING, Phase.ENABLING) else []
         if phase is Phase.PROVING:
@@ -477,7 +478,7 @@ class Cycle:
         if before.phase is machine.phase:
             return
         if before.phase is Phase.PROVING and self.proving.over:
-            self.tell("proved", self.proving.ending().removeprefix(f"{OPERATORS_STOP}: "), **self.proving.as_data())
+            self.tell("proved", self.proving.ending(), **self.proving.as_data())
         if machine.phase is Phase.TENSIONING:
             self.stage.begin(self.inputs)
             self.setpoints.begin_at(np.zeros(self.line.n))
@@ -762,7 +763,7 @@ class Cycle:
                 speed_setpoint_m_per_s=self.setpoints.speed_m_per_s,
                 state=machine.state,
                 phase=machine.phase,
-                by_person=machine.state is LoopState.STOP and machine.reason.startswith(OPERATORS_STOP),
+                by_person=machine.state is LoopState.STOP and (machine.by_person or machine.proved),
                 standstill=self.standstill.look(inputs, asked),
                 saturated=saturated,
                 held=account.held,

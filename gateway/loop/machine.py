@@ -43,6 +43,8 @@ class Machine:
     phase: Phase = Phase.SILENT
     since_s: float = 0.0  #: when the phase began
     reason: str = ""  #: why the line stopped, or why an arming failed
+    by_person: bool = False  #: a person stopped it
+    proved: bool = False  #: it stopped because a proof of the wiring ended well: as whoever asked for it wanted
     steady_since_s: float | None = None  #: since when the tensions have been inside their band, while tensioning
     proves: bool = False  #: what was started is no production: the wiring is proved
     resumes: bool = False  #: while HOLDING: the line PLC warns, and then the web that stands is set in motion
@@ -71,11 +73,17 @@ class Observation:
     taking_up_s: float = 0.0  #: while TENSIONING: what the web that was taken up so far may have taken
     drilled: str = ""  #: while DRILLING: that it is over, in words
     proved: str = ""  #: while PROVING: that it is over, in words
+    proved_well: bool = False  #: and that nothing speaks against the wiring
 
 
-def to_phase(machine: Machine, phase: Phase, now_s: float, reason: str | None = None) -> Machine:
+def to_phase(
+    machine: Machine, phase: Phase, now_s: float, reason: str | None = None, *, by_person: bool = False
+) -> Machine:
+    """In `phase` from now on. Without a `reason` it is the one of before, and whose it was."""
     proves = machine.proves and phase in (Phase.WARNING, Phase.ENABLING, Phase.PROVING)
-    return Machine(phase, now_s, machine.reason if reason is None else reason, proves=proves)
+    if reason is None:
+        return Machine(phase, now_s, machine.reason, machine.by_person, machine.proved, proves=proves)
+    return Machine(phase, now_s, reason, by_person, proves=proves)
 
 
 def resume(machine: Machine, now_s: float) -> Machine:
@@ -83,27 +91,27 @@ def resume(machine: Machine, now_s: float) -> Machine:
     return replace(to_phase(machine, Phase.HOLDING, now_s, ""), resumes=True)
 
 
-def stop(machine: Machine, now_s: float, reason: str) -> Machine:
+def stop(machine: Machine, now_s: float, reason: str | None, *, by_person: bool = False) -> Machine:
     """The way to STOP from any phase: controlled where there is torque, at once where there is none."""
     match machine.phase:
         case Phase.TENSIONING | Phase.RUNNING | Phase.HOLDING:
-            return to_phase(machine, Phase.SLOWING, now_s, reason)
+            return to_phase(machine, Phase.SLOWING, now_s, reason, by_person=by_person)
         case Phase.ARMING | Phase.DRILLING | Phase.READY | Phase.WARNING | Phase.ENABLING:
-            return to_phase(machine, Phase.OFF, now_s, reason)
+            return to_phase(machine, Phase.OFF, now_s, reason, by_person=by_person)
         case Phase.PROVING:  # the line stands, and no law holds the web
-            return to_phase(machine, Phase.UNLOADING, now_s, reason)
+            return to_phase(machine, Phase.UNLOADING, now_s, reason, by_person=by_person)
         case _:  # SILENT has nothing to stop; the phases of STOP are under way
             return machine
 
 
-def torque_off(machine: Machine, now_s: float, reason: str) -> Machine:
+def torque_off(machine: Machine, now_s: float, reason: str | None) -> Machine:
     """The way to STOP when tension control must not go on: torque ramps to zero at once."""
     if machine.phase in (Phase.TENSIONING, Phase.RUNNING, Phase.HOLDING, Phase.SLOWING, Phase.BRAKING, Phase.PROVING):
         return to_phase(machine, Phase.UNLOADING, now_s, reason)
     return stop(machine, now_s, reason)
 
 
-def brake(times: Times, machine: Machine, now_s: float, reason: str) -> Machine:
+def brake(times: Times, machine: Machine, now_s: float, reason: str | None) -> Machine:
     """The way to STOP when the web has broken, is slack, or no tension control holds it at speed.
 
     Braked where something turns and a drive may brake it.
@@ -183,7 +191,9 @@ def _proving(times: Times, machine: Machine, seen: Observation, now_s: float, el
         return to_phase(machine, Phase.OFF, now_s, seen.drilled) if seen.drilled else machine
     over = f"the wiring could not be proved within {times.proving_s:.3g} s" if elapsed > times.proving_s else ""
     reason = seen.proved or over
-    return to_phase(machine, Phase.UNLOADING, now_s, reason) if reason else machine
+    if not reason:
+        return machine
+    return replace(to_phase(machine, Phase.UNLOADING, now_s, reason), proved=bool(seen.proved) and seen.proved_well)
 
 
 def _slowing(times: Times, machine: Machine, seen: Observation, now_s: float, elapsed: float) -> Machine:
@@ -192,7 +202,7 @@ def _slowing(times: Times, machine: Machine, seen: Observation, now_s: float, el
     if seen.plc_answers and seen.feedback and elapsed <= times.stop_s:
         return machine
     # Tension control cannot go on. What is fast would coast, and whoever comes to look finds it turning.
-    return brake(times, machine, now_s, machine.reason) if seen.fast else to_phase(machine, Phase.UNLOADING, now_s)
+    return brake(times, machine, now_s, None) if seen.fast else to_phase(machine, Phase.UNLOADING, now_s)
 
 
 def _tensioning(times: Times, machine: Machine, seen: Observation, now_s: float, elapsed: float) -> Machine:

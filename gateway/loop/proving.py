@@ -12,7 +12,6 @@ import numpy as np
 
 from gateway.core.line import Line
 from gateway.core.signals import FloatArray, Inputs
-from gateway.core.states import OPERATORS_STOP
 from gateway.loop.pull import BLIND_RAMPS, End, PullRun, Release, Ways, longest_pull_s, slowed_where_blind
 from safety.actions import Finding
 from safety.proving import ZERO_S, Noise, Pull, proving_limits, slack_of_one_span
@@ -20,7 +19,7 @@ from safety.proving_judgement import Judged, judge, judge_zeros
 
 SETTLE_S = 2.0  #: from a release to the next pull, at most: its roller's drift is looked at meanwhile
 SETTLE_LAGS = 20.0  #: in which a roller under its own friction loses its momentum
-PROVED = f"{OPERATORS_STOP}: the wiring has been proved"  #: nothing speaks against it
+PROVED = "the wiring has been proved"  #: nothing speaks against it
 AFAR = 0.3  #: of what answers most
 ANSWERS_A_LITTLE = 0.1  #: of the tension that a torque explains
 

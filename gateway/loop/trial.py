@@ -12,7 +12,7 @@ from gateway.core.deployment import least_shown
 from gateway.core.line import Line
 from gateway.core.line_scales import ANSWERED, line_scales
 from gateway.core.signals import FloatArray, Inputs
-from gateway.core.states import OPERATORS_STOP, LoopState, Phase
+from gateway.core.states import LoopState, Phase
 from gateway.loop.machine import Machine
 from gateway.loop.setpoints import Setpoints
 
@@ -68,7 +68,7 @@ class Trial:
         complete = self.tension_moved and self.speed_changed
         if machine.state is LoopState.STOP:
             # What a person stops has shown what it has; whatever else stops a line that it leads speaks against it.
-            if self._leads and not (complete and machine.reason.startswith(OPERATORS_STOP)):
+            if self._leads and not (complete and machine.by_person):
                 self.begin()
             self._leads = self._leads and machine.phase is not Phase.OFF
             return

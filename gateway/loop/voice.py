@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 
 from drivers.port import Link
 from gateway.core.messages import BUS_REPORTS, BusReport, Event
-from gateway.core.states import OPERATORS_STOP, LoopState, Phase
+from gateway.core.states import LoopState, Phase
 from gateway.core.telemetry import Frame, pack
 from gateway.core.topics import LOOP_BUSES, LOOP_EVENT, LOOP_TELEMETRY
 from gateway.loop.machine import Machine
@@ -75,7 +75,7 @@ class Voice:
         """That the line is being stopped from now on, from where, and who wanted it; None: it is not."""
         if after.state is not LoopState.STOP or before.state is LoopState.STOP:
             return None
-        asked = after.reason == OPERATORS_STOP  # a proof that is over has it in its words, too
+        asked = after.by_person
         if not asked and most_severe(findings) < Action.STOP and before.phase not in _MOVING:
             return None  # a drill or a proof that is over, an arming that came to nothing
         peer = self.stopper() if asked else None

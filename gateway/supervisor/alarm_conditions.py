@@ -7,7 +7,6 @@ from collections.abc import Callable
 
 from gateway.core.doubts import WORDS, Doubt
 from gateway.core.finding import Finding
-from gateway.core.states import OPERATORS_STOP
 from gateway.core.status import GatewayStatus, SpanStatus, band_n, torque_limit_nm
 from gateway.supervisor.audit import AuditState
 from gateway.wording.catalogue import sentences
@@ -52,7 +51,7 @@ class Conditions:
             self.stopped_by = newest.findings
 
     def _line_stopped(self, status: GatewayStatus) -> str:
-        if status.loop.state != "STOP" or self._told.startswith(OPERATORS_STOP):
+        if status.loop.state != "STOP" or status.loop.by_person:
             return ""
         return self._told or "the gateway was not there to see why"
 

@@ -1,11 +1,10 @@
 """What the loop tells of a stop: each event on the way has what led to it, as data."""
 
 from gateway.core.messages import Event
-from gateway.core.states import OPERATORS_STOP, Phase
+from gateway.core.states import Phase
 from gateway.core.telemetry import Frame, unpack
 from gateway.core.topics import LOOP_EVENT
 from gateway.loop.machine import Machine
-from gateway.loop.proving import PROVED
 from gateway.loop.voice import Voice
 from safety.actions import Action, Finding, found
 from tests.unit.supervisor_support import frame_of
@@ -53,12 +52,12 @@ def stopped(before: Phase, after: Machine, findings: list[Finding]) -> object:
 
 
 def test_a_stop_is_a_persons_where_a_person_wants_it_and_the_end_of_a_proof_is_none() -> None:
-    by_person = stopped(Phase.RUNNING, Machine(Phase.SLOWING, 0.0, OPERATORS_STOP), [])
+    by_person = stopped(Phase.RUNNING, Machine(Phase.SLOWING, by_person=True), [])
     assert by_person == {"state": "RUN", "phase": "RUNNING", "by_person": True}
     by_itself = stopped(Phase.RUNNING, Machine(Phase.SLOWING, 0.0, WHY.text), [WHY])
     assert by_itself == {"state": "RUN", "phase": "RUNNING", "by_person": False}
-    assert stopped(Phase.PROVING, Machine(Phase.UNLOADING, 0.0, PROVED), []) is None
-    assert stopped(Phase.SLOWING, Machine(Phase.UNLOADING, 0.0, OPERATORS_STOP), []) is None
+    assert stopped(Phase.PROVING, Machine(Phase.UNLOADING, proved=True), []) is None
+    assert stopped(Phase.SLOWING, Machine(Phase.UNLOADING, by_person=True), []) is None
 
 
 class Deaf(Heard):

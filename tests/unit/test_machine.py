@@ -120,6 +120,32 @@ def test_a_controlled_stop_slows_unloads_and_stays_off():
     assert advance(TIMES, machine, FINE, 1e6) == machine
 
 
+def test_a_persons_stop_is_theirs_to_its_end_but_for_what_is_found_on_the_way():
+    slowing = stop(Machine(Phase.RUNNING), 1.0, "whatever it is called", by_person=True)
+    ways = [replace(FINE, standstill=True), replace(FINE, feedback=False), replace(FINE, feedback=False, fast=True)]
+    for seen in ways:
+        machine = advance(BRAKES, slowing, seen, 2.0)
+        assert machine.by_person and machine.reason == slowing.reason
+        machine = advance(BRAKES, machine, replace(FINE, torque_zero=True), 15.0)
+        assert machine.by_person
+    off = replace(FINE, action=Action.TORQUE_OFF, reason="operator's stop, in the words of a rule")
+    assert not advance(TIMES, slowing, off, 2.0).by_person
+    assert not advance(TIMES, Machine(Phase.RUNNING), off, 2.0).by_person
+    assert not to_phase(advance(TIMES, slowing, FINE, 99.0), Phase.ARMING, 100.0, "").by_person
+
+
+@pytest.mark.parametrize(
+    ("proved", "well"), [("it is proved", True), ("drive-2 pulls the wrong way", False), ("", True)]
+)
+def test_a_proof_that_ends_well_ends_as_the_person_wanted_who_asked_for_it(proved, well):
+    seen = replace(FINE, proved=proved, proved_well=well)
+    machine = advance(replace(TIMES, proving_s=5.0), Machine(Phase.PROVING, proves=True), seen, 5.1)
+    assert machine.phase is Phase.UNLOADING
+    assert machine.proved == (bool(proved) and well), "one that takes too long does not"
+    assert not machine.by_person, "nobody stopped it"
+    assert advance(TIMES, machine, replace(FINE, torque_zero=True), 15.0).proved == machine.proved
+
+
 @pytest.mark.parametrize(
     "seen",
     [
