@@ -3,11 +3,14 @@
 Age is what the monotonic clocks of this boot and the ones after it add up to; the time between boots counts only
 where wall clocks were seen to agree (`dating.py`). A clock that was set deletes nothing by itself, and as even one that
 agrees may be wrong, no more than a day of telemetry and a day of events go in an hour. What is too much goes by its
-order.
+order: events where they take more than their share of it, or there is nothing else; telemetry else. So the bound holds
+for both, and neither drives the other out.
 """
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from math import ceil
 from typing import cast
 
 import apsw
@@ -20,6 +23,11 @@ DAY_S = 86_400.0
 TURN_S = 3_600.0  #: in which no more than a day goes by its age: a backlog of a year takes two weeks
 BLOBS_AT_ONCE = 30  #: ten minutes of history every twenty seconds: it catches up, and no turn takes long
 EVENTS_AT_ONCE = 1000
+EVENTS_SHARE = 0.25  #: of what may be kept, that events have where there is more
+MUCH_AT_ONCE = 20_000  #: events, where they are too much: more than a loop can tell until the next look
+WEIGHED = 200  #: events that are weighed for all of them
+_SIZE, _THESE = "octet_length(text) + octet_length(data)", "SELECT value FROM json_each(?)"
+ROW_BYTES = 80  #: of an event in its table and in the index by time, beside its text and data
 PAGES_AT_ONCE = 2000  #: given back to the disk
 SPARE_PAGES = 128  #: and a twentieth of the file: used again by what comes; giving them back would move the newest
 
@@ -75,11 +83,13 @@ def expire(connection: apsw.Connection, retention: Retention, allowance: Allowan
     ends = ends_of_boots(connection, boot, now_s)
     oldest = _oldest(connection, "blob", "end_s", BLOBS_AT_ONCE)
     blobs = _too_old(oldest, ends, retention.telemetry_s, allowance.telemetry)
-    if not blobs and used_bytes(connection) > retention.most_bytes:
-        blobs = [blob for blob, _, _ in oldest]
     events = _too_old(
         _oldest(connection, "event", "time_s", EVENTS_AT_ONCE), ends, retention.events_s, allowance.events
     )
+    if (used := used_bytes(connection)) > (most := retention.most_bytes):
+        much = _too_many(connection, EVENTS_SHARE * most) if oldest else _too_many(connection, most, used)
+        events = much or events
+        blobs = blobs if blobs or much else [blob for blob, _, _ in oldest]
     if blobs or events:
         with connection:
             delete_blobs(connection, blobs)
@@ -107,6 +117,24 @@ def _too_old(
             break
         found.append(number)
     return found
+
+
+def _too_many(connection: apsw.Connection, most_bytes: float, all_bytes: float | None = None) -> Sequence[int]:
+    """The oldest events, as many as all of them take beyond `most_bytes`, but not all at once.
+
+    Where it is not known what all of them take, some are weighed, evenly spread. As only the oldest go, their numbers
+    have no gaps.
+    """
+    first, last = cast("tuple[int | None, int | None]", connection.execute("SELECT min(id), max(id) FROM event").get)
+    if first is None or last is None:
+        return ()
+    count = last - first + 1
+    if all_bytes is None:
+        some = json.dumps([*range(first, last + 1, -(-count // WEIGHED))])
+        mean_bytes = connection.execute(f"SELECT avg({_SIZE}) FROM event WHERE id IN ({_THESE})", (some,)).get
+        all_bytes = count * (ROW_BYTES + mean_bytes)
+    beyond = ceil(count * (1.0 - most_bytes / all_bytes))
+    return range(first, first + min(max(beyond, 0), MUCH_AT_ONCE))
 
 
 def _give_back(connection: apsw.Connection) -> None:

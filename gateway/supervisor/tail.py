@@ -72,14 +72,17 @@ class Tail:
         head = {"run": run_id, "frame_bytes": frame_dtype(run.spans).itemsize, **asdict(run)}
         self._write(_MAGIC + _framed(json.dumps(head).encode()))
 
-    def append(self, record: TailRecord) -> None:
+    def append(self, record: TailRecord) -> int:
+        """Returns how many bytes there are of it in memory, about."""
         head = {
             "number": record.number,
             "wall_ahead_s": record.wall_ahead_s,
             "frames": len(record.frames),
             "events": [one.model_dump() for one in record.events],
         }
-        self._write(_framed(json.dumps(head).encode() + b"\n" + _packed(record.frames)))
+        told = json.dumps(head).encode()
+        self._write(_framed(told + b"\n" + _packed(record.frames)))
+        return len(told) + record.frames.nbytes
 
     def close(self) -> None:
         """It stays where it is."""

@@ -33,7 +33,7 @@ from gateway.supervisor.tail import DamagedTail, Tail, TailRecord, read_tail, ta
 
 BLOB_S = 20.0  #: of frames in a blob: before the kernel writes the tail to the disk, and small columns share a page
 MAX_BLOB_FRAMES = 20_000
-MAX_TAIL_BYTES = 32 * 2**20  #: of frames in the tail, where they cannot be packed
+MAX_TAIL_BYTES = 32 * 2**20  #: of frames and events in the tail, where they cannot be packed
 MOST_LOG_BYTES = 4 * LOG_BYTES  #: beyond it somebody has kept a read open: it is copied back and cut
 
 
@@ -64,12 +64,12 @@ class Writer:
         if self._gathered_bytes > MAX_TAIL_BYTES:
             self.pack()
         record = TailRecord(self._last_record + 1, wall_ahead_s, table_of(frames, self._run.spans), [*events])
-        self._begun_tail().append(record)
+        size_bytes = self._begun_tail().append(record)
         self._last_record = record.number
         if self._agreed_ahead_s is not None and abs(wall_ahead_s - self._agreed_ahead_s) > JUMP_S:
             self._agreed_ahead_s = None
         self._gathered.append(record)
-        self._gathered_bytes += record.frames.nbytes
+        self._gathered_bytes += size_bytes
 
     def gathered_s(self) -> float:
         """From the first to the last frame in the tail."""

@@ -78,6 +78,59 @@ def test_a_history_that_is_too_large_loses_its_oldest_and_gives_space_back(tmp_p
     assert times[-1] == pytest.approx(2000.0) and len(times) % 100 == 0 and len(times) >= 6000
 
 
+def fill(path: Path, turns: int, events: int, letters: int, keep: Retention) -> History:
+    """A history of a line whose loop tells `events` a turn, kept within bounds all the while."""
+    writer = Writer(path, Run("boot", 0.0, WALL_AHEAD_S, "site", "line", 6), 0)
+    for turn in range(turns):
+        frames = [frame_of(100 * turn + k, turn + 0.01 * k) for k in range(100)]
+        told = [Event(time_s=float(turn), kind="alarm", text=f"{turn} {'x' * letters}") for _ in range(events)]
+        writer.store(frames, told, WALL_AHEAD_S)
+        writer.pack()
+        writer.expire(keep, float(turn))
+    writer.disconnect()
+    return History(path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("events", "letters"), [(100, 3000), (2000, 60)])
+def test_events_that_are_told_without_end_drive_out_themselves_and_no_telemetry(
+    tmp_path: Path, events: int, letters: int
+) -> None:
+    keep = Retention(telemetry_s=1e12, events_s=1e12, most_bytes=5_000_000)
+    with fill(tmp_path / "history.sqlite", 30, events, letters, keep) as history:
+        assert len(history.read_wall(0.0, 1e12, ("time_s",))["time_s"]) == 3000
+        texts = [event.text for event in history.events(0.0, 1e12)]
+    connection = open_store(tmp_path / "history.sqlite")
+    assert used_bytes(connection) <= 5_000_000 + events * (letters + 2000) and texts[-1].startswith("29 ")
+    told_bytes = sum(len(text) for text in texts)
+    assert 0.1 * 5_000_000 < told_bytes < 0.5 * 5_000_000 and len(texts) < 30 * events
+    connection.close()
+
+
+def test_where_there_is_nothing_but_events_the_bound_holds_for_them_too(tmp_path: Path) -> None:
+    path = tmp_path / "history.sqlite"
+    writer = Writer(path, Run("boot", 0.0, WALL_AHEAD_S, "site", "line", 6), 0)
+    for turn in range(6):
+        writer.store([], [Event(time_s=float(turn), kind="alarm", text=3000 * "x") for _ in range(100)], WALL_AHEAD_S)
+        writer.pack()
+        writer.expire(Retention(1e12, 1e12, 500_000), float(turn))
+    writer.disconnect()
+    connection = open_store(path)
+    assert used_bytes(connection) <= 500_000
+    connection.close()
+
+
+def test_few_events_stay_for_their_years_however_much_telemetry_there_is(tmp_path: Path) -> None:
+    path = tmp_path / "history.sqlite"
+    written(path, 60, 10.0, frames=50)
+    connection = open_store(path)
+    limit = used_bytes(connection) // 2
+    connection.close()
+    expired(path, Retention(1e12, 1e12, limit), "boot", 1000.0, turns=2)
+    frames, events = kept(path)
+    assert frames < 60 * 50 and len(events) == 60
+
+
 def test_what_is_neither_old_nor_much_stays(tmp_path: Path) -> None:
     path = tmp_path / "history.sqlite"
     written(path, 5, DAY_S)
