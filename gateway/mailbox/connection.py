@@ -14,6 +14,7 @@ from gateway.mailbox.who_serves import peer_of
 SEND_BUFFER = 262_144
 #: Datagrams taken from one peer before everybody else in the event loop has a turn.
 READ_BUDGET = 8
+_LOOK = socket.MSG_PEEK | socket.MSG_TRUNC  #: how long the next datagram is, of which nothing is taken
 #: The datagram is lost, the connection is not.
 _DROPPED = frozenset((errno.EAGAIN, errno.ENOBUFS, errno.EMSGSIZE, errno.ENOMEM))
 
@@ -101,11 +102,12 @@ class Connection:
 
     def _readable(self) -> None:
         for _ in range(READ_BUDGET):
-            if not self._turns.is_on(self.pid):
-                self._loop.remove_reader(self._socket)
-                self._turns.wait(self.pid, self._go_on)
-                return
             try:
+                length = self._socket.recv_into(self._buffer, 1, _LOOK)
+                if length and not self._turns.is_on(self.pid, length):
+                    self._loop.remove_reader(self._socket)
+                    self._turns.wait(self.pid, length, self._go_on)
+                    return
                 length = self._socket.recv_into(self._buffer)
             except BlockingIOError:
                 return
@@ -114,7 +116,7 @@ class Connection:
             if length == 0:
                 self.close()
                 return
-            self._turns.took(self.pid)
+            self._turns.took(self.pid, length)
             self.heard_s = self._loop.time()
             self._take(bytes(self._buffer[:length]))
             if not self.open:

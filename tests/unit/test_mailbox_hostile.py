@@ -15,7 +15,7 @@ from gateway.mailbox.codec import MAX_DATAGRAM, Envelope, Kind, decode, encode
 from gateway.mailbox.connection import READ_BUDGET
 from gateway.mailbox.listener import BACKLOG
 from gateway.mailbox.port import RemoteError, Unreachable
-from gateway.mailbox.turns import MAX_PER_WINDOW, WINDOW_S
+from gateway.mailbox.turns import LONG_PER_WINDOW, MAX_PER_WINDOW, WINDOW_S
 from gateway.mailbox.unix import MAX_IN_FLIGHT, UnixMailbox
 from tests.unit.supervisor_support import child, frame_of, until
 from tests.unit.test_mailbox_unix import LISTEN, echo, mailboxes, run
@@ -196,6 +196,46 @@ def test_a_peer_is_read_at_most_so_often_and_loses_only_its_own_messages() -> No
             assert len(heard) <= MAX_PER_WINDOW * windows
             before = len(heard)
             await until(lambda: len(heard) > before)  # and is read again
+
+    run(story)
+
+
+LONG_FLOOD = """
+import socket, sys
+from gateway.mailbox.codec import Envelope, Kind, encode
+longest = encode(Envelope(Kind.PUBLISH, "loop/telemetry", 0, bytes(262_144)))
+peers = [socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) for _ in range(8)]
+for peer in peers:
+    peer.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 300_000)
+    peer.connect(sys.argv[1])
+    peer.setblocking(False)
+print("flooding", flush=True)
+while True:
+    for peer in peers:
+        try:
+            peer.send(longest)
+        except BlockingIOError:
+            pass
+"""
+
+
+def test_the_longest_messages_of_many_are_read_so_many_bytes_at_a_time_and_a_short_one_is_answered_beside_them() -> (
+    None
+):
+    async def story(folder: Path) -> None:
+        async with mailboxes(2) as (asking, serving):
+            heard: list[int] = []
+            serving.subscribe(LOOP_TELEMETRY, lambda payload: heard.append(len(payload)))
+            serving.serve(LOOP_COMMAND, echo)
+            await serving.listen(folder / "l")
+            asking.connect({LOOP_COMMAND}, folder / "l")
+            with child(LONG_FLOOD, folder / "l") as (_, said):
+                assert said == "flooding\n"
+                began_s = time.perf_counter()
+                while len(heard) < 12:
+                    assert await asking.request(LOOP_COMMAND, b"stop", 5.0) == b"stop"
+                windows = (time.perf_counter() - began_s) / WINDOW_S + 2
+                assert sum(heard) <= LONG_PER_WINDOW * windows
 
     run(story)
 
