@@ -143,7 +143,7 @@ async def _measure_here(period_s: float, seconds: float, cpu: int | None, priori
     freeze_collector()
     _, refused = become_punctual(cpu, priority)
     sleepy = stay_awake()
-    fifo = os.sched_getscheduler(0) == os.SCHED_FIFO
+    fifo = os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK == os.SCHED_FIFO
     given = os.sched_getparam(0).sched_priority if fifo else 0
     processors = sorted(os.sched_getaffinity(0))
     locked_kb = _locked_kb()
@@ -157,7 +157,7 @@ async def _measure_here(period_s: float, seconds: float, cpu: int | None, priori
     finally:
         pacer.close()
         if fifo:  # what follows is no loop's work
-            os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+            os.sched_setscheduler(0, os.SCHED_OTHER | os.SCHED_RESET_ON_FORK, os.sched_param(0))
     p50_s, p99_s = percentiles(late_s, (0.5, 0.99))
     return Punctuality(given, processors, locked_kb, refused, sleepy, len(late_s), skipped, p50_s, p99_s, max(late_s))
 

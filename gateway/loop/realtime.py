@@ -15,7 +15,8 @@ def become_punctual(cpu: int | None, priority: int) -> tuple[list[str], list[str
     granted: list[str] = []
     refused: list[str] = []
     try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+        # For this thread alone: threads and processes that it starts from now on have no such priority.
+        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
         granted.append(f"real-time priority {priority} (SCHED_FIFO)")
     except PermissionError:
         # Pinned without priority it would only queue behind whatever else runs on that processor.

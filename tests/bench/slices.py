@@ -135,7 +135,8 @@ def loop_cpu() -> int:
 
 
 def _require_punctual(pid: int) -> None:
-    if os.sched_getscheduler(pid) != os.SCHED_FIFO or os.sched_getaffinity(pid) != {loop_cpu()}:
+    fifo = os.sched_getscheduler(pid) & ~os.SCHED_RESET_ON_FORK == os.SCHED_FIFO
+    if not fifo or os.sched_getaffinity(pid) != {loop_cpu()}:
         raise SystemExit("the loop has no real-time priority and processor of its own: run as root, or with rtprio")
 
 
