@@ -7,13 +7,20 @@ x~ = [T - T_ref; v - v_ref], u~ = u - u_ref, where u_ref drives the line along t
 from typing import Annotated, Literal, Self
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from gateway.core.line import NonNegative, Positive, Strict
 from gateway.core.signals import FloatArray
 
 CONVEX = 1e-9  #: of the greatest eigenvalue: how far below 0 the smallest may come by rounding
-Matrix = list[list[float]]
+
+
+def _between_rows(row: list[float]) -> list[float]:
+    """The row: between two of them, which are checked in one call else, other threads have their turn."""
+    return row
+
+
+Matrix = list[Annotated[list[float], AfterValidator(_between_rows)]]
 Vector = list[float]
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
 Solver = Literal["daqp", "osqp"]

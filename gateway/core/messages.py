@@ -1,16 +1,17 @@
 """What processes say to each other: commands and their replies (JSON), events (JSON), telemetry (see `telemetry`)."""
 
-import json
 import zlib
 from collections import Counter
 from itertools import islice
+from math import inf
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, TypeAdapter, ValidationError
 
 from gateway.core.deployment import Deployment, Epoch, Hash, InService, RecoveryPrediction, Region
 from gateway.core.experiment import Experiment, experiment_hash
-from gateway.core.finding import Finding
+from gateway.core.finding import Finding, finding
+from gateway.core.json_rows import TooLongAPiece, load_rows
 from gateway.core.line import Name, Strict
 from gateway.core.wiring_proof import MOST_DEVICES
 from gateway.core.wiring_proof import Answer as ProofAnswer
@@ -177,8 +178,9 @@ _command: TypeAdapter[Command] = TypeAdapter(Command)
 Deploying = Deploy | Renew | Keep | WatchGood | Narrow | Confirmed
 
 MAX_COMMAND = 4096  #: bytes of a command as JSON
-#: The same for those with matrices, unpacked. What parses it holds the interpreter for about 10 ms a megabyte.
-MAX_DEPLOYMENT = 2 * 1024 * 1024
+MAX_DEPLOYMENT = 2 * 1024 * 1024  #: the same for those with matrices, unpacked
+HELD_S_PER_BYTE = 10e-9  #: for which reading a message holds the interpreter, in one piece
+HELD_SHARE = 0.1  #: of a period, that a piece of a message may hold it for
 MOST_KEYS = 256  #: of one object of a command; none has forty
 MOST_TOLD = 20  #: errors of one command
 
@@ -238,7 +240,11 @@ BUS_REPORTS: TypeAdapter[list[BusReport]] = TypeAdapter(list[BusReport])
 
 
 class MalformedMessage(Exception):
-    """Bytes from outside that are no message; the text says why."""
+    """Bytes from outside that are no message; the text says why, and `findings` where it has a code."""
+
+    def __init__(self, text: str, *findings: Finding) -> None:
+        super().__init__(text)
+        self.findings = findings
 
 
 def _no_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -258,17 +264,32 @@ def command_bytes(command: Command) -> bytes:
     return payload if len(payload) <= MAX_COMMAND else zlib.compress(payload)
 
 
-def parse_command(payload: bytes) -> Command:
-    """A command from outside. Raises MalformedMessage with every reason."""
+def most_at_once(period_s: float) -> int:
+    """Bytes of a message that may be read in one piece while somebody waits for the interpreter once in `period_s`."""
+    return min(MAX_DEPLOYMENT, max(MAX_COMMAND, round(min(HELD_SHARE * period_s / HELD_S_PER_BYTE, MAX_DEPLOYMENT))))
+
+
+def parse_command(payload: bytes, period_s: float = inf) -> Command:
+    """A command from outside. Raises MalformedMessage with every reason.
+
+    One that could not be read without holding the interpreter for longer than a tenth of `period_s` is none.
+    """
     packed = payload[:1] == b"\x78"  # no JSON begins so
     if packed:
         payload = _unpacked(payload)
     elif len(payload) > MAX_COMMAND:
         raise MalformedMessage(
-            f"a command has at most {MAX_COMMAND} bytes unless it is packed, this one {len(payload)}"
+            f"a command has at most {MAX_COMMAND} bytes unless it is packed, this one {len(payload)}",
+            finding("message-too-long", allowed_bytes=MAX_COMMAND),
         )
+    most = most_at_once(period_s)
     try:
-        document = json.loads(payload, object_pairs_hook=_no_duplicates)
+        document = load_rows(payload.decode(), most, _no_duplicates)
+    except TooLongAPiece as error:
+        raise MalformedMessage(
+            f"{error.size_bytes} bytes to be read in one piece; at most {most} are within a tenth of a period",
+            finding("message-piece-too-long", size_bytes=error.size_bytes, allowed_bytes=most),
+        ) from error
     except (ValueError, RecursionError) as error:
         raise MalformedMessage(f"not JSON: {error}") from error
     try:
@@ -292,5 +313,6 @@ def _unpacked(payload: bytes) -> bytes:
     except zlib.error as error:
         raise MalformedMessage(f"not packed as zlib does: {error}") from error
     if packer.unconsumed_tail or not packer.eof:
-        raise MalformedMessage(f"longer than {MAX_DEPLOYMENT} bytes unpacked, or cut off")
+        too_long = [finding("message-too-long", allowed_bytes=MAX_DEPLOYMENT)] if packer.unconsumed_tail else []
+        raise MalformedMessage(f"longer than {MAX_DEPLOYMENT} bytes unpacked, or cut off", *too_long)
     return unpacked

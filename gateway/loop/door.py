@@ -11,6 +11,7 @@ import os
 import secrets
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
+from math import inf
 from typing import Protocol
 
 from gateway.core.finding import Finding, finding
@@ -63,8 +64,10 @@ class Door:
         tell: Callable[..., None] | None = None,
         *,
         is_open: bool = True,
+        period_s: float = inf,
     ) -> None:
-        """`is_open`: whether the loop has started; until `open` only what anybody may say is taken."""
+        """`is_open`: whether the loop has started; until `open` only what anybody may say is taken. `period_s`: of the
+        loop, which goes on beside whatever is read here."""
         self.nonce = secrets.token_hex(16)
         self.stopper: Peer | None = None  #: who asks for the stop that is being carried out
         self._behind = behind
@@ -80,6 +83,7 @@ class Door:
         self._told = Allowance(TOLD_PER_S)
         self._untold = 0
         self._is_open = is_open
+        self._period_s = period_s
 
     def open(self) -> None:
         """The loop has started: from now on its gateway's commands are taken."""
@@ -98,7 +102,7 @@ class Door:
         try:
             reply = await (self._of_gateway(payload) if is_sealed(payload) else self._of_anybody(payload))
         except MalformedMessage as error:
-            reply = self._behind.refused(f"not a command: {error}")
+            reply = self._behind.refused(f"not a command: {error}", error.findings)
         return reply.model_dump_json().encode()
 
     async def _of_anybody(self, payload: bytes) -> Reply:
@@ -159,7 +163,7 @@ class Door:
         statement = proof.statement
         if against := why_not_addressed(statement, content, self._of, self.nonce) or why_not_signed(proof, self._key):
             return against
-        command = parse_command(content)
+        command = parse_command(content, self._period_s)
         if not _is_grounded(command, statement.grounds):
             return finding("no-grounds", command=command.command)
         return why_not_claimed(statement, command) or command

@@ -110,8 +110,9 @@ async def _main(
     runner = Runner(cycle, store)
     # A gateway that is started for the first time makes its key later than this loop has looked for it.
     door = Door(
-        runner, LineName(line.site, line.line), lambda: key or gateways_key(), monotonic, voice.tell, is_open=False
-    )
+        runner, LineName(line.site, line.line), lambda: key or gateways_key(), monotonic, voice.tell, is_open=False,
+        period_s=line.control.period_s,
+    )  # fmt: skip
     voice.stopper = lambda: door.stopper
     identity = _identity(run_folder, cycle, say)
     ending = asyncio.Event()

@@ -335,7 +335,10 @@ class Gateway:
             time_s = self._answer_time_s(command)
             return await self._answered(command, time_s)
         except MalformedMessage as error:
-            return Reply(ok=False, state=state, text=f"not understood: {error}", reasons=[str(error)])
+            findings = list(error.findings)
+            return Reply(
+                ok=False, state=state, text=f"not understood: {error}", reasons=[str(error)], findings=findings
+            )
         except Unreachable as error:
             return Reply(ok=False, state=state, text=str(error), reasons=[str(error)], known=isinstance(error, NotSent))
 

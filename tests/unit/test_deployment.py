@@ -13,6 +13,7 @@ from gateway.control.design import design_lqg, design_lqi, task_of
 from gateway.core.controller import config_hash
 from gateway.core.controller_laws import Feedforward
 from gateway.core.deployment import Deployment, RecoveryNode, RecoveryPrediction, Region
+from gateway.core.json_rows import TooLongAPiece, load_rows
 from gateway.core.line_file import load_line
 from gateway.core.line_template import line_template
 from gateway.core.messages import (
@@ -27,9 +28,12 @@ from gateway.core.messages import (
     Rollback,
     command_bytes,
     in_words,
+    most_at_once,
     parse_command,
 )
 from gateway.mailbox.port import MAX_PAYLOAD
+
+SHORTEST_S = 0.001  #: no line has a shorter period
 
 
 def deployment(spans=6, design=design_lqi, **changes):
@@ -59,7 +63,7 @@ def test_a_deployment_arrives_as_it_was_sent_within_the_mailboxs_limit(spans, de
     command = Deploy(deployment=deployment(spans, design, watch=prediction(spans)))
     sent = command_bytes(command)
     assert len(sent) <= MAX_PAYLOAD
-    assert parse_command(sent) == command
+    assert parse_command(sent) == parse_command(sent, SHORTEST_S) == command
     assert config_hash(parse_command(sent).deployment.controller) == command.deployment.hash
 
 
@@ -83,6 +87,60 @@ def test_what_is_too_long_packed_or_not_is_refused_before_it_is_read():
         parse_command(zlib.compress(b" " * (MAX_DEPLOYMENT + 1)))
     with pytest.raises(MalformedMessage, match="cut off"):
         parse_command(command_bytes(Deploy(deployment=deployment(20)))[:-20])
+
+
+def code_of(payload, period_s=0.01):
+    with pytest.raises(MalformedMessage) as refused:
+        parse_command(payload, period_s)
+    return [one.code for one in refused.value.findings]
+
+
+def test_what_is_too_long_has_a_code_and_what_is_allowed():
+    assert code_of(b'{"command": "stop"}' + b" " * MAX_COMMAND) == ["message-too-long"]
+    assert code_of(zlib.compress(b" " * (MAX_DEPLOYMENT + 1))) == ["message-too-long"]
+    assert code_of(b"\x78rubbish") == []
+
+
+def test_what_holds_the_interpreter_for_longer_than_a_tenth_of_a_period_is_refused_whatever_it_is():
+    numbers = {"command": "watch-good", "watch": {"x": [0.123456789012345] * (MAX_DEPLOYMENT // 21)}}
+    objects = {"command": "deploy", "deployment": {"controller": [{"a": 1.5}] * (MAX_DEPLOYMENT // 14)}}
+    for document in (numbers, objects):
+        assert code_of(zlib.compress(json.dumps(document).encode())) == ["message-piece-too-long"]
+    assert most_at_once(0.001) == 10_000 and most_at_once(0.01) == 100_000
+    with pytest.raises(MalformedMessage) as refused:
+        parse_command(zlib.compress(json.dumps({"x": [0.5] * 30_000}).encode()), 0.01)
+    (found,) = refused.value.findings
+    assert found.parameters == {"size_bytes": 150_000, "allowed_bytes": 100_000}
+
+
+NUMBERS = st.lists(st.integers(-(10**9), 10**9) | st.floats(allow_nan=False, allow_infinity=False), max_size=60)
+DOCUMENTS = st.recursive(
+    NUMBERS | st.text(max_size=5) | st.booleans() | st.none(),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=5), inner, max_size=4),
+)
+
+
+@given(DOCUMENTS, st.integers(0, 100))
+def test_row_by_row_it_is_the_same_document_or_none(document, most):
+    text = json.dumps(document)
+    try:
+        assert load_rows(text, most, dict) == document
+    except TooLongAPiece as error:
+        assert error.size_bytes > most
+    assert load_rows(text, len(text), dict) == document
+
+
+@pytest.mark.parametrize("wrong", ["1 2", "1,,2", "+1", "1e", "-"])
+def test_a_row_that_is_none_is_no_json(wrong):
+    with pytest.raises(ValueError, match=r"."):
+        load_rows(f'{{"x": [{wrong}{60 * ", 0"}], "y": [{", ".join(60 * "0")}]}}', 200, dict)
+
+
+def test_what_stands_in_a_text_is_no_row():
+    text = json.dumps({"reason": f"[{'1, ' * 40}2]", "x": [1.0] * 60})
+    with pytest.raises(ValueError, match="delimiter"):
+        load_rows(text, 320, dict)
+    assert load_rows(text, len(text), dict) == json.loads(text)
 
 
 def test_an_object_with_more_keys_than_any_command_has_is_refused_before_it_is_looked_at():

@@ -36,6 +36,7 @@ from gateway.core.messages import (
     Start,
     Stop,
     command_bytes,
+    most_at_once,
     parse_command,
 )
 from gateway.core.proof import opened, sealed
@@ -314,6 +315,26 @@ def test_a_loop_without_a_key_takes_what_is_safe_and_finds_the_key_once_there_is
 def test_what_is_signed_is_the_command_as_it_is_parsed():
     for command in SAID:
         assert parse_command(opened(signed(command)(door_nonce())).command) == command
+
+
+@pytest.mark.parametrize(("period_s", "answer"), [(0.01, "message-piece-too-long"), (0.1, "malformed")])
+def test_what_would_keep_a_period_waiting_while_it_is_read_is_refused_with_what_is_allowed(period_s, answer):
+    class Numbers:
+        command = "watch-good"
+
+        def model_dump_json(self):
+            return json.dumps({"command": "watch-good", "watch": {"x": [0.123456789012345] * 20_000}})
+
+    async def story():
+        door = Door(Loop(), name_of(LINE), lambda: PUBLIC, lambda: NOW_S, period_s=period_s)
+        try:
+            return json.loads(await door.command(signed(Numbers())(door)))
+        finally:
+            door.close()
+
+    told = asyncio.run(story())
+    codes = [(one["code"], one["parameters"]["allowed_bytes"]) for one in told["findings"]]
+    assert codes == ([] if answer == "malformed" else [(answer, most_at_once(period_s))]) and not told["ok"]
 
 
 def door_nonce():
