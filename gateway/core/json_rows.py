@@ -12,7 +12,7 @@ from typing import Any
 
 Pairs = list[tuple[str, Any]]
 
-_ROW = re.compile(r"\[[-+0-9.eE, \t\r\n]{64,}\]")  #: what is shorter costs less than its place would
+_ROW = re.compile(r"\[[-+0-9.eE, \t\r\n]{64,}+\]")  #: what is shorter costs less than its place would
 
 
 class TooLongAPiece(Exception):
