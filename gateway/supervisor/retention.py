@@ -87,7 +87,7 @@ def expire(connection: apsw.Connection, retention: Retention, allowance: Allowan
         _oldest(connection, "event", "time_s", EVENTS_AT_ONCE), ends, retention.events_s, allowance.events
     )
     if (used := used_bytes(connection)) > (most := retention.most_bytes):
-        much = _too_many(connection, EVENTS_SHARE * most) if oldest else _too_many(connection, most, used)
+        much = _too_many(connection, used - most, EVENTS_SHARE * most if oldest else 0.0)
         events = much or events
         blobs = blobs if blobs or much else [blob for blob, _, _ in oldest]
     if blobs or events:
@@ -119,22 +119,19 @@ def _too_old(
     return found
 
 
-def _too_many(connection: apsw.Connection, most_bytes: float, all_bytes: float | None = None) -> Sequence[int]:
-    """The oldest events, as many as all of them take beyond `most_bytes`, but not all at once.
+def _too_many(connection: apsw.Connection, over_bytes: int, share_bytes: float) -> Sequence[int]:
+    """The oldest events that take `over_bytes`, as far as all of them take more than `share_bytes`; not all at once.
 
-    Where it is not known what all of them take, some are weighed, evenly spread. As only the oldest go, their numbers
-    have no gaps.
+    Some are weighed for all, evenly spread. As only the oldest go, their numbers have no gaps.
     """
     first, last = cast("tuple[int | None, int | None]", connection.execute("SELECT min(id), max(id) FROM event").get)
     if first is None or last is None:
         return ()
     count = last - first + 1
-    if all_bytes is None:
-        some = json.dumps([*range(first, last + 1, -(-count // WEIGHED))])
-        mean_bytes = connection.execute(f"SELECT avg({_SIZE}) FROM event WHERE id IN ({_THESE})", (some,)).get
-        all_bytes = count * (ROW_BYTES + mean_bytes)
-    beyond = ceil(count * (1.0 - most_bytes / all_bytes))
-    return range(first, first + min(max(beyond, 0), MUCH_AT_ONCE))
+    some = json.dumps([*range(first, last + 1, -(-count // WEIGHED))])
+    mean_bytes = ROW_BYTES + connection.execute(f"SELECT avg({_SIZE}) FROM event WHERE id IN ({_THESE})", (some,)).get
+    beyond = ceil(min(float(over_bytes), count * mean_bytes - share_bytes) / mean_bytes)
+    return range(first, first + min(max(beyond, 0), count, MUCH_AT_ONCE))
 
 
 def _give_back(connection: apsw.Connection) -> None:
