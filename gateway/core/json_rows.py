@@ -12,7 +12,8 @@ from typing import Any
 
 Pairs = list[tuple[str, Any]]
 
-_ROW = re.compile(r"\[[-+0-9.eE, \t\r\n]{64,}+\]")  #: what is shorter costs less than its place would
+#: A text, which is left as it is, or a row of numbers. What is shorter costs less than its place would.
+_TEXT_OR_ROW = re.compile(r'"[^"\\]*+(?:\\.[^"\\]*+)*+"|\[[-+0-9.eE, \t\r\n]{16,}+\]', re.DOTALL)
 
 
 class TooLongAPiece(Exception):
@@ -37,14 +38,17 @@ def load_rows(text: str, most: int, object_of: Callable[[Pairs], Any]) -> Any:
         return rows[pairs[0][1]] if len(pairs) == 1 and pairs[0][0] == name else object_of(pairs)
 
     around: list[str] = []
-    at = size = 0
-    while (found := _ROW.search(text, at, at + 2 * most)) is not None:
-        around += text[at : found.start()], f'{{"{name}":{len(rows)}}}'
-        size += found.start() - at
-        if (longest := max(size, found.end() - found.start())) > most:
+    begun = at = size = 0
+    while (found := _TEXT_OR_ROW.search(text, at, at + 2 * most)) is not None:
+        at = found.end()
+        if text[found.start()] == '"':
+            continue
+        around += text[begun : found.start()], f'{{"{name}":{len(rows)}}}'
+        size += found.start() - begun
+        if (longest := max(size, at - found.start())) > most:
             raise TooLongAPiece(longest)
         rows.append(json.loads(found.group()))
-        at = found.end()
-    if (size := size + len(text) - at) > most:
+        begun = at
+    if (size := size + len(text) - begun) > most:
         raise TooLongAPiece(size)
-    return json.loads("".join((*around, text[at:])), object_pairs_hook=with_rows)
+    return json.loads("".join((*around, text[begun:])), object_pairs_hook=with_rows)

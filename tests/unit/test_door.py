@@ -323,7 +323,7 @@ def test_what_would_keep_a_period_waiting_while_it_is_read_is_refused_with_what_
         command = "watch-good"
 
         def model_dump_json(self):
-            return json.dumps({"command": "watch-good", "watch": {"x": [0.123456789012345] * 20_000}})
+            return json.dumps({"command": "watch-good", "watch": {"x": [0.123456789012345] * 4_000}})
 
     async def story():
         door = Door(Loop(), name_of(LINE), lambda: PUBLIC, lambda: NOW_S, period_s=period_s)
