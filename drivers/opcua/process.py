@@ -106,8 +106,10 @@ class ProcessChannel:
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         ours.setblocking(False)
         processors = ",".join(map(str, processors_without(self._loop_cpu)))
+        # Of one processor the kernel takes the real-time class 0.05 s in a second: that has to last the loop.
+        priority = self._priority if len(os.sched_getaffinity(0)) > 1 else 0
         try:
-            arguments = (str(os.getpid()), str(self._priority), processors)
+            arguments = (str(os.getpid()), str(priority), processors)
             self.pid = spawn("drivers.opcua.spawner", theirs.fileno(), *arguments)
         except OSError as error:
             ours.close()

@@ -1,8 +1,9 @@
 """The process that holds the OPC UA client: `python -m drivers.opcua.worker FD PARENT GENERATION PRIORITY`.
 
 It exists so that nothing a server sends can take time, memory or the interpreter from the loop: memory is limited,
-its real-time priority lies below the loop's, it stays off the loop's processor (as the spawner, its parent, does), and
-it ends with the loop. It reads the plan from its socket, then questions, and answers each of them.
+its real-time priority lies below the loop's (on one processor it has none), it stays off the loop's processor (as the
+spawner, its parent, does), and it ends with the loop. It reads the plan from its socket, then questions, and answers
+each of them.
 """
 
 import asyncio
@@ -73,7 +74,9 @@ async def _serve(connection: socket.socket, generation: int, priority: int) -> i
 
 
 def _become_real_time(priority: int) -> None:
-    """After the imports, which would hold a processor for long."""
+    """After the imports, which would hold a processor for long. 0: not at all."""
+    if priority == 0:
+        return
     soft = int(1e6 * REAL_TIME_CPU_S)
     resource.setrlimit(resource.RLIMIT_RTTIME, (soft, soft))
     with suppress(OSError):  # where it is not permitted, the loop has said so

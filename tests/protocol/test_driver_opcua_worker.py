@@ -143,6 +143,19 @@ def test_a_round_trip_and_an_ordered_end(server: DeviceServer) -> None:
     assert not is_running(pids[0])
 
 
+def test_on_one_processor_the_real_time_class_is_the_loops_alone(server: DeviceServer) -> None:
+    async def scene(rig: Rig) -> None:
+        await rig.until(rig.inputs.tension.good)
+        assert os.sched_getscheduler(worker_of(rig)) == os.SCHED_OTHER
+
+    granted = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(granted)})
+    try:
+        run(Rig(link_with_worker(line(server.endpoint))), scene)
+    finally:
+        os.sched_setaffinity(0, granted)
+
+
 def test_a_worker_that_is_killed_is_replaced_and_nothing_is_written_meanwhile(server: DeviceServer) -> None:
     devices = server.devices
     rig, other = (Rig(link_with_worker(line(server.endpoint))) for _ in range(2))
