@@ -9,12 +9,14 @@ import typer
 from pydantic import ValidationError
 
 from gateway.cli.stop_line import stop_line
+from gateway.core.finding import finding
 from gateway.core.messages import Arm, Command, Hold, Reply, SelectRecipe, SetSpeed, SetTension, Start, Stop
-from gateway.core.topics import GATEWAY_COMMAND
+from gateway.core.topics import GATEWAY_COMMAND, SAFE_S
 from gateway.mailbox.listener import PathTooLong
 from gateway.mailbox.paths import GATEWAY_SOCKET
 from gateway.mailbox.port import Unreachable
 from gateway.mailbox.unix import UnixMailbox
+from gateway.wording.catalogue import sentence
 
 REFUSED, UNREACHABLE = 2, 3
 ARM_TIME_S = 15.0
@@ -45,7 +47,7 @@ def hold(run_dir: RunFolder = None, as_json: Json = False) -> None:
 
     Example: r2rgate hold
     """
-    send(Hold(), run_dir, as_json)
+    send(Hold(), run_dir, as_json, SAFE_S)
 
 
 def stop(run_dir: RunFolder = None, as_json: Json = False) -> None:
@@ -57,7 +59,7 @@ def stop(run_dir: RunFolder = None, as_json: Json = False) -> None:
 
     Example: r2rgate stop
     """
-    send(Stop(), run_dir, as_json)
+    send(Stop(), run_dir, as_json, SAFE_S)
 
 
 def set_tension(
@@ -141,7 +143,9 @@ def send(command: Command, run_dir: Path | None, as_json: bool, timeout_s: float
     try:
         reply = asyncio.run(request(choose_run_folder(run_dir), command, timeout_s))
     except (Unreachable, PathTooLong) as error:
-        typer.echo(str(error), err=True)
+        safe = {"stop": "loop-unanswered", "hold": "gateway-unanswered"}.get(command.command)
+        text = sentence(finding(safe, command=command.command, because=str(error))) if safe else str(error)
+        typer.echo(text, err=True)
         raise typer.Exit(UNREACHABLE) from None
     if as_json:
         typer.echo(reply.model_dump_json(indent=2))

@@ -2,9 +2,10 @@
 
 import asyncio
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Coroutine, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 from gateway.core.controller import ControllerRefused
 from gateway.core.finding import Finding
@@ -44,6 +45,8 @@ from safety.actions import Action, found
 HEARD_AGAIN_S = 1.0  #: for devices that were lost to tell what speaks against arming, or that nothing does
 PERSISTED_S = 1.0  #: for the disk to have what was taken back, until the answer says that it has not
 MAX_WAITING = 32  #: commands between two periods; more are refused, but for what is SAFE
+MAX_TO_ITS_END = 8  #: that build or write, one after the other: behind a disk that hangs they do not pile up
+UNDONE_S = 0.3  #: that the answer to a stop waits for an arming to be undone, which goes on
 #: Before everything else and in this order; each has one place of its own, however many ask for it.
 SAFE: tuple[type[Command], ...] = (Stop, Hold)
 BOUNDARY_SHARE = 0.1  #: of a period, for the commands of one boundary; what is left over waits for the next
@@ -70,7 +73,8 @@ class Runner:
         self._disk = Aside()  # of its own: what is taken back does not wait for what is being built
         self._persistence = Persistence(cycle.configurations, store, self._disk, cycle.tell)
         self._configuring = asyncio.Lock()
-        self._configurings: set[asyncio.Task[Reply]] = set()  #: asyncio itself keeps tasks only weakly
+        self._to_their_end: set[asyncio.Task[Reply]] = set()  #: whoever waits; asyncio itself keeps tasks only weakly
+        self._undoing: set[asyncio.Task[None]] = set()
         self._waiting: deque[Waiting] = deque()
         self._safe: dict[type[Command], Waiting] = {}  #: what is SAFE and waits
         self._passed = asyncio.Event()
@@ -171,16 +175,23 @@ class Runner:
                 self._armed = asyncio.create_task(self._arm(command))
                 return await asyncio.shield(self._armed)
             case Deploy() | Keep() | WatchGood():  # what is written ahead is decided, whoever waits for it
-                configuring = asyncio.create_task(self._configure_next(command, proof))
-                self._configurings.add(configuring)
-                configuring.add_done_callback(self._configurings.discard)
-                return await asyncio.shield(configuring)
+                return await self._to_its_end(self._configure_next(command, proof))
             case Rollback() | Narrow():
                 return await self._take_back(command)
             case KeepProof():
-                return await self._keep_proof(command)
+                return await self._to_its_end(self._keep_proof(command))
             case _:
                 return await self._at_boundary(command)
+
+    async def _to_its_end(self, work: Coroutine[Any, Any, Reply]) -> Reply:
+        """Whoever gives up waiting for it cuts nothing; what would wait behind too much of it is refused."""
+        if len(self._to_their_end) >= MAX_TO_ITS_END:
+            work.close()
+            return self.refused("too much waits for the disk, or to be built: try again")
+        task = asyncio.create_task(work)
+        self._to_their_end.add(task)
+        task.add_done_callback(self._to_their_end.discard)
+        return await asyncio.shield(task)
 
     def close(self) -> None:
         """What is still being worked on aside ends by itself."""
@@ -188,12 +199,14 @@ class Runner:
         self._disk.close()
 
     async def _stop(self, command: Stop) -> Reply:
-        """Whatever else waits, and also into an arming, whose undoing it does not wait for."""
+        """Whatever else waits, and also into an arming, whose undoing it waits for a little, and does not cut."""
         self._stops += 1
         self._refuse_waiting((Arm, Drill), "not armed: it was stopped")
         undone = asyncio.create_task(self._cancel_arming())
+        self._undoing.add(undone)
+        undone.add_done_callback(self._undoing.discard)
         reply = await self._at_boundary(command)
-        await undone
+        await asyncio.wait((undone,), timeout=UNDONE_S)
         return reply
 
     async def _at_boundary(self, command: Command, prepared: Prepared = None, proof: Proof | None = None) -> Reply:

@@ -3,6 +3,7 @@
 import asyncio
 import errno
 import socket
+from collections import Counter
 from collections.abc import Callable
 
 from gateway.mailbox.codec import MAX_DATAGRAM, Envelope, MalformedEnvelope, decode
@@ -39,10 +40,10 @@ class Connection:
         "_socket",
         "_turns",
         "heard_s",
-        "in_flight",
         "open",
         "peer",
         "pending",
+        "places",
     )
 
     def __init__(
@@ -57,7 +58,7 @@ class Connection:
         connected.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
         self.peer = peer_of(connected)
         self.pending: dict[int, asyncio.Future[bytes]] = {}  #: requests that wait for an answer from this peer
-        self.in_flight = 0  #: requests of this peer that are being answered
+        self.places: Counter[str] = Counter()  #: that requests of this peer have, by topic and command
         self.open = True
         self._socket = connected
         self._counters = counters
@@ -69,6 +70,11 @@ class Connection:
         self._loop = asyncio.get_running_loop()
         self.heard_s = self._loop.time()
         self._loop.add_reader(connected, self._readable)
+
+    @property
+    def in_flight(self) -> int:
+        """Requests of this peer that are being answered."""
+        return self.places.total()
 
     @property
     def pid(self) -> int:

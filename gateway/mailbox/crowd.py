@@ -13,8 +13,12 @@ from typing import Protocol, TypeVar
 class Guest(Protocol):
     """A connection, as far as it matters here."""
 
-    in_flight: int  #: requests that are being answered
     heard_s: float  #: monotonic; when something came over it last
+
+    @property
+    def in_flight(self) -> int:
+        """Requests that are being answered."""
+        ...
 
     @property
     def pid(self) -> int: ...

@@ -2,15 +2,18 @@
 
 A party listens on a path, or dials others by path, or both. Whatever a peer does (flood, stall, die, send rubbish),
 this side neither waits nor fails: sending is one non-blocking call into a bounded kernel buffer, reading has a budget,
-and what cannot be handed over is dropped and counted. All methods belong to the thread of the event loop.
+and what cannot be handed over is dropped and counted. A request has a place for as long as its topic allows
+(`places`). All methods belong to the thread of the event loop.
 """
 
 import asyncio
 import socket
 import time
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
+from dataclasses import dataclass
 from functools import partial
 from itertools import count
 from pathlib import Path
@@ -21,6 +24,7 @@ from gateway.mailbox.connection import Connection, receive_buffer
 from gateway.mailbox.crowd import who_makes_room
 from gateway.mailbox.dial import dial, dial_patiently
 from gateway.mailbox.listener import Listener, accepted_at_once, check_path
+from gateway.mailbox.places import MAX_OVERDUE, most_at_once, safe_command, within_s
 from gateway.mailbox.port import (
     ANSWERED,
     MAX_PAYLOAD,
@@ -39,7 +43,7 @@ from gateway.mailbox.who_serves import ServedByStranger
 
 RECONNECT_S = 1.0  #: a publisher looks for a lost listener at most this often
 MAX_CONNECTIONS = 32
-MAX_IN_FLIGHT = 32  #: requests of one peer that are answered at the same time
+DIALLERS = 4  #: threads in which a place in a backlog is waited for
 
 
 PATIENCE_S = 1.0  #: of a request, for a place among those who wait to be taken
@@ -47,6 +51,19 @@ PATIENCE_S = 1.0  #: of a request, for a place among those who wait to be taken
 
 class Crowded(NotSent):
     """So many wait to be taken that there is no place to wait."""
+
+
+@dataclass(slots=True, eq=False)
+class _Request:
+    """One that has a place."""
+
+    connection: Connection
+    envelope: Envelope
+    topic: Topic
+    place: str  #: that it has, of its peer
+    within_s: float
+    is_over: bool = False  #: its time: the place is free, and who asked has been told
+    task: "asyncio.Task[None] | None" = None
 
 
 class UnixMailbox:
@@ -61,8 +78,10 @@ class UnixMailbox:
         self._dialled: dict[Path, Connection] = {}
         self._next_dial_s: dict[Path, float] = {}
         self._subscribers: defaultdict[str, list[PublishHandler]] = defaultdict(list)
-        self._servers: dict[str, RequestHandler] = {}
+        self._servers: dict[str, tuple[Topic, RequestHandler]] = {}
         self._answering: set[asyncio.Task[None]] = set()
+        self._overdue: Counter[str] = Counter()  #: by topic that acts: begun, past their time and not at their end
+        self._diallers: ThreadPoolExecutor | None = None  #: of its own: a stop waits behind no store
         self._ids = count(1)
         self._buffer = receive_buffer()
         self._turns: Turns | None = None  #: from the first connection on
@@ -100,7 +119,7 @@ class UnixMailbox:
         """Answer the requests of a topic. Raises ValueError where it has a handler already."""
         if topic.name in self._servers:
             raise ValueError(f"{topic.name} is served already")
-        self._servers[topic.name] = handler
+        self._servers[topic.name] = topic, handler
 
     async def request(self, topic: Topic, payload: bytes, timeout_s: float) -> bytes:
         """Raises Unreachable, RemoteError where the other side is there but could not answer, and ServedByStranger."""
@@ -134,6 +153,8 @@ class UnixMailbox:
         self._listeners.clear()
         if self._turns is not None:
             self._turns.close()
+        if self._diallers is not None:
+            self._diallers.shutdown(wait=False, cancel_futures=True)
         for task in self._answering:
             task.cancel()
         # Before anything is waited for, which may be cancelled.
@@ -172,8 +193,11 @@ class UnixMailbox:
     async def _dial_patiently(self, topic: Topic, within_s: float) -> None:
         """Until there is a place in the backlog, in a thread; where there is none in time, nothing is dialled."""
         path = self._routes[topic.name]
+        if self._diallers is None:
+            self._diallers = ThreadPoolExecutor(DIALLERS, "dial")
+        dialling = asyncio.get_running_loop().run_in_executor(self._diallers, dial_patiently, path, within_s)
         with suppress(OSError):
-            self._took(path, await asyncio.to_thread(dial_patiently, path, within_s))
+            self._took(path, await dialling)
 
     def _dial(self, path: Path) -> Connection:
         return self._took(path, dial(path))
@@ -239,26 +263,57 @@ class UnixMailbox:
             self._resolve(connection, envelope)
 
     def _take_request(self, connection: Connection, envelope: Envelope) -> None:
-        if connection.in_flight >= MAX_IN_FLIGHT:
-            self.counters.refused += 1
-            connection.send(_error(envelope, f"more than {MAX_IN_FLIGHT} requests at once"))
+        served = self._servers.get(envelope.topic)
+        if served is None:
+            connection.send(_error(envelope, f"{envelope.topic} is not served here"))
             return
-        connection.in_flight += 1
-        task = asyncio.get_running_loop().create_task(self._answer(connection, envelope))
-        self._answering.add(task)
-        task.add_done_callback(self._answering.discard)
+        topic, handler = served
+        safe = safe_command(topic.name, envelope.payload)
+        place, most = f"{topic.name} {safe}", most_at_once(safe)
+        if connection.places[place] >= most:
+            self._refuse(connection, envelope, f"more than {most} requests at once")
+            return
+        if not safe and self._overdue[topic.name] >= MAX_OVERDUE:
+            self._refuse(connection, envelope, f"{MAX_OVERDUE} requests before it have not come to their end")
+            return
+        connection.places[place] += 1
+        request = _Request(connection, envelope, topic, place, within_s(topic, safe))
+        request.task = asyncio.get_running_loop().create_task(self._answer(request, handler))
+        self._answering.add(request.task)
+        request.task.add_done_callback(self._answering.discard)
 
-    async def _answer(self, connection: Connection, envelope: Envelope) -> None:
-        PEER.set(connection.peer)
+    def _refuse(self, connection: Connection, envelope: Envelope, why: str) -> None:
+        self.counters.refused += 1
+        connection.send(_error(envelope, f"{envelope.topic}: {why}"))
+
+    async def _answer(self, request: _Request, handler: RequestHandler) -> None:
+        PEER.set(request.connection.peer)
+        late = asyncio.get_running_loop().call_later(request.within_s, self._end_time, request)
         try:
-            connection.send(await self._answer_to(envelope))
+            answer = await self._answer_to(request.envelope, handler)
+            if not request.is_over:
+                request.connection.send(answer)
         finally:
-            connection.in_flight -= 1
+            late.cancel()
+            if request.is_over:
+                self._overdue[request.topic.name] -= request.topic.acts
+            else:
+                request.connection.places[request.place] -= 1
 
-    async def _answer_to(self, envelope: Envelope) -> bytes:
-        handler = self._servers.get(envelope.topic)
-        if handler is None:
-            return _error(envelope, f"{envelope.topic} is not served here")
+    def _end_time(self, request: _Request) -> None:
+        """Free its place, and tell who asked. What acts comes to its end, what only reads is cut."""
+        request.is_over = True
+        request.connection.places[request.place] -= 1
+        name, acts = request.topic.name, request.topic.acts
+        then = "what was asked may be done all the same" if acts else "it is given up"
+        text = f"no answer within {request.within_s:g} s; {then}"
+        request.connection.send(_error(request.envelope, f"{name}: {text}"))
+        self._failed(name, TimeoutError(text))
+        self._overdue[name] += acts
+        if not acts and request.task is not None:
+            request.task.cancel()
+
+    async def _answer_to(self, envelope: Envelope, handler: RequestHandler) -> bytes:
         try:
             payload = await handler(envelope.payload)
             return encode(Envelope(Kind.ANSWER, envelope.topic, envelope.id, payload))

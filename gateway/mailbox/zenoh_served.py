@@ -1,13 +1,14 @@
 """A topic that is served over Zenoh: requests are refused at the door, or answered in the event loop.
 
 The door is on Zenoh's thread, and whoever floods stays there: no more requests than `Topic.most_per_s`, nor than
-MAX_IN_FLIGHT at once, reach the event loop, and none that is for several keys or too long.
+MAX_IN_FLIGHT at once, reach the event loop, and none that is for several keys or too long. Each has a place for
+`Topic.within_s`; then it is free, and what only reads is cut.
 """
 
 import asyncio
 from collections.abc import Callable
 from contextlib import suppress
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import zenoh
 
@@ -37,6 +38,7 @@ class Served:
         self._allowance = None if topic.most_per_s is None else Allowance(topic.most_per_s)
         self._in_flight = 0
         self._answering: set[asyncio.Task[None]] = set()
+        self._handling: set[asyncio.Future[bytes]] = set()  #: more than have a place, where what acts goes on
         self._closed = False
 
     def take(self, query: zenoh.Query) -> None:
@@ -52,9 +54,10 @@ class Served:
     async def close(self) -> None:
         """What is being answered is not any more."""
         self._closed = True
-        for task in self._answering:
+        tasks: list[asyncio.Future[Any]] = [*self._answering, *self._handling]
+        for task in tasks:
             task.cancel()
-        await asyncio.gather(*self._answering, return_exceptions=True)
+        await asyncio.gather(*tasks, return_exceptions=True)
 
     def _why_not(self, key: str, length: int) -> str:
         """Why a request is refused; empty: it is in flight now."""
@@ -87,14 +90,29 @@ class Served:
 
     async def _said(self, payload: bytes) -> bytes | _Failure:
         name = self._topic.name
+        handling = asyncio.ensure_future(self._handler(payload))
+        self._handling.add(handling)
+        handling.add_done_callback(self._handled)
+        done, _ = await asyncio.wait((handling,), timeout=self._topic.within_s)
+        if not done:
+            if not self._topic.acts:
+                handling.cancel()
+            late = TimeoutError(f"no answer within {self._topic.within_s:g} s")
+            self._bridge.failed(self._topic, late)
+            return _Failure(f"{name}: {late}")
         try:
-            answer = await self._handler(payload)
+            answer = handling.result()
         except Exception as error:
             self._bridge.failed(self._topic, error)
             return _Failure(f"{name} failed: {type(error).__name__}: {error}")
         if len(answer) > MAX_PAYLOAD:
             return _Failure(f"{name}: answer of {len(answer)} bytes, at most {MAX_PAYLOAD} are allowed")
         return answer
+
+    def _handled(self, handling: asyncio.Future[bytes]) -> None:
+        self._handling.discard(handling)
+        if not handling.cancelled():
+            handling.exception()  # looked at, also where nobody waits for it any more
 
     def _done(self) -> None:
         with self._bridge.lock:

@@ -14,6 +14,7 @@ from gateway.core.access import AtTheDoor
 from gateway.core.asked_before import AskedTold, ShowAsked
 from gateway.core.courses import CoursesTold, ShowCourses
 from gateway.core.decisions import ListProposals, ProposalList, ProposalShown, ShowProposal
+from gateway.core.finding import finding
 from gateway.core.line import Strict
 from gateway.core.line_past import RecordsAfter, RecordsTold, TensionsBetween, TensionsTold
 from gateway.core.messages import Reply
@@ -27,9 +28,12 @@ from gateway.core.topics import (
     GATEWAY_PAST,
     GATEWAY_PROPOSALS,
     GATEWAY_STATUS,
+    SAFE_S,
     Topic,
 )
 from gateway.mailbox.port import Mailbox, Unreachable
+from gateway.mailbox.rights import OVERTAKES
+from gateway.wording.catalogue import sentence
 
 STATUS_S = 0.1  #: between two looks
 PROPOSALS_S = 0.5
@@ -114,12 +118,18 @@ class LineSide:
         return _told(TensionsTold, await self._in_turn(GATEWAY_PAST, asked))
 
     async def say(self, person: Person, said: Said) -> Reply:
-        """In a person's name. A gateway that is away is an answer, too."""
+        """In a person's name. A gateway that is away is an answer, too: to a stop or a hold, with what to press."""
+        safe = said.command in OVERTAKES
         try:
             payload = ForPerson(person=person, said=said).model_dump_json().encode()
-            return Reply.model_validate_json(await self._saying.request(GATEWAY_FOR_PERSON, payload, ACT_S))
+            within_s = SAFE_S if safe else ACT_S
+            return Reply.model_validate_json(await self._saying.request(GATEWAY_FOR_PERSON, payload, within_s))
         except (Unreachable, ValidationError) as error:
-            return Reply(ok=False, state="", text=str(error), reasons=[str(error)], known=False)
+            reply = Reply(ok=False, state="", text=str(error), reasons=[str(error)], known=False)
+        if not safe:
+            return reply
+        found = finding("gateway-unanswered", command=said.command, because=reply.text)
+        return reply.model_copy(update={"text": sentence(found), "findings": [found]})
 
     async def at_the_door(self, happened: AtTheDoor) -> bool:
         """For the audit. False: it has to be told again later."""

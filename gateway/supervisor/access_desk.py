@@ -51,7 +51,7 @@ class AccessDesk:
         return (await self._record(happened)).model_dump_json().encode()
 
     async def _record(self, happened: CameIn | WrongLogins | UsersNow) -> Reply:
-        peer = who_of(PEER.get())
+        peer = await who_of(PEER.get())
         if isinstance(happened, CameIn):
             who = who_is(happened.person, PEER.get())
             return await self._came_in(happened, who)

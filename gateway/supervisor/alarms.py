@@ -129,7 +129,7 @@ class Alarms:
         except ValidationError as error:
             reasons = [f"{'.'.join(map(str, one['loc']))}: {one['msg']}" for one in error.errors()]
             return refused("not understood", reasons[:20]).model_dump_json().encode()
-        who = who_of(PEER.get())
+        who = await who_of(PEER.get())
         return (self._inbox.refuse(who, len(payload)) or await self.say(said, who)).model_dump_json().encode()
 
     async def _acknowledge(self, said: AcknowledgeAlarm, who: Who) -> Reply:

@@ -317,7 +317,7 @@ class Gate:
         return reply
 
     async def _answer_propose(self, payload: bytes) -> bytes:
-        return (await self.propose(payload, who_of(PEER.get()))).model_dump_json().encode()
+        return (await self.propose(payload, await who_of(PEER.get()))).model_dump_json().encode()
 
     async def answer_query(self, payload: bytes) -> bytes:
         """What is asked of proposals, and changes nothing."""
@@ -342,7 +342,7 @@ class Gate:
             decision = DECISION.validate_json(payload)
         except ValidationError as error:
             return _not_understood(error)
-        who = who_of(PEER.get())
+        who = await who_of(PEER.get())
         if isinstance(decision, RollBackNow):  # the safe side: always done, and on record now and then
             reply = await self.decide(decision, who, self._rollbacks.left_out(caller_of(who).group))
         else:

@@ -7,7 +7,7 @@ from gateway.core.audit_record import Who
 from gateway.core.messages import Event
 from gateway.mailbox.port import Peer
 from gateway.supervisor.loop_records import LoopRecords
-from gateway.supervisor.peers import who_of
+from gateway.supervisor.peers import who_at_once
 
 STOPPED = "line-stopped"  #: kind of record
 LOOP, NOT_KNOWN = Who(name="loop"), Who(name="not known")
@@ -23,7 +23,7 @@ def hear_stop(event: Event, records: LoopRecords, asked: Callable[[], Who | None
     if by_person and pid == os.getpid():
         who = asked() or NOT_KNOWN
     elif by_person and isinstance(uid, int) and isinstance(pid, int):
-        who = who_of(Peer(uid, pid))
+        who = who_at_once(Peer(uid, pid))
     what: dict[str, object] = {
         "by_person": bool(by_person),
         "state": str(stopped.get("state")),

@@ -1,9 +1,8 @@
 """A line's past for whoever looks at it: records of the audit in words, and tensions out of the history.
 
-It only reads, in a thread, one question of each sort at a time; an answer always fits a message.
+It only reads, in a thread of each sort, one question at a time; an answer always fits a message.
 """
 
-import asyncio
 from collections.abc import Callable
 from itertools import islice
 from pathlib import Path
@@ -22,6 +21,7 @@ from gateway.supervisor.audit_file import FILE_NAME, KIND, AuditFile, AuditUnava
 from gateway.supervisor.history import History, HistoryError
 from gateway.supervisor.past_tensions import NotTold, thinned
 from gateway.supervisor.record_words import IN_EVERY_LANGUAGE, in_a_sentence
+from gateway.tasks.threads import Worker
 from gateway.wording.catalogue import languages
 
 BUSY_MS = 500
@@ -36,12 +36,12 @@ class Past:
         self._line = line
         self._history = history
         self._records = _Records(folder)
-        self._reading, self._thinning = asyncio.Lock(), asyncio.Lock()
+        self._reading, self._thinning = Worker("records"), Worker("trends")
         mailbox.serve(GATEWAY_PAST, self._answer)
 
     async def close(self) -> None:
-        async with self._reading:
-            await asyncio.to_thread(self._records.close)
+        await self._reading.close(self._records.close)
+        await self._thinning.close()
 
     async def _answer(self, payload: bytes) -> bytes:
         try:
@@ -51,10 +51,8 @@ class Past:
             return _refused("not understood", reasons[:20])
         try:
             if isinstance(asked, RecordsAfter):
-                async with self._reading:
-                    return await asyncio.to_thread(self._records.told, asked)
-            async with self._thinning:
-                return await asyncio.to_thread(self._tensions, asked)
+                return await self._reading.do(self._records.told, asked)
+            return await self._thinning.do(self._tensions, asked)
         except (AuditUnavailable, HistoryError, NotTold) as error:
             return _refused("it is not told", [str(error)])
 

@@ -1,5 +1,6 @@
 """What people say through OPC UA and the page: held against their role once more, recorded, and handed on."""
 
+import asyncio
 from collections.abc import Awaitable, Callable, Mapping
 from typing import Any
 
@@ -20,13 +21,14 @@ from gateway.supervisor.said_inbox import COMMAND_EVENT, OF_PEOPLE, SaidInbox
 
 #: What one person can have recorded: more than any hand does, and little enough for a disk.
 MOST_SAID, SAID_EVERY_S = 600, 1.0
+RECORDED_S = 0.15  #: that the answer to a stop or a hold waits for its record, which is made all the same
 A_PROGRAM = "a program"  #: that decides in a person's place, as the audit has it before its user's name
 
 Decision = Decide | RollBackNow | Archive | LineChanged | Confirm
 
 
 class PersonsDesk:
-    """A handler on a mailbox."""
+    """A handler on a mailbox; `close` at the end."""
 
     def __init__(
         self,
@@ -48,8 +50,14 @@ class PersonsDesk:
         self._note = note
         self._refusals = Bounded(clock)
         self._said = Bounded(clock, MOST_SAID, SAID_EVERY_S)
+        self._event = event
         self._inbox = SaidInbox(COMMAND_EVENT, OF_PEOPLE, clock, event)
+        self._recording: set[asyncio.Task[str]] = set()
         mailbox.serve(GATEWAY_FOR_PERSON, self._answer)
+
+    async def close(self) -> None:
+        """What was answered before it was on record is on record, or nobody could."""
+        await asyncio.gather(*self._recording, return_exceptions=True)
 
     async def _answer(self, payload: bytes) -> bytes:
         try:
@@ -65,8 +73,7 @@ class PersonsDesk:
         if reason := why_may_not(person, said.command):
             if (left_out := self._refusals.left_out(who.name)) is not None:
                 what = with_left_out({"command": said.command, "because": reason}, left_out)
-                if await self._kept("refused-person", who, what):
-                    self._refusals.undo(who.name, left_out + 1)
+                await self._recorded("refused-person", said.command, who, what, self._refusals, left_out)
             return _reply(Reply(ok=False, state="", text=reason, reasons=[reason]))
         if isinstance(said, Decide) and person.is_script:
             said = said.model_copy(update={"script": said.script or A_PROGRAM})
@@ -86,9 +93,31 @@ class PersonsDesk:
         if left_out is None:
             return reply
         what = with_left_out({"command": in_words(said), "done": reply.ok, "answer": reply.text}, left_out)
-        if unkept := await self._kept("operated", who, what):
-            self._said.undo(who.name, left_out + 1)
+        unkept = await self._recorded("operated", said.command, who, what, self._said, left_out)
         return reply.model_copy(update={"text": f"{reply.text}{unkept}"}) if unkept else reply
+
+    async def _recorded(
+        self, kind: str, command: str, who: Who, what: Mapping[str, Any], bounded: Bounded, left_out: int
+    ) -> str:
+        """Empty once it is on record; else that it is not, or not yet, to be told."""
+        task = asyncio.create_task(self._record(kind, who, what, bounded, left_out))
+        self._recording.add(task)
+        task.add_done_callback(self._recording.discard)
+        await asyncio.wait((task,), timeout=RECORDED_S if command in OVERTAKES else None)
+        if task.done():
+            return task.result()
+        task.add_done_callback(self._tell_unkept)
+        return "; its record waits for the disk"
+
+    async def _record(self, kind: str, who: Who, what: Mapping[str, Any], bounded: Bounded, left_out: int) -> str:
+        if unkept := await self._kept(kind, who, what):
+            bounded.undo(who.name, left_out + 1)
+        return unkept
+
+    def _tell_unkept(self, task: asyncio.Task[str]) -> None:
+        """Of what was answered before."""
+        if not task.cancelled() and (unkept := task.result()):
+            self._event(COMMAND_EVENT, f"a stop or a hold was answered{unkept}", ok=False)
 
     async def _kept(self, kind: str, who: Who, what: Mapping[str, Any]) -> str:
         """Empty where it is; else that it is not, to be told."""

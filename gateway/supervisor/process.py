@@ -46,7 +46,7 @@ from gateway.supervisor.line_desk import LineDesk
 from gateway.supervisor.memory import GivenBack
 from gateway.supervisor.models import Models
 from gateway.supervisor.past import Past
-from gateway.supervisor.peers import GATEWAY
+from gateway.supervisor.peers import GATEWAY, know_users
 from gateway.supervisor.persons_desk import PersonsDesk
 from gateway.supervisor.retention import retention_of
 from gateway.supervisor.service import Gateway
@@ -130,6 +130,7 @@ async def serve(
     def around(configurations: Configurations, models: Models) -> LineSurroundings:
         return LineSurroundings(line, gateway.newest, gateway.recent, experiments, configurations, models, clocks)
 
+    await know_users()
     # First the socket, whose lock makes this the only instance; only then is the history touched.
     await mailbox.listen(run_folder / GATEWAY_SOCKET)
     try:
@@ -150,7 +151,7 @@ async def serve(
     gateway.audit_head = lambda: heads.head
     alarms = Alarms(mailbox, data_folder, gate.audit.append, gateway.note, clock, wall_clock, gate.shelvings)
     gateway.alarms = alarms.status
-    PersonsDesk(mailbox, gateway.command, gate.decide, alarms.say, gate.audit.append, clock, gateway.note)
+    people = PersonsDesk(mailbox, gateway.command, gate.decide, alarms.say, gate.audit.append, clock, gateway.note)
     gate.roles = AccessDesk(mailbox, gate.audit.append, clock).roles
     # One process for what nobody's verdict may wait for.
     beside = JudgeWorkers(line, nicer=NICEST)
@@ -194,6 +195,7 @@ async def serve(
             {
                 "alarms' file": alarms.keep,
                 "closing the agents' bus": bus.close,
+                "records of stops": people.close,
                 "closing courses": courses.close,
                 "closing dry runs": dry_runs.close,
                 "closing the past": past.close,

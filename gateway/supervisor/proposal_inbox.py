@@ -35,7 +35,7 @@ from gateway.supervisor.admission import bounds_of, caller_of, turned_away, why_
 from gateway.supervisor.audit_file import AuditUnavailable
 from gateway.supervisor.deployer_sides import JudgeSide, Surroundings
 from gateway.supervisor.lifecycle import PROPOSED, Impossible, Stage
-from gateway.supervisor.peers import GATEWAY
+from gateway.supervisor.peers import GATEWAY, in_directory
 from gateway.supervisor.proposal_records import ProposalRecords, done, refused
 
 AT_ONCE = 2  #: that are being judged: one has its context made up while the judge is at the other
@@ -69,7 +69,11 @@ class Inbox:
         ]
         if self._line.gate.autonomy == "closed":
             wrong.append('the line takes no changes: gate.autonomy is "closed" in its file')
-        if (differs := why_not_author(proposal.author, who, self._people())) is not None:
+        try:
+            differs = await in_directory(why_not_author, proposal.author, who, frozenset(self._people()))
+        except TimeoutError:
+            return refused("it is not judged", ["the users of this machine are not told in time: propose it again"])
+        if differs is not None:
             return turned_away(differs)
         if wrong:
             return refused("it is not judged", wrong)

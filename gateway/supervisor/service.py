@@ -43,11 +43,12 @@ from gateway.core.status import (
 from gateway.core.telemetry import Frame
 from gateway.core.topics import GATEWAY_COMMAND, GATEWAY_STATUS, LOOP_BUSES, LOOP_EVENT, LOOP_TELEMETRY
 from gateway.mailbox.port import PEER, Counters, Mailbox, NotSent, Unreachable
+from gateway.mailbox.rights import OVERTAKES
 from gateway.mailbox.to_loop import ToLoop
 from gateway.supervisor.bounded import Bounded
 from gateway.supervisor.historian import Historian
 from gateway.supervisor.intake import bounded_event, bus_reports_of, event_of
-from gateway.supervisor.peers import who_of
+from gateway.supervisor.peers import who_at_once, who_of
 from gateway.supervisor.recent import Recent
 from gateway.supervisor.said_inbox import (
     CAUSED_BY_ANYBODY,
@@ -65,6 +66,7 @@ from gateway.tasks.supervisor import TaskFault
 from gateway.wording.catalogue import sentence
 
 LOOP_TIME_S = 2.5  #: for the loop to answer a command
+SAFE_TIME_S, SAFE_SHOWN_S = 0.75, 0.6  #: for it to answer stop and hold, and of that to show it: `topics.SAFE_S` in all
 ARM_TIME_S = 14.0  #: arming configures every drive and reads its watchdog back
 DRILL_MOST_S = 8.0  #: of the drill itself, beside the warning
 EARLY_PERIODS = (
@@ -299,9 +301,10 @@ class Gateway:
         return status_payload(self.status())
 
     async def _answer_command(self, payload: bytes) -> bytes:
-        who = who_of(PEER.get())
-        refusal = None if is_never_held_back(payload) else self._inbox.refuse(who, len(payload))
-        return (refusal or await self.command(payload, who)).model_dump_json().encode()
+        if is_never_held_back(payload):
+            return (await self.command(payload, who_at_once(PEER.get()))).model_dump_json().encode()
+        who = await who_of(PEER.get())
+        return (self._inbox.refuse(who, len(payload)) or await self.command(payload, who)).model_dump_json().encode()
 
     async def command(self, payload: bytes, who: Who) -> Reply:
         """Hand a command on to the loop, and note who gave it; what is said again and again is counted."""
@@ -332,8 +335,9 @@ class Gateway:
                 reasons = [sentence(one) for one in found]
                 text = f"not {command.command}ed: {reasons[0]}"
                 return Reply(ok=False, state=state, text=text, reasons=reasons, findings=found)
-            time_s = self._answer_time_s(command)
-            return await self._answered(command, time_s)
+            if command.command in OVERTAKES:
+                return await self._safe(command, state)
+            return await self._answered(command, self._answer_time_s(command), SHOWN_S)
         except MalformedMessage as error:
             findings = list(error.findings)
             return Reply(
@@ -342,13 +346,24 @@ class Gateway:
         except Unreachable as error:
             return Reply(ok=False, state=state, text=str(error), reasons=[str(error)], known=isinstance(error, NotSent))
 
+    async def _safe(self, command: Command, state: str) -> Reply:
+        """A stop or a hold: what the loop answers, or what to press instead, before whoever said it stops waiting."""
+        try:
+            async with asyncio.timeout(SAFE_TIME_S):
+                return await self._answered(command, SAFE_TIME_S, SAFE_SHOWN_S)
+        except (Unreachable, TimeoutError) as error:
+            because = str(error) or f"no answer within {SAFE_TIME_S:g} s"
+            found = finding("loop-unanswered", command=in_words(command), because=because)
+            text, known = sentence(found), isinstance(error, NotSent)
+            return Reply(ok=False, state=state, text=text, reasons=[because], findings=[found], known=known)
+
     def _answer_time_s(self, command: Command) -> float:
         if isinstance(command, Drill):
             return ARM_TIME_S + DRILL_MOST_S + self._line.stages.start_warning_s
         return ARM_TIME_S if isinstance(command, Arm) else LOOP_TIME_S
 
-    async def _answered(self, command: Command, time_s: float) -> Reply:
-        """What the loop answers, once its frames show it. Raises Unreachable."""
+    async def _answered(self, command: Command, time_s: float, shown_s: float) -> Reply:
+        """What the loop answers within `time_s`, once its frames show it, within `shown_s`. Raises Unreachable."""
         seen: set[tuple[int, int]] = set()
         self._confirming.append(seen)
         try:
@@ -357,7 +372,7 @@ class Gateway:
                 return reply
             if not await self.true_loop.has_answered():
                 return self._not_believed(finding("false-loop-answered", command=in_words(command)))
-            if not reply.ok or await self._is_shown(command, reply, seen):
+            if not reply.ok or await self._is_shown(command, reply, seen, shown_s):
                 return reply
             shown = ", ".join(names_of(seen)) or "-"
             found = finding("reply-contradicted", command=in_words(command), answered=reply.state, shown=shown)
@@ -365,9 +380,9 @@ class Gateway:
         finally:
             self._confirming.remove(seen)
 
-    async def _is_shown(self, command: Command, reply: Reply, seen: set[tuple[int, int]]) -> bool:
+    async def _is_shown(self, command: Command, reply: Reply, seen: set[tuple[int, int]], within_s: float) -> bool:
         """Whether frames that came since the command was given show what the reply says, within a little while."""
-        until_s, turns = self._clock() + SHOWN_S, 0
+        until_s, turns = self._clock() + within_s, 0
         while not is_shown(command, reply, seen):
             if self._clock() >= until_s and turns >= SHOWN_TURNS:
                 return False

@@ -11,7 +11,8 @@ from pathlib import Path
 
 from gateway.core.topics import GATEWAY_STATUS
 from gateway.mailbox.paths import GATEWAY_SOCKET
-from gateway.mailbox.unix import MAX_IN_FLIGHT, UnixMailbox
+from gateway.mailbox.places import MAX_IN_FLIGHT
+from gateway.mailbox.unix import UnixMailbox
 
 
 async def read(run_folder: Path) -> int:

@@ -237,7 +237,7 @@ def test_who_is_told_apart_by_what():
     assert approver_of(person("anna")) == ("anna",)
     assert approver_of(who_is(Person(name="anna", role="viewer", through="opc-ua"), None)) == ("anna",)
     assert approver_of(Who(name="Anna", uid=7)) == ("anna", "uid 7")
-    assert approver_of(who_of(None)) == ("gateway",)
+    assert approver_of(asyncio.run(who_of(None))) == ("gateway",)
 
 
 @run

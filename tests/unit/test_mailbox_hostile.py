@@ -14,9 +14,10 @@ from gateway.core.topics import LOOP_COMMAND, LOOP_TELEMETRY
 from gateway.mailbox.codec import MAX_DATAGRAM, Envelope, Kind, decode, encode
 from gateway.mailbox.connection import READ_BUDGET
 from gateway.mailbox.listener import BACKLOG
+from gateway.mailbox.places import MAX_IN_FLIGHT
 from gateway.mailbox.port import RemoteError, Unreachable
 from gateway.mailbox.turns import LONG_PER_WINDOW, MAX_PER_WINDOW, WINDOW_S
-from gateway.mailbox.unix import MAX_IN_FLIGHT, UnixMailbox
+from gateway.mailbox.unix import UnixMailbox
 from tests.unit.supervisor_support import child, frame_of, until
 from tests.unit.test_mailbox_unix import LISTEN, echo, mailboxes, run
 

@@ -16,8 +16,9 @@ import pytest
 from gateway.core.topics import GATEWAY_STATUS, LOOP_COMMAND, LOOP_EVENT, LOOP_TELEMETRY
 from gateway.mailbox.codec import Envelope, Kind, encode
 from gateway.mailbox.listener import AlreadyRunning, CannotListen, PathTooLong
+from gateway.mailbox.places import MAX_IN_FLIGHT
 from gateway.mailbox.port import MAX_PAYLOAD, PEER, Peer, RemoteError, Unreachable
-from gateway.mailbox.unix import MAX_CONNECTIONS, MAX_IN_FLIGHT, RECONNECT_S, UnixMailbox
+from gateway.mailbox.unix import MAX_CONNECTIONS, RECONNECT_S, UnixMailbox
 from tests.unit.supervisor_support import child, short_folder, until
 
 CROWD = 10

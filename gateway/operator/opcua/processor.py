@@ -43,7 +43,7 @@ _SERVICES = _OPEN | _numbers(
 )  # fmt: skip
 (_CREATE,), (_ACTIVATE,), (_CALL,) = _numbers("CreateSession"), _numbers("ActivateSession"), _numbers("Call")
 (_HISTORY,) = _numbers("HistoryRead")
-URGENT = frozenset(f"{ROOT}.{name}" for name in ("Stop", "Hold"))  #: what nothing else may keep waiting
+URGENT = tuple(f"{ROOT}.{name}" for name in ("Stop", "Hold"))  #: what nothing else may keep waiting
 _ANYBODY = User(role=UserRole.User)  #: what asyncua is told of whoever has logged in; roles are ours
 
 
@@ -80,7 +80,7 @@ class Processor(UaProcessor):
         self._has_its_share = has_its_share
         self._is_trusted = is_trusted
         self._calls: set[asyncio.Task[None]] = set()  #: without those that are urgent
-        self._urgent: set[asyncio.Task[None]] = set()
+        self._urgent: dict[str, set[asyncio.Task[None]]] = {name: set() for name in URGENT}
         self._histories: set[asyncio.Task[None]] = set()
 
     async def _process_message(self, typeid: Any, requesthdr: Any, seqhdr: Any, body: Buffer) -> bool:
@@ -92,10 +92,10 @@ class Processor(UaProcessor):
         if service not in _OPEN and service != _CREATE:
             self._check_token(requesthdr)
         if service == _CALL:
-            urgent = _is_urgent(body)
-            at_most(len(self._calls) + len(self._urgent) + 1 if urgent else 0, MAX_URGENT)
-            at_most(0 if urgent else len(self._calls) + 1, MAX_CALLS)
-            self._begin(self._urgent if urgent else self._calls, typeid, requesthdr, seqhdr, body)
+            urgent = _urgent(body)
+            running = self._urgent[urgent] if urgent else self._calls
+            at_most(len(running) + 1, MAX_URGENT if urgent else MAX_CALLS)
+            self._begin(running, typeid, requesthdr, seqhdr, body)
             return True
         if service == _HISTORY:
             at_most(len(self._histories) + 1, MAX_HISTORY_READS)
@@ -230,10 +230,11 @@ def place_of(address: str) -> str:
     return str(found.ipv4_mapped or IPv6Network((found, 64), strict=False))
 
 
-def _is_urgent(body: Buffer) -> bool:
-    """A request that does nothing but stop the line. Raises ServiceError."""
+def _urgent(body: Buffer) -> str:
+    """The method of a request that does nothing but stop or hold the line; empty: another. Raises ServiceError."""
     try:
         calls = struct_from_binary(ua.CallParameters, body.copy()).MethodsToCall or ()
     except Exception as error:  # whatever asyncua makes of bytes that are no request
         raise ServiceError(ua.StatusCodes.BadDecodingError) from error
-    return bool(calls) and all(call.MethodId.Identifier in URGENT for call in calls)
+    called = {call.MethodId.Identifier for call in calls}
+    return next((name for name in URGENT if name in called), "") if called <= set(URGENT) else ""

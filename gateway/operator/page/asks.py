@@ -1,6 +1,7 @@
 """What the page asks for: the line, proposals, records, tensions of the past; and what people say."""
 
 import json
+from collections import Counter
 from collections.abc import Awaitable, Callable
 from typing import Annotated, Any
 
@@ -9,10 +10,11 @@ from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.routing import Route
 
+from gateway.core.finding import finding
 from gateway.core.line import Line, Strict
 from gateway.core.line_past import TensionsBetween
-from gateway.core.messages import Reply
-from gateway.core.people import LEAST, Said, may, why_may_not
+from gateway.core.messages import Hold, Reply, Stop
+from gateway.core.people import LEAST, Person, Said, may, why_may_not
 from gateway.operator.line_side import Declined, LineSide, NotTold
 from gateway.operator.page.answer import JSONResponse
 from gateway.operator.page.guard import body_of
@@ -21,6 +23,9 @@ from gateway.operator.page.tick import line_told
 from gateway.operator.page.told import proposal_told
 from gateway.wording.catalogue import languages, sentence
 
+MAX_SAFE = 8  #: stops that wait for their answer, and holds, whatever else is asked
+#: Each at an address of its own: where there is no place for requests any more, there still is one for these.
+SAFE: dict[str, Stop | Hold] = {"/api/stop": Stop(), "/api/hold": Hold()}
 _SAID: TypeAdapter[Said] = TypeAdapter(Annotated[Said, Field(discriminator="command")])
 
 
@@ -31,6 +36,7 @@ class Asks:
         self._line = line_told(line)
         self._side = side
         self._door = door
+        self._waiting: Counter[str] = Counter()  #: of what is SAFE
 
     def routes(self) -> list[Route]:
         return [
@@ -42,6 +48,7 @@ class Asks:
             Route("/api/records", self._records),
             Route("/api/tensions", self._tensions),
             Route("/api/say", self._say, methods=["POST"]),
+            *(Route(path, self._say_safe, methods=["POST"]) for path in SAFE),
         ]
 
     async def _of_line(self, request: Request) -> JSONResponse:
@@ -109,6 +116,24 @@ class Asks:
             said = _SAID.validate_python(_object(await body_of(request)))
         except ValidationError as error:
             raise HTTPException(400, _in_words(error)) from None
+        return await self._said(person, said)
+
+    async def _say_safe(self, request: Request) -> JSONResponse:
+        """A stop or a hold; its address says all, nothing is read."""
+        person, path = self._door.person(request), request.url.path
+        said = SAFE[path]
+        if self._waiting[path] >= MAX_SAFE:
+            found = finding("safe-crowded", command=said.command, waiting=MAX_SAFE)
+            text = sentence(found)
+            reply = Reply(ok=False, state="", text=text, reasons=[text], findings=[found], known=False)
+            return JSONResponse(_told(reply), 503)
+        self._waiting[path] += 1
+        try:
+            return await self._said(person, said)
+        finally:
+            self._waiting[path] -= 1
+
+    async def _said(self, person: Person, said: Said) -> JSONResponse:
         if reason := why_may_not(person, said.command):
             # The gateway refuses it as well, and its audit has to know that it was tried.
             reply = await self._side.say(person, said)

@@ -11,7 +11,7 @@ import { notDone, reply, stopSent } from "./reply.js";
 import { Trends } from "./trends.js";
 import { number, preferred, speak, time, word } from "./words.js";
 
-const STALE_MS = 1000, AGAIN_MS = 3000, STOP_MS = 3000, RECORDS_MS = 3000, MOST_RECORDS = 200, LONG = 22, VIEWS = ["line", "change", "history", "health"];
+const STALE_MS = 1000, AGAIN_MS = 3000, SAFE_MS = 1500, RECORDS_MS = 3000, MOST_RECORDS = 200, LONG = 22, VIEWS = ["line", "change", "history", "health"];
 let parts = null, tick = null, heard_ms = 0, broken = false, followed = null, stops = 0, skew_s = 0, list = null, records = [], again_at = 0, asked_ms = 0, asks = 0, newest = 0;
 
 async function begin() {
@@ -189,11 +189,12 @@ function route() {
 }
 
 async function say(said) {
-  const stop = said.command === "stop", mine = stop ? ++stops : stops;
-  const tell = (answer) => mine === stops && reply(answer, stop); // what comes late never covers what came of a stop
+  const stop = said.command === "stop", safe = stop || said.command === "hold", mine = stop ? ++stops : stops;
+  const tell = (answer) => mine === stops && reply(answer, safe); // what comes late never covers what came of a stop
   if (stop) stopSent();
   try {
-    tell(await ask("api/say", said, stop ? STOP_MS : undefined));
+    // Stop and hold at an address of their own: there is a place for them where nothing else is answered any more.
+    tell(await (safe ? ask(`api/${said.command}`, {}, SAFE_MS) : ask("api/say", said)));
   } catch (error) {
     if (!(error instanceof Refused)) throw error;
     if (error.status === 401) return out(stop ? "stop" : "said");
