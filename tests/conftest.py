@@ -1,4 +1,6 @@
-"""For all tests: what is about the wall clock says so by its mark, and no property fails because it took long."""
+"""For all tests: what is about the wall clock says so by its mark, no property fails because it took long, and the
+gateway's event loops wait for nothing.
+"""
 
 import gc
 import os
@@ -13,6 +15,9 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the commands: on small 
 
 from hypothesis import HealthCheck, settings
 
+from tests.support import event_loop_guard
+
+event_loop_guard.begin()
 settings.register_profile(
     "any machine", deadline=None, derandomize=False, max_examples=100, suppress_health_check=[HealthCheck.too_slow]
 )
@@ -32,6 +37,13 @@ def _leaves_nothing_behind() -> Iterator[None]:
     sys.setswitchinterval(before_s)
     os.umask(umask)
     gc.collect()
+
+
+@pytest.fixture(autouse=True)
+def _event_loops_wait_for_nothing() -> Iterator[None]:
+    """Of the gateway's: no store, no zip, no long hash and no look-up of a user in their own thread."""
+    yield
+    assert event_loop_guard.taken() == []
 
 
 @pytest.hookimpl(wrapper=True)

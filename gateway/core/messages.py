@@ -177,6 +177,7 @@ _command: TypeAdapter[Command] = TypeAdapter(Command)
 #: What only the gateway's deployer says, never a person directly.
 Deploying = Deploy | Renew | Keep | WatchGood | Narrow | Confirmed
 
+PACKED = b"\x78"  #: what zlib has packed begins so, and no JSON
 MAX_COMMAND = 4096  #: bytes of a command as JSON
 MAX_DEPLOYMENT = 2 * 1024 * 1024  #: the same for those with matrices, unpacked
 #: For which reading a message holds the interpreter, in one piece: 10 ns of long numbers, up to 32 ns of short ones
@@ -276,7 +277,7 @@ def parse_command(payload: bytes, period_s: float = inf) -> Command:
 
     One that could not be read without holding the interpreter for longer than a tenth of `period_s` is none.
     """
-    packed = payload[:1] == b"\x78"  # no JSON begins so
+    packed = payload[:1] == PACKED
     if packed:
         payload = _unpacked(payload)
     elif len(payload) > MAX_COMMAND:

@@ -17,6 +17,7 @@ from typing import Protocol
 from gateway.core.finding import Finding, finding
 from gateway.core.messages import (
     MAX_COMMAND,
+    PACKED,
     Command,
     Deploy,
     Keep,
@@ -106,7 +107,7 @@ class Door:
         return reply.model_dump_json().encode()
 
     async def _of_anybody(self, payload: bytes) -> Reply:
-        if len(payload) > MAX_COMMAND or payload[:1] == b"\x78":  # packed: nothing that anybody may say is so long
+        if len(payload) > MAX_COMMAND or payload[:1] == PACKED:  # packed: nothing that anybody may say is so long
             return self._turn_away("what is packed", finding("no-proof", command="a packed command"))
         command = parse_command(payload)
         if not may_be_said_by_anybody(command.command):

@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from threading import Lock
 
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
@@ -29,13 +30,14 @@ class LineName:
 
 
 class Signer:
-    """Of one gateway process."""
+    """Of one gateway process, from any of its threads."""
 
     def __init__(self, key: Ed25519PrivateKey, of: LineName, clock: Callable[[], float] = time.monotonic) -> None:
         self._key = key
         self._of = of
         self._clock = clock
         self._last = 0
+        self._numbering = Lock()  #: what is long is signed in a thread
 
     def sealed(self, command: Command, loop: str, grounds: Grounds | None = None) -> bytes:
         """`command` for the start of a loop that has the nonce `loop`."""
@@ -44,9 +46,10 @@ class Signer:
 
     def proof(self, command: Command, content: bytes, loop: str, grounds: Grounds | None = None) -> Proof:
         """That the gateway asks for `command`, whose bytes are `content`."""
-        self._last = max(self._last + 1, round(self._clock() * 1e9))
+        with self._numbering:
+            number = self._last = max(self._last + 1, round(self._clock() * 1e9))
         statement = Statement(
-            site=self._of.site, line=self._of.line, loop=loop, number=self._last, command=command.command,
+            site=self._of.site, line=self._of.line, loop=loop, number=number, command=command.command,
             content=content_hash(content), claim=claim_of(command), grounds=grounds or Grounds(),
         )  # fmt: skip
         return Proof(statement=statement, signature=self._key.sign(statement.signed_bytes()).hex())

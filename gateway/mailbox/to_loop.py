@@ -1,8 +1,10 @@
 """The gateway's way to its loop: each command signed for the loop that is there now."""
 
+import asyncio
+
 from pydantic import ValidationError
 
-from gateway.core.messages import Command, Reply, command_bytes
+from gateway.core.messages import Command, Deploy, Keep, Reply, WatchGood, command_bytes
 from gateway.core.proof import Grounds, Introduction
 from gateway.core.topics import LOOP_COMMAND, LOOP_HELLO
 from gateway.mailbox.port import Mailbox, NotSent, RemoteError, Unreachable
@@ -37,7 +39,11 @@ class ToLoop:
 
     async def _signed(self, command: Command, timeout_s: float, grounds: Grounds | None) -> Reply:
         loop = self._loop = self._loop or await self._hello()
-        return await self._ask(self._signer.sealed(command, loop, grounds), timeout_s)
+        if isinstance(command, Deploy | Keep | WatchGood):  # packed and hashed, which takes its time
+            payload = await asyncio.to_thread(self._signer.sealed, command, loop, grounds)
+        else:
+            payload = self._signer.sealed(command, loop, grounds)
+        return await self._ask(payload, timeout_s)
 
     async def _hello(self) -> str:
         """Raises NotSent: whatever was to be told has not been told."""

@@ -135,7 +135,7 @@ class AgentsDesk:
         )  # fmt: skip
         try:
             async with self._writing:
-                await asyncio.to_thread(self._log.keep, pack(one), one)
+                await asyncio.to_thread(lambda: self._log.keep(pack(one), one))
         except InteractionsError as error:
             self._note("interaction", f"agent {agent}, {told.question.decision}: it is not kept: {error}", ok=False)
         return _bytes(Reply(ok=True, state="", text="it is noted"))

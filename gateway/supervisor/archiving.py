@@ -1,5 +1,6 @@
 """A configuration kept under a name: recorded before it is done, like everything that changes a store."""
 
+import asyncio
 from collections.abc import Mapping
 from typing import Any, Protocol
 
@@ -22,10 +23,10 @@ class Appends(Protocol):
 async def archive(
     audit: Appends, storage: Configurations, site: str, line: str, command: Archive, who: Who, now_s: float
 ) -> Reply:
-    """Of a line's configurations. Puts nothing into service."""
+    """Of a line's configurations, each step of the store in a thread. Puts nothing into service."""
     try:
         require_name(command.name)
-        one = storage.find(command.configuration, site, line)
+        one = await asyncio.to_thread(storage.find, command.configuration, site, line)
         if one.controller is None:
             raise ConfigurationsError(f"version {one.version} is damaged: {one.damage}")
         what = {"configuration": one.id, "version": one.version, "name": command.name, "because": command.because}
@@ -33,7 +34,8 @@ async def archive(
     except (ConfigurationsError, AuditUnavailable) as error:
         return refused("nothing was archived", [str(error)])
     try:
-        storage.archive(site, line, one.id, command.name, now_s, who.name, command.because)
+        given = one.id, command.name, now_s, who.name, command.because
+        await asyncio.to_thread(storage.archive, site, line, *given)
     except ConfigurationsError as error:
         try:
             await audit.append(NOT_ARCHIVED, who, {**what, "because": str(error)[:1000]})

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from gateway.core.audit_record import BEFORE_FIRST, NotRecordable, Who, head_of, record_of
+from gateway.core.audit_record import BEFORE_FIRST, NotRecordable, Who, record_of
 from gateway.supervisor.audit_anchor import NOTHING_YET, Anchor
 from gateway.supervisor.audit_file import AuditUnavailable
 from gateway.supervisor.audit_verify import MOST_AT_ONCE
@@ -220,7 +220,7 @@ def _checked(kind: str, who: Who, what: Mapping[str, Any], blobs: Mapping[str, b
             "kind": kind,
             "who": who,
             "what": dict(what),
-            "blobs": {part: head_of(payload) for part, payload in blobs.items()},
+            "blobs": dict.fromkeys(blobs, BEFORE_FIRST),  # their heads are made by the thread that writes
             "previous": BEFORE_FIRST,
         }
     )

@@ -99,7 +99,7 @@ class CoursesDesk:
             courses = (await self._judge.courses(payload, context, region)).courses
         except NoVerdict:
             courses = []
-        self._kept[verdict] = proposal, _of(proposal, verdict, context, courses=courses)
+        self._kept[verdict] = proposal, await asyncio.to_thread(_of, proposal, verdict, context, courses)
 
 
 def _of(

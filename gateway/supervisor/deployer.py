@@ -334,14 +334,20 @@ class Deployer:
 
     async def close(self) -> None:
         await self._inbox.close()
+        await self._surroundings.close()
 
-    async def at_hand(self, beginning: str | None = None) -> None:
-        """Before `watch`, `listed`, `shown` and `decide`: what they need of the disk. `beginning`: of this proposal."""
+    async def at_hand(self, beginning: str | None = None, *, difference: bool = False) -> None:
+        """Before `watch`, `listed`, `shown` and `decide`: what they need of the disk. `beginning`: of this proposal.
+
+        `difference`: also what is needed to tell what it would change.
+        """
         if self._line.gate.autonomy == "approve-first":  # whether it passes by itself depends on what it is
             await self._small.look()
         if beginning is not None:
             found = (one for hash_, one in self.book.entries.items() if hash_.startswith(beginning))
             await self._records.fetch(islice(found, 1))
+        if difference:
+            await self._surroundings.at_hand(self.book)
 
     def listed(self, most: int, skip: int = 0) -> ProposalList:
         """The newest first, but for the first `skip`; with those that are not done with, where none are left out."""

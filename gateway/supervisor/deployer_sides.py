@@ -63,9 +63,15 @@ class Surroundings(Protocol):
 
     async def context(self, book: Book) -> tuple[JudgeContext, list[Recording]]: ...
 
-    def difference(self, proposal: Proposal, book: Book) -> list[str]:
-        """What it would change, for a person."""
+    async def at_hand(self, book: Book) -> None:
+        """Before `difference`: what it needs of the disk."""
         ...
+
+    def difference(self, proposal: Proposal, book: Book) -> list[str]:
+        """What it would change, for a person. Reads no disk."""
+        ...
+
+    async def close(self) -> None: ...
 
     async def recovery(self, fallback: str, region: Region, book: Book) -> RecoveryPrediction | None:
         """Whether configuration `fallback` would recover the line, for the loop to see; None: no model is accepted.

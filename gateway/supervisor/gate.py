@@ -31,7 +31,12 @@ from gateway.supervisor.audit import Audit
 from gateway.supervisor.audit_file import AuditUnavailable
 from gateway.supervisor.book_file import CannotBegin, book_in, done_in
 from gateway.supervisor.bounded import Bounded, with_left_out
-from gateway.supervisor.configurations import Configurations, ConfigurationsError, begin_configurations
+from gateway.supervisor.configurations import (
+    Configurations,
+    ConfigurationsError,
+    begin_configurations,
+    open_configurations,
+)
 from gateway.supervisor.deployer import Deployer
 from gateway.supervisor.deployer_sides import JudgeSide
 from gateway.supervisor.experiments import ENDS as EXPERIMENT_ENDS
@@ -45,6 +50,7 @@ from gateway.supervisor.model_store import ModelsError
 from gateway.supervisor.models import Models, begin_repository
 from gateway.supervisor.patience import Patience
 from gateway.supervisor.peers import GATEWAY, who_of
+from gateway.supervisor.proposal_records import refused
 from gateway.supervisor.said_inbox import DECISION_EVENT, OF_DECISIONS, SaidInbox
 from gateway.supervisor.store_writer import StoreWriter
 from gateway.supervisor.surroundings import LineSurroundings
@@ -246,8 +252,8 @@ class Gate:
         await self._loop_records.close()
         if self.deployer is not None:
             await self.deployer.close()
-        for store in self._stores or ():
-            store.close()
+        for store in (self._stores or ()) if self.deployer is None else ():  # else its surroundings have closed them
+            await asyncio.to_thread(store.close)
         await asyncio.to_thread(self.audit.close)
 
     async def _open(self) -> None:
@@ -327,11 +333,12 @@ class Gate:
             return _not_understood(error)
         if self.deployer is None:
             return self.shut_reply().model_dump_json().encode()
-        await self.deployer.at_hand(None if isinstance(query, ListProposals) else query.proposal)
         if isinstance(query, ListProposals):
+            await self.deployer.at_hand()
             found = self.deployer.listed(query.most, query.skip)
             told = found.model_copy(update={"controller": await self._in_service.told(self.deployer.book)})
             return told.model_dump_json().encode()
+        await self.deployer.at_hand(query.proposal, difference=True)
         found = self.deployer.shown(query.proposal)
         if isinstance(found, str):
             return Reply(ok=False, state="", text=found, reasons=[found]).model_dump_json().encode()
@@ -359,9 +366,7 @@ class Gate:
             await self.deployer.at_hand(decision.proposal)
             reply = await self.deployer.decide(decision, who)
         elif isinstance(decision, Archive):
-            assert self._stores is not None  # they are open before the gate is
-            line, now_s = self._line, self._wall_clock()
-            reply = await archive(self.audit, self._stores[0], line.site, line.line, decision, who, now_s)
+            reply = await self._archive(decision, who)
         elif isinstance(decision, Confirm):
             reply = await self.deployer.confirm(decision, who)
         elif isinstance(decision, LineChanged):
@@ -385,6 +390,18 @@ class Gate:
         except AuditUnavailable as error:
             self._refusals.undo(who.name, left_out + 1)
             self._note("gate", f"a refusal could not be recorded: {error}")
+
+    async def _archive(self, said: Archive, who: Who) -> Reply:
+        """With a connection of its own, in a thread, as all that writes to a store."""
+        line, now_s = self._line, self._wall_clock()
+        try:
+            store = await asyncio.to_thread(open_configurations, self._folder / configurations_store.FILE_NAME)
+        except ConfigurationsError as error:
+            return refused("nothing was archived", [str(error)])
+        try:
+            return await archive(self.audit, store, line.site, line.line, said, who, now_s)
+        finally:
+            await asyncio.to_thread(store.close)
 
     async def _line_changed(self, deployer: Deployer, said: LineChanged, who: Who) -> Reply:
         reply = await deployer.line_changed(said.because, who)

@@ -1,6 +1,5 @@
 """The audit of a gateway as its gate uses it: written by its own thread, read where it lies, and not read twice."""
 
-import asyncio
 from collections import OrderedDict
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -10,6 +9,7 @@ from gateway.core.audit_record import Who, head_of
 from gateway.supervisor.audit import Audit
 from gateway.supervisor.audit_file import AuditFile, AuditUnavailable
 from gateway.supervisor.deployer_sides import NotAtHand
+from gateway.tasks.threads import Worker, beside
 
 MOST_KEPT, MOST_BYTES = 64, 32_000_000  #: proposals and verdicts that are being looked at; one is kept in any case
 LOOKED_AT = ("proposal", "verdict")  #: parts of a record
@@ -24,6 +24,7 @@ class KeptAudit:
         #: The last ones that were asked for; None: it is not what was stored.
         self._blobs: OrderedDict[str, bytes | None] = OrderedDict()
         self._bytes = 0  #: of all of them
+        self._reader = Worker("audit-reader")
         self._trouble = ""  #: why nothing could be fetched
 
     async def append(
@@ -32,7 +33,7 @@ class KeptAudit:
         stored = await self._audit.append(kind, who, what, blobs)
         for part, content in (blobs or {}).items():
             if part in LOOKED_AT:
-                self._keep(head_of(content), content)
+                self._keep(await beside(len(content), head_of, content), content)
         return stored
 
     async def fetch(self, ids: Iterable[str]) -> None:
@@ -45,7 +46,7 @@ class KeptAudit:
         if not missing:
             return
         try:
-            found = await asyncio.to_thread(self._read, missing)
+            found = await self._reader.do(self._read, missing)
         except AuditUnavailable as error:
             self._trouble = str(error)
             raise

@@ -5,16 +5,16 @@ They are judged in turns (`mailbox.inbox`): whoever proposes much waits behind h
 
 import asyncio
 import hashlib
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from datetime import datetime
-from typing import Any
+from typing import Any, NamedTuple
 
 from gateway.core.audit_record import Who
 from gateway.core.canonical import known_hashes
 from gateway.core.controller import config_hash
 from gateway.core.experiment import experiment_hash
+from gateway.core.judge_context import JudgeContext, context_hash, dated
 from gateway.core.judge_context import canonical as canonical_context
-from gateway.core.judge_context import context_hash, dated
 from gateway.core.line import Line
 from gateway.core.line_model import LineModel, model_hash
 from gateway.core.messages import Reply
@@ -28,6 +28,7 @@ from gateway.core.proposal import (
     parse_proposal,
     proposal_hash,
 )
+from gateway.core.recording import Recording
 from gateway.core.verdict import Verdict, canonical_line, verdict_hash
 from gateway.core.verdict import canonical as canonical_verdict
 from gateway.mailbox.inbox import FairQueue
@@ -37,6 +38,7 @@ from gateway.supervisor.deployer_sides import JudgeSide, Surroundings
 from gateway.supervisor.lifecycle import PROPOSED, Impossible, Stage
 from gateway.supervisor.peers import GATEWAY, in_directory
 from gateway.supervisor.proposal_records import ProposalRecords, done, refused
+from gateway.tasks.threads import beside
 
 AT_ONCE = 2  #: that are being judged: one has its context made up while the judge is at the other
 
@@ -60,9 +62,10 @@ class Inbox:
     async def propose(self, payload: bytes, who: Who) -> Reply:
         """Take a proposal in, and judge it in the background."""
         try:
-            proposal = parse_proposal(payload, self._line.gate.proposal_max_bytes)
+            taken = await beside(len(payload), _taken_in, payload, self._line.gate.proposal_max_bytes)
         except ProposalRefused as malformed:
             return await self._malformed(payload, malformed, who)
+        proposal, hash_ = taken.proposal, taken.hash
         wrong = [
             f"it is for {proposal.site}/{proposal.line}; allowed: {self._line.site}/{self._line.line}"
             for _ in range((proposal.site, proposal.line) != (self._line.site, self._line.line))
@@ -81,20 +84,19 @@ class Inbox:
         full = self._waiting.refuse(caller, bounds_of(who, self._line), self._line.gate.verdict_max_s)
         if full is not None:
             return turned_away(full)
-        hash_ = proposal_hash(proposal)
         what = {
             "proposal": hash_,
             "change": proposal.kind,
             "author": proposal.author,
             "base": proposal.base,
-            "changes": _brings(proposal),
+            "changes": taken.changes,
             "created": proposal.created,
             "expires": proposal.expires,
             "expires_s": datetime.fromisoformat(proposal.expires).timestamp(),
         }
         try:
             async with self._records.one_step:
-                await self._records.step(PROPOSED, what, who, {"proposal": canonical(proposal)})
+                await self._records.step(PROPOSED, what, who, {"proposal": taken.content})
         except (Impossible, AuditUnavailable) as error:
             return refused("it is not judged", [str(error)])
         self._begin(hash_, who)
@@ -161,11 +163,18 @@ class Inbox:
         if (now_s := self._records.now_for(entry)) is not None:
             context = dated(context, now_s)
         verdict = await self._judge.judge(canonical(proposal), context, recordings)
+        in_service = self._records.book.model
+        what, blobs = await asyncio.to_thread(self._to_record, verdict, context, recordings, in_service)
+        return "accepted" if verdict.accepted else "refused", {"proposal": hash_, **what}, blobs
+
+    def _to_record(
+        self, verdict: Verdict, context: JudgeContext, recordings: Sequence[Recording], in_service: str | None
+    ) -> tuple[dict[str, Any], dict[str, bytes]]:
+        """Of a verdict, and what lies beside it: hashed, and packed, which takes seconds."""
         what = {
-            "proposal": hash_,
             "verdict": verdict_hash(verdict),
             "context": context_hash(context),
-            "model": None if context.model is None else _id_of(context.model, self._records.book.model),
+            "model": None if context.model is None else _id_of(context.model, in_service),
             "line": verdict.line,
             "seed": verdict.seed,
             "because": _first_reason(verdict),
@@ -175,16 +184,34 @@ class Inbox:
             "context": canonical_context(context),
             "line": canonical_line(self._line),
         }
-        blobs |= {f"data-{number}": packed(one) for number, one in enumerate(recordings, start=1)}
-        return "accepted" if verdict.accepted else "refused", what, blobs
+        return what, blobs | {f"data-{number}": packed(one) for number, one in enumerate(recordings, start=1)}
 
     async def _malformed(self, payload: bytes, malformed: ProposalRefused, who: Who) -> Reply:
-        what = {"payload": hashlib.sha256(payload).hexdigest(), "reasons": malformed.reasons[:20]}
+        what = {"payload": await beside(len(payload), _sha256, payload), "reasons": malformed.reasons[:20]}
         try:
             await self._records.note("malformed-proposal", who, what)
         except AuditUnavailable as error:
             return refused("it is no proposal", [*malformed.reasons, str(error)])
         return refused("it is no proposal", malformed.reasons)
+
+
+class _Taken(NamedTuple):
+    """A proposal as it came in."""
+
+    proposal: Proposal
+    hash: str
+    content: bytes  #: canonical
+    changes: str  #: hash of what it brings
+
+
+def _taken_in(payload: bytes, most_bytes: int) -> _Taken:
+    """Raises ProposalRefused."""
+    proposal = parse_proposal(payload, most_bytes)
+    return _Taken(proposal, proposal_hash(proposal), canonical(proposal), _brings(proposal))
+
+
+def _sha256(payload: bytes) -> str:
+    return hashlib.sha256(payload).hexdigest()
 
 
 def _id_of(model: LineModel, in_service: str | None) -> str:

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from typing import Final
 
 from gateway.core.audit_record import Who
-from gateway.core.messages import MAX_COMMAND, MAX_DEPLOYMENT, MalformedMessage, Reply, parse_command
+from gateway.core.messages import MAX_COMMAND, MAX_DEPLOYMENT, PACKED, MalformedMessage, Reply, parse_command
 from gateway.mailbox.inbox import Bounds, RateLimiter, name_of
 from gateway.mailbox.rights import OVERTAKES
 from gateway.supervisor.admission import caller_of, turned_away
@@ -68,7 +68,7 @@ def is_stop(payload: bytes) -> bool:
 
 def _name_of(payload: bytes) -> str:
     """Of a short command; of any other nothing."""
-    if len(payload) > MAX_COMMAND or payload[:1] == b"\x78":  # packed: none of these is
+    if len(payload) > MAX_COMMAND or payload[:1] == PACKED:  # packed: none of these is
         return ""
     try:
         return parse_command(payload).command

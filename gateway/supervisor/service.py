@@ -17,6 +17,7 @@ from gateway.core.deployment import WiringStatus
 from gateway.core.finding import Finding, finding
 from gateway.core.line import Line
 from gateway.core.messages import (
+    PACKED,
     Arm,
     BusReport,
     Command,
@@ -81,6 +82,7 @@ EVENTS_SHOWN = 20
 SAID_SHOWN = 8  #: of these, at most, of what any local process can cause
 REPEATS = (3, 10.0)  #: events of one thing said again and again: in a row, and then one every so many seconds
 NO_BUS = BusStatus(open=False, text="it is about to be opened", agents=[], refused=0)
+BY_PROPOSAL = "only a proposal that was judged and approved changes the controller"
 FINDINGS_SHOWN = 8  #: of an event in the status
 TEXT_SHOWN = 300  #: characters of an event's text in the status; the history keeps all
 
@@ -325,9 +327,12 @@ class Gateway:
     async def _pass_on(self, payload: bytes) -> Reply:
         state = loop_status(self._line, self._sink, self._clock()).state
         try:
+            if payload[:1] == PACKED:  # nothing that may be said here is: it is not even unpacked
+                text = f"{_in_words(payload)}: {BY_PROPOSAL}"
+                return Reply(ok=False, state=state, text=text, reasons=[text])
             command = parse_command(payload)
             if isinstance(command, Deploying) or (isinstance(command, RunExperiment) and command.proposal is not None):
-                text = f"{in_words(command)}: only a proposal that was judged and approved changes the controller"
+                text = f"{in_words(command)}: {BY_PROPOSAL}"
                 return Reply(ok=False, state=state, text=text, reasons=[text])
             if isinstance(command, Arm | Start) and (
                 found := await self.hold_against_records() or self.not_to_be_armed()
@@ -400,6 +405,8 @@ class Gateway:
 
 
 def _in_words(payload: bytes) -> str:
+    if payload[:1] == PACKED:
+        return "a packed command"
     try:
         return in_words(parse_command(payload))
     except MalformedMessage:

@@ -1,7 +1,12 @@
-"""What the line is like now, as a verdict needs it: state, what is in service, the model, the newest data that move."""
+"""What the line is like now, as a verdict needs it: state, what is in service, the model, the newest data that move.
+
+The stores are read in a thread, one after the other: who holds one of them holds up what needs it, and nothing else.
+"""
 
 import asyncio
+from collections import OrderedDict
 from collections.abc import Callable
+from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -24,11 +29,64 @@ from gateway.supervisor.model_store import ModelsError
 from gateway.supervisor.models import Models
 from gateway.supervisor.proposal_records import iso
 from gateway.supervisor.recent import STANDING_S, WINDOW_S, Recent
+from gateway.tasks.threads import Worker
 from safety.probation import Standing, look_at
 from safety.trial import Trial
 
 PATIENCE_S, LOOK_S = STANDING_S + 1.0, 0.1
 NODES = (0.1, 0.5, 1.0)  #: of the fastest speed: where recovery is predicted
+MOST_KEPT = 16  #: configurations, and models, that were looked up last: what has a hash never changes
+
+AT_HAND_S = 1.0  #: that whoever looks at a proposal waits for the stores
+
+Content = TypeVar("Content")
+
+
+class _Wanted(NamedTuple):
+    """What the stores are asked for, of a book."""
+
+    in_service: str | None
+    model: str | None
+    first_as_far: tuple[str, Region] | None
+    line_changed_s: float | None
+
+
+class _OfStores(NamedTuple):
+    in_service: Controller
+    model: LineModel | None
+    baseline: Controller | None
+    baseline_region: Region
+
+
+class _Kept(Generic[Content]):
+    """What was found by hash, and why it was not."""
+
+    def __init__(self) -> None:
+        self._found: OrderedDict[str, Content | NotKnown] = OrderedDict()
+
+    def look_up(self, hash_: str, find: Callable[[str], Content]) -> Content:
+        """In the stores' thread. Raises NotKnown."""
+        if isinstance(found := self._found.get(hash_), NotKnown | None):
+            try:
+                found = find(hash_)
+            except NotKnown as error:
+                self._keep(hash_, error)
+                raise
+        self._keep(hash_, found)
+        return found
+
+    def at_hand(self, hash_: str) -> Content:
+        """As it was found last. Raises NotKnown."""
+        found = self._found.get(hash_)
+        if found is None or isinstance(found, NotKnown):
+            raise NotKnown(str(found or "it was not looked up yet: ask again"))
+        return found
+
+    def _keep(self, hash_: str, found: Content | NotKnown) -> None:
+        self._found[hash_] = found
+        self._found.move_to_end(hash_)
+        while len(self._found) > MOST_KEPT:
+            self._found.popitem(last=False)
 
 
 class LineSurroundings:
@@ -51,6 +109,8 @@ class LineSurroundings:
         self._experiments = experiments
         self._configurations = configurations
         self._models = models
+        self._stores = Worker("stores")  #: the only thread in which these two are asked
+        self._kept_controllers, self._kept_models = _Kept[Controller](), _Kept[LineModel]()
         self._clock = clock
         self._before: Standing | None = None  #: how the line stood before the change
         self._trial = self._new_trial()
@@ -60,27 +120,41 @@ class LineSurroundings:
     async def context(self, book: Book) -> tuple[JudgeContext, list[Recording]]:
         """Of a line that runs once it stands, or in some seconds as it is then. Raises NotKnown."""
         await self._stands()
-        found = await asyncio.to_thread(self._experiments, self._line.gate.data_max_age_s)
+        found = await asyncio.to_thread(self._data, self._line.gate.data_max_age_s)
+        while True:  # what it is asked for may change meanwhile
+            wanted = _wanted(book)
+            of_stores = await self._stores.do(self._of_stores, wanted)
+            if wanted == _wanted(book):
+                break
         now_s = self._clock.now().wall_s
         if book.line_changed is not None:
             changed_s = now_s - self._clock.age(book.line_changed).least_s
             found = [one for one in found if one[1] > changed_s]
-        baseline, baseline_region = self._baseline(book)
         return JudgeContext(
             format=1,
             now=iso(now_s),
             state=self._state(book),
-            in_service=self._controller(book.in_service),
+            in_service=of_stores.in_service,
             region=book.judged_for,
-            baseline=baseline,
-            baseline_region=baseline_region,
-            model=self._model(book),
+            baseline=of_stores.baseline,
+            baseline_region=of_stores.baseline_region,
+            model=of_stores.model,
             data=[
-                DataReference(path=f"{one.digest()}.npz", digest=one.digest(), recorded=iso(end_s))
-                for one, end_s in found
+                DataReference(path=f"{digest}.npz", digest=digest, recorded=iso(end_s)) for _, end_s, digest in found
             ],
             decided=[entry.proposal for entry in book.entries.values() if entry.stage is not Stage.RECEIVED][-4096:],
-        ), [one for one, _ in found]
+        ), [one for one, _, _ in found]
+
+    async def at_hand(self, book: Book) -> None:
+        """Before `difference`: what it needs of the stores, as far as they answer in time."""
+        try:
+            async with asyncio.timeout(AT_HAND_S):
+                await self._stores.do(self._look_up, _wanted(book))
+        except TimeoutError:
+            return
+
+    async def close(self) -> None:
+        await self._stores.close(self._close_stores)
 
     async def _stands(self) -> None:
         """Until it does, or does not for longer than that takes at a line that is left alone."""
@@ -91,22 +165,24 @@ class LineSurroundings:
             await asyncio.sleep(LOOK_S)
 
     def difference(self, proposal: Proposal, book: Book) -> list[str]:
-        """What it would change, in words and numbers; where something is not known, that."""
-        change = proposal.change
+        """What it would change, in words and numbers, of what is at hand; where something is not known, that."""
+        change, in_service, model = proposal.change, book.in_service, book.model
         try:
             if isinstance(change, GainsChange):
-                return of_controllers(self._controller(book.in_service), change.controller)
+                return of_controllers(self._kept_controllers.at_hand(_known(in_service)), change.controller)
             if isinstance(change, ExperimentChange):
                 return of_experiment(change.experiment)
-            return of_models(self._model(book), change.model)
+            return of_models(None if model is None else self._kept_models.at_hand(model), change.model)
         except NotKnown as error:
             return [str(error)]
 
     async def recovery(self, fallback: str, region: Region, book: Book) -> RecoveryPrediction | None:
         """Of the accepted model, in a thread: it takes a while. Raises NotKnown."""
-        model, controller = self._model(book), self._controller(fallback)
-        if model is None:
+        if book.model is None:
+            await self._stores.do(self._controller, fallback)
             return None
+        model = await self._stores.do(self._model, book.model)
+        controller = await self._stores.do(self._controller, fallback)
         return await asyncio.to_thread(_prediction, model, controller, self._line, region)
 
     def begin_probation(self) -> None:
@@ -153,48 +229,91 @@ class LineSurroundings:
             since_change_s=None if book.changed is None else self._clock.age(book.changed).least_s,
         )
 
-    def _controller(self, hash_: str | None) -> Controller:
-        if hash_ is None:
-            raise NotKnown("the loop has not said what controls the line: start it, then propose again")
-        try:
-            controller = self._configurations.find(hash_, self._line.site, self._line.line).controller
-        except ConfigurationsError as error:
-            raise NotKnown(f"the configuration in service, {hash_[:12]}, is not known here: {error}") from error
-        if controller is None:
-            raise NotKnown(f"the configuration in service, {hash_[:12]}, is damaged in the store")
-        return controller
+    def _data(self, most_s: float) -> list[tuple[Recording, float, str]]:
+        """With the digest of each. It may block, and takes its time."""
+        return [(one, end_s, one.digest()) for one, end_s in self._experiments(most_s)]
 
-    def _baseline(self, book: Book) -> tuple[Controller | None, Region]:
+    def _of_stores(self, wanted: _Wanted) -> _OfStores:
+        """Raises NotKnown."""
+        in_service = self._controller(_known(wanted.in_service))
+        baseline, region = self._baseline(wanted)
+        model = None if wanted.model is None else self._model(wanted.model)
+        return _OfStores(in_service, model, baseline, region)
+
+    def _look_up(self, wanted: _Wanted) -> None:
+        """What is not there is kept as that."""
+        for hash_, look_up in ((wanted.in_service, self._controller), (wanted.model, self._model)):
+            try:
+                if hash_ is not None:
+                    look_up(hash_)
+            except NotKnown:
+                continue
+
+    def _close_stores(self) -> None:
+        self._configurations.close()
+        self._models.close()
+
+    def _controller(self, hash_: str) -> Controller:
+        return self._kept_controllers.look_up(hash_, self._stored_controller)
+
+    def _model(self, hash_: str) -> LineModel:
+        return self._kept_models.look_up(hash_, self._stored_model)
+
+    def _stored_controller(self, hash_: str) -> Controller:
+        what = f"the configuration in service, {hash_[:12]}, is"
+        try:
+            found = self._configurations.get(self._line.site, self._line.line, hash_)
+        except ConfigurationsError as error:
+            raise NotKnown(f"{what} not known here: {error}") from error
+        if found is None:
+            raise NotKnown(f"{what} not known here: it was never stored")
+        if found.controller is None:
+            raise NotKnown(f"{what} damaged in the store")
+        return found.controller
+
+    def _baseline(self, wanted: _Wanted) -> tuple[Controller | None, Region]:
         """What was archived on the line as it is; else the first that was kept for as much as what is in service."""
-        archived = self._archived(book)
+        archived = self._archived(wanted)
         if archived is not None:
             return archived, Region()
-        first = book.first_as_far
-        if first is None or first[0] == book.in_service:
+        first = wanted.first_as_far
+        if first is None or first[0] == wanted.in_service:
             return None, Region()
         return self._controller(first[0]), first[1]
 
-    def _archived(self, book: Book) -> Controller | None:
+    def _archived(self, wanted: _Wanted) -> Controller | None:
         """On another web it was never judged."""
-        site, line, changed_s = self._line.site, self._line.line, book.line_changed_s
+        site, line, changed_s = self._line.site, self._line.line, wanted.line_changed_s
         try:
-            archived = [one.time_s for _, one in self._configurations.archives(site, line) if one.name == STABLE]
-            if not archived or (changed_s is not None and archived[-1] <= changed_s):
+            archived = [(id_, one) for id_, one in self._configurations.archives(site, line) if one.name == STABLE]
+            if not archived or (changed_s is not None and archived[-1][1].time_s <= changed_s):
                 return None
-            return self._configurations.find(STABLE, site, line).controller
-        except ConfigurationsError:
+            return self._controller(archived[-1][0])
+        except (ConfigurationsError, NotKnown):
             return None
 
-    def _model(self, book: Book) -> LineModel | None:
-        if book.model is None:
-            return None
+    def _stored_model(self, hash_: str) -> LineModel:
+        what = f"the model in service, {hash_[:12]}, is"
         try:
-            model = self._models.find(book.model, self._line.site, self._line.line).model
+            found = self._models.get(hash_)
         except ModelsError as error:
-            raise NotKnown(f"the model in service, {book.model[:12]}, is not known here: {error}") from error
-        if model is None:
-            raise NotKnown(f"the model in service, {book.model[:12]}, is damaged in the repository")
-        return model
+            raise NotKnown(f"{what} not known here: {error}") from error
+        if found is None or (found.site, found.line) != (self._line.site, self._line.line):
+            raise NotKnown(f"{what} not known here: it was never stored for this line")
+        if found.model is None:
+            raise NotKnown(f"{what} damaged in the repository")
+        return found.model
+
+
+def _wanted(book: Book) -> _Wanted:
+    return _Wanted(book.in_service, book.model, book.first_as_far, book.line_changed_s)
+
+
+def _known(in_service: str | None) -> str:
+    """Raises NotKnown."""
+    if in_service is None:
+        raise NotKnown("the loop has not said what controls the line: start it, then propose again")
+    return in_service
 
 
 def _prediction(model: LineModel, fallback: Controller, line: Line, region: Region) -> RecoveryPrediction:

@@ -9,7 +9,15 @@ from typing import ParamSpec, TypeVar
 P = ParamSpec("P")
 T = TypeVar("T")
 
+SMALL_BYTES = 65_536  #: what is done with no more than so many takes less than going to a thread would matter
 CLOSED_S = 2.0  #: that a thread has at the end for what it is at
+
+
+async def beside(size_bytes: int, work: Callable[P, T], *arguments: P.args, **named: P.kwargs) -> T:
+    """What `work` returns or raises, with so many bytes: of many in a thread."""
+    if size_bytes <= SMALL_BYTES:
+        return work(*arguments, **named)
+    return await asyncio.to_thread(work, *arguments, **named)
 
 
 class Worker:

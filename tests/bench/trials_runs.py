@@ -88,6 +88,9 @@ class Around(LineSurroundings):
     def difference(self, proposal: Proposal, book: Book) -> list[str]:
         return ["a trial"]
 
+    async def close(self) -> None:
+        """There is nothing to be closed."""
+
     async def recovery(self, fallback: str, region: Region, book: Book) -> RecoveryPrediction | None:
         return None
 

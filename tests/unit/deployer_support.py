@@ -265,8 +265,14 @@ class FakeSurroundings:
         model = None if book.model is None else self.models[book.model]
         return JudgeContext(format=1, now=iso(self.loop.now_s), state=state, in_service=FIRST, model=model), []
 
+    async def at_hand(self, book) -> None:
+        """There is no disk."""
+
     def difference(self, one, book) -> list[str]:
         return ["a test"]
+
+    async def close(self) -> None:
+        """There is nothing to be closed."""
 
     async def recovery(self, fallback, region, book):
         if self.unknown:
