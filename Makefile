@@ -7,7 +7,7 @@ PARALLEL := --numprocesses auto --maxprocesses 4 --dist loadfile
 export PYTHONDONTWRITEBYTECODE :=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup run test test-long test-long-realtime test-long-rest coverage test-realtime test-rest system-test landing search test-fast ready check types lint format bench bench-stepped bench-wire bench-processes bench-cycle bench-engage bench-history bench-trials bench-mpc bench-loop-states bench-loop-kill bench-monitor bench-control bench-identify bench-faults bench-fuzz bench-soak bench-gate bench-lifecycle bench-audit bench-kill bench-gate-live bench-agents-live bench-operator bench-harm bench-intrusions bench-knowledge bench-agents minilm mutate lock clean
+.PHONY: help setup run test test-long test-long-realtime test-long-rest coverage test-realtime test-rest system-test landing search test-fast ready check types lint format bench bench-stepped bench-wire bench-processes bench-cycle bench-engage bench-history bench-trials bench-mpc bench-loop-states bench-loop-kill bench-monitor bench-control bench-identify bench-faults bench-fuzz bench-soak bench-gate bench-lifecycle bench-audit bench-kill bench-gate-live bench-agents-live bench-operator bench-harm bench-intrusions bench-knowledge bench-agents bench-stop minilm mutate lock clean
 
 help: ## this list
 	@echo "r2rgate: make TARGET"
@@ -161,6 +161,9 @@ bench-knowledge: setup ## how well notes are found, and how fast; with MiniLM wh
 
 bench-agents: $(VENV)/.compiled ## lines commissioned by every persona of a language model, and by none (about an hour; ARGS="--personas off,perfect --tasks 4")
 	@$(PY) -m tests.bench.agents $(ARGS)
+
+bench-stop: setup ## a stop from page, OPC UA and terminal beside held stores, a held audit and packing (about 1 min; ARGS="--stops 20")
+	@$(PY) -m tests.bench.stop $(ARGS)
 
 bench-engage: $(VENV)/.compiled ## a predictive controller takes over on a loop that runs, 6 to 60 spans; as root (about 3 min; ARGS="--spans 40")
 	@$(PY) -m tests.bench.engage $(ARGS)

@@ -131,7 +131,9 @@ class UnixMailbox:
         try:
             connection = self._send_request(topic, datagram)
         except Crowded:
+            until_s = asyncio.get_running_loop().time() + timeout_s
             await self._dial_patiently(topic, min(timeout_s, PATIENCE_S))
+            timeout_s = max(0.0, until_s - asyncio.get_running_loop().time())
             connection = self._send_request(topic, datagram)
         future = connection.pending[number] = asyncio.get_running_loop().create_future()
         try:
