@@ -200,7 +200,7 @@ class SteppedGate:
 
     async def _shown(self, proposal: str) -> ProposalShown | str:
         """A sentence where there is none."""
-        await self.deployer.at_hand(proposal)
+        await self.deployer.at_hand(proposal, difference=True)
         return self.deployer.shown(proposal)
 
     async def is_back(self, why: str) -> bool:

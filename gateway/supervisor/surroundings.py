@@ -120,6 +120,7 @@ class LineSurroundings:
     async def context(self, book: Book) -> tuple[JudgeContext, list[Recording]]:
         """Of a line that runs once it stands, or in some seconds as it is then. Raises NotKnown."""
         await self._stands()
+        self._state(book)  # where that is not known, nothing is looked up
         found = await asyncio.to_thread(self._data, self._line.gate.data_max_age_s)
         while True:  # what it is asked for may change meanwhile
             wanted = _wanted(book)

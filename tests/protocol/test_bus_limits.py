@@ -208,3 +208,21 @@ def test_any_topic_and_payload_comes_through_as_it_was() -> None:
             finally:
                 for mailbox in (there, here, hall):
                     runner.run(mailbox.close())
+
+
+def test_a_place_on_the_bus_is_free_when_the_time_of_its_topic_is_over() -> None:
+    async def story(folder: Path) -> None:
+        async with router(folder) as gateway, client(folder) as agents:
+            topic = Topic(STATUS.name, "request", "", kept=False, within_s=0.05)
+
+            async def slow(payload: bytes) -> bytes:
+                return await (never(payload) if payload == b"slow" else echo(payload))
+
+            gateway.serve(topic, slow)
+            asked = [agents.request(topic, b"slow", LONG_S) for _ in range(MAX_IN_FLIGHT)]
+            told = await asyncio.gather(*asked, return_exceptions=True)
+            assert all("no answer within 0.05 s" in str(one) for one in told)
+            assert await agents.request(topic, b"quick", LONG_S) == b"echo quick"
+            assert gateway.counters.handler_errors == MAX_IN_FLIGHT
+
+    run(story)

@@ -11,14 +11,14 @@ from gateway.cli.stepped import SteppedLoop
 from gateway.control.design import design_lqg, design_lqi, design_mpc, design_pid, task_of
 from gateway.core.controller import config_hash
 from gateway.core.deployment import Deployment, first_region
-from gateway.core.messages import Deploy, Keep, Narrow, Rollback, WatchGood
+from gateway.core.messages import Deploy, Keep, Narrow, Rollback, Stop, WatchGood
 from gateway.core.theta import nominal_theta
 from gateway.loop import persistence, runner
 from gateway.loop.deploy import prepare
 from gateway.loop.kept import BEFORE, Durable, Kept, Store, fingerprint
 from gateway.loop.pacer import Tick
 from gateway.loop.persistence import NOT_PERSISTED, PERSISTED
-from gateway.loop.runner import Runner
+from gateway.loop.runner import MAX_TO_ITS_END, Runner
 from safety.recovery_prediction import recovery_prediction
 from tests.closed_loop.conftest import demo_line, real_plant
 from tests.support.gateway_key import proof_of, store_of
@@ -343,3 +343,26 @@ def test_what_was_taken_back_is_nothing_to_go_back_to_either(tmp_path):
         store.deaths.count(fingerprint(good), "a defect")
     kept = store_of(tmp_path, GIVEN).read(LINE, print)
     assert kept is not None and kept.controller == GIVEN
+
+
+def test_what_waits_for_a_disk_that_hangs_is_bounded_and_a_stop_waits_for_none_of_it(tmp_path):
+    hangs, begun = threading.Event(), threading.Event()
+
+    async def story(it):
+        def write(_):
+            begun.set()
+            hangs.wait()
+
+        it.store.write = write
+        waiting = [asyncio.ensure_future(it.runner.submit(WatchGood(watch=WATCH))) for _ in range(MAX_TO_ITS_END)]
+        await it.until(begun.is_set)
+        refused = await it.ask(WatchGood(watch=WATCH))
+        assert not refused.ok and "waits for the disk" in refused.text
+        for one in waiting[1:]:
+            one.cancel()  # whoever gives up makes no room: it is begun all the same
+        assert not (await it.ask(WatchGood(watch=WATCH))).ok
+        assert (await it.ask(Stop())).ok and not waiting[0].done()
+        hangs.set()
+        await it.until(waiting[0].done)
+
+    told(Disk(tmp_path), story)
