@@ -144,6 +144,7 @@ def test_recordings_of_a_judged_proposal_are_packed_and_hashed_in_a_thread():
     asyncio.run(story())
 
 
+@pytest.mark.wires
 def test_a_directory_of_users_that_is_away_keeps_neither_a_stop_nor_anybody_else_for_long(monkeypatch):
     monkeypatch.setattr(peers, "LOOKED_UP_S", 0.01)
     monkeypatch.setattr(peers, "_directory", Worker("test"))

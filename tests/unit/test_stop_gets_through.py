@@ -228,6 +228,7 @@ def test_what_acts_and_comes_to_no_end_is_bounded_and_no_stop_by_it(monkeypatch)
     run(story)
 
 
+@pytest.mark.wires
 def test_a_history_that_hangs_blinds_nobody_and_keeps_no_record_from_being_told(monkeypatch):
     hangs = threading.Event()
 
