@@ -44,6 +44,7 @@ from gateway.supervisor.lifecycle import Book
 from gateway.supervisor.model_store import ModelsError
 from gateway.supervisor.models import open_repository
 from gateway.supervisor.proposal_records import iso, refused
+from gateway.tasks.threads import Worker
 
 Experiments = Callable[[float], list[tuple[Recording, float]]]  #: of so many seconds, the newest first; it may block
 _HEAD_BYTES = 1024  #: of a part of the knowledge, beside what it tells
@@ -62,6 +63,7 @@ class LineDesk:
             str, Recording
         ] = {}  #: by digest, of the last list: some few, and only of them parts are told
         self._reading, self._gathering = asyncio.Lock(), asyncio.Lock()
+        self._stores = Worker("asked-stores")
 
     def serve_on(self, bus: Mailbox) -> None:
         served: dict[object, Callable[[bytes], Awaitable[bytes]]] = {
@@ -93,14 +95,14 @@ class LineDesk:
         id_ = self._book().model if wanted is None else wanted
         if id_ is None:
             return ModelTold(hash=None, model=None).model_dump_json().encode()
-        return await asyncio.to_thread(self._stored_model, id_)
+        return await self._stores.do(self._stored_model, id_)
 
     async def _controller(self, payload: bytes) -> bytes:
         wanted = parse_ask(payload, OfHash).hash
         id_ = self._book().in_service if wanted is None else wanted
         if id_ is None:
             raise AskRefused(["the loop has not told yet what controls the line: start it, then ask again"])
-        return await asyncio.to_thread(self._stored_controller, id_)
+        return await self._stores.do(self._stored_controller, id_)
 
     async def _recordings(self, _: bytes) -> bytes:
         async with self._reading:
