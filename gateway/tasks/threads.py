@@ -33,6 +33,9 @@ class Worker:
 
     async def close(self, last: Callable[[], object] | None = None) -> None:
         """Do `last`, if there is time for it; what waits is not begun any more."""
+        done = set[asyncio.Future[object]]()
         if last is not None:
-            await asyncio.wait((asyncio.ensure_future(self.do(last)),), timeout=CLOSED_S)
+            done, _ = await asyncio.wait((asyncio.ensure_future(self.do(last)),), timeout=CLOSED_S)
         self._thread.shutdown(wait=False, cancel_futures=True)
+        for one in done:
+            one.result()
