@@ -260,7 +260,8 @@ class Gate:
         """Once a record of the start is on the disk, the records before it are read."""
         try:
             if not self._start_recorded:
-                await self.audit.append("gateway-start", GATEWAY, {"version": version("r2rgate")})
+                installed = await asyncio.to_thread(version, "r2rgate")
+                await self.audit.append("gateway-start", GATEWAY, {"version": installed})
                 self._start_recorded = True
             book = await asyncio.to_thread(book_in, self._folder)
             if self._stores is None:

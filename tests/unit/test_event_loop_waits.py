@@ -90,7 +90,9 @@ def test_a_store_is_found_in_the_thread_of_an_event_loop(tmp_path):
         with pytest.raises(Blocks):
             past._tensions(None)  # type: ignore[arg-type] # noqa: SLF001
 
-    apsw.Connection(str(tmp_path / "history.sqlite")).close()
+    store = apsw.Connection(str(tmp_path / "history.sqlite"))
+    store.execute("CREATE TABLE something (a)")
+    store.close()
     with suppress(Exception):
         History(tmp_path / "history.sqlite")
     asyncio.run(story())
