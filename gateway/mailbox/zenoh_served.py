@@ -14,6 +14,7 @@ import zenoh
 
 from gateway.core.topics import Topic
 from gateway.mailbox.allowance import Allowance
+from gateway.mailbox.places import MAX_OVERDUE
 from gateway.mailbox.port import MAX_PAYLOAD, RequestHandler
 from gateway.mailbox.zenoh_bridge import Bridge
 
@@ -69,6 +70,8 @@ class Served:
         with self._bridge.lock:
             if self._in_flight >= MAX_IN_FLIGHT:
                 return f"{name}: more than {MAX_IN_FLIGHT} requests at once"
+            if len(self._handling) >= MAX_OVERDUE:
+                return f"{name}: {MAX_OVERDUE} requests before it have not come to their end"
             if self._allowance is not None and not self._allowance.take(self._clock()):
                 return f"{name}: more than {self._topic.rate}; ask again later"
             self._in_flight += 1

@@ -25,7 +25,7 @@ ROOMS = ("gateway/supervisor", "gateway/mailbox")
 ASKED = ("gateway/core", "gateway/storage", "tests/support/event_loop_guard.py") + tuple(
     f"gateway/supervisor/{name}.py"
     for name in (
-        "audit_anchor", "audit_begin", "audit_file", "audit_verify", "baselines", "blobs", "book_file",
+        "audit_anchor", "audit_begin", "audit_file", "audit_verify", "audit_writer", "baselines", "blobs", "book_file",
         "configurations", "dating", "experiments", "find_version", "history", "history_recording", "interactions",
         "model_store", "models", "past_tensions", "retention", "store", "tail", "writer",
     )

@@ -30,16 +30,17 @@ async def test_an_audit_that_fails_on_probation_leaves_the_line_on_what_was_good
 @contextlib.asynccontextmanager
 async def disk_that_hangs(gateway):
     """While it does, a proposal has come in and waits for its record, with the lock of all steps."""
-    append, hangs = gateway.audit.append, asyncio.Event()
+    append, begun, hangs = gateway.audit.append, asyncio.Event(), asyncio.Event()
 
     async def hang(*record):
+        begun.set()
         await hangs.wait()
         await append(*record)
 
     gateway.audit.append = hang
     one = proposal(7, gateway.loop.runs, gateway.loop.now_s)
     coming_in = asyncio.create_task(gateway.propose(one))
-    await asyncio.sleep(0)
+    await begun.wait()
     yield
     hangs.set()
     await coming_in

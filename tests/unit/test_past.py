@@ -134,7 +134,7 @@ def test_every_kind_that_the_gateway_records_has_a_sentence() -> None:
             if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute | ast.Name):
                 name = node.func.attr if isinstance(node.func, ast.Attribute) else node.func.id
                 first = node.args[0] if node.args else None
-                if name in ("append", "_append", "step", "_kept") and isinstance(first, ast.Constant):
+                if name in ("append", "_append", "step", "_recorded") and isinstance(first, ast.Constant):
                     named |= {str(first.value)} if re.fullmatch(r"[a-z-]+", str(first.value)) else set()
     assert {"operated", "gateway-start", "agents", "refused-person"} <= named
     assert named - set(SENTENCES) == set()

@@ -345,6 +345,7 @@ def test_what_was_taken_back_is_nothing_to_go_back_to_either(tmp_path):
     assert kept is not None and kept.controller == GIVEN
 
 
+@pytest.mark.wires
 def test_what_waits_for_a_disk_that_hangs_is_bounded_and_a_stop_waits_for_none_of_it(tmp_path):
     hangs, begun = threading.Event(), threading.Event()
 
