@@ -1,6 +1,7 @@
 """`r2rgate commission` against a gateway in this process that keeps its promises, and no more."""
 
 import asyncio
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from datetime import UTC, datetime
 
@@ -68,7 +69,8 @@ class LateHistorian(Historian):
     def health(self):
         self.looks += 1
         if self.looks % 4 == 0:
-            self._turn(False)
+            with ThreadPoolExecutor(1) as thread:  # as it does otherwise
+                thread.submit(self._turn, False).result()
         return super().health()
 
 
