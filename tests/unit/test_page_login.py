@@ -5,6 +5,7 @@ import asyncio
 import pytest
 
 from gateway.core.people import Role
+from gateway.operator.page.login import TOKEN_HEADER
 from gateway.operator.page.sessions import (
     FREE_TRIES,
     IDLE_S,
@@ -13,6 +14,7 @@ from gateway.operator.page.sessions import (
     MOST_EACH,
     MOST_PLACES,
     MOST_SESSIONS,
+    Session,
     Sessions,
     Tries,
 )
@@ -139,17 +141,15 @@ def test_tries_from_ever_new_places_take_no_more_memory():
     assert tries.wait_s("0") == 0.0 and tries.wait_s(str(MOST_PLACES)) > 0.0
 
 
-@pytest.mark.parametrize("step_s, steps", [(IDLE_S + 1.0, 1), (IDLE_S - 1.0, int(LONGEST_S // (IDLE_S - 1.0)) + 1)])
-def test_a_session_ends_when_idle_and_at_the_end_of_a_shift(step_s: float, steps: int):
+def test_a_session_in_use_ends_with_the_shift():
     clock = Clock()
     sessions = Sessions(clock)
     key = sessions.begin("anna", "operator")
-    found = sessions.use(key)
-    for _ in range(steps):
-        assert found is not None
-        clock.now_s += step_s
+    while clock.now_s - 1000.0 <= LONGEST_S:
         found = sessions.use(key)
-    assert found is None
+        assert found is not None and not found.is_idle
+        clock.now_s += IDLE_S - 1.0
+    assert sessions.use(key) is None
 
 
 def test_who_only_looks_has_to_log_in_again_who_says_something_has_not():
@@ -175,9 +175,63 @@ def test_looking_on_does_not_keep_a_session_alive():
     sessions = Sessions(clock)
     key = sessions.begin("anna", "operator")
     clock.now_s += IDLE_S
-    assert sessions.find(key) is not None
+    assert not found_in(sessions, key).is_idle
     clock.now_s += 1.0
+    assert found_in(sessions, key).is_idle
+    sessions.use(key)
+    assert found_in(sessions, key).is_idle  # once it is, nothing makes it whole again
+    clock.now_s = 1000.0 + LONGEST_S + 1.0
     assert sessions.find(key) is None
+
+
+def found_in(sessions: Sessions, key: str) -> Session:
+    found = sessions.find(key)
+    assert found is not None
+    return found
+
+
+@pytest.mark.parametrize("anonymous, looks", [("none", 401), ("read", 200)])
+def test_an_idle_session_still_stops_and_holds_and_does_nothing_else(anonymous: str, looks: int):
+    clock = Clock()
+
+    async def story() -> None:
+        async with page(clock=clock, anonymous=anonymous) as there:
+            token = (await there.log_in()).json()["token"]
+            clock.now_s += IDLE_S + 1.0
+            role = "viewer" if anonymous == "read" else None
+            told = {"name": None, "role": role, "token": token, "idle": "operator"}
+            for command in ("stop", "hold", "stop"):
+                assert (await there.browser.get("/api/me")).json() == told
+                assert (await there.say(command)).status_code == 200
+                heard = there.gateway.said[-1]
+                assert (heard.person.name, heard.said.command) == ("operator", command)
+            assert (await there.say("start")).status_code == (await there.say("arm")).status_code == 401
+            assert len(there.gateway.said) == 3
+            for path in ("/api/line", "/api/proposals", "/api/records"):
+                assert (await there.browser.get(path)).status_code == looks
+            there.browser.headers[TOKEN_HEADER] = "another"
+            assert (await there.say("stop")).status_code == 403
+            clock.now_s += LONGEST_S
+            there.browser.headers[TOKEN_HEADER] = token
+            assert (await there.say("stop")).status_code == 401 and len(there.gateway.said) == 3
+
+    asyncio.run(story())
+
+
+def test_of_whoever_may_not_stop_or_is_no_user_any_more_nothing_is_left_when_idle():
+    clock = Clock()
+    roles: dict[str, Role | None] = {"operator": "operator", "viewer": "viewer"}
+
+    async def story(name: str) -> None:
+        async with page(clock=clock, role_of=roles.get) as there:
+            await there.log_in(name)
+            clock.now_s += IDLE_S + 1.0
+            roles.pop("operator", None)
+            assert (await there.say("stop")).status_code == 401 and there.gateway.said == []
+            assert (await there.browser.get("/api/me")).json() == {"name": None, "role": None, "token": None}
+
+    asyncio.run(story("operator"))
+    asyncio.run(story("viewer"))
 
 
 def test_of_too_many_sessions_the_longest_unused_goes():

@@ -19,6 +19,7 @@ from gateway.operator.line_side import Declined, LineSide, NotTold
 from gateway.operator.page.answer import JSONResponse
 from gateway.operator.page.guard import body_of
 from gateway.operator.page.login import Door
+from gateway.operator.page.sessions import MAY_IDLE
 from gateway.operator.page.tick import line_told
 from gateway.operator.page.told import proposal_told
 from gateway.wording.catalogue import languages, sentence
@@ -111,16 +112,17 @@ class Asks:
             raise HTTPException(503, str(error)) from error
 
     async def _say(self, request: Request) -> JSONResponse:
-        person = self._door.person(request)
+        self._door.person(request, idle_too=True)
         try:
             said = _SAID.validate_python(_object(await body_of(request)))
         except ValidationError as error:
             raise HTTPException(400, _in_words(error)) from None
+        person = self._door.person(request, idle_too=said.command in MAY_IDLE)
         return await self._said(person, said)
 
     async def _say_safe(self, request: Request) -> JSONResponse:
         """A stop or a hold; its address says all, nothing is read."""
-        person, path = self._door.person(request), request.url.path
+        person, path = self._door.person(request, idle_too=True), request.url.path
         said = SAFE[path]
         if self._waiting[path] >= MAX_SAFE:
             found = finding("safe-crowded", command=said.command, waiting=MAX_SAFE)

@@ -16,9 +16,9 @@ from starlette.types import Receive, Scope, Send
 
 from gateway.core.clean_text import clean_texts
 from gateway.core.decisions import ProposalList
-from gateway.core.people import Role
 from gateway.core.status import GatewayStatus
 from gateway.operator.line_side import LineSide
+from gateway.operator.page.login import Visitor
 from gateway.operator.page.tick import tick_of
 
 MOST_BROWSERS = 20
@@ -73,7 +73,7 @@ class Ticks:
 class _Stream(StreamingResponse):
     """Counts who looks for exactly as long as the answer lasts, also where it never begins."""
 
-    def __init__(self, ticks: Ticks, looks: Callable[[], Role | None]) -> None:
+    def __init__(self, ticks: Ticks, looks: Callable[[], Visitor | None]) -> None:
         super().__init__(_events(ticks, looks), media_type="text/event-stream")
         self._ticks = ticks
 
@@ -85,11 +85,11 @@ class _Stream(StreamingResponse):
             self._ticks.looking -= 1
 
 
-async def _events(ticks: Ticks, looks: Callable[[], Role | None]) -> AsyncIterator[str]:
+async def _events(ticks: Ticks, looks: Callable[[], Visitor | None]) -> AsyncIterator[str]:
     yield "retry: 1000\n\n"
-    number, role = ticks.number, looks()  # what was made before, for others, may be hours old
+    number, visitor = ticks.number, looks()  # what was made before, for others, may be hours old
     while not ticks.ended:
-        if (now := looks()) is None or now != role:  # the page has to be loaded anew: they may more, less, or nothing
+        if (now := looks()) is None or now != visitor:  # they may more, less, or nothing: the page is loaded anew
             yield _event("anew", {})
             return
         number, text = await ticks.after(number)
@@ -97,7 +97,7 @@ async def _events(ticks: Ticks, looks: Callable[[], Role | None]) -> AsyncIterat
 
 
 def stream(
-    ticks: Ticks, visitor: Callable[[Request], object], looks: Callable[[Request], Role | None]
+    ticks: Ticks, visitor: Callable[[Request], object], looks: Callable[[Request], Visitor | None]
 ) -> Callable[[Request], Awaitable[StreamingResponse]]:
     """The endpoint. `visitor` raises where nobody may look; `looks`: as whom, still."""
 

@@ -12,11 +12,11 @@ from starlette.requests import Request
 from starlette.routing import Route
 
 from gateway.core.line import Strict
-from gateway.core.people import Person, Role
+from gateway.core.people import Person, Role, may
 from gateway.operator.access import Access
 from gateway.operator.page.answer import JSONResponse
 from gateway.operator.page.guard import body_of
-from gateway.operator.page.sessions import LONGEST_S, Session, Sessions, Tries
+from gateway.operator.page.sessions import LONGEST_S, MAY_IDLE, Session, Sessions, Tries
 from gateway.operator.users import RoleOf
 
 Check = Callable[[str, str], Awaitable[Role | None]]
@@ -38,6 +38,7 @@ class Visitor:
     name: str | None  #: None: nobody has logged in, and anybody may look
     role: Role
     token: str | None
+    idle: str | None = None  #: whose session is idle: it may still stop and hold, and nothing else
 
 
 class Door:
@@ -80,23 +81,25 @@ class Door:
             raise HTTPException(401, "log in")
         return visitor
 
-    def looks(self, request: Request) -> Role | None:
+    def looks(self, request: Request) -> Visitor | None:
         """As whom, still; None: they may not. This is no request of the person."""
         session = self._sessions.find(self._key(request))
         if session is not None and self._clock() - session.looked_up_s >= LOOK_UP_S:
             session = self._session(request)
-        visitor = self._known(session)
-        return None if visitor is None else visitor.role
+        return self._known(session)
 
-    def person(self, request: Request) -> Person:
-        """Who says something. Raises HTTPException where nobody has logged in, or another site's page asks."""
-        visitor = self.visitor(request)
-        if visitor.name is None or visitor.token is None:
+    def person(self, request: Request, idle_too: bool = False) -> Person:
+        """Who says something. Raises HTTPException where nobody has logged in, or another site's page asks.
+
+        `idle_too`: also of a session that is idle, for what such a one may still say.
+        """
+        session = self._session(request)
+        if session is None or (session.is_idle and not idle_too):
             raise HTTPException(401, "log in")
-        if not secrets.compare_digest(request.headers.get(TOKEN_HEADER, "").encode(), visitor.token.encode()):
+        if not secrets.compare_digest(request.headers.get(TOKEN_HEADER, "").encode(), session.token.encode()):
             raise HTTPException(403, "the request does not carry this session's token; load the page anew")
         self._sessions.use(self._key(request))
-        return Person(name=visitor.name, role=visitor.role, through="page")
+        return Person(name=session.name, role=session.role, through="page")
 
     async def _login(self, request: Request) -> JSONResponse:
         try:
@@ -139,7 +142,7 @@ class Door:
         return answer
 
     async def _logout(self, request: Request) -> JSONResponse:
-        self.person(request)
+        self.person(request, idle_too=True)
         self._sessions.end(self._key(request))
         answer = JSONResponse({})
         answer.delete_cookie(self._cookie, path="/", secure=self._secure, httponly=True, samesite="strict")
@@ -149,29 +152,34 @@ class Door:
         session = self._session(request)
         self._sessions.use(self._key(request))
         visitor = self._known(session)
-        return JSONResponse(_told(visitor) if visitor else {"name": None, "role": None, "token": None})
+        if session is None or not session.is_idle:
+            return JSONResponse(_told(visitor))
+        return JSONResponse(_told(visitor) | {"token": session.token, "idle": session.name})
 
     def _session(self, request: Request) -> Session | None:
-        """With the role that they have now; whoever is no user any more has none."""
+        """With the role that they have now. None: nobody has one, is a user any more, or may say anything with it."""
         key = self._key(request)
         session = self._sessions.find(key)
         if session is None:
             return None
         role, session.looked_up_s = self._role_of(session.name), self._clock()
-        if role is None:
+        if role is None or (session.is_idle and not any(may(role, command) for command in MAY_IDLE)):
             self._sessions.end(key)
             return None
         session.role = role
         return session
 
     def _known(self, session: Session | None) -> Visitor | None:
-        if session is not None:
+        if session is not None and not session.is_idle:
             return Visitor(session.name, session.role, session.token)
-        return Visitor(None, "viewer", None) if self._anonymous else None
+        idle = None if session is None else session.name
+        return Visitor(None, "viewer", None, idle) if self._anonymous else None
 
     def _key(self, request: Request) -> str:
         return request.cookies.get(self._cookie, "")
 
 
-def _told(visitor: Visitor) -> dict[str, str | None]:
+def _told(visitor: Visitor | None) -> dict[str, str | None]:
+    if visitor is None:
+        return {"name": None, "role": None, "token": None}
     return {"name": visitor.name, "role": visitor.role, "token": visitor.token}

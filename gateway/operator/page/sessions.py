@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from gateway.core.people import Role
 
 IDLE_S = 3600.0  #: nothing said, and the page not loaded anew; looking on alone is nothing
+MAY_IDLE = ("stop", "hold")  #: what a session that is idle may still say, where its role may
 LONGEST_S = 12.0 * 3600.0  #: a shift, and the way there
 MOST_SESSIONS = 64  #: the one that has been idle for longest goes first
 MOST_EACH = 5  #: of one name; the oldest ends
@@ -27,6 +28,7 @@ class Session:
     began_s: float
     seen_s: float
     looked_up_s: float  #: when it was made sure last that they have this role
+    is_idle: bool = False  #: as it was seen last; it stays so
 
 
 class Sessions:
@@ -48,20 +50,21 @@ class Sessions:
         return key
 
     def find(self, key: str) -> Session | None:
-        """None: there is none, or no longer."""
+        """None: there is none, or no longer. One that is idle is there until its longest time is over."""
         session = self._by_key.get(key)
         if session is None:
             return None
         now_s = self._clock()
-        if now_s - session.seen_s > IDLE_S or now_s - session.began_s > LONGEST_S:
+        if now_s - session.began_s > LONGEST_S:
             del self._by_key[key]
             return None
+        session.is_idle = session.is_idle or now_s - session.seen_s > IDLE_S
         return session
 
     def use(self, key: str) -> Session | None:
-        """As `find`, and it is not idle."""
+        """As `find`; from now on it is not idle, unless it has become so already."""
         session = self.find(key)
-        if session is not None:
+        if session is not None and not session.is_idle:
             session.seen_s = self._clock()
             self._by_key.move_to_end(key)
         return session

@@ -21,6 +21,8 @@ async function begin() {
   sessionStorage.removeItem("unsaid");
   try {
     const me = await ask("api/me");
+    keepToken(me.token);
+    idle(me.idle);
     await (me.role === null ? askName() : enter(me));
   } catch (error) {
     if (!(error instanceof Refused)) throw error;
@@ -36,6 +38,12 @@ function out(unsaid) {
   location.reload();
 }
 
+// A session in which nothing was said for long may still stop and hold; everything else wants a log-in.
+function idle(name) {
+  for (const id of ["stop", "hold", "idle"]) show($(id), Boolean(name));
+  if (name) setText($("idle"), word("idle", { name }));
+}
+
 function askName() {
   for (const id of ["now", "views", "logout"]) show($(id), false);
   for (const view of VIEWS) show($(`view-${view}`), false);
@@ -45,13 +53,12 @@ function askName() {
 }
 
 async function enter(me) {
-  keepToken(me.token);
   const line = await ask("api/line");
   show($("login"), false);
   show($("views"), true);
   show($("now"), true);
   const may = (command) => me.name !== null && line.may.includes(command);
-  show($("stop"), may("stop"));
+  show($("stop"), Boolean(me.idle) || may("stop"));
   show($("logout"), true);
   setText($("logout"), word(me.name ? "logout" : "login.enter"));
   $("logout").onclick = me.name ? logOut : askName;
@@ -200,7 +207,7 @@ async function say(said) {
     if (error.status === 401) return out(stop ? "stop" : "said");
     tell(error);
   }
-  await news();
+  if (parts) await news();
 }
 
 $("login").addEventListener("submit", async (event) => {
@@ -219,14 +226,14 @@ document.querySelector(".skip").addEventListener("click", (event) => {
   event.preventDefault(); // the part that is open stands behind the #
   $("content").focus();
 });
-$("stop").addEventListener("click", () => say({ command: "stop" }));
+for (const command of ["stop", "hold"]) $(command).addEventListener("click", () => say({ command }));
 $("language").addEventListener("change", () => {
   localStorage.setItem("language", $("language").value);
   location.reload();
 });
 addEventListener("hashchange", () => {
   route();
-  news();
+  if (parts) news();
 });
 setInterval(look, 250);
 begin();
