@@ -12,6 +12,7 @@ from typing import Literal
 from gateway.core.access import MOST_NAMES, MOST_PLACES, CameIn, UsersNow, WrongLogins, WrongPlace
 from gateway.core.people import Person, Role
 from gateway.operator.line_side import LineSide
+from gateway.operator.places import place_of
 from gateway.operator.users import Users, UsersFile, UsersRefused
 from gateway.tasks.supervisor import Supervisor, TaskFault
 
@@ -57,7 +58,7 @@ class Access:
 
     def refused(self, through: Through, address: str, certificate: str | None, name: str) -> None:
         """Name and password that let nobody in."""
-        key = through, address[:LONGEST_ADDRESS], certificate
+        key = through, place_of(address)[:LONGEST_ADDRESS], certificate
         if key not in self._wrong and len(self._wrong) >= MOST_PLACES:
             self._elsewhere += 1
             return

@@ -9,7 +9,6 @@ import pytest
 from asyncua import Client, ua
 
 from gateway.operator.opcua import limits
-from gateway.operator.opcua.processor import place_of
 from tests.protocol.operator_support import PASSWORD, bench
 
 CODES = ua.StatusCodes
@@ -391,14 +390,3 @@ def test_a_session_to_which_nobody_logs_in_does_not_stay_whatever_was_there_befo
             client.disconnect_socket()
 
     run(story)
-
-
-@pytest.mark.parametrize(
-    ("address", "place"),
-    [
-        ("192.0.2.7", "192.0.2.7"), ("::ffff:192.0.2.7", "192.0.2.7"), ("2001:db8:1:2:3::4", "2001:db8:1:2::/64"),
-        ("fe80::1%eth0", "fe80::/64"), ("", ""), ("no address", "no address"),
-    ],
-)  # fmt: skip
-def test_a_machine_is_one_place_however_many_addresses_it_has(address, place):
-    assert place_of(address) == place

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 import pytest
 
 from gateway.core.messages import SetSpeed, SetTension
+from gateway.operator.page import sessions
 from tests.operator.fake_line import PASSWORD, FakeGateway, alarm
 from tests.operator.real_line import until
 from tests.system.made_up_page import made_up_page
@@ -57,6 +58,18 @@ def test_a_page_that_hears_nothing_new_shows_what_grows_older(gateway: FakeGatew
     ages_s = browser("ages", 3)
     assert len(ages_s) >= 25 and ages_s[-1] - ages_s[0] >= 1.5
     assert ages_s[20:] == sorted(ages_s[20:])
+
+
+def test_an_idle_page_still_stops_and_holds_and_says_what_wants_a_log_in(
+    gateway: FakeGateway, browser: AtPage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sessions, "IDLE_S", 0.0)
+    browser("see", "#idle", "wants a log-in")
+    for command in ("stop", "hold"):
+        browser("click", f"#{command}")
+        browser("see", "#reply", "Done")
+        until(lambda: gateway.said[-1].said.command, lambda said, command=command: said == command)
+    assert browser("count", "#login, #stop, #hold") == 3 and browser("count", "#views a") == 0
 
 
 def test_a_new_record_leaves_the_focus_where_it_is_in_the_history(gateway: FakeGateway, browser: AtPage) -> None:

@@ -79,22 +79,26 @@ class Served:
         async with httpx.AsyncClient(base_url=base, headers=headers) as browser:
             assert (await browser.post("/api/logout", json={})).status_code == 200
 
-    async def look(self, receive_bytes: int | None = None) -> Stream:
+    async def look(self, receive_bytes: int | None = None, source: str = "127.0.0.1", named: bool = True) -> Stream:
         here = socket.socket()
+        here.bind((source, 0))
         if receive_bytes is not None:
             here.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, receive_bytes)
         here.setblocking(False)
         await asyncio.get_running_loop().sock_connect(here, ("127.0.0.1", self.port))
         reader, writer = await asyncio.open_connection(sock=here, limit=65_536)
-        writer.write(f"GET /events HTTP/1.1\r\nhost: 127.0.0.1\r\ncookie: {self.cookie}\r\n\r\n".encode())
+        cookie = f"cookie: {self.cookie}\r\n" if named else ""
+        writer.write(f"GET /events HTTP/1.1\r\nhost: 127.0.0.1\r\n{cookie}\r\n".encode())
         stream = Stream(reader, writer)
         self.streams.append(stream)
         return await stream.begin()
 
 
 @asynccontextmanager
-async def served(spans: int = 3, watched: bool = True, role_of: RoleOf = role_of_anybody) -> AsyncIterator[Served]:
-    async with page(spans, watched=watched, role_of=role_of) as there:
+async def served(
+    spans: int = 3, watched: bool = True, role_of: RoleOf = role_of_anybody, **operator: str
+) -> AsyncIterator[Served]:
+    async with page(spans, watched=watched, role_of=role_of, **operator) as there:
         listener = socket.create_server(("127.0.0.1", 0))
         found = Served(there, listener)
         try:
@@ -216,6 +220,29 @@ def test_no_more_look_than_can_and_a_place_becomes_free_again():
 
             while not await free():
                 pass
+
+    asyncio.run(story())
+
+
+def test_one_place_does_not_keep_those_of_another_from_looking():
+    async def story() -> None:
+        async with served() as at:
+            streams = [await at.look() for _ in range(MOST_BROWSERS)]
+            assert (await at.look(source="127.0.0.2")).status == 200
+            await streams[0].until("anew")
+            assert (await at.look()).status == 503
+            assert at.there.app.state.end.__self__.looking == MOST_BROWSERS
+
+    asyncio.run(story())
+
+
+def test_whoever_has_logged_in_looks_before_those_without_a_name():
+    async def story() -> None:
+        async with served(anonymous="read") as at:
+            streams = [await at.look(named=False) for _ in range(MOST_BROWSERS)]
+            assert (await at.look(named=False, source="127.0.0.2")).status == 503  # they would put each other out
+            assert (await at.look()).status == 200
+            await streams[0].until("anew")
 
     asyncio.run(story())
 

@@ -2,10 +2,11 @@
 
 import asyncio
 
+import httpx
 import pytest
 
 from gateway.core.people import Role
-from gateway.operator.page.login import TOKEN_HEADER
+from gateway.operator.page.login import MOST_CHECKS, TOKEN_HEADER
 from gateway.operator.page.sessions import (
     FREE_TRIES,
     IDLE_S,
@@ -18,8 +19,10 @@ from gateway.operator.page.sessions import (
     Sessions,
     Tries,
 )
-from tests.operator.fake_line import PASSWORD
-from tests.unit.page_support import page
+from gateway.operator.places import share_of
+from tests.operator.fake_line import PASSWORD, check
+from tests.unit.page_support import Page, page
+from tests.unit.supervisor_support import until
 
 ASKED = (
     "/api/line",
@@ -108,6 +111,52 @@ def test_who_fails_waits_each_time_longer_even_with_the_right_password():
             assert waits.status_code == 429 and waits.headers["retry-after"] == "1"
             clock.now_s += 1.0
             assert (await there.browser.post("/api/login", json=right)).status_code == 200
+
+    asyncio.run(story())
+
+
+def browser_from(there: Page, address: str) -> httpx.AsyncClient:
+    base = there.line.operator.page
+    transport = httpx.ASGITransport(there.app, client=(address, 50_000))
+    return httpx.AsyncClient(transport=transport, base_url=base, headers={"origin": base})
+
+
+def test_who_fails_from_one_address_after_the_other_of_a_network_of_their_own_waits_as_well():
+    async def story() -> None:
+        async with page() as there:
+            for k in range(FREE_TRIES + 1):
+                async with browser_from(there, f"2001:db8::{k}") as one:
+                    answer = await one.post("/api/login", json={"name": "operator", "password": "x"})
+                assert answer.status_code == (429 if k == FREE_TRIES else 403)
+            async with browser_from(there, "2001:db8:0:1::1") as other:
+                right = {"name": "operator", "password": PASSWORD}
+                assert (await other.post("/api/login", json=right)).status_code == 200
+
+    asyncio.run(story())
+
+
+def test_whoever_tries_much_at_a_time_lets_others_in(monkeypatch: pytest.MonkeyPatch):
+    async def story() -> None:
+        checking, go = 0, asyncio.Event()
+
+        async def slow(name: str, password: str) -> Role | None:
+            nonlocal checking
+            checking += name == "viewer"
+            if name == "viewer":
+                await go.wait()
+            return await check(name, password)
+
+        monkeypatch.setattr("tests.unit.page_support.check", slow)
+        async with page() as there, browser_from(there, "192.0.2.1") as many, browser_from(there, "192.0.2.2") as other:
+            tries = [many.post("/api/login", json={"name": "viewer", "password": "x"}) for _ in range(2 * MOST_CHECKS)]
+            trying = [asyncio.create_task(one) for one in tries]
+            await until(lambda: sum(one.done() for one in trying) == 2 * MOST_CHECKS - share_of(MOST_CHECKS))
+            assert {one.result().status_code for one in trying if one.done()} == {503}
+            right = {"name": "operator", "password": PASSWORD}
+            assert (await other.post("/api/login", json=right)).status_code == 200
+            assert checking == share_of(MOST_CHECKS)
+            go.set()
+            assert {(await one).status_code for one in trying} == {403, 503}
 
     asyncio.run(story())
 

@@ -14,8 +14,11 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 
 from gateway.operator.page import guard, serve
-from gateway.operator.page.serve import CannotServe, listening, serve_on, tls_of
+from gateway.operator.page.login import TOKEN_HEADER
+from gateway.operator.page.serve import MOST_CONNECTIONS, CannotServe, listening, serve_on, tls_of
+from tests.operator.fake_line import PASSWORD
 from tests.unit.page_support import page
+from tests.unit.supervisor_support import until
 
 
 def certificate_in(folder: Path) -> tuple[Path, Path]:
@@ -53,6 +56,64 @@ def test_beyond_loopback_the_page_speaks_tls(tmp_path: Path):
             async with httpx.AsyncClient() as browser:
                 with pytest.raises(httpx.HTTPError):
                     await browser.get(f"http://127.0.0.1:{port}/")
+            serving.cancel()
+            await asyncio.gather(serving, return_exceptions=True)
+
+    asyncio.run(story())
+
+
+@pytest.mark.wires
+@pytest.mark.parametrize("sent", [b"", b"\x16\x03\x01\x02\x00\x01\x00"], ids=["nothing", "half a handshake"])
+@pytest.mark.parametrize("with_tls", [False, True], ids=["http", "https"])
+def test_past_any_number_of_connections_that_say_nothing_a_person_gets_in(tmp_path: Path, with_tls: bool, sent: bytes):
+    """From the same address; those connections end meanwhile, so that they hold no descriptors either."""
+    files = certificate_in(tmp_path) if with_tls else (None, None)
+    scheme, flood = ("https" if with_tls else "http"), 4 * MOST_CONNECTIONS
+
+    async def story() -> None:
+        async with page(page=f"{scheme}://127.0.0.1:8480") as there:
+            listener = socket.create_server(("127.0.0.1", 0))
+            serving = asyncio.create_task(serve_on(there.app, listener, tls_of(*files)))
+            base = f"{scheme}://127.0.0.1:{listener.getsockname()[1]}"
+            trusted = await asyncio.to_thread(ssl.create_default_context, cafile=files[0]) if with_tls else False
+
+            def browser() -> httpx.AsyncClient:
+                return httpx.AsyncClient(base_url=base, verify=trusted, headers={"origin": base}, timeout=30.0)
+
+            async with browser() as before, browser() as later:
+                login = await before.post("/api/login", json={"name": "operator", "password": PASSWORD})
+                later.headers[TOKEN_HEADER] = before.headers[TOKEN_HEADER] = login.json()["token"]
+                later.cookies.update(before.cookies)
+                silent = [await asyncio.open_connection("127.0.0.1", listener.getsockname()[1]) for _ in range(flood)]
+                for _, writer in silent:
+                    writer.write(sent)
+                for one in (before, later):
+                    assert (await one.post("/api/say", json={"command": "stop"})).status_code == 200
+                await until(lambda: sum(map(is_ended, (one for one, _ in silent))) >= flood - MOST_CONNECTIONS)
+                for _, writer in silent:
+                    writer.close()
+            serving.cancel()
+            await asyncio.gather(serving, return_exceptions=True)
+
+    asyncio.run(story())
+
+
+def is_ended(reader: asyncio.StreamReader) -> bool:
+    return reader.at_eof() or reader.exception() is not None
+
+
+@pytest.mark.wires
+def test_a_handshake_that_is_not_finished_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(serve, "HANDSHAKE_S", 0.05)
+
+    async def story() -> None:
+        async with page(page="https://127.0.0.1:8480") as there:
+            listener = socket.create_server(("127.0.0.1", 0))
+            serving = asyncio.create_task(serve_on(there.app, listener, tls_of(*certificate_in(tmp_path))))
+            reader, writer = await asyncio.open_connection("127.0.0.1", listener.getsockname()[1])
+            writer.write(b"\x16\x03\x01\x02\x00\x01\x00")
+            await until(lambda: is_ended(reader))
+            writer.close()
             serving.cancel()
             await asyncio.gather(serving, return_exceptions=True)
 

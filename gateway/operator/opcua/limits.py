@@ -29,7 +29,6 @@ MAX_UNACKNOWLEDGED = 20  #: messages of one subscription that are kept to be sen
 SUBSCRIPTIONS_EACH = 4  #: of a session
 MORE_CONNECTIONS = 12  #: than sessions: for clients that look for the endpoints, or have not logged in yet
 BEING_ENDED = 128  #: connections that count until the event loop has come round to their end
-SHARE = 0.75  #: of the sessions that one address may have: the others can still come in
 PENDING_MESSAGES = 64
 LOGIN_S = 5.0  #: from a connection to a session
 UNHEARD_MS = 15_000  #: that a client takes nothing of what is sent: it is gone, and frees its place

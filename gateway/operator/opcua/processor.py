@@ -7,7 +7,6 @@ import asyncio
 import sys
 from collections.abc import Callable
 from functools import partial
-from ipaddress import IPv4Address, IPv6Network, ip_address
 from typing import Any
 
 from asyncua import ua as asyncua_ua
@@ -26,6 +25,7 @@ from gateway.operator.opcua.line_nodes import ROOT
 from gateway.operator.opcua.login import Logins
 from gateway.operator.opcua.session import Session
 from gateway.operator.opcua.trust import application_uri, fingerprint
+from gateway.operator.places import place_of
 
 ua: Any = asyncua_ua  #: what it declares of its values and what they are differ
 
@@ -217,17 +217,6 @@ def address_of(transport: asyncio.BaseTransport) -> str:
     """Of the other side in the network; empty where it is gone already."""
     name: Any = transport.get_extra_info("peername")
     return str(name[0]) if name else ""
-
-
-def place_of(address: str) -> str:
-    """By which connections are counted: of IPv6 the /64, in which one machine has as many addresses as it likes."""
-    try:
-        found = ip_address(address.partition("%")[0])
-    except ValueError:
-        return address
-    if isinstance(found, IPv4Address):
-        return str(found)
-    return str(found.ipv4_mapped or IPv6Network((found, 64), strict=False))
 
 
 def _urgent(body: Buffer) -> str:

@@ -3,7 +3,6 @@ people with names, no discovery of others, nothing that can be written.
 """
 
 import asyncio
-import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -27,6 +26,7 @@ from gateway.operator.opcua.processor import OnlyProven, Processor
 from gateway.operator.opcua.session import Session
 from gateway.operator.opcua.sockets import Sockets
 from gateway.operator.opcua.trust import CERTIFICATE, PRIVATE_KEY, NotUsable, TrustList, application_uri, first_of
+from gateway.operator.places import share_of
 
 PRODUCT = "urn:r2rgate"
 
@@ -150,8 +150,7 @@ class OperatorServer(Server):
 
     def _has_its_share(self, place: str) -> bool:
         """No more sessions are for clients of this place."""
-        most = max(1, math.floor(limits.SHARE * self._sessions_max))
-        return isinstance(self.bserver, Sockets) and self.bserver.sessions_from(place) >= most
+        return isinstance(self.bserver, Sockets) and self.bserver.sessions_from(place) >= share_of(self._sessions_max)
 
 
 def _load(stack: InternalServer, pki: Path) -> str:

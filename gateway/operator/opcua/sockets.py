@@ -5,7 +5,6 @@ other.
 import asyncio
 import socket
 import time
-from collections import Counter
 from collections.abc import Callable
 from typing import Any, cast
 
@@ -19,7 +18,8 @@ from asyncua.ua.uaerrors import UaStatusCodeError
 
 from gateway.operator.opcua import limits
 from gateway.operator.opcua.limits import LEAST_CHUNK, MAX_CHUNK, MAX_CHUNKS, MAX_MESSAGE
-from gateway.operator.opcua.processor import Processor, address_of, place_of
+from gateway.operator.opcua.processor import Processor, address_of
+from gateway.operator.places import make_room, place_of
 
 ua: Any = asyncua_ua  #: what it declares of its values and what they are differ
 
@@ -62,22 +62,9 @@ class Sockets(BinaryServer):
         return sum(one.place == place and one.services.session is not None for one in self._open())
 
     def make_room(self, place: str) -> bool:
-        """For a connection from there, which has no session yet. False: there is none.
-
-        One is ended of the place that has most of them, the oldest on which nobody has shown a trusted certificate:
-        who floods takes places from nobody but themselves.
-        """
+        """For a connection from there, which has no session yet. False: there is none."""
         waiting = [one for one in self._open() if not one.services.is_logged_in()]
-        if len(waiting) < limits.MORE_CONNECTIONS:
-            return True
-        held = Counter([place, *(one.place for one in waiting)])
-        most = max(held.values())
-        theirs = [one for one in waiting if held[one.place] == most]
-        unproven = [one for one in theirs if not one.services.is_encrypted()]
-        if not unproven and held[place] == most:
-            return False
-        (unproven or theirs)[0].end()
-        return True
+        return make_room(place, waiting, limits.MORE_CONNECTIONS)
 
     def _open(self) -> list["_Connection"]:
         """In the order in which they came."""
@@ -113,6 +100,10 @@ class _Connection(OPCUAProtocol):
 
     def is_open(self) -> bool:
         return self.transport is not None and not self.transport.is_closing()
+
+    def is_proven(self) -> bool:
+        """Somebody has shown a trusted certificate."""
+        return self.services.is_encrypted()
 
     def end(self) -> None:
         """At once, also where the other side reads nothing."""

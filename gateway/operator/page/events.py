@@ -18,10 +18,11 @@ from gateway.core.clean_text import clean_texts
 from gateway.core.decisions import ProposalList
 from gateway.core.status import GatewayStatus
 from gateway.operator.line_side import LineSide
-from gateway.operator.page.login import Visitor
+from gateway.operator.page.login import Visitor, address_of
 from gateway.operator.page.tick import tick_of
+from gateway.operator.places import make_room, place_of
 
-MOST_BROWSERS = 20
+MOST_BROWSERS = 20  #: a share of them from one place, where others want to look; who has logged in goes first
 HEARTBEAT_S = 0.5
 
 
@@ -29,7 +30,7 @@ class Ticks:
     """Made of every status that comes, as long as somebody looks."""
 
     def __init__(self, side: LineSide) -> None:
-        self.looking = 0
+        self.lookers: list[_Stream] = []
         self.ended = False
         self._side = side
         self._text = ""
@@ -43,6 +44,10 @@ class Ticks:
     def number(self) -> int:
         """Of the newest."""
         return self._number
+
+    @property
+    def looking(self) -> int:
+        return len(self.lookers)
 
     def end(self) -> None:
         """The process ends: all streams do."""
@@ -73,16 +78,28 @@ class Ticks:
 class _Stream(StreamingResponse):
     """Counts who looks for exactly as long as the answer lasts, also where it never begins."""
 
-    def __init__(self, ticks: Ticks, looks: Callable[[], Visitor | None]) -> None:
-        super().__init__(_events(ticks, looks), media_type="text/event-stream")
+    def __init__(self, ticks: Ticks, looks: Callable[[], Visitor | None], place: str, named: bool) -> None:
+        super().__init__(_events(ticks, lambda: None if self._out else looks()), media_type="text/event-stream")
+        self.place = place
         self._ticks = ticks
+        self._named = named
+        self._out = False
+
+    def is_proven(self) -> bool:
+        return self._named
+
+    def end(self) -> None:
+        """Another takes its place: it is told to load the page anew."""
+        self._out = True
+        self._ticks.lookers.remove(self)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        self._ticks.looking += 1
+        self._ticks.lookers.append(self)
         try:
             await super().__call__(scope, receive, send)
         finally:
-            self._ticks.looking -= 1
+            if not self._out:
+                self._ticks.lookers.remove(self)
 
 
 async def _events(ticks: Ticks, looks: Callable[[], Visitor | None]) -> AsyncIterator[str]:
@@ -97,15 +114,16 @@ async def _events(ticks: Ticks, looks: Callable[[], Visitor | None]) -> AsyncIte
 
 
 def stream(
-    ticks: Ticks, visitor: Callable[[Request], object], looks: Callable[[Request], Visitor | None]
+    ticks: Ticks, visitor: Callable[[Request], Visitor], looks: Callable[[Request], Visitor | None]
 ) -> Callable[[Request], Awaitable[StreamingResponse]]:
     """The endpoint. `visitor` raises where nobody may look; `looks`: as whom, still."""
 
     async def events(request: Request) -> StreamingResponse:
-        visitor(request)
-        if ticks.looking >= MOST_BROWSERS:
+        named, place = visitor(request).name is not None, place_of(address_of(request))
+        # Whoever has no name puts nobody out: they would come and go in turns.
+        if ticks.looking >= MOST_BROWSERS and not (named and make_room(place, ticks.lookers, MOST_BROWSERS)):
             raise HTTPException(503, f"{MOST_BROWSERS} pages are open already; close one", {"retry-after": "10"})
-        return _Stream(ticks, lambda: looks(request))
+        return _Stream(ticks, lambda: looks(request), place, named)
 
     return events
 

@@ -2,6 +2,7 @@
 
 import math
 import secrets
+from collections import Counter
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from typing import Annotated
@@ -17,11 +18,12 @@ from gateway.operator.access import Access
 from gateway.operator.page.answer import JSONResponse
 from gateway.operator.page.guard import body_of
 from gateway.operator.page.sessions import LONGEST_S, MAY_IDLE, Session, Sessions, Tries
+from gateway.operator.places import place_of, share_of
 from gateway.operator.users import RoleOf
 
 Check = Callable[[str, str], Awaitable[Role | None]]
 
-MOST_CHECKS = 4  #: passwords that wait to be checked: each takes memory and time
+MOST_CHECKS = 4  #: passwords that wait to be checked, a share of them from one place: each takes memory and time
 LOOK_UP_S = 10.0  #: between two looks at the role of somebody who looks on; whoever says something is looked up then
 TOKEN_HEADER = "x-r2rgate-token"
 
@@ -65,7 +67,7 @@ class Door:
         self._cookie = f"__Host-r2rgate-{port}" if secure else f"r2rgate-{port}"
         self._sessions = Sessions(clock)
         self._tries = Tries(clock)
-        self._checking = 0
+        self._checking: Counter[str] = Counter()  #: by place
 
     def routes(self) -> list[Route]:
         return [
@@ -106,30 +108,31 @@ class Door:
             login = _Login.model_validate_json(await body_of(request))
         except ValidationError:
             raise HTTPException(400, "a login is a name and a password") from None
-        place = request.client.host if request.client else ""
+        address = address_of(request)
+        place = place_of(address)
         if wait_s := self._tries.wait_s(place):
             whole_s = math.ceil(wait_s)
             raise HTTPException(429, f"too many tries; wait {whole_s} s", {"retry-after": str(whole_s)})
-        if self._checking >= MOST_CHECKS:
+        if self._checking.total() >= MOST_CHECKS or self._checking[place] >= share_of(MOST_CHECKS):
             raise HTTPException(503, "too many people are logging in; try again", {"retry-after": "1"})
-        role = await self._role(login)
+        role = await self._role(login, place)
         if role is None:
             self._tries.failed(place, login.name)
             if self._access is not None:
-                self._access.refused("page", place, None, login.name)
+                self._access.refused("page", address, None, login.name)
             raise HTTPException(403, "name or password is wrong")
         self._tries.went_well(place, login.name)
         self._sessions.end(self._key(request))
         if self._access is not None:
-            self._access.came_in(Person(name=login.name, role=role, through="page"), place)
+            self._access.came_in(Person(name=login.name, role=role, through="page"), address)
         return self._let_in(login.name, role)
 
-    async def _role(self, login: _Login) -> Role | None:
-        self._checking += 1
+    async def _role(self, login: _Login, place: str) -> Role | None:
+        self._checking[place] += 1
         try:
             return await self._check(login.name, login.password)
         finally:
-            self._checking -= 1
+            self._checking -= Counter([place])  # which forgets a place without any
 
     def _let_in(self, name: str, role: Role) -> JSONResponse:
         key = self._sessions.begin(name, role)
@@ -167,6 +170,7 @@ class Door:
             self._sessions.end(key)
             return None
         session.role = role
+        _prove(request)
         return session
 
     def _known(self, session: Session | None) -> Visitor | None:
@@ -179,7 +183,17 @@ class Door:
         return request.cookies.get(self._cookie, "")
 
 
+def address_of(request: Request) -> str:
+    return request.client.host if request.client else ""
+
+
 def _told(visitor: Visitor | None) -> dict[str, str | None]:
     if visitor is None:
         return {"name": None, "role": None, "token": None}
     return {"name": visitor.name, "role": visitor.role, "token": visitor.token}
+
+
+def _prove(request: Request) -> None:
+    """Whoever asks this has a session: their connection is the last that makes room for another."""
+    if (proven := getattr(request.state, "proven", None)) is not None:  # of one that `serve` has accepted
+        proven()

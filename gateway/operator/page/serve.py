@@ -1,4 +1,8 @@
-"""The page on its address: plain on loopback, TLS elsewhere. It shares the event loop of the operator's process."""
+"""The page on its address: plain on loopback, TLS elsewhere. It shares the event loop of the operator's process.
+
+Connections are counted from the moment they are accepted, before any handshake, by where they come from: whoever opens
+many without a session, and whatever they say or leave unsaid, takes neither places nor descriptors from others.
+"""
 
 import asyncio
 import contextlib
@@ -6,6 +10,7 @@ import socket
 import ssl
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 from urllib.parse import SplitResult, urlsplit
 
 import uvicorn
@@ -13,10 +18,14 @@ from starlette.applications import Starlette
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from gateway.operator.page.asks import SAFE
+from gateway.operator.places import make_room, place_of
 from gateway.tasks.cleanup import finish
 
 MOST_CONNECTIONS = 100
 IDLE_S = 10.0  #: of a connection without a whole request
+HANDSHAKE_S = 5.0  #: for the whole of it
+WAITING = 1024  #: connections, in the kernel, to be accepted
+ACCEPT_AGAIN_S = 0.1  #: where there is nothing to accept with, as while there are no descriptors
 UNHEARD_MS = 15_000  #: that a browser takes nothing of what is sent: it is gone, and frees its place
 CLOSING_S = 1  #: for answers that are on their way
 
@@ -26,7 +35,9 @@ class CannotServe(Exception):
 
 
 class _Connection(H11Protocol):
-    """Is closed when it brings no whole request: whoever opens many and says nothing takes no place from others."""
+    """HTTP. Is closed when it brings no whole request."""
+
+    guest: "_Guest"
 
     @property
     def limit_concurrency(self) -> int | None:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -39,9 +50,12 @@ class _Connection(H11Protocol):
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
         super().connection_made(transport)
-        ours: socket.socket = transport.get_extra_info("socket")
-        ours.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, UNHEARD_MS)
+        self.guest.transport = transport
         self.loop.call_later(IDLE_S, self._look, self.cycle)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        super().connection_lost(exc)
+        self.guest.leave()
 
     def _look(self, before: object) -> None:
         """`before`: the request that was the newest when it was looked at last."""
@@ -53,7 +67,96 @@ class _Connection(H11Protocol):
             self.loop.call_later(IDLE_S, self._look, self.cycle)
 
 
+class _Guest:
+    """A connection from its acceptance to its end, whether it has come through its handshake or not."""
+
+    def __init__(self, server: "_Server", ours: socket.socket, place: str) -> None:
+        self.place = place
+        self.transport: asyncio.Transport | None = None  #: once HTTP is spoken over it
+        self._server = server
+        self._ours = ours
+        self._has_session = False
+        self._begins = asyncio.get_running_loop().create_task(self._begin())
+
+    def is_proven(self) -> bool:
+        return self._has_session
+
+    def end(self) -> None:
+        """At once, whatever its other side does not say or take."""
+        self.leave()
+        if self.transport is not None:
+            self.transport.abort()
+        else:
+            with contextlib.suppress(OSError):
+                self._ours.shutdown(socket.SHUT_RDWR)  # the handshake fails by it
+
+    def leave(self) -> None:
+        self._server.guests.pop(self, None)
+
+    async def _begin(self) -> None:
+        tls: dict[str, Any] = {}
+        if self._server.config.ssl is not None:
+            tls = {"ssl": self._server.config.ssl, "ssl_handshake_timeout": HANDSHAKE_S,
+                   "ssl_shutdown_timeout": CLOSING_S}  # fmt: skip
+        try:
+            await asyncio.get_running_loop().connect_accepted_socket(self._speak, self._ours, **tls)
+        except OSError:
+            pass  # it is gone, or there was no handshake, or none in time: asyncio has closed it
+        finally:
+            if self.transport is None:
+                self.leave()
+
+    def _speak(self) -> _Connection:
+        connection = _Connection(self._server.config, self._server.server_state, {"proven": self._proven})
+        connection.guest = self
+        return connection
+
+    def _proven(self) -> None:
+        self._has_session = True
+
+
 class _Server(uvicorn.Server):
+    """Accepts by itself."""
+
+    def __init__(self, config: uvicorn.Config) -> None:
+        super().__init__(config)
+        self.guests: dict[_Guest, None] = {}  #: as they came
+        self._accepting: asyncio.Task[None] | None = None
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        self.servers, self.started = [], True
+        (listener,) = sockets or ()
+        listener.listen(WAITING)
+        listener.setblocking(False)
+        self._accepting = asyncio.get_running_loop().create_task(self._accept(listener))
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        assert self._accepting is not None  # it has started
+        self._accepting.cancel()
+        for guest in list(self.guests):
+            if guest.transport is None:
+                guest.end()
+        await super().shutdown(sockets)
+
+    async def _accept(self, listener: socket.socket) -> None:
+        while True:
+            try:
+                ours, address = await asyncio.get_running_loop().sock_accept(listener)
+                ours.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, UNHEARD_MS)
+            except OSError:
+                await asyncio.sleep(ACCEPT_AGAIN_S)
+                continue
+            place = place_of(address[0])
+            if make_room(place, list(self.guests), MOST_CONNECTIONS):
+                self.guests[_Guest(self, ours, place)] = None
+            else:
+                ours.close()
+            await asyncio.sleep(0)  # the others' turn, also while they come without end
+
+    async def on_tick(self, counter: int) -> bool:
+        """Whether to end, which it does as well where nothing is accepted any more."""
+        return await super().on_tick(counter) or self._accepting is None or self._accepting.done()
+
     @contextlib.contextmanager
     def capture_signals(self) -> Iterator[None]:
         """Signals belong to the process, which is more than a page."""
@@ -113,7 +216,6 @@ async def serve_on(app: Starlette, listener: socket.socket, tls: ssl.SSLContext 
         access_log=False,
         server_header=False,
         proxy_headers=False,
-        limit_concurrency=MOST_CONNECTIONS,
         timeout_keep_alive=5,
         timeout_graceful_shutdown=CLOSING_S,
         h11_max_incomplete_event_size=16_384,
