@@ -45,6 +45,7 @@ from gateway.supervisor.judging import NICEST, JudgeWorkers
 from gateway.supervisor.line_desk import LineDesk
 from gateway.supervisor.memory import GivenBack
 from gateway.supervisor.models import Models
+from gateway.supervisor.operated import Operated
 from gateway.supervisor.past import Past
 from gateway.supervisor.peers import GATEWAY, know_users
 from gateway.supervisor.persons_desk import PersonsDesk
@@ -151,7 +152,9 @@ async def serve(
     gateway.audit_head = lambda: heads.head
     alarms = Alarms(mailbox, data_folder, gate.audit.append, gateway.note, clock, wall_clock, gate.shelvings)
     gateway.alarms = alarms.status
-    people = PersonsDesk(mailbox, gateway.command, gate.decide, alarms.say, gate.audit.append, clock, gateway.note)
+    operated = Operated(gate.audit.append, clock, gateway.note)
+    gateway.on_record = operated.keep_local
+    PersonsDesk(mailbox, gateway.command, gate.decide, alarms.say, operated, clock, gateway.note)
     gate.roles = AccessDesk(mailbox, gate.audit.append, clock).roles
     # One process for what nobody's verdict may wait for.
     beside = JudgeWorkers(line, nicer=NICEST)
@@ -195,7 +198,7 @@ async def serve(
             {
                 "alarms' file": alarms.keep,
                 "closing the agents' bus": bus.close,
-                "records of stops": people.close,
+                "records of what was said": operated.close,
                 "closing courses": courses.close,
                 "closing dry runs": dry_runs.close,
                 "closing the past": past.close,

@@ -92,6 +92,11 @@ async def nothing_found() -> list[Finding]:
     return []
 
 
+async def on_no_record(_: Command, reply: Reply, __: Who) -> Reply:
+    """Where there is no audit."""
+    return reply
+
+
 class Gateway:
     """Handlers on a mailbox, and what they remember. Sockets, signals and threads are its owner's."""
 
@@ -132,6 +137,8 @@ class Gateway:
         self.wiring: Callable[[], WiringStatus | None] = lambda: None  #: whether it is as it was proved to be
         self.unexplained: Callable[[], list[Finding]] = list  #: what was changed or tried at the loop
         self.task_faults: Callable[[], list[TaskFault]] = list
+        #: Puts on record what a local process has said, and what the line has answered.
+        self.on_record: Callable[[Command, Reply, Who], Awaitable[Reply]] = on_no_record
         self.stop_asked: Who | None = None  #: who asked for the last stop that was handed on
         #: With their number, in which order they came.
         self._events: deque[tuple[int, EventStatus]] = deque(maxlen=EVENTS_SHOWN)
@@ -304,9 +311,16 @@ class Gateway:
 
     async def _answer_command(self, payload: bytes) -> bytes:
         if is_never_held_back(payload):
-            return (await self.command(payload, who_at_once(PEER.get()))).model_dump_json().encode()
-        who = await who_of(PEER.get())
-        return (self._inbox.refuse(who, len(payload)) or await self.command(payload, who)).model_dump_json().encode()
+            who, refusal = who_at_once(PEER.get()), None
+        else:
+            who = await who_of(PEER.get())
+            refusal = self._inbox.refuse(who, len(payload))
+        if refusal is not None:
+            return refusal.model_dump_json().encode()
+        reply, said = await self.command(payload, who), _command_of(payload)
+        if said is not None:
+            reply = await self.on_record(said, reply, who)
+        return reply.model_dump_json().encode()
 
     async def command(self, payload: bytes, who: Who) -> Reply:
         """Hand a command on to the loop, and note who gave it; what is said again and again is counted."""
@@ -407,7 +421,15 @@ class Gateway:
 def _in_words(payload: bytes) -> str:
     if payload[:1] == PACKED:
         return "a packed command"
+    said = _command_of(payload)
+    return payload[:80].decode("utf-8", "replace") if said is None else in_words(said)
+
+
+def _command_of(payload: bytes) -> Command | None:
+    """None: it is none, or packed, which nothing is that may be said here."""
+    if payload[:1] == PACKED:
+        return None
     try:
-        return in_words(parse_command(payload))
+        return parse_command(payload)
     except MalformedMessage:
-        return payload[:80].decode("utf-8", "replace")
+        return None

@@ -1,4 +1,6 @@
-"""Each stop of a line in its processes is one record: who asked for it, or what was found; the audit stays sound."""
+"""Each stop of a line in its processes is one record: who asked for it, or what was found; so is each command of a local
+process; the audit stays sound.
+"""
 
 import os
 from typing import Any
@@ -7,6 +9,7 @@ import pytest
 
 from gateway.supervisor.audit_file import AuditFile
 from gateway.supervisor.line_stops import STOPPED
+from gateway.supervisor.operated import OPERATED
 from gateway.supervisor.record_words import in_a_sentence
 from tests.closed_loop.gate_line import GateLine
 from tests.closed_loop.wire import at_rest
@@ -14,9 +17,13 @@ from tests.closed_loop.wire import at_rest
 pytestmark = [pytest.mark.realtime, pytest.mark.timeout(180)]
 
 
-def stops(line: GateLine) -> list[Any]:
+def of_kind(line: GateLine, kind: str) -> list[Any]:
     with AuditFile(line.data) as file:
-        return [record for row in file.rows() if (record := row.record()).kind == STOPPED]
+        return [record for row in file.rows() if (record := row.record()).kind == kind]
+
+
+def stops(line: GateLine) -> list[Any]:
+    return of_kind(line, STOPPED)
 
 
 def test_a_persons_stop_and_a_web_break_are_one_record_each(tmp_path) -> None:
@@ -36,6 +43,9 @@ def test_a_persons_stop_and_a_web_break_are_one_record_each(tmp_path) -> None:
         assert "von selbst" in in_a_sentence(broke.kind, broke.who.name, broke.what, language="de")
         shown = line.audit("show", "--kind", STOPPED)
         assert "the line has stopped by itself, from RUNNING: " in shown
+        operated = of_kind(line, OPERATED)
+        assert {one.what["command"] for one in operated} >= {"arm", "start"}
+        assert {(one.who.uid, one.what["command"] == "stop") for one in operated} == {(os.getuid(), False)}
         line.children.end("gateway")
         assert len(stops(line)) == 2  # on its way to torque off it has told more
         assert "sound" in line.audit("verify")

@@ -35,6 +35,7 @@ from gateway.supervisor.alarms import FILE_NAME, Alarms
 from gateway.supervisor.audit import AuditState
 from gateway.supervisor.audit_anchor import NOTHING_YET
 from gateway.supervisor.audit_file import AuditUnavailable
+from gateway.supervisor.operated import Operated
 from gateway.supervisor.persons_desk import PersonsDesk
 from gateway.supervisor.said_inbox import OF_DECISIONS
 from gateway.supervisor.store import boot_id
@@ -325,7 +326,8 @@ class Desk:
             self.mailbox, self.folder, self.append, self.note,
             lambda: self.now_s, lambda: self.now_s + self.wall_ahead_s, self.shelvings,
         )  # fmt: skip
-        PersonsDesk(self.mailbox, self._none, self._none, self.alarms.say, self.append, lambda: 0.0)
+        operated = Operated(self.append, lambda: 0.0)
+        PersonsDesk(self.mailbox, self._none, self._none, self.alarms.say, operated, lambda: 0.0)
 
     def note(self, kind: str, text: str, **_: object) -> None:
         self.notes.append((kind, text))

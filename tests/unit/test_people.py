@@ -5,6 +5,7 @@ import asyncio
 import pytest
 
 from gateway.core.alarms import AcknowledgeAlarm, ShelveAlarm
+from gateway.core.audit_record import Who
 from gateway.core.decisions import Archive, Confirm, Decide, LineChanged, RollBackNow
 from gateway.core.messages import (
     AbortExperiment,
@@ -23,7 +24,8 @@ from gateway.core.topics import GATEWAY_FOR_PERSON
 from gateway.mailbox.inprocess import Hub, InProcessMailbox
 from gateway.supervisor.audit_file import AuditUnavailable
 from gateway.supervisor.bounded import AT_ONCE, EVERY_S
-from gateway.supervisor.persons_desk import MOST_SAID, SAID_EVERY_S, PersonsDesk
+from gateway.supervisor.operated import MOST_SAID, SAID_EVERY_S, Operated
+from gateway.supervisor.persons_desk import PersonsDesk
 
 HASH = "a" * 64
 COMMANDS = [
@@ -49,7 +51,8 @@ class Desk:
         self.commands, self.decisions, self.records = [], [], []
         self.audit_open = True
         self.now_s = 0.0
-        PersonsDesk(self.mailbox, self.command, self.decide, self.alarm, self.note, lambda: self.now_s)
+        self.operated = Operated(self.note, lambda: self.now_s)
+        PersonsDesk(self.mailbox, self.command, self.decide, self.alarm, self.operated, lambda: self.now_s)
 
     async def command(self, payload, who):
         self.commands.append((parse_command(payload), who))
@@ -152,6 +155,28 @@ def test_who_says_more_than_any_hand_does_is_still_heard_and_fills_no_disk(desk)
     assert desk.records[-1][2]["left_out"] == 50 + 3
     desk.now_s += SAID_EVERY_S
     assert desk.ask("operator", AcknowledgeAlarm(alarm="load-cell")).ok
+
+
+def test_what_a_local_process_says_is_on_record_as_a_persons_and_fills_no_disk(desk):
+    answered, who = Reply(ok=True, state="RUN", text="done"), Who(name="otto", uid=1000, pid=7)
+
+    def say(*commands):
+        return [asyncio.run(desk.operated.keep_local(one, answered, who)) for one in commands]
+
+    say(*COMMANDS)
+    recorded = [one for one in COMMANDS if not isinstance(one, Stop | Hold)]
+    assert [(kind, who.name, what["done"]) for kind, who, what in desk.records] == [("operated", "otto", True)] * 6
+    assert all(
+        what["command"].startswith(one.command) for (_, _, what), one in zip(desk.records, recorded, strict=True)
+    )
+    say(*[Arm()] * (MOST_SAID + 50))
+    assert len(desk.records) == MOST_SAID
+    desk.now_s += SAID_EVERY_S
+    say(Arm())
+    assert desk.records[-1][2]["left_out"] == 50 + 6
+    desk.now_s, desk.audit_open = desk.now_s + SAID_EVERY_S, False
+    (reply,) = say(Arm())
+    assert reply.ok and "could not be recorded: the disk is full" in reply.text
 
 
 def test_a_stop_is_done_though_nothing_can_be_recorded(desk):
