@@ -7,6 +7,7 @@ from gateway.cli.demo_asked_page import result_words, story_of, verdict_words
 from gateway.cli.demo_result import PAPER_RMSE_N, AskedResult, ChainResult, ChangeResult, DemoResult
 from gateway.cli.report import Section, Story, Table
 from gateway.commissioning.past import Step
+from gateway.core.line_problem import quoted
 from gateway.core.scenario import PAPER
 from gateway.core.verdict import Verdict
 
@@ -117,7 +118,7 @@ def _diagnoses(chain: ChainResult, later: Sequence[ChangeResult]) -> list[AskedR
 def concluded(one: AskedResult) -> str:
     """By whom, what, and the reason in their own words."""
     option = next((option.title for option in one.options if option.id == one.chosen), one.chosen)
-    return f"{_who(one).capitalize()} concluded: {option}. \u201c{one.reason}\u201d"
+    return f"{_who(one).capitalize()} concluded: {option}. {quoted(one.reason)}"
 
 
 def _who(one: AskedResult) -> str:

@@ -88,8 +88,14 @@ def value_in_words(value: Any) -> str:
 
 
 def quoted(text: str, most: int | None = None) -> str:
-    """What somebody has said, between quotation marks that its own cannot close."""
-    return f'"{printable(text)[:most].translate(_OWN_MARKS)}"'
+    """What somebody has said, on one line, between quotation marks that its own cannot close.
+
+    `most`: characters of it; \u2026 is the last of one that was longer.
+    """
+    said = printable(" ".join(text.split())).translate(_OWN_MARKS)
+    if most is not None and len(said) > most:
+        said = f"{said[: most - 1]}\u2026"
+    return f"\u201c{said}\u201d"
 
 
 def printable(text: str) -> str:

@@ -2,7 +2,7 @@
 
 import asyncio
 from collections.abc import Awaitable, Callable, Mapping
-from typing import Any, Final
+from typing import Any
 
 from gateway.core.audit_record import Who
 from gateway.core.messages import Command, Reply, in_words
@@ -11,7 +11,6 @@ from gateway.supervisor.audit_file import AuditUnavailable
 from gateway.supervisor.bounded import Bounded, with_left_out
 from gateway.supervisor.said_inbox import COMMAND_EVENT
 
-OPERATED: Final = "operated"  #: kind of record
 #: What one person, or one local user, can have recorded: more than any hand does, and little enough for a disk.
 MOST_SAID, SAID_EVERY_S = 600, 1.0
 RECORDED_S = 0.15  #: that the answer to a stop or a hold waits for its record, which is made all the same

@@ -9,7 +9,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from gateway.core.finding import Finding, finding
-from gateway.core.line_problem import printable
+from gateway.core.line_problem import printable, quoted
 from gateway.wording.catalogue import ENGLISH, sentence, sentences
 
 LONGEST_QUOTE = 200  #: characters
@@ -32,10 +32,10 @@ def in_a_sentence(kind: str, who: str, what: What, reason: str = "", language: s
     return tell(_clean(who, 200), {**what, "reason": reason} if kind == "proposed" else what)
 
 
-def quoted(text: object) -> str:
-    """With what leads to it; empty where nothing was said."""
-    said = _clean(str(text or ""), LONGEST_QUOTE)
-    return f": \u201c{said}\u201d" if said else ""
+def _said(text: object) -> str:
+    """In quotation marks, with what leads to it; empty where nothing was said."""
+    said = str(text or "").strip()
+    return f": {quoted(said, LONGEST_QUOTE)}" if said else ""
 
 
 def _clean(text: str, most: int) -> str:
@@ -59,18 +59,18 @@ def _because(what: What) -> str:
 
 
 def _proposed(_: str, what: What) -> str:
-    return f"{_of(what, 'author')} proposes {_of(what, 'change')} {_hash(what)}{quoted(what['reason'])}"
+    return f"{_of(what, 'author')} proposes {_of(what, 'change')} {_hash(what)}{_said(what['reason'])}"
 
 
 def _approved(who: str, what: What) -> str:
     if what.get("by") == "verdict":
         return f"proposal {_hash(what)} passes by its verdict alone: it is like {_hash(what, 'like')}"
     second = f" as the second, after {_of(what, 'first')}" if "first" in what else ""
-    return f"{who} approves proposal {_hash(what)}{second}{quoted(what.get('comment'))}"
+    return f"{who} approves proposal {_hash(what)}{second}{_said(what.get('comment'))}"
 
 
 def _approved_once(who: str, what: What) -> str:
-    return f"{who} approves proposal {_hash(what)} as the first of two{quoted(what.get('comment'))}"
+    return f"{who} approves proposal {_hash(what)} as the first of two{_said(what.get('comment'))}"
 
 
 def _deployed(_: str, what: What) -> str:
@@ -110,7 +110,7 @@ def _operated(who: str, what: What) -> str:
 
 def _archived(who: str, what: What) -> str:
     kept = f"configuration {_hash(what, 'configuration')} (version {_of(what, 'version')}) as {_of(what, 'name')}"
-    return f"{who} keeps {kept}{quoted(what.get('because'))}"
+    return f"{who} keeps {kept}{_said(what.get('because'))}"
 
 
 def _not_archived(_: str, what: What) -> str:
@@ -120,8 +120,8 @@ def _not_archived(_: str, what: What) -> str:
 def _shelved(who: str, what: What) -> str:
     alarm, for_s = _of(what, "alarm"), what.get("for_s", 0.0)
     if not for_s:
-        return f"{who} takes alarm {alarm} off the shelf{quoted(what.get('because'))}"
-    return f"{who} shelves alarm {alarm} for {for_s / 60.0:.0f} min{quoted(what.get('because'))}"
+        return f"{who} takes alarm {alarm} off the shelf{_said(what.get('because'))}"
+    return f"{who} shelves alarm {alarm} for {for_s / 60.0:.0f} min{_said(what.get('because'))}"
 
 
 def _left_out(what: What) -> str:
@@ -199,7 +199,7 @@ SENTENCES: dict[str, Callable[[str, What], str]] = {
     "approved-once": _approved_once,
     "approved": _approved,
     "approval-lapsed": _of_proposal("waits again"),
-    "rejected": lambda who, what: f"{who} rejects proposal {_hash(what)}{quoted(what.get('comment'))}",
+    "rejected": lambda who, what: f"{who} rejects proposal {_hash(what)}{_said(what.get('comment'))}",
     "expired": _of_proposal("has expired"),
     "superseded": _of_proposal("is superseded"),
     "deploying": lambda who, what: f"proposal {_hash(what)} goes to the loop as epoch {_of(what, 'epoch')}",
@@ -212,12 +212,12 @@ SENTENCES: dict[str, Callable[[str, What], str]] = {
     "experiment-ends": _experiment_ends,
     "model-in-service": lambda who, what: f"proposals are judged by model {_hash(what, 'model')} from now on",
     "found-in-service": _found,
-    "confirmed": lambda who, what: f"{who} confirms {_hash(what, 'configuration')}{quoted(what.get('because'))}",
+    "confirmed": lambda who, what: f"{who} confirms {_hash(what, 'configuration')}{_said(what.get('because'))}",
     "refused-at-loop": lambda _, what: f"at the loop was refused{_because(what)}{_left_out(what)}",
     "set-aside": lambda _, what: f"the loop has set aside what lay in its folder{_because(what)}",
-    "rollback-asked": lambda who, what: f"{who} asks for what was before{quoted(what.get('comment'))}{_left_out(what)}",
+    "rollback-asked": lambda who, what: f"{who} asks for what was before{_said(what.get('comment'))}{_left_out(what)}",
     "wiring-proved": _wiring_proved,
-    "line-changed": lambda who, what: f"{who} says that the line has changed{quoted(what.get('because'))}",
+    "line-changed": lambda who, what: f"{who} says that the line has changed{_said(what.get('because'))}",
     "archived": _archived,
     "not-archived": _not_archived,
     "operated": _operated,
@@ -228,10 +228,10 @@ SENTENCES: dict[str, Callable[[str, What], str]] = {
     "logged-in": _logged_in,
     "wrong-logins": _wrong_logins,
     "users": _users,
-    "acknowledged": lambda who, what: f"{who} has seen alarm {_of(what, 'alarm')}{quoted(what.get('comment'))}",
+    "acknowledged": lambda who, what: f"{who} has seen alarm {_of(what, 'alarm')}{_said(what.get('comment'))}",
     "shelved": _shelved,
     "malformed-proposal": lambda who, what: f"{who} sent what is no proposal",
-    "agents": lambda who, what: f"agents, {_of(what, 'times')} times {_of(what, 'case')}{quoted(what.get('newest'))}",
+    "agents": lambda who, what: f"agents, {_of(what, 'times')} times {_of(what, 'case')}{_said(what.get('newest'))}",
     "gateway-start": lambda who, what: f"the gateway has started, version {_of(what, 'version')}",
     "begun": lambda who, what: "the audit has begun",
     "not-done": lambda who, what: f"records {_of(what, 'sequences')} were stored, and nothing came of them",

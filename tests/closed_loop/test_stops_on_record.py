@@ -1,5 +1,5 @@
-"""Each stop of a line in its processes is one record: who asked for it, or what was found; so is each command of a local
-process; the audit stays sound.
+"""Each stop of a line in its processes is one record: who asked for it, or what was found. What a local process says is
+one, too; the audit stays sound.
 """
 
 import os
@@ -9,7 +9,6 @@ import pytest
 
 from gateway.supervisor.audit_file import AuditFile
 from gateway.supervisor.line_stops import STOPPED
-from gateway.supervisor.operated import OPERATED
 from gateway.supervisor.record_words import in_a_sentence
 from tests.closed_loop.gate_line import GateLine
 from tests.closed_loop.wire import at_rest
@@ -43,7 +42,7 @@ def test_a_persons_stop_and_a_web_break_are_one_record_each(tmp_path) -> None:
         assert "von selbst" in in_a_sentence(broke.kind, broke.who.name, broke.what, language="de")
         shown = line.audit("show", "--kind", STOPPED)
         assert "the line has stopped by itself, from RUNNING: " in shown
-        operated = of_kind(line, OPERATED)
+        operated = of_kind(line, "operated")
         assert {one.what["command"] for one in operated} >= {"arm", "start"}
         assert {(one.who.uid, one.what["command"] == "stop") for one in operated} == {(os.getuid(), False)}
         line.children.end("gateway")

@@ -253,7 +253,7 @@ def test_what_is_subscribed_to_is_told_when_it_changes():
 def test_a_proposal_that_waits_is_there_as_variables_and_goes_when_it_is_decided():
     async def story():
         async with bench(spans=1) as b, b.connected("vera") as client:
-            one = shown(reason="approve me at once").model_copy(update={"why": "emma has approved"})
+            one = shown(reason="approve me at once\u201d\nThe gate: fine. \u201c").model_copy(update={"why": "emma has approved"})
             b.gateway.waiting = [one]
             current = "Line.Proposals.Current"
             await b.until(client, f"{current}.Id", lambda found: found.Value.Value == one.proposal_hash)
@@ -262,7 +262,7 @@ def test_a_proposal_that_waits_is_there_as_variables_and_goes_when_it_is_decided
                 assert await b.value(client, f"{path}.ShownHash") == SHOWN
                 assert await b.value(client, f"{path}.BaseRevision") == 3
                 assert await b.value(client, f"{path}.Why") == "emma has approved"
-                assert await b.value(client, f"{path}.Reason") == "\u201capprove me at once\u201d"
+                assert await b.value(client, f"{path}.Reason") == "\u201capprove me at once' The gate: fine. '\u201d"
                 assert await b.value(client, f"{path}.Difference") == ["gain of span 2 from 1 to 2"]
                 assert await b.value(client, f"{path}.Rule") == ["delay margin", "shape"]
                 margins = await b.value(client, f"{path}.RuleMargin")

@@ -227,7 +227,7 @@ def test_what_an_agent_chooses_is_proposed_in_its_name_and_what_was_refused_is_t
     assert [one.rung for one in found.tried] == [*own, *ladder]
     shown = list(gateway.shown.values())
     assert {one.proposal.author for one in shown[:-1]} == {"agents"}
-    assert shown[0].proposal.reason.endswith('initial-control says: "it is the calmest"')
+    assert shown[0].proposal.reason.endswith("initial-control says: \u201cit is the calmest\u201d")
     assert "torque_per_nm2 times 64" in shown[0].proposal.reason
     assert interactions_of(shown[0].proposal.evidence) == [f"{1:016x}"]
     named_in = [each for one in shown for each in interactions_of(one.proposal.evidence)]

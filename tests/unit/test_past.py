@@ -118,7 +118,7 @@ def test_the_reason_of_an_agent_is_a_quotation_shortened_and_harmless(folder: Pa
     text = records(folder).records[-1].text
     before, quote = text.split("\u201c")
     assert before == f"agents proposes gains {proposal_hash(one)[:12]}: "
-    assert quote.startswith('approve at once", says the gate. \\u001b[31mxxx') and quote.endswith("\u2026\u201d")
+    assert quote.startswith("approve at once', says the gate. \\u001b[31mxxx") and quote.endswith("\u2026\u201d")
     assert quote.count("\u201d") == 1 and len(quote) <= LONGEST_QUOTE + 1 and text.isprintable()
 
 
@@ -134,7 +134,7 @@ def test_every_kind_that_the_gateway_records_has_a_sentence() -> None:
             if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute | ast.Name):
                 name = node.func.attr if isinstance(node.func, ast.Attribute) else node.func.id
                 first = node.args[0] if node.args else None
-                if name in ("append", "_append", "step", "_recorded") and isinstance(first, ast.Constant):
+                if name in ("append", "_append", "step", "recorded", "_kept") and isinstance(first, ast.Constant):
                     named |= {str(first.value)} if re.fullmatch(r"[a-z-]+", str(first.value)) else set()
     assert {"operated", "gateway-start", "agents", "refused-person"} <= named
     assert named - set(SENTENCES) == set()

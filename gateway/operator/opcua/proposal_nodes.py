@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from math import nan
 
 from gateway.core.decisions import ProposalShown
+from gateway.core.line_problem import quoted
 from gateway.core.verdict import RuleFinding
 from gateway.operator.opcua.line_nodes import ROOT
 from gateway.operator.opcua.space import BOOLEAN, DOUBLE, NO_DATA, STRING, UINT32, Row, Space, Value
@@ -93,10 +94,6 @@ def _kept(current: ProposalShown | None, waiting: Sequence[ProposalShown]) -> Pr
             if (one.proposal_hash, one.shown) == (current.proposal_hash, current.shown):
                 return one
     return waiting[0] if waiting else None
-
-
-def quoted(reason: str) -> str:
-    return f"\u201c{reason}\u201d"
 
 
 def _values(shown: ProposalShown | None) -> Iterator[tuple[str, Value]]:
