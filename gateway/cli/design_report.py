@@ -15,6 +15,7 @@ from gateway.commissioning.records import Attempt, DecisionRecord
 from gateway.commissioning.selection import TERMS
 from gateway.core.finding import finding
 from gateway.core.line import Priorities
+from gateway.core.line_problem import quoted
 from gateway.core.scenario import Scenario
 from gateway.core.signals import FloatArray
 from gateway.wording.catalogue import sentence
@@ -113,7 +114,7 @@ def _decisions(result: DesignResult) -> Section:
             one.task,
             one.option + "".join(f", {name} times {factor:g}" for name, factor in one.factors.items()),
             one.by,
-            one.why if one.by == RULES else f'"{one.reason}"',
+            one.why if one.by == RULES else quoted(one.reason),
             f"asked, {one.instead}" if one.instead else "the same" if _as_usual(one) else f"{one.usual}: {one.why}",
         )
         for one in result.decisions
@@ -190,7 +191,7 @@ def _attempts(one: TuningResult) -> Section:
             *_values(attempt.values, knobs),
             "-" if attempt.trial is None or attempt.trial.cost_n2s is None else f"{attempt.trial.cost_n2s:.2f}",
             "accepted" if attempt.accepted else attempt.refused or "not better",
-            attempt.reason if attempt.by == RULES else f'"{attempt.reason}"',
+            attempt.reason if attempt.by == RULES else quoted(attempt.reason),
             *((attempt.by, _rules_instead(attempt, knobs)) if asked else ()),
         )
         for attempt in one.history
@@ -219,4 +220,4 @@ def _ended(one: TuningResult) -> tuple[str, ...]:
     """Who has ended it, where that was not the rules."""
     if one.stopped is None:
         return ()
-    return (f'Ended by {one.stopped.by}: "{one.stopped.reason}" The rules: {one.stopped.usual.reason}.',)
+    return (f"Ended by {one.stopped.by}: {quoted(one.stopped.reason)} The rules: {one.stopped.usual.reason}.",)
