@@ -3,14 +3,16 @@
 Reading says what is there, sound or not; `audit_verify` judges. Each read is short, because a writer waits for it.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from heapq import merge
+from operator import itemgetter
 from pathlib import Path
 from typing import NamedTuple
 
 import apsw
 
 from gateway.core.audit_record import AuditRecord, NotRecordable, head_of, parse_record
-from gateway.storage.sqlite_file import FileKind, open_there, told
+from gateway.storage.sqlite_file import FileKind, open_to_read, told
 
 FILE_NAME = "audit.sqlite"
 APPLICATION_ID = 0x52324155  # "R2AU"
@@ -32,6 +34,9 @@ CREATE TRIGGER blob_stays BEFORE UPDATE ON blob BEGIN SELECT RAISE(ABORT, 'a blo
 CREATE TRIGGER blob_is_kept BEFORE DELETE ON blob BEGIN SELECT RAISE(ABORT, 'a blob is kept'); END;
 PRAGMA application_id = {APPLICATION_ID};
 """
+
+#: Of a record; null where it is none.
+_KIND_OF = "CASE WHEN json_valid(CAST(content AS TEXT)) THEN json_extract(CAST(content AS TEXT), '$.kind') END"
 
 #: From version k (the key) to version k + 1. Every version that was ever released stays here.
 MIGRATIONS: dict[int, str] = {0: _SCHEMA_1}
@@ -55,6 +60,7 @@ KIND = FileKind(
     absent="there is no audit at {path}; a gateway begins one when it starts",
     damaged=f"It was left as it is. {WHAT_TO_DO}",
     undone="nothing was recorded, so that nothing may be changed",
+    additions=f"CREATE INDEX IF NOT EXISTS record_kind ON record ({_KIND_OF});",
 )
 
 
@@ -76,11 +82,14 @@ class Row(NamedTuple):
 
 
 class AuditFile:
-    """The database, opened for reading; `close` it, or use it as a context manager. Raises AuditUnavailable."""
+    """The database, opened for reading; `close` it, or use it as a context manager. Raises AuditUnavailable.
+
+    It is not checked whole: each row and each blob shows by its hash whether it is what was stored.
+    """
 
     def __init__(self, folder: Path, connection: apsw.Connection | None = None) -> None:
         self.path = folder / FILE_NAME
-        self.connection = connection or open_there(self.path, KIND)
+        self.connection = connection or open_to_read(self.path, KIND)
 
     def __enter__(self) -> "AuditFile":
         return self
@@ -110,6 +119,39 @@ class AuditFile:
             rows = [_row(*one) for one in part]
             yield from rows
             # A damaged database may say anything, also the same again.
+            if len(rows) < AT_ONCE or rows[-1].sequence <= after:
+                return
+            after = rows[-1].sequence
+
+    def kinds(self) -> list[str]:
+        """Of all records that are there, each once, as the index has them."""
+        found, kind = list[str](), ""
+        with told(self.path, KIND):
+            while True:
+                query = f"SELECT {_KIND_OF} FROM record WHERE {_KIND_OF} > ? ORDER BY {_KIND_OF} LIMIT 1"
+                if not isinstance(kind := self.connection.execute(query, (kind,)).get, str):
+                    return found
+                found.append(kind)
+
+    def rows_of(self, kinds: Iterable[str]) -> Iterator[Row]:
+        """Those of some kinds, in order, and with them whatever is no record. Others are not read.
+
+        Of what is there now. By the index, which whoever writes here makes; without it, it takes its time.
+        """
+        last = self.last()
+        return merge(*(self._rows_of(kind, last) for kind in (None, *kinds)), key=itemgetter(0))
+
+    def _rows_of(self, kind: str | None, last: int) -> Iterator[Row]:
+        after = 0
+        while True:
+            with told(self.path, KIND):
+                part = self.connection.execute(
+                    f"SELECT sequence, content, CAST(head AS BLOB) FROM record WHERE {_KIND_OF} IS ? AND sequence > ?"
+                    " AND sequence <= ? ORDER BY sequence LIMIT ?",
+                    (kind, after, last, AT_ONCE),
+                ).fetchall()
+            rows = [_row(*one) for one in part]
+            yield from rows
             if len(rows) < AT_ONCE or rows[-1].sequence <= after:
                 return
             after = rows[-1].sequence

@@ -1,14 +1,20 @@
-"""What the audit of a folder says of proposals: the book that a gate begins with."""
+"""What the audit of a folder says of proposals: the book that a gate begins with.
 
+Only what the book goes by is read, and one record at a time: what else people and agents had written down, of which
+there may be a hundred times more, costs neither time nor memory.
+"""
+
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 from pydantic import TypeAdapter
 
-from gateway.core.audit_record import AuditRecord
+from gateway.core.audit_record import AuditRecord, NotRecordable
+from gateway.supervisor.audit import OFTEN
 from gateway.supervisor.audit_file import AuditFile, AuditUnavailable
 from gateway.supervisor.audit_writer import NOT_DONE
-from gateway.supervisor.lifecycle import Book, Impossible, book_of
+from gateway.supervisor.lifecycle import IN_THE_BOOK, Book, Impossible, book_of
 
 _SEQUENCES: TypeAdapter[set[int]] = TypeAdapter(set[int])
 
@@ -27,15 +33,21 @@ def book_in(folder: Path) -> Book:
         raise CannotBegin(f"the records of the audit do not fit together: {error}; `r2rgate audit verify`") from error
 
 
-def done_in(folder: Path) -> list[AuditRecord]:
-    """A folder's records but those that were not done. Raises AuditUnavailable, ValueError and KeyError."""
+def done_in(folder: Path, only: Iterable[str] = ()) -> Iterator[AuditRecord]:
+    """A folder's records but those that were not done: of the kinds `only`, or of all that a book may go by.
+
+    Raises AuditUnavailable, ValueError and KeyError, the last two also where anything that is there is no record.
+    """
     with AuditFile(folder) as file:
-        records = [row.record() for row in file.rows()]
-    not_done: set[int] = set()
-    for record in records:
-        if record.kind == NOT_DONE:
-            not_done |= _SEQUENCES.validate_python(record.what["sequences"])
-    return [record for record in records if record.sequence not in not_done]
+        noted = (row.record().what["sequences"] for row in file.rows_of([NOT_DONE]))
+        not_done = {number for one in noted for number in _SEQUENCES.validate_python(one)}
+        # By what is left out: a key of the index that is damaged is no kind that is, and its record is read.
+        kinds = set(only) or {kind for kind in file.kinds() if kind not in OFTEN or kind in IN_THE_BOOK}
+        for row in file.rows_of(sorted(kinds)):
+            if (record := row.record()).kind not in kinds:
+                raise NotRecordable(f"record {row.sequence} is not of the kind that the index says")
+            if row.sequence not in not_done:
+                yield record
 
 
 def _what(record: AuditRecord) -> dict[str, Any]:

@@ -236,10 +236,9 @@ class Gate:
         if self.deployer is None:
             return None
         try:
-            records = await asyncio.to_thread(done_in, self._folder)
+            return await asyncio.to_thread(lambda: list(done_in(self._folder, [SHELVED])))
         except (AuditUnavailable, ValueError, KeyError):
             return None
-        return [one for one in records if one.kind == SHELVED]
 
     def change(self) -> ChangeStatus | None:
         """What a proposal does to the line now."""

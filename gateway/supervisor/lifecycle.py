@@ -63,6 +63,7 @@ PERSON, SCRIPT, VERDICT = "person", "script", "verdict"  #: who approved
 PROPOSED, FOUND, LINE_CHANGED, CONFIRMED = "proposed", "found-in-service", "line-changed", "confirmed"
 WIRING_PROVED = "wiring-proved"  #: the kind of a record that is no step: the loop has kept a proof
 OF_NO_PROPOSAL = (FOUND, LINE_CHANGED, CONFIRMED)
+IN_THE_BOOK = frozenset((*STEPS, PROPOSED, *OF_NO_PROPOSAL, WIRING_PROVED))  #: kinds of records that `Book` goes by
 OWN_KIND: dict[str, Kind] = {"deploying": "gains", "experiment-begins": "experiment", "model-in-service": "model"}
 
 

@@ -10,9 +10,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from gateway.core.audit_record import Who
+from gateway.storage.sqlite_file import open_there
 from gateway.supervisor.audit_anchor import FILE_NAME as ANCHOR
 from gateway.supervisor.audit_anchor import read_anchor
-from gateway.supervisor.audit_file import FILE_NAME, AuditFile, AuditUnavailable, Row
+from gateway.supervisor.audit_file import FILE_NAME, KIND, AuditFile, AuditUnavailable, Row
 from gateway.supervisor.audit_verify import verify
 from gateway.supervisor.audit_writer import AuditWriter, Draft
 
@@ -44,7 +45,7 @@ def make_interrupted(folder: Path) -> None:
     """An audit as a kill leaves it in the middle of a commit: the pages are half written, the journal is there."""
     working = folder.with_name(folder.name + "-working")
     make_sound(working)
-    with AuditFile(working) as file:
+    with AuditFile(working, open_there(working / FILE_NAME, KIND)) as file:
         run = file.connection.execute
         run("PRAGMA cache_size = 1")  # so that pages are written before the commit, and the journal before them
         run("BEGIN IMMEDIATE")
