@@ -3,6 +3,7 @@
 Reading says what is there, sound or not; `audit_verify` judges. Each read is short, because a writer waits for it.
 """
 
+import json
 from collections.abc import Iterable, Iterator
 from heapq import merge
 from operator import itemgetter
@@ -35,8 +36,11 @@ CREATE TRIGGER blob_is_kept BEFORE DELETE ON blob BEGIN SELECT RAISE(ABORT, 'a b
 PRAGMA application_id = {APPLICATION_ID};
 """
 
-#: Of a record; null where it is none.
-_KIND_OF = "CASE WHEN json_valid(CAST(content AS TEXT)) THEN json_extract(CAST(content AS TEXT), '$.kind') END"
+#: Of a record; null where it is none, or names no proposal.
+_KIND_OF, _PROPOSAL_OF = (
+    f"CASE WHEN json_valid(CAST(content AS TEXT)) THEN json_extract(CAST(content AS TEXT), '{path}') END"
+    for path in ("$.kind", "$.what.proposal")
+)
 
 #: From version k (the key) to version k + 1. Every version that was ever released stays here.
 MIGRATIONS: dict[int, str] = {0: _SCHEMA_1}
@@ -60,7 +64,10 @@ KIND = FileKind(
     absent="there is no audit at {path}; a gateway begins one when it starts",
     damaged=f"It was left as it is. {WHAT_TO_DO}",
     undone="nothing was recorded, so that nothing may be changed",
-    additions=f"CREATE INDEX IF NOT EXISTS record_kind ON record ({_KIND_OF});",
+    additions=f"""
+        CREATE INDEX IF NOT EXISTS record_kind ON record ({_KIND_OF});
+        CREATE INDEX IF NOT EXISTS record_proposal ON record ({_PROPOSAL_OF});
+    """,
 )
 
 
@@ -155,6 +162,26 @@ class AuditFile:
             if len(rows) < AT_ONCE or rows[-1].sequence <= after:
                 return
             after = rows[-1].sequence
+
+    def newest_of(self, kind: str, but: Iterable[int], most: int, skip: int) -> list[Row]:
+        """Of one kind, the newest first, but for the first `skip`; those of the numbers `but` count for none."""
+        query = (
+            f"SELECT sequence, content, CAST(head AS BLOB) FROM record WHERE {_KIND_OF} = ?"
+            " AND sequence NOT IN (SELECT value FROM json_each(?)) ORDER BY sequence DESC LIMIT ? OFFSET ?"
+        )
+        with told(self.path, KIND):
+            found = self.connection.execute(query, (kind, json.dumps(list(but)), most, skip)).fetchall()
+        return [_row(*one) for one in found]
+
+    def about(self, beginning: str, most: int) -> list[Row]:
+        """Those about proposals whose hash begins so, in order; the first `most`."""
+        query = (
+            f"SELECT sequence, content, CAST(head AS BLOB) FROM record WHERE {_PROPOSAL_OF} >= ?"
+            f" AND {_PROPOSAL_OF} < ? ORDER BY +sequence LIMIT ?"  # by the index, then in order
+        )
+        with told(self.path, KIND):
+            found = self.connection.execute(query, (beginning, f"{beginning}~", most)).fetchall()
+        return [_row(*one) for one in found]
 
     def blob(self, id_: str) -> bytes | None:
         """What is called so; None: there is none, or it is not what was stored."""

@@ -87,8 +87,8 @@ class CoursesDesk:
 
     def _make_room(self, deployer: Deployer) -> None:
         """What waits for a decision stays. Raises NotKnown where too much does."""
-        entries = deployer.book.entries
-        over = [one for one, (whose, _) in self._kept.items() if entries[whose].stage is not Stage.WAITING]
+        waiting = {entry.proposal for entry in deployer.book.undecided if entry.stage is Stage.WAITING}
+        over = [one for one, (whose, _) in self._kept.items() if whose not in waiting]
         for one in over[: max(0, len(over) - MOST_KEPT)]:
             del self._kept[one]
         if len(self._kept) >= MOST_KEPT + MOST_WAITING:

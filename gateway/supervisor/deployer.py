@@ -8,7 +8,6 @@ proposals judged, `on_the_line` carries out what is approved.
 import asyncio
 import os
 from collections.abc import Awaitable, Callable, Mapping
-from itertools import islice
 from math import inf
 from typing import Any
 
@@ -98,6 +97,7 @@ class Deployer:
         self._on_the_line = OnTheLine(line, self._records, loop, surroundings, take_up, clock, note)
         self._small = SmallChanges(line, self._records)
         self._clock = clock
+        self._recalled: dict[str, Entry] = {}  #: that the book has forgotten, and somebody has asked for last
         #: Of proposals that would pass without a person, or not: when that is looked at again; inf: never.
         self._looked_at_again_s: dict[str, float] = {}
         self._failures: dict[str, int] = {}  #: to carry out what passes without a person, by proposal
@@ -140,7 +140,7 @@ class Deployer:
         if decision.script:
             who = who.model_copy(update={"name": f"{decision.script}, run by {who.name}"})
         async with self._records.one_step:
-            entry = self.book.entries.get(decision.proposal)
+            entry = self.book.entries.get(decision.proposal) or self._recalled.get(decision.proposal)
             if reasons := self._why_not_decide(entry, decision, approver):
                 return refused("nothing was decided", reasons)
             assert entry is not None  # _why_not_decide says so
@@ -315,6 +315,7 @@ class Deployer:
                 self._records.trouble = str(error)
             else:
                 self._records.trouble = self._on_the_line.unconfined or self._on_the_line.unwatched
+            self.book.forget()
 
     async def judged(self) -> None:
         """Until nothing is being judged any more."""
@@ -339,21 +340,35 @@ class Deployer:
     async def at_hand(self, beginning: str | None = None, *, difference: bool = False) -> None:
         """Before `watch`, `listed`, `shown` and `decide`: what they need of the disk. `beginning`: of this proposal.
 
-        `difference`: also what is needed to tell what it would change.
+        `difference`: also what is needed to tell what it would change. One that the book has forgotten is shown until
+        the next is asked for.
         """
         if self._line.gate.autonomy == "approve-first":  # whether it passes by itself depends on what it is
             await self._small.look()
         if beginning is not None:
-            found = (one for hash_, one in self.book.entries.items() if hash_.startswith(beginning))
-            await self._records.fetch(islice(found, 1))
+            try:
+                found = await self._records.recall(beginning)
+            except AuditUnavailable:
+                found = []  # it is said not to be there, until it can be read
+            await self._records.fetch(found[:1])
+            self._recalled = {one.proposal: one for one in found if one.proposal not in self.book.entries}
         if difference:
             await self._surroundings.at_hand(self.book)
 
-    def listed(self, most: int, skip: int = 0) -> ProposalList:
-        """The newest first, but for the first `skip`; with those that are not done with, where none are left out."""
+    async def page(self, most: int, skip: int) -> ProposalList:
+        """As `listed`, also of what the book has forgotten. Raises AuditUnavailable."""
+        return self.listed(most, skip, await self._records.newest(most, skip))
+
+    def listed(self, most: int, skip: int = 0, page: list[Entry] | None = None) -> ProposalList:
+        """The newest first, but for the first `skip`; with those that are not done with, where none are left out.
+
+        `page`: these of them, as the records have them.
+        """
         entries = list(reversed(self.book.entries.values()))
-        newest, older = entries[skip : skip + most], entries[skip + most :]
+        newest = entries[skip : skip + most] if page is None else page
         if not skip:  # whoever proposes much must not hide what waits
+            told = {entry.proposal for entry in newest}
+            older = (entry for entry in entries if entry.proposal not in told)
             newest += [entry for entry in older if entry.stage in (*UNDECIDED, *ON_THE_LINE)][:MOST_LISTED]
         return ProposalList(
             format=1,
@@ -364,13 +379,14 @@ class Deployer:
             epoch=self.book.epoch,
             model=self.book.model,
             line_changed_s=self.book.line_changed_s,
-            since_change=len(self.book.since_change),
+            since_change=self.book.made - self.book.before_change,
             proposals=[_line_of(entry, self._why(entry)) for entry in newest],
         )
 
     def shown(self, beginning: str) -> ProposalShown | str:
         """The proposal whose hash begins so; a sentence where there is not exactly one."""
-        found = [entry for hash_, entry in self.book.entries.items() if hash_.startswith(beginning)]
+        known = {**self._recalled, **self.book.entries}
+        found = [entry for hash_, entry in known.items() if hash_.startswith(beginning)]
         if len(found) != 1:
             return f"{len(found)} proposals begin with {beginning}: `r2rgate proposals` lists them"
         (entry,) = found

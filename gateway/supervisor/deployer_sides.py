@@ -12,7 +12,7 @@ from gateway.core.proposal import Proposal
 from gateway.core.recording import Recording
 from gateway.core.verdict import Verdict
 from gateway.supervisor.audit_file import AuditUnavailable
-from gateway.supervisor.lifecycle import Book
+from gateway.supervisor.lifecycle import Book, Entry
 
 
 class NotTakenUp(Exception):
@@ -43,6 +43,14 @@ class AuditSide(Protocol):
 
         Raises NotAtHand.
         """
+        ...
+
+    async def newest(self, most: int, skip: int) -> list[Entry]:
+        """Proposals as the records have them, the newest first, but for the first `skip`. Raises AuditUnavailable."""
+        ...
+
+    async def recall(self, beginning: str) -> list[Entry]:
+        """Those whose hash begins so, as the records have them. Raises AuditUnavailable."""
         ...
 
 

@@ -335,7 +335,10 @@ class Gate:
             return self.shut_reply().model_dump_json().encode()
         if isinstance(query, ListProposals):
             await self.deployer.at_hand()
-            found = self.deployer.listed(query.most, query.skip)
+            try:
+                found = await self.deployer.page(query.most, query.skip)
+            except AuditUnavailable as error:
+                return Reply(ok=False, state="", text=str(error), reasons=[str(error)]).model_dump_json().encode()
             told = found.model_copy(update={"controller": await self._in_service.told(self.deployer.book)})
             return told.model_dump_json().encode()
         await self.deployer.at_hand(query.proposal, difference=True)

@@ -1,14 +1,16 @@
 """The audit of a gateway as its gate uses it: written by its own thread, read where it lies, and not read twice."""
 
 from collections import OrderedDict
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 from gateway.core.audit_record import Who, head_of
 from gateway.supervisor.audit import Audit
 from gateway.supervisor.audit_file import AuditFile, AuditUnavailable
+from gateway.supervisor.book_file import entries_in, newest_in
 from gateway.supervisor.deployer_sides import NotAtHand
+from gateway.supervisor.lifecycle import Entry
 from gateway.tasks.threads import Worker, beside
 
 MOST_KEPT, MOST_BYTES = 64, 32_000_000  #: proposals and verdicts that are being looked at; one is kept in any case
@@ -60,6 +62,18 @@ class KeptAudit:
             raise NotAtHand(self._trouble or f"{id_[:12]} was not read from the audit yet: ask again")
         self._blobs.move_to_end(id_)
         return self._blobs[id_]
+
+    async def newest(self, most: int, skip: int) -> list[Entry]:
+        return await self._of_records(lambda: newest_in(self._folder, most, skip))
+
+    async def recall(self, beginning: str) -> list[Entry]:
+        return await self._of_records(lambda: entries_in(self._folder, beginning))
+
+    async def _of_records(self, look: Callable[[], list[Entry]]) -> list[Entry]:
+        try:
+            return await asyncio.to_thread(look)
+        except (ValueError, KeyError) as error:
+            raise AuditUnavailable(f"the records of a proposal are damaged: {error}; `r2rgate audit verify`") from error
 
     def _read(self, ids: Iterable[str]) -> dict[str, bytes]:
         with AuditFile(self._folder) as file:

@@ -7,7 +7,6 @@ have been done, and the loop says what was: `Book.explains` holds the one agains
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
-from itertools import islice
 from typing import Any
 
 from gateway.core.canonical import hash_of
@@ -36,6 +35,7 @@ class Stage(StrEnum):
 
 
 UNDECIDED = (Stage.RECEIVED, Stage.WAITING, Stage.APPROVED)
+MOST_CLOSED = 4096  #: proposals that are done with and never went to the line, held in memory: the last ones
 ON_THE_LINE = (Stage.DEPLOYING, Stage.PROBATION, Stage.KEEPING, Stage.RUNNING)  #: one at a time
 
 #: Kinds of records: from which stages, to which.
@@ -96,13 +96,17 @@ class Entry:
     received: Moment | None = None  #: None: its record does not say
     region: Region | None = None  #: of a configuration that has been deployed: for what it was judged
     good: str | None = None  #: of one that was kept: what was gone back to from then on
+    number: int = 0  #: of proposals that were made before it
 
 
 @dataclass
 class Book:
-    """All proposals of a line, oldest first, and what is in service as far as the records say."""
+    """The proposals of a line, oldest first, and what is in service as far as the records say."""
 
     entries: dict[str, Entry] = field(default_factory=dict[str, Entry])
+    made: int = 0  #: proposals, with those that were forgotten
+    forgotten: int = field(default=0, compare=False)  #: that the records alone tell of
+    stay: int = field(default=0, compare=False)  #: of `entries`, that were not to be forgotten at the last look
     in_service: str | None = None
     last_known_good: str | None = None
     epoch: int = 0  #: of the last deployment that the loop has taken, or is being told of
@@ -149,7 +153,7 @@ class Book:
     @property
     def since_change(self) -> list[Entry]:
         """Of the line as it is now."""
-        return list(islice(self.entries.values(), self.before_change, None))
+        return [entry for entry in self.entries.values() if entry.number >= self.before_change]
 
     @property
     def kept_for(self) -> dict[str, Region]:
@@ -172,6 +176,25 @@ class Book:
         """The earliest that was kept for all that the one in service is, which no chain of small steps moves."""
         here = self.judged_for
         return next(((one, region) for one, region in self.kept_for.items() if here.within(region)), None)
+
+    def forget(self) -> None:
+        """Hold no more than `MOST_CLOSED` proposals, and a quarter, that are done with and never went to the line.
+
+        Nothing here goes by those. Whoever asks for one is told from the records.
+        """
+        if len(self.entries) - self.stay < MOST_CLOSED + MOST_CLOSED // 4:
+            return
+        trusted = set(self.trusted.values())
+        closed = [
+            one.proposal
+            for one in self.entries.values()
+            if one.stage not in (*UNDECIDED, *ON_THE_LINE) and one.region is None and one.epoch is None
+            and one.proposal not in trusted
+        ]  # fmt: skip
+        self.stay = len(self.entries) - len(closed)
+        for one in closed[: max(0, len(closed) - MOST_CLOSED)]:
+            del self.entries[one]
+            self.forgotten += 1
 
     def why_outdated(self, entry: Entry) -> str:
         """Why its verdict counts no more, while it waits; empty: it counts."""
@@ -235,26 +258,10 @@ class Book:
             return
         proposal = str(what["proposal"])
         if kind == PROPOSED:
-            self.entries[proposal] = Entry(
-                **{key: what[key] for key in ("proposal", "author", "base", "changes", "created", "expires")},
-                kind=what["change"],
-                expires_s=float(what["expires_s"]),
-                since_s=_at(what),
-                received=moment_of(what),
-            )
+            self.entries[proposal] = _proposed(what, self.made)
+            self.made += 1
             return
-        entry = self.entries[proposal]
-        more: dict[str, Any] = {key: what[key] for key in ("verdict", "epoch") if key in what}
-        if kind == "accepted":  # records of an earlier version do not say by which model
-            more["judged_by"], more["line"] = what.get("model", self.model), what.get("line")
-        if kind == "deploying":
-            more["region"] = _region(what)
-        if kind == "approved":
-            more["by_person"], more["approval"] = what.get("by", PERSON) == PERSON, hash_of(dict(what))
-        self.entries[proposal] = entry = replace(
-            entry, stage=STEPS[kind][1], why=str(what.get("because", entry.why)), since_s=_at(what),
-            first=first_of(what) if kind == APPROVED_ONCE else None, **more,
-        )  # fmt: skip
+        self.entries[proposal] = entry = _moved(self.entries[proposal], kind, what, self.model)
         self._in_service(kind, entry, what)
         self._trust(kind, entry)
 
@@ -308,10 +315,8 @@ class Book:
         self.model = None
         self.trusted.clear()
         for entry in self.undecided:
-            self.entries[entry.proposal] = replace(
-                entry, stage=Stage.SUPERSEDED, why=f"the line has changed: {what['because']}", since_s=_at(what)
-            )
-        self.line_changed_s, self.line_changed, self.before_change = _at(what), moment_of(what), len(self.entries)
+            self.entries[entry.proposal] = superseded_by_change(entry, what)
+        self.line_changed_s, self.line_changed, self.before_change = _at(what), moment_of(what), self.made
 
     def explains(self, found: InService) -> bool:
         """Whether the records say how the loop may have come to what it says of itself, in all that its proof says.
@@ -342,6 +347,48 @@ class Book:
             return False
         judged = [self.regions.get(found.hash), *(one.region for one in brought)]
         return any(one is not None and found.region.within(one) for one in judged)
+
+
+def _proposed(what: Mapping[str, Any], number: int) -> Entry:
+    return Entry(
+        **{key: what[key] for key in ("proposal", "author", "base", "changes", "created", "expires")},
+        kind=what["change"],
+        expires_s=float(what["expires_s"]),
+        number=number,
+        since_s=_at(what),
+        received=moment_of(what),
+    )
+
+
+def _moved(entry: Entry, kind: str, what: Mapping[str, Any], model: str | None) -> Entry:
+    """`model`: by which one judges now."""
+    more: dict[str, Any] = {key: what[key] for key in ("verdict", "epoch") if key in what}
+    if kind == "accepted":  # records of an earlier version do not say by which model
+        more["judged_by"], more["line"] = what.get("model", model), what.get("line")
+    if kind == "deploying":
+        more["region"] = _region(what)
+    if kind == "approved":
+        more["by_person"], more["approval"] = what.get("by", PERSON) == PERSON, hash_of(dict(what))
+    return replace(
+        entry, stage=STEPS[kind][1], why=str(what.get("because", entry.why)), since_s=_at(what),
+        first=first_of(what) if kind == APPROVED_ONCE else None, **more,
+    )  # fmt: skip
+
+
+def superseded_by_change(entry: Entry, what: Mapping[str, Any]) -> Entry:
+    """`what`: of the record that the line has changed."""
+    return replace(entry, stage=Stage.SUPERSEDED, why=f"the line has changed: {what['because']}", since_s=_at(what))
+
+
+def entry_of(records: Iterable[tuple[str, Mapping[str, Any]]]) -> Entry | None:
+    """Where a proposal stands by its own records; None: they do not begin with it."""
+    entry = None
+    for kind, what in records:
+        if kind == PROPOSED:
+            entry = _proposed(what, 0)
+        elif entry is not None and kind in STEPS:
+            entry = _moved(entry, kind, what, None)
+    return entry
 
 
 def _at(what: Mapping[str, Any]) -> float | None:
@@ -416,8 +463,9 @@ def _settled(book: Book, change: Entry, found: InService) -> tuple[str, dict[str
 
 
 def book_of(records: Iterable[tuple[str, Mapping[str, Any]]]) -> Book:
-    """From kinds and contents in the order of the audit. Raises Impossible."""
+    """From kinds and contents in the order of the audit, what is done with left out. Raises Impossible."""
     book = Book()
     for kind, what in records:
         book.apply(kind, what)
+        book.forget()
     return book

@@ -95,6 +95,8 @@ class Inbox:
             "expires_s": datetime.fromisoformat(proposal.expires).timestamp(),
         }
         try:
+            if await self._records.was_forgotten(hash_):
+                return refused("it is not judged", [f"proposal {hash_[:12]} was made before, and is done with"])
             async with self._records.one_step:
                 await self._records.step(PROPOSED, what, who, {"proposal": taken.content})
         except (Impossible, AuditUnavailable) as error:
@@ -146,7 +148,8 @@ class Inbox:
             kind, blobs = "refused", dict[str, bytes]()
             what = {"proposal": hash_, "because": f"it could not be judged: {type(error).__name__}: {error}"[:1000]}
         async with self._records.one_step:
-            if self._records.book.entries[hash_].stage is not Stage.RECEIVED:
+            entry = self._records.book.entries.get(hash_)
+            if entry is None or entry.stage is not Stage.RECEIVED:
                 return  # it has expired meanwhile, or what it would change is gone
             try:
                 await self._records.step(kind, what, GATEWAY, blobs)

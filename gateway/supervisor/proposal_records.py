@@ -55,6 +55,29 @@ class ProposalRecords:
         """A record that is no step of a proposal. Raises AuditUnavailable."""
         await self._audit.append(kind, who, what)
 
+    async def was_forgotten(self, proposal: str) -> bool:
+        """Whether it was made before, and is done with for so long that the book has it no more."""
+        if not self.book.forgotten or proposal in self.book.entries:
+            return False
+        return bool(await self._audit.recall(proposal))
+
+    async def newest(self, most: int, skip: int) -> list[Entry] | None:
+        """A page of proposals, the newest first, as the records have them; None: the book has all of it."""
+        held = list(reversed(self.book.entries.values()))[: skip + most]
+        if all(one.number == self.book.made - 1 - place for place, one in enumerate(held)):
+            if len(held) == skip + most or not self.book.forgotten:
+                return None
+        found = await self._audit.newest(most, skip)
+        return [self.book.entries.get(one.proposal, one) for one in found]
+
+    async def recall(self, beginning: str) -> list[Entry]:
+        """Those whose hash begins so, with such as the book has forgotten."""
+        held = [entry for hash_, entry in self.book.entries.items() if hash_.startswith(beginning)]
+        if not self.book.forgotten or (held and held[0].proposal == beginning):
+            return held
+        found = await self._audit.recall(beginning)
+        return [self.book.entries.get(one.proposal, one) for one in found]
+
     async def fetch(self, entries: Iterable[Entry]) -> None:
         """What lies beside these, so that nobody waits for it afterwards. What cannot be read says so then."""
         ids = [id_ for one in entries for id_ in (one.proposal, one.verdict) if id_ is not None]

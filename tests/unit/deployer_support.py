@@ -27,6 +27,7 @@ from gateway.core.verdict import RuleFinding, Verdict
 from gateway.mailbox.port import NotSent, Unreachable
 from gateway.supervisor.audit_file import AuditUnavailable
 from gateway.supervisor.deployer_sides import NotKnown
+from gateway.supervisor.lifecycle import entry_of
 from gateway.supervisor.proposal_records import iso
 from tests.unit.model_support import model as fitted
 from tests.unit.supervisor_support import line_of
@@ -99,6 +100,16 @@ class FakeAudit:
             raise Killed
 
     async def fetch(self, ids): ...
+
+    async def newest(self, most, skip):
+        return list(reversed(await self.recall("")))[skip : skip + most]
+
+    async def recall(self, beginning):
+        names = dict.fromkeys(what["proposal"] for kind, what in self.records if kind == "proposed")
+        return [
+            entry_of((kind, what) for kind, what in self.records if what.get("proposal") == name)
+            for name in names if name.startswith(beginning)
+        ]  # fmt: skip
 
     def blob(self, id_):
         return self.blobs.get(id_)

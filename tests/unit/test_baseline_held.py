@@ -35,7 +35,7 @@ def kept(*configurations: tuple[int, Region]) -> Book:
     for number, (k, region) in enumerate(configurations):
         proposal = f"{number:064x}"
         book.entries[proposal] = Entry(
-            proposal, "gains", "ann", "0" * 64, hash_of(k), "", "", 4e9, Stage.KEPT, region=region
+            proposal, "gains", "ann", "0" * 64, hash_of(k), "", "", 4e9, Stage.KEPT, region=region, number=number
         )
         book.in_service, book.region = hash_of(k), region
     return book

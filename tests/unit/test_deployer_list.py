@@ -1,6 +1,7 @@
 """How proposals are listed: page by page, and nothing that waits is hidden by what came after it."""
 
 from gateway.core.controller import config_hash
+from gateway.supervisor import lifecycle
 from gateway.supervisor.deployer_sides import NotAtHand
 from gateway.supervisor.lifecycle import Stage
 from gateway.supervisor.small_changes import MOST_AT_ONCE
@@ -32,6 +33,38 @@ async def test_pages_together_are_everything_once_but_for_what_waits():
     gateway, waits, others = await with_one_that_waits_before_many()
     pages = [[one.proposal for one in gateway.deployer.listed(2, skip).proposals] for skip in (2, 4, 6)]
     assert pages == [[others[2], others[1]], [others[0], waits], []]
+
+
+@run
+async def test_what_is_done_with_leaves_memory_and_is_told_from_the_records(monkeypatch):
+    monkeypatch.setattr(lifecycle, "MOST_CLOSED", 4)
+    gateway = await started()
+    first = proposal(1, config_hash(FIRST), 0.0)
+    await gateway.propose(first)
+    assert (await gateway.decide(first)).ok
+    await gateway.pass_time(PROBATION_S + 1.0)
+    waits = proposal(2, gateway.loop.runs, gateway.loop.now_s)
+    await gateway.propose(waits)
+    others = [proposal(3, gateway.loop.runs, gateway.loop.now_s, nonce=k) for k in range(12)]
+    gateway.judge.refuses = {hash_of(one) for one in others}
+    for one in others:
+        await gateway.propose(one)
+    book, every = gateway.deployer.book, [hash_of(one) for one in (first, waits, *others)]
+    await gateway.deployer.watch()
+    for _ in range(2):
+        held = list(book.entries)
+        assert held[:2] == every[:2] and held[2:] == every[-len(held[2:]) :] and len(held) <= 2 + 4 + 1
+        assert (book.made, book.forgotten) == (14, 14 - len(held))
+        pages = [await gateway.deployer.page(4, skip) for skip in (0, 4, 8, 12)]
+        assert [one.proposal for page in pages for one in page.proposals[:4]] == every[::-1]
+        assert {page.since_change for page in pages} == {14}
+        await gateway.deployer.at_hand(every[2][:8])
+        shown = gateway.deployer.shown(every[2][:8])
+        assert not isinstance(shown, str) and shown.proposal == others[0] and shown.stage == "refused"
+        assert not (await gateway.propose(others[0])).ok
+        assert book.made == 14
+        gateway.begin()
+        book = gateway.deployer.book
 
 
 @run

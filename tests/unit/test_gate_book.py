@@ -1,11 +1,18 @@
 """What a gateway takes its records for: what one calls not done was not."""
 
 import asyncio
+import sqlite3
+from pathlib import Path
+
+import pytest
 
 from gateway.core.audit_record import Who
+from gateway.supervisor import audit_file, lifecycle
 from gateway.supervisor.audit import Audit
-from gateway.supervisor.audit_writer import NOT_DONE
-from gateway.supervisor.book_file import book_in
+from gateway.supervisor.audit_anchor import Anchor
+from gateway.supervisor.audit_file import FILE_NAME, AuditFile
+from gateway.supervisor.audit_writer import NOT_DONE, AuditWriter, Draft
+from gateway.supervisor.book_file import CannotBegin, book_in, entries_in, newest_in
 from gateway.supervisor.lifecycle import Stage
 
 ANNA = Who(name="anna", uid=1000, pid=1)
@@ -13,6 +20,90 @@ PROPOSED = {
     "proposal": "1" * 64, "change": "gains", "author": "rules", "base": "2" * 64, "changes": "3" * 64,
     "created": "2026-01-01T00:00:00+00:00", "expires": "2026-01-02T00:00:00+00:00", "expires_s": 1.8e9,
 }  # fmt: skip
+OFTEN = Draft("operated", ANNA, {"command": "speed 1.25", "done": True, "answer": "line speed to 1.25 m/s"})
+FOUND = Draft("found-in-service", ANNA, {"configuration": "2" * 64, "last_known_good": "2" * 64, "epoch": 0})
+
+
+def named(number: int) -> str:
+    return f"{number:08x}" + "0" * 56
+
+
+def proposed(number: int, *kinds: str) -> list[Draft]:
+    made = Draft("proposed", ANNA, {**PROPOSED, "proposal": named(number)})
+    return [made, *(Draft(kind, ANNA, {"proposal": named(number), "because": f"{kind} {number}"}) for kind in kinds)]
+
+
+def written_in(folder: Path, *drafts: Draft) -> list[Anchor]:
+    writer = AuditWriter(folder)
+    try:
+        return writer.append(drafts)
+    finally:
+        writer.close()
+
+
+def test_of_what_people_and_agents_write_often_nothing_is_read_when_the_gate_opens(tmp_path, monkeypatch):
+    written_in(tmp_path, FOUND, *[OFTEN] * 500, *proposed(1, "accepted"), *[OFTEN] * 500)
+    read = list[str]()
+    parse = audit_file.parse_record
+
+    def noted(content: bytes):
+        read.append((found := parse(content)).kind)
+        return found
+
+    monkeypatch.setattr(audit_file, "parse_record", noted)
+    assert book_in(tmp_path).entries[named(1)].stage is Stage.WAITING
+    assert read == ["begun", "found-in-service", "proposed", "accepted"]
+
+
+def test_what_is_read_is_found_by_an_index(tmp_path):
+    written_in(tmp_path, FOUND, *proposed(1, "accepted"))
+    plans = list[str]()
+    with AuditFile(tmp_path) as file:
+
+        def look(statement: str, values: tuple[object, ...]) -> bool:
+            if not statement.startswith("EXPLAIN"):
+                plan = file.connection.execute(f"EXPLAIN QUERY PLAN {statement}", values).fetchall()
+                plans.extend(f"{one[3]}: {statement}" for one in plan if "json_each" not in one[3])
+            return True
+
+        file.connection.exec_trace = look
+        assert file.kinds() == ["accepted", "begun", "found-in-service", "proposed"]
+        assert len(list(file.rows_of(["proposed"]))) == len(file.newest_of("proposed", [], 9, 0)) == 1
+        assert len(file.about(named(1)[:4], 9)) == 2
+    of_records = [plan for plan in plans if "record" in plan and "max(sequence)" not in plan]
+    assert of_records and all("USING INDEX record_" in plan or "USING COVERING INDEX record_" in plan
+                              for plan in of_records if "record" in plan.partition(":")[0])  # fmt: skip
+
+
+def test_proposals_that_are_done_with_are_told_from_the_file(tmp_path, monkeypatch):
+    monkeypatch.setattr(lifecycle, "MOST_CLOSED", 8)
+    closed = [one for k in range(40) for one in proposed(k, "refused")]
+    undone = proposed(99)
+    waiting = proposed(50, "accepted")
+    stored = written_in(tmp_path, FOUND, *undone, *closed, *waiting)
+    changed = Draft("line-changed", ANNA, {"because": "another web"})
+    later = [one for k in range(60, 90) for one in proposed(k, "refused")]
+    not_done = Draft(NOT_DONE, ANNA, {"sequences": [stored[1].sequence], "because": "nobody waited any more"})
+    written_in(tmp_path, not_done, changed, *later)
+    book, every = book_in(tmp_path), [named(k) for k in (*range(40), 50, *range(60, 90))]
+    assert len(book.entries) <= 8 + 2 and list(book.entries) == every[-len(book.entries) :]
+    assert (book.made, book.made - book.forgotten, book.before_change) == (71, len(book.entries), 41)
+    pages = [newest_in(tmp_path, 25, skip) for skip in (0, 25, 50)]
+    assert [one.proposal for page in pages for one in page] == every[::-1]
+    (first,) = entries_in(tmp_path, named(0))
+    assert (first.stage, first.why) == (Stage.REFUSED, "refused 0")
+    (ended,) = entries_in(tmp_path, named(50)[:8])
+    assert (ended.stage, ended.why) == (Stage.SUPERSEDED, "the line has changed: another web")
+    assert entries_in(tmp_path, named(99)) == [] and len(entries_in(tmp_path, "0000000")) == 16
+
+
+def test_a_record_that_is_none_keeps_the_gate_shut_wherever_it_stands(tmp_path):
+    written_in(tmp_path, FOUND, OFTEN, *proposed(1))
+    connection = sqlite3.connect(tmp_path / FILE_NAME)
+    connection.executescript("DROP TRIGGER record_stays; UPDATE record SET content = x'6e6f' WHERE sequence = 3")
+    connection.close()
+    with pytest.raises(CannotBegin):
+        book_in(tmp_path)
 
 
 def test_an_approval_that_came_too_late_to_be_told_is_none_and_may_come_again(tmp_path):
