@@ -90,7 +90,12 @@ class _Child:
         try:
             with one_thread_each(), interrupt_later():
                 process.start()
+        except (OSError, MemoryError) as error:
+            ours.close()
+            return Outcome(failed=f"its process cannot be started: {type(error).__name__}: {error}"[:600])
+        finally:
             theirs.close()
+        try:
             self._heard(ours, self._limits.begin_s, "was not ready")
             return Outcome.model_validate_json(self._heard(ours, self._limits.wall_s, "was not done"))
         except _NoOutcome as none:

@@ -71,6 +71,7 @@ class Audit:
         self._writer = AuditWriter(folder, clock, wall_clock)  # the thread's own
         self._queue: deque[_Waiting] = deque()
         self._given_up: list[int] = []  #: stored, nobody was told, and not noted yet
+        self._too_late: list[int] = []  #: of these, that the writer has not heard of
         self._changed = threading.Condition()
         self._closing = False
         self._decided = 0
@@ -94,7 +95,8 @@ class Audit:
             async with asyncio.timeout(self._within_s):
                 return await asyncio.wrap_future(stored)
         except asyncio.CancelledError:
-            stored.cancel()
+            if not stored.cancel() and stored.exception() is None:  # the writer has settled it: noted as the others are
+                self._give_up(stored.result())
             raise
         except TimeoutError:
             stored.cancel()
@@ -135,6 +137,12 @@ class Audit:
             self._changed.notify()
         return one.stored
 
+    def _give_up(self, at: Anchor) -> None:
+        """Whoever asked for this one is not told any more that it is stored."""
+        with self._changed:
+            self._too_late.append(at.sequence)
+            self._changed.notify()
+
     def _settled(self, stored: "Future[Anchor]") -> Anchor:
         """What became of a record that was waited for too long."""
         try:
@@ -147,15 +155,19 @@ class Audit:
     def _live(self) -> None:
         try:
             self._store([])  # opens
-            while batch := self._take():
+            while (batch := self._take()) is not None:
                 self._store(batch)
         finally:
             self._writer.close()
 
-    def _take(self) -> list[_Waiting]:
-        """What waits, at least one; none: it is time to end."""
+    def _take(self) -> list[_Waiting] | None:
+        """What waits; nothing: only such as nobody was told of. None: it is time to end."""
         with self._changed:
-            self._changed.wait_for(lambda: self._queue or self._closing)
+            self._changed.wait_for(lambda: self._queue or self._too_late or self._closing)
+            if not self._queue and not self._too_late:
+                return None
+            self._given_up += self._too_late
+            self._too_late.clear()
             return [self._queue.popleft() for _ in range(min(MOST_AT_ONCE, len(self._queue)))]
 
     def _store(self, batch: list[_Waiting]) -> None:

@@ -45,12 +45,18 @@ class _Worker:
     """One process, and the pipe to it. Its methods block: they are for threads."""
 
     def __init__(self, line: Line, nicer: int) -> None:
+        """Raises NoVerdict."""
         context = get_context("spawn")
         self._ours, theirs = context.Pipe()
         self._process: BaseProcess = context.Process(target=_work, args=(theirs, line, nicer), daemon=True)
-        with one_thread_each(), interrupt_later():
-            self._process.start()
-        theirs.close()
+        try:
+            with one_thread_each(), interrupt_later():
+                self._process.start()
+        except (OSError, MemoryError) as error:
+            self._ours.close()
+            raise NoVerdict(WORKER_RULE, f"the judge's process cannot be started: {error}") from error
+        finally:
+            theirs.close()
         self._ready = False
 
     @property
@@ -110,7 +116,11 @@ class JudgeWorkers:
         """All that idle and have not begun: the first verdict does not wait for them to load, and to compile."""
         for _ in range(self._idle.qsize()):
             worker = self._idle.get_nowait()
-            self._idle.put_nowait(worker or self._begun())
+            try:
+                worker = worker or self._begun()
+            except NoVerdict:
+                pass  # whatever is to be judged tries again
+            self._idle.put_nowait(worker)
 
     async def __aexit__(self, *_: object) -> None:
         await self.close()
@@ -175,6 +185,7 @@ class JudgeWorkers:
         return answer
 
     def _begun(self) -> _Worker:
+        """Raises NoVerdict."""
         worker = _Worker(self._line, self._nicer)
         self._all.add(worker)
         return worker

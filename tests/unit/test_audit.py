@@ -217,6 +217,26 @@ def test_a_record_that_nobody_waits_for_any_more_is_called_not_done(
     assert verify(tmp_path).sound
 
 
+@pytest.mark.wires
+def test_a_record_that_was_stored_before_whoever_waits_for_it_could_hear_it_and_is_cancelled_is_called_not_done(
+    tmp_path: Path,
+) -> None:
+    async def cancelled(audit: Audit) -> None:
+        task = asyncio.create_task(audit.append("deploying", ANN, {}))
+        await asyncio.sleep(0)  # it has been handed to the writer
+        audit.append_and_wait("users", ANN, {})  # which has settled the first, and the event loop has not turned
+        task.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await task
+
+    with running(tmp_path) as audit:
+        asyncio.run(cancelled(audit))
+    with AuditFile(tmp_path) as file:
+        records = [row.record() for row in file.rows()]
+    assert [one.kind for one in records] == ["begun", "deploying", "users", NOT_DONE]
+    assert records[3].what["sequences"] == [2] and verify(tmp_path).sound
+
+
 # What is not written upon
 
 

@@ -7,6 +7,7 @@ import socket
 import threading
 from collections.abc import Callable
 from dataclasses import replace
+from multiprocessing.context import SpawnProcess
 from pathlib import Path
 
 import numpy as np
@@ -85,6 +86,14 @@ def test_one_that_dies_or_stumbles_or_says_nonsense_is_told() -> None:
     assert run(works.raises).failed == "RuntimeError: the algorithm has stumbled"
     assert run(works.says_nonsense).failed == "its process has said what is no outcome"
     assert run(works.says_too_much).failed == "its process has said more than 8388608 bytes"
+
+
+def test_one_that_cannot_be_started_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_memory(_: SpawnProcess) -> None:
+        raise OSError(12, "Cannot allocate memory")
+
+    monkeypatch.setattr(SpawnProcess, "start", no_memory)
+    assert "cannot be started" in run(works.stands).failed and "Cannot allocate memory" in run(works.stands).failed
 
 
 def test_it_gives_way_to_the_others() -> None:

@@ -1,8 +1,10 @@
 """Judge workers: the same verdicts as at home, and a refusal where none comes."""
 
 import asyncio
+import errno
 import os
 import signal
+from multiprocessing.context import SpawnProcess
 
 import pytest
 from typer.testing import CliRunner
@@ -50,6 +52,27 @@ def test_a_worker_judges_as_the_judge_does_and_one_that_gives_none_is_replaced(o
     assert not late.accepted and [one.rule for one in late.findings] == ["time"]
     assert not dead.accepted and [one.rule for one in dead.findings] == ["judge process"]
     assert late.proposal == first.proposal and late.kind == "gains"
+
+
+def test_where_no_process_can_be_started_that_is_the_refusal_and_the_next_may_be_started(of, payload, monkeypatch):
+    context, data = of.context(), [of.recording]
+
+    async def story():
+        with monkeypatch.context() as without:
+            without.setattr(SpawnProcess, "start", no_memory)
+            async with JudgeWorkers(of.line) as workers:
+                assert not workers.pids
+                refused = await workers.judge(payload, context, data)
+                without.undo()
+                return refused, await workers.judge(payload, context, data, seed=5)
+
+    refused, judged = asyncio.run(story())
+    assert [one.rule for one in refused.findings] == ["judge process"] and "memory" in refused.findings[0].text
+    assert judged.accepted
+
+
+def no_memory(_: SpawnProcess) -> None:
+    raise OSError(errno.ENOMEM, os.strerror(errno.ENOMEM).lower())
 
 
 def test_a_worker_draws_courses_between_what_it_judges(of, payload):
