@@ -133,6 +133,7 @@ class _Server(uvicorn.Server):
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         assert self._accepting is not None  # it has started
         self._accepting.cancel()
+        await asyncio.wait([self._accepting])  # before its socket is closed
         for guest in list(self.guests):
             if guest.transport is None:
                 guest.end()
