@@ -315,7 +315,10 @@ class Deployer:
                 self._records.trouble = str(error)
             else:
                 self._records.trouble = self._on_the_line.unconfined or self._on_the_line.unwatched
-            self.book.forget()
+            if self.book.forget():
+                for noted in (self._looked_at_again_s, self._failures):
+                    for one in noted.keys() - self.book.entries.keys():
+                        del noted[one]
 
     async def judged(self) -> None:
         """Until nothing is being judged any more."""

@@ -177,13 +177,13 @@ class Book:
         here = self.judged_for
         return next(((one, region) for one, region in self.kept_for.items() if here.within(region)), None)
 
-    def forget(self) -> None:
+    def forget(self) -> bool:
         """Hold no more than `MOST_CLOSED` proposals, and a quarter, that are done with and never went to the line.
 
-        Nothing here goes by those. Whoever asks for one is told from the records.
+        Nothing here goes by those. Whoever asks for one is told from the records. False: there was nothing to forget.
         """
         if len(self.entries) - self.stay < MOST_CLOSED + MOST_CLOSED // 4:
-            return
+            return False
         trusted = set(self.trusted.values())
         closed = [
             one.proposal
@@ -192,9 +192,11 @@ class Book:
             and one.proposal not in trusted
         ]  # fmt: skip
         self.stay = len(self.entries) - len(closed)
-        for one in closed[: max(0, len(closed) - MOST_CLOSED)]:
+        gone = closed[: max(0, len(closed) - MOST_CLOSED)]
+        for one in gone:
             del self.entries[one]
-            self.forgotten += 1
+        self.forgotten += len(gone)
+        return bool(gone)
 
     def why_outdated(self, entry: Entry) -> str:
         """Why its verdict counts no more, while it waits; empty: it counts."""
