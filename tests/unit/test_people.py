@@ -165,7 +165,7 @@ def test_what_a_local_process_says_is_on_record_as_a_persons_and_fills_no_disk(d
 
     say(*COMMANDS)
     recorded = [one for one in COMMANDS if not isinstance(one, Stop | Hold)]
-    assert [(kind, who.name, what["done"]) for kind, who, what in desk.records] == [("operated", "otto", True)] * 6
+    assert [(kind, name, what["done"]) for kind, name, what in desk.records] == [("operated", "otto", True)] * 6
     assert all(
         what["command"].startswith(one.command) for (_, _, what), one in zip(desk.records, recorded, strict=True)
     )
