@@ -125,7 +125,8 @@ class _Server(uvicorn.Server):
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         self.servers, self.started = [], True
-        (listener,) = sockets or ()
+        assert sockets is not None  # `serve_on` gives one
+        (listener,) = sockets
         listener.listen(WAITING)
         listener.setblocking(False)
         self._accepting = asyncio.get_running_loop().create_task(self._accept(listener))
