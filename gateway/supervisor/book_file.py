@@ -80,8 +80,7 @@ def entries_in(folder: Path, beginning: str) -> list[Entry]:
 def _entries_about(file: AuditFile, beginning: str, not_done: set[int]) -> list[Entry]:
     steps: dict[str, list[AuditRecord]] = {}
     for row in file.about(beginning, MOST_STEPS):
-        if row.sequence not in not_done:
-            record = row.record()
+        if row.sequence not in not_done and (record := row.record()).kind in IN_THE_BOOK:
             steps.setdefault(str(record.what.get("proposal")), []).append(record)
     found = [(entry_of((one.kind, _what(one)) for one in records), records[-1]) for records in steps.values()]
     return [_ended(file, entry, last) for entry, last in found if entry is not None]
