@@ -139,6 +139,8 @@ class _Server(uvicorn.Server):
             if guest.transport is None:
                 guest.end()
         await super().shutdown(sockets)
+        if not self._accepting.cancelled():
+            self._accepting.result()  # why it ended by itself: raised
 
     async def _accept(self, listener: socket.socket) -> None:
         while True:
