@@ -140,13 +140,20 @@ class AuditFile:
                     return found
                 found.append(kind)
 
-    def rows_of(self, kinds: Iterable[str]) -> Iterator[Row]:
+    def rows_of(self, kinds: Iterable[str], last: int | None = None) -> Iterator[Row]:
         """Those of some kinds, in order, and with them whatever is no record. Others are not read.
 
-        Of what is there now. By the index, which whoever writes here makes; without it, it takes its time.
+        Up to `last`, or of what is there now. By the index, which whoever writes here makes; without it, it takes its
+        time. Where the index is damaged, some may be absent: see `count_of`. Raises NotRecordable where some are twice.
         """
-        last = self.last()
+        last = self.last() if last is None else last
         return merge(*(self._rows_of(kind, last) for kind in (None, *kinds)), key=itemgetter(0))
+
+    def count_of(self, kind: str, last: int) -> int:
+        """How many of a kind the index has, up to `last`."""
+        query = f"SELECT count(*) FROM record WHERE {_KIND_OF} = ? AND sequence <= ?"
+        with told(self.path, KIND):
+            return int(self.connection.execute(query, (kind, last)).get)
 
     def _rows_of(self, kind: str | None, last: int) -> Iterator[Row]:
         after = 0
@@ -157,11 +164,14 @@ class AuditFile:
                     " AND sequence <= ? ORDER BY sequence LIMIT ?",
                     (kind, after, last, AT_ONCE),
                 ).fetchall()
-            rows = [_row(*one) for one in part]
-            yield from rows
-            if len(rows) < AT_ONCE or rows[-1].sequence <= after:
+            for one in part:
+                row = _row(*one)
+                if row.sequence <= after:
+                    raise NotRecordable(f"the index of records is damaged: record {row.sequence} is not in its place")
+                yield row
+                after = row.sequence
+            if len(part) < AT_ONCE:
                 return
-            after = rows[-1].sequence
 
     def newest_of(self, kind: str, but: Iterable[int], most: int, skip: int) -> list[Row]:
         """Of one kind, the newest first, but for the first `skip`; those of the numbers `but` count for none."""

@@ -52,14 +52,18 @@ def done_in(folder: Path, only: Iterable[str] = ()) -> Iterator[AuditRecord]:
     Raises AuditUnavailable, ValueError and KeyError, the last two also where anything that is there is no record.
     """
     with AuditFile(folder) as file:
-        not_done = _not_done(file)
+        not_done, last, there = _not_done(file), file.last(), file.kinds()
         # By what is left out: a key of the index that is damaged is no kind that is, and its record is read.
-        kinds = set(only) or {kind for kind in file.kinds() if kind not in OFTEN or kind in IN_THE_BOOK}
-        for row in file.rows_of(sorted(kinds)):
+        kinds = set(only) or {kind for kind in there if kind not in OFTEN or kind in IN_THE_BOOK}
+        found = 0
+        for row in file.rows_of(sorted(kinds), last):
+            found += 1
             if (record := row.record()).kind not in kinds:
                 raise NotRecordable(f"record {row.sequence} is not of the kind that the index says")
             if row.sequence not in not_done:
                 yield record
+        if not only and (found := found + sum(file.count_of(one, last) for one in there if one not in kinds)) != last:
+            raise NotRecordable(f"the index of records has {found} of {last}")
 
 
 def newest_in(folder: Path, most: int, skip: int) -> list[Entry]:

@@ -1,5 +1,7 @@
 """How proposals are listed: page by page, and nothing that waits is hidden by what came after it."""
 
+import asyncio
+
 from gateway.core.controller import config_hash
 from gateway.supervisor import lifecycle
 from gateway.supervisor.deployer_sides import NotAtHand
@@ -35,9 +37,12 @@ async def test_pages_together_are_everything_once_but_for_what_waits():
     assert pages == [[others[2], others[1]], [others[0], waits], []]
 
 
-@run
-async def test_what_is_done_with_leaves_memory_and_is_told_from_the_records(monkeypatch):
+def test_what_is_done_with_leaves_memory_and_is_told_from_the_records(monkeypatch):
     monkeypatch.setattr(lifecycle, "MOST_CLOSED", 4)
+    asyncio.run(one_in_service_one_that_waits_and_many_refused())
+
+
+async def one_in_service_one_that_waits_and_many_refused():
     gateway = await started()
     first = proposal(1, config_hash(FIRST), 0.0)
     await gateway.propose(first)

@@ -106,6 +106,19 @@ def test_a_record_that_is_none_keeps_the_gate_shut_wherever_it_stands(tmp_path):
         book_in(tmp_path)
 
 
+def test_an_index_that_has_not_every_record_keeps_the_gate_shut(tmp_path):
+    written_in(tmp_path, FOUND, OFTEN, *proposed(1, "accepted"), OFTEN)
+    with sqlite3.connect(tmp_path / FILE_NAME) as file:  # all but one are in it, and it says: all
+        ((made,),) = file.execute("SELECT sql FROM sqlite_schema WHERE name = 'record_kind'").fetchall()
+        file.execute("DROP INDEX record_kind")
+        file.execute(f"{made} WHERE sequence <> 5")
+        file.execute("PRAGMA writable_schema = ON")
+        file.execute("UPDATE sqlite_schema SET sql = ? WHERE name = 'record_kind'", (made,))
+    file.close()
+    with pytest.raises(CannotBegin, match="the index of records has 5 of 6"):
+        book_in(tmp_path)
+
+
 def test_an_approval_that_came_too_late_to_be_told_is_none_and_may_come_again(tmp_path):
     audit, one = Audit(tmp_path), {"proposal": "1" * 64}
     audit.start()
