@@ -71,7 +71,7 @@ class KeptAudit:
 
     async def _of_records(self, look: Callable[[], list[Entry]]) -> list[Entry]:
         try:
-            return await asyncio.to_thread(look)
+            return await self._reader.do(look)
         except (ValueError, KeyError) as error:
             raise AuditUnavailable(f"the records of a proposal are damaged: {error}; `r2rgate audit verify`") from error
 

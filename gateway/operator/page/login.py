@@ -122,7 +122,7 @@ class Door:
                 self._access.refused("page", address, None, login.name)
             raise HTTPException(403, "name or password is wrong")
         self._tries.went_well(place, login.name)
-        prove(request)
+        _prove(request)
         self._sessions.end(self._key(request))
         if self._access is not None:
             self._access.came_in(Person(name=login.name, role=role, through="page"), address)
