@@ -22,12 +22,14 @@ from gateway.tasks.threads import SMALL_BYTES
 
 ROOT = Path(__file__).parents[2]
 ROOMS = ("gateway/supervisor", "gateway/mailbox")
-ASKED = ("gateway/core", "gateway/storage", "tests/support/event_loop_guard.py") + tuple(
+ASKED = (
+    "gateway/core", "gateway/storage", "gateway/supervisor/knowledge", "tests/support/event_loop_guard.py",
+) + tuple(
     f"gateway/supervisor/{name}.py"
     for name in (
         "audit_anchor", "audit_begin", "audit_file", "audit_verify", "audit_writer", "baselines", "blobs", "book_file",
         "configurations", "dating", "experiments", "find_version", "history", "history_recording", "interactions",
-        "model_store", "models", "past_tensions", "retention", "store", "tail", "writer",
+        "lifecycle", "model_store", "models", "past_tensions", "retention", "store", "tail", "writer",
     )
 )  # fmt: skip
 

@@ -17,7 +17,6 @@ import uvicorn
 from starlette.applications import Starlette
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from gateway.operator.page.asks import SAFE
 from gateway.operator.places import make_room, place_of
 from gateway.tasks.cleanup import finish
 
@@ -38,15 +37,6 @@ class _Connection(H11Protocol):
     """HTTP. Is closed when it brings no whole request."""
 
     guest: "_Guest"
-
-    @property
-    def limit_concurrency(self) -> int | None:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """uvicorn asks once a request is read; what stops or holds the line has places of its own (`asks`)."""
-        return None if self.scope["path"] in SAFE else self.config.limit_concurrency
-
-    @limit_concurrency.setter
-    def limit_concurrency(self, _: int | None) -> None:
-        """As uvicorn sets it, from the same settings."""
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
         super().connection_made(transport)

@@ -3,6 +3,7 @@ import { english } from "./dom.js";
 import { word } from "./words.js";
 
 const WITHIN_MS = 25000, SILENT_MS = 5000, AGAIN_MS = 1000;
+const asking = new Set(); // questions under way
 
 export class Refused extends Error {
   constructor(status, text, reasons, said = {}) {
@@ -21,9 +22,14 @@ export class Refused extends Error {
 let token = null;
 export const keepToken = (given) => (token = given);
 
+// What has less time than others is urgent: a browser keeps some six connections to a page, and questions that hang
+// are given up for it.
 export async function ask(path, body, within_ms = WITHIN_MS) {
-  const options = { cache: "no-store", signal: AbortSignal.timeout(within_ms) };
-  if (body !== undefined) {
+  const mine = new AbortController(), timer = setTimeout(() => mine.abort(), within_ms);
+  const options = { cache: "no-store", signal: mine.signal };
+  if (body === undefined) asking.add(mine);
+  else {
+    if (within_ms < WITHIN_MS) asking.forEach((one) => one.abort());
     Object.assign(options, { method: "POST", body: JSON.stringify(body), headers: { "content-type": "application/json" } });
     if (token) options.headers["x-r2rgate-token"] = token;
   }
@@ -33,6 +39,9 @@ export async function ask(path, body, within_ms = WITHIN_MS) {
     found = await answer.text();
   } catch {
     throw new Refused(0, word("net.away"), []);
+  } finally {
+    clearTimeout(timer);
+    asking.delete(mine);
   }
   found = parsed(found) ?? { text: answer.statusText };
   if (!answer.ok) throw new Refused(answer.status, found.text ?? answer.statusText, found.reasons ?? [], found.said);
