@@ -44,6 +44,7 @@ def at(line: PageLine, browser: AtPage) -> Iterator[AtPage]:
 def test_an_operator_sees_the_line_approves_a_change_and_takes_it_back(line: PageLine, at: AtPage):
     before, proposal = line.in_service(), line.waiting()
     at.log_in("operator")
+    at("see", "#picture .tension")
     seen = at("texts", "#picture .tension")
     assert len(seen) == line.line.n
     line.look_on(lambda: at("texts", "#picture .tension"), lambda now: now != seen)
