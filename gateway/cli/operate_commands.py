@@ -142,7 +142,10 @@ def send(command: Command, run_dir: Path | None, as_json: bool, timeout_s: float
 
     try:
         reply = asyncio.run(request(choose_run_folder(run_dir), command, timeout_s))
-    except (Unreachable, PathTooLong) as error:
+    except PathTooLong as error:
+        typer.echo(str(error), err=True)
+        raise typer.Exit(UNREACHABLE) from None
+    except Unreachable as error:
         safe = {"stop": "loop-unanswered", "hold": "gateway-unanswered"}.get(command.command)
         text = sentence(finding(safe, command=command.command, because=str(error))) if safe else str(error)
         typer.echo(text, err=True)

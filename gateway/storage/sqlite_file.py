@@ -6,6 +6,7 @@ else is left as it is, to the byte. How it is written is part of what the file i
 
 import errno
 import os
+import re
 import struct
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -53,7 +54,7 @@ class FileKind:
     undone: str = "nothing was stored"
     anothers: type[Exception] | None = None  #: raised for the file of another program; None: `error`
     journal: Journal = Journal.ROLLBACK
-    additions: str = ""  #: IF NOT EXISTS: tables that older programs of the same schema need not know
+    additions: str = ""  #: IF NOT EXISTS: tables and indexes that older programs of the same schema need not know
     gives_back: bool = False  #: free pages can be given back to the disk; of a file that is begun
     busy_ms: int | None = None  #: how long a lock of somebody else is waited for; None: `BUSY_MS`
 
@@ -201,8 +202,8 @@ def _anothers(path: Path, kind: FileKind, owner: int) -> Exception:
 
 def _migrate(connection: apsw.Connection, kind: FileKind) -> None:
     """To today's schema, in one transaction."""
-    if connection.pragma("user_version") == kind.schema and not kind.additions:
-        return
+    if connection.pragma("user_version") == kind.schema and _has_additions(connection, kind):
+        return  # without a lock: somebody may be reading
     with transaction(connection):
         version = int(connection.pragma("user_version"))  # again: another process may have been first
         for step in range(version, kind.schema):
@@ -210,6 +211,11 @@ def _migrate(connection: apsw.Connection, kind: FileKind) -> None:
         if version != kind.schema:
             connection.execute(f"PRAGMA user_version = {kind.schema}")
         connection.execute(kind.additions)
+
+
+def _has_additions(connection: apsw.Connection, kind: FileKind) -> bool:
+    there = {name for (name,) in connection.execute("SELECT name FROM sqlite_schema")}
+    return there.issuperset(re.findall(r"IF NOT EXISTS (\w+)", kind.additions))
 
 
 @contextmanager

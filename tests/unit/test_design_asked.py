@@ -76,7 +76,7 @@ def test_a_choice_other_than_the_least_score_is_on_record_as_such(found: Design)
     assert (last.decision, last.by, last.usual) == ("design.selection", AGENT, found.candidates[0].architecture)
     assert found.chosen is not None and found.chosen.architecture == last.option != last.usual
     said = " ".join(found.explanation)
-    assert f"{last.option} is chosen by {AGENT}" in said and f'"I say {last.option}."' in said
+    assert f"{last.option} is chosen by {AGENT}" in said and f"\u201cI say {last.option}.\u201d" in said
     assert f"{found.candidates[0].score:.3f} of {last.usual}" in said and "is ahead of" in said
 
 
