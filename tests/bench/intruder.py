@@ -23,6 +23,7 @@ from typing import Any
 
 import zenoh
 
+from gateway.core.topics import LOOP_COMMAND
 from gateway.mailbox.bus import client_settings, open_session
 from gateway.mailbox.codec import Envelope, Kind, MalformedEnvelope, decode, encode
 from gateway.mailbox.unix import UnixMailbox
@@ -90,7 +91,7 @@ def take_loop(step: dict[str, Any]) -> dict[str, Any]:
             heard.append(payload[:80].decode("utf-8", "replace"))
             return json.dumps({"ok": True, "state": "STOP", "text": "done", "reasons": []}).encode()
 
-        box._servers["loop/command"] = done  # noqa: SLF001 - whatever is asked there
+        box.serve(LOOP_COMMAND, done)
         await box.listen(path)
         print(json.dumps({"took": True}), flush=True)
         await asyncio.sleep(step["seconds"])
