@@ -174,7 +174,7 @@ class WireLine:
 
 
 def at_rest(status: GatewayStatus) -> bool:
-    return status.loop.state == "STOP" and all(span.torque_nm == 0.0 for span in status.spans)
+    return status.loop.phase == "OFF" and all(span.torque_nm == 0.0 for span in status.spans)
 
 
 def settled(status: GatewayStatus) -> bool:

@@ -4,7 +4,6 @@ other.
 
 import asyncio
 import socket
-import time
 from collections.abc import Callable
 from typing import Any, cast
 
@@ -47,7 +46,7 @@ class Sockets(BinaryServer):
         """Connections of those who are no users any more, those that have had no session for too long, and those that
         never finish closing, as their other side takes nothing of what was still to be sent: they would take places.
         """
-        now_s = time.monotonic()
+        now_s = asyncio.get_running_loop().time()
         for one in self.clients:
             if isinstance(one, _Connection) and not one.is_open():
                 one.end()
@@ -94,7 +93,7 @@ class _Connection(OPCUAProtocol):
         ours.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, limits.UNHEARD_MS)
         super().connection_made(transport)
         if self.transport is not None:  # otherwise there are too many already
-            self.place, self.without_s = place, time.monotonic()
+            self.place, self.without_s = place, asyncio.get_running_loop().time()
             self.processor = self.services = self.make(self.transport, self.limits)
             self.services.set_policies(self.policies)
 
