@@ -162,7 +162,7 @@ bench-knowledge: setup ## how well notes are found, and how fast; with MiniLM wh
 bench-agents: $(VENV)/.compiled ## lines commissioned by every persona of a language model, and by none (about an hour; ARGS="--personas off,perfect --tasks 4")
 	@$(PY) -m tests.bench.agents $(ARGS)
 
-bench-stop: setup ## a stop from page, OPC UA and terminal beside held stores, a held audit and packing (about 1 min; ARGS="--stops 20")
+bench-stop: setup ## a stop from page, OPC UA and terminal beside held stores, packing, judging, silent connections and floods; a lease beside all of it (about 20 min; ARGS="--parts stops --stops 20")
 	@$(PY) -m tests.bench.stop $(ARGS)
 
 bench-engage: $(VENV)/.compiled ## a predictive controller takes over on a loop that runs, 6 to 60 spans; as root (about 3 min; ARGS="--spans 40")

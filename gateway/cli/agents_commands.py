@@ -9,6 +9,7 @@ import typer
 from gateway.cli.operate_commands import RunFolder
 from gateway.cli.process_commands import REFUSED, DataFolder, LineFile, begin_process, read_line
 from gateway.core.topics import AGENT_NAMES
+from gateway.mailbox.paths import AGENTS_DATA
 
 if TYPE_CHECKING:
     from gateway.mailbox.bus import TlsEndpoint
@@ -33,8 +34,8 @@ def agents(
     """The agents: they answer what the phases leave to judgement, with a language model if the line's file names one.
 
     They reach the line by its bus alone, look things up in its knowledge (`r2rgate ask`), and each answer with all that
-    led to it is kept (`r2rgate log`). The heads of the line's audit are kept as well, in audit-heads.txt in the data
-    folder (`r2rgate audit verify --against audit-heads.txt`). Without them, and wherever they fail, the rules decide.
+    led to it is kept (`r2rgate log`). The heads of the line's audit are kept as well, in agents/audit-heads.txt of the
+    data folder (`r2rgate audit verify --against FILE`). Without them, and wherever they fail, the rules decide.
 
     Example: r2rgate agents line.toml
 
@@ -46,7 +47,8 @@ def agents(
 
     line = read_line(file)
     where, data = begin_process(line, run_dir, data_dir)
-    raise typer.Exit(run_agents(line, _remote(gateway, certificate) or where, data / FOLDER, data / HEADS))
+    own = data / AGENTS_DATA
+    raise typer.Exit(run_agents(line, _remote(gateway, certificate) or where, own / FOLDER, own / HEADS))
 
 
 def _remote(address: str | None, certificate: Path | None) -> "TlsEndpoint | None":
@@ -81,7 +83,7 @@ def log(
     Example, one of them whole: r2rgate log 17 --line line.toml
     """
     from gateway.cli.agents_view import as_story, as_table
-    from gateway.cli.data_place import data_folder
+    from gateway.cli.data_place import gateway_data
     from gateway.core.nearest import nearest
     from gateway.supervisor.interactions import FILE_NAME, Interactions, InteractionsError
 
@@ -89,8 +91,8 @@ def log(
         like = nearest(agent, AGENT_NAMES)
         _refuse(f"--agent is {agent}; allowed: {', '.join(AGENT_NAMES)}{f'; did you mean {like}?' if like else ''}")
     try:
-        folder = data_dir or data_folder(
-            None if line_file is None else read_line(line_file), FILE_NAME, "interactions of agents",
+        folder = gateway_data(
+            None if line_file is None else read_line(line_file), data_dir, FILE_NAME, "interactions of agents",
             "they begin with `r2rgate commission` while `r2rgate agents` runs", InteractionsError,
         )  # fmt: skip
         kept = Interactions(folder)

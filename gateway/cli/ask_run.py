@@ -13,14 +13,16 @@ from agents.rag.embedders import embedder_named
 from agents.rag.index_file import IndexRefused
 from agents.rag.library import INDEX, Opened, add_files, open_library
 from agents.rag.stages import Asked, Retrieval
+from gateway.cli.data_place import own_folder
 from gateway.cli.process_commands import default_data_folder
 from gateway.core.line import Agents, Line
 from gateway.core.nearest import nearest
 from gateway.core.questions import DECISIONS, Decision
+from gateway.mailbox.paths import AGENTS_DATA, GATEWAY_DATA
 from gateway.supervisor.knowledge.gathered import Known
 from gateway.supervisor.knowledge.stored import known_in
 
-FOLDER = "knowledge"  #: in the data folder of a line
+FOLDER = "knowledge"  #: in the agents' data of a line
 
 
 class AskRefused(Exception):
@@ -41,9 +43,9 @@ class Search:
     def folder(self) -> Path:
         """Of a line in its data; without one in a cache of the user."""
         if self.data_dir is not None:
-            return self.data_dir / FOLDER
+            return own_folder(self.data_dir, AGENTS_DATA) / FOLDER
         if self.line is not None:
-            return default_data_folder(self.line) / FOLDER
+            return own_folder(default_data_folder(self.line), AGENTS_DATA) / FOLDER
         return Path(environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "r2rgate" / FOLDER
 
     @property
@@ -92,7 +94,8 @@ def _left_out(opened: Opened, of_line: Known | None) -> list[str]:
 async def _run(search: Search, asked: Asked | None) -> Done:
     url = (search.line.agents if search.line else Agents()).url
     embedder = await embedder_named(search.embedder, url)
-    of_line = None if search.line is None else await asyncio.to_thread(known_in, search.folder.parent, search.line)
+    records = search.folder.parent.with_name(GATEWAY_DATA)
+    of_line = None if search.line is None else await asyncio.to_thread(known_in, records, search.line)
     added = add_files(search.folder, search.add, search.tier)
     if embedder is not None and (search.reindex or not (search.folder / INDEX).is_file()):
         typer.echo(f"making vectors of every passage with {embedder.identity.name}: this takes minutes, once", err=True)

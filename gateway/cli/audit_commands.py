@@ -15,7 +15,7 @@ import typer
 
 from gateway.cli.audit_against import why_not_contained, why_not_exported
 from gateway.cli.audit_view import found_in, print_record, print_verification
-from gateway.cli.data_place import data_folder
+from gateway.cli.data_place import gateway_data
 from gateway.cli.process_commands import REFUSED, DataFolder, read_line
 from gateway.core.audit_export import RecordLine, blob_line, line_text, wrong_in
 from gateway.core.audit_head import AuditHead, heads_in, parse_head
@@ -202,8 +202,8 @@ def audit_folder(line: Path | None, data_dir: Path | None) -> Path:
     described = None if line is None else read_line(line)
     advice = "a gateway begins one when it starts"
     try:
-        folder = data_dir or data_folder(described, "audit.*", "audits", advice, AuditUnavailable)
-        if not folder.is_dir():
+        folder = gateway_data(described, data_dir, "audit.*", "audits", advice, AuditUnavailable)
+        if not folder.is_dir() and not folder.parent.is_dir():
             raise AuditUnavailable(f"there is no folder {folder}, so no audit: {advice}")
     except AuditUnavailable as error:
         refuse(error)

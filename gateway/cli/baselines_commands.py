@@ -11,7 +11,7 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from gateway.cli.data_place import data_folder
+from gateway.cli.data_place import gateway_data
 from gateway.cli.process_commands import REFUSED, DataFolder, read_line
 from gateway.core.line_problem import printable
 from gateway.supervisor.baselines import FILE_NAME, BaselinesError, Measurement, in_force, open_baselines
@@ -39,7 +39,7 @@ def baselines(
     described = None if line is None else read_line(line)
     advice = "the gateway stores what a configuration does on the line"
     try:
-        folder = data_dir or data_folder(described, FILE_NAME, "baselines", advice, BaselinesError)
+        folder = gateway_data(described, data_dir, FILE_NAME, "baselines", advice, BaselinesError)
         with open_baselines(folder / FILE_NAME) as database:
             key = (described.site, described.line) if described else (None, None)
             every = database.measurements(*key)

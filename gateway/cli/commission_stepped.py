@@ -119,6 +119,7 @@ class SteppedGate:
         self._gate = Gate(
             self.line, self._mailboxes[1], to_loop, folder, SteppedJudge(loop, seed), self._around, _unnoted,
             lambda: self.wall_s, lambda: self.wall_s,  # of one boot, however often the loop is started anew
+            folder,
         )  # fmt: skip
 
     async def __aenter__(self) -> "SteppedGate":

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from agents.code.materials import Given
+from gateway.cli.data_place import gateway_folder, own_folder
 from gateway.cli.model_place import chosen, chosen_of, reasons_against_line
 from gateway.cli.process_commands import default_data_folder
 from gateway.cli.recordings import read_recording
@@ -12,6 +13,7 @@ from gateway.core.controller import Controller, ControllerRefused, parse_control
 from gateway.core.line import Line
 from gateway.core.line_model import LineModel
 from gateway.files import MOST_BYTES, read_bytes
+from gateway.mailbox.paths import CONTROLLER, LOOP_DATA
 from gateway.supervisor.model_store import ModelsError
 from gateway.supervisor.models import FILE_NAME, open_repository
 
@@ -25,12 +27,12 @@ def given(
     data_dir: Path | None,
 ) -> Given:  # fmt: skip
     """Raises MaterialsRefused."""
-    folder = data_dir or default_data_folder(line)
-    kept = folder / "controller.json"
+    models = gateway_folder(line, data_dir) / FILE_NAME
+    kept = own_folder(data_dir or default_data_folder(line), LOOP_DATA) / CONTROLLER
     path = controller or (kept if kept.exists() else None)
     try:
         return Given(
-            _named(model, line, file, data_dir) if model else _accepted(line, folder / FILE_NAME),
+            _named(model, line, file, data_dir) if model else _accepted(line, models),
             None if path is None else _controller(path),
             [read_recording(one, line.control.period_s) for one in recordings],
         )

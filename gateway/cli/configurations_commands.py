@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.table import Table
 
 from gateway.cli.audit_commands import this_user
-from gateway.cli.data_place import data_folder
+from gateway.cli.data_place import gateway_data
 from gateway.cli.operate_commands import RunFolder
 from gateway.cli.process_commands import REFUSED, DataFolder, read_line
 from gateway.cli.status_commands import ask_status
@@ -261,7 +261,7 @@ def _found(which: str, line: Path | None, data_dir: Path | None) -> Configuratio
 def _storage(line: Path | None, data_dir: Path | None) -> tuple[Configurations, Key]:
     described = None if line is None else read_line(line)
     advice = "the gateway stores each that is put into service"
-    folder = data_dir or data_folder(described, FILE_NAME, "configurations", advice, ConfigurationsError)
+    folder = gateway_data(described, data_dir, FILE_NAME, "configurations", advice, ConfigurationsError)
     key: Key = (described.site, described.line) if described else (None, None)
     return open_configurations(folder / FILE_NAME), key
 

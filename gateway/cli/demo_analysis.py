@@ -101,7 +101,7 @@ def _configurations(windows: Sequence[Window]) -> list[Controller]:
 def read_evidence(setup: Setup, windows: list[Window], world_start_s: float) -> Evidence:
     """What recorder and gateway left. Raises DemoFailed when the history is damaged."""
     recording = read_recording(setup.out / "recording")
-    with History(setup.data / FILE_NAME) as file:
+    with History(setup.gateway_data / FILE_NAME) as file:
         history = file.read(world_start_s, windows[-1].end_s + 60.0, FIELDS)
         if file.damaged:
             raise DemoFailed(f"the history is damaged: {'; '.join(file.damaged)}")

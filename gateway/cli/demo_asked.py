@@ -10,6 +10,6 @@ from gateway.supervisor.interactions import InteractionsError
 def read_interactions(setup: Setup) -> list[Interaction]:
     """The oldest first. Raises DemoFailed where the log cannot be read; without one nothing was asked."""
     try:
-        return interactions_in(setup.data)
+        return interactions_in(setup.gateway_data)
     except InteractionsError as error:
         raise DemoFailed(str(error)) from error

@@ -38,7 +38,7 @@ def page(
     sections = [
         _beside_the_paper(result),
         selection_section(chain),
-        adaptations_section(result, chain, verdicts_in(setup.data)),
+        adaptations_section(result, chain, verdicts_in(setup.gateway_data)),
     ]
     sections += [_against_stepped(result)]
     sections += [_case(case, result, [one for one in traces if one.window.case == case], evidence) for case in PAPER]
@@ -54,7 +54,7 @@ def page(
             title="r2rgate demonstration",
             origin=f"Line {setup.line.site}/{setup.line.line}, plant {evidence.summary['plant']}",
             when=result.date,
-            audit_head=head_in(setup.data),
+            audit_head=head_in(setup.gateway_data),
             command=result.command,
             versions=result.versions,
             machine=f"{os.cpu_count() or 1} processors. {'. '.join(result.machine)}",
@@ -73,7 +73,7 @@ def page(
                 "The first configuration is simulated on corners of the line's file that do not reach as far as the "
                 "true line lies: with the file's own defaults it would run no faster than 0.02 m/s until there is a "
                 "model. Here nobody can be hurt.",
-                *unconfirmed_in(read_records(setup.data).book),
+                *unconfirmed_in(read_records(setup.gateway_data).book),
                 *(f"Not run: {one}." for one in chain.left_out),
                 *(f"Begun anew after the line had stopped: {stop}" for stop in result.stops),
             ),

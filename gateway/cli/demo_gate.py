@@ -24,7 +24,7 @@ def chain_result(setup: Setup, chain: Chain, evidence: Evidence, interactions: S
     """After every process has ended. `interactions`: with the agents."""
     found = chain.commissioned
     assert found is not None  # the chain was carried out
-    records = read_records(setup.data)
+    records = read_records(setup.gateway_data)
     approved = {one.hash: step.who for one in records.proposals if (step := one.step("approved")) is not None}
     shown = {one.proposal_hash: one for one in chain.shown}
     limits, steps = setup.line.limits, _steps(evidence.recording)
@@ -63,7 +63,7 @@ def _steps(recording: Recording) -> list[tuple[FloatArray, FloatArray]]:
 
 def _swaps(setup: Setup, evidence: Evidence, steps: Sequence[tuple[FloatArray, FloatArray]]) -> list[SwapResult]:
     start_s = float(evidence.history["time_s"][0])
-    with History(setup.data / FILE_NAME) as file:
+    with History(setup.gateway_data / FILE_NAME) as file:
         deployed = [event for event in file.events(0.0, FAR_S) if event.kind == "deployed"]
     return [
         SwapResult(

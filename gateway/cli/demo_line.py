@@ -18,6 +18,7 @@ from gateway.core.controller import Controller, canonical
 from gateway.core.line import Agents, Line, Operator
 from gateway.core.line_file import load_line
 from gateway.core.line_template import line_template
+from gateway.mailbox.paths import GATEWAY_DATA
 
 SPANS = 6
 SIM_PRIORITY = 40  #: below the loop's: devices of a real line do not wait for this computer
@@ -68,8 +69,13 @@ class Setup:
 
     @property
     def data(self) -> Path:
-        """History, audit, stores, the agents' log."""
+        """Of the line, a folder for each process."""
         return self.out / "data"
+
+    @property
+    def gateway_data(self) -> Path:
+        """History, audit, stores, the agents' log."""
+        return self.data / GATEWAY_DATA
 
 
 @contextmanager

@@ -9,6 +9,7 @@ from gateway.cli.demo_orders import Access
 from gateway.cli.pki_opcua import keep_opcua_pki
 from gateway.core.line import Line
 from gateway.core.people import ROLES, SCRIPTS
+from gateway.mailbox.paths import OPERATOR_DATA
 from gateway.operator.opcua.trust import pki_folder
 from gateway.operator.users import FILE_NAME, Users
 
@@ -34,13 +35,14 @@ def let_in(line: Line, data: Path, people: bool) -> LetIn:
 
     `people`: viewer, operator and engineer, too.
     """
-    pki = pki_folder(line, data)
+    own = data / OPERATOR_DATA
+    pki = pki_folder(line, own)
     server, client = keep_opcua_pki(pki, line.site, line.line, HOSTS, [CLIENT], datetime.now(UTC))
     secret, password = secrets.token_urlsafe(24), "-".join(secrets.choice(WORDS) for _ in range(4)) if people else ""
     users = Users.nobody().with_user(SCRIPT, secret, "operator")
     for role in ROLES if people else ():
         users = users.with_user(role, password, role)
-    users.write(data / FILE_NAME)
+    users.write(own / FILE_NAME)
     access = Access(
         url=line.operator.opc_ua,
         uri=client.uri,

@@ -48,7 +48,7 @@ def page(setup: Setup, result: DemoResult, windows: list[Window], evidence: Evid
             "The controller is designed on the nominal model of the line file, which is wrong on purpose: stiffness, "
             "radius, inertia, friction and span length differ from the simulated line's by 5 to 33 %.",
             *(f"A case was repeated: {stop}" for stop in result.stops),
-            *unconfirmed_in(read_records(setup.data).book),
+            *unconfirmed_in(read_records(setup.gateway_data).book),
             f"In stepped time: the mean of {SEEDS} runs of the whole cycle without wires and without waiting.",
         ),
     )

@@ -17,6 +17,7 @@ from gateway.cli.operate_commands import RunFolder
 from gateway.cli.process_commands import REFUSED, DataFolder, LineFile, default_data_folder, read_line
 from gateway.core.line import Line
 from gateway.core.line_model import LineModel
+from gateway.mailbox.paths import GATEWAY_DATA
 
 if TYPE_CHECKING:
     from gateway.cli.asked_agents import AskedAgents
@@ -212,7 +213,7 @@ def _phase(
         _write(out, canonical(found.chosen.config) + b"\n")
     record, report = _beside(out)
     _write(record, (result.model_dump_json(indent=2) + "\n").encode())
-    folder, page = default_data_folder(line), page_of(result, found)
+    folder, page = default_data_folder(line) / GATEWAY_DATA, page_of(result, found)
     in_service = unconfirmed_in(read_records(folder).book) if head_in(folder) else []
     page = replace(page, audit_head=head_in(folder), notes=(*in_service, *page.notes))
     _write(report, render_page(page).encode())

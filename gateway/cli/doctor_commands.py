@@ -17,7 +17,7 @@ from gateway.core.line import Bus, CanopenBus, Line, ModbusTcpBus
 from gateway.core.line_file import check_line
 from gateway.core.line_problem import printable
 from gateway.mailbox.listener import living
-from gateway.mailbox.paths import LOOP_SOCKET, default_run_folder, running_lines
+from gateway.mailbox.paths import GATEWAY_DATA, LOOP_SOCKET, OPERATOR_DATA, default_run_folder, running_lines
 
 if TYPE_CHECKING:
     from drivers.inspection import BusFacts
@@ -78,11 +78,14 @@ async def examine(line: Line, run_folder: Path, data_folder: Path, seconds: floa
 
     tell("software, permissions, computer, certificates, language model")
     checks = [
-        *software(), *permissions(line, run_folder, data_folder), gateway_key(line, data_folder),
-        *machine(line, data_folder), *clocks(),
+        *software(), *permissions(line, run_folder, data_folder), gateway_key(line, data_folder / GATEWAY_DATA),
+        *machine(line, data_folder / GATEWAY_DATA), *clocks(),
     ]  # fmt: skip
     now = datetime.now(UTC)
-    checks += [*certificates(line.network, now), *opcua_certificates(pki_folder(line, data_folder), now)]
+    checks += [
+        *certificates(line.network, now),
+        *opcua_certificates(pki_folder(line, data_folder / OPERATOR_DATA), now),
+    ]
     checks += await language_model(line.agents)
     if living(run_folder / LOOP_SOCKET):
         why = f"the line's loop runs ({run_folder / LOOP_SOCKET})"

@@ -19,12 +19,12 @@ _GROUP, _SUBJECT = "permissions", "gateway's key"
 WANTED = "readable by the gateway's user alone; its public key where only root writes"
 
 
-def gateway_key(line: Line, data_folder: Path, installed: Path = INSTALLED) -> Check:
-    """Reads only; makes no key."""
-    private = data_folder / FOLDER / PRIVATE
+def gateway_key(line: Line, own: Path, installed: Path = INSTALLED) -> Check:
+    """`own`: the gateway's folder. Reads only; makes no key."""
+    private = own / FOLDER / PRIVATE
     try:
-        key = existing_private_key(data_folder)
-        known = public_key(line.site, line.line, data_folder, installed)
+        key = existing_private_key(own)
+        known = public_key(line.site, line.line, own, installed)
     except KeyUnusable as error:
         return Check(_GROUP, _SUBJECT, "", "FAIL", str(error), WANTED, "mend what is named, then start the gateway")
     if known is None:

@@ -14,13 +14,13 @@ _GROUP = "machine"
 _GB = 1e9
 
 
-def machine(line: Line, data_folder: Path, root: Path = ROOT) -> Iterator[Check]:
+def machine(line: Line, gateway_data: Path, root: Path = ROOT) -> Iterator[Check]:
     """`root` is where /sys and /proc are found."""
     yield _cores(line)
     yield _governor(root)
     yield _swap(root)
     yield _throttling(root)
-    yield _disk(line, data_folder)
+    yield _disk(line, gateway_data)
 
 
 def _cores(line: Line) -> Check:
@@ -81,10 +81,10 @@ def _throttling(root: Path) -> Check:
     return Check(_GROUP, "throttling", "", "skipped", "this computer does not count it")
 
 
-def _disk(line: Line, data_folder: Path) -> Check:
-    there = existing(data_folder)
+def _disk(line: Line, gateway_data: Path) -> Check:
+    there = existing(gateway_data)
     free_gb = shutil.disk_usage(there).free / _GB
-    kept_gb = sum(file.stat().st_size for file in data_folder.glob("*") if file.is_file()) / _GB
+    kept_gb = sum(file.stat().st_size for file in gateway_data.glob("*") if file.is_file()) / _GB
     needed_gb = max(0.0, line.history.keep_gb - kept_gb)
     measured, wanted = f"{free_gb:.1f} GB free at {there}", f"{needed_gb:.1f} GB more will be kept (history.keep_gb)"
     if free_gb < LEAST_FREE_GB:

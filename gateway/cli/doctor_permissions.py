@@ -6,9 +6,11 @@ import stat
 from collections.abc import Iterator
 from pathlib import Path
 
+from gateway.cli.data_before import moves
 from gateway.cli.doctor_check import Check
 from gateway.cli.doctor_machine import existing
 from gateway.core.line import CanopenBus, Line
+from gateway.mailbox.paths import AGENTS_DATA, GATEWAY_DATA, LOOP_DATA, OPERATOR_DATA
 from gateway.mailbox.who_serves import owners, unsafe_place
 from gateway.wording.catalogue import sentence
 
@@ -20,6 +22,12 @@ def permissions(line: Line, run_folder: Path, data_folder: Path, root: Path = RO
     """`root` is where /sys is found."""
     yield _folder("run folder", run_folder, of_sockets=True)
     yield _folder("data folder", data_folder, of_sockets=False)
+    if way_out := moves(data_folder):
+        measured, wanted = "files of several processes lie side by side", "a folder for each process"
+        yield Check(_GROUP, "data folder", "", "FAIL", measured, wanted, f"`{way_out}`")
+    for own in (LOOP_DATA, GATEWAY_DATA, OPERATOR_DATA, AGENTS_DATA):
+        if (folder := data_folder / own).is_dir() and folder.stat().st_mode & (stat.S_IRWXG | stat.S_IRWXO):
+            yield _folder(f"data folder, {own}", folder, of_sockets=False)
     for bus in line.buses:
         if isinstance(bus, CanopenBus) and bus.interface == "socketcan":
             yield _can_interface(bus, root)

@@ -8,10 +8,12 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
+from gateway.cli.data_place import own_folder
 from gateway.cli.operate_commands import REFUSED, UNREACHABLE, Json, RunFolder
 from gateway.cli.process_commands import ControllerFile, DataFolder, LineFile, default_data_folder, read_line
 from gateway.core.line import Line
 from gateway.files import MOST_BYTES, read_bytes
+from gateway.mailbox.paths import CONTROLLER, LOOP_DATA
 
 if TYPE_CHECKING:
     from gateway.core.controller import Controller
@@ -151,7 +153,7 @@ def _controller(line: Line, file: Path, given: Path | None, data_dir: Path | Non
     from gateway.control.design import DesignRefused, design_lqi, task_of
     from gateway.core.controller import ControllerRefused, config_hash, parse_controller
 
-    path = given or (data_dir or default_data_folder(line)) / "controller.json"
+    path = given or own_folder(data_dir or default_data_folder(line), LOOP_DATA) / CONTROLLER
     try:
         config = parse_controller(read_bytes(path, MOST_BYTES))
         return config, f"the {config.kind} controller in {path}, {config_hash(config)[:12]}"

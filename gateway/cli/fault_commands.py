@@ -139,13 +139,14 @@ def _ask(control: Path | None, request: dict[str, Any]) -> dict[str, Any]:
 def _only_line() -> Path:
     """The control socket of the simulated line beside the gateway that `r2rgate status` would find."""
     from gateway.cli.status_commands import ask_status, choose_run_folder
+    from gateway.mailbox.paths import SIM_DATA
     from gateway.mailbox.port import Unreachable
     from sim_plant.faults.control import SOCKET_FILE
 
     folder = choose_run_folder(None)
     way_out = "name its recording with --control"
     try:
-        data = Path(asyncio.run(ask_status(folder)).historian.path).parent
+        data = Path(asyncio.run(ask_status(folder)).historian.path).parent.with_name(SIM_DATA)
     except Unreachable as error:
         _refuse(f"{folder}: {error}; {way_out}", UNREACHABLE)
     found = [path for path in sorted(data.glob(f"recording-*/{SOCKET_FILE}")) if living(path)]

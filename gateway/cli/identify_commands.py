@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 import typer
 from rich.console import Console
 
-from gateway.cli.process_commands import REFUSED, DataFolder, LineFile, default_data_folder, read_line
+from gateway.cli.data_place import gateway_folder
+from gateway.cli.process_commands import REFUSED, DataFolder, LineFile, read_line
 from gateway.core.line_problem import printable
 
 if TYPE_CHECKING:
@@ -92,13 +93,13 @@ def identify(
         _refuse(str(refused))
     except (Unreachable, PathTooLong) as error:
         _refuse(str(error), UNREACHABLE)
-    folder = data_dir or default_data_folder(line)
+    folder = gateway_folder(line, data_dir)
     storing = (data_dir is not None or folder.is_dir()) if store is None else store
-    parent = _parent(prior, line, file, folder)
+    parent = _parent(prior, line, file, folder, data_dir)
     _identify(Data(line, recordings, known), parent, align, out, report, folder if storing else None, as_json)
 
 
-def _parent(prior: str, line: "Line", file: Path, folder: Path) -> "LineModel | None":
+def _parent(prior: str, line: "Line", file: Path, folder: Path, data_dir: Path | None) -> "LineModel | None":
     """The model that shall be the prior; None: the line's file."""
     from gateway.cli.model_place import chosen, chosen_of
     from gateway.identification.inheritance import NotInherited, earlier_of
@@ -116,7 +117,7 @@ def _parent(prior: str, line: "Line", file: Path, folder: Path) -> "LineModel | 
             last = max(accepted, key=lambda one: one.marks[-1].time_s)
             model = chosen_of(last, folder / FILE_NAME).model
         else:
-            model = chosen(prior, file, folder).model
+            model = chosen(prior, file, data_dir).model
         earlier_of(model, line)
     except (ModelsError, NotInherited) as error:
         _refuse(f"--prior {prior}: {error}")

@@ -12,8 +12,9 @@ from typing import Any
 from gateway.core.controller import ControllerRefused, canonical, config_hash, parse_controller
 from gateway.core.line import Line
 from gateway.files import MOST_BYTES, read_bytes
+from gateway.mailbox.paths import CONTROLLER
 
-CONTROLLER, SOURCE = "controller.json", "controller.source.json"
+SOURCE = "controller.source.json"
 
 
 def source_hash(line: Line) -> str:

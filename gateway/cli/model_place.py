@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from gateway.cli.data_place import data_folder
+from gateway.cli.data_place import gateway_data
 from gateway.cli.process_commands import read_line
 from gateway.core.line import Line
 from gateway.core.line_model import LineModel, ModelRefused, model_hash, parse_model
@@ -39,7 +39,8 @@ class Chosen:
 def place_of(line_file: Path | None, data_dir: Path | None) -> Place:
     """The repository that is meant, though it may not exist. Raises ModelsError where none or several may be."""
     line = None if line_file is None else read_line(line_file)
-    folder = data_dir or data_folder(line, FILE_NAME, "models", "r2rgate models import FILE takes one", ModelsError)
+    advice = "r2rgate models import FILE takes one"
+    folder = gateway_data(line, data_dir, FILE_NAME, "models", advice, ModelsError)
     return Place(folder / FILE_NAME, line)
 
 

@@ -10,6 +10,7 @@ from typing import Annotated, Any, NoReturn
 import typer
 from rich.console import Console
 
+from gateway.cli.data_place import own_folder
 from gateway.cli.model_place import (
     Chosen,
     Place,
@@ -22,6 +23,7 @@ from gateway.cli.model_place import (
 from gateway.cli.process_commands import REFUSED, DataFolder, data_folder_of
 from gateway.core.line_model import LineModel, canonical
 from gateway.core.line_problem import printable
+from gateway.mailbox.paths import GATEWAY_DATA
 from gateway.supervisor.model_store import ModelsError
 from gateway.supervisor.models import FILE_NAME, Entry, begin_repository, open_repository
 
@@ -213,7 +215,7 @@ def _stored(place: Place) -> list[Entry]:
 def _place_for(model: LineModel, line: Path | None, data_dir: Path | None) -> Place:
     """Where a model goes: it names its line itself."""
     if line is None and data_dir is None:
-        return Place(data_folder_of(model.site, model.line) / FILE_NAME)
+        return Place(own_folder(data_folder_of(model.site, model.line), GATEWAY_DATA) / FILE_NAME)
     return place_of(line, data_dir)
 
 

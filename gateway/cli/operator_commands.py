@@ -10,6 +10,7 @@ from gateway.cli.process_commands import (
     read_line,
     writable_folder,
 )
+from gateway.mailbox.paths import OPERATOR_DATA
 
 
 def operator(file: LineFile, run_dir: RunFolder = None, data_dir: DataFolder = None) -> None:
@@ -26,4 +27,5 @@ def operator(file: LineFile, run_dir: RunFolder = None, data_dir: DataFolder = N
 
     line = read_line(file)
     run_folder, data = begin_process(line, run_dir, data_dir)
-    raise typer.Exit(run_operator(line, run_folder, writable_folder(data, "--data-dir")))
+    writable_folder(data / OPERATOR_DATA, "--data-dir")
+    raise typer.Exit(run_operator(line, run_folder, data))

@@ -13,7 +13,8 @@ from urllib.parse import urlsplit
 
 import typer
 
-from gateway.cli.process_commands import REFUSED, DataFolder, default_data_folder, read_line
+from gateway.cli.data_place import operator_folder
+from gateway.cli.process_commands import REFUSED, DataFolder, read_line
 from gateway.core.line_problem import printable
 from gateway.core.line_rules_opcua import is_host
 from gateway.files import MOST_BYTES, read_bytes
@@ -77,7 +78,7 @@ def init(
     folder = (out or line_file.absolute().parent / "pki").absolute()
     names = agents or (line.network.names if line.network is not None else [AGENTS])
     own = list(host or [])
-    of_opcua = pki_folder(line, data_dir or default_data_folder(line)).absolute()
+    of_opcua = pki_folder(line, operator_folder(line, data_dir)).absolute()
     _check(names, clients or (), own)
     hosts = list(dict.fromkeys([*own, *_listened_on(line), *_this_machine()]))
     now = datetime.now(UTC)
@@ -105,8 +106,8 @@ def trust(
 ) -> None:
     """Let an OPC UA client in. Compare the fingerprint with the one that the client itself shows.
 
-    An unknown client's certificate lies in pki/rejected of the line's data folder once it has tried. To let one out
-    again, remove its file from pki/trusted. Both count from the next connection on.
+    An unknown client's certificate lies in operator/pki/rejected of the line's data folder once it has tried. To let
+    one out again, remove its file from operator/pki/trusted. Both count from the next connection on.
 
     Exit code: 0 trusted, 2 refused.
 
@@ -119,7 +120,7 @@ def trust(
 
     line = read_line(line_file)
     try:
-        path = trusted(pki_folder(line, data_dir or default_data_folder(line)), read_bytes(file, MOST_BYTES))
+        path = trusted(pki_folder(line, operator_folder(line, data_dir)), read_bytes(file, MOST_BYTES))
     except NotUsable as error:
         _refuse(f"{file} is not trusted: {error}")
     except OSError as error:

@@ -13,12 +13,23 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 import typer
 
 from drivers.device_map import load_maps
+from gateway.cli.data_before import moves
 from gateway.cli.line_commands import read_line_text, roles_of
 from gateway.core.line import Line
 from gateway.core.line_file import load_line
 from gateway.core.line_problem import LineRefused, printable
 from gateway.files import MOST_BYTES, read_bytes
-from gateway.mailbox.paths import default_run_folder, name_of
+from gateway.mailbox.paths import (
+    AGENTS_DATA,
+    CONTROLLER,
+    GATEWAY_DATA,
+    LOGS,
+    LOOP_DATA,
+    OPERATOR_DATA,
+    SIM_DATA,
+    default_run_folder,
+    name_of,
+)
 
 if TYPE_CHECKING:
     from gateway.core.controller import Controller
@@ -28,7 +39,10 @@ CRASHED, REFUSED, ALREADY_RUNNING = 1, 2, 3
 
 LineFile = Annotated[Path, typer.Argument(help="The line description (r2rgate init writes one).")]
 RunFolder = Annotated[Path | None, typer.Option("--run-dir", help="Where the line's sockets shall lie.")]
-DataFolder = Annotated[Path | None, typer.Option("--data-dir", help="Where history and configurations are kept.")]
+DataFolder = Annotated[
+    Path | None,
+    typer.Option("--data-dir", help="Where the line's data are kept: a folder of its own for each process."),
+]
 ControllerFile = Annotated[
     Path | None, typer.Option("--controller", help="The controller configuration (r2rgate design writes one).")
 ]
@@ -68,23 +82,35 @@ def data_folder_of(site: str, line: str) -> Path:
 
 
 def begin_process(line: Line, run_dir: Path | None, data_dir: Path | None) -> tuple[Path, Path]:
-    """Run folder and data folder of a process of the line. All that it makes from now on is its user's alone."""
-    os.umask(0o077)
-    folders = run_dir or default_run_folder(line), data_dir or default_data_folder(line)
-    _close_to_others(folders[1], always=data_dir is None)
-    return folders
+    """Run folder and data folder of a process of the line. All that it makes from now on is its user's alone.
 
-
-def _close_to_others(data: Path, *, always: bool) -> None:
-    """A data folder as an earlier version has made it: whoever may read a database may lock it.
-
-    One that was named, and may be of other things, too, is closed where databases lie in it.
+    In the data folder it keeps to its own (`LOOP_DATA` and so on).
     """
+    os.umask(0o077)
+    run_folder, data = run_dir or default_run_folder(line), data_dir or default_data_folder(line)
+    require_a_folder_a_process(data)
+    for own in (LOOP_DATA, GATEWAY_DATA, OPERATOR_DATA, AGENTS_DATA, SIM_DATA, LOGS):
+        _close_to_others(data / own)
+    if data_dir is None:  # one that is named may be of other things, too
+        _close_to_others(data)
+    return run_folder, data
+
+
+def require_a_folder_a_process(data: Path, *, gateways_too: bool = True) -> None:
+    """Refuses data as they lay before each process had its own folder: what was approved would not be found."""
+    if way_out := moves(data, gateways_too=gateways_too):
+        _refuse(
+            f"each process has its own folder in {data} from this version on; end the line's processes, then move what "
+            f"is there: `{way_out}`"
+        )
+
+
+def _close_to_others(folder: Path) -> None:
+    """As whoever made it by hand may have left it: whoever may read a database may lock it."""
     with suppress(OSError):  # it is not there yet, or whoever needs it says that it cannot be used
-        found = data.stat()
-        open_to_others = found.st_uid == os.geteuid() and found.st_mode & (stat.S_IRWXG | stat.S_IRWXO)
-        if open_to_others and (always or any(data.glob("*.sqlite"))):
-            data.chmod(0o700)
+        found = folder.stat()
+        if found.st_uid == os.geteuid() and found.st_mode & (stat.S_IRWXG | stat.S_IRWXO):
+            folder.chmod(0o700)
 
 
 def loop(
@@ -110,7 +136,7 @@ def loop(
 
     line = read_line(file)
     run_folder, data = begin_process(line, run_dir, data_dir)
-    path = controller or data / "controller.json"
+    path = controller or data / LOOP_DATA / CONTROLLER
     way_out = f"r2rgate design {quote(str(file))} --out {quote(str(path))}"
     try:
         config = parse_controller(read_bytes(path, MOST_BYTES))
@@ -146,7 +172,7 @@ def gateway(file: LineFile, run_dir: RunFolder = None, data_dir: DataFolder = No
 
     line = read_line(file)
     run_folder, data = begin_process(line, run_dir, data_dir)
-    writable_folder(data, "--data-dir")
+    writable_folder(data / GATEWAY_DATA, "--data-dir")
     with _a_crash_is_no_refusal():
         code = run_gateway(line, run_folder, data)
     raise typer.Exit(code)
@@ -224,12 +250,13 @@ def run(
     run_folder, data = begin_process(line, run_dir, data_dir)
     _require_alone(run_folder)
     writable_folder(run_folder, "--run-dir")
-    writable_folder(data, "--data-dir")
-    _require_key(data)
+    for own in (LOOP_DATA, GATEWAY_DATA):
+        writable_folder(data / own, "--data-dir")
+    _require_key(data / GATEWAY_DATA)
     opening: list[str] = []
     if controller is None:
         try:
-            controller, said = kept_controller(line, data)
+            controller, said = kept_controller(line, data / LOOP_DATA)
         except DesignRefused as refused:
             _refuse(f"no lqi controller for {file}: {refused}; design one yourself and name it with --controller")
         except OSError as error:

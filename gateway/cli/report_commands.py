@@ -6,7 +6,8 @@ from typing import Annotated
 import typer
 
 from gateway.cli.audit_commands import UNSOUND, instant_of, refuse
-from gateway.cli.process_commands import DataFolder, default_data_folder, read_line
+from gateway.cli.data_place import gateway_folder
+from gateway.cli.process_commands import DataFolder, read_line
 from gateway.core.line_problem import printable
 from gateway.supervisor.audit_file import FILE_NAME
 
@@ -31,7 +32,7 @@ def report(
     """
     described = read_line(line)
     since_s = 0.0 if since is None else instant_of(since)
-    folder = data_dir or default_data_folder(described)
+    folder = gateway_folder(described, data_dir)
     if not folder.is_dir():
         refuse(
             f"there is no folder {folder}, so nothing to report of {described.site}/{described.line}: a gateway makes "

@@ -22,6 +22,7 @@ from rich.text import Text
 from gateway.cli.status_view import render
 from gateway.cli.tended import Child, Exit
 from gateway.core.line import Line
+from gateway.mailbox.paths import LOGS, SIM_DATA
 
 PATIENCE_S = 3.0  #: beyond the time that a stop may take
 REFRESH_S = 0.2
@@ -47,23 +48,25 @@ def run_together(
 ) -> int:
     """Run until Ctrl-C or SIGTERM, which stop the line first. Returns the exit code: 0, or that of a refused child.
 
-    Both folders exist. The screen shows the sentences of `opening` at first.
+    Both folders exist; logs lie in `LOGS` of the data. The screen shows the sentences of `opening` at first.
     """
+    logs = data_folder / LOGS
+    logs.mkdir(exist_ok=True)
     folders = ["--run-dir", str(run_folder), "--data-dir", str(data_folder)]
     gateway, loop = [str(file), *folders], [str(file), "--controller", str(controller), *folders]
     children = [
-        Child("gateway", lambda: gateway, data_folder / "gateway.log"),
-        Child("loop", lambda: loop, data_folder / "loop.log"),
-        Child("agents", lambda: gateway, data_folder / "agents.log", is_needed=False),
-        Child("operator", lambda: gateway, data_folder / "operator.log", is_needed=False),
+        Child("gateway", lambda: gateway, logs / "gateway.log"),
+        Child("loop", lambda: loop, logs / "loop.log"),
+        Child("agents", lambda: gateway, logs / "agents.log", is_needed=False),
+        Child("operator", lambda: gateway, logs / "operator.log", is_needed=False),
     ]
     if plant is not None:
         loop.append("--simulated")  # it is the line that is started here
 
         def sim() -> list[str]:
-            return [str(plant), "--record", str(new_recording(data_folder)), "--priority", "40"]
+            return [str(plant), "--record", str(new_recording(data_folder / SIM_DATA)), "--priority", "40"]
 
-        children.insert(0, Child("sim", sim, data_folder / "sim.log"))
+        children.insert(0, Child("sim", sim, logs / "sim.log"))
     ending = _Ending()
     console = Console(highlight=False)
     notices = Notices(console, time.monotonic(), opening)
@@ -73,7 +76,7 @@ def run_together(
             while not ending.asked and final is None:
                 final = _tend(children, notices)
                 if live is not None:
-                    live.update(_screen(console, notices, run_folder, data_folder), refresh=True)
+                    live.update(_screen(console, notices, run_folder, logs), refresh=True)
                 time.sleep(REFRESH_S)
     finally:
         console.print("stopping the line, then ending")
@@ -85,11 +88,11 @@ def run_together(
     return final.code
 
 
-def new_recording(data_folder: Path) -> Path:
+def new_recording(of_sim: Path) -> Path:
     """A folder that does not exist yet: a recording is never written over."""
     stem = time.strftime("recording-%Y%m%dT%H%M%S")
     names = (stem, *(f"{stem}-{k}" for k in range(2, 1000)))
-    return next(data_folder / name for name in names if not (data_folder / name).exists())
+    return next(of_sim / name for name in names if not (of_sim / name).exists())
 
 
 def _tend(children: Sequence[Child], notices: "Notices") -> Exit | None:
@@ -201,7 +204,7 @@ def _control(said: list[str]) -> str | None:
     return None
 
 
-def _screen(console: Console, notices: Notices, run_folder: Path, data_folder: Path) -> RenderableType:
+def _screen(console: Console, notices: Notices, run_folder: Path, logs: Path) -> RenderableType:
     import asyncio
 
     from gateway.cli.status_commands import ask_status
@@ -212,7 +215,7 @@ def _screen(console: Console, notices: Notices, run_folder: Path, data_folder: P
     try:
         status = render(asyncio.run(ask_status(run_folder)), console.width, height)
     except Unreachable as error:
-        status = Text(f"{error}\nlogs: {data_folder}")
+        status = Text(f"{error}\nlogs: {logs}")
     return Group(*told, Text(), status) if told else status
 
 

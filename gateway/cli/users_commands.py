@@ -9,7 +9,8 @@ from typing import Annotated, NoReturn, cast
 
 import typer
 
-from gateway.cli.process_commands import REFUSED, DataFolder, LineFile, default_data_folder, read_line
+from gateway.cli.data_place import operator_folder
+from gateway.cli.process_commands import REFUSED, DataFolder, LineFile, read_line
 from gateway.core.line_problem import printable
 from gateway.core.nearest import nearest
 from gateway.core.people import ROLES, Role
@@ -105,7 +106,7 @@ def remove(file: LineFile, name: Name, data_dir: DataFolder = None) -> None:
 
 
 def _path(file: Path, data_dir: Path | None) -> Path:
-    return (data_dir or default_data_folder(read_line(file))) / FILE_NAME
+    return operator_folder(read_line(file), data_dir) / FILE_NAME
 
 
 def _users(path: Path) -> Users:

@@ -223,7 +223,7 @@ HELP: dict[str, dict[str, str]] = {
         "opc_ua": "where OPC UA clients reach the line, signed and encrypted only",
         "page": "where browsers do; beyond this machine https:// only",
         "anonymous": '"read": whoever has no name may look; "none": nobody',
-        "pki": "folder with the certificates and the trusted ones; without this key: pki in the line's data folder",
+        "pki": "folder with the certificates and the trusted ones; without this key: operator/pki of the line's data",
         "sessions_max": "OPC UA clients at once; of one address three quarters, at least 1",
         "nodesets": "folder with the OPC Foundation's node sets (DI, Machinery, ...); without this key: own types only",
     },

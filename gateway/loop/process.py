@@ -30,7 +30,7 @@ from gateway.mailbox.keys import KeyUnusable, PublicKey, public_key
 from gateway.mailbox.listener import AlreadyRunning
 from gateway.mailbox.loop_proof import NoKey, keep_key, new_key, read_key
 from gateway.mailbox.one_process import hold_alone
-from gateway.mailbox.paths import GATEWAY_SOCKET, LOOP_SOCKET
+from gateway.mailbox.paths import GATEWAY_DATA, GATEWAY_SOCKET, LOOP_DATA, LOOP_SOCKET
 from gateway.mailbox.seal import LineName
 from gateway.mailbox.unix import UnixMailbox
 from gateway.tasks.cleanup import finish, finish_all
@@ -55,8 +55,8 @@ def run_loop(
 ) -> None:
     """Run until SIGTERM or SIGINT, which stop the line first.
 
-    The last known good configuration outlives the loop in `data_folder`. `simulated`: the line is, for certain; then
-    it takes experiments.
+    The last known good configuration outlives the loop in its part of `data_folder`, the line's. `simulated`: the line
+    is, for certain; then it takes experiments.
 
     Raises AlreadyRunning before anything is sent, CannotListen, PathTooLong, and LinksRefused
     when the drivers cannot carry the line.
@@ -64,7 +64,7 @@ def run_loop(
 
     def gateways_key() -> PublicKey | None:
         try:
-            return public_key(line.site, line.line, data_folder)
+            return public_key(line.site, line.line, data_folder / GATEWAY_DATA)
         except KeyUnusable as error:
             say(f"no command of the gateway can be taken: {error}")
             return None
@@ -82,13 +82,14 @@ async def _main(
     simulated: bool,
 ) -> None:
     key = gateways_key()
-    store = Store(data_folder, config, key)
+    own = data_folder / LOOP_DATA
+    store = Store(own, config, key)
     mailbox = UnixMailbox(most_per_window=MOST_PER_WINDOW)
     # First the socket, whose lock makes this the only loop of the line; only then are the buses touched. Whoever asks
     # waits in the kernel until there are answers: up to `_open` nothing gives the event loop a turn.
     await mailbox.listen(run_folder / LOOP_SOCKET)
     try:
-        alone = hold_alone(data_folder, "loop", say)
+        alone = hold_alone(own, "loop", say)
     except AlreadyRunning:
         await mailbox.close()
         raise
@@ -96,7 +97,7 @@ async def _main(
     links = build_links(line)
     voice = Voice(mailbox, links, line.control.period_s)
     watch = Watch(line, speed_steps_m_per_s(line), drive_tells(line))
-    wiring = Wiring(line, map_files(line), data_folder)
+    wiring = Wiring(line, map_files(line), own)
     wiring.read(say)
     cycle = Cycle(
         line, config, links, watch, monotonic, voice.record, voice.announce, voice.tell, simulated=simulated,

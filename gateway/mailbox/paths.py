@@ -1,4 +1,6 @@
-"""Where the sockets of a line lie: one run folder a line, named site_line, under the first base that may be written."""
+"""Where sockets and data of a line lie: one run folder a line, named site_line, under the first base that one
+may write; one data folder a line, in which each process has its own, so that each can have a user of its own.
+"""
 
 import os
 from pathlib import Path
@@ -10,6 +12,10 @@ from gateway.mailbox.who_serves import ServedByStranger
 GATEWAY_SOCKET = "gateway.sock"
 BUS_SOCKET = "bus.sock"  #: the agents'
 LOOP_SOCKET = "loop.sock"
+#: In the data folder of a line: what that process alone writes.
+LOOP_DATA, GATEWAY_DATA, OPERATOR_DATA, AGENTS_DATA, SIM_DATA = "loop", "gateway", "operator", "agents", "sim"
+CONTROLLER = "controller.json"  #: in `LOOP_DATA`: what `r2rgate loop` starts with
+LOGS = "logs"  #: of `r2rgate run`
 _SERVICE = Path("/run/r2rgate")  # made by the service manager for its user
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from gateway.core.line import Line
 from gateway.core.people import Role
 from gateway.core.topics import GATEWAY_FOR_PERSON
-from gateway.mailbox.paths import GATEWAY_SOCKET
+from gateway.mailbox.paths import GATEWAY_SOCKET, OPERATOR_DATA
 from gateway.mailbox.unix import UnixMailbox
 from gateway.operator.access import Access
 from gateway.operator.line_side import READ, LineSide
@@ -52,8 +52,9 @@ async def serve(line: Line, run_folder: Path, data_folder: Path) -> None:
     mailbox, saying = UnixMailbox(), UnixMailbox()
     mailbox.connect(READ, run_folder / GATEWAY_SOCKET)
     saying.connect((GATEWAY_FOR_PERSON,), run_folder / GATEWAY_SOCKET)
-    side, users = LineSide(mailbox, saying), UsersFile(data_folder / FILE_NAME)
-    check, pki = checked_by(users, _tell), pki_folder(line, data_folder)
+    own = data_folder / OPERATOR_DATA
+    side, users = LineSide(mailbox, saying), UsersFile(own / FILE_NAME)
+    check, pki = checked_by(users, _tell), pki_folder(line, own)
     access = Access(side, users, _tell, time.monotonic)
     page_tls = (pki / CERTIFICATE, pki / PRIVATE_KEY) if line.operator.page.startswith("https:") else (None, None)
     served_page = PageWay(

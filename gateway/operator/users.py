@@ -1,6 +1,6 @@
 """Who may come in through OPC UA and the page: names, roles, and what proves a password without telling it.
 
-One file in the line's data folder, for its owner's eyes only; `r2rgate users` writes it. Passwords are salted and
+One file in the operator's data, for its owner's eyes only; `r2rgate users` writes it. Passwords are salted and
 hashed with scrypt, which takes 32 MB and some 50 ms for a guess, and as long for a name that nobody has.
 """
 

@@ -20,6 +20,7 @@ from gateway.core.status import ChangeStatus
 from gateway.core.topics import GATEWAY_DECISION, GATEWAY_PROPOSALS, GATEWAY_PROPOSE
 from gateway.core.wiring_proof import WiringProof, proof_hash
 from gateway.mailbox.inbox import RateLimiter, name_of
+from gateway.mailbox.paths import LOOP_DATA
 from gateway.mailbox.port import PEER, Mailbox, RemoteError
 from gateway.mailbox.to_loop import ToLoop
 from gateway.supervisor import configurations as configurations_store
@@ -49,7 +50,7 @@ from gateway.supervisor.loop_records import LoopRecords
 from gateway.supervisor.model_store import ModelsError
 from gateway.supervisor.models import Models, begin_repository
 from gateway.supervisor.patience import Patience
-from gateway.supervisor.peers import GATEWAY, who_of
+from gateway.supervisor.peers import GATEWAY, who_at_once, who_of
 from gateway.supervisor.proposal_records import refused
 from gateway.supervisor.said_inbox import DECISION_EVENT, OF_DECISIONS, SaidInbox
 from gateway.supervisor.store_writer import StoreWriter
@@ -95,7 +96,9 @@ class Gate:
         note: Callable[..., None],
         clock: Callable[[], float],
         wall_clock: Callable[[], float],
+        loops: Path | None = None,
     ) -> None:
+        """`folder`: the gateway's; `loops`: the loop's, of which it reads what that was started with; None: beside."""
         self.deployer: Deployer | None = None
         #: Of the people who may come in; None: nobody has told yet.
         self.roles: Callable[[], Mapping[str, Role] | None] = lambda: None
@@ -111,7 +114,7 @@ class Gate:
         self.audit = Audit(folder, clock=clock, wall_clock=wall_clock)
         self.audit.start()
         self._stores: tuple[Configurations, Models] | None = None
-        self._writer = StoreWriter(line, folder, wall_clock)
+        self._writer = StoreWriter(line, folder, loops or folder.with_name(LOOP_DATA), wall_clock)
         self._start_recorded = False
         self._shut = "the gate is about to open"  #: why it is, while it is
         self._in_service = InServiceView(line, folder)
@@ -352,10 +355,11 @@ class Gate:
             decision = DECISION.validate_json(payload)
         except ValidationError as error:
             return _not_understood(error)
-        who = await who_of(PEER.get())
-        if isinstance(decision, RollBackNow):  # the safe side: always done, and on record now and then
+        if isinstance(decision, RollBackNow):  # the safe side: always done, at once, and on record now and then
+            who = who_at_once(PEER.get())
             reply = await self.decide(decision, who, self._rollbacks.left_out(caller_of(who).group))
         else:
+            who = await who_of(PEER.get())
             reply = self._decisions.refuse(who, len(payload)) or await self.decide(decision, who)
         return reply.model_dump_json().encode()
 

@@ -18,7 +18,7 @@ from gateway.core.steady_clock import SteadyClock
 from gateway.core.topics import LOOP_COMMAND, LOOP_HELLO, LOOP_SHOWN
 from gateway.mailbox.listener import AlreadyRunning, CannotListen, PathTooLong
 from gateway.mailbox.one_process import hold_alone
-from gateway.mailbox.paths import GATEWAY_SOCKET, LOOP_SOCKET
+from gateway.mailbox.paths import GATEWAY_DATA, GATEWAY_SOCKET, LOOP_DATA, LOOP_SOCKET
 from gateway.mailbox.port import ANSWERED, Counters, Peer
 from gateway.mailbox.seal import LineName, Signer
 from gateway.mailbox.to_loop import ToLoop
@@ -92,20 +92,20 @@ async def serve(
     watch_s: float = WATCH_S,
     give_back: Callable[[], None] = lambda: None,
 ) -> int:
-    """All of it, in one event loop; `give_back`, of memory, has its turn with the others.
+    """All of it, in one event loop; `give_back`, of memory, has its turn with the others. `data_folder`: the line's.
 
     Raises AlreadyRunning, CannotListen and PathTooLong.
     """
-    stop = asyncio.Event()
+    own, stop = data_folder / GATEWAY_DATA, asyncio.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
     mailbox = UnixMailbox()
     mailbox.connect((LOOP_COMMAND, LOOP_HELLO, LOOP_SHOWN), run_folder / LOOP_SOCKET)
     historian = Historian(
-        data_folder, line.site, line.line, line.n, retention=retention_of(line.history), clock=clock,
+        own, line.site, line.line, line.n, retention=retention_of(line.history), clock=clock,
         wall_clock=wall_clock,
     )  # fmt: skip
-    key, key_trouble = gateway_key(line.site, line.line, data_folder)
+    key, key_trouble = gateway_key(line.site, line.line, own)
     to_loop = ToLoop(mailbox, Signer(key, LineName(line.site, line.line), clock))
 
     def loop_begins() -> None:
@@ -135,13 +135,13 @@ async def serve(
     # First the socket, whose lock makes this the only instance; only then is the history touched.
     await mailbox.listen(run_folder / GATEWAY_SOCKET)
     try:
-        alone = hold_alone(data_folder, "gateway", _say)
+        alone = hold_alone(own, "gateway", _say)
     except AlreadyRunning:
         await mailbox.close()
         raise
     historian.start()
     judge.begin()
-    gate = Gate(line, mailbox, to_loop, data_folder, judge, around, gateway.note, clock, wall_clock)
+    gate = Gate(line, mailbox, to_loop, own, judge, around, gateway.note, clock, wall_clock, data_folder / LOOP_DATA)
     true_loop.record = lambda what, left_out: gate.audit.append("false-loop", GATEWAY, with_left_out(what, left_out))
     gate.loop.has_answered = true_loop.has_answered
     gateway.on_event, gateway.change, gateway.unexplained = gate.hear, gate.change, gate.unexplained
@@ -150,7 +150,7 @@ async def serve(
     gate.stop_asked = lambda: gateway.stop_asked
     heads = HeadTold(gate.audit.state, lambda text: print(text, flush=True), clock)
     gateway.audit_head = lambda: heads.head
-    alarms = Alarms(mailbox, data_folder, gate.audit.append, gateway.note, clock, wall_clock, gate.shelvings)
+    alarms = Alarms(mailbox, own, gate.audit.append, gateway.note, clock, wall_clock, gate.shelvings)
     gateway.alarms = alarms.status
     operated = Operated(gate.audit.append, clock, gateway.note)
     gateway.on_record = operated.keep_local
@@ -159,13 +159,13 @@ async def serve(
     # One process for what nobody's verdict may wait for.
     beside = JudgeWorkers(line, nicer=NICEST)
     courses = CoursesDesk(mailbox, lambda: gate.deployer, beside)
-    past = Past(line, mailbox, data_folder, lambda: historian.path)
+    past = Past(line, mailbox, own, lambda: historian.path)
     dry_runs = DryRuns(line, beside)
     cases = AgentsCases(gate.audit.append, clock)
-    log = Interactions(data_folder)
+    log = Interactions(own)
     desk = AgentsDesk(gateway.status, gate, dry_runs, log, gateway.note, cases)
     AskedDesk(mailbox, lambda: gate.deployer, log)
-    line_desk = LineDesk(line, gate, data_folder, experiments, cases)
+    line_desk = LineDesk(line, gate, own, experiments, cases)
     bus = AgentsBus(line, run_folder, (desk, line_desk), gateway.note, cases, clock)
     gateway.agents_bus = bus.status
     handlers = _Handlers(mailbox.counters)

@@ -21,7 +21,7 @@ from gateway.supervisor.model_store import ModelsError
 from gateway.supervisor.models import Models, open_repository
 from gateway.supervisor.peers import GATEWAY
 
-#: Files in the line's folder from which a loop takes its first configuration, and how they are read.
+#: Files of the loop from which a loop takes its first configuration, and how they are read.
 STARTED_WITH: dict[str, Callable[[bytes], Controller]] = {
     "controller.json": parse_controller,
     "started-with.json": parse_controller,
@@ -30,11 +30,11 @@ STARTED_WITH: dict[str, Callable[[bytes], Controller]] = {
 
 
 class StoreWriter:
-    """Of the stores in `folder`, which are there."""
+    """Of the stores in `folder`, which are there; in `loops` lies what the loop is started with."""
 
-    def __init__(self, line: Line, folder: Path, wall_clock: Callable[[], float]) -> None:
+    def __init__(self, line: Line, folder: Path, loops: Path, wall_clock: Callable[[], float]) -> None:
         self._line = line
-        self._folder = folder
+        self._loops = loops
         self._configurations = folder / configurations_store.FILE_NAME
         self._models = folder / models_store.FILE_NAME
         self._wall_clock = wall_clock
@@ -70,7 +70,7 @@ class StoreWriter:
         found: list[tuple[str, Controller]] = []
         for name, read in STARTED_WITH.items():
             try:
-                found.append((name, read(read_bytes(self._folder / name, MOST_BYTES))))
+                found.append((name, read(read_bytes(self._loops / name, MOST_BYTES))))
             except (OSError, ValueError, KeyError, TypeError, RecursionError, ControllerRefused):
                 continue  # the loop says what it runs; a proposal finds that it is not known here
         site, line = self._line.site, self._line.line

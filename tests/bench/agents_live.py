@@ -217,7 +217,7 @@ def _pair(line: GateLine, case: Case, seconds: float) -> list[Turn]:
     begin_s = time.monotonic()
     time.sleep(seconds)
     quiet = Turn(None, begin_s, time.monotonic())
-    while time.time() < settled_s(case.records, found := records_in(line.data), began_s, ended_s):
+    while time.time() < settled_s(case.records, found := records_in(line.gateway_data), began_s, ended_s):
         time.sleep(1.0)
     of_case.missing = missing(case.records, found, began_s, time.time())
     return [of_case, quiet]
@@ -247,7 +247,7 @@ def report(bench: Bench, line: GateLine, turns: list[Turn], state: str) -> None:
     absent = {f"{turn.case.name}, pair {k // 2 + 1}": sorted(turn.missing)
               for k, turn in enumerate(turns) if turn.case and turn.missing}  # fmt: skip
     of_case: dict[str, list[FloatArray]] = {}
-    with closing(History(line.data / FILE_NAME)) as history:
+    with closing(History(line.gateway_data / FILE_NAME)) as history:
         for turn in turns:
             lateness = history.read(turn.begin_s, turn.end_s, ["lateness_s"])["lateness_s"].astype(float)
             of_case.setdefault(turn.case.name if turn.case else "quiet", []).append(lateness)

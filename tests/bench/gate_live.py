@@ -23,6 +23,7 @@ from gateway.core.deployment import Deployment
 from gateway.core.judge_context import JudgeContext, LineState
 from gateway.core.proposal import GainsChange, Proposal, canonical
 from gateway.core.signals import FloatArray
+from gateway.mailbox.paths import GATEWAY_DATA
 from gateway.supervisor.historian import FILE_NAME
 from gateway.supervisor.history import History
 from gateway.supervisor.judging import JudgeWorkers
@@ -87,7 +88,7 @@ def one_run(seed: int, rollbacks: int, seconds: float, found: Found) -> None:
         found.unsafe += sum(line.unsafe().values())
         found.swaps_nm += [largest_step_nm(recording, *window) for window in windows[1:]]
         found.calm_nm.append(largest_step_nm(recording, *windows[0]))
-        with closing(History(line.folder / "data" / FILE_NAME)) as history:
+        with closing(History(line.folder / "data" / GATEWAY_DATA / FILE_NAME)) as history:
             taken_back(line, history, recording, found)
             for begin_s, end_s, judges in turns:
                 lateness = history.read(begin_s, end_s, ["lateness_s"])["lateness_s"].astype(float)

@@ -26,7 +26,7 @@ from gateway.control.design import design_lqg, design_lqi, design_lqr, task_of
 from gateway.core.messages import Stop
 from gateway.core.status import GatewayStatus
 from gateway.core.topics import GATEWAY_STATUS
-from gateway.mailbox.paths import GATEWAY_SOCKET
+from gateway.mailbox.paths import GATEWAY_SOCKET, LOOP_DATA
 from gateway.mailbox.port import Unreachable
 from gateway.mailbox.unix import UnixMailbox
 from tests.bench import intrusions_families, intrusions_files, intrusions_forged
@@ -256,7 +256,7 @@ class Ground:
     def _keep(self) -> None:
         line = self.line
         line.until(line.approved(design_lqr(task_of(line.line)), BUSY_S), "kept", BUSY_S)
-        first = (line.data / KEPT).read_bytes()
+        first = (line.data / LOOP_DATA / KEPT).read_bytes()
         # The one that stays brings tensions to their set-points.
         line.until(line.approved(design_lqg(task_of(line.line)), BUSY_S), "kept", BUSY_S)
         self.older.mkdir()
@@ -277,7 +277,12 @@ class Ground:
         document = json.loads(line.shown(hash_).proposal.model_dump_json())
         described = line.line
         self.site = Site(
-            line.children.run_folder, described.site, described.line, described.n, document, line.data / KEPT
+            line.children.run_folder,
+            described.site,
+            described.line,
+            described.n,
+            document,
+            line.data / LOOP_DATA / KEPT,
         )
         self.watcher = Watcher(line.children.run_folder)
         self.watcher.start()

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from gateway.mailbox.paths import LOOP_DATA
 from tests.bench.intrusions_families import Attempt, Family, Site
 
 KEPT, BEFORE, GIVEN = "configuration.json", "configuration-before.json", "started-with.json"
@@ -34,17 +35,19 @@ def _edited(path: Path, change: Callable[[dict[str, Any]], dict[str, Any]]) -> N
 
 def kept_gains(rng: random.Random, folder: Path, older: Path) -> None:
     factor = rng.choice([-3.0, -1.0, 10.0, 1.05, 0.0])
-    _edited(folder / "data" / KEPT, lambda kept: {**kept, "controller": _scaled(kept["controller"], factor)})
+    _edited(
+        folder / "data" / LOOP_DATA / KEPT, lambda kept: {**kept, "controller": _scaled(kept["controller"], factor)}
+    )
 
 
 def kept_region(rng: random.Random, folder: Path, older: Path) -> None:
     region = rng.choice([{}, {"speed_max_m_per_s": 0.1}, {"tension_step_max_n": 1e308}])
-    _edited(folder / "data" / KEPT, lambda kept: {**kept, "region": region})
+    _edited(folder / "data" / LOOP_DATA / KEPT, lambda kept: {**kept, "region": region})
 
 
 def kept_epoch(rng: random.Random, folder: Path, older: Path) -> None:
     epoch = rng.choice([0, 2, 2**31, 2**63])
-    _edited(folder / "data" / KEPT, lambda kept: {**kept, "epoch": epoch})
+    _edited(folder / "data" / LOOP_DATA / KEPT, lambda kept: {**kept, "epoch": epoch})
 
 
 def kept_proof(rng: random.Random, folder: Path, older: Path) -> None:
@@ -54,21 +57,21 @@ def kept_proof(rng: random.Random, folder: Path, older: Path) -> None:
             return {**kept, "proof": None, "controller": _scaled(kept["controller"], -1.0)}
         return {**kept, "proof": {**proof, "signature": "0" * 128}}
 
-    _edited(folder / "data" / KEPT, strange)
+    _edited(folder / "data" / LOOP_DATA / KEPT, strange)
 
 
 def kept_back(rng: random.Random, folder: Path, older: Path) -> None:
     """As it was before what is in service was kept."""
-    shutil.copy(older / KEPT, folder / "data" / KEPT)
+    shutil.copy(older / KEPT, folder / "data" / LOOP_DATA / KEPT)
 
 
 def kept_gone(rng: random.Random, folder: Path, older: Path) -> None:
     for name in rng.choice([(KEPT,), (KEPT, BEFORE), (KEPT, BEFORE, GIVEN)]):
-        (folder / "data" / name).unlink(missing_ok=True)
+        (folder / "data" / LOOP_DATA / name).unlink(missing_ok=True)
 
 
 def kept_garbage(rng: random.Random, folder: Path, older: Path) -> None:
-    path = folder / "data" / KEPT
+    path = folder / "data" / LOOP_DATA / KEPT
     content = path.read_bytes()
     path.write_bytes(
         rng.choice([b"", b"{}", content[: rng.randrange(len(content))], rng.randbytes(500), b"[" * 10_000])
@@ -92,22 +95,24 @@ def first_values(rng: random.Random, folder: Path, older: Path) -> None:
 
 def proof_hash(rng: random.Random, folder: Path, older: Path) -> None:
     """Of another wiring."""
-    _edited(folder / "data" / PROOF, lambda proof: {**proof, "wiring": f"{rng.randrange(2**256):064x}"})
+    _edited(folder / "data" / LOOP_DATA / PROOF, lambda proof: {**proof, "wiring": f"{rng.randrange(2**256):064x}"})
 
 
 def proof_unknown(rng: random.Random, folder: Path, older: Path) -> None:
     """Of this very wiring, and no record has it: an older one, or one that was edited."""
-    _edited(folder / "data" / PROOF, lambda proof: {**proof, "wall_s": proof["wall_s"] + rng.randint(1, 10**6)})
+    _edited(
+        folder / "data" / LOOP_DATA / PROOF, lambda proof: {**proof, "wall_s": proof["wall_s"] + rng.randint(1, 10**6)}
+    )
 
 
 def cells_garbage(rng: random.Random, folder: Path, older: Path) -> None:
     content = rng.choice([b"", b"{", b"[]", b'{"x": 1}', rng.randbytes(500), b"[" * 10_000])
-    (folder / "data" / CELLS).write_bytes(content)
+    (folder / "data" / LOOP_DATA / CELLS).write_bytes(content)
 
 
 def cells_emptied(rng: random.Random, folder: Path, older: Path) -> None:
     """No load cell is contradicted, which is so here."""
-    (folder / "data" / CELLS).write_bytes(b"{}")
+    (folder / "data" / LOOP_DATA / CELLS).write_bytes(b"{}")
 
 
 WIRING: dict[str, Spoil] = {

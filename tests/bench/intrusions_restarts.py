@@ -9,6 +9,7 @@ from pathlib import Path
 from gateway.core.deployment import first_region
 from gateway.core.messages import Arm, Start
 from gateway.loop.process import SET_ASIDE
+from gateway.mailbox.paths import LOOP_DATA
 from gateway.mailbox.port import Unreachable
 from tests.bench.intrusions_families import Attempt
 from tests.bench.intrusions_files import CELLS, HARMLESS, KEPT, NOT_STARTED, PROOF, SPOILS_OF_ALL, WIRING, rewrite
@@ -94,7 +95,7 @@ class Restarts:
 
     def _against_alarms(self, since_wall_s: float) -> list[str]:
         """What the loop has set aside since stands in the alarms."""
-        data = self._line.folder / "data"
+        data = self._line.folder / "data" / LOOP_DATA
         if not any(path.stat().st_mtime >= since_wall_s for path in data.glob("configuration-set-aside*")):
             return []
         until_s = time.monotonic() + TOLD_S
@@ -158,7 +159,7 @@ class Restarts:
                 path.unlink(missing_ok=True)
 
     def _paths(self) -> list[Path]:
-        data = self._line.folder / "data"
+        data = self._line.folder / "data" / LOOP_DATA
         names = (KEPT, "configuration-before.json", "started-with.json", "deaths.json", PROOF, CELLS)
         return [self._line.folder / "controller.json", *(data / name for name in names)]
 
@@ -174,7 +175,7 @@ def with_audit(line: GateLine, attempt: Attempt) -> list[str]:
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder) / "copy"
         copy.mkdir()
-        for path in (line.folder / "data").glob("audit*"):
+        for path in line.gateway_data.glob("audit*"):
             if path.is_file() and not path.name.endswith(".lock"):
                 shutil.copy(path, copy / path.name)
         head = parse_head(head_in(copy))

@@ -18,7 +18,7 @@ SHORT = 12  #: letters of a hash, as a loop's start tells it
 def unexplained_torques(line: GateLine, since_s: float) -> tuple[int, float]:
     """Milliseconds of torque since then (world) under what no record allows or explains; and until when was looked."""
     recording = read_recording(line.folder / "recording", events=False)
-    with History(line.data / FILE_NAME) as history:
+    with History(line.gateway_data / FILE_NAME) as history:
         found = history.events(0.0, math.inf, CONFIGURATION_CHANGES)
     changes = sorted((one.time_s - line.world_start_s, _hash(one.kind, one.text, one.data)) for one in found)
     times, known = [time_s for time_s, _ in changes], allowed(line)
@@ -33,7 +33,7 @@ def unexplained_torques(line: GateLine, since_s: float) -> tuple[int, float]:
 def allowed(line: GateLine) -> set[str]:
     """What was approved, what a person has confirmed, and what was found in service as the records have it."""
     changes, known = dict[str, str](), set[str]()
-    with AuditFile(line.data) as file:
+    with AuditFile(line.gateway_data) as file:
         for record in (row.record() for row in file.rows()):
             what = record.what
             if record.kind == "proposed":

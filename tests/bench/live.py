@@ -21,7 +21,7 @@ from gateway.core.line_file import load_line
 from gateway.core.messages import Arm, Command, Reply, Start, Stop
 from gateway.core.status import GatewayStatus
 from gateway.core.topics import GATEWAY_STATUS
-from gateway.mailbox.paths import GATEWAY_SOCKET
+from gateway.mailbox.paths import GATEWAY_DATA, GATEWAY_SOCKET
 from gateway.mailbox.port import Unreachable
 from gateway.mailbox.unix import UnixMailbox
 from gateway.supervisor.historian import FILE_NAME
@@ -185,7 +185,7 @@ class LiveLine:
 
     def history(self, start_s: float, end_s: float, *fields: str) -> dict[str, Any]:
         """What the gateway has stored of the loop's frames between two monotonic times. End the gateway first."""
-        with closing(History(self.folder / "data" / FILE_NAME)) as file:
+        with closing(History(self.folder / "data" / GATEWAY_DATA / FILE_NAME)) as file:
             found = file.read(start_s, end_s, fields)
             if file.damaged:
                 raise LineStalls(f"the history is damaged: {'; '.join(file.damaged)}")

@@ -231,7 +231,7 @@ def _row(found: Found, case: str, lateness_us: FloatArray, quiet_us: float) -> d
 
 def _lateness_us(line: OperatorLine, found: Found) -> dict[str, FloatArray]:
     by_case: dict[str, list[FloatArray]] = {}
-    with closing(History(line.data / FILE_NAME)) as history:
+    with closing(History(line.gateway_data / FILE_NAME)) as history:
         for turn in found.turns:
             lateness = history.read(turn.begin_s, turn.end_s, ["lateness_s"])["lateness_s"].astype(float)
             by_case.setdefault(turn.case, []).append(1e6 * lateness)

@@ -1,10 +1,15 @@
 """`make bench-stop`: how long a stop takes from a person to the loop, beside disks that hang and work that is heavy.
 
-A real gateway and a real operator's process; the loop is one that answers at once and tells when each stop came. Stops
-come from the page, over OPC UA and from the terminal's way, in turns, each while something else goes on: nothing
-(`quiet`); the stores of configurations and models held by another program, with archives and looks at proposals that
-wait for them (`held`); the audit's thread held in its write, with decisions that wait for it (`writing`); recordings
-being packed in the gateway as those of a verdict are (`packing`). A stop that is not answered as done is refused.
+`stops`: a real gateway and a real operator's process; the loop is one that answers at once and tells when each stop
+came. Stops come from the page, over OPC UA and from a terminal through the gateway, in turns, each while something else
+goes on: nothing (`quiet`); the stores of configurations and models held by another program, with archives and looks at
+proposals that wait for them (`held`); the audit's thread held in its write (`writing`); recordings being packed as
+those of a verdict are (`packing`); two judge workers at full load (`judging`); 1,200 silent connections to page and
+OPC UA each (`silent`); eight flooding peers of the mailbox (`flooding`); all of it at once (`all`). A stop that is not
+answered as done is refused.
+
+`lease`: a simulated line in its processes runs a change on probation beside all of it for ten minutes. A lease that is
+not renewed in time puts the loop back by itself.
 
 Writes out/bench/stop.json.
 """
@@ -12,7 +17,6 @@ Writes out/bench/stop.json.
 import argparse
 import asyncio
 import contextlib
-import os
 import subprocess
 import sys
 import tempfile
@@ -20,25 +24,26 @@ import time
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import ExitStack, asynccontextmanager
 from pathlib import Path
+from typing import Any
 
-import apsw
 import httpx
 import numpy as np
 from asyncua import ua
 
 from gateway.cli.stop_line import stop_line
-from gateway.core.decisions import Archive, ShowProposal
+from gateway.control.design import design_lqg, task_of
+from gateway.core.controller import config_hash
 from gateway.core.line_file import load_line
 from gateway.core.line_template import line_template
-from gateway.core.messages import Reply
+from gateway.core.messages import Reply, Stop, command_bytes
 from gateway.core.states import LoopState, Phase
 from gateway.core.topics import (
-    GATEWAY_DECISION,
-    GATEWAY_PROPOSALS,
+    GATEWAY_COMMAND,
     LOOP_COMMAND,
     LOOP_SHOWN,
     LOOP_TELEMETRY,
 )
+from gateway.mailbox.paths import OPERATOR_DATA
 from gateway.mailbox.port import Unreachable
 from gateway.mailbox.unix import UnixMailbox
 from gateway.operator.page.login import TOKEN_HEADER
@@ -46,45 +51,21 @@ from gateway.operator.users import FILE_NAME as USERS_FILE
 from gateway.operator.users import Users
 from tests.bench.figures import Bench
 from tests.bench.operator_clients import connected, node
+from tests.bench.stop_loads import CASES, GATEWAY, beside
 from tests.operator.names import PANEL, PASSWORD
+from tests.operator.real_line import OperatorLine
 from tests.support.ports import free_port
+from tests.support.proved import record_proof
 from tests.unit.supervisor_support import ShowsWho, frame_of
 
 SPANS, PERIOD_S = 6, 0.01
 STOPS = 100  #: of each way in each case
 PAUSE_S = 0.02  #: between two
-CASES = ("quiet", "held", "writing", "packing")
-PACK = "pack"  #: the file that has the gateway pack
-ENVIRONMENT = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
-HELD = {"held": ("configurations.sqlite", "models.sqlite"), "writing": ("audit.sqlite",)}
-
-#: A gateway that packs the recordings of a verdict, in a thread as that does, again and again while it is told to.
-GATEWAY = f"""
-import asyncio, sys
-from pathlib import Path
-import numpy as np
-from gateway.core.line_file import load_line
-from gateway.core.packed_recording import packed
-from gateway.core.recording import recording_of
-from gateway.core.telemetry import frame_dtype
-from gateway.supervisor.process import run_gateway
-from gateway.supervisor.service import Gateway
-
-folder, rng, packing = Path(sys.argv[1]), np.random.default_rng(1), []
-frames = np.zeros(6000, frame_dtype(60))
-frames["time_s"] = 0.01 * np.arange(len(frames))
-for name in ("tension_n", "speed_m_per_s", "torque_nm", "torque_actual_nm"):
-    frames[name] = rng.normal(100.0, 1.0, frames[name].shape)
-recording, watch = recording_of(frames, 0.01, "a bench"), Gateway.watch
-
-def watched(self):
-    watch(self)
-    if (folder / "{PACK}").exists() and not any(not one.done() for one in packing):
-        packing[:] = [asyncio.ensure_future(asyncio.to_thread(packed, recording))]
-
-Gateway.watch = watched
-sys.exit(run_gateway(load_line((folder / "line.toml").read_text(), "line.toml"), folder, folder / "data"))
-"""
+SETTLED_S = 1.0  #: beside what goes on, before the first
+LEASE_S = 600.0  #: that a change is on probation beside everything
+LOOK_S = 1.0  #: between two looks at what the loop runs
+PARTS = ("stops", "lease")
+ROOT = Path(__file__).parents[2]
 
 
 class Loop:
@@ -92,13 +73,20 @@ class Loop:
 
     def __init__(self, folder: Path) -> None:
         self.came_s: list[float] = []
+        self.known = asyncio.Event()  #: the gateway has asked who it is
         self._folder = folder
         self._mailbox = UnixMailbox()
 
     async def run(self) -> None:
         mailbox = self._mailbox
         mailbox.serve(LOOP_COMMAND, self._answer)
-        mailbox.serve(LOOP_SHOWN, ShowsWho(self._folder, Phase.OFF).answer)
+        shown = ShowsWho(self._folder, Phase.OFF)
+
+        async def show(challenge: bytes) -> bytes:
+            self.known.set()
+            return await shown.answer(challenge)
+
+        mailbox.serve(LOOP_SHOWN, show)
         await mailbox.listen(self._folder / "loop.sock")
         mailbox.connect({LOOP_TELEMETRY}, self._folder / "gateway.sock")
         sequence = 0
@@ -123,7 +111,7 @@ Press = Callable[[], Awaitable[bool]]
 @asynccontextmanager
 async def ways_of(folder: Path, line_page: str, line_opcua: str) -> AsyncIterator[dict[str, Press]]:
     """By name how a stop is pressed, and whether it was answered as done."""
-    client = await connected(line_opcua, folder / "data" / "pki", "otto")
+    client = await connected(line_opcua, folder / "data" / OPERATOR_DATA / "pki", "otto")
     async with httpx.AsyncClient(base_url=line_page, headers={"origin": line_page}) as browser:
         login = await browser.post("/api/login", json={"name": "otto", "password": PASSWORD})
         browser.headers[TOKEN_HEADER] = login.json()["token"]
@@ -141,58 +129,42 @@ async def ways_of(folder: Path, line_page: str, line_opcua: str) -> AsyncIterato
                 return (await stop_line(folder, 1.0)).ok
             return False
 
+        terminal = UnixMailbox()
+        terminal.connect({GATEWAY_COMMAND}, folder / "gateway.sock")
+
+        async def through_gateway() -> bool:
+            with contextlib.suppress(Unreachable):
+                answer = await terminal.request(GATEWAY_COMMAND, command_bytes(Stop()), 1.0)
+                return Reply.model_validate_json(answer).ok
+            return False
+
         try:
-            yield {"page": on_page, "opc-ua": over_opcua, "terminal": at_terminal}
+            yield {"page": on_page, "opc-ua": over_opcua, "terminal": at_terminal, "through": through_gateway}
         finally:
+            await terminal.close()
             await client.disconnect()
 
 
-async def beside(case: str, folder: Path) -> None:
-    """What goes on meanwhile, until it is cancelled."""
-    held = [apsw.Connection(str(folder / "data" / name)) for name in HELD.get(case, ())]
-    for one in held:
-        one.set_busy_timeout(10_000)
-        one.execute("BEGIN EXCLUSIVE")
-    asking = UnixMailbox()
-    asking.connect((GATEWAY_DECISION, GATEWAY_PROPOSALS), folder / "gateway.sock")
-    archive = Archive(configuration="newest", name="phi_stable", because="a bench").model_dump_json().encode()
-    show = ShowProposal(proposal="a" * 64).model_dump_json().encode()
-    try:
-        if case == "packing":
-            (folder / PACK).touch()
-        while True:
-            for topic, payload in ((GATEWAY_DECISION, archive), (GATEWAY_PROPOSALS, show)) if held else ():
-                with contextlib.suppress(Unreachable):
-                    await asking.request(topic, payload, 0.5)
-            await asyncio.sleep(0.1)
-    finally:
-        (folder / PACK).unlink(missing_ok=True)
-        for one in held:
-            one.close()
-        await asking.close()
-
-
-async def measured(bench: Bench, folder: Path, page: str, opcua: str, stops: int) -> None:
-    loop = Loop(folder)
+async def stops(bench: Bench, folder: Path, page: str, opcua: str, count: int) -> None:
+    loop, doors = Loop(folder), [one.partition("://")[2] for one in (page, opcua)]
     running = asyncio.create_task(loop.run())
     refused, all_ms = 0, dict[str, list[float]]()
     async with ways_of(folder, page, opcua) as ways:
-        await asyncio.sleep(2.0)  # for the gateway to know the loop
+        await loop.known.wait()
         for case in CASES:
-            going_on = asyncio.create_task(beside(case, folder))
-            await asyncio.sleep(1.0)
-            for name, press in ways.items():
-                took_ms, row = list[float](), all_ms.setdefault(case, [])
-                for _ in range(stops):
-                    loop.came_s.clear()
-                    pressed_s = time.monotonic()
-                    refused += not await press()
-                    took_ms.append(1e3 * (loop.came_s[0] - pressed_s) if loop.came_s else float("inf"))
-                    await asyncio.sleep(PAUSE_S)
-                bench.figure(f"{case}_{name}_p99_ms", float(np.percentile(took_ms, 99.0)), "ms", len(took_ms))
-                row += took_ms
-            going_on.cancel()
-            await asyncio.gather(going_on, return_exceptions=True)
+            async with beside(case, folder, folder, doors) as said:
+                await asyncio.sleep(SETTLED_S)
+                for name, press in ways.items():
+                    took_ms = list[float]()
+                    for _ in range(count):
+                        loop.came_s.clear()
+                        pressed_s = time.monotonic()
+                        refused += not await press()
+                        took_ms.append(1e3 * (loop.came_s[0] - pressed_s) if loop.came_s else float("inf"))
+                        await asyncio.sleep(PAUSE_S)
+                    bench.figure(f"{case}_{name}_p99_ms", float(np.percentile(took_ms, 99.0)), "ms", len(took_ms))
+                    all_ms.setdefault(case, []).extend(took_ms)
+            print(f"{case}: {'; '.join(said)}", file=sys.stderr)
     for case, row in all_ms.items():
         bench.figure(f"{case}_p99_ms", float(np.percentile(row, 99.0)), "ms", len(row))
     bench.figure("refused", refused, "stops", sum(len(row) for row in all_ms.values()))
@@ -200,14 +172,56 @@ async def measured(bench: Bench, folder: Path, page: str, opcua: str, stops: int
     await asyncio.gather(running, return_exceptions=True)
 
 
-def _started(stack: ExitStack, folder: Path, *words: str) -> None:
+class BesideWork(OperatorLine):
+    """Its gateway has work that is never done."""
+
+    def start_gateway(self, *, proved: bool = True) -> None:
+        record_proof(self.line, self.data)
+        self.gateway = subprocess.Popen(
+            [sys.executable, "-c", GATEWAY, str(self.folder), str(self.children.run_folder)], cwd=ROOT,
+            stdout=(self.folder / "gateway.out").open("w"), stderr=subprocess.STDOUT,
+        )  # fmt: skip
+
+    def __exit__(self, *error: Any) -> None:
+        self.gateway.terminate()
+        super().__exit__(*error)
+
+
+def lease(bench: Bench, folder: Path, for_s: float) -> None:
+    with BesideWork(folder, probation_s=for_s + 120.0) as line:
+        line.run()
+        line.operate()
+        better = design_lqg(task_of(line.line))
+        proposal = line.approved(better)
+        doors = [one.partition("://")[2] for one in (line.page, line.endpoint)]
+        runs_s, state = asyncio.run(_runs(line, config_hash(better), doors, for_s))
+        found = line.shown(proposal)
+        print(f"{found.stage} {found.why}, the line is in {state}", file=sys.stderr)
+        bench.figure("lease_held_s", runs_s, "s", 1)
+        bench.figure("leases_lost", float(line.in_service() != config_hash(better)), "of 1", 1)
+
+
+async def _runs(line: OperatorLine, wanted: str, doors: list[str], for_s: float) -> tuple[float, str]:
+    """For how long it is in service beside all of it, by the loop's own word; and the state of the line then."""
+    began_s = time.monotonic()
+    async with beside("all", line.folder, line.children.run_folder, doors) as said:
+        while (held_s := time.monotonic() - began_s) < for_s:
+            if await asyncio.to_thread(line.in_service) != wanted:
+                break
+            await asyncio.sleep(LOOK_S)
+    print(f"lease: {'; '.join(said)}", file=sys.stderr)
+    status = await asyncio.to_thread(line.status)
+    return held_s, "" if status is None else status.loop.state
+
+
+def _started(stack: ExitStack, *words: str) -> None:
     """A process of the line, once it has said its first line."""
     process = stack.enter_context(
-        subprocess.Popen([sys.executable, *words], cwd=folder, env=ENVIRONMENT, stdout=subprocess.PIPE, text=True)
+        subprocess.Popen([sys.executable, *words], cwd=ROOT, stdout=subprocess.PIPE, text=True)
     )
     stack.callback(process.kill)
-    assert process.stdout is not None
-    print(process.stdout.readline(), end="", file=sys.stderr)
+    assert process.stdout is not None and (said := process.stdout.readline()), words[:3]
+    print(said, end="", file=sys.stderr)
 
 
 def _set_up(folder: Path) -> tuple[str, str]:
@@ -218,25 +232,31 @@ def _set_up(folder: Path) -> tuple[str, str]:
         text = text.replace(f'# {key} = "{address}"', f'{key} = "{found[-1]}"')
     (folder / "line.toml").write_text(text, encoding="utf-8")
     load_line(text, "line.toml")
-    words = ["pki", "init", "--line", "line.toml", "--client", PANEL, "--data-dir", "data"]
-    subprocess.run(
-        [sys.executable, "-m", "gateway.cli", *words], cwd=folder, env=ENVIRONMENT, check=True, capture_output=True
-    )
-    Users.nobody().with_user("otto", PASSWORD, "operator").write(folder / "data" / USERS_FILE)
+    words = ["pki", "init", "--line", folder / "line.toml", "--client", PANEL, "--data-dir", folder / "data"]
+    subprocess.run([sys.executable, "-m", "gateway.cli", *words], cwd=ROOT, check=True, capture_output=True)
+    Users.nobody().with_user("otto", PASSWORD, "operator").write(folder / "data" / OPERATOR_DATA / USERS_FILE)
     return found[0], found[1]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--stops", type=int, default=STOPS, help="of each way in each case")
+    parser.add_argument("--lease", type=float, default=LEASE_S, help="seconds on probation")
+    parser.add_argument("--parts", default=",".join(PARTS), help="of these")
     asked = parser.parse_args()
     bench = Bench("stop", libraries=("numpy", "apsw", "asyncua", "uvicorn"))
     with tempfile.TemporaryDirectory(prefix="r2r-", dir="/tmp") as name, ExitStack() as stack:
         folder = Path(name)
-        page, opcua = _set_up(folder)
-        _started(stack, folder, "-c", GATEWAY, name)
-        _started(stack, folder, "-m", "gateway.cli", "operator", "line.toml", "--run-dir", name, "--data-dir", "data")
-        asyncio.run(measured(bench, folder, page, opcua, asked.stops))
+        if "stops" in asked.parts:
+            page, opcua = _set_up(folder)
+            _started(stack, "-c", GATEWAY, name, name)
+            words = ("operator", str(folder / "line.toml"), "--run-dir", name, "--data-dir", str(folder / "data"))
+            _started(stack, "-m", "gateway.cli", *words)
+            asyncio.run(stops(bench, folder, page, opcua, asked.stops))
+        if "lease" in asked.parts:
+            stack.close()  # its processes take none of the time of those of the line
+            (folder / "line").mkdir()
+            lease(bench, folder / "line", asked.lease)
     bench.finish()
 
 

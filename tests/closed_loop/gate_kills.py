@@ -53,7 +53,7 @@ from gateway.loop.runner import Runner
 from gateway.loop.voice import Voice
 from gateway.mailbox.keys import public_key
 from gateway.mailbox.loop_proof import make_key
-from gateway.mailbox.paths import GATEWAY_SOCKET, LOOP_SOCKET
+from gateway.mailbox.paths import GATEWAY_DATA, GATEWAY_SOCKET, LOOP_DATA, LOOP_SOCKET
 from gateway.mailbox.port import Unreachable
 from gateway.mailbox.seal import LineName
 from gateway.mailbox.unix import UnixMailbox
@@ -93,18 +93,20 @@ class Tally:
 class FastLoop(SteppedLoop):
     """A line in production, and its loop behind a socket."""
 
-    def talk(self, mailbox: UnixMailbox, fast: FastTime, folder: Path) -> None:
+    def talk(self, mailbox: UnixMailbox, fast: FastTime, data: Path) -> None:
         self._mailbox = mailbox
-        self.runner = Runner(self.cycle, Store(folder, self.config))
+        self.runner = Runner(self.cycle, Store(data / LOOP_DATA, self.config))
         site, line = self.line.site, self.line.line
-        self.door = Door(self.runner, LineName(site, line), lambda: public_key(site, line, folder), fast.clock)
+        self.door = Door(
+            self.runner, LineName(site, line), lambda: public_key(site, line, data / GATEWAY_DATA), fast.clock
+        )
         tension_n = np.array(self.line.recipes[0].tension_n)
         self.begin_in_production(tension_n, self.line.recipes[0].speed_m_per_s)
         self._fast = fast
         self._voice = Voice(mailbox, self.cycle.links, self.line.control.period_s)
         mailbox.serve(LOOP_COMMAND, self.door.command)
         mailbox.serve(LOOP_HELLO, self.door.introduce)
-        mailbox.serve(LOOP_SHOWN, Identity(make_key(folder.parent / "run"), self.cycle).answer)
+        mailbox.serve(LOOP_SHOWN, Identity(make_key(data.with_name("run")), self.cycle).answer)
 
     async def live(self) -> None:
         """Periods as they come due; a machine that is too slow makes the line's time slower, not its periods."""
@@ -150,7 +152,7 @@ class Site:
 
     @property
     def data(self) -> Path:
-        return self.folder / "data"
+        return self.folder / "data" / GATEWAY_DATA
 
     async def fork(self) -> int:
         """A gateway that answers. Raises TimeoutError."""
@@ -300,7 +302,7 @@ class Site:
         runs, good, epoch = configurations.running.hash, configurations.good.hash, configurations.epoch
         self._explained(good in kept, f"{good[:8]} is the last known good, and was not kept on record")
         self._explained(runs in (good, deployed.get(epoch)), f"{runs[:8]} runs as epoch {epoch}, not on record")
-        if (path := self.data / "configuration.json").exists():
+        if (path := self.data.with_name(LOOP_DATA) / "configuration.json").exists():
             on_disk = config_hash(Kept.model_validate_json(path.read_bytes()).controller)
             self._explained(on_disk in kept, f"{on_disk[:8]} is kept by the loop's file, not on record")
 
@@ -327,12 +329,12 @@ class Site:
 async def site(tally: Tally, rng: random.Random) -> AsyncIterator[Site]:
     """Everything that was begun is ended."""
     folder = Path(tempfile.mkdtemp(prefix="r2r-kill-"))
-    for name in ("run", "data"):
-        (folder / name).mkdir()
+    for name in ("run", f"data/{LOOP_DATA}", f"data/{GATEWAY_DATA}"):
+        (folder / name).mkdir(parents=True)
     (folder / "line.toml").write_text(line_text())
     line = load_line(line_text(), "line.toml")
     config = design_lqi(task_of(line))
-    (folder / "data" / "controller.json").write_bytes(canonical(config))
+    (folder / "data" / LOOP_DATA / "controller.json").write_bytes(canonical(config))
     plant = load_plant("sim_plant/plants/s_real.toml").model_copy(update={"spans": 1})
     fast = FastTime(SCALE, time.monotonic())
     arguments = [sys.executable, "-m", "tests.closed_loop.gate_victim", folder, str(SCALE), str(fast.began_s)]

@@ -18,7 +18,7 @@ from gateway.core.messages import AskConfiguration, Deploy, Reply, command_bytes
 from gateway.core.proposal import GainsChange, Proposal, canonical, proposal_hash
 from gateway.core.topics import GATEWAY_DECISION, GATEWAY_PROPOSALS, GATEWAY_PROPOSE, LOOP_COMMAND, Topic
 from gateway.mailbox.inbox import come_again_s
-from gateway.mailbox.paths import GATEWAY_SOCKET, LOOP_SOCKET
+from gateway.mailbox.paths import GATEWAY_DATA, GATEWAY_SOCKET, LOOP_SOCKET
 from gateway.mailbox.port import Unreachable
 from gateway.mailbox.unix import UnixMailbox
 from sim_plant.recording import Recording
@@ -37,8 +37,13 @@ class GateLine(WireLine):
 
     @property
     def data(self) -> Path:
-        """Audit, stores and history."""
+        """The line's."""
         return self.folder / "data"
+
+    @property
+    def gateway_data(self) -> Path:
+        """Audit, stores and history."""
+        return self.data / GATEWAY_DATA
 
     @property
     def first(self) -> Controller:
@@ -120,7 +125,7 @@ class GateLine(WireLine):
 
     def audit(self, *words: str) -> str:
         """What `r2rgate audit` says of this line."""
-        return self._command("audit", *words, "--data-dir", self.folder / "data")
+        return self._command("audit", *words, "--data-dir", self.data)
 
     def command(self, *words: str | Path) -> str:
         """What a command of `r2rgate` to this line says."""

@@ -23,6 +23,7 @@ from gateway.core.line import Line
 from gateway.core.line_file import load_line
 from gateway.core.recording import Recording
 from gateway.core.verdict import RuleFinding, Verdict, line_hash
+from gateway.mailbox.paths import GATEWAY_DATA
 from gateway.supervisor.audit import Audit
 from gateway.supervisor.process import serve
 
@@ -68,7 +69,7 @@ class QuickJudge:
 
 
 def live(folder: Path, scale: float, began_s: float) -> None:
-    told = os.open(folder / "data" / TOLD_FILE, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+    told = os.open(folder / "data" / GATEWAY_DATA / TOLD_FILE, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
     append = Audit.append
 
     async def telling(self, *args):

@@ -25,6 +25,7 @@ from gateway.core.states import LoopState
 from gateway.identification import identify as pipeline
 from gateway.identification import inheritance
 from gateway.identification.identify import NotIdentified
+from gateway.mailbox.paths import GATEWAY_DATA
 from gateway.supervisor.models import open_repository
 from tests.closed_loop.recorded import demonstration_line, real_plant, recorded
 from tests.closed_loop.spoiled import shifted, swapped
@@ -95,7 +96,7 @@ def test_the_model_is_written_stored_and_that_of_the_data(
         assert interval.high - interval.low < 0.01 * truth
         assert abs(interval.value - truth) < interval.high - interval.low  # twice the half-width: no seed fails here
     assert result.kept is not None and result.kept.id == model_hash(model) and result.kept.version == 1
-    with open_repository(folder / "data" / "models.sqlite") as models:
+    with open_repository(folder / "data" / GATEWAY_DATA / "models.sqlite") as models:
         (entry,) = models.entries()
     assert entry.model == model and entry.state is None
 
@@ -187,7 +188,7 @@ def test_a_model_that_does_not_hold_is_kept_as_rejected(recording: Recording, fo
     assert code == 4, err
     assert "does NOT hold" in out and "finding: " in out and "recommended: " in out and "marked as rejected" in out
     assert "r2rgate design" not in out
-    with open_repository(folder / "data" / "models.sqlite") as models:
+    with open_repository(folder / "data" / GATEWAY_DATA / "models.sqlite") as models:
         (entry,) = models.entries()
     assert entry.state == "rejected" and "innovation" in entry.marks[0].reason
     assert entry.model is not None and entry.model.data.source == "a.csv, b.csv"

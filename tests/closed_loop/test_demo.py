@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 from gateway.cli.demo_result import DemoResult
+from gateway.mailbox.paths import OPERATOR_DATA
 from gateway.operator.users import FILE_NAME, UsersFile
 from sim_plant.recorder import read_recording
 from tests.bench.figures import GOALS
@@ -112,7 +113,10 @@ def test_a_line_to_play_with_has_a_report_a_page_and_a_change_and_ends_with_ctrl
         run_folder, waiting = re.search(r"--run-dir (\S+)$", text, re.M), re.search(r"r2rgate approve (\w+)", text)
         assert page and password and run_folder and waiting, text
         assert httpx.get(page[1]).status_code == 200
-        assert UsersFile(folder / "data" / FILE_NAME).current().check("engineer", password[1]) == "engineer"
+        assert (
+            UsersFile(folder / "data" / OPERATOR_DATA / FILE_NAME).current().check("engineer", password[1])
+            == "engineer"
+        )
         words = [sys.executable, "-m", "gateway.cli", "approve", waiting[1], "--yes", "--run-dir", run_folder[1]]
         said = subprocess.run(words, capture_output=True, text=True, check=False)
         assert said.returncode == 0 and "probation" in said.stdout, said

@@ -15,6 +15,7 @@ from gateway.core.states import Phase
 from gateway.core.wiring_proof import devices_of, proof_hash
 from gateway.loop.drill import ROOM_PERIODS, Stage
 from gateway.loop.wiring import FILE, Wiring
+from gateway.mailbox.paths import LOOP_DATA
 from tests.bench import lines
 from tests.bench.faults_lines import DEMO, virtual_line
 from tests.bench.lines import WIRINGS, Ports, line_text
@@ -254,7 +255,7 @@ def test_a_drill_does_not_outlive_a_device_that_is_exchanged():
 
 def test_a_proof_that_is_kept_tells_whose_exchange_would_not_be_seen(tmp_path):
     line = stepped(2).line
-    wiring = Wiring(line, map_files(line), tmp_path)
+    wiring = Wiring(line, map_files(line), tmp_path / LOOP_DATA)
     wiring.write(wiring.proof_of([], [], [], []))
     told = wiring.take_written()
     assert "no serial number" in told and line.plc.name in told
@@ -263,7 +264,7 @@ def test_a_proof_that_is_kept_tells_whose_exchange_would_not_be_seen(tmp_path):
 def test_a_loop_that_starts_anew_reads_the_proof_that_was_kept(tmp_path):
     line = stepped(2).line
     store_proof(line, tmp_path)
-    wiring = Wiring(line, map_files(line), tmp_path)
+    wiring = Wiring(line, map_files(line), tmp_path / LOOP_DATA)
     assert [each.code for each in wiring.against] == ["wiring-unproved"]
     wiring.read(print)
     assert wiring.against == []
@@ -272,7 +273,7 @@ def test_a_loop_that_starts_anew_reads_the_proof_that_was_kept(tmp_path):
 def test_a_loop_that_starts_anew_does_not_say_proved_before_it_has_read_its_devices(tmp_path):
     loop = stepped(2)
     store_proof(loop.line, tmp_path)
-    wiring = Wiring(loop.line, map_files(loop.line), tmp_path)
+    wiring = Wiring(loop.line, map_files(loop.line), tmp_path / LOOP_DATA)
     assert wiring.status().unproved and not wiring.status().not_read
     wiring.read(print)
     hash_ = proof_hash(proof_of_wiring(loop.line))
@@ -303,8 +304,8 @@ def test_an_arming_that_finds_another_device_tells_it_at_once():
 def test_a_proof_that_is_cut_off_is_none_and_that_is_told(tmp_path):
     line, told = stepped(2).line, []
     store_proof(line, tmp_path)
-    (tmp_path / FILE).write_text((tmp_path / FILE).read_text()[:-20])
-    wiring = Wiring(line, map_files(line), tmp_path)
+    (tmp_path / LOOP_DATA / FILE).write_text((tmp_path / LOOP_DATA / FILE).read_text()[:-20])
+    wiring = Wiring(line, map_files(line), tmp_path / LOOP_DATA)
     wiring.read(told.append)
     assert [each.code for each in wiring.against] == ["wiring-unproved"]
     assert [each.rule for each in wiring.unusable] == ["file-unusable"] and told
@@ -312,11 +313,11 @@ def test_a_proof_that_is_cut_off_is_none_and_that_is_told(tmp_path):
 
 def test_what_is_kept_is_on_the_disk_and_proves_the_line(tmp_path):
     line = stepped(2).line
-    wiring = Wiring(line, map_files(line), tmp_path)
+    wiring = Wiring(line, map_files(line), tmp_path / LOOP_DATA)
     wiring.write(wiring.proof_of(*shown_as_described(line), []))
     assert [each.code for each in wiring.against] == ["wiring-unproved"]  # before it takes effect
     wiring.take_written()
-    again = Wiring(line, map_files(line), tmp_path)
+    again = Wiring(line, map_files(line), tmp_path / LOOP_DATA)
     again.read(print)
     assert wiring.against == again.against == [] and again.proof == wiring.proof
 

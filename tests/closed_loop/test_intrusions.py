@@ -17,7 +17,7 @@ from gateway.core.messages import AskConfiguration, Deploy, Hold, Keep, Reply, S
 from gateway.core.topics import LOOP_COMMAND
 from gateway.loop.kept import FILE, SET_ASIDE
 from gateway.mailbox.keys import private_key
-from gateway.mailbox.paths import LOOP_SOCKET
+from gateway.mailbox.paths import LOOP_DATA, LOOP_SOCKET
 from gateway.mailbox.unix import UnixMailbox
 from tests.closed_loop.gate_line import GateLine
 from tests.support.gateway_key import as_gateway
@@ -179,7 +179,7 @@ def straight(socket, command) -> Reply:
 
 def test_a_kept_configuration_outlives_the_loop_and_one_that_was_edited_is_not_used(line):
     given, config = config_hash(line.first), design_lqg(task_of(line.line))
-    private_key(line.data)
+    private_key(line.gateway_data)
     line.start_loop()
     line.look_on(lambda: is_up(line), bool)
     region = Region(speed_max_m_per_s=0.05)
@@ -190,14 +190,14 @@ def test_a_kept_configuration_outlives_the_loop_and_one_that_was_edited_is_not_u
     again(line)
     found = line.configuration()
     assert (found.hash, found.epoch, found.region) == (config_hash(config), 1, region)
-    path = line.data / FILE
+    path = line.data / LOOP_DATA / FILE
     kept = json.loads(path.read_text())
     kept["controller"]["gain_state"] = [[1.05 * gain for gain in row] for row in kept["controller"]["gain_state"]]
     path.write_text(json.dumps(kept))
     again(line)
     found = line.configuration()
     assert (found.hash, found.region, found.epoch) == (given, first_region(line.line), 1)
-    assert json.loads((line.data / SET_ASIDE).read_text()) == kept
+    assert json.loads((line.data / LOOP_DATA / SET_ASIDE).read_text()) == kept
     assert "without the gateway's signature" in line.children.log("loop").read_text()
 
 

@@ -26,6 +26,7 @@ from gateway.core.line_template import line_template
 from gateway.core.messages import Event
 from gateway.core.proposal import GainsChange
 from gateway.core.verdict import Verdict
+from gateway.mailbox.paths import GATEWAY_DATA
 from gateway.operator.page.told import used
 from gateway.supervisor.audit import Audit
 from gateway.supervisor.audit_file import FILE_NAME as AUDIT
@@ -57,8 +58,8 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A line's folder, with its file beside the data: a first configuration that was kept, an experiment that waits."""
     folder = tmp_path_factory.mktemp("line")
     (folder / "line.toml").write_text(TEXT)
-    data = folder / "data"
-    data.mkdir()
+    data = folder / "data" / GATEWAY_DATA
+    data.mkdir(parents=True)
     loop = SteppedLoop(LINE, design_lqi(task_of(LINE)), random_plant(SEED, SPANS), SEED)
     loop.begin_in_production(np.array(LINE.recipes[0].tension_n), LINE.recipes[0].speed_m_per_s)
     approvals = 0
@@ -143,7 +144,7 @@ def test_every_proposal_stands_there_with_who_decided_over_what_and_what_it_came
     made: Path, reported: tuple[str, str]
 ) -> None:
     words = " ".join(Page(reported[1]).words.split())
-    stored = records(made / "data")
+    stored = records(made / "data" / GATEWAY_DATA)
     by_kind = {kind: [one for one in stored if one["kind"] == kind] for kind in {one["kind"] for one in stored}}
     assert len(by_kind["kept"]) == 1 and len(by_kind["proposed"]) >= 2
     for one in by_kind["proposed"]:
@@ -161,8 +162,9 @@ def test_every_proposal_stands_there_with_who_decided_over_what_and_what_it_came
 def test_every_rule_and_margin_stands_there_as_the_stored_verdict_has_it(made: Path, reported: tuple[str, str]) -> None:
     verdicts = [
         Verdict.model_validate_json(content)
-        for one in records(made / "data")
-        if "verdict" in one["blobs"] and (content := blob(made / "data", one["blobs"]["verdict"])) is not None
+        for one in records(made / "data" / GATEWAY_DATA)
+        if "verdict" in one["blobs"]
+        and (content := blob(made / "data" / GATEWAY_DATA, one["blobs"]["verdict"])) is not None
     ]
     page = Page(reported[1])
     told = page.data["verdicts"]
@@ -197,10 +199,12 @@ def test_configurations_are_shown_in_the_same_cases_each_with_its_course_and_rms
             squared = sum(np.square(rows[k] - rows[-1]) for rows in tension)
             rmse_n = float(np.sqrt(np.mean(squared)))
             assert rmse_n == pytest.approx(next(stated), rel=1e-4)
-    with AuditFile(made / "data") as file:
-        payload = next(file.blob(one["what"]["proposal"]) for one in records(made / "data") if one["kind"] == "kept")
+    with AuditFile(made / "data" / GATEWAY_DATA) as file:
+        payload = next(
+            file.blob(one["what"]["proposal"]) for one in records(made / "data" / GATEWAY_DATA) if one["kind"] == "kept"
+        )
     change = GainsChange.model_validate(json.loads(payload or b"")["change"])
-    assert config_hash(change.controller) == kept(made / "data")[-1]
+    assert config_hash(change.controller) == kept(made / "data" / GATEWAY_DATA)[-1]
     assert "the nominal model of the line's file: no model is accepted" in page.words
     assert "it was judged up to" in page.words  # a first configuration is let through for small steps only
 
@@ -229,14 +233,14 @@ def test_alarms_questions_and_the_state_of_the_audit_stand_there(made: Path, rep
     words = Page(reported[1]).words
     assert "load-cell: a load cell cannot be trusted: span 2 <b>" in words
     assert "Span 3 swings." in words and "pid-calm" in words
-    last = records(made / "data")[-1]
-    with AuditFile(made / "data") as file:
+    last = records(made / "data" / GATEWAY_DATA)[-1]
+    with AuditFile(made / "data" / GATEWAY_DATA) as file:
         head = [row.head for row in file.rows()][-1]
     assert head in words and f"The audit is sound: {last['sequence']} records." in words
 
 
 def test_an_audit_that_was_tampered_with_is_told_first_and_the_rest_all_the_same(folder: Path) -> None:
-    path = folder / "data" / AUDIT
+    path = folder / "data" / GATEWAY_DATA / AUDIT
     content = path.read_bytes()
     assert b'"by":"person"' in content
     path.write_bytes(content.replace(b'"by":"person"', b'"by":"parson"'))
@@ -252,7 +256,7 @@ def test_an_audit_that_was_tampered_with_is_told_first_and_the_rest_all_the_same
 
 
 def test_an_audit_that_is_no_database_any_more_leaves_what_else_there_is(folder: Path) -> None:
-    (folder / "data" / AUDIT).write_bytes(b"no database" * 1000)
+    (folder / "data" / GATEWAY_DATA / AUDIT).write_bytes(b"no database" * 1000)
     code, said, text = report(folder)
     assert code == 1 and "NOT SOUND" in said
     words = Page(text).words
@@ -260,7 +264,7 @@ def test_an_audit_that_is_no_database_any_more_leaves_what_else_there_is(folder:
 
 
 def test_it_is_read_beside_what_writes_it_and_left_as_it_was(folder: Path) -> None:
-    data = folder / "data"
+    data = folder / "data" / GATEWAY_DATA
     writing = Audit(data)
     writing.start()
     writer = writer_of(data / HISTORY, wall_ahead_s=BEGIN.timestamp(), spans=SPANS)
@@ -285,8 +289,8 @@ def stores(data: Path) -> dict[str, bytes]:
 
 def test_a_line_on_which_nothing_was_ever_proposed_shows_what_controls_it(tmp_path: Path) -> None:
     (tmp_path / "line.toml").write_text(TEXT)
-    data = tmp_path / "data"
-    data.mkdir()
+    data = tmp_path / "data" / GATEWAY_DATA
+    data.mkdir(parents=True)
     controller = design_lqi(task_of(LINE))
     hash_ = config_hash(controller)
     with begin_configurations(data / CONFIGURATIONS) as storage:
@@ -318,7 +322,7 @@ def test_a_time_without_a_change_says_so_and_shows_what_is_in_service(folder: Pa
     ("spoil", "words", "said"),
     [
         (lambda folder: shutil.rmtree(folder / "data"), (), "there is no folder"),
-        (lambda folder: (folder / "data" / AUDIT).unlink(), (), "there is no audit in"),
+        (lambda folder: (folder / "data" / GATEWAY_DATA / AUDIT).unlink(), (), "there is no audit in"),
         (lambda folder: None, ("--since", "yesterday"), "allowed is a date and time such as"),
         (lambda folder: None, ("--out", "/nowhere/report.html"), "--out /nowhere/report.html cannot be written"),
         (lambda folder: other(folder / "line.toml"), (), "has the records of demo/line-1"),

@@ -12,6 +12,7 @@ import pytest
 from gateway.core.messages import Arm, Start, Stop
 from gateway.core.wiring_proof import WiringProof, proof_hash
 from gateway.loop.wiring import FILE
+from gateway.mailbox.paths import GATEWAY_DATA, LOOP_DATA
 from gateway.supervisor.audit_file import AuditFile
 from sim_plant.recording import Recording
 from tests.closed_loop.wire import WireLine, at_rest
@@ -51,10 +52,10 @@ def test_no_start_before_the_proof_and_one_after_it_also_of_a_loop_that_starts_a
         wire.wait(at_rest)
         said = prove(wire)
         assert said.returncode == 0, said
-        assert "the wiring is proved" in said.stdout and (tmp_path / "data" / FILE).exists()
+        assert "the wiring is proved" in said.stdout and (tmp_path / "data" / LOOP_DATA / FILE).exists()
         shown = wire.wait(lambda status: status.wiring is not None and not status.wiring.unproved).wiring
         assert shown is not None and shown.proved_wall_s is not None and abs(shown.proved_wall_s - time.time()) < 60.0
-        with AuditFile(tmp_path / "data") as audit:
+        with AuditFile(tmp_path / "data" / GATEWAY_DATA) as audit:
             (proved,) = [record for row in audit.rows() if (record := row.record()).kind == "wiring-proved"]
         assert proved.what["wall_s"] == shown.proved_wall_s and proved.what["proof"] == shown.proof
         assert not wire.wait(lambda status: status.loop.running).unexplained
@@ -81,10 +82,10 @@ def test_one_drive_alone_is_proved_anew_and_the_line_starts(tmp_path):
         assert said.returncode == 2 and "drive-" in said.stderr, said
         assert wire.order(Stop()).ok
         wire.wait(at_rest)
-        before = WiringProof.model_validate_json((tmp_path / "data" / FILE).read_text())
+        before = WiringProof.model_validate_json((tmp_path / "data" / LOOP_DATA / FILE).read_text())
         said = prove(wire, "--only", before.drives[0].drive)
         assert said.returncode == 0, said
-        after = WiringProof.model_validate_json((tmp_path / "data" / FILE).read_text())
+        after = WiringProof.model_validate_json((tmp_path / "data" / LOOP_DATA / FILE).read_text())
         assert after.drives[1:] == before.drives[1:] and after.drives[0].torque_nm > 0.0
         shown = wire.wait(lambda status: status.wiring is not None and status.wiring.proof == proof_hash(after))
         assert not shown.unexplained
@@ -101,7 +102,7 @@ def test_a_load_cell_that_shows_less_where_the_web_pulls_more_is_named_and_the_l
         wire.wait(lambda status: status.loop.running)
         said = prove(wire)
         assert said.returncode == 2 and 'set sign = "inverted"' in said.stderr, said
-        assert not (tmp_path / "data" / FILE).exists()
+        assert not (tmp_path / "data" / LOOP_DATA / FILE).exists()
         wire.wait(at_rest)
         assert wire.order(Arm()).ok
         assert [each.code for each in wire.order(Start()).findings] == ["wiring-unproved"]

@@ -17,7 +17,7 @@ pytestmark = [pytest.mark.realtime, pytest.mark.timeout(180)]
 
 
 def of_kind(line: GateLine, kind: str) -> list[Any]:
-    with AuditFile(line.data) as file:
+    with AuditFile(line.gateway_data) as file:
         return [record for row in file.rows() if (record := row.record()).kind == kind]
 
 

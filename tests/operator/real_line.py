@@ -14,6 +14,7 @@ from cryptography.hazmat.primitives.serialization import Encoding
 
 from gateway.core.line import Operator
 from gateway.core.messages import Arm, Start
+from gateway.mailbox.paths import OPERATOR_DATA
 from gateway.supervisor.audit_file import AuditFile
 from gateway.supervisor.peers import GATEWAY
 from tests.closed_loop.gate_line import GateLine
@@ -51,7 +52,7 @@ class OperatorLine(GateLine):
 
     @property
     def pki(self) -> Path:
-        return self.data / "pki"
+        return self.data / OPERATOR_DATA / "pki"
 
     def make_certificate(self, client: str, data: Path) -> None:
         """Of a client, trusted by the server whose data these are."""
@@ -64,7 +65,7 @@ class OperatorLine(GateLine):
         self.make_certificate(STRANGER, elsewhere)
         for ending in ("pem", "key.pem"):
             name = f"opcua-client-{STRANGER}.{ending}"
-            (self.pki / name).write_bytes((elsewhere / "pki" / name).read_bytes())
+            (self.pki / name).write_bytes((elsewhere / OPERATOR_DATA / "pki" / name).read_bytes())
 
     def fingerprint(self, client: str) -> str:
         """SHA-256 of the certificate's DER bytes."""
@@ -91,7 +92,7 @@ class OperatorLine(GateLine):
 
     def records(self) -> list[Any]:
         """Of the audit."""
-        with AuditFile(self.data) as file:
+        with AuditFile(self.gateway_data) as file:
             return [row.record() for row in file.rows()]
 
     @contextmanager

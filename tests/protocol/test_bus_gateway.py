@@ -22,7 +22,7 @@ from gateway.core.messages import Reply
 from gateway.core.proposal import Proposal, canonical
 from gateway.core.status import GatewayStatus
 from gateway.core.topics import AGENT_DECIDE, ASK_JUDGE, ASK_LOG, ASK_PROPOSALS, ASK_PROPOSE, ASK_STATUS, GATEWAY_STATUS
-from gateway.mailbox.paths import BUS_SOCKET, GATEWAY_SOCKET
+from gateway.mailbox.paths import BUS_SOCKET, GATEWAY_DATA, GATEWAY_SOCKET
 from gateway.mailbox.port import RemoteError
 from gateway.mailbox.unix import UnixMailbox
 from gateway.mailbox.zenoh_mailbox import ZenohMailbox
@@ -121,7 +121,7 @@ def test_agents_propose_look_and_try_over_the_bus_and_are_named_in_the_audit() -
                 assert "start it" in Reply.model_validate_json(tried).reasons[0]  # there is no loop
             after = await status_with(folder, lambda status: "dry-run" in {event.kind for event in status.events})
             assert any(one.kind == "proposal" and one.text.startswith("agent sysid: ") for one in after.events)
-        with AuditFile(folder / "data") as file:
+        with AuditFile(folder / "data" / GATEWAY_DATA) as file:
             who = [record.who for record in (row.record() for row in file.rows()) if record.kind == "proposed"]
         assert who == [Who(name="agent sysid")]
 
@@ -191,7 +191,7 @@ def test_a_flood_of_requests_is_told_once_and_people_are_answered_meanwhile() ->
 
 def test_agents_that_die_flood_or_talk_nonsense_are_on_record_and_so_is_who_went_on_without_them() -> None:
     def recorded(folder: Path) -> dict[str, dict[str, Any]]:
-        with AuditFile(folder / "data") as file:
+        with AuditFile(folder / "data" / GATEWAY_DATA) as file:
             found = [record.what for record in (row.record() for row in file.rows()) if record.kind == "agents"]
         assert len(found) == len({str(what["case"]) for what in found})  # no case twice in a minute
         return {str(what["case"]): dict(what) for what in found}
@@ -268,7 +268,7 @@ def test_the_heads_that_a_peer_has_kept_show_a_history_that_was_made_anew_from_s
     kept = tmp_path / "heads.txt"
 
     async def story(folder: Path) -> None:
-        data = folder / "data"
+        data = folder / "data" / GATEWAY_DATA
         with gateway(folder):
             await status_with(folder, lambda status: bool(status.audit_head))
             with child(AGENTS, folder, tmp_path):

@@ -22,6 +22,7 @@ from gateway.cli.doctor_certificates import opcua_certificates
 from gateway.cli.main import app
 from gateway.core.line_file import load_line
 from gateway.core.line_template import line_template
+from gateway.mailbox.paths import OPERATOR_DATA
 from gateway.mailbox.unix import UnixMailbox
 from gateway.operator.opcua.trust import MOST_BYTES, TRUSTED, fingerprint
 from gateway.operator.users import FILE_NAME, Users
@@ -42,7 +43,7 @@ def set_up(folder: Path, *words: str) -> Path:
     (folder / "line.toml").write_text(text, encoding="utf-8")
     done = command(folder, "init", "--client", "panel", *words)
     assert done.exit_code == 0, done.output
-    return folder / "data" / "pki"
+    return folder / "data" / OPERATOR_DATA / "pki"
 
 
 def command(folder: Path, name: str, *words: str):
@@ -67,7 +68,7 @@ def operator(folder: Path):
 def test_a_panel_with_its_own_certificate_and_a_user_of_the_file_reach_the_line():
     async def story(folder: Path):
         pki = set_up(folder)
-        Users.nobody().with_user("otto", PASSWORD, "operator").write(folder / "data" / FILE_NAME)
+        Users.nobody().with_user("otto", PASSWORD, "operator").write(folder / "data" / OPERATOR_DATA / FILE_NAME)
         line = load_line((folder / "line.toml").read_text(encoding="utf-8"), "line.toml")
         mailbox = UnixMailbox()
         gateway = FakeGateway(line, mailbox)
@@ -116,7 +117,7 @@ def test_without_a_certificate_yet_there_is_the_page_and_what_to_do_is_said():
 def test_that_nobody_can_come_in_is_told_until_there_is_a_user():
     with short_folder() as folder:
         set_up(folder)
-        file = folder / "data" / FILE_NAME
+        file = folder / "data" / OPERATOR_DATA / FILE_NAME
         Users.nobody().write(file)  # the last one was removed
         with operator(folder) as process:
             assert process.stderr.readline().startswith("nobody can come in yet: ")
@@ -206,7 +207,7 @@ def test_a_certificate_is_trusted_by_its_file_and_what_is_none_is_not(tmp_path):
         (tmp_path / "bad.der").write_bytes(content)
         done = command(tmp_path, "trust", str(tmp_path / "bad.der"))
         assert done.exit_code == 2 and "is not trusted" in done.stderr
-    done = command(tmp_path, "trust", str(pki.parent.parent / "pki" / "authority.pem"))  # a key of another kind
+    done = command(tmp_path, "trust", str(tmp_path / "pki" / "authority.pem"))  # a key of another kind
     assert done.exit_code == 2 and "RSA" in done.stderr
     assert set((pki / TRUSTED).iterdir()) == before | {new}
 

@@ -1,4 +1,4 @@
-"""What may block must not be called by the gateway in an event loop's own thread: stores, zip, long hashes, users.
+"""What may block must not be called by gateway or operator in an event loop's own thread: stores, zip, hashes, users.
 
 By thread, not by time: a disk is quick on the machine that tests, and hangs on the one that does not. Stores and the
 vocabulary do what they are asked; whoever asks is looked at. What tests and commands call themselves is their own.
@@ -21,9 +21,10 @@ from gateway.core.recording import Recording
 from gateway.tasks.threads import SMALL_BYTES
 
 ROOT = Path(__file__).parents[2]
-ROOMS = ("gateway/supervisor", "gateway/mailbox")
+ROOMS = ("gateway/supervisor", "gateway/mailbox", "gateway/operator")
 ASKED = (
-    "gateway/core", "gateway/storage", "gateway/supervisor/knowledge", "tests/support/event_loop_guard.py",
+    "gateway/core", "gateway/storage", "gateway/operator/users.py", "gateway/supervisor/knowledge",
+    "tests/support/event_loop_guard.py",
 ) + tuple(
     f"gateway/supervisor/{name}.py"
     for name in (
@@ -53,6 +54,7 @@ def begin() -> None:
     """Once in a process, before what is to be looked at is imported."""
     apsw.connection_hooks.append(_watch)
     hashlib.sha256 = _of_many_bytes(hashlib.sha256, "a hash")  # pyright: ignore[reportAttributeAccessIssue]
+    hashlib.scrypt = _checked(hashlib.scrypt, "a password's hash")  # pyright: ignore[reportAttributeAccessIssue]
     zlib.compress = _of_many_bytes(zlib.compress, "zlib")
     zlib.decompressobj = _checked(zlib.decompressobj, "zlib")
     zipfile.ZipFile.__init__ = _checked(zipfile.ZipFile.__init__, "zip")  # pyright: ignore[reportAttributeAccessIssue]

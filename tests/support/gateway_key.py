@@ -17,6 +17,7 @@ from gateway.core.topics import LOOP_COMMAND, LOOP_HELLO
 from gateway.loop.door import Behind, Door
 from gateway.loop.kept import Durable, Store
 from gateway.mailbox.keys import PublicKey, private_key
+from gateway.mailbox.paths import GATEWAY_DATA
 from gateway.mailbox.port import Mailbox
 from gateway.mailbox.seal import LineName, Signer
 from gateway.mailbox.to_loop import ToLoop
@@ -56,7 +57,9 @@ async def as_gateway(socket: Path, line: Line, data: Path, command: Command, tim
     mailbox = UnixMailbox()
     mailbox.connect({LOOP_COMMAND, LOOP_HELLO}, socket)
     try:
-        return await ToLoop(mailbox, Signer(private_key(data), name_of(line))).tell(command, timeout_s, GROUNDS)
+        return await ToLoop(mailbox, Signer(private_key(data / GATEWAY_DATA), name_of(line))).tell(
+            command, timeout_s, GROUNDS
+        )
     finally:
         await mailbox.close()
 

@@ -7,6 +7,7 @@ from gateway.cli.stepped import shown_as_described
 from gateway.core.line import CanopenBus, Drive, Line, LinePlc, LoadCell
 from gateway.core.wiring_proof import WiringProof, device_identities, devices_of, proof_hash, wiring_hash
 from gateway.loop.wiring import FILE, Wiring
+from gateway.mailbox.paths import GATEWAY_DATA, LOOP_DATA
 from gateway.supervisor.audit import Audit
 from gateway.supervisor.audit_file import FILE_NAME
 from gateway.supervisor.lifecycle import WIRING_PROVED
@@ -39,10 +40,11 @@ def _serial(device: Drive | LoadCell | LinePlc, *, on_canopen: bool) -> str:
     return str(amplifier.SERIAL if isinstance(device, LoadCell) else line_plc.SERIAL)
 
 
-def store_proof(line: Line, folder: Path) -> None:
-    """Into the data folder of a loop that is not started yet."""
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / FILE).write_text(proof_of_wiring(line).model_dump_json())
+def store_proof(line: Line, data: Path) -> None:
+    """For a loop that is not started yet; `data`: the line's."""
+    own = data / LOOP_DATA
+    own.mkdir(parents=True, exist_ok=True)
+    (own / FILE).write_text(proof_of_wiring(line).model_dump_json())
 
 
 def proved_wiring(line: Line, *, serials: bool = True) -> Wiring:
@@ -53,12 +55,13 @@ def proved_wiring(line: Line, *, serials: bool = True) -> Wiring:
     return wiring
 
 
-def record_proof(line: Line, folder: Path) -> None:
+def record_proof(line: Line, data: Path) -> None:
     """Into the audit of a gateway that is not started there yet: it explains the proof that `store_proof` stores."""
-    if (folder / FILE_NAME).exists():
+    own = data / GATEWAY_DATA
+    if (own / FILE_NAME).exists():
         return
-    folder.mkdir(parents=True, exist_ok=True)
-    proof, audit = proof_of_wiring(line), Audit(folder)
+    own.mkdir(parents=True, exist_ok=True)
+    proof, audit = proof_of_wiring(line), Audit(own)
     audit.start()
     what = {"wiring": proof.wiring, "wall_s": proof.wall_s, "answers": [], "proof": proof_hash(proof)}
     audit.append_and_wait(WIRING_PROVED, GATEWAY, what)

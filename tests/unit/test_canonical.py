@@ -102,13 +102,13 @@ def test_what_was_stored_under_an_older_hash_is_found_under_both(tmp_path, monke
         then.setattr("gateway.supervisor.configurations.config_hash", lambda config: known_hashes(config)[1])
         then.setattr("gateway.supervisor.configurations.canonical", lambda config: _as_it_was(config))
         configurations.store(LINE.site, LINE.line, one, origin)
-    asyncio.run(StoreWriter(LINE, tmp_path, lambda: 2.0).store_given())
+    asyncio.run(StoreWriter(LINE, tmp_path, tmp_path, lambda: 2.0).store_given())
     with begin_configurations(tmp_path / "configurations.sqlite") as configurations:
         old = configurations.get(LINE.site, LINE.line, formerly)
         new = configurations.get(LINE.site, LINE.line, config_hash(one))
         assert old is not None and old.controller == one and new is not None and new.controller == one
         assert len(configurations.entries()) == 2
-    asyncio.run(StoreWriter(LINE, tmp_path, lambda: 3.0).store_given())
+    asyncio.run(StoreWriter(LINE, tmp_path, tmp_path, lambda: 3.0).store_given())
     with begin_configurations(tmp_path / "configurations.sqlite") as configurations:
         assert len(configurations.entries()) == 2
 

@@ -98,9 +98,9 @@ def test_nothing_found_is_told() -> None:
 
 @pytest.mark.slow
 def test_what_the_lines_own_records_tell_is_known_without_a_gateway(tmp_path: Path) -> None:
-    line, data = tmp_path / "line.toml", tmp_path / "data"
+    line, data = tmp_path / "line.toml", tmp_path / "data" / "gateway"
     line.write_text(line_template(2))
-    of_line = ["--line", line, "--data-dir", data]
+    of_line = ["--line", line, "--data-dir", data.parent]
     manual = tmp_path / "belt.md"
     manual.write_text("# The belt\n\nTimbuktu belts slip.\n")
     with Records(data) as records:

@@ -36,7 +36,7 @@ def compute(calls: object, *options: object) -> tuple[int, str, str]:
 
 def test_calls_are_computed_with_the_controller_that_is_kept_and_with_one_anothers() -> None:
     config = design_lqi(task_of(LINE))
-    folder = Path("data") / f"{LINE.site}_{LINE.line}"
+    folder = Path("data") / f"{LINE.site}_{LINE.line}" / "loop"
     folder.mkdir(parents=True)
     (folder / "controller.json").write_bytes(canonical(config))
     calls = [
@@ -51,7 +51,7 @@ def test_calls_are_computed_with_the_controller_that_is_kept_and_with_one_anothe
 
 
 def test_without_a_model_the_one_that_was_accepted_last_is_in_service() -> None:
-    folder = Path("data") / f"{LINE.site}_{LINE.line}"
+    folder = Path("data") / f"{LINE.site}_{LINE.line}" / "gateway"
     folder.mkdir(parents=True)
     call = {"call": "design", "architecture": "lqi"}
 

@@ -77,7 +77,7 @@ def test_without_a_folder_a_model_goes_to_its_line_and_is_found_there(
     code, _, err = r2rgate("list")
     assert code == 2 and f"there are no models in {tmp_path}" in err and "models import FILE" in err
     assert r2rgate("import", file_of(tmp_path, model()))[0] == 0
-    assert (tmp_path / "demo_line-1" / "models.sqlite").is_file()
+    assert (tmp_path / "demo_line-1" / "gateway" / "models.sqlite").is_file()
     code, said, _ = r2rgate("list")
     assert code == 0 and "demo/line-1" in said
     line_file = tmp_path / "line.toml"

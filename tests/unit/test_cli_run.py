@@ -127,7 +127,8 @@ def test_a_refused_child_ends_all_with_its_words_and_its_code(
     assert run(tmp_path) == code
     told = capsys.readouterr().err
     assert (
-        f"gateway has ended with exit code {code}\n  the end of {tmp_path / 'gateway.log'}:\n    no such thing" in told
+        f"gateway has ended with exit code {code}\n  the end of {tmp_path / 'logs' / 'gateway.log'}:\n    no such thing"
+        in told
     )
     assert rests.exists()
 
@@ -171,12 +172,12 @@ def test_each_start_of_the_simulated_line_records_into_a_folder_of_its_own(scrip
     scripts["gateway"] = scripts["loop"] = WAITS
     scripts["sim"] = (
         "import os, pathlib, signal, sys\n"
-        "pathlib.Path(sys.argv[3]).mkdir(); print('open', flush=True)\n"
-        f"if len(list(pathlib.Path({str(tmp_path)!r}).glob('recording-*'))) < 3: raise SystemExit(1)\n"
+        "pathlib.Path(sys.argv[3]).mkdir(parents=True); print('open', flush=True)\n"
+        f"if len(list(pathlib.Path({str(tmp_path / 'sim')!r}).glob('recording-*'))) < 3: raise SystemExit(1)\n"
         "os.kill(os.getppid(), signal.SIGINT); signal.sigwait([signal.SIGTERM])"
     )
     assert run(tmp_path, PLANT) == 0
-    assert len(list(tmp_path.glob("recording-*"))) == 3
+    assert len(list(tmp_path.glob("sim/recording-*"))) == 3
 
 
 def test_recordings_of_one_second_differ(tmp_path: Path) -> None:
@@ -275,7 +276,7 @@ def test_places_that_cannot_be_written_are_refused_in_one_sentence(where: str, l
     good = tmp_path / "good"
     for command in ("run", "gateway"):
         said = refused(command, line_file, "--data-dir", bad, "--run-dir", good)
-        assert f"the folder {bad} cannot be used" in said and "--data-dir" in said
+        assert f"the folder {bad}/" in said and "cannot be used" in said and "--data-dir" in said
     said = refused("run", line_file, "--data-dir", good, "--run-dir", bad)
     assert f"the folder {bad} cannot be used" in said and "--run-dir" in said
     assert str(bad) in refused("gateway", line_file, "--data-dir", good, "--run-dir", bad)

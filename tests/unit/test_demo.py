@@ -35,6 +35,7 @@ from gateway.core.line_file import load_line
 from gateway.core.people import ROLES
 from gateway.core.proposal import GainsChange
 from gateway.core.scenario import PAPER
+from gateway.mailbox.paths import OPERATOR_DATA
 from gateway.operator.opcua.trust import TrustList, from_file
 from gateway.operator.users import FILE_NAME, UsersFile
 from sim_plant.judge import UNSAFE
@@ -269,12 +270,12 @@ def test_what_is_ended_in_order_is_not_interrupted():
 @pytest.mark.slow
 def test_who_is_let_in_has_a_certificate_that_is_trusted_and_a_password_that_is_a_good_one(tmp_path):
     alone, people = (let_in(LINE, tmp_path / name, people=name == "b") for name in ("a", "b"))
-    users = [UsersFile(tmp_path / name / FILE_NAME).current() for name in ("a", "b")]
+    users = [UsersFile(tmp_path / name / OPERATOR_DATA / FILE_NAME).current() for name in ("a", "b")]
     assert [one.name for one in users[0].entries()] == ["script-operator"] and alone.password == ""
     assert [users[1].check(role, people.password) for role in ROLES] == list(ROLES)
     script = people.script
     assert users[1].check(script.user, script.password) == "operator" and alone.script.password != script.password
-    pki = tmp_path / "b" / "pki"
+    pki = tmp_path / "b" / OPERATOR_DATA / "pki"
     trusted = TrustList(pki, print, lambda: datetime.now(UTC))
     trusted.look()
     assert trusted.why_not(from_file(Path(script.certificate).read_bytes())) == ""

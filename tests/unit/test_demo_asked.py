@@ -56,13 +56,13 @@ def change(hash_: str, **changes: Any) -> ChangeResult:
 def test_the_log_is_read_in_the_order_in_which_was_asked_and_without_one_nothing_was(tmp_path: Path) -> None:
     setup = Setup(tmp_path, **SETUP_OF)
     assert read_interactions(setup) == []
-    setup.data.mkdir()
-    log = Interactions(setup.data)
+    setup.gateway_data.mkdir(parents=True)
+    log = Interactions(setup.gateway_data)
     every = [interaction(number) for number in (3, 1, 2)]
     for one in every:
         log.keep(pack(one), one)
     assert read_interactions(setup) == every
-    (setup.data / FILE_NAME).write_bytes(b"no database" * 1000)
+    (setup.gateway_data / FILE_NAME).write_bytes(b"no database" * 1000)
     with pytest.raises(DemoFailed, match=r"interaction log|interactions"):
         read_interactions(setup)
 

@@ -127,7 +127,7 @@ def test_a_store_that_a_backup_holds_for_five_seconds_ends_nothing_and_holds_up_
     @run
     async def story():
         gateway = await trusted_once()
-        writer = StoreWriter(LINE, tmp_path, lambda: gateway.loop.now_s)
+        writer = StoreWriter(LINE, tmp_path, tmp_path, lambda: gateway.loop.now_s)
         gateway.take_up = writer.take_up
         two = proposal(2, gateway.loop.runs, gateway.loop.now_s, nonce=7)
         await gateway.propose(two)

@@ -25,6 +25,7 @@ from gateway.core.line_model import LineModel, canonical, model_hash, model_of, 
 from gateway.core.line_template import line_template
 from gateway.core.scenario import PAPER, TENSION
 from gateway.core.theta import Noise, nominal_theta
+from gateway.mailbox.paths import GATEWAY_DATA
 from gateway.supervisor.models import begin_repository
 from tests.unit.model_support import fields, model
 
@@ -219,7 +220,7 @@ def test_a_first_guess_on_a_model_is_the_design_on_its_theta(folder: Path) -> No
 def test_the_whole_phase_on_a_stored_model(folder: Path) -> None:
     data = folder / "data"
     lagging = changed(2, latency_s=0.0101, torque_lag_s=0.003)
-    with begin_repository(data / "models.sqlite") as models:
+    with begin_repository(data / GATEWAY_DATA / "models.sqlite") as models:
         models.store(model(), 1.0)
         models.store(lagging, 2.0)
     code, said, err = design(folder, "--iterations", 1, "--model", "newest", "--data-dir", data)
@@ -255,7 +256,7 @@ def test_a_model_that_does_not_fit_is_refused_before_the_work(folder: Path) -> N
 
 
 def test_a_rejected_model_is_not_designed_on(folder: Path) -> None:
-    with begin_repository(folder / "data" / "models.sqlite") as models:
+    with begin_repository(folder / "data" / GATEWAY_DATA / "models.sqlite") as models:
         models.mark(models.store(model(), 1.0).id, "rejected", 2.0, "innovations are not white")
     code, _, err = design(folder, "--untuned", "--model", "newest", "--data-dir", folder / "data")
     assert code == 2 and "version 1 was rejected: innovations are not white" in err

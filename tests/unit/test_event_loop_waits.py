@@ -32,6 +32,7 @@ from gateway.core.topics import (
     GATEWAY_STATUS,
     LOOP_COMMAND,
 )
+from gateway.mailbox.paths import GATEWAY_DATA
 from gateway.mailbox.port import Peer
 from gateway.mailbox.unix import UnixMailbox
 from gateway.supervisor import configurations, line_desk, peers, proposal_inbox
@@ -179,7 +180,8 @@ def test_whatever_is_asked_of_a_whole_gateway_its_event_loop_calls_nothing_that_
         client, saying = UnixMailbox(), UnixMailbox()
         client.connect(ASKED, folder / "gateway.sock")
         saying.connect((GATEWAY_FOR_PERSON,), folder / "gateway.sock")
-        while (await ask(client)).audit_head == "" or not (folder / "data" / "configurations.sqlite").exists():  # noqa: ASYNC110
+        made = folder / "data" / GATEWAY_DATA / "configurations.sqlite"
+        while (await ask(client)).audit_head == "" or not made.exists():  # noqa: ASYNC110
             await asyncio.sleep(0.01)
 
         async def say(topic, payload: bytes) -> bytes:
@@ -218,7 +220,7 @@ def test_whatever_is_asked_of_a_whole_gateway_its_event_loop_calls_nothing_that_
 @pytest.mark.wires
 def test_a_stop_is_answered_while_a_store_is_held_and_an_archive_waits_for_it():
     async def story(folder: Path) -> None:
-        store = folder / "data" / configurations.FILE_NAME
+        store = folder / "data" / GATEWAY_DATA / configurations.FILE_NAME
         with gateway(folder):
 
             async def answer(_: bytes) -> bytes:

@@ -28,6 +28,7 @@ from gateway.mailbox.loop_proof import (
     read_key,
     shown,
 )
+from gateway.mailbox.paths import GATEWAY_DATA
 from gateway.mailbox.port import Peer
 from gateway.mailbox.unix import UnixMailbox
 from gateway.supervisor.audit_file import AuditFile
@@ -108,7 +109,7 @@ def codes_of(status: GatewayStatus) -> set[str]:
 
 def recorded(folder: Path) -> set[str]:
     """Kinds of records in the audit."""
-    with AuditFile(folder / "data") as file:
+    with AuditFile(folder / "data" / GATEWAY_DATA) as file:
         return {record.kind for record in (row.record() for row in file.rows())}
 
 

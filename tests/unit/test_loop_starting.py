@@ -16,7 +16,7 @@ from gateway.core.messages import Arm, Reply
 from gateway.core.topics import LOOP_SHOWN
 from gateway.mailbox.keys import private_key
 from gateway.mailbox.loop_proof import KEY_FILE, AskShown, LoopShown, Unproven, new_challenge, proven, read_key
-from gateway.mailbox.paths import LOOP_SOCKET
+from gateway.mailbox.paths import GATEWAY_DATA, LOOP_SOCKET
 from gateway.mailbox.port import ANSWERED
 from gateway.mailbox.unix import UnixMailbox
 from tests.support.gateway_key import as_gateway
@@ -88,7 +88,7 @@ async def shown(folder: Path) -> LoopShown:
 def test_a_loop_that_opens_its_buses_shows_who_it_is_and_takes_no_command_before_they_are_open() -> None:
     with starting() as folder:
         line = load_line((folder / "line.toml").read_text(), "line.toml")
-        private_key(folder / "data")
+        private_key(folder / "data" / GATEWAY_DATA)
 
         def arm() -> Reply:
             return asyncio.run(as_gateway(folder / LOOP_SOCKET, line, folder / "data", Arm()))

@@ -26,6 +26,7 @@ from gateway.core.topics import (
     LOOP_SHOWN,
     LOOP_TELEMETRY,
 )
+from gateway.mailbox.paths import GATEWAY_DATA
 from gateway.mailbox.port import RemoteError, Unreachable
 from gateway.mailbox.unix import UnixMailbox
 from gateway.supervisor.history import History
@@ -120,7 +121,7 @@ def test_from_start_to_sigterm_everything_is_kept() -> None:
                 with pytest.raises(Unreachable, match="r2rgate gateway"):
                     await ask(client)
         assert not (folder / "gateway.sock").exists()
-        with History(folder / "data" / "history.sqlite") as history:
+        with History(folder / "data" / GATEWAY_DATA / "history.sqlite") as history:
             found = history.read_wall(time.time() - 60.0, time.time() + 1.0, ["sequence", "wall_s"])
             assert found["sequence"].tolist() == list(range(150))
             assert abs(found["wall_s"][-1] - time.time()) < 20.0
@@ -141,7 +142,7 @@ def test_an_end_of_which_a_step_fails_takes_the_others_all_the_same() -> None:
             assert said.startswith("gateway of demo/")
             process.terminate()
             assert process.wait(20.0) == 0
-        with History(folder / "data" / "history.sqlite") as history:
+        with History(folder / "data" / GATEWAY_DATA / "history.sqlite") as history:
             events = history.events(0.0, 1e12)
         told = [event.data.get("task") for event in events if event.kind == "task-failed"]
         assert told == ["closing the agents' bus"]
@@ -185,7 +186,7 @@ def test_after_a_sigkill_the_next_gateway_takes_over_and_the_loop_finds_it() -> 
                     await status_with(client, lambda status: status.historian.frames_stored > 0)
                     process.kill()
                     process.wait()
-            with History(folder / "data" / "history.sqlite") as history:
+            with History(folder / "data" / GATEWAY_DATA / "history.sqlite") as history:
                 found = history.read(0.0, 1e12, ["sequence"])["sequence"].tolist()
                 assert found == sorted(set(found))
                 assert len(found) >= 2
@@ -222,7 +223,7 @@ def test_a_loop_may_come_go_and_come_again() -> None:
                 assert status.loop.restarts == 1
                 commands = [event.text for event in status.events if event.kind == "command"]
                 assert len(commands) == 3
-        with History(folder / "data" / "history.sqlite") as history:
+        with History(folder / "data" / GATEWAY_DATA / "history.sqlite") as history:
             stored = [event for event in history.events(0.0, 1e12) if event.kind == "command"]
             assert stored[0].data["uid"] == os.getuid()
             assert stored[0].data["pid"] == os.getpid()
@@ -327,7 +328,7 @@ def test_a_question_of_the_past_costs_the_gateway_no_lock_and_another_program_no
     """Where nobody holds a lock, an SQLite before 3.51 takes itself for the last one and deletes the log."""
 
     async def story(folder: Path) -> None:
-        history = folder / "data" / "history.sqlite"
+        history = folder / "data" / GATEWAY_DATA / "history.sqlite"
         with gateway(folder) as process:
             async with loop_and_client(folder) as (loop, client):
                 client.connect((GATEWAY_PAST,), folder / "gateway.sock")

@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 
 from gateway.cli.main import app
 from gateway.core.line_template import line_template
+from gateway.mailbox.paths import OPERATOR_DATA
 from gateway.operator.users import Users, UsersFile, UsersRefused, change, why_weak
 
 GOOD = "vier warme Walzen"
@@ -182,7 +183,7 @@ def users(place: list[str], *arguments: str, typed: str | None = None) -> tuple[
 
 
 def test_a_user_from_the_first_day_to_the_last(place: list[str]) -> None:
-    path = Path(place[0]).parent / "data" / "users.toml"
+    path = Path(place[0]).parent / "data" / OPERATOR_DATA / "users.toml"
     code, said = users(place, "list")
     assert code == 0 and "nobody may come in" in said
     assert users(place, "add", "anna", "--role", "operator", typed=GOOD + "\n")[0] == 0
@@ -213,12 +214,12 @@ def test_what_cannot_be_is_refused_in_one_sentence_and_nothing_is_written(
 ) -> None:
     code, output = users(place, *arguments, typed=typed + "\n")
     assert code == 2 and said in output and len(output.splitlines()) == 1
-    assert not (Path(place[0]).parent / "data" / "users.toml").exists()
+    assert not (Path(place[0]).parent / "data" / OPERATOR_DATA / "users.toml").exists()
 
 
 def test_a_file_open_to_others_is_not_written_over(place: list[str], anna: Users) -> None:
-    folder = Path(place[0]).parent / "data"
-    folder.mkdir()
+    folder = Path(place[0]).parent / "data" / OPERATOR_DATA
+    folder.mkdir(parents=True)
     anna.write(folder / "users.toml")
     (folder / "users.toml").chmod(0o644)
     code, said = users(place, "add", "bert", typed=GOOD + "\n")

@@ -31,8 +31,8 @@ class NotUsable(Exception):
     """Bytes that are no certificate of an OPC UA application; the text says why."""
 
 
-def pki_folder(line: Line, data_folder: Path) -> Path:
-    return data_folder / "pki" if line.operator.pki is None else Path(line.operator.pki)
+def pki_folder(line: Line, own: Path) -> Path:
+    return own / "pki" if line.operator.pki is None else Path(line.operator.pki)
 
 
 def fingerprint(der: bytes) -> str:

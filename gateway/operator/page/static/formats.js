@@ -28,13 +28,13 @@ export const named = (text) => text.split(/(: |, )/).map((part) => words[`gate.$
 
 export function number(value, digits = 1) {
   if (value == null) return "–";
-  return value.toLocaleString(language, { minimumFractionDigits: digits, maximumFractionDigits: digits }).replace("-", "−");
+  return value.toLocaleString(language, { minimumFractionDigits: digits, maximumFractionDigits: digits, signDisplay: "negative" }).replace("-", "−");
 }
 
 // With as many digits as it needs to be told from its neighbours.
 export function figure(value) {
   if (value == null) return "–";
-  return value.toLocaleString(language, { maximumSignificantDigits: 3, useGrouping: Math.abs(value) >= 1e5 }).replace("-", "−");
+  return value.toLocaleString(language, { maximumSignificantDigits: 3, signDisplay: "negative", useGrouping: Math.abs(value) >= 1e5 }).replace("-", "−");
 }
 
 export function time(wall_s, withDate = false) {
