@@ -274,7 +274,7 @@ def test_the_model_in_service_is_the_prior_only_when_it_is_asked_for_and_one_was
     shutil.copytree(run[0] / "data", data)
     code, _, err = identify(folder, good, "--data-dir", data, "--prior", "in-service")
     assert code == 2 and "no model of demo/line-1 was accepted; allowed: line, a model" in err and not asked
-    with open_repository(data / "models.sqlite") as models:
+    with open_repository(data / GATEWAY_DATA / "models.sqlite") as models:
         (entry,) = models.entries()
         models.mark(entry.id, "accepted", 1.0, "a test")
     for prior in ("in-service", "1", str(run[0] / "new" / "model.json")):
