@@ -1,24 +1,32 @@
 """The runtime monitor: what speaks for the fallback while a configuration controls the line. Pure; time in periods.
 
-It asks nothing of statistics: torques that turn round again and again, torques that are cut again and again, and
-whether the fallback would still recover the line (`recoverability`).
+Torques that chatter, torques that are cut again and again, and whether the fallback would still recover the line
+(`recoverability`).
+
+Chatter is what the gate and a probation measure, by the same limit (gate.chatter_max_nm): the root mean square of a
+torque's change from period to period. They look where nothing moves; here changes that go on the same way are left
+out, so that a step is none, and of a slower swing only its turns count. What is beyond the limit adds up, what is below
+takes off (a cumulative sum, Page 1954): a torque that jumps there and back every period or two is found within tenths
+of a second, one that is a tenth beyond the limit within seconds, and one that the gate has let through, under more
+noise than the line has, never.
 """
 
 from dataclasses import dataclass, field
-from math import ceil
+from math import ceil, sqrt
 
 import numpy as np
 
 from gateway.control.deviation import Measured
 from gateway.core.line import Line
+from gateway.core.line_limits import chatter_limit_nm
 from gateway.core.line_scales import line_scales
 from gateway.core.signals import BoolArray, FloatArray
 from safety.actions import Action, Finding, found
 from safety.recoverability import Recovery
 
 WINDOW_MOMENTS = 25.0
-REVERSAL_SHARE_OF_STEP = 0.5  #: of the most that a torque may change by in a period: moves of more count
-REVERSALS = 0.3  #: share of the window's periods in which a drive turns round: it chatters
+CHATTERED = 2.0  #: windows that a torque may have chattered by sqrt(2) of the limit, or half of one by sqrt(5) of it
+MOST = 3.0  #: times the limit that a change counts for: where rates are high, a step and its way back are no chatter
 CUT = 0.5  #: share of the window's periods in which a torque is cut
 UNRECOVERABLE = {"span": "unrecoverable-tension", "roller": "unrecoverable-speed"}
 
@@ -26,17 +34,23 @@ UNRECOVERABLE = {"span": "unrecoverable-tension", "roller": "unrecoverable-speed
 @dataclass(frozen=True, slots=True)
 class MonitorLimits:
     n: int
-    reversal_nm: float
+    chatter_nm: float  #: root mean square
     window: int  #: periods
-    reversals: int  #: of one drive within the window
     cuts: int
+
+    @property
+    def beyond_nm2(self) -> float:
+        """What squared changes of one torque may add up to beyond the limit."""
+        return CHATTERED * self.window * self.chatter_nm**2
 
 
 def monitor_limits(line: Line) -> MonitorLimits:
-    period_s = line.control.period_s
     window = max(10, line_scales(line).periods(WINDOW_MOMENTS))
-    reversal_nm = REVERSAL_SHARE_OF_STEP * line.limits.torque_rate_nm_per_s * period_s
-    return MonitorLimits(line.n, reversal_nm, window, ceil(REVERSALS * window), ceil(CUT * window))
+    return MonitorLimits(line.n, chatter_limit_nm(line), window, ceil(CUT * window))
+
+
+def _none() -> FloatArray:
+    return np.zeros(0)
 
 
 @dataclass(slots=True)
@@ -44,9 +58,10 @@ class MonitorState:
     """Since a configuration took over."""
 
     before_nm: FloatArray | None = None  #: (n,)
-    way: FloatArray = field(default_factory=lambda: np.zeros(0))  #: -1 or 1: of each drive's last move that counts
-    turned: list[BoolArray] = field(default_factory=list[BoolArray])  #: of the window's periods, (n,) each
-    counts: FloatArray = field(default_factory=lambda: np.zeros(0))  #: (n,), turns in the window
+    last_nm: FloatArray = field(default_factory=_none)  #: (n,), the last change of each torque that was none of 0
+    counted: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))  #: whether that was chatter already
+    beyond_nm2: FloatArray = field(default_factory=_none)  #: (n,), what chatter adds up to beyond the limit, squared
+    periods: FloatArray = field(default_factory=_none)  #: (n,), since which it does
     cut: list[bool] = field(default_factory=list[bool])
     cuts: int = 0
 
@@ -55,22 +70,22 @@ def look(limits: MonitorLimits, state: MonitorState, torque_nm: FloatArray, cut:
     """A period's torque (n,) that is about to be sent, and whether a limit cut it: what speaks against the law."""
     if state.before_nm is None:
         state.before_nm = torque_nm
-        state.way, state.counts = np.zeros(limits.n), np.zeros(limits.n)
+        state.last_nm, state.beyond_nm2, state.periods = np.zeros((3, limits.n))
+        state.counted = np.zeros(limits.n, dtype=np.bool_)
         return []
-    state.way, turned = _turns(state.way, torque_nm - state.before_nm, limits.reversal_nm)
+    _chatter(limits.chatter_nm, state, torque_nm - state.before_nm)
     state.before_nm = torque_nm
-    state.turned.append(turned)
-    state.counts += turned
     state.cut.append(cut)
     state.cuts += cut
     if len(state.cut) > limits.window:
-        state.counts -= state.turned.pop(0)
         state.cuts -= state.cut.pop(0)
     findings: list[Finding] = []
-    if state.counts.max() >= limits.reversals:
-        i = int(state.counts.argmax())
-        counts = {"reversals": int(state.counts[i]), "periods": len(state.cut), "allowed": limits.reversals - 1}
-        findings.append(found("chattering", Action.NONE, roller=i + 1, reversal_nm=limits.reversal_nm, **counts))
+    if not state.beyond_nm2.max() < limits.beyond_nm2:  # what is no number is beyond
+        i = int(state.beyond_nm2.argmax())
+        periods = max(int(state.periods[i]), 1)
+        chatter_nm = sqrt(limits.chatter_nm**2 + float(state.beyond_nm2[i]) / periods)
+        told = {"chatter_nm": chatter_nm, "periods": periods, "allowed_nm": limits.chatter_nm}
+        findings.append(found("chattering", Action.NONE, roller=i + 1, **told))
     if state.cuts >= limits.cuts:
         counts = {"cuts": state.cuts, "periods": len(state.cut), "allowed": limits.cuts - 1}
         findings.append(found("torque-cut", Action.NONE, **counts))
@@ -92,7 +107,16 @@ def recoverable(
     return [] if short is None else [found(UNRECOVERABLE[short.what], Action.STOP, **short.parameters)]
 
 
-def _turns(way: FloatArray, move_nm: FloatArray, reversal_nm: float) -> tuple[FloatArray, BoolArray]:
-    """Which torques turn round by a period's `move_nm`, and the sign of the last move of each that counts; (n,)."""
-    now = np.where(np.abs(move_nm) > reversal_nm, np.sign(move_nm), way)
-    return now, now * way < 0.0
+def _chatter(limit_nm: float, state: MonitorState, change_nm: FloatArray) -> None:
+    """A period's changes (n,) of the torques: where one turns round, it and the one that it turns round count.
+
+    What is no number turns round.
+    """
+    change_nm = np.clip(change_nm, -MOST * limit_nm, MOST * limit_nm)
+    turned = ~(change_nm * state.last_nm >= 0.0)
+    square: FloatArray = change_nm**2 + np.where(state.counted, 0.0, state.last_nm**2)
+    state.beyond_nm2 = np.maximum(state.beyond_nm2 + np.where(turned, square, 0.0) - limit_nm**2, 0.0)
+    state.periods = np.where(state.beyond_nm2 > 0.0, state.periods + 1.0, 0.0)
+    moved = change_nm != 0.0
+    state.counted = np.where(moved, turned, state.counted)
+    state.last_nm = np.where(moved, change_nm, state.last_nm)

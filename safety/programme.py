@@ -12,7 +12,7 @@ from gateway.control.judged_courses import CornerCourses, programme_courses
 from gateway.control.mpc_linear import unconstrained
 from gateway.control.rollout import Rollouts, simulate
 from gateway.core.controller_laws import MpcConfig
-from gateway.core.line_limits import tension_bands_n
+from gateway.core.line_limits import chatter_limit_nm, tension_bands_n
 from gateway.core.line_scales import line_scales
 from safety.case import Case
 from safety.corner_runs import corners_held
@@ -79,7 +79,7 @@ def _fails_in_small(case: Case) -> bool:
         and (found.tension_max_n <= high).all()
         and found.tail_swing_n[:, spans].max() <= gate.tail_oscillation_max_n
         and found.tail_error_n[:, spans].max() <= gate.tail_error_max_n
-        and found.chatter_nm.max() <= gate.chatter_max_nm
+        and found.chatter_nm.max() <= chatter_limit_nm(case.line)
         for found in in_small(case).values()
     )
 

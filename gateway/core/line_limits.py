@@ -13,6 +13,9 @@ if TYPE_CHECKING:  # what the line's file leaves out is derived from these
     from gateway.core.line import Drive, Line
 
 
+OF_GREATEST_CHANGE = 0.7  #: of a torque in a period: there and back every period is chatter by any measure
+
+
 def torque_limits_nm(line: "Line") -> FloatArray:
     """Of each roller's drive (n,), either direction."""
     common = line.limits.torque_nm
@@ -24,6 +27,15 @@ def torque_limit_nm(line: "Line", roller: int) -> float:
     if not 1 <= roller <= len(line.rollers):
         return line.limits.torque_nm
     return float(torque_limits_nm(line)[roller - 1])
+
+
+def chatter_limit_nm(line: "Line") -> float:
+    """By how much a torque may change from period to period, root mean square, where nothing moves.
+
+    As the gate has it; where drives change so slowly that none could chatter by it, most of what they can.
+    """
+    most_nm = line.limits.torque_rate_nm_per_s * line.control.period_s
+    return min(line.gate.chatter_max_nm, OF_GREATEST_CHANGE * most_nm)
 
 
 def motor_torque_limit_nm(line: "Line", drive: "Drive") -> float:

@@ -14,7 +14,7 @@ from gateway.control.mpc_linear import unconstrained
 from gateway.control.rollout import Rollouts, simulate
 from gateway.core.controller import Controller
 from gateway.core.controller_laws import MpcConfig
-from gateway.core.line_limits import tension_bands_n, torque_limits_nm
+from gateway.core.line_limits import chatter_limit_nm, tension_bands_n, torque_limits_nm
 from gateway.core.signals import FloatArray
 from gateway.core.verdict import RuleFinding
 from safety import programme
@@ -124,9 +124,9 @@ def _limits(case: Case, worst: Worst) -> list[RuleFinding]:
             f"{gate.tail_error_max_n:g} N",
         ),
         at_most(
-            "corners: chatter", chatter, gate.chatter_max_nm, "Nm",
+            "corners: chatter", chatter, chatter_limit_nm(case.line), "Nm",
             f"torque moves by {_n(chatter, 'Nm')} rms from period to period ({chatter_at}); allowed: "
-            f"gate.chatter_max_nm, {gate.chatter_max_nm:g} Nm",
+            f"gate.chatter_max_nm, {chatter_limit_nm(case.line):g} Nm",
         ),
     ]  # fmt: skip
 
