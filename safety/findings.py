@@ -23,6 +23,17 @@ def at_most(rule: str, value: float, limit: float, unit: str, text: str) -> Rule
     return _of_number(rule, -inf < value <= limit, value, limit, limit - value, unit, text)
 
 
+def share_of(found: RuleFinding, tension_step_n: float) -> float | None:
+    """Its margin as a share of value or limit, the greater; of a tension at least of the step: zero is no measure.
+
+    None of what has no number.
+    """
+    if found.margin is None or found.value is None or found.limit is None:
+        return None
+    scale = max(abs(found.value), abs(found.limit), tension_step_n if found.rule.endswith(" tension") else 0.0)
+    return found.margin / scale if scale > 0.0 else 0.0
+
+
 def _of_number(rule: str, passed: bool, value: float, limit: float, margin: float, unit: str, text: str) -> RuleFinding:
     return RuleFinding(
         rule=rule, passed=bool(passed), text=_short(text), value=_finite(value), limit=_finite(limit),

@@ -1,6 +1,7 @@
 """The judge: what every rule finds of a proposal, and nothing else. Pure: no clock, no files, no chance of its own.
 
-The same bytes, context, line, recordings and seed give the same verdict. A rule that fails is a refusal.
+The same bytes, context, line, recordings and seed give the same verdict. A rule that fails is a refusal. A finding near
+its limit is drawn again (`draws`).
 """
 
 from collections.abc import Callable, Sequence
@@ -20,18 +21,23 @@ from gateway.core.line import Line
 from gateway.core.proposal import Proposal, ProposalRefused, parse_proposal, proposal_hash
 from gateway.core.recording import Recording
 from gateway.core.theta import expected_noise, nominal_theta
-from gateway.core.verdict import RuleFinding, ScenarioFigures, Verdict, line_hash
+from gateway.core.verdict import OF_THE_MOMENT, RuleFinding, ScenarioFigures, Verdict, line_hash
 from safety.case import Case
+from safety.draws import GoesOn, drawn_again, words_on
 from safety.findings import told
-from safety.rules import roller_speed
+from safety.rules import alignment, authority, roller_speed, validity
 from safety.rules.table import FIGURES, REPORTED, RULES, Rule
 from safety.simulated import plants_under_stress, setup_of
 
 FORMAT_RULE, DATA_RULE = "format", "data"
+OF_NO_DESIGN = OF_THE_MOMENT | {authority.RULE, validity.RULE, alignment.RULE}
 
 
-def judge(payload: bytes, context: JudgeContext, line: Line, recordings: Sequence[Recording], seed: int) -> Verdict:
-    """`recordings` as `context.data` names them, one for each, in that order."""
+def judge(
+    payload: bytes, context: JudgeContext, line: Line, recordings: Sequence[Recording], seed: int,
+    goes_on: GoesOn = lambda: None,
+) -> Verdict:  # fmt: skip
+    """`recordings` as `context.data` names them, one for each, in that order. `goes_on`: it will take as long again."""
     try:
         proposal = parse_proposal(payload, line.gate.proposal_max_bytes)
     except ProposalRefused as refused:
@@ -42,12 +48,26 @@ def judge(payload: bytes, context: JudgeContext, line: Line, recordings: Sequenc
     if wrong := _wrong_data(context, recordings):
         return _verdict(payload, context, line, seed, proposal, [told(DATA_RULE, False, text) for text in wrong])
     with np.errstate(all="ignore"):  # numbers that run away are found by the rules, not by warnings
-        findings = [finding for rule in RULES[proposal.kind] for finding in _asked(rule, case)]
+        found = [(rule, _asked(rule, case)) for rule in RULES[proposal.kind]]
+        findings = drawn_again(case, found, _asked, goes_on)
+        at_first = [finding for _, some in found for finding in some]
         reported = [finding for rule in REPORTED[proposal.kind] for finding in _asked(rule, case)]
+        reported += words_on(at_first, findings)
         figures = _figures(case)
     accepted = all(finding.passed for finding in findings)
     region = _region(case) if accepted and proposal.kind == "gains" else None
     return _verdict(payload, context, line, seed, proposal, findings, reported, figures, region)
+
+
+def findings_on_design(proposal: Proposal, context: JudgeContext, line: Line, seed: int) -> list[RuleFinding]:
+    """Of a configuration that nobody has proposed yet: no verdict, for some rules are not asked (`OF_NO_DESIGN`).
+
+    Those that speak of the moment, of who proposes, and of the model and its data, which are the same for every design.
+    """
+    case = Case(line, context, proposal, proposal_hash(proposal), (), seed)
+    with np.errstate(all="ignore"):
+        rules = [rule for rule in RULES[proposal.kind] if rule.name not in OF_NO_DESIGN]
+        return drawn_again(case, [(rule, _asked(rule, case)) for rule in rules], _asked, lambda: None)
 
 
 def refusal(payload: bytes, context: JudgeContext, line: Line, seed: int, rule: str, text: str) -> Verdict:

@@ -38,12 +38,12 @@ from gateway.supervisor.configurations import Configurations
 from gateway.supervisor.deployer import Deployer
 from gateway.supervisor.experiments import ENDS, MOST_EXPERIMENTS
 from gateway.supervisor.gate import Gate
-from gateway.supervisor.judging import LARGEST_SEED
 from gateway.supervisor.lifecycle import Stage
 from gateway.supervisor.models import Models
 from gateway.supervisor.recent import Recent
 from gateway.supervisor.store import boot_id
 from gateway.supervisor.surroundings import LineSurroundings
+from safety.draws import seed_of
 from safety.judge import failed, judge
 
 BEGIN = datetime(2026, 1, 5, 6, 0, tzinfo=UTC)  #: of the stepped clock
@@ -70,14 +70,14 @@ def approve_all(shown: ProposalShown) -> bool:
 
 
 class SteppedJudge:
-    """The judge in this process; each verdict has a seed of its own, drawn from one."""
+    """The judge in this process. `seed`: from which those of its verdicts follow."""
 
     def __init__(self, loop: SteppedLoop, seed: int) -> None:
         self._line = loop.line
-        self._seeds = np.random.default_rng([seed, 11])
+        self._secret = str(seed).encode()
 
     async def judge(self, payload: bytes, context: JudgeContext, recordings: list[Recording]) -> Verdict:
-        seed = int(self._seeds.integers(LARGEST_SEED))
+        seed = seed_of(self._secret, payload, context, self._line)
         try:
             return judge(payload, context, self._line, recordings, seed)
         except Exception as error:  # whatever it is, it is no yes

@@ -8,6 +8,7 @@ import asyncio
 import os
 import secrets
 import signal
+import time
 from collections.abc import Sequence
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
@@ -23,11 +24,12 @@ from gateway.core.verdict import Verdict
 from gateway.mailbox.spawned import end_with_parent, interrupt_later, one_thread_each
 
 NICER, NICEST = 10, 19  #: than the process that starts them; and where nobody waits for a verdict
-LONGER = 4.0  #: times gate.verdict_max_s: what is nicest has only what the others leave of the processors
+#: Times gate.verdict_max_s: all draws of a verdict; and of what is nicest, which has only what the others leave, each.
+LONGER = 4.0
 BEGIN_S = 600.0  #: until one is ready: on a new machine it compiles first
-LARGEST_SEED = 2**53  #: below it every number is one in JSON, too
 #: Rules under which this process refuses by itself.
 TIME_RULE, WORKER_RULE = "time", "judge process"
+GOES_ON = "goes on"  #: of a worker that draws again, and has its time anew
 
 
 Answer = TypeVar("Answer", Verdict, Courses)
@@ -44,11 +46,11 @@ class NoVerdict(Exception):
 class _Worker:
     """One process, and the pipe to it. Its methods block: they are for threads."""
 
-    def __init__(self, line: Line, nicer: int) -> None:
+    def __init__(self, line: Line, nicer: int, secret: bytes) -> None:
         """Raises NoVerdict."""
         context = get_context("spawn")
         self._ours, theirs = context.Pipe()
-        self._process: BaseProcess = context.Process(target=_work, args=(theirs, line, nicer), daemon=True)
+        self._process: BaseProcess = context.Process(target=_work, args=(theirs, line, nicer, secret), daemon=True)
         try:
             with one_thread_each(), interrupt_later():
                 self._process.start()
@@ -90,9 +92,13 @@ class _Worker:
 
     def _answer(self, limit_s: float, missing: str) -> object:
         try:
-            if not self._ours.poll(limit_s):
-                raise NoVerdict(TIME_RULE, f"the judge {missing} within {limit_s:g} s, and none in time is a refusal")
-            return self._ours.recv()
+            until_s = time.monotonic() + LONGER * limit_s  # of all draws
+            while True:
+                if not self._ours.poll(min(limit_s, max(until_s - time.monotonic(), 0.0))):
+                    text = f"the judge {missing} within {limit_s:g} s, and none in time is a refusal"
+                    raise NoVerdict(TIME_RULE, text)
+                if (answer := self._ours.recv()) != GOES_ON:
+                    return answer
         except (EOFError, OSError) as error:
             raise NoVerdict(WORKER_RULE, "the judge's process has ended before it gave a verdict") from error
 
@@ -100,9 +106,11 @@ class _Worker:
 class JudgeWorkers:
     """Processes begin with the first proposal that needs them, or with `async with`; `close` ends them."""
 
-    def __init__(self, line: Line, count: int = 1, nicer: int = NICER) -> None:
+    def __init__(self, line: Line, count: int = 1, nicer: int = NICER, secret: bytes | None = None) -> None:
+        """`secret`: from which seeds follow (`safety.draws.seed_of`); without, one of its own."""
         self._line = line
         self._nicer = nicer
+        self._secret = secrets.token_bytes() if secret is None else secret
         self._idle: asyncio.Queue[_Worker | None] = asyncio.Queue()
         for _ in range(count):
             self._idle.put_nowait(None)
@@ -146,9 +154,9 @@ class JudgeWorkers:
     ) -> Verdict:
         """Always a verdict: where none comes within `limit_s` (gate.verdict_max_s), a refusal that says so.
 
-        `seed` None: drawn anew, so that nobody can prepare a proposal for it.
+        A worker that draws again has as long for each draw, and four times as long for all. `seed` None: as the secret
+        has it of what is proposed.
         """
-        seed = secrets.randbelow(LARGEST_SEED) if seed is None else seed
         limit_s = self._line.gate.verdict_max_s if limit_s is None else limit_s
         try:
             return await self._asked((payload, context, list(recordings), seed), limit_s, Verdict)
@@ -186,15 +194,15 @@ class JudgeWorkers:
 
     def _begun(self) -> _Worker:
         """Raises NoVerdict."""
-        worker = _Worker(self._line, self._nicer)
+        worker = _Worker(self._line, self._nicer, self._secret)
         self._all.add(worker)
         return worker
 
 
-def _refusal(payload: bytes, context: JudgeContext, line: Line, seed: int, none: NoVerdict) -> Verdict:
+def _refusal(payload: bytes, context: JudgeContext, line: Line, seed: int | None, none: NoVerdict) -> Verdict:
     from safety.judge import refusal  # loads all that the judge needs, which takes its time
 
-    return refusal(payload, context, line, seed, none.rule, str(none))
+    return refusal(payload, context, line, seed or 0, none.rule, str(none))  # where nothing was drawn it is no matter
 
 
 def _forgotten(asked: "asyncio.Future[Any]") -> None:
@@ -203,11 +211,12 @@ def _forgotten(asked: "asyncio.Future[Any]") -> None:
         asked.exception()
 
 
-def _work(pipe: Connection, line: Line, nicer: int) -> None:
+def _work(pipe: Connection, line: Line, nicer: int, secret: bytes) -> None:
     """A worker's life: ready, then a verdict or courses for each job, until the other end is gone."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the process that has started this one
     end_with_parent()
     os.nice(nicer)
+    from safety.draws import seed_of
     from safety.judge import failed, judge, warm_up
 
     warm_up(line)
@@ -220,9 +229,10 @@ def _work(pipe: Connection, line: Line, nicer: int) -> None:
                 continue
             recordings, seed = job
             try:
-                verdict = judge(payload, context, line, recordings, seed)
+                seed = seed_of(secret, payload, context, line) if seed is None else seed
+                verdict = judge(payload, context, line, recordings, seed, lambda: pipe.send(GOES_ON))
             except Exception as error:  # whatever it is, it is no yes
-                verdict = failed(payload, context, line, seed, error)
+                verdict = failed(payload, context, line, seed or 0, error)
             pipe.send(verdict)
     except (EOFError, OSError):
         return

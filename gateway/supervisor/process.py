@@ -36,7 +36,7 @@ from gateway.supervisor.deployer_sides import JudgeSide
 from gateway.supervisor.dry_runs import DryRuns
 from gateway.supervisor.experiments import MOST_EXPERIMENTS, recent_experiments
 from gateway.supervisor.gate import Gate
-from gateway.supervisor.gateway_key import gateway_key
+from gateway.supervisor.gateway_key import gateway_key, seeds_secret
 from gateway.supervisor.head_told import HeadTold
 from gateway.supervisor.historian import Historian
 from gateway.supervisor.history import HistoryError
@@ -65,7 +65,8 @@ SHOWN_TIME_S = 1.0  #: for the loop to show who it is
 def run_gateway(line: Line, run_folder: Path, data_folder: Path) -> int:
     """Serve until SIGTERM or SIGINT. Returns the process's exit code."""
     try:
-        return asyncio.run(serve(line, run_folder, data_folder, JudgeWorkers(line), give_back=GivenBack().look))
+        judge = JudgeWorkers(line, secret=seeds_secret(data_folder / GATEWAY_DATA))
+        return asyncio.run(serve(line, run_folder, data_folder, judge, give_back=GivenBack().look))
     except AlreadyRunning as error:
         print(f"a gateway runs here already, this one ends: {error}", file=sys.stderr)
         return EXIT_ALREADY_RUNNING
@@ -157,7 +158,7 @@ async def serve(
     PersonsDesk(mailbox, gateway.command, gate.decide, alarms.say, operated, clock, gateway.note)
     gate.roles = AccessDesk(mailbox, gate.audit.append, clock).roles
     # One process for what nobody's verdict may wait for.
-    beside = JudgeWorkers(line, nicer=NICEST)
+    beside = JudgeWorkers(line, nicer=NICEST, secret=seeds_secret(own, of="dry runs"))
     courses = CoursesDesk(mailbox, lambda: gate.deployer, beside)
     past = Past(line, mailbox, own, lambda: historian.path)
     dry_runs = DryRuns(line, beside)
