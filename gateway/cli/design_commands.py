@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 import typer
 
 from gateway.cli.operate_commands import RunFolder
-from gateway.cli.process_commands import REFUSED, DataFolder, LineFile, default_data_folder, read_line
+from gateway.cli.process_commands import REFUSED, DataFolder, LineFile, read_line
 from gateway.core.line import Line
 from gateway.core.line_model import LineModel
-from gateway.mailbox.paths import GATEWAY_DATA
 
 if TYPE_CHECKING:
     from gateway.cli.asked_agents import AskedAgents
+    from gateway.commissioning.beforehand import Beforehand
 
 
 class LawName(StrEnum):
@@ -67,6 +67,8 @@ def design(
     Candidates run on the nominal model and on lines within its tolerances. One that would stand less than 4 ms more
     delay, or leave the tension limits, is not offered. Weights of the score: \\[priorities] of the line's file. Beside
     OUT lie OUT's .design.json (every attempt with its reason) and .design.html (the report). About three minutes.
+    The best of each is judged as the gate would, against what is in service where the line has run; what it refuses is
+    made calmer, and what it still refuses is not chosen.
     With --model (r2rgate models) the identified model and its intervals stand in place of FILE's values and tolerances.
     With --agents they are asked what there is to choose (docs/agents.md); what they say stands in the report.
 
@@ -78,6 +80,7 @@ def design(
 
     Example, on what was identified last: r2rgate design line.toml --model newest
     """
+    from gateway.cli.data_place import gateway_folder
     from gateway.control.design import DesignRefused
 
     line = read_line(file)
@@ -96,7 +99,11 @@ def design(
             _first_guess(line, identified, names, speeds, out, as_json)
         else:
             with _asked(line, run_dir) if agents else nullcontext() as asked:
-                _phase(line, identified, names, scenario or [], speeds, iterations, seed, out, as_json, asked)
+                gate, judged = _gate(line, identified, data_dir, run_dir, seed)
+                _phase(
+                    line, identified, names, scenario or [], speeds, iterations, seed, out, as_json, asked, gate,
+                    judged, gateway_folder(line, data_dir),
+                )  # fmt: skip
     except DesignRefused as refused:
         _refuse(f"no controller for {file}: {refused}")
 
@@ -181,6 +188,9 @@ def _phase(
     out: Path,
     as_json: bool,
     asked: "AskedAgents | None",
+    gate: "Beforehand",
+    judged: str,
+    folder: Path,
 ) -> None:
     from gateway.cli.audit_against import head_in
     from gateway.cli.design_phase import ANSWER_S, RULES_DECIDE, run_design
@@ -206,14 +216,14 @@ def _phase(
             line, scenarios, names, iterations, seed, progress.attempted, speeds, model,
             decider=RULES_DECIDE if asked is None else asked,
             answer_s=ANSWER_S if asked is None else 2.0 * asked.within_s,  # they see to their own time
-            on_decision=progress.decided,
+            on_decision=progress.decided, gate=gate,
         )  # fmt: skip
-    result = result_of(line, found, seed, model)
+    result = result_of(line, found, seed, model, judged)
     if found.chosen is not None and found.chosen.config is not None:
         _write(out, canonical(found.chosen.config) + b"\n")
     record, report = _beside(out)
     _write(record, (result.model_dump_json(indent=2) + "\n").encode())
-    folder, page = default_data_folder(line) / GATEWAY_DATA, page_of(result, found)
+    page = page_of(result, found)
     in_service = unconfirmed_in(read_records(folder).book) if head_in(folder) else []
     page = replace(page, audit_head=head_in(folder), notes=(*in_service, *page.notes))
     _write(report, render_page(page).encode())
@@ -232,6 +242,25 @@ def _phase(
             f"on a line that runs: r2rgate propose {quote(str(out))} --reason TEXT; on one that does not: "
             f"r2rgate run FILE --controller {quote(str(out))}"
         )
+
+
+def _gate(
+    line: Line, model: LineModel | None, data_dir: Path | None, run_dir: Path | None, seed: int
+) -> "tuple[Beforehand, str]":
+    """By which candidates are judged, and against what they are. Raises DesignRefused."""
+    from gateway.cli.line_in_service import context_of, in_service, stands
+    from gateway.commissioning.beforehand import Beforehand
+    from gateway.core.controller import ControllerRefused
+    from gateway.supervisor.configurations import ConfigurationsError
+
+    try:
+        held, at = in_service(line, data_dir), stands(line, run_dir)
+    except (ConfigurationsError, ControllerRefused) as error:
+        _refuse(f"what is in service is not known: {error}")
+    except OSError as error:
+        _refuse(f"what is in service cannot be read: {error}")
+    said = "; ".join(one.said for one in (held, at) if one is not None) or "as of a line that is new"
+    return Beforehand(line, context_of(line, model, held, at), seed), said
 
 
 def _beside(out: Path) -> tuple[Path, Path]:

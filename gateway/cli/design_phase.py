@@ -7,6 +7,7 @@ from gateway.cli.asked_in_time import InTime
 from gateway.cli.design_tuning import Finished, Tuning, step_time_s, tuned_in_workers
 from gateway.commissioning.architectures import ARCHITECTURES
 from gateway.commissioning.assessment import Assessment, assess
+from gateway.commissioning.beforehand import Beforehand
 from gateway.commissioning.belief import words_on
 from gateway.commissioning.decisions import RULES, Decided, Decider, Rules
 from gateway.commissioning.design_questions import (
@@ -64,11 +65,12 @@ def run_design(
     decider: Decider = RULES_DECIDE,
     answer_s: float = ANSWER_S,
     on_decision: Callable[[DecisionRecord], None] = lambda decision: None,
+    gate: Beforehand | None = None,
 ) -> Design:
     """Tune, compare, choose, on the line's nominal model or on `model`. Raises DesignRefused where none can begin.
 
     `decider` is asked wherever there is something to choose; it has `answer_s` for each question, and where it fails
-    the rules decide.
+    the rules decide. `gate`: by which candidates are judged beforehand.
     """
     ground = ground_of(line, scenarios, BOX_PLANTS, seed, speeds_m_per_s, model)
     assessment = assess(line, ground.task)
@@ -83,7 +85,7 @@ def run_design(
         said = words_on(model, f"model {model_hash(model)[:12]}", scenarios)
         assessment = assessment.model_copy(update={"sentences": [*said, *assessment.sentences]})
     questions = {name: MOST_ASKED if name == first else LESS_ASKED for name in names}
-    how = Tuning(line.site, line.line, iterations, questions)
+    how = Tuning(line.site, line.line, iterations, questions, gate)
     finished = tuned_in_workers(ground, how, asking.decider, on_attempt)
     candidates = ranked([_candidate(one, ground, line, otherwise) for one in finished])
     chosen = _chosen(line, candidates, asking)
@@ -111,7 +113,7 @@ class _Asking:
 
 def _chosen(line: Line, candidates: Sequence[Candidate], asking: _Asking) -> str:
     """The architecture of C*; "" where nothing can be offered."""
-    if candidates[0].score is None:
+    if not candidates[0].can_be_chosen:
         return ""
     return asking.of(selection_question(line, candidates, explanation(candidates))).option
 
@@ -135,4 +137,5 @@ def _candidate(one: Finished, ground: Ground, line: Line, otherwise: Priorities 
         one.refused,
         line.priorities,
         otherwise,
+        one.gate,
     )

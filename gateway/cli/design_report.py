@@ -23,8 +23,8 @@ from gateway.wording.catalogue import sentence
 BEFORE_S, AFTER_S = 0.5, 2.5  #: of the change, that the charts show
 
 HEADS = (
-    "Law", "RMSE, N", "t_s, s", "Overshoot, %", "Effort, (Nm)² s", "R, N", "Step, µs", "Delay margin, ms", "J, N² s",
-    "S",
+    "Law", "RMSE, N", "t_s, s", "Overshoot, %", "Effort, (Nm)² s", "R, N", "Step, µs", "Delay margin, ms",
+    "S", "Gate",
 )  # fmt: skip
 
 

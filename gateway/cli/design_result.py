@@ -38,6 +38,7 @@ class DesignResult(Strict):
     candidates: list[Candidate]  #: the one with the least score first
     tuning: list[TuningResult]
     chosen: str  #: the architecture; "" where none can be offered
+    judged: str = ""  #: against what the gate was asked beforehand; "": it was not
     controller: str  #: hash of the configuration; "" likewise
     explanation: list[str]
 
@@ -45,7 +46,7 @@ class DesignResult(Strict):
 LIBRARIES = ("r2rgate", "numpy", "scipy", "numba", "daqp", "osqp")
 
 
-def result_of(line: Line, found: Design, seed: int, model: LineModel | None = None) -> DesignResult:
+def result_of(line: Line, found: Design, seed: int, model: LineModel | None = None, judged: str = "") -> DesignResult:
     """The outcome of phase 1, to be kept."""
     name = "" if found.chosen is None else found.chosen.architecture
     chosen = next((one for one in found.candidates if one.architecture == name), None)
@@ -74,6 +75,7 @@ def result_of(line: Line, found: Design, seed: int, model: LineModel | None = No
             for one in found.finished
         ],
         chosen=name,
+        judged=judged,
         controller=chosen.hash if chosen else "",
         explanation=found.explanation,
     )

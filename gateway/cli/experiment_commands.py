@@ -8,12 +8,10 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
-from gateway.cli.data_place import own_folder
 from gateway.cli.operate_commands import REFUSED, UNREACHABLE, Json, RunFolder
-from gateway.cli.process_commands import ControllerFile, DataFolder, LineFile, default_data_folder, read_line
+from gateway.cli.process_commands import ControllerFile, DataFolder, LineFile, read_line
 from gateway.core.line import Line
 from gateway.files import MOST_BYTES, read_bytes
-from gateway.mailbox.paths import CONTROLLER, LOOP_DATA
 
 if TYPE_CHECKING:
     from gateway.core.controller import Controller
@@ -38,22 +36,27 @@ def design(
     controller: ControllerFile = None,
     data_dir: DataFolder = None,
     out: Annotated[Path, typer.Option(help="The experiment to write.")] = Path("experiment.json"),
-    recipe: Annotated[str, typer.Option(help="Where the line stands; without: the first recipe.")] = "",
+    recipe: Annotated[
+        str, typer.Option(help="Where the line stands; without: as it stands now, or the first recipe.")
+    ] = "",
     speed: Annotated[
         list[float] | None, typer.Option(help="Of a leg in m/s; repeatable. Without: two that suit the tolerances.")
     ] = None,
     strong: Annotated[float, typer.Option(min=1e-4, help="95 % half-width wanted of EA/L, R/J and f/J, in %.")] = 0.5,
     rest: Annotated[float, typer.Option(min=1e-4, help="The same of EA, L, R, J and f, in %.")] = 3.0,
     seed: Annotated[int, typer.Option(min=0, help="Of the levels.")] = 0,
+    run_dir: RunFolder = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print experiment, intervals and reasons as JSON.")] = False,
 ) -> None:
     """Design an experiment: amplitude, dwell and duration from the line's tolerances, with the reasons in words.
 
     As little movement as tells what is wanted; tensions are foreseen on the corners of the tolerances, under the
-    controller in service (--controller; without: the one in --data-dir, or the lqi that `run` would design).
+    controller in service (--controller; without: as the line's records have it, or the lqi that `run` would design),
+    from where set-points stand now, or from a recipe.
 
     Example: r2rgate experiment design line.toml --out experiment.json
     """
+    from gateway.cli.line_in_service import stands as standing
     from gateway.cli.waiting import interruptible, progress
     from gateway.core.experiment import ExperimentRefused, canonical, experiment_hash
     from gateway.identification.experiment_design import Wanted, design_experiment
@@ -64,14 +67,19 @@ def design(
     if stands is None:
         _refuse(f"there is no recipe {recipe!r}; known: {', '.join(recipes)}")
     config, said = _controller(line, file, controller, data_dir)
+    now = None if recipe else standing(line, run_dir)
+    now = None if now is None or now.speed_m_per_s <= 0.0 else now  # at rest nothing is told
+    tension_n, speed_m_per_s = (
+        (stands.tension_n, stands.speed_m_per_s) if now is None else (now.tension_n, now.speed_m_per_s)
+    )
     try:
         with interruptible(f"{out} is as before"), progress() as show:
             show("simulating amplitudes, dwells and durations on corners of the tolerances: a minute")
             found = design_experiment(
                 line,
                 config,
-                tension_n=stands.tension_n,
-                speed_m_per_s=stands.speed_m_per_s,
+                tension_n=tension_n,
+                speed_m_per_s=speed_m_per_s,
                 speeds_m_per_s=speed or None,
                 wanted=Wanted(0.01 * strong, 0.01 * rest),
                 seed=seed,
@@ -85,7 +93,8 @@ def design(
     if as_json:
         typer.echo(json.dumps(_document(found), indent=2))
         return
-    typer.echo("\n".join([f"for {said}", *found.reasons]))
+    where = now.said if now is not None else f"recipe {stands.name}"
+    typer.echo("\n".join([f"for {said}; from {where}", *found.reasons]))
     typer.echo(f"{out}: {experiment_hash(found.experiment)[:12]}")
     name = quote(str(out))
     typer.echo(f"next: r2rgate propose {name} --reason TEXT; a simulated line takes r2rgate experiment run {name}, too")
@@ -150,22 +159,28 @@ def abort(run_dir: RunFolder = None, as_json: Json = False) -> None:
 
 def _controller(line: Line, file: Path, given: Path | None, data_dir: Path | None) -> tuple["Controller", str]:
     """The configuration in service, and what to call it."""
+    from gateway.cli.line_in_service import in_service
     from gateway.control.design import DesignRefused, design_lqi, task_of
     from gateway.core.controller import ControllerRefused, config_hash, parse_controller
+    from gateway.supervisor.configurations import ConfigurationsError
 
-    path = given or own_folder(data_dir or default_data_folder(line), LOOP_DATA) / CONTROLLER
+    if given is not None:
+        try:
+            config = parse_controller(read_bytes(given, MOST_BYTES))
+        except FileNotFoundError:
+            _refuse(f"there is no controller configuration at {given}")
+        except OSError as error:
+            _refuse(f"{given} cannot be read: {error.strerror}")
+        except ControllerRefused as refused:
+            _refuse(f"{given} is not used: {refused}")
+        return config, f"the {config.kind} controller in {given}, {config_hash(config)[:12]}"
     try:
-        config = parse_controller(read_bytes(path, MOST_BYTES))
-        return config, f"the {config.kind} controller in {path}, {config_hash(config)[:12]}"
-    except FileNotFoundError:
-        if given is not None:
-            _refuse(f"there is no controller configuration at {path}")
-    except OSError as error:
-        _refuse(f"{path} cannot be read: {error.strerror}")
-    except ControllerRefused as refused:
-        _refuse(f"{path} is not used: {refused}")
-    try:
-        return design_lqi(task_of(line)), f"the lqi controller that `r2rgate run` would design: none is kept at {path}"
+        held = in_service(line, data_dir)
+        if held is not None:
+            return held.controller, held.said
+        return design_lqi(task_of(line)), "the lqi controller that `r2rgate run` would design: the line has never run"
+    except (ConfigurationsError, ControllerRefused, OSError) as error:
+        _refuse(f"what is in service is not known: {error}; name one with --controller")
     except DesignRefused as refused:
         _refuse(f"no lqi controller for {file}: {refused}; name one with --controller")
 

@@ -4,6 +4,7 @@ import asyncio
 import json
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
@@ -15,7 +16,7 @@ from rich.console import Console
 from gateway.cli.operate_commands import REFUSED, UNREACHABLE, Json, RunFolder
 from gateway.cli.proposal_view import print_list, print_shown
 from gateway.cli.waiting import interruptible, progress
-from gateway.core.controller import ControllerRefused, parse_controller
+from gateway.core.controller import ControllerRefused, config_hash, parse_controller
 from gateway.core.decisions import (
     Confirm,
     Decide,
@@ -50,7 +51,7 @@ REPLY_TIME_S = 20.0  #: a deployment is built and read back before it is answere
 POLL_S = 0.25
 JUDGED_WITHIN_S = 240.0
 AGAIN_WITHIN_S = 30.0  #: for which a full inbox is waited for
-LONG_S = 30.0  #: no verdict takes that long once the judge has begun
+LONG_S = 30.0  #: hardly a verdict takes that long once the judge has begun
 
 Which = Annotated[str, typer.Argument(help="The proposal's hash, or its first letters (at least 6).")]
 Comment = Annotated[str, typer.Option("--comment", help="Why; it stands in the audit.")]
@@ -98,7 +99,24 @@ def propose(
         found = asyncio.run(_judged(run_dir, _hash_of(payload), show))
     _show(found, as_json)
     if found.verdict is not None and not found.verdict.accepted:
+        if not as_json and isinstance(found.proposal.change, GainsChange):
+            typer.echo(_way_on(file, config_hash(found.proposal.change.controller)))
         raise typer.Exit(REFUSED)
+
+
+def _way_on(file: Path, refused: str) -> str:
+    """After a refusal of a configuration: the next of the design beside its file, where there is one."""
+    from gateway.cli.design_result import DesignResult
+
+    others = ""
+    with suppress(OSError, ValidationError):  # there is none, or it is none
+        result = DesignResult.model_validate_json(read_bytes(file.with_suffix(".design.json"), MOST_BYTES))
+        left = [one.architecture for one in result.candidates if one.can_be_chosen and one.hash != refused]
+        others = f"the next of its design is {left[0]} (r2rgate design --law {left[0]}); " if left else ""
+    return (
+        f"the way on: {others}`r2rgate design LINE.toml --model newest` chooses among what the gate lets through, "
+        "`r2rgate commission LINE.toml` goes on by itself"
+    )
 
 
 def proposals(
@@ -300,7 +318,9 @@ async def _judged(run_dir: Path | None, hash_: str, show: Callable[[str], None])
     mailbox, began_s = _mailbox(run_dir), clock()
     try:
         while (waited_s := clock() - began_s) < JUDGED_WITHIN_S:
-            first = ": on a new machine the judge compiles once, which takes a minute" if waited_s > LONG_S else ""
+            first = ""
+            if waited_s > LONG_S:
+                first = ": near a limit it is drawn again; on a new machine the judge compiles once, a minute"
             show(f"proposal {hash_[:12]} is being judged, {waited_s:.0f} s{first}")
             query = ShowProposal(proposal=hash_).model_dump_json().encode()
             found = _parsed_shown(await mailbox.request(GATEWAY_PROPOSALS, query, REPLY_TIME_S))

@@ -107,8 +107,8 @@ def weighed(priorities: Priorities, factors: Mapping[str, float]) -> Priorities:
 
 
 def selection_question(line: Line, candidates: Sequence[Candidate], said: Sequence[str]) -> Question:
-    """Which of `candidates` with a score, at least one, is C*. `said`: of those that have none, and of the scores."""
-    order = [one for one in ranked(candidates) if one.score is not None]
+    """Which of `candidates` that can be chosen, one at least, is C*. `said`: of those that cannot, and of scores."""
+    order = [one for one in ranked(candidates) if one.can_be_chosen]
     return _question(
         line, "design.selection", "which controller is chosen for the line",
         [*said, f"scores that differ by less than {CLOSE:.0%} are as good as equal on a line"],

@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from math import inf, isnan
 
+from gateway.commissioning.beforehand import GateAnswer
 from gateway.commissioning.records import Trial
 from gateway.core.line import NonNegative, Positive, Priorities, Strict
 from gateway.core.metrics import Performance, score, weights
@@ -11,6 +12,10 @@ TERMS = ("tracking error", "settling time", "overshoot", "effort", "robustness",
 UNITS = ("N", "s", "%", "(Nm)2 s", "N", "ms")
 SHOWN = (1.0, 1.0, 1.0, 1.0, 1.0, 1e3)  #: factor from SI to the unit above
 CLOSE = 0.02  #: of the score: a difference that no line would show
+WAY_ON = (
+    "The way on: `r2rgate commission` goes on with calmer laws, smaller steps and better data by itself; or ask for "
+    "less: limits.tension_step_max_n, limits.speed_max_m_per_s."
+)
 
 
 class Candidate(Strict):
@@ -23,9 +28,14 @@ class Candidate(Strict):
     trial: Trial | None
     compute_s: NonNegative | None  #: median of a step
     refused: str  #: why it is not offered; "" where it is
+    gate: GateAnswer | None = None  #: what the gate says of it beforehand; None: it was not asked
     score: NonNegative | None  #: S; None: not offered, or a metric is without bound
     score_otherwise: NonNegative | None = None  #: S by the weights that somebody has proposed; None: nobody has
     terms: list[float]  #: the parts of S, in the order of TERMS
+
+    @property
+    def can_be_chosen(self) -> bool:
+        return self.score is not None and not isnan(self.score) and (self.gate is None or self.gate.passed)
 
 
 def candidate(
@@ -38,13 +48,14 @@ def candidate(
     refused: str,
     priorities: Priorities,
     otherwise: Priorities | None = None,
+    gate: GateAnswer | None = None,
 ) -> Candidate:
     """With its score, where it has one; `otherwise`: other weights, by which it is scored, too."""
     performance = None if refused or trial is None or compute_s is None else performance_of(trial, compute_s)
     whole = score(performance, priorities) if performance else None
     return Candidate(
         architecture=architecture, title=title, hash=config_hash, values=dict(values), trial=trial,
-        compute_s=compute_s, refused=refused, score=whole,
+        compute_s=compute_s, refused=refused, gate=gate, score=whole,
         score_otherwise=score(performance, otherwise) if performance and otherwise else None,
         terms=(weights(priorities) * performance.vector()).tolist() if performance else [],
     )  # fmt: skip
@@ -65,8 +76,12 @@ def performance_of(trial: Trial, compute_s: float) -> Performance | None:
 
 
 def ranked(candidates: Sequence[Candidate]) -> list[Candidate]:
-    """C* first (argmin S); what has no score, or one that is no number, comes last."""
-    return sorted(candidates, key=lambda one: inf if one.score is None or isnan(one.score) else one.score)
+    """C* first: of what the gate lets through the one with the least S. Then the others by S, and what has none."""
+
+    def place(one: Candidate) -> tuple[bool, float]:
+        return not one.can_be_chosen, inf if one.score is None or isnan(one.score) else one.score
+
+    return sorted(candidates, key=place)
 
 
 def explanation(candidates: Sequence[Candidate], chosen: str = "", by: str = "") -> list[str]:
@@ -76,12 +91,16 @@ def explanation(candidates: Sequence[Candidate], chosen: str = "", by: str = "")
     """
     order = ranked(candidates)
     said: list[str] = []
-    scored = [one for one in order if one.score is not None]
+    scored = [one for one in order if one.can_be_chosen]
     if scored:
         best = scored[0]
         if chosen in ("", best.architecture):
-            said.append(f"{best.architecture} is chosen: its score of {best.score:.3f} is the least.")
+            least = "the least" if best.gate is None else "the least of those that the gate lets through"
+            said.append(f"{best.architecture} is chosen: its score of {best.score:.3f} is {least}.")
             said += [_against(best, other) for other in scored[1:2]]
+            if best.gate is not None:
+                then = f"; should the line show otherwise, {scored[1].architecture} is the next" if scored[1:] else ""
+                said.append(f"The gate's nearest rule is {best.gate.short}: {best.gate.text}{then}.")
         else:
             taken = next(one for one in scored if one.architecture == chosen)
             said.append(
@@ -91,6 +110,8 @@ def explanation(candidates: Sequence[Candidate], chosen: str = "", by: str = "")
             said.append(_against(best, taken, f"{best.architecture} is ahead of {chosen}"))
     else:
         said.append("No architecture can be offered.")
+        if any(one.gate is not None for one in order):
+            said.append(WAY_ON)
     said += _unscored(order)
     return said
 
@@ -101,6 +122,8 @@ def _unscored(order: Sequence[Candidate]) -> list[str]:
     for one in order:
         if one.refused:
             said.append(f"{one.architecture} is not offered: {one.refused}.")
+        elif one.gate is not None and not one.gate.passed:
+            said.append(f"{one.architecture} is not offered: the gate would refuse it: {'; '.join(one.gate.refusals)}.")
         elif one.trial is not None and one.trial.settling_s is None:
             said.append(f"{one.architecture} does not settle within 2 % of its set-points while it is watched.")
     return said
