@@ -61,7 +61,7 @@ class LiveGate:
         self._tell = tell
         self._pause = pause
         self._clock = clock
-        self._told = ""  #: for which proposal a person has been asked
+        self._told = ""  #: for which proposal a person has been asked, and why
         self._settled: dict[str, ProposalShown] = {}  #: proposals to which nothing happens any more
 
     async def proposals(self) -> list[ProposalShown]:
@@ -165,9 +165,10 @@ class LiveGate:
 
     async def wait_for(self, proposal: str) -> None:
         shown = await self._shown(proposal)
-        if shown.stage == "waiting" and self._told != proposal:
-            self._told = proposal
-            self._tell(f"  the gate lets it through; a person decides: r2rgate approve {proposal[:12]}")
+        if shown.stage == "waiting" and self._told != (asked := f"{proposal} {shown.why}"):
+            self._told = asked
+            why = f"it was not taken: {shown.why}" if shown.why else "the gate lets it through"
+            self._tell(f"  {why}; a person decides: r2rgate approve {proposal[:12]}")
         await self._pause(POLL_S)
 
     async def is_back(self, why: str) -> bool:

@@ -26,7 +26,7 @@ MOST_STORIES = 40
 SHORT = 12  #: letters of a hash
 KINDS = {"gains": "controller", "experiment": "experiment", "model": "model"}
 DECISION = ("approved-once", "approved", "approval-lapsed", "rejected", "expired", "superseded")
-ON_THE_LINE = ("deploying", "not-deployed", "deployed", "experiment-begins", "model-in-service")
+ON_THE_LINE = ("deploying", "not-deployed", "put-off", "deployed", "experiment-begins", "model-in-service")
 RESULT = ("kept", "rolled-back", "experiment-ends")
 
 

@@ -50,6 +50,7 @@ STEPS: dict[str, tuple[tuple[Stage, ...], Stage]] = {
     "superseded": (UNDECIDED, Stage.SUPERSEDED),
     "deploying": ((Stage.APPROVED,), Stage.DEPLOYING),
     "not-deployed": ((Stage.DEPLOYING,), Stage.NOT_DEPLOYED),
+    "put-off": ((Stage.DEPLOYING,), Stage.WAITING),
     "deployed": ((Stage.DEPLOYING,), Stage.PROBATION),
     "keeping": ((Stage.PROBATION,), Stage.KEEPING),
     "kept": ((Stage.KEEPING,), Stage.KEPT),
@@ -282,7 +283,7 @@ class Book:
             self.changed = moment_of(what)
         if kind == "deploying":
             self.epoch = int(what["epoch"])
-        elif kind == "not-deployed":
+        elif kind in ("not-deployed", "put-off"):
             self.epoch = int(what["epoch"]) - 1
         elif kind == "deployed":
             self.in_service, self.region = entry.changes, entry.region or Region()
@@ -369,6 +370,8 @@ def _moved(entry: Entry, kind: str, what: Mapping[str, Any], model: str | None) 
         more["judged_by"], more["line"] = what.get("model", model), what.get("line")
     if kind == "deploying":
         more["region"] = _region(what)
+    if kind == "put-off":  # as if it had never been told
+        more |= {"epoch": None, "region": None, "by_person": False, "approval": None}
     if kind == "approved":
         more["by_person"], more["approval"] = what.get("by", PERSON) == PERSON, hash_of(dict(what))
     return replace(

@@ -40,6 +40,14 @@ LATE_S = 30.0  #: for so long a loop that has not answered may still do what it 
 MOST_SETTLING = 1000  #: records in a row from one look at the loop; more is a fault of this program
 
 
+#: Findings of the loop that speak against the moment, as `gateway.loop.deploy` has them, and its watch.
+PASSING = frozenset(
+    {
+        "no-change-now", "experiment-under-way", "setpoints-move", "signals-held", "line-too-fast", "on-probation",
+        "doubt-saturated", "doubt-cell-stuck", "doubt-cell-drifts", "doubt-torque-not-compared",
+    }
+)  # fmt: skip
+AGAIN = "it waits, and may be approved again once that has passed"
 TOLD_LATER = "`r2rgate proposals` and the events tell it once the loop has been asked"
 
 
@@ -243,8 +251,10 @@ class OnTheLine:
             return not_known(f"whether it controls the line as epoch {epoch}; {TOLD_LATER}", [str(error)])
         if not reply.ok and reply.in_service is not None and reply.in_service.epoch < epoch:
             because = "; ".join([reply.text, *reply.reasons])[:1000]
-            await self._records.step("not-deployed", {**named, "because": because}, GATEWAY)
-            return reply
+            codes = {one.code for one in reply.findings}
+            passes = entry.by_person and bool(codes) and codes <= PASSING
+            await self._records.step("put-off" if passes else "not-deployed", {**named, "because": because}, GATEWAY)
+            return reply.model_copy(update={"text": f"{reply.text}; {AGAIN}"}) if passes else reply
         try:
             await self.settle()  # what the loop says it runs, read back
         except (Unreachable, AuditUnavailable) as error:

@@ -204,6 +204,7 @@ SENTENCES: dict[str, Callable[[str, What], str]] = {
     "superseded": _of_proposal("is superseded"),
     "deploying": lambda who, what: f"proposal {_hash(what)} goes to the loop as epoch {_of(what, 'epoch')}",
     "not-deployed": _of_proposal("was not taken by the loop"),
+    "put-off": _of_proposal("was not taken by the loop now, and waits again"),
     "deployed": _deployed,
     "keeping": _of_proposal("is about to be kept"),
     "kept": _of_proposal("is kept"),

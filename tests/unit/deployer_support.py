@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from gateway.control.design import design_lqi, task_of
 from gateway.core.controller import config_hash
 from gateway.core.deployment import Deployment, InService, RecoveryNode, RecoveryPrediction, Region
+from gateway.core.finding import finding
 from gateway.core.judge_context import JudgeContext, LineState, context_hash
 from gateway.core.line_model import LineModel
 from gateway.core.messages import (
@@ -134,6 +135,7 @@ class FakeLoop:
         self.waiting: list[tuple[float, Command]] = []
         self.spoiled: set[str] | None = None  #: the commands that `answers`, `loses` and `late_s` are for; None: all
         self.takes = True
+        self.refuses_by = [finding("configuration-misfit", because="a test")]  #: what it does not take
         self.fast = False
         self.narrows = True
         self.watches: list[tuple[str, RecoveryPrediction | None]] = []  #: by command
@@ -239,7 +241,8 @@ class FakeLoop:
             self.go_back(f"rolled back: {command.reason}")
         elif isinstance(command, RunExperiment):
             ok, text = False, "no experiment in these tests"
-        return Reply(ok=ok, state="RUN", text=text, in_service=self.in_service())
+        findings = self.refuses_by if isinstance(command, Deploy) and not ok else []
+        return Reply(ok=ok, state="RUN", text=text, in_service=self.in_service(), findings=findings)
 
 
 @dataclass

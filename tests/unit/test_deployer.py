@@ -5,6 +5,7 @@ import asyncio
 import pytest
 
 from gateway.core.controller import config_hash
+from gateway.core.finding import finding
 from gateway.supervisor.lifecycle import Stage, book_of
 from tests.unit.deployer_gateway import ANNA, PROBATION_S, deployed, run, started
 from tests.unit.deployer_support import FIRST, LIFETIME_S, LINE, controller, hash_of, model_proposal, proposal
@@ -94,6 +95,26 @@ async def test_a_refusal_of_the_loop_is_no_deployment():
     two = proposal(2, config_hash(FIRST), 0.0)
     await gateway.propose(two)
     assert (await gateway.decide(two)).ok
+
+
+@run
+async def test_what_the_loop_refuses_for_what_passes_waits_for_the_person_again():
+    gateway = await started()
+    one = proposal(1, config_hash(FIRST), 0.0)
+    await gateway.propose(one)
+    gateway.loop.takes, gateway.loop.refuses_by = False, [finding("setpoints-move")]
+    for _ in range(2):
+        reply = await gateway.decide(one)
+        assert not reply.ok and "approved again" in reply.text
+        assert gateway.stage(one) is Stage.WAITING
+        entry = gateway.deployer.book.entries[hash_of(one)]
+        assert "not its successor, or not now" in entry.why
+        assert (entry.epoch, entry.region, entry.by_person, entry.approval) == (None, None, False, None)
+    assert gateway.audit.kinds.count("put-off") == 2
+    said = gateway.loop.in_service()
+    assert gateway.deployer.book.explains(said) and gateway.deployer.book.epoch == said.epoch == 0
+    gateway.loop.takes = True
+    assert (await gateway.decide(one)).ok and gateway.stage(one) is Stage.PROBATION
 
 
 @run
