@@ -76,6 +76,7 @@ def identify(
     """
     from gateway.cli.identify_data import Asked, DataRefused, measured_of, recordings_of
     from gateway.cli.identify_outcome import Data
+    from gateway.cli.waiting import interruptible, progress
     from gateway.mailbox.listener import PathTooLong
     from gateway.mailbox.port import Unreachable
 
@@ -88,7 +89,8 @@ def identify(
         _refuse(f"--out and --report are both {out}; name two files")
     try:
         known = measured_of(measured or [], line)
-        recordings = recordings_of(line, files, Asked(last, history, run_dir))
+        with interruptible("nothing was written"), progress() as show:
+            recordings = recordings_of(line, files, Asked(last, history, run_dir), show)
     except DataRefused as refused:
         _refuse(str(refused))
     except (Unreachable, PathTooLong) as error:

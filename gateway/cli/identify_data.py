@@ -3,7 +3,7 @@
 import asyncio
 import re
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -15,6 +15,7 @@ from gateway.cli.status_commands import ask_status, choose_run_folder
 from gateway.core.line import Line, Parameter
 from gateway.core.nearest import nearest
 from gateway.core.recording import Recording
+from gateway.core.status import GatewayStatus
 from gateway.identification.parameters import EACH
 from gateway.mailbox.paths import default_run_folder, running_lines
 from gateway.supervisor.experiments import newest_experiments
@@ -22,6 +23,7 @@ from gateway.supervisor.history import HistoryError
 
 MEASURABLE = ("stiffness_n", *EACH)
 LAST = "60s"
+LOOK_S, STORED_WITHIN_S = 0.25, 5.0
 EXPERIMENTS_S = 604_800.0  #: back in the history, for one to identify on
 _MEASURED = re.compile(r"\s*(\w+)\s*=\s*([^,\s]+)\s*,\s*([0-9.eE+-]+)\s*%\s*")
 
@@ -39,10 +41,12 @@ class Asked:
     run_dir: Path | None
 
 
-def recordings_of(line: Line, files: Sequence[Path], asked: Asked) -> list[Recording]:
+def recordings_of(
+    line: Line, files: Sequence[Path], asked: Asked, tell: Callable[[str], None] = lambda text: None
+) -> list[Recording]:
     """Of the files, else of the running line's history. Raises DataRefused, Unreachable, PathTooLong."""
     if not files:
-        return [_from_history(line, asked)]
+        return [_from_history(line, asked, tell)]
     found: list[Recording] = []
     refused: list[str] = []
     for file in files:
@@ -61,7 +65,7 @@ def recordings_of(line: Line, files: Sequence[Path], asked: Asked) -> list[Recor
     return found
 
 
-def _from_history(line: Line, asked: Asked) -> Recording:
+def _from_history(line: Line, asked: Asked, tell: Callable[[str], None]) -> Recording:
     seconds = seconds_of(asked.last or LAST)
     path = asked.history
     if path is None:
@@ -73,6 +77,8 @@ def _from_history(line: Line, asked: Asked) -> Recording:
                 f"in {folder} runs {status.site}/{status.line}, the file describes {line.site}/{line.line}: name its "
                 "--run-dir, or its file"
             )
+        if asked.last is None:
+            asyncio.run(_experiment_over(folder, status, tell))
         path = Path(status.historian.path)
     now_s = time.time()
     if asked.last is None and (newest := _newest_experiment(path, now_s)) is not None:
@@ -84,6 +90,26 @@ def _from_history(line: Line, asked: Asked) -> Recording:
             f"{error}; the last {seconds:g} s were asked for: --last takes more, r2rgate export makes a file of a "
             "while that is worth keeping"
         ) from error
+
+
+async def _experiment_over(folder: Path, status: GatewayStatus, tell: Callable[[str], None]) -> None:
+    """Once one that runs has ended, and its data are stored. Raises Unreachable, PathTooLong."""
+
+    def runs() -> bool:
+        return status.change is not None and (status.change.kind, status.change.stage) == ("experiment", "running")
+
+    if not runs():
+        return
+    while runs():
+        tell("an experiment runs: its end is waited for (Ctrl-C, and --last 60s takes what there is)")
+        await asyncio.sleep(LOOK_S)
+        status = await ask_status(folder)
+    ended_s, until_s = status.wall_s, status.wall_s + STORED_WITHIN_S
+    while (age_s := status.historian.last_stored_age_s) is None or status.wall_s - age_s < ended_s:
+        if status.wall_s > until_s:
+            return  # what there is says what is missing
+        await asyncio.sleep(LOOK_S)
+        status = await ask_status(folder)
 
 
 def _newest_experiment(path: Path, now_s: float) -> Recording | None:

@@ -32,7 +32,7 @@ def assess_time(recording: Recording, line: Line) -> list[Finding]:
         return [_refusal("time order", what, _sample(recording, int(back[0]) + 1), len(back), 0.0, mend)]
     found = _duplicates(recording, step)
     period = _period(recording, line, step)
-    return found + (period or _jitter(recording, step) + _gaps(recording, line, step) + _controlled(recording, line))
+    return found + (period or _jitter(recording, step) + _gaps(recording, step) + _controlled(recording, line))
 
 
 def _duplicates(recording: Recording, step: FloatArray) -> list[Finding]:
@@ -82,24 +82,24 @@ def _jitter(recording: Recording, step: FloatArray) -> list[Finding]:
     return [Finding("jitter", severity, what, "time_s", jitter, limit, mend)]
 
 
-def _gaps(recording: Recording, line: Line, step: FloatArray) -> list[Finding]:
-    """Between two samples under control. As many as the loop itself bridges at a time are no refusal."""
+def _gaps(recording: Recording, step: FloatArray) -> list[Finding]:
+    """Between two samples under control. What lies between is used as pieces; only much that is lost is a refusal."""
     inside = recording.controlled[1:] & recording.controlled[:-1]
     places = np.flatnonzero((step > 1.5 * recording.period_s) & inside)
     if not len(places):
         return []
     lost = np.round(step[places] / recording.period_s).astype(int) - 1
     longest, share = int(lost.max()), float(lost.sum()) / (len(step) + 1 + float(lost.sum()))
-    refused = longest > line.limits.hold_periods or share > LOST_SHARE
+    refused = share > LOST_SHARE
     worst = int(places[np.argmax(lost)])
     what = f"{len(places)} gaps, {lost.sum()} samples lost ({share:.1%}), up to {longest} in a row"
     parts = sorted(recording.stretches(2), key=lambda part: -part.samples)
-    mend = "repeat the recording"
-    if parts:
+    mend = "the parts between them are used together" if not refused else "repeat the recording"
+    if parts and refused:
         begin, end = float(parts[0].time_s[0]), float(parts[0].time_s[-1])
         mend = f"take the longest part without a gap, {begin:.6g} to {end:.6g} s, or repeat the recording"
     severity = Severity.REFUSAL if refused else Severity.WARNING
-    return [Finding("gap", severity, what, _sample(recording, worst + 1), longest, line.limits.hold_periods, mend)]
+    return [Finding("gap", severity, what, _sample(recording, worst + 1), share, LOST_SHARE, mend)]
 
 
 def _controlled(recording: Recording, line: Line) -> list[Finding]:

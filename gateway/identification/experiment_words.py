@@ -5,6 +5,7 @@ from math import inf
 
 from gateway.core.experiment import Experiment
 from gateway.core.line import Line
+from gateway.identification.assess_excitation import Wanted as IdentifyWanted
 
 WORDS = {
     "stiffness_per_length": "EA/L", "radius_per_inertia": "R/J", "friction_per_inertia": "f/J", "stiffness_n": "EA",
@@ -64,10 +65,25 @@ def why(
         f"expected half-widths of 95 % intervals (at the worst corner tried): {told}",
         f"foreseen within the tolerances: {foreseen}, limits {limits.tension_min_n:g} and {limits.tension_max_n:g} N; "
         f"a torque at a limit in up to {saturated_share:.0%} of the periods of a second{left}",
+        enough(worst),
         f"it ends itself when a tension is {abort.deviation_n:g} N off; when in {abort.window_s:g} s torques are at a "
         f"limit in more than {abort.saturated_share:.0%} of the periods, or turn round by {abort.reversal_nm:g} Nm in "
         f"more than {abort.reversal_share:.0%}; when the line leaves RUN; when signals are missing for more than "
         f"{abort.held_periods} period{'' if abort.held_periods == 1 else 's'} in a row",
+    )
+
+
+def enough(worst: Mapping[str, float]) -> str:
+    """Whether what is expected is what `identify` asks of data before it estimates anything."""
+    wanted = IdentifyWanted()
+    limits = {name: getattr(wanted, name) for name in ("stiffness_per_length", "radius_per_inertia",
+              "friction_per_inertia")}  # fmt: skip
+    asked = ", ".join(f"{WORDS[name]} {percent(limit)}" for name, limit in limits.items())
+    if all(worst[name] <= limit for name, limit in limits.items()):
+        return f"identify will have enough, also at the worst corner: it wants {asked}"
+    return (
+        f"identify may refuse the data of a line at the worst corner: it wants {asked}; a second speed, a faster one "
+        "or smaller half-widths (--strong) tell more"
     )
 
 
