@@ -59,7 +59,7 @@ def _process(spans: int) -> str:
         "tensioning_time_s": "20.0" if spans <= 20 else "40.0",
     }
     moves = {
-        "shape": '"ramp"',
+        "shape": '"minimum-jerk"',
         "tension_rate_n_per_s": f"{tension_rate:.1f}",
         "speed_rate_m_per_s2": "0.05",
         "stop_rate_m_per_s2": "0.1",

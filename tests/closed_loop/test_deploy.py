@@ -44,8 +44,12 @@ LAWS = {
 CANDIDATE = LAWS["lqg"]
 
 
-def producing(config=GOOD, speed_m_per_s=0.05, seed=1):
-    loop = SteppedLoop(LINE, config, real_plant(), seed)
+def on_ramps(line):
+    return line.model_copy(update={"moves": line.moves.model_copy(update={"shape": "ramp"})})
+
+
+def producing(config=GOOD, speed_m_per_s=0.05, seed=1, line=LINE):
+    loop = SteppedLoop(line, config, real_plant(), seed)
     loop.begin_in_production(TENSION_N, speed_m_per_s)
     loop.step(30)
     return loop
@@ -244,7 +248,7 @@ def test_what_was_not_judged_is_refused_with_what_lifts_it():
 def test_an_experiment_with_a_verdict_of_its_own_may_leave_the_region_but_not_on_probation():
     loop = producing()
     faster = Experiment(
-        format=1, amplitude_n=[1.0] * LINE.n, dwell_s=0.1, legs=[Leg(duration_s=1.0, speed_m_per_s=0.08)],
+        format=1, amplitude_n=[1.0] * LINE.n, dwell_s=0.1, legs=[Leg(duration_s=1.5, speed_m_per_s=0.08)],
         abort=Abort(deviation_n=10.0),
     )  # fmt: skip
     judged, unjudged = RunExperiment(experiment=faster, proposal="a" * 64), RunExperiment(experiment=faster)
@@ -253,15 +257,14 @@ def test_an_experiment_with_a_verdict_of_its_own_may_leave_the_region_but_not_on
     assert loop.command(Keep(epoch=1)).ok
     assert codes(loop.command(unjudged)) == ["leg-unjudged"]
     assert loop.command(judged).ok
-    loop.step(100)
+    loop.step(140)
     assert loop.truth.world.unwind_speed_m_per_s == pytest.approx(0.08)
     loop.step(200)
     assert loop.truth.world.unwind_speed_m_per_s == pytest.approx(0.05)
 
 
 def test_on_probation_set_points_move_along_curves_and_afterwards_on_ramps_again():
-    loop = producing()
-    assert LINE.moves.shape == "ramp"
+    loop = producing(line=on_ramps(LINE))
     assert loop.command(deployment(lease_s=60.0)).ok
     assert loop.command(SetTension(span=1, tension_n=34.0)).ok
     seen = []

@@ -163,7 +163,7 @@ def test_more_precision_takes_more_movement_or_time():
     coarse = design_experiment(line, config, wanted=Wanted(0.02, 0.10))
     fine = design_experiment(line, config, wanted=Wanted(0.0045, 0.03))
     assert cost(coarse) < cost(fine)
-    assert coarse.experiment.legs[1].duration_s - 1.0 == PREFERRED_S
+    assert coarse.experiment.legs[1].duration_s - 2.0 == PREFERRED_S  # and the way from speed to speed
 
 
 def test_tensions_move_by_more_than_noise_though_less_would_tell_enough():

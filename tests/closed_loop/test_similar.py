@@ -23,7 +23,7 @@ from tests.closed_loop.similar_line import Change, SimilarLoop
 from tests.support.similar import Similar
 
 SPANS, AT = 3, 150  #: the period in which something happens
-PERIODS, OF_A_START, OF_A_BREAK = 500, 700, 1050
+PERIODS, OF_A_START, OF_A_BREAK = 500, 1000, 1050
 SIZES = {
     "foil of 0.1 N": Similar(force=2.0**-9),
     "laminator of 15 kN": Similar(force=2.0**8),

@@ -69,9 +69,14 @@ def test_stop_is_latched_and_only_arm_leads_out(running):
 
 def test_setpoints_ramp_or_step_within_the_limits(running):
     assert running.command(SetTension(span=1, tension_n=38.0)).ok
-    running.step(25)
-    assert running.cycle.setpoints.tension_n[0] == pytest.approx(28.0 + 0.25 * 20.0)
-    running.step(200)
+    before, moves = 28.0, []
+    for _ in range(100):
+        running.step()
+        before, moved = running.cycle.setpoints.tension_n[0], running.cycle.setpoints.tension_n[0] - before
+        moves.append(moved)
+    assert before == 38.0 and moves[0] < 0.1 * max(moves)  # along a curve
+    assert max(moves) == pytest.approx(20.0 * running.line.control.period_s, rel=0.05)
+    running.step(125)
     assert running.truth.world.tension_n[0] == pytest.approx(38.0, abs=1.0)
     assert running.command(SetTension(span=3, tension_n=44.0, step=True)).ok
     assert running.cycle.setpoints.tension_n[2] == 44.0

@@ -133,7 +133,11 @@ def test_a_line_is_brought_up_and_down_by_the_operator_alone():
         assert told[-1].by_person and told[-1].standstill and told[-1].phase == Phase.OFF
         assert {frame.by_person for frame in told if frame.phase < Phase.SLOWING} == {False}
         assert not [frame for frame in told if frame.standstill and np.abs(frame.speed_m_per_s).max() > moves_m_per_s]
-        assert not [frame for frame in told if frame.standstill and frame.phase == Phase.RUNNING]
+        runs_m_per_s = line.cycle.limits.standstill_m_per_s  # a curve begins slowly
+        assert not [
+            frame for frame in told
+            if frame.standstill and frame.phase == Phase.RUNNING and frame.unwind_speed_m_per_s > runs_m_per_s
+        ]  # fmt: skip
     assert phases == [
         Phase.ARMING, Phase.READY, Phase.ENABLING, Phase.TENSIONING, Phase.RUNNING,
         Phase.SLOWING, Phase.UNLOADING, Phase.OFF,

@@ -171,7 +171,7 @@ REFUSED: list[Refused] = [
         [("tensioning_time_s = 20.0", "tensioning_time_s = 2.0")],
         "recipes[1].tension_n",
         "tension_n",
-        "at moves.tension_rate_n_per_s (20 N/s) the ramp takes 2 s, limits.tensioning_time_s is 2 "
+        "at moves.tension_rate_n_per_s (20 N/s) the ramp takes 3.75 s, limits.tensioning_time_s is 2 "
         "s; allowed: a faster rate, a longer time or lower tensions",
     ),
     (

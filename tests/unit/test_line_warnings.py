@@ -71,7 +71,7 @@ ALLOWED: list[list[Edit]] = [
     [("capacity_n = 100.0\n", "capacity_n = 66.0\n")],
     [("[28.0, 36.0", "[28.0, 7.9")],
     [("[28.0, 36.0", "[28.0, 54.1")],
-    [("tensioning_time_s = 20.0", "tensioning_time_s = 2.1")],
+    [("tensioning_time_s = 20.0", "tensioning_time_s = 3.8")],
     [("address = 3\n", "address = 127\n")],
     [('"udp_multicast"', '"virtual"'), ("port = 43113 ", "# ")],
     [('"udp_multicast"', '"socketcan"'), ("port = 43113 ", "# "), ('"239.74.163.2"', '"can0"')],
