@@ -7,7 +7,7 @@ PARALLEL := --numprocesses auto --maxprocesses 4 --dist loadfile
 export PYTHONDONTWRITEBYTECODE :=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup run test test-long test-long-realtime test-long-rest coverage test-realtime test-rest system-test landing search test-fast ready check types lint format bench bench-stepped bench-wire bench-processes bench-cycle bench-engage bench-history bench-trials bench-mpc bench-loop-states bench-loop-kill bench-monitor bench-control bench-identify bench-faults bench-fuzz bench-soak bench-gate bench-lifecycle bench-audit bench-kill bench-gate-live bench-agents-live bench-operator bench-harm bench-intrusions bench-knowledge bench-agents bench-stop minilm mutate lock clean
+.PHONY: help setup run test test-long test-long-realtime test-long-rest coverage test-realtime test-rest system-test landing search test-fast ready check types lint format bench bench-stepped bench-wire bench-processes bench-cycle bench-engage bench-history bench-trials bench-mpc bench-loop-states bench-loop-kill bench-monitor bench-control bench-identify bench-faults bench-fuzz bench-soak bench-gate bench-lifecycle bench-audit bench-kill bench-gate-live bench-agents-live bench-operator bench-harm bench-intrusions bench-knowledge bench-agents bench-chain bench-stop minilm mutate lock clean
 
 help: ## this list
 	@echo "r2rgate: make TARGET"
@@ -161,6 +161,9 @@ bench-knowledge: setup ## how well notes are found, and how fast; with MiniLM wh
 
 bench-agents: $(VENV)/.compiled ## lines commissioned by every persona of a language model, and by none (about an hour; ARGS="--personas off,perfect --tasks 4")
 	@$(PY) -m tests.bench.agents $(ARGS)
+
+bench-chain: setup ## from `init` to a redesign that is kept, on drawn lines; the same change has the same verdict (about 20 min; ARGS="--lines 20")
+	@$(PY) -m tests.bench.chain $(ARGS)
 
 bench-stop: setup ## a stop from page, OPC UA and terminal beside held stores, packing, judging, silent connections and floods; a lease beside all of it (about 20 min; ARGS="--parts stops --stops 20")
 	@$(PY) -m tests.bench.stop $(ARGS)
