@@ -162,7 +162,7 @@ bench-knowledge: setup ## how well notes are found, and how fast; with MiniLM wh
 bench-agents: $(VENV)/.compiled ## lines commissioned by every persona of a language model, and by none (about an hour; ARGS="--personas off,perfect --tasks 4")
 	@$(PY) -m tests.bench.agents $(ARGS)
 
-bench-chain: setup ## from `init` to a redesign that is kept, on drawn lines; the same change has the same verdict (about 20 min; ARGS="--lines 20")
+bench-chain: setup ## from `init` to a redesign that is kept, on drawn lines; the same change has the same verdict (about 10 min; ARGS="--lines 20")
 	@$(PY) -m tests.bench.chain $(ARGS)
 
 bench-stop: setup ## a stop from page, OPC UA and terminal beside held stores, packing, judging, silent connections and floods; a lease beside all of it (about 20 min; ARGS="--parts stops --stops 20")

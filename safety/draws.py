@@ -135,8 +135,10 @@ def _decided(drawn: Sequence[RuleFinding]) -> bool | None:
 
 def _settled(drawn: Sequence[RuleFinding]) -> RuleFinding:
     """The worst of the draws that came out as is decided; what cannot be told is refused where any draw was."""
+    if len(drawn) == 1:
+        return drawn[0]
     decided = _decided(drawn)
     passed = all(one.passed for one in drawn) if decided is None else decided
     alike = [one for one in drawn if one.passed is passed] or drawn
     worst = min(alike, key=lambda one: -inf if one.margin is None else one.margin)
-    return worst if worst.passed is passed else worst.model_copy(update={"passed": passed})
+    return worst.model_copy(update={"passed": passed})

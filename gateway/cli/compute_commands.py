@@ -30,7 +30,7 @@ def compute(
     """Compute as the Code agent does for the others: simulate, identify, design, tune, margins, spectrum, compare.
 
     Each call runs in a process without network, with little time and memory. Nothing of it reaches a drive. Without
-    --controller the one in the data folder is in-service, where there is one; without --model the one that was accepted
+    --controller what the records in the data folder have is in-service; without --model the one that was accepted
     last, as the data folder has it, else the line's file speaks.
     What a call may say: docs/agents.md.
 

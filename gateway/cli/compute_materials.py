@@ -4,16 +4,16 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from agents.code.materials import Given
-from gateway.cli.data_place import gateway_folder, own_folder
+from gateway.cli.data_place import gateway_folder
+from gateway.cli.line_in_service import in_service
 from gateway.cli.model_place import chosen, chosen_of, reasons_against_line
-from gateway.cli.process_commands import default_data_folder
 from gateway.cli.recordings import read_recording
 from gateway.cli.recordings_table import RecordingRefused
 from gateway.core.controller import Controller, ControllerRefused, parse_controller
 from gateway.core.line import Line
 from gateway.core.line_model import LineModel
 from gateway.files import MOST_BYTES, read_bytes
-from gateway.mailbox.paths import CONTROLLER, LOOP_DATA
+from gateway.supervisor.configurations import ConfigurationsError
 from gateway.supervisor.model_store import ModelsError
 from gateway.supervisor.models import FILE_NAME, open_repository
 
@@ -28,15 +28,14 @@ def given(
 ) -> Given:  # fmt: skip
     """Raises MaterialsRefused."""
     models = gateway_folder(line, data_dir) / FILE_NAME
-    kept = own_folder(data_dir or default_data_folder(line), LOOP_DATA) / CONTROLLER
-    path = controller or (kept if kept.exists() else None)
     try:
+        held = None if controller is not None else in_service(line, data_dir)
         return Given(
             _named(model, line, file, data_dir) if model else _accepted(line, models),
-            None if path is None else _controller(path),
+            _controller(controller) if controller is not None else None if held is None else held.controller,
             [read_recording(one, line.control.period_s) for one in recordings],
         )
-    except (ModelsError, RecordingRefused) as error:
+    except (ModelsError, RecordingRefused, ConfigurationsError, ControllerRefused, OSError) as error:
         raise MaterialsRefused(str(error)) from error
 
 

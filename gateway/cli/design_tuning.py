@@ -15,6 +15,7 @@ from threading import Thread
 from typing import TypeVar
 
 import numpy as np
+from numpy.linalg import LinAlgError
 
 from gateway.cli.background import in_background
 from gateway.cli.timed_law import TimedLaw
@@ -193,7 +194,7 @@ def _let_through(architecture: Architecture, best: _Good, ground: Ground, gate: 
         before, values = values, calmer(architecture, values)
         if alike(before, values):
             break
-        with suppress(DesignRefused):
+        with suppress(DesignRefused, LinAlgError):  # a calmer one of which there is no design is left out
             config = architecture.design(ground.task, values, ground.speeds_m_per_s)
             runs = run_on(config, ground)
             trial = trial_of(config, ground, runs)

@@ -40,7 +40,7 @@ def judge(
     proposals: Annotated[Path, typer.Option(help="One proposal a line (JSON lines).")],
     out: Annotated[Path, typer.Option(help="One verdict a line, in the same order.")],
     seed: Annotated[
-        int | None, typer.Option(min=0, help="For the same verdicts again. Without: drawn anew for each proposal.")
+        int | None, typer.Option(min=0, help="For the same verdicts again. Without: others in each run.")
     ] = None,
     workers: Annotated[int, typer.Option(min=0, max=64, help="Processes that judge. 0: one per processor.")] = 0,
 ) -> None:

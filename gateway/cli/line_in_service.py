@@ -25,7 +25,7 @@ from gateway.supervisor.lifecycle import Book
 
 
 @dataclass(frozen=True)
-class InService:
+class ControllerHeld:
     """Of a line: the controller, for what it was judged, and what small steps are held against."""
 
     controller: Controller
@@ -44,7 +44,7 @@ class Stands:
     said: str
 
 
-def in_service(line: Line, data_dir: Path | None) -> InService | None:
+def in_service(line: Line, data_dir: Path | None) -> ControllerHeld | None:
     """As the audit has it; where that has nothing, what the loop keeps. None: neither has anything.
 
     Raises ConfigurationsError where the store lacks what the audit names, ControllerRefused and OSError for a file.
@@ -56,13 +56,13 @@ def in_service(line: Line, data_dir: Path | None) -> InService | None:
             found = store.find(book.in_service, line.site, line.line)
             if found.controller is not None:
                 said = f"{found.controller.kind} {book.in_service[:12]}, in service"
-                return InService(found.controller, book.judged_for, *_baseline(store, line, book), said)
+                return ControllerHeld(found.controller, book.judged_for, *_baseline(store, line, book), said)
     kept = own_folder(data_dir or default_data_folder(line), LOOP_DATA) / CONTROLLER
     try:
         controller = parse_controller(read_bytes(kept, MOST_BYTES))
     except FileNotFoundError:
         return None
-    return InService(controller, Region(), None, Region(), f"the {controller.kind} controller in {kept}")
+    return ControllerHeld(controller, Region(), None, Region(), f"the {controller.kind} controller in {kept}")
 
 
 def stands(line: Line, run_dir: Path | None) -> Stands | None:
@@ -77,7 +77,7 @@ def stands(line: Line, run_dir: Path | None) -> Stands | None:
     return Stands(tension, speed, "as the line stands now")
 
 
-def context_of(line: Line, model: LineModel | None, held: InService | None, at: Stands | None) -> JudgeContext:
+def context_of(line: Line, model: LineModel | None, held: ControllerHeld | None, at: Stands | None) -> JudgeContext:
     """In which the gate would judge a design. Raises DesignRefused where nothing is in service, and no lqi can be."""
     from gateway.control.design import design_lqi, task_of
 

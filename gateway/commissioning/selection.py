@@ -13,8 +13,8 @@ UNITS = ("N", "s", "%", "(Nm)2 s", "N", "ms")
 SHOWN = (1.0, 1.0, 1.0, 1.0, 1.0, 1e3)  #: factor from SI to the unit above
 CLOSE = 0.02  #: of the score: a difference that no line would show
 WAY_ON = (
-    "The way on: `r2rgate commission` goes on with calmer laws, smaller steps and better data by itself; or ask for "
-    "less: limits.tension_step_max_n, limits.speed_max_m_per_s."
+    "The way on: `r2rgate commission` goes on by itself, with calmer laws and more data; or ask for less in the line's "
+    "file: limits.tension_step_max_n, limits.speed_max_m_per_s."
 )
 
 

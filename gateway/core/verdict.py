@@ -47,7 +47,7 @@ class Verdict(Strict):
     context: Digest
     line: Digest  #: SHA-256 of the line's file in its canonical form
     kind: Kind | None
-    seed: Annotated[int, Field(ge=0)]  #: drawn anew for each proposal
+    seed: Annotated[int, Field(ge=0)]  #: follows from what is proposed, and a secret of the gateway
     accepted: bool
     findings: list[RuleFinding]  #: of the rules that decide, each
     reported: list[RuleFinding] = []  #: beside them: S_robust, the paper's criteria

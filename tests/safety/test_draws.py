@@ -106,8 +106,7 @@ def test_how_far_a_tension_goes_is_a_limit_of_each_draw(case):
         return [at_most("corners: highest tension", value, LIMIT, "N", f"{value}")]
 
     rule = Rule("corners", check, luck=0.15)
-    seen = {settled(case, rule, 1).passed for _ in range(3)}
-    assert seen == {False}
+    assert not settled(case, rule, 1).passed
 
 
 def test_findings_of_one_name_do_not_stand_for_each_other(case):
